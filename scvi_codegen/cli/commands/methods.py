@@ -57,7 +57,8 @@ def _entries_of(name: str) -> Iterator[dict[str, Any]]:
             "name": name,
             "arguments": list(ARGUMENTS[name]),
             "number": size_of(name),
-            "example": _option(name, arguments),
+            "example": _spelled(name, arguments),
+            "options": _options(arguments),
             "order": method.order,
             "symplectic": method.symplectic,
             "symmetric": method.symmetric,
@@ -72,7 +73,7 @@ def methods_table(entries: Iterable[Mapping[str, Any]]) -> str:
         first = (name, ", ".join(entry["arguments"]) or "none") if entry["name"] != last else ("", "")
         order = "none claimed" if entry["order"] is None else str(entry["order"])
         holds = ("yes" if entry[what] else "no" for what in ("symplectic", "symmetric"))
-        rows.append((*first, entry["example"], order, *holds))
+        rows.append((*first, " ".join([entry["example"], *entry["options"]]), order, *holds))
         last = entry["name"]
     return table(rows)
 
@@ -119,15 +120,16 @@ def _example(name: str) -> Mapping[str, Any]:
     return EXAMPLES.get(name, {"stages": EXAMPLE_STAGES} if "stages" in ARGUMENTS[name] else {})
 
 
-def _option(name: str, arguments: Mapping[str, Any]) -> str:
-    """Return a method as ``--method`` accepts it, followed by further options."""
+def _spelled(name: str, arguments: Mapping[str, Any]) -> str:
+    """Return a method as ``--method`` accepts it."""
     size = size_of(name)
-    words = [f"{name}:{arguments[size]}" if size and size in arguments else name]
-    if "abscissae" in arguments:
-        words.append(f"--abscissae {','.join(map(str, arguments['abscissae']))}")
-    if not arguments.get("variational", True):
-        words.append("--printed")
-    return " ".join(words)
+    return f"{name}:{arguments[size]}" if size and size in arguments else name
+
+
+def _options(arguments: Mapping[str, Any]) -> list[str]:
+    """Return further options of a method."""
+    abscissae = ["--abscissae", ",".join(map(str, arguments["abscissae"]))] if "abscissae" in arguments else []
+    return abscissae if arguments.get("variational", True) else [*abscissae, "--printed"]
 
 
 def _yes_or_not(holds: bool) -> str:
