@@ -74,12 +74,12 @@ from scvi_codegen.methods import RungeKutta as RungeKutta
 from scvi_codegen.methods import SpectralCollocation as SpectralCollocation
 from scvi_codegen.methods import StoermerVerlet as StoermerVerlet
 from scvi_codegen.methods import as_method as as_method
-from scvi_codegen.models.fmu import generate_fmu as generate_fmu
 from scvi_codegen.models.model import Model as Model
-from scvi_codegen.models.model_file import load_model as load_model
-from scvi_codegen.models.model_file import save_model as save_model
-from scvi_codegen.models.package import generate_package as generate_package
-from scvi_codegen.models.package import load_package as load_package
+from scvi_codegen.models.model_files.model_file import load_model as load_model
+from scvi_codegen.models.model_files.model_file import save_model as save_model
+from scvi_codegen.models.packages.fmu import generate_fmu as generate_fmu
+from scvi_codegen.models.packages.package import generate_package as generate_package
+from scvi_codegen.models.packages.package import load_package as load_package
 from scvi_codegen.models.problems import PROBLEMS as PROBLEMS
 from scvi_codegen.models.problems import problem as problem
 from scvi_codegen.native.options import SolverOptions as SolverOptions

@@ -31,7 +31,7 @@ from scvi_codegen.errors import (
     closest,
 )
 from scvi_codegen.files.atomic import write_atomically
-from scvi_codegen.models.key_hints import EVENTS
+from scvi_codegen.models.model_files.key_hints import EVENTS
 from scvi_codegen.native.announcements import announce_to
 
 __all__ = [

@@ -14,8 +14,8 @@ from scvi_codegen.cli.conservation import momentum_report
 from scvi_codegen.cli.formatting import counted, duration
 from scvi_codegen.cli.memory import check_memory
 from scvi_codegen.cli.progress import interruptions, progress_bar
-from scvi_codegen.models.ensemble_file import EnsembleStates
 from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_files.ensemble_file import EnsembleStates
 from scvi_codegen.native.options import FAILURES, SolverOptions
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.ensemble.independent import AdaptiveEnsemble

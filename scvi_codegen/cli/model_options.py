@@ -17,7 +17,7 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.mechanics.time_transformation import CONTROLLERS
 from scvi_codegen.methods import ARGUMENTS, METHODS, size_of, specification_of
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_file import catalogue_model, load_model
+from scvi_codegen.models.model_files.model_file import catalogue_model, load_model
 from scvi_codegen.models.problems import PROBLEMS, problem
 
 __all__ = [

@@ -20,7 +20,7 @@ from scvi_codegen.cli.running import conserved, final_state
 from scvi_codegen.errors import ModelFileError, StepFailedError
 from scvi_codegen.files import export
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_file import dump_model, parse_model
+from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 from scvi_codegen.models.time_span import whole_steps_in
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.results.recording import RecordedRun, load_run, record_run, resume_run

@@ -1,1 +1,1 @@
-"""Models: a system with a method, an initial state and a time span; model files, ensembles, generated folders, FMUs."""
+"""Models: a system with a method, an initial state and a time span; their files, and generated folders and FMUs."""

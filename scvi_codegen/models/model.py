@@ -24,7 +24,7 @@ from scvi_codegen.representation import summary
 from scvi_codegen.validation.argument_types import check_kind
 
 if TYPE_CHECKING:
-    from scvi_codegen.models.input_tables import InputTable
+    from scvi_codegen.models.model_files.input_tables import InputTable
     from scvi_codegen.native.options import SolverOptions
     from scvi_codegen.runtime.core.stepper import Stepper
     from scvi_codegen.runtime.core.validation import Array
@@ -99,7 +99,7 @@ class Model(TimeSpan):
             )
         self._check_time_span(has_time_transformation=self.has_time_transformation)
         if self.inputs:
-            from scvi_codegen.models.input_tables import checked_tables  # not needed for reading a model
+            from scvi_codegen.models.model_files.input_tables import checked_tables  # not needed for reading a model
 
             object.__setattr__(self, "inputs", checked_tables(self.system, self.inputs))
 

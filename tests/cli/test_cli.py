@@ -29,7 +29,7 @@ from scvi_codegen.cli.model_options import ModelOptions, read_model
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_file import load_model, parse_model, save_model
+from scvi_codegen.models.model_files.model_file import load_model, parse_model, save_model
 from scvi_codegen.models.problems import PROBLEMS, problem
 
 pytestmark = pytest.mark.long
@@ -577,7 +577,7 @@ def test_unwritable_package_is_a_failure(tmp_path, monkeypatch):
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("scvi_codegen.models.folders.write_atomically", full)
+    monkeypatch.setattr("scvi_codegen.models.packages.folders.write_atomically", full)
     result = CliRunner().invoke(main, ["generate", "kepler", "-o", str(tmp_path / "kepler_svi")])
     assert result.exit_code == 1
     assert "cannot be written: No space left" in result.output

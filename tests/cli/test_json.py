@@ -17,7 +17,7 @@ import scvi_codegen as sc
 from scvi_codegen import benchmark
 from scvi_codegen.benchmark.report import ResultTable
 from scvi_codegen.cli import command_group, main
-from scvi_codegen.models.model_file import parse_model
+from scvi_codegen.models.model_files.model_file import parse_model
 
 KEPLER = ("kepler", "--step", "0.1", "--steps", "50", "--method", "svi:4")
 QUIET_COMMANDS = (
@@ -150,7 +150,9 @@ def test_json_of_lists_and_model_files():
     sections = document("systems", "kepler")
     again = parse_model(invoke("systems", "kepler").stdout)
     assert sections["initial"]["q"] == list(again.q)
-    by_name = {entry["example"]: entry for entry in document("methods")["methods"]}
+    by_name = {" ".join([entry["example"], *entry["options"]]): entry for entry in document("methods")["methods"]}
+    for entry in by_name.values():
+        specification_of(entry["example"])  # as --method reads it
     for example, entry in by_name.items():
         assert entry["symplectic"] in (True, False)
         if " " in example:

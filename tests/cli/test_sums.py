@@ -13,7 +13,7 @@ from click.testing import CliRunner, Result
 from scvi_codegen import SVI, load_model
 from scvi_codegen.cli import main
 from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.models.package import load_package
+from scvi_codegen.models.packages.package import load_package
 from scvi_codegen.native.compilers import find_compiler
 
 RING = """

@@ -32,10 +32,10 @@ from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import ARGUMENTS, METHODS, SCVI, SVI, Gauss, method_from_specification
-from scvi_codegen.models.ensemble_file import load_ensemble
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_file import dump_model, parse_model
-from scvi_codegen.models.package import generate_package
+from scvi_codegen.models.model_files.ensemble_file import load_ensemble
+from scvi_codegen.models.model_files.model_file import dump_model, parse_model
+from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.models.problems import problem
 from scvi_codegen.pipeline.sources import generate_source
 from scvi_codegen.tables.nodes import nodes_by_name

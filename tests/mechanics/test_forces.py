@@ -16,7 +16,7 @@ from scvi_codegen.mechanics.symmetry.symmetry import symmetries
 from scvi_codegen.mechanics.time_transformation import reparametrise
 from scvi_codegen.methods import SCVI, SVI
 from scvi_codegen.methods.discretise import discretise
-from scvi_codegen.models.model_file import dump_model, parse_model
+from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 
 PARAMETERS = {"m": 1.2, "c": 0.1, "F": 0.5, "w": 2.0}
 

@@ -29,7 +29,7 @@ from scvi_codegen.methods import (
     StoermerVerlet,
 )
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_file import dump_model, parse_model
+from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 from scvi_codegen.models.problems import problem
 
 QUICK = ("-O1", "-ffp-contract=off")

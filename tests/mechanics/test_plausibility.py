@@ -8,7 +8,7 @@ import pytest
 import sympy
 
 import scvi_codegen as sc
-from scvi_codegen.models.model_file import parse_model
+from scvi_codegen.models.model_files.model_file import parse_model
 
 UNUSED = "is not used in the {}, the forces or the constraints of 'system'; remove it or use it."
 x, v, k, m, z = sympy.symbols("x x_dot k m z")

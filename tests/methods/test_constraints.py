@@ -28,7 +28,7 @@ from scvi_codegen import (
     reparametrise,
     symmetries,
 )
-from scvi_codegen.models.model_file import parse_model
+from scvi_codegen.models.model_files.model_file import parse_model
 from scvi_codegen.runtime.ensemble.lockstep import Ensemble
 
 G = 9.81

@@ -13,8 +13,8 @@ from click.testing import CliRunner
 import scvi_codegen as sc
 from scvi_codegen.cli import main
 from scvi_codegen.formulas.arrays import parse_array
-from scvi_codegen.models.model_file import load_model
-from scvi_codegen.models.values import read_array
+from scvi_codegen.models.model_files.model_file import load_model
+from scvi_codegen.models.model_files.values import read_array
 from scvi_codegen.native.compilers import find_compiler
 
 NET = """

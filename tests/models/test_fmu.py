@@ -31,7 +31,7 @@ from scvi_codegen import (
     reparametrise,
 )
 from scvi_codegen.cli import main
-from scvi_codegen.models import fmu as fmu_module
+from scvi_codegen.models.packages import fmu as fmu_module
 from scvi_codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.native.cross import TARGETS
 

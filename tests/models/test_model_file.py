@@ -17,7 +17,7 @@ from scvi_codegen.errors import ExpressionError, MethodWarning, ModelFileError, 
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_file import dump_model, load_model, parse_model, save_model
+from scvi_codegen.models.model_files.model_file import dump_model, load_model, parse_model, save_model
 from scvi_codegen.models.problems import PROBLEMS, problem
 from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.tableau import lobatto_iiib
@@ -64,7 +64,7 @@ def test_model_file_is_read():
 
 
 def test_the_layout_described_in_the_module_is_read():
-    from scvi_codegen.models import model_file
+    from scvi_codegen.models.model_files import model_file
 
     lines = (model_file.__doc__ or "").splitlines()
     text = "\n".join(line for line in lines if line.startswith("    ") or not line)

@@ -8,8 +8,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from scvi_codegen import LagrangianSystem, Model, ModelFileError, compile_stepper, load_model, save_model
-from scvi_codegen.models.input_tables import InputTable
-from scvi_codegen.models.model_file import dump_model, parse_model
+from scvi_codegen.models.model_files.input_tables import InputTable
+from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 
 MODEL = """
 [system]

@@ -12,8 +12,8 @@ from click.testing import CliRunner
 import scvi_codegen as sc
 from scvi_codegen.cli import main
 from scvi_codegen.errors import ModelFileError
-from scvi_codegen.models.model_file import catalogue_model, dump_model, parse_model
-from scvi_codegen.models.package import generate_package, load_package
+from scvi_codegen.models.model_files.model_file import catalogue_model, dump_model, parse_model
+from scvi_codegen.models.packages.package import generate_package, load_package
 
 STRICT = "-O2 -std=c99 -Wall -Wextra -Werror -Wno-psabi -ffp-contract=off"
 BY_CLOCK = {"system": {"time_transformation": "frequency"}, "run": {"step": 0.2, "span": 20.0}}

@@ -15,8 +15,8 @@ from click.testing import CliRunner
 import scvi_codegen as sc
 from scvi_codegen.cli import main
 from scvi_codegen.errors import ModelFileError, StateError, SystemDefinitionError
-from scvi_codegen.models.model_file import catalogue_model, dump_model, parse_model
-from scvi_codegen.models.package import generate_package, load_package
+from scvi_codegen.models.model_files.model_file import catalogue_model, dump_model, parse_model
+from scvi_codegen.models.packages.package import generate_package, load_package
 from scvi_codegen.runtime.run.largest_step import REFINEMENTS, largest_step
 
 SHAKEN = """

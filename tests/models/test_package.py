@@ -19,8 +19,8 @@ from scvi_codegen.errors import BuildError, PackageError, StateError, StepFailed
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SVI, Gauss, SpectralCollocation
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_file import load_model
-from scvi_codegen.models.package import generate_package, load_package
+from scvi_codegen.models.model_files.model_file import load_model
+from scvi_codegen.models.packages.package import generate_package, load_package
 from scvi_codegen.models.problems import problem
 from scvi_codegen.tables.quadrature import Quadrature
 

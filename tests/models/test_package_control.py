@@ -11,7 +11,7 @@ import pytest
 
 import scvi_codegen as sc
 from scvi_codegen.errors import MethodError
-from scvi_codegen.models.package import generate_package, load_package
+from scvi_codegen.models.packages.package import generate_package, load_package
 
 STRICT = "-O2 -std=c99 -Wall -Wextra -Werror -Wno-psabi -ffp-contract=off"
 SPAN = 10.0

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from style import check_style
 
 from scvi_codegen import SVI, Gauss, LagrangianSystem, Model, StoermerVerlet, compile_stepper, load_model, load_package
-from scvi_codegen.models.package import generate_package
+from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.runtime.inputs.segments import checked_inputs, parameters_of, prepared_segments
 

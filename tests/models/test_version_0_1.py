@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scvi_codegen.models.package import load_package
+from scvi_codegen.models.packages.package import load_package
 from scvi_codegen.runtime.core.stepper import Stepper
 
 FOLDER = Path(__file__).parents[1] / "corpus" / "version_0_1" / "pendulum_verlet"

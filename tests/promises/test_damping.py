@@ -31,7 +31,7 @@ from scvi_codegen import (
     reparametrise,
     verify,
 )
-from scvi_codegen.models.model_file import parse_model
+from scvi_codegen.models.model_files.model_file import parse_model
 
 L = "(1 + x**2)*x_dot**2/2 + y_dot**2/2 + x_dot*y_dot/3 + cos(x) - y**2*x/4 + y*cos(2*t)/5"
 GAMMA = 0.4 * 0.9

@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
 from scvi_codegen.cli import main
-from scvi_codegen.models.model_file import load_model
+from scvi_codegen.models.model_files.model_file import load_model
 from scvi_codegen.native.building import FLAGS_VARIABLE
 
 pytestmark = pytest.mark.long

@@ -14,7 +14,7 @@ from programs import needs
 
 import scvi_codegen
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.package import generate_package
+from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.models.problems import problem
 
 PACKAGE = Path(scvi_codegen.__file__).parent

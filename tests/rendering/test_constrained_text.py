@@ -21,7 +21,7 @@ from scvi_codegen import (
     load_package,
 )
 from scvi_codegen.exact.step import compiled_equations, derived_step
-from scvi_codegen.models.model_file import dump_model, parse_model
+from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 
 STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
 LINKAGE = linkage()

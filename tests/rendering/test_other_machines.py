@@ -14,7 +14,7 @@ from programs import needs
 from scvi_codegen.methods import SCVI, SVI, StoermerVerlet
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.package import generate_package
+from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.models.problems import problem
 
 pytestmark = [

@@ -14,7 +14,7 @@ from scvi_codegen.cli import main, memory
 from scvi_codegen.errors import RecordingError, StateError
 from scvi_codegen.methods import SVI
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_file import dump_model, parse_model
+from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 from scvi_codegen.models.problems import problem
 from scvi_codegen.results.recording import load_run, record_run, resume_run
 from scvi_codegen.runtime.core.stepper import Stepper

@@ -22,7 +22,7 @@ from scvi_codegen.errors import MissingLibraryError, RecordingError, RecordingWa
 from scvi_codegen.files import export
 from scvi_codegen.methods import SVI, Gauss, StoermerVerlet
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_file import dump_model
+from scvi_codegen.models.model_files.model_file import dump_model
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.results.recording import RecordedRun, load_run, manifest, record_run, resume_run, writing

@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 import scvi_codegen as sc
 from scvi_codegen.derivation.arrays import derive_sums
 from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, SystemDefinitionError
-from scvi_codegen.models.package import generate_package
+from scvi_codegen.models.packages.package import generate_package
 
 RATTLE = sc.SVI(1, "gauss-lobatto:2")
 ROUNDING = 2.0**-52

@@ -22,8 +22,8 @@ from scvi_codegen.cli import main
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import ModelFileError, StateError, StepFailedError
 from scvi_codegen.methods import SCVI, SVI, Gauss, Method, RadauIIA, StoermerVerlet
-from scvi_codegen.models.ensemble_file import load_ensemble
 from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_files.ensemble_file import load_ensemble
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.stepper import Stepper

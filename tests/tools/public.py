@@ -20,7 +20,7 @@ import click
 import scvi_codegen
 from scvi_codegen.cli import main
 from scvi_codegen.methods import ARGUMENTS
-from scvi_codegen.models import model_file
+from scvi_codegen.models.model_files import model_file
 from scvi_codegen.runtime import distributed
 
 __all__ = ["RECORDED", "public"]

@@ -28,8 +28,8 @@ from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import Gauss, SpectralCollocation
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_file import save_model
-from scvi_codegen.models.package import generate_package
+from scvi_codegen.models.model_files.model_file import save_model
+from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native import announcements
 from scvi_codegen.tables.precision import mp

@@ -14,8 +14,8 @@ from scvi_codegen.cli.model_options import (
     read_model,
     with_known_sizes,
 )
-from scvi_codegen.models.fmu import generate_fmu
-from scvi_codegen.models.package import generate_package
+from scvi_codegen.models.packages.fmu import generate_fmu
+from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.native.cross import TARGETS
 from scvi_codegen.rendering.program_source import Embedded
 

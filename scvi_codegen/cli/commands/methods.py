@@ -67,7 +67,8 @@ def _entries_of(name: str) -> Iterator[dict[str, Any]]:
 
 def methods_table(entries: Iterable[Mapping[str, Any]]) -> str:
     """Return a line for each method with its arguments, and the properties of an example."""
-    rows, last = [("name", "arguments", "example", "order", "symplectic", "symmetric")], ""
+    rows: list[Sequence[str]] = [("name", "arguments", "example", "order", "symplectic", "symmetric")]
+    last = ""
     for entry in entries:
         name = f"{entry['name']}[:{entry['number']}]" if entry["number"] else entry["name"]
         first = (name, ", ".join(entry["arguments"]) or "none") if entry["name"] != last else ("", "")

@@ -24,8 +24,8 @@ from scvi_codegen.cli.model_options import (
 from scvi_codegen.cli.recording import RecordedOutcome, Recording, check_format, check_resumed, is_run_folder
 from scvi_codegen.cli.running import RunOutcome, integrate_model, known_at_end, summary
 from scvi_codegen.cli.step_selection import model_with_adaptive_steps, model_with_advised_step, model_with_global_error
-from scvi_codegen.models.ensemble_file import load_ensemble
 from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_files.ensemble_file import load_ensemble
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.pictures.arrays import plot_arrays
 from scvi_codegen.pictures.canvas import check_plot_path

@@ -13,8 +13,8 @@ from scvi_codegen.cli.command_group import FAILURE, CommandFailure, check_writab
 from scvi_codegen.cli.model_options import METHOD_CHOICES, SOLVER_OPTION, ModelOptions, model_arguments, read_model
 from scvi_codegen.errors import PackageError
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_file import load_model
-from scvi_codegen.models.package import CERTIFICATE_FILE, MODEL_FILE, load_package
+from scvi_codegen.models.model_files.model_file import load_model
+from scvi_codegen.models.packages.package import CERTIFICATE_FILE, MODEL_FILE, load_package
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.verification import Certificate
 

@@ -7,8 +7,8 @@ from typing import Any, TypeVar
 
 from scvi_codegen.errors import ModelFileError, ScviCodegenError, closest
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification, sized, specification_of
-from scvi_codegen.models.key_hints import key_hint
 from scvi_codegen.models.model import DEFAULT_METHOD
+from scvi_codegen.models.model_files.key_hints import key_hint
 from scvi_codegen.models.time_span import real
 from scvi_codegen.validation.argument_types import FORMULA
 from scvi_codegen.validation.counts import checked_count

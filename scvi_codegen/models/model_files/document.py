@@ -14,7 +14,7 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.model import Model
 
 if TYPE_CHECKING:
-    from scvi_codegen.models.input_tables import InputTable
+    from scvi_codegen.models.model_files.input_tables import InputTable
 
 __all__ = ["document_of", "motion_of"]
 

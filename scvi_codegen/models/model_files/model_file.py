@@ -15,7 +15,7 @@
     [forces]                                            # on coordinates; default: 0
     q = "F*cos(w*t)"
 
-    [inputs]                                            # of the inputs named above; see models/input_files.py
+    [inputs]                                            # of the inputs named above; see input_files.py
     # u = { file = "u.csv", kind = "cubic" }            # relative to this file; or constant, linear (default)
     # w = { t = [0.0, 1.0, 2.0], values = [0.0, 0.5, 0.0] }
 
@@ -51,7 +51,7 @@ the names ``p_q``; with constraints the model is that of its Lagrangian.
 ``[system]`` may also be ``catalogue = "kepler"`` alone; then ``[parameters]`` changes default values, and missing
 entries of ``[initial]`` and ``[run]`` are the catalogue's. Written files are complete.
 
-Coordinates and parameters may be arrays, ``coordinates = ["x", "q[N]"]``: see :mod:`scvi_codegen.models.values`.
+Coordinates and parameters may be arrays, ``["x", "q[N]"]``: see :mod:`scvi_codegen.models.model_files.values`.
 
 Further sections, such as command-line options, can be merged over those of a file: they add and replace entries.
 '''
@@ -72,10 +72,9 @@ from scvi_codegen.lowering.arrays import one_coordinate
 from scvi_codegen.mechanics.definition_checks import warn_of_mistakes
 from scvi_codegen.mechanics.time_transformation import time_rescaling_function, with_time_transformation
 from scvi_codegen.methods import fitted
-from scvi_codegen.models.document import document_of, motion_of
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.problems import Problem
-from scvi_codegen.models.sections import (
+from scvi_codegen.models.model_files.document import document_of, motion_of
+from scvi_codegen.models.model_files.sections import (
     Document,
     Section,
     check_keys,
@@ -85,7 +84,7 @@ from scvi_codegen.models.sections import (
     read_method,
     read_run,
 )
-from scvi_codegen.models.system_section import (
+from scvi_codegen.models.model_files.system_section import (
     FORMULAS,
     check_complete,
     check_used,
@@ -93,11 +92,12 @@ from scvi_codegen.models.system_section import (
     read_catalogue,
     read_system,
 )
-from scvi_codegen.models.values import read_values
+from scvi_codegen.models.model_files.values import read_values
+from scvi_codegen.models.problems import Problem
 from scvi_codegen.validation.argument_types import PATH, checks_arguments, of
 
 if TYPE_CHECKING:
-    from scvi_codegen.models.input_tables import InputTable
+    from scvi_codegen.models.model_files.input_tables import InputTable
 
 __all__ = ["catalogue_model", "dump_model", "load_model", "parse_model", "save_model"]
 
@@ -256,6 +256,6 @@ def _check_error_bound(error: Any, run: Section) -> None:
 def _read_inputs(section: Section, folder: str | os.PathLike[str]) -> Mapping[str, InputTable]:
     if not section:
         return {}
-    from scvi_codegen.models.input_files import read_input  # imported here: it imports the runtime
+    from scvi_codegen.models.model_files.input_files import read_input  # imported here: it imports the runtime
 
     return {name: read_input(name, entry, folder) for name, entry in section.items()}

@@ -10,8 +10,7 @@ from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import lagrangian_of
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.models.problems import Problem, problem
-from scvi_codegen.models.sections import (
+from scvi_codegen.models.model_files.sections import (
     ALTERNATIVES,
     Document,
     Section,
@@ -22,6 +21,7 @@ from scvi_codegen.models.sections import (
     names_of,
     text_of,
 )
+from scvi_codegen.models.problems import Problem, problem
 from scvi_codegen.models.time_span import real
 
 __all__ = ["FORMULAS", "check_complete", "check_used", "has_arrays", "is_number", "read_catalogue", "read_system"]

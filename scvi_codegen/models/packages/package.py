@@ -24,8 +24,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from scvi_codegen.errors import ModelFileError, PackageError
-from scvi_codegen.models.folders import CERTIFICATE_FILE, INTERFACE_FILE, record_text, write_folder
-from scvi_codegen.models.generated_folders import damaged, prefix_of, read_record, source_in
+from scvi_codegen.models.packages.folders import CERTIFICATE_FILE, INTERFACE_FILE, record_text, write_folder
+from scvi_codegen.models.packages.generated_folders import damaged, prefix_of, read_record, source_in
 from scvi_codegen.rendering.source import Interface, Source, check_interface
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.stepper import Stepper
@@ -114,7 +114,7 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
 
 def _stepper_of_arrays(folder: Path) -> Stepper:
     """Return the stepper of a folder with arrays whose sizes are known at run time; its model has their layout."""
-    from scvi_codegen.models.model_file import load_model
+    from scvi_codegen.models.model_files.model_file import load_model
     from scvi_codegen.pipeline.sources import generate_array_source
     from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 
@@ -127,8 +127,8 @@ def _stepper_of_arrays(folder: Path) -> Stepper:
 
 def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
     """Return texts by file name, ``interface.json`` last."""
-    from scvi_codegen.models.example import example_of
-    from scvi_codegen.models.readme import package_template, readme_text
+    from scvi_codegen.models.packages.example import example_of
+    from scvi_codegen.models.packages.readme import package_template, readme_text
     from scvi_codegen.pipeline.sources import generate_source
     from scvi_codegen.rendering.program_source import render_example
 
@@ -159,8 +159,8 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
 
 def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
     """Return the texts of a model whose array sizes are known at run time."""
-    from scvi_codegen.models.example import array_example_of
-    from scvi_codegen.models.readme import package_template
+    from scvi_codegen.models.packages.example import array_example_of
+    from scvi_codegen.models.packages.readme import package_template
     from scvi_codegen.pipeline.sources import generate_array_source
     from scvi_codegen.rendering.program_source import render_example
 
@@ -178,7 +178,7 @@ def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, si
 
 def model_text(model: Model) -> str | None:
     """Return the model file, or ``None`` for a method that a file cannot represent (a user-defined quadrature)."""
-    from scvi_codegen.models.model_file import dump_model
+    from scvi_codegen.models.model_files.model_file import dump_model
 
     try:
         return dump_model(model)

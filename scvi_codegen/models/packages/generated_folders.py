@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from scvi_codegen.errors import PackageError
-from scvi_codegen.models.folders import FORMAT, INTERFACE_FILE
+from scvi_codegen.models.packages.folders import FORMAT, INTERFACE_FILE
 from scvi_codegen.rendering.source import PREFIX, Source, included
 
 __all__ = ["damaged", "prefix_of", "read_record", "source_in"]

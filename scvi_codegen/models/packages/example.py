@@ -12,8 +12,8 @@ from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.models.input_tables import tables_of_example
 from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_files.input_tables import tables_of_example
 from scvi_codegen.rendering.program_source import ExampleArrays, ExampleRun
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.interface import read_arrays, read_state, table_limits

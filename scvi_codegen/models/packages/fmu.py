@@ -24,11 +24,11 @@ from typing import IO
 from scvi_codegen.errors import ModelFileError, PackageError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.formulas.inputs import PARTS
-from scvi_codegen.models.example import example_of
-from scvi_codegen.models.fmu_description import build_description, model_description
-from scvi_codegen.models.generated_folders import prefix_of
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.package import MODEL, model_text
+from scvi_codegen.models.packages.example import example_of
+from scvi_codegen.models.packages.fmu_description import build_description, model_description
+from scvi_codegen.models.packages.generated_folders import prefix_of
+from scvi_codegen.models.packages.package import MODEL, model_text
 from scvi_codegen.native.building import PORTABLE_FLAGS, load
 from scvi_codegen.native.cross import TARGETS, library_for
 from scvi_codegen.pipeline.sources import generate_source

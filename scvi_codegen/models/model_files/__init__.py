@@ -1,0 +1,1 @@
+"""Model files in TOML: reading, writing, and the tables and arrays that they refer to."""
