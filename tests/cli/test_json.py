@@ -17,6 +17,7 @@ import scvi_codegen as sc
 from scvi_codegen import benchmark
 from scvi_codegen.benchmark.report import ResultTable
 from scvi_codegen.cli import command_group, main
+from scvi_codegen.methods import specification_of
 from scvi_codegen.models.model_files.model_file import parse_model
 
 KEPLER = ("kepler", "--step", "0.1", "--steps", "50", "--method", "svi:4")
