@@ -3,7 +3,7 @@
     MechanicalSystem, Method
       -> Sources   header, source and interface, derived once (:mod:`scvi_codegen.pipeline.sources`) and cached
       -> build     library, compiled once (:mod:`scvi_codegen.native.building`); Newton's iteration is
-                   added when a fixed point first fails (:mod:`scvi_codegen.rendering.simd`)
+                   added when a fixed point first fails (:mod:`scvi_codegen.rendering.kernels.simd`)
       -> Stepper   step, integrate (:mod:`scvi_codegen.runtime.core.stepper`)
 
 Each stage is a pure function of frozen data; only ``build`` touches the disk. Sources and compiled libraries are

@@ -11,7 +11,7 @@ from scvi_codegen.ir.equations import ConstrainedSteps
 from scvi_codegen.ir.iterations import HamiltonianIteration, SeparableIteration, Splitting
 from scvi_codegen.ir.numbers import Number
 from scvi_codegen.ir.program import Program
-from scvi_codegen.lowering.arrays import lower_arrays
+from scvi_codegen.lowering.program import lower
 from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.arrays.terms import constraint_text, force_of
@@ -28,7 +28,7 @@ def derive_sums(system: ArraySystem, method: Method, *, as_latex: bool = False) 
     Raises:
         MethodError: for a method without fixed-point iteration.
     """
-    program = lower_arrays(system, method, "derived")
+    program = lower(system, method, prefix="derived")
     if as_latex:
         return "\n".join(_latex(system))
     return "\n".join([*_text(system), "", *_step(program, method)])
@@ -48,9 +48,9 @@ def _text(system: ArraySystem) -> Iterator[str]:
             for mass in system.masses
             for access, formula in mass.targets
         )
-    if system.forces:
+    if system.applied_forces:
         yield "Forces beside:"
-        yield from (f"  {force}" for force in system.forces)
+        yield from (f"  {force}" for force in system.applied_forces)
     if system.constraints:
         yield "Constraints, each with what it adds to the forces:"
     for term in system.constraints:

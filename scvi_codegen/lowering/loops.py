@@ -38,7 +38,7 @@ def looped_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, n
             *(_potential(system, term, number) for number, term in enumerate(potentials)),
             *(
                 _added(system, f"force_{number}", force, arguments, f"forces {force}", "Forces.")
-                for number, force in enumerate(system.forces, len(potentials))
+                for number, force in enumerate(system.applied_forces, len(potentials))
             ),
         ),
         masses=tuple(_added(system, f"mass_{number}", mass, (), text, "A mass.") for text, mass, number in masses),

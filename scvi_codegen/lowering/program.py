@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import sympy
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.indices import Array
-from scvi_codegen.ir.equations import LoweredStageGroup, Rattle
-from scvi_codegen.ir.iteration import FixedPointIteration
-from scvi_codegen.ir.iterations import Splitting
+from scvi_codegen.ir.equations import LoweredStageGroup
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import lower_matrix, lower_vector
 from scvi_codegen.ir.program import (
@@ -24,16 +23,20 @@ from scvi_codegen.ir.program import (
     StageCurve,
     StageEquations,
 )
-from scvi_codegen.lowering.constraints import lowered_constraints
+from scvi_codegen.lowering.arrays import check_solver_of_arrays, one_coordinate
+from scvi_codegen.lowering.constraints import constrained_steps, lowered_constraints, rattle_of
 from scvi_codegen.lowering.kernels import comment_text, damping_kernel, integrand_kernel, system_kernel
+from scvi_codegen.lowering.loops import looped_terms
+from scvi_codegen.lowering.solvers.selection import check_solver, iteration_of, splitting_of
 from scvi_codegen.lowering.solvers.tables import resolved_degree, velocity_tables
 from scvi_codegen.lowering.stage_groups import bandwidth, bandwidth_ordering, has_action, layout_of, lowered_stage_group
+from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.symmetry.work_and_impulse import work_rates
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.constraints import END_VELOCITY
-from scvi_codegen.methods.discretise import is_conformally_symplectic, is_symplectic
+from scvi_codegen.methods.discretise import discretise, is_conformally_symplectic, is_symplectic
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_structure import Accelerations, PrintedCurve, ShotCurve, Velocities
 from scvi_codegen.methods.stage_system import StageSystem
@@ -43,46 +46,97 @@ from scvi_codegen.tables.precision import Matrix, Vector, mp
 __all__ = ["lower"]
 
 
+SOLVERS = ("auto", "explicit", "fixed-point", "newton")
+
+
 def lower(
-    system: MechanicalSystem,
+    system: MechanicalSystem | ArraySystem,
     method: Method,
-    stages: StageSystem,
     *,
     prefix: str,
-    fixed_point: FixedPointIteration | None = None,
-    splitting: Splitting | None = None,
-    newton: bool = True,
-    rattle: Rattle | None = None,
+    solver: str = "auto",
     symmetries: Sequence[Symmetry] = (),
+    lanes: bool = True,
+    fallback: bool = True,
 ) -> Program:
     """Return the program of one step of ``method`` for ``system``; exported C names begin with ``prefix``.
 
+    Systems of arrays of run-time sizes have constant masses, so that the tables of a method are the same for every
+    coordinate: those of a system of one coordinate serve all.
+
     Args:
-        system, method: the system and the method.
-        stages: its equations (:func:`scvi_codegen.methods.discretise.discretise`).
+        system, method: the system, of named coordinates or of arrays, and the method.
         prefix: a C identifier.
-        fixed_point: the fixed-point iteration to try first
-            (:func:`scvi_codegen.lowering.solvers.selection.iteration_of`).
-        splitting: the explicit solver that replaces both
-            (:func:`scvi_codegen.lowering.solvers.selection.splitting_of`).
-        newton: whether Newton's method is included; with it the discrete Legendre transforms.
-        rattle: tables of RATTLE, which is tried before Newton's method, if applicable.
+        solver: as in :func:`~scvi_codegen.compile_stepper`.
         symmetries: whose momentum maps are included.
+        lanes: allow a solver that uses SIMD lanes.
+        fallback: include Newton's iteration as a fallback. Systems with integrals along the curve always include it.
+
+    Raises:
+        MethodError: if the solver is not available for the method and the system.
     """
+    arrays = isinstance(system, ArraySystem)
+    one = one_coordinate(system) if isinstance(system, ArraySystem) else system
+    stages = discretise(one, method)
+    explicit = arrays or solver in ("auto", "explicit")
+    splitting = splitting_of(one, method) if explicit and not (system.constraints or one.integrands) else None
+    iterated = not system.constraints if arrays else lanes and solver in ("auto", "fixed-point")
+    velocities = isinstance(system, ArraySystem) and bool(system.velocities)
+    fixed_point = iteration_of(one, stages, velocities=velocities) if iterated and splitting is None else None
+    program = partial(
+        Program,
+        prefix=prefix,
+        title=comment_text(f"{system.name}: {method.title}"),
+        notes=_notes(method, one, forced=isinstance(system, ArraySystem) and bool(system.applied_forces)),
+        order=method.order or len(stages.blocks),
+        layout=_layout(system),
+        fixed_point=fixed_point,
+        splitting=splitting,
+    )
+    if isinstance(system, ArraySystem):
+        constrained = constrained_steps(system, stages, method) if system.constraints else None
+        loops = looped_terms(system, constrained, newton=solver == "newton")
+        check_solver_of_arrays(system, method, solver, splitting or constrained or fixed_point, loops)
+        points = len(fixed_point.guess.abscissae) if fixed_point else 0
+        return program(loops=loops, polynomial_curves=points > 1 or (points == 1 and not velocities))
+    check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else fixed_point)
+    alone = fixed_point is not None and not fallback and not system.integrands
+    newton = solver in ("auto", "newton") and splitting is None and not alone
+    polynomial = method.exactness.curve != 0
+    return program(
+        newton=newton,
+        polynomial_curves=polynomial,
+        equations=_equations(system, method, stages, newton=newton, curve=newton and polynomial and splitting is None),
+        quantities=_quantities(system, method, stages, symmetries),
+        constraints=lowered_constraints(system),
+        rattle=rattle_of(system, stages) if solver == "auto" else None,
+        damping=damping_kernel(system),
+    )
+
+
+def _layout(system: MechanicalSystem | ArraySystem) -> Layout:
+    """Return the arrays and parameters of a system."""
+    numbers = {"parameters": tuple(each.name for each in system.parameters), "defaults": system.defaults}
+    if isinstance(system, ArraySystem):
+        kinds = ("coordinates", "momenta", "velocities", "fields", "tables", "sizes")
+        return Layout(**{kind: getattr(system, kind) for kind in kinds}, **numbers)
+    return Layout(
+        coordinates=tuple(Array(q.name, ()) for q in system.coordinates),
+        inputs=tuple((name, system.parameters.index(symbol(f"{name}_0"))) for name in system.inputs),
+        **numbers,
+    )
+
+
+def _equations(
+    system: MechanicalSystem, method: Method, stages: StageSystem, *, newton: bool, curve: bool
+) -> StageEquations:
+    """Return the stage equations; ``newton``: with the stage groups, ``curve``: with the error estimate."""
     m, sites = system.dimension, layout_of(stages, system.dimension)
     blocks, rows = [stages.blocks[b] for b in sites.columns[m]], [stages.rows[r] for r in sites.rows[m]]
-    mass = forms_of(system).legendre_jacobian
     stage_groups = tuple(lowered_stage_group(system, group, sites) for group in stages.stage_groups) if newton else ()
-    coupled = [*mass, *_coupled_coordinates(stage_groups)]
+    coupled = [*forms_of(system).legendre_jacobian, *_coupled_coordinates(stage_groups)]
     order = bandwidth_ordering(coupled, sites.count)
-    polynomial = method.exactness.curve != 0
-    layout = Layout(
-        coordinates=tuple(Array(q.name, ()) for q in system.coordinates),
-        parameters=tuple(parameter.name for parameter in system.parameters),
-        defaults=system.defaults,
-        inputs=tuple((name, system.parameters.index(symbol(f"{name}_0"))) for name in system.inputs),
-    )
-    equations = StageEquations(
+    return StageEquations(
         sites=sites.count,
         blocks=len(blocks),
         stage_groups=stage_groups,
@@ -98,34 +152,24 @@ def lower(
             tuple(line for columns in sites.columns.values() for line in _required_extrapolation(stages, columns))
         ),
         acts=sites.count == m and has_action(system) and any(group.in_action for group in stages.stage_groups),
-        stage_curve=_stage_curve(stages) if newton and polynomial and splitting is None else None,
+        stage_curve=_stage_curve(stages) if curve else None,
         numbers=_numbers(system, method, len(rows)) if len(blocks) * sites.count <= FEW_UNKNOWNS else ("", "", ""),
     )
-    quantities = Quantities(
+
+
+def _quantities(
+    system: MechanicalSystem, method: Method, stages: StageSystem, symmetries: Sequence[Symmetry]
+) -> Quantities:
+    """Return the functions of the state that a run evaluates or integrates."""
+    return Quantities(
         legendre=_legendre_kernel(system),
-        mass_entries=tuple(mass),
+        mass_entries=tuple(forms_of(system).legendre_jacobian),
         energy=_energy_kernel(system),
         hamiltonian=bool(system.auxiliaries),
         momentum_maps=tuple(_momentum_map(each, method) for each in symmetries),
         momentum_kernel=_momentum_kernel(system, symmetries),
         integrals=_integrals(system, method, stages),
         work_and_impulses=_work_and_impulse_names(system, stages),
-    )
-    return Program(
-        prefix=prefix,
-        title=comment_text(f"{system.name}: {method.title}"),
-        notes=notes_of(method, system),
-        order=method.order or len(stages.blocks),
-        layout=layout,
-        fixed_point=fixed_point,
-        splitting=splitting,
-        newton=newton,
-        polynomial_curves=polynomial,
-        equations=equations,
-        quantities=quantities,
-        constraints=lowered_constraints(system),
-        rattle=rattle,
-        damping=damping_kernel(system),
     )
 
 
@@ -256,19 +300,13 @@ def _coupled_coordinates(stage_groups: Sequence[LoweredStageGroup]) -> list[tupl
     return [pair for group in stage_groups for block in group.blocks for pair in block.entries]
 
 
-def notes_of(method: Method, system: MechanicalSystem) -> tuple[str, ...]:
+def _notes(method: Method, system: MechanicalSystem, *, forced: bool) -> tuple[str, ...]:
+    """Return the lines of the header's comment: order, symplecticity, symmetry; ``forced``: with further forces."""
     order = "no order claimed" if method.order is None else f"order {method.order}"
-    return (
-        order,
-        _geometry(method, system),
-        "symmetric" if method.symmetric else "not symmetric",
-    )
-
-
-def _geometry(method: Method, system: MechanicalSystem) -> str:
-    if is_symplectic(method, system):
-        return "symplectic"
-    return f"{'conformally' if is_conformally_symplectic(method, system) else 'not'} symplectic"
+    geometry = "symplectic" if is_symplectic(method, system) else "conformally symplectic"
+    if forced or not is_conformally_symplectic(method, system):
+        geometry = "not symplectic"
+    return order, geometry, "symmetric" if method.symmetric else "not symmetric"
 
 
 def _required_extrapolation(stages: StageSystem, columns: Sequence[int]) -> Matrix:

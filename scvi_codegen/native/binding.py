@@ -1,7 +1,7 @@
 """Binding of a compiled library: functions, structs, pointers into arrays.
 
 A library with only the fixed-point iteration uses Newton's method of a second library, which is compiled when a call
-first requests it (:mod:`scvi_codegen.rendering.simd`); that call is then repeated from its start.
+first requests it (:mod:`scvi_codegen.rendering.kernels.simd`); that call is then repeated from its start.
 """
 
 from __future__ import annotations

@@ -7,14 +7,11 @@ from collections.abc import Sequence
 from functools import partial
 
 from scvi_codegen.ir.program import Program
-from scvi_codegen.lowering.constraints import rattle_of
 from scvi_codegen.lowering.loops import with_sums
 from scvi_codegen.lowering.program import lower
-from scvi_codegen.lowering.solvers.selection import check_solver, iteration_of, splitting_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, all_symmetries
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.term_groups import rolled
-from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
 
 __all__ = ["c_identifier", "program_of"]
@@ -26,7 +23,6 @@ C_HEADERS = frozenset(
     stdint stdio stdlib string tgmath time wchar wctype unistd
     """.split()  # noqa: SIM905  (a paragraph of words reads better than thirty quoted ones)
 )
-SOLVERS = ("auto", "explicit", "fixed-point", "newton")
 
 
 def program_of(
@@ -41,50 +37,16 @@ def program_of(
 ) -> Program:
     """Return the lowered program of an integrator; other arguments as of :func:`compile_stepper`.
 
-    Args:
-        lanes: allow a solver that uses SIMD lanes.
-        fallback: include Newton's iteration as a fallback. Systems with integrals along the curve always include it.
+    ``lanes`` and ``fallback`` are those of :func:`~scvi_codegen.lowering.program.lower`.
     """
     name = c_identifier(prefix or f"{system.name}_{method.name}")
     tracked = all_symmetries(system, symmetries)
     program_part = partial(
-        _program, method=method, solver=solver, prefix=name, symmetries=tracked, lanes=lanes, fallback=fallback
+        lower, method=method, prefix=name, solver=solver, symmetries=tracked, lanes=lanes, fallback=fallback
     )
     parts = rolled(system)
     looped = with_sums(program_part(parts.rest), parts) if parts else None
     return looped or program_part(system)
-
-
-def _program(
-    system: MechanicalSystem,
-    *,
-    method: Method,
-    solver: str,
-    prefix: str,
-    symmetries: Sequence[Symmetry],
-    lanes: bool,
-    fallback: bool,
-) -> Program:
-    """Lower a system without rolling its terms into loops."""
-    stages = discretise(system, method)
-    explicit = solver in ("auto", "explicit") and not system.integrands
-    splitting = splitting_of(system, method) if explicit else None
-    use_fixed_point = lanes and solver in ("auto", "fixed-point") and splitting is None
-    fixed_point = iteration_of(system, stages) if use_fixed_point else None
-    check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else fixed_point)
-    alone = fixed_point is not None and not fallback and not system.integrands
-    newton = solver in ("auto", "newton") and splitting is None and not alone
-    return lower(
-        system,
-        method,
-        stages,
-        prefix=prefix,
-        fixed_point=fixed_point,
-        splitting=splitting,
-        newton=newton,
-        rattle=rattle_of(system, stages) if solver == "auto" else None,
-        symmetries=symmetries,
-    )
 
 
 def c_identifier(name: str) -> str:

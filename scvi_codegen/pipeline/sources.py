@@ -28,11 +28,9 @@ from scvi_codegen.indices import SIZES_REQUIRED
 from scvi_codegen.ir.iteration import Control
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.arrays import check_solver as check_solver_of_arrays
-from scvi_codegen.lowering.arrays import lower_arrays
 from scvi_codegen.lowering.control import control_of, density_of
 from scvi_codegen.lowering.derivatives import derivatives_of
 from scvi_codegen.lowering.program import lower
-from scvi_codegen.lowering.solvers.selection import iteration_of
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES, Symmetry
@@ -136,11 +134,7 @@ class Sources:
         )
         if varied is None:
             return None
-        stages, prefix = discretise(varied, self.method), self.program().prefix
-        program = lower(
-            varied, self.method, stages, prefix=prefix, fixed_point=iteration_of(varied, stages), newton=False
-        )
-        return render_ensemble(program)
+        return render_ensemble(lower(varied, self.method, prefix=self.program().prefix, solver="fixed-point"))
 
     def _rendered(self, control: Control | None = None) -> Source:
         return render(self.program(), control, fallback="external" if self.uses_fallback_library else None)
@@ -177,7 +171,7 @@ class ArraySources:
         """Lowered program with fixed step size."""
         with announced(f"deriving the equations of {self.system.name} by {self.method.name}"):
             try:
-                return lower_arrays(self.system, self.method, self.prefix, newton=self.solver == "newton")
+                return lower(self.system, self.method, prefix=self.prefix, solver=self.solver)
             except MethodError as error:
                 raise MethodError(f"{error}. This concerns '{self.system.name}': {SIZES_REQUIRED}") from error
 

@@ -2,7 +2,7 @@
 
 Entry templates are named after the file they make; parts are in ``templates/parts``. Templates contain only structure:
 loops over the program's tables and the C that does not depend on it. Kernels are printed by
-:mod:`scvi_codegen.rendering.printer` through filters.
+:mod:`scvi_codegen.rendering.kernels.printer` through filters.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from scvi_codegen.ir.kernel import Kernel, is_divided
 from scvi_codegen.ir.program import Program
 from scvi_codegen.rendering.convergence import INPUT_PRECISION, LARGEST_VIOLATION, MAX_ITERATIONS, ROUNDING_UNITS
 from scvi_codegen.rendering.environment import support_text, template_environment
-from scvi_codegen.rendering.loops import loop_context
-from scvi_codegen.rendering.printer import constants, inverse_roots
-from scvi_codegen.rendering.simd import POINTS, TRAJECTORIES, Fallback, iteration_source, predictor_text
+from scvi_codegen.rendering.kernels.loops import loop_context
+from scvi_codegen.rendering.kernels.printer import constants, inverse_roots
+from scvi_codegen.rendering.kernels.simd import POINTS, TRAJECTORIES, Fallback, iteration_source, predictor_text
+from scvi_codegen.rendering.kernels.unrolled_equations import unrolled_equations
 from scvi_codegen.rendering.source import Interface, Source, included
 from scvi_codegen.rendering.target import DOUBLE, SINGLE, Target
-from scvi_codegen.rendering.unrolled_equations import unrolled_equations
 
 __all__ = [
     "EMBEDDED",

@@ -49,7 +49,7 @@ from scvi_codegen.methods import (
     stage_system,
 )
 from scvi_codegen.methods import method as method_room
-from scvi_codegen.rendering import printer as c_printer
+from scvi_codegen.rendering.kernels import printer as c_printer
 from scvi_codegen.tables import quadrature, tableau
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.spaces import Splines, Trigonometric

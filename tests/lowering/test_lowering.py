@@ -25,7 +25,7 @@ from scvi_codegen.methods import SCVI, SVI, Gauss, RadauIIA, SpectralCollocation
 from scvi_codegen.models.problems import PROBLEMS, problem
 from scvi_codegen.models.systems import double_pendulum, duffing, fput_chain, kepler
 from scvi_codegen.native.compilers import find_compiler
-from scvi_codegen.rendering.printer import print_expression, print_number
+from scvi_codegen.rendering.kernels.printer import print_expression, print_number
 
 mp = mpmath.mp.clone()
 mp.dps = 120

@@ -7,8 +7,8 @@ import pytest
 from either_system import either_system
 from style import check_style
 
-from scvi_codegen.lowering.arrays import lower_arrays, one_coordinate
 from scvi_codegen.lowering.control import control_of
+from scvi_codegen.lowering.program import lower
 from scvi_codegen.methods import as_method
 from scvi_codegen.native.compilers import find_compiler
 from scvi_codegen.rendering.program_source import render
@@ -57,7 +57,7 @@ def rendered(name: str, method: str, *, newton: bool = False) -> Source:
         tables=["bonds[B, 2]"],
         forces=FORCES.get(name),
     )
-    program = lower_arrays(system, as_method(method, one_coordinate(system)), "arrays", newton=newton)
+    program = lower(system, as_method(method), prefix="arrays", solver="newton" if newton else "auto")
     control = control_of(program)
     assert control is not None or method == "stoermer-verlet"
     return render(program, control)

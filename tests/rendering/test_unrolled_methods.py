@@ -12,7 +12,7 @@ from scvi_codegen import SCVI, SVI, Gauss, StoermerVerlet, compile_stepper, gene
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.models.systems import planar_pendulum
 from scvi_codegen.native.building import PORTABLE_FLAGS
-from scvi_codegen.rendering import unrolled_equations
+from scvi_codegen.rendering.kernels import unrolled_equations
 from scvi_codegen.runtime.core.stepper import Stepper
 
 pytestmark = pytest.mark.usefixtures("as_users_compile")

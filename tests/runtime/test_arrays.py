@@ -484,6 +484,26 @@ def test_friction_damps_at_the_exact_rate() -> None:
     assert run.q["q"][-1] == pytest.approx(exact, abs=1e-12)
 
 
+def test_uniform_damping_has_the_exact_rate() -> None:
+    """Damped oscillators of mass 2, in closed form; for a Hamiltonian it requires known sizes."""
+    system = sc.LagrangianSystem.from_text(
+        name="damped", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2 - q[i]**2)", damping=0.4
+    )
+    stepper = sc.compile_stepper(system, "svi:5")
+    assert "not symplectic" in stepper.source.header
+    run = stepper.integrate(np.ones(3), h=0.2, steps=50)
+    w = np.sqrt(1 - 0.2**2)
+    exact = np.exp(-2.0) * (np.cos(10 * w) + 0.2 / w * np.sin(10 * w))
+    assert run.q["q"][-1] == pytest.approx(exact, abs=1e-12)
+    with pytest.raises(sc.MethodError, match="does not support velocity-dependent forces"):
+        sc.compile_stepper(system, "stoermer-verlet")
+    other = sc.HamiltonianSystem.from_text(
+        name="damped", coordinates=["q[N]"], hamiltonian="sum(i in N, p_q[i]**2 + q[i]**2)", damping=0.4
+    )
+    with pytest.raises(sc.SystemDefinitionError, match="damping of a Hamiltonian requires known sizes"):
+        sc.compile_stepper(other, "svi:5")
+
+
 def test_table_with_one_axis() -> None:
     """Springs at some places only."""
     pinned = sc.LagrangianSystem.from_text(

@@ -17,11 +17,11 @@ from programs import needs
 
 import scvi_codegen as sc
 from scvi_codegen.errors import MethodError, StateError
-from scvi_codegen.lowering.arrays import lower_arrays, one_coordinate
+from scvi_codegen.lowering.program import lower
 from scvi_codegen.methods import as_method
 from scvi_codegen.native.compilers import find_compiler
 from scvi_codegen.pipeline.sources import generate_array_source
-from scvi_codegen.rendering.loop_nests import Sharing, sharing_of
+from scvi_codegen.rendering.kernels.loop_nests import Sharing, sharing_of
 
 RNG = np.random.default_rng(5)
 THREADS = (1, 2, 3, 5)
@@ -140,7 +140,7 @@ def bits(run: Any) -> tuple[Any, ...]:
 @pytest.mark.parametrize("name", CASES)
 def test_terms_are_distributed_over_threads(name: str) -> None:
     system = system_of(CASES[name])
-    program = lower_arrays(system, as_method("svi:2", one_coordinate(system)), "shared")
+    program = lower(system, as_method("svi:2"), prefix="shared")
     assert {sharing_of(looped) for looped in program.loops.forces} == {CASES[name].shared}
 
 

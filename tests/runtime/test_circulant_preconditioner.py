@@ -7,7 +7,7 @@ import pytest
 
 import scvi_codegen as sc
 from scvi_codegen.errors import StepFailedError
-from scvi_codegen.lowering.arrays import lower_arrays
+from scvi_codegen.lowering.program import lower
 from scvi_codegen.methods import as_method
 
 RANDOM = np.random.default_rng(1)
@@ -156,4 +156,4 @@ def test_systems_with_a_circulant_preconditioner(term, reach):
         tables=["bonds[B, 2]"],
         lagrangian=f"sum(i in N, sum(a in 2, u_dot[i, a]**2/2)) - {term}",
     )
-    assert lower_arrays(system, as_method("svi:2"), "some", newton=True).loops.reach == reach
+    assert lower(system, as_method("svi:2"), prefix="some", solver="newton").loops.reach == reach

@@ -27,7 +27,7 @@ from scvi_codegen.runtime.core.stepper import Stepper
 
 def lowered(system: MechanicalSystem, method: Method) -> Program:
     """The program with Newton's iteration alone."""
-    return lower(system, method, discretise(system, method), prefix="p")
+    return lower(system, method, prefix="p", solver="newton")
 
 
 def fixed_point(system: MechanicalSystem, method: Method) -> FixedPointIteration | None:

@@ -11,7 +11,7 @@ from scvi_codegen.benchmark.cases.large import field, ring
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
-from scvi_codegen.lowering.arrays import lower_arrays, one_coordinate
+from scvi_codegen.lowering.program import lower
 from scvi_codegen.methods import as_method
 
 __all__: list[str] = []
@@ -36,7 +36,7 @@ def _one_size(method: str, name: str, size: int) -> str:
         run.advance(steps)
         best = min(best, (time.process_time() - start) / steps)
     iterations = (run.iterations - iterations_before) / (7 * steps)
-    program = lower_arrays(each.system, as_method(method, one_coordinate(each.system)), name)
+    program = lower(each.system, as_method(method), prefix=name)
     rates = [1e-9 * each * count / best for each in (_operations(program, iterations), _bytes(program, iterations))]
     numbers = (first, 1e9 * best / count, iterations, *rates, _most_memory())
     return " ".join(map(repr, numbers))

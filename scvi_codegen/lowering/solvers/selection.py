@@ -41,11 +41,18 @@ FIXED_POINTS: tuple[Solver, ...] = (
 """Fixed-point solvers, the fastest first; the first that is applicable is used."""
 
 
-def iteration_of(system: MechanicalSystem, stages: StageSystem) -> FixedPointIteration | None:
-    """Return the fixed-point iteration of the stage equations of a system, or ``None`` if there is none."""
+def iteration_of(
+    system: MechanicalSystem, stages: StageSystem, *, velocities: bool = False
+) -> FixedPointIteration | None:
+    """Return the fixed-point iteration of the stage equations of a system, or ``None`` if there is none.
+
+    With ``velocities`` it has a table of those at the points, on which forces depend.
+    """
     if system.constraints:
         return None
     problem = StepProblem(system, stages.shape)
+    if velocities:
+        return separable_iteration(problem, velocities=True)
     return next((fixed_point for solver in FIXED_POINTS if (fixed_point := solver(problem)) is not None), None)
 
 

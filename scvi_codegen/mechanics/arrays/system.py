@@ -11,7 +11,7 @@ may differ between elements. With known sizes they are systems of named coordina
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any, ClassVar
 
@@ -27,14 +27,18 @@ from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.subexpressions import key_of
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
-from scvi_codegen.indices import SIZES_REQUIRED, Access, Array, Loop, Size
+from scvi_codegen.indices import SIZES_REQUIRED, Access, Array, Loop
 from scvi_codegen.mechanics.arrays.terms import (
     check_constraint,
     check_form,
     constraint_text,
     force_of,
     friction,
+    friction_of,
     masses_of,
+    momenta_of,
+    substituted,
+    table_of,
     terms_at_rest,
 )
 from scvi_codegen.mechanics.definition_checks import warn_of_negative, warn_of_unused
@@ -120,8 +124,8 @@ class ArraySystem:
             inputs = "|".join(f"{name}_[0123t]" for name in self.inputs)
             for term in self.constraints:
                 check_constraint(term, self.coordinates, self.fields, inputs)
-            if self.damping != 0:
-                raise SystemDefinitionError("damping of all momenta requires known sizes: write it as forces")
+            if self.damping != 0 and self.momenta:
+                raise SystemDefinitionError("damping of a Hamiltonian requires known sizes: write it as forces")
             for array in self.coordinates:
                 if len(array.axes) > 1 and any(not axis.name for axis in array.axes[:-1]):
                     raise SystemDefinitionError(
@@ -203,8 +207,8 @@ class ArraySystem:
             "constraints": list(constraints),
         }
         arrays = tuple(map(parse_coordinate, coordinates))
-        conjugate = _momenta(arrays, momenta, lagrangian, hamiltonian)
-        index_tables = tuple(map(_table, tables))
+        conjugate = momenta_of(arrays, momenta, lagrangian, hamiltonian)
+        index_tables = tuple(map(table_of, tables))
         values = with_inputs({key: number(key, value) for key, value in (parameters or {}).items()}, inputs)
         fields = {key: parse_array(key) for key in values if "[" in key}
         scalars = {key: value for key, value in values.items() if key not in fields}
@@ -229,8 +233,8 @@ class ArraySystem:
             fields=tuple(fields.values()),
             field_defaults=tuple(values[key] for key in fields),
             tables=index_tables,
-            terms=tuple(_with_formulas(term, driven) for term in parse_sums(text, everything, known, index_tables)),
-            forces=tuple(_with_forces(force, driven) for force in chain(*applied)),
+            terms=tuple(substituted(term, driven) for term in parse_sums(text, everything, known, index_tables)),
+            forces=tuple(substituted(force, driven) for force in chain(*applied)),
             inputs=tuple(inputs),
             constraints=tuple(parse_constraint(each, everything, known, index_tables) for each in constraints),
             damping=damping_rate(damping, lambda formula: parse_expression(str(formula), known)),
@@ -287,7 +291,7 @@ class ArraySystem:
     @property
     def velocities(self) -> tuple[Array, ...]:
         """Arrays of velocities that forces depend on: all of them if any occurs, else none; none for a Hamiltonian."""
-        names = {access.array.name for force in self.forces for _, access in force.slots}
+        names = {access.array.name for force in self.applied_forces for _, access in force.slots}
         arrays = tuple(Array(name, array.axes) for name, array in self._velocities.items())
         return arrays if any(array.name in names for array in arrays) else ()
 
@@ -295,9 +299,9 @@ class ArraySystem:
     def accesses(self) -> tuple[tuple[Access, tuple[Loop, ...]], ...]:
         """Array accesses, each with its enclosing loops."""
         slots = [(access, term.loops) for term in self.terms for _, access in term.slots]
-        slots += [(access, force.loops) for force in self.forces for _, access in force.slots]
+        slots += [(access, force.loops) for force in self.applied_forces for _, access in force.slots]
         slots += [(access, term.loops) for term in self.constraints for _, access in term.slots]
-        return (*slots, *((access, force.loops) for force in self.forces for access, _ in force.targets))
+        return (*slots, *((access, force.loops) for force in self.applied_forces for access, _ in force.targets))
 
     @property
     def changes_energy(self) -> str:
@@ -326,9 +330,14 @@ class ArraySystem:
         return terms_at_rest(self.terms, self._velocities, self.state, negative=bool(self.momenta), moving=False)
 
     @property
+    def applied_forces(self) -> tuple[ArrayForce, ...]:
+        """The forces, and for run-time sizes those of a damping, -gamma m v for each mass m."""
+        return (*self.forces, *(friction_of(mass, self.damping) for mass in self.masses if self.damping != 0))
+
+    @property
     def all_forces(self) -> tuple[ArrayForce, ...]:
         """Derivatives of the terms of -V or -H with respect to the state, then the other forces."""
-        return (*(force_of(term, self.state) for term in self.potentials), *self.forces)
+        return (*(force_of(term, self.state) for term in self.potentials), *self.applied_forces)
 
     def _repr_latex_(self) -> str:
         return rf"$\displaystyle {self.latex}$"
@@ -337,7 +346,7 @@ class ArraySystem:
     def latex(self) -> str:
         """L or H in LaTeX."""
         arguments = ", ".join(array.name for array in self.state)
-        shown = (latex_sum(_with_formulas(term, self._by_name)) for term in self.terms)
+        shown = (latex_sum(substituted(term, self._by_name)) for term in self.terms)
         return rf"{self.function[0]}({arguments}) = {' + '.join(shown).replace('+ -', '-')}"
 
     @property
@@ -352,8 +361,8 @@ class ArraySystem:
 
     def __str__(self) -> str:
         arguments = ", ".join(map(str, self.state))
-        terms = " + ".join(str(_with_formulas(term, self._by_name)) for term in self.terms)
-        applied = "; ".join(str(_with_forces(force, self._by_name)) for force in self.forces)
+        terms = " + ".join(str(substituted(term, self._by_name)) for term in self.terms)
+        applied = "; ".join(str(substituted(force, self._by_name)) for force in self.forces)
         constraints = "; ".join(map(constraint_text, self.constraints))
         others = f"{f'; forces {applied}' if applied else ''}{f'; {constraints}' if constraints else ''}"
         return f"{self.name}: {self.function[0]}({arguments}) = {terms}{others}"
@@ -377,6 +386,7 @@ class ArraySystem:
         """Warn of parameters and inputs that occur in no formula, and of negative masses."""
         terms = [*self.terms, *self.constraints]
         formulas = [term.formula for term in terms] + [f for force in self.forces for _, f in force.targets]
+        formulas.append(self.damping)
         used = {symbol(access.array.name) for access, _ in self.accesses}.union(*(f.free_symbols for f in formulas))
         scalars = {symbol(array.name): value for array, value in zip(self.fields, self.field_defaults, strict=True)}
         values = scalars | dict(zip(self.parameters, self.defaults, strict=True))
@@ -416,46 +426,6 @@ class ArrayHamiltonian(ArraySystem):
 
     __slots__ = ()
     ACTS_AS: ClassVar[str] = "HamiltonianSystem"
-
-
-def _with_formulas(term: ArrayTerm, rule: Mapping[Any, Expr]) -> ArrayTerm:
-    """Return the term with expressions substituted by ``rule``."""
-    return replace(term, formula=term.formula.xreplace(rule)) if rule else term
-
-
-def _with_forces(force: ArrayForce, rule: Mapping[Any, Expr]) -> ArrayForce:
-    targets = tuple((access, formula.xreplace(rule)) for access, formula in force.targets)
-    return replace(force, targets=targets) if rule else force
-
-
-def _table(text: str) -> Array:
-    """Parse the declaration of an index table; one with a single axis gets one column."""
-    array = parse_array(text)
-    return array if len(array.axes) > 1 else replace(array, axes=(*array.axes, Size("", 1)))
-
-
-def _momenta(
-    coordinates: Sequence[Array], names: Sequence[str] | None, lagrangian: str | None, hamiltonian: str | None
-) -> tuple[Array, ...]:
-    """Return the arrays of momenta of a Hamiltonian; none for a Lagrangian."""
-    if (lagrangian is None) == (hamiltonian is None):
-        raise SystemDefinitionError("give exactly one of lagrangian and hamiltonian")
-    if hamiltonian is None:
-        if names is not None:
-            raise SystemDefinitionError(
-                "momenta were given for a Lagrangian, which has velocities, q_dot[i]: leave them out, or "
-                "give a hamiltonian"
-            )
-        return ()
-    if names is None:
-        return tuple(Array(f"p_{array.name}", array.axes) for array in coordinates)
-    arrays = tuple(map(parse_coordinate, names))
-    if [array.axes for array in arrays] != [array.axes for array in coordinates]:
-        shown = ", ".join(map(str, coordinates))
-        raise SystemDefinitionError(
-            f"momenta must be arrays with the axes of the coordinates, {shown}, not {', '.join(names)}"
-        )
-    return arrays
 
 
 ARRAYS = of("a system with arrays whose sizes are known at run time, as coordinates=['q[N]']", ArraySystem)

@@ -15,16 +15,18 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any, TypeVar
 
 import sympy
 from sympy import Add, Expr, S, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.array_statements import ArrayForce
-from scvi_codegen.formulas.arrays import ArrayTerm
+from scvi_codegen.formulas.arrays import ArrayTerm, parse_array, parse_coordinate
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.indices import Access, Array
+from scvi_codegen.formulas.symbols import DOT, symbol
+from scvi_codegen.indices import Access, Array, Size
 
 __all__ = [
     "check_constraint",
@@ -35,10 +37,16 @@ __all__ = [
     "entries_of",
     "force_of",
     "friction",
+    "friction_of",
     "masses_of",
+    "momenta_of",
+    "substituted",
+    "table_of",
     "terms_at_rest",
     "velocity_symbols",
 ]
+
+Term = TypeVar("Term", ArrayTerm, ArrayForce)
 
 
 def force_of(term: ArrayTerm, state: Collection[Array]) -> ArrayForce:
@@ -67,6 +75,14 @@ def friction(terms: Sequence[ArrayTerm], coordinates: Mapping[Array, Array]) -> 
             )
         forces.append(replace(force, targets=targets))
     return tuple(forces)
+
+
+def friction_of(mass: ArrayForce, rate: Expr) -> ArrayForce:
+    """Return the force -rate m v of a mass."""
+    ((access, m),) = mass.targets
+    velocity = replace(access, array=Array(access.array.name + DOT, access.array.axes))
+    v = symbol(str(velocity))
+    return ArrayForce(loops=mass.loops, slots=(*mass.slots, (v, velocity)), targets=((access, -rate * m * v),))
 
 
 def masses_of(term: ArrayTerm, velocities: Mapping[str, Array]) -> tuple[ArrayForce, ...]:
@@ -181,3 +197,42 @@ def constraint_second_rate(
     rates = [*velocities, S.One]
     rate = Add(*(derivative * rates[k] for k, derivative in gradient(term.formula, variables).items()))
     return Add(*(derivative * rates[k] for k, derivative in gradient(rate, variables).items()))
+
+
+def substituted(term: Term, rule: Mapping[Any, Expr]) -> Term:
+    """Return a term, or forces, with expressions substituted by ``rule``."""
+    if not rule:
+        return term
+    if isinstance(term, ArrayForce):
+        return replace(term, targets=tuple((access, formula.xreplace(rule)) for access, formula in term.targets))
+    return replace(term, formula=term.formula.xreplace(rule))
+
+
+def table_of(text: str) -> Array:
+    """Parse the declaration of an index table; one with a single axis gets one column."""
+    array = parse_array(text)
+    return array if len(array.axes) > 1 else replace(array, axes=(*array.axes, Size("", 1)))
+
+
+def momenta_of(
+    coordinates: Sequence[Array], names: Sequence[str] | None, lagrangian: str | None, hamiltonian: str | None
+) -> tuple[Array, ...]:
+    """Return the arrays of momenta of a Hamiltonian; none for a Lagrangian."""
+    if (lagrangian is None) == (hamiltonian is None):
+        raise SystemDefinitionError("give exactly one of lagrangian and hamiltonian")
+    if hamiltonian is None:
+        if names is not None:
+            raise SystemDefinitionError(
+                "momenta were given for a Lagrangian, which has velocities, q_dot[i]: leave them out, or "
+                "give a hamiltonian"
+            )
+        return ()
+    if names is None:
+        return tuple(Array(f"p_{array.name}", array.axes) for array in coordinates)
+    arrays = tuple(map(parse_coordinate, names))
+    if [array.axes for array in arrays] != [array.axes for array in coordinates]:
+        shown = ", ".join(map(str, coordinates))
+        raise SystemDefinitionError(
+            f"momenta must be arrays with the axes of the coordinates, {shown}, not {', '.join(names)}"
+        )
+    return arrays

@@ -14,7 +14,7 @@ from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.building import TUNED_FLAGS, load
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.rendering.loop_nests import MOST_THREADS
+from scvi_codegen.rendering.kernels.loop_nests import MOST_THREADS
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.runtime.arrays.constraints import consistent, project

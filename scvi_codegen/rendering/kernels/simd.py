@@ -19,8 +19,8 @@ from typing import Literal, TypeAlias
 from scvi_codegen.ir.iteration import AdaptivePredictor, FixedPointIteration, StoredValues
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import Number, NumberTable
+from scvi_codegen.rendering.kernels.printer import INVERSE_ROOT, Sources, lane_functions, print_number
 from scvi_codegen.rendering.layout import table
-from scvi_codegen.rendering.printer import INVERSE_ROOT, Sources, lane_functions, print_number
 from scvi_codegen.rendering.target import DOUBLE
 
 __all__ = [

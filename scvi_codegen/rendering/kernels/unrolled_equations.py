@@ -14,8 +14,8 @@ from typing import TypeAlias
 from scvi_codegen.ir.equations import LoweredStageGroup
 from scvi_codegen.ir.numbers import Number
 from scvi_codegen.ir.program import FEW_UNKNOWNS, Program
+from scvi_codegen.rendering.kernels.printer import print_number
 from scvi_codegen.rendering.layout import wrapped
-from scvi_codegen.rendering.printer import print_number
 from scvi_codegen.rendering.target import Target
 
 __all__ = ["UnrolledEquations", "UnrolledGroup", "unrolled_equations"]

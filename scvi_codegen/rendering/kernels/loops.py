@@ -12,11 +12,11 @@ from scvi_codegen.indices import Array
 from scvi_codegen.ir.equations import ConstrainedSteps
 from scvi_codegen.ir.kernel import Kernel, LoopedKernel, is_divided
 from scvi_codegen.ir.program import Program
-from scvi_codegen.rendering.functions import kernel_text
-from scvi_codegen.rendering.loop_nests import (
+from scvi_codegen.rendering.kernels.functions import kernel_text
+from scvi_codegen.rendering.kernels.loop_nests import (
     DIRECTION,
     MOST_THREADS,
-    Nest,
+    ArrayNest,
     Sharing,
     count_text,
     product_text,
@@ -25,8 +25,8 @@ from scvi_codegen.rendering.loop_nests import (
     size_text,
     sizes_text,
 )
-from scvi_codegen.rendering.printer import inverse_roots, scalar_functions
-from scvi_codegen.rendering.simd import LIBRARY, POINTS, IterationSource, iteration_source
+from scvi_codegen.rendering.kernels.printer import inverse_roots, scalar_functions
+from scvi_codegen.rendering.kernels.simd import LIBRARY, POINTS, IterationSource, iteration_source
 from scvi_codegen.rendering.target import DOUBLE
 
 __all__ = ["loop_context"]
@@ -104,7 +104,7 @@ def _force_text(program: Program, looped: LoopedKernel) -> str:
     """Return a function that adds to the forces; for an explicit method, with a factor."""
     explicit = program.fixed_point is None
     chunked, sharing = explicit and bool(looped.loops), sharing_of(looped)
-    nest = Nest(program, looped, "lanes", "X", chunked=chunked, sharing=sharing)
+    nest = ArrayNest(program, looped, "lanes", "X", chunked=chunked, sharing=sharing)
     slots = range(len(looped.writes))
     inner = [nest.is_innermost(target) for target in looped.writes]
 
@@ -158,7 +158,7 @@ def _function(
     source: str = "X",
 ) -> str:
     """Return a function of numbers with the same statements for every element."""
-    nest = Nest(program, looped, "double", source)
+    nest = ArrayNest(program, looped, "double", source)
     text = ["(void)given;", *nest.text(innermost=lines)]
     declared = f"double value[{values}]" if values else ""
     return nest.function(f"static void {name}", ["const problem *given", *arguments], text, values=declared)
@@ -173,7 +173,7 @@ def _energy_text(program: Program, looped: LoopedKernel, kernel: Kernel) -> str:
 
 def _mass_text(program: Program, looped: LoopedKernel) -> str:
     """Return a function that adds to the masses."""
-    name, place = looped.kernel.name, Nest(program, looped, "", "").place_of(looped.writes[0])
+    name, place = looped.kernel.name, ArrayNest(program, looped, "", "").place_of(looped.writes[0])
     lines = [f"{name}(NULL, 0.0, parameters, value);", f"mass[{place}] += value[0];"]
     return _function(program, looped, f"add_{name}", ["double *mass"], lines, source="")
 
@@ -212,7 +212,7 @@ def _constraint_texts(program: Program, condition: LoopedKernel, curvature: Loop
     arguments = [X, f"const double *restrict {DIRECTION}", "double t", now]
     yield _function(program, curvature, f"find_{second}", arguments, lines)
     bare = replace(condition, reads=(), given=())
-    places = map(Nest(program, bare, "", "").place_of, condition.writes)
+    places = map(ArrayNest(program, bare, "", "").place_of, condition.writes)
     lines = [
         "now->first[now->count++] = (int)now->entries;",
         *(f"now->place[now->entries++] = (int)({place});" for place in places),

@@ -14,6 +14,7 @@ additions on sizes, never on the number of threads.
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Sequence
 from enum import Enum, auto
 from typing import TypeAlias
@@ -26,6 +27,7 @@ from scvi_codegen.rendering.layout import wrapped, wrapped_comment
 __all__ = [
     "DIRECTION",
     "MOST_THREADS",
+    "ArrayNest",
     "Lines",
     "Nest",
     "Sharing",
@@ -138,37 +140,35 @@ def _starts(program: Program) -> Iterator[tuple[str, str]]:
         sizes.append(product_text(array))
 
 
-class Nest:
+class Nest(ABC):
     """Loops of a kernel, with arguments and parameters assigned in the outermost loop in which they are known.
 
-    The innermost loop is divided into parts. On each part the neighbours across a periodic boundary have constant
-    distances from the index, so that no element needs a test.
+    A kernel without loops becomes straight code. The innermost loop is divided into parts if necessary. On each part
+    the neighbours across a periodic boundary have constant distances from the index, so that no element needs a test.
 
     Args:
-        program: with the arrays.
         looped: the kernel.
-        scalar: type of the arguments.
-        source: array that they are read from; empty if there are none.
         chunked: whether all values of a part are computed before any is added, in loops without conflicts, which a
             compiler vectorises.
         sharing: how threads share it; without sharing, one task covers all.
     """
 
-    def __init__(
-        self,
-        program: Program,
-        looped: LoopedKernel,
-        scalar: str,
-        source: str,
-        *,
-        chunked: bool = False,
-        sharing: Sharing = Sharing.ALONE,
-    ) -> None:
-        self.program, self.looped, self.scalar, self.source = program, looped, scalar, source
-        self.chunked, self.sharing = chunked, sharing
+    def __init__(self, looped: LoopedKernel, *, chunked: bool = False, sharing: Sharing = Sharing.ALONE) -> None:
+        self.looped, self.chunked, self.sharing = looped, chunked, sharing
         self.levels = {loop.index: depth for depth, loop in enumerate(looped.loops, 1)}
         self.loops = {loop.index: loop for loop in looped.loops}
-        self.scalars = len(program.layout.parameters)
+
+    @abstractmethod
+    def read(self, k: int, slot: Access) -> str:
+        """Return the assignment of argument k; empty if there are none."""
+
+    @abstractmethod
+    def constant(self, k: int, access: Access) -> str:
+        """Return the assignment of constant k of an element."""
+
+    @abstractmethod
+    def table_entry(self, place: Place) -> str:
+        """Return an index in a table."""
 
     def depth_of(self, access: Access) -> int:
         """Return the depth of the innermost loop on whose index an entry depends."""
@@ -198,7 +198,7 @@ class Nest:
     def _inside(
         self, depth_of: int, prepare: Lines, innermost: Sequence[str], finish: Lines, behind: Sequence[Sequence[str]]
     ) -> list[str]:
-        lines = list(self._found(depth_of))
+        lines = list(self.known(depth_of))
         outer = [k for k, target in enumerate(self.looped.writes) if self.depth_of(target) == depth_of]
         if depth_of == len(self.looped.loops):
             return [*lines, *innermost]
@@ -275,7 +275,7 @@ class Nest:
         moved = {place.base.number for place in places if place.index == loop.index and not place.table}
         return sorted(moved - {0}) if loop.periodic else []
 
-    def _found(self, depth_of: int) -> Iterator[str]:
+    def known(self, depth_of: int) -> Iterator[str]:
         """Yield the lines known at a level: arguments, parameters, elements that not every task adds to."""
         for k, target in enumerate(self.looped.writes if self.sharing is Sharing.BY_PLACES else ()):
             if self.depth_of(target) == depth_of and not self._in_a_part(k):
@@ -283,16 +283,15 @@ class Nest:
         if depth_of == len(self.looped.loops):
             yield from self._passed_over()
         for k, slot in enumerate(self.looped.reads):
-            if self.depth_of(slot) == depth_of and self.source:
-                source = self.source if k < len(self.looped.reads) - self.looped.along else DIRECTION
-                yield f"u[{k}] = {source}[{self.place_of(slot)}];"
-        for k, access in enumerate(self.looped.given, self.scalars):
+            if self.depth_of(slot) == depth_of and (line := self.read(k, slot)):
+                yield line
+        for k, access in enumerate(self.looped.given):
             if self.depth_of(access) == depth_of:
-                yield f"parameters[{k}] = field_{access.array.name}[{self.place(access)}];"
+                yield self.constant(k, access)
 
     def place_of(self, access: Access) -> str:
-        """Return the index of an entry in the state."""
-        return f"start_{access.array.name} + {self.place(access)}"
+        """Return the index of an entry in the array that holds those of all arrays."""
+        return self.place(access)
 
     def place(self, access: Access) -> str:
         """Return the index of an entry in its array, in row-major order."""
@@ -306,8 +305,7 @@ class Nest:
     def index(self, place: Place) -> str:
         """Return an index on an axis."""
         if place.table:
-            columns = next(table for table in self.program.layout.tables if table.name == place.table).axes[1].number
-            return f"table_{place.table}[index_{place.index} * {columns} + {place.column}]"
+            return self.table_entry(place)
         if not place.index:
             return size_text(place.base)
         name, offset = f"index_{place.index}", place.base.number
@@ -317,6 +315,50 @@ class Nest:
         if loop is self.looped.loops[-1]:
             return f"{name} + {_shift(place.index, offset)}"
         return f"wrapped_index({name} + {offset}, {size_text(loop.end)})".replace("+ -", "- ")
+
+
+class ArrayNest(Nest):
+    """Loops over the arrays of a program.
+
+    Args:
+        program: with the arrays.
+        looped: the kernel.
+        scalar: type of the arguments.
+        source: array that they are read from; empty if there are none.
+        chunked, sharing: as of :class:`Nest`.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        looped: LoopedKernel,
+        scalar: str,
+        source: str,
+        *,
+        chunked: bool = False,
+        sharing: Sharing = Sharing.ALONE,
+    ) -> None:
+        super().__init__(looped, chunked=chunked, sharing=sharing)
+        self.program, self.scalar, self.source = program, scalar, source
+        self.scalars = len(program.layout.parameters)
+
+    def read(self, k: int, slot: Access) -> str:
+        """Return the assignment of an argument: an entry of the state, or of a direction."""
+        source = self.source if k < len(self.looped.reads) - self.looped.along else DIRECTION
+        return f"u[{k}] = {source}[{self.place_of(slot)}];" if self.source else ""
+
+    def constant(self, k: int, access: Access) -> str:
+        """Return the assignment of a parameter: an entry of a field."""
+        return f"parameters[{self.scalars + k}] = field_{access.array.name}[{self.place(access)}];"
+
+    def table_entry(self, place: Place) -> str:
+        """Return an index in a table of the problem."""
+        columns = next(table for table in self.program.layout.tables if table.name == place.table).axes[1].number
+        return f"table_{place.table}[index_{place.index} * {columns} + {place.column}]"
+
+    def place_of(self, access: Access) -> str:
+        """Return the index of an entry in the state."""
+        return f"start_{access.array.name} + {self.place(access)}"
 
     def function(self, head: str, arguments: Sequence[str], lines: Sequence[str], *, values: str = "") -> str:
         """Return the loops as a function; without values no kernel is evaluated."""

@@ -1,0 +1,1 @@
+"""Kernels and the loops around them as C: numbers, vectors, arrays."""
