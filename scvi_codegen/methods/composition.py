@@ -66,19 +66,55 @@ FIRST_HALVES = {
 """Coefficients gamma_1, gamma_2, .. before the middle one, which makes the sum 1; by order."""
 
 
-def _check_sequence(sequence: str) -> None:
-    """Raise :class:`MethodError` for an unknown sequence."""
-    if sequence not in (KICK_DRIFT_KICK, DRIFT_KICK_DRIFT):
-        raise MethodError(f"sequence must be '{KICK_DRIFT_KICK}' or '{DRIFT_KICK_DRIFT}', not {sequence!r}")
+class _Leapfrogs(Method):
+    """Leapfrog steps, one or several in turn; ``sequence`` determines with what each begins."""
 
+    __slots__ = ()
+    sequence: str
 
-def _sequence_of(sequence: str) -> Specification:
-    """Return the entry of a specification for a sequence; empty for the default."""
-    return {} if sequence == KICK_DRIFT_KICK else {"sequence": sequence}
+    def _check_sequence(self) -> None:
+        """Raise :class:`MethodError` for an unknown sequence."""
+        if self.sequence not in (KICK_DRIFT_KICK, DRIFT_KICK_DRIFT):
+            raise MethodError(f"sequence must be '{KICK_DRIFT_KICK}' or '{DRIFT_KICK_DRIFT}', not {self.sequence!r}")
+
+    @property
+    def _named_sequence(self) -> Specification:
+        """Entry of the specification for the sequence; empty for the default."""
+        return {} if self.sequence == KICK_DRIFT_KICK else {"sequence": self.sequence}
+
+    @property
+    def drifts_first(self) -> bool:
+        """True if each leapfrog step begins with a drift."""
+        return self.sequence == DRIFT_KICK_DRIFT
+
+    @property
+    def symmetric(self) -> bool:
+        """Always true."""
+        return True
+
+    @property
+    def symplectic(self) -> bool:
+        """Always true."""
+        return True
+
+    @property
+    def exactness(self) -> Exactness:
+        """Exactness of straight lines, which composition preserves; f may be linear in q."""
+        return Exactness(curve=1, quadrature=2, gauge=1)
+
+    def stage_system(self, system: MechanicalSystem) -> StageSystem:
+        """Return the leapfrog equations; unknowns are the velocities V_k of the drifts, determined row after row."""
+        from scvi_codegen.methods.leapfrog_stages import leapfrog_system
+
+        return leapfrog_system(system, self)
+
+    def paper_form(self, system: MechanicalSystem) -> StageSystem:
+        """Return the same equations: the paper uses Stoermer-Verlet without printing it."""
+        return self.stage_system(system)
 
 
 @dataclass(frozen=True, slots=True)
-class Composition(Method):
+class Composition(_Leapfrogs):
     """Symmetric composition of Stoermer-Verlet steps, for L = sum m_i v_i^2 / 2 - V(q, t) with constant masses.
 
     Args:
@@ -95,7 +131,7 @@ class Composition(Method):
     __repr__ = summary("composition_order", "sequence")
 
     def __post_init__(self) -> None:
-        _check_sequence(self.sequence)
+        self._check_sequence()
         order = checked_count(self.composition_order, "the order", least=2, error=MethodError)
         if order not in FIRST_HALVES:
             raise MethodError(f"order must be 2, 8 or 10, not {order}")
@@ -105,16 +141,6 @@ class Composition(Method):
     def of(cls, order: int, sequence: str = KICK_DRIFT_KICK) -> Composition:
         """Return the composition of an order."""
         return cls(order, sequence)
-
-    @property
-    def drifts_first(self) -> bool:
-        """True if each leapfrog step begins with a drift."""
-        return self.sequence == DRIFT_KICK_DRIFT
-
-    @property
-    def exactness(self) -> Exactness:
-        """Exactness of Stoermer-Verlet, which composition preserves."""
-        return Exactness(curve=1, quadrature=2, gauge=1)
 
     @property
     def implicit(self) -> bool:
@@ -143,33 +169,13 @@ class Composition(Method):
         """Order of the composition."""
         return self.composition_order
 
-    @property
-    def symmetric(self) -> bool:
-        """Always true."""
-        return True
-
-    @property
-    def symplectic(self) -> bool:
-        """Always true."""
-        return True
-
     def specification(self) -> Specification:
         """See :meth:`Method.specification`."""
-        return {"method": "composition", "order": self.composition_order, **_sequence_of(self.sequence)}
-
-    def stage_system(self, system: MechanicalSystem) -> StageSystem:
-        """Return the leapfrog equations; unknowns are the velocities V_k of the drifts, determined row after row."""
-        from scvi_codegen.methods.leapfrog_stages import leapfrog_system
-
-        return leapfrog_system(system, self)
-
-    def paper_form(self, system: MechanicalSystem) -> StageSystem:
-        """Return the same equations: the paper does not use the method."""
-        return self.stage_system(system)
+        return {"method": "composition", "order": self.composition_order, **self._named_sequence}
 
 
 @dataclass(frozen=True, slots=True)
-class StoermerVerlet(Method):
+class StoermerVerlet(_Leapfrogs):
     """Stoermer-Verlet: the two-stage Lobatto IIIA-IIIB pair, order 2, symplectic, symmetric.
 
     For L = v^T M v / 2 - V(q, t) with constant M it is the leapfrog scheme, and the SVI of degree 1 with the
@@ -184,12 +190,7 @@ class StoermerVerlet(Method):
     sequence: str = KICK_DRIFT_KICK
 
     def __post_init__(self) -> None:
-        _check_sequence(self.sequence)
-
-    @property
-    def drifts_first(self) -> bool:
-        """True if a step begins with a drift."""
-        return self.sequence == DRIFT_KICK_DRIFT
+        self._check_sequence()
 
     @property
     def name(self) -> str:
@@ -209,21 +210,6 @@ class StoermerVerlet(Method):
         return 2
 
     @property
-    def symmetric(self) -> bool:
-        """Always true."""
-        return True
-
-    @property
-    def symplectic(self) -> bool:
-        """Always true."""
-        return True
-
-    @property
-    def exactness(self) -> Exactness:
-        """Exactness of straight lines; f may be linear in q."""
-        return Exactness(curve=1, quadrature=2, gauge=1)
-
-    @property
     def fractions(self) -> Vector:
         """Fractions of a single leapfrog step: 1."""
         return (mp.one,)
@@ -235,15 +221,14 @@ class StoermerVerlet(Method):
 
     def specification(self) -> Specification:
         """See :meth:`Method.specification`."""
-        return {"method": "stoermer-verlet", **_sequence_of(self.sequence)}
+        return {"method": "stoermer-verlet", **self._named_sequence}
 
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
         """Return the pair by its generating function, unknowns V_1, V_2; drift-kick-drift as leapfrog equations."""
         from scvi_codegen.methods.galerkin_stages import galerkin_system
-        from scvi_codegen.methods.leapfrog_stages import leapfrog_system
 
         if self.drifts_first:
-            return leapfrog_system(system, self)
+            return _Leapfrogs.stage_system(self, system)
         tableau = lobatto_iiia(2)
         return galerkin_system(
             system,
@@ -254,7 +239,3 @@ class StoermerVerlet(Method):
             end_position=tableau.b,
             extrapolation=extrapolation(tableau.c, 1),
         )
-
-    def paper_form(self, system: MechanicalSystem) -> StageSystem:
-        """Return the same equations: the paper uses the method without printing it."""
-        return self.stage_system(system)
