@@ -17,7 +17,7 @@ enum {
   SITES = 2, /* coordinates, then the components of other unknowns */
   B = 5, /* unknowns per site */
   N = 10, /* unknowns */
-  POINTS = 5, /* largest number of points of a stage group, or of blocks */
+  MOST_POINTS = 5, /* largest number of points of a stage group, or of blocks */
   POINT = 0, /* numbers that describe where a reused Jacobian was evaluated */
   MOST_ITERATIONS = INT_MAX, /* whatever the options are */
   MAX_ITERATIONS = 50, /* default */

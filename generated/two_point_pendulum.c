@@ -16,7 +16,7 @@ enum {
   SITES = 1, /* coordinates, then the components of other unknowns */
   B = 1, /* unknowns per site */
   N = 1, /* unknowns */
-  POINTS = 2, /* largest number of points of a stage group, or of blocks */
+  MOST_POINTS = 2, /* largest number of points of a stage group, or of blocks */
   POINT = 0, /* numbers that describe where a reused Jacobian was evaluated */
   MOST_ITERATIONS = INT_MAX, /* whatever the options are */
   MAX_ITERATIONS = 50, /* default */

@@ -161,7 +161,7 @@ def density_of(system: MechanicalSystem, g: str | Expr) -> Control:
     change = sympy.Add(*(derivative * rates[variables[i]] for i, derivative in gradient(rate, variables).items()))
     kernel = system_kernel(
         system,
-        "density",
+        "step_density",
         (1 / rate, -change / rate),
         of=forms.legendre_arguments,
         purpose=f"1/g and -d(log g)/dt of the time rescaling g at u = {'(q, p)' if system.auxiliaries else '(q, v)'}.",

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from scvi_codegen.indices import Access, Array, ArrayMap, Loop
+from scvi_codegen.rendering.names import with_own_names
 from scvi_codegen.rendering.preprocessing import preprocessed
 from scvi_codegen.version import __version__
 
@@ -74,8 +75,12 @@ class Source:
         return (self, self.beside) if self.beside else (self,)
 
     def amalgamated(self) -> Source:
-        """Return the source as one file: support headers inserted, without alternatives that it does not use."""
+        """Return the source as one file: support headers inserted, without alternatives that it does not use.
+
+        Files of several integrators can be included in one translation unit.
+        """
         code, _ = preprocessed(self.code, dict(self.support).__getitem__)
+        code = with_own_names(code, self.prefix)
         beside = self.beside.amalgamated() if self.beside else None
         return replace(self, code=code, support=(), beside=beside)
 

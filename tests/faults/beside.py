@@ -58,10 +58,10 @@ DAMPING = (
     text(
         "slopes by the rate lost",
         case("damped/svi"),
-        r"flow\(back, growth, step->h \* slope\[e\].*;",
+        r"propagate\(back, growth, step->h \* slope\[e\].*;",
         ";",
     ),
-    text("slopes of what grows by h alone", case("damped/svi"), r"flow\(0, p, -at->p1\[i\], at->grown\);", ";"),
+    text("slopes of what grows by h alone", case("damped/svi"), r"propagate\(0, p, -at->p1\[i\], at->grown\);", ";"),
 )
 
 RATTLES = tuple(
@@ -204,15 +204,15 @@ C_TEXT = (
         "time that does not pass on the way back",
         "driven/svi",
         "end_time",
-        r"flow\(back, at->v \+ INPUT_H - 1",
-        "flow(0, at->v + INPUT_H - 1",
+        r"propagate\(back, at->v \+ INPUT_H - 1",
+        "propagate(0, at->v + INPUT_H - 1",
     ),
     (
         "time that goes on without the step",
         "driven/svi",
         "end_time",
-        r"flow\(back, at->v \+ INPUT_H - 1, 1,",
-        "flow(back, at->v + INPUT_H - 1, back,",
+        r"propagate\(back, at->v \+ INPUT_H - 1, 1,",
+        "propagate(back, at->v + INPUT_H - 1, back,",
     ),
     (
         "tangents by iteration scaled by h once too little",
@@ -254,8 +254,8 @@ C_TEXT = (
         "half of the last row",
         "double/svi",
         "end_momentum",
-        r"flow\(0, p, 1, at->rows",
-        "flow(0, p, 0.5, at->rows",
+        r"propagate\(0, p, 1, at->rows",
+        "propagate(0, p, 0.5, at->rows",
     ),
     (
         "positions that unknowns move by 1, not by h",

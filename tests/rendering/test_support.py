@@ -97,7 +97,7 @@ int main(void)
     for (int k = 0; k < 2; k++) {{
       double extrema[EVENT_DEGREE];
       int count;
-      printf("%.6f ", uncertain_abscissa(all[i], doubts[i][k], extrema, &count));
+      printf("%.6f ", {prefix}_uncertain_abscissa(all[i], doubts[i][k], extrema, &count));
     }}
   return 0;
 }}
@@ -111,7 +111,9 @@ def test_intervals_are_split_only_where_a_root_is_uncertain(tmp_path):
     extra = stepper.source.beside
     assert extra is not None
     written(stepper.source, tmp_path)
-    program = f'#include <stdio.h>\n#include "{written(extra, tmp_path)}.c"\n{DOUBT.format()}'
+    prefix = written(extra, tmp_path)
+    degree = f"#define EVENT_DEGREE {prefix}_EVENT_DEGREE"  # names at file scope have the prefix
+    program = f'#include <stdio.h>\n#include "{prefix}.c"\n{degree}\n{DOUBT.format(prefix=prefix)}'
     flags = ("-Wno-unused-function", f"{stepper.source.prefix}.c")
     found = [float(place) for place in output_of(program, tmp_path, *flags).split()]
     assert found == pytest.approx([2.0, 0.0, 2.0, 0.0, 2.0, 0.5, 2.0, 0.2, 2.0, 0.0], abs=1e-6)

@@ -1,7 +1,7 @@
 #ifndef SUPPORT_STAGES_H
 #define SUPPORT_STAGES_H
 
-/* Interpolation from the unknowns z to values at points. Requires: real, B, POINTS. Unknown b of site i is z[i B +
+/* Interpolation from the unknowns z to values at points. Requires: real, B, MOST_POINTS. Unknown b of site i is z[i B +
  * b]. */
 
 /* u[n * across + i * along] = scale sum_b table[b][n] z_b for sites i from z on and every point n. */
@@ -9,7 +9,7 @@ static inline void gather(const real *table, int points, real scale, const real 
     int along)
 {
   for (int i = 0; i < sites; i++) {
-    real sum[POINTS] = {0};
+    real sum[MOST_POINTS] = {0};
     for (int b = 0; b < B; b++)
       for (int n = 0; n < points; n++)
         sum[n] += table[b * points + n] * z[i * B + b];
@@ -29,9 +29,8 @@ static inline real *entry(real *jacobian, const band *shape, int i, int r, int j
       POSITION_IN_MATRIX[i] * blocks + r;
 }
 #else
-/* Sums between blocks of unknowns z and points, for every method. Requires: real, M, B, POINTS, POSITION_IN_MATRIX,
- * band.h, step.h. Row r of site i is rows[i (B + 1) + r], the last one for p1. The first M sites are the
- * coordinates. */
+/* Sums between blocks of unknowns z and points, for every method. Requires: real, M, B, POSITION_IN_MATRIX, band.h,
+ * step.h. Row r of site i is rows[i (B + 1) + r], the last one for p1. The first M sites are the coordinates. */
 
 /* u = q0 + u at every point, including the compensation of q0. */
 static inline void offset(const step_data *step, int points, real *u, int across)

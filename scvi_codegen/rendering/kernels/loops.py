@@ -133,8 +133,10 @@ def _force_text(program: Program, looped: LoopedKernel) -> str:
     if sharing is Sharing.BY_PLACES:
         zero.append("const int whole = here->whole;")
     unused = ["(void)here;"] if sharing is Sharing.ALONE else []
-    values = f"lanes value[{len(looped.writes)}]"
-    text = nest.function(f"static void add_{looped.kernel.name}", arguments, [*unused, *zero, *lines], values=values)
+    values, name = f"lanes value[{len(looped.writes)}]", f"static void add_{looped.kernel.name}"
+    text = nest.function(name, arguments, [*unused, *zero, *lines], values=values)
+    if text.count("given") == 1:  # among the arguments
+        text = nest.function(name, arguments, ["(void)given;", *unused, *zero, *lines], values=values)
     return f"{text}\n\n{_sharing_text(program, looped)}"
 
 

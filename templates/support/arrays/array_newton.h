@@ -3,7 +3,8 @@
 
 /* Linear systems of Newton's method for the points of a step of an array system: (1 - h^2 A F' / m) dX = the change
  * by one fixed-point iteration, where A is PRODUCT and F' the Jacobian of the forces at the points, which is only
- * multiplied by vectors, term group by term group. Requires: separable_iteration.h; products and diagonals of F'. */
+ * multiplied by vectors, term group by term group. Requires: separable_iteration.h, jacobian_times,
+ * jacobian_diagonal. */
 
 typedef struct {
   const step_data *step;
@@ -24,7 +25,7 @@ typedef struct {
 static void multiply(const linear_system *of, const lanes *x, lanes *y)
 {
   const long long n = of->n;
-  products(of->step, of->points->X, x, of->forces);
+  jacobian_times(of->step, of->points->X, x, of->forces);
   for (long long i = of->own.first; i < of->own.end; i++) {
     const double unit = unit_of(of->points, i);
     for (int g = 0; g < GROUPS; g++)
@@ -98,7 +99,7 @@ static double mean_derivative(const linear_system *of, const lanes *x, long long
 /* Inverts 1 - h^2 A F'_ii / m of every coordinate. */
 static void find_own_inverses(linear_system *of)
 {
-  diagonals(of->step, of->points->X, of->forces);
+  jacobian_diagonal(of->step, of->points->X, of->forces);
   for (long long i = of->own.first; i < of->own.end; i++)
     keep_inverse(of, i, mean_derivative(of, of->forces, i), 1.0);
 }

@@ -28,7 +28,7 @@ typedef struct {
 static void *run_worker(void *one)
 {
   worker *self = one;
-  const thread_barrier *at = self->run.thread_barrier;
+  const barrier *at = self->run.thread_barrier;
   while (__atomic_load_n(&at->threads, __ATOMIC_ACQUIRE) == 0)
     sched_yield();
   self->way->go(&self->run, self->way, &self->report);
@@ -41,7 +41,7 @@ static int run_workers(run_memory *run, const job *way, solver_report *report)
   worker others[MOST_THREADS];
   const long long wanted = run->threads < MOST_THREADS ? run->threads : MOST_THREADS;
   long long threads = 1;
-  thread_barrier place = {0};
+  barrier place = {0};
   int status;
   if (wanted < 2 || !is_worth_sharing(run, way->given))
     return way->go(run, way, report);

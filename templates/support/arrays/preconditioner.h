@@ -99,7 +99,7 @@ static void probe_stencils(linear_system *of, const lattice *all, lanes *x, lane
           find_mean(of, &probe, of->forces, mean);
       }
     if (asked)
-      products(of->step, of->points->X, x, of->forces); /* begins with a barrier */
+      jacobian_times(of->step, of->points->X, x, of->forces); /* begins with a barrier */
   }
   wait_at_barrier(of->run);
 }

@@ -25,7 +25,7 @@ typedef struct {
   run_memory *run;
   const problem *given;
   parts_of_work parts;
-  held held;
+  constraint_system held;
   long long n;
   const solver_options *options;
   solver_report *report;
@@ -40,7 +40,7 @@ static constrained_run constrained_run_of(run_memory *run, const problem *given,
 }
 
 /* x = G^T lambda. */
-static void compute_constraint_forces(const held *held, const double *lambda, double *x, long long n)
+static void compute_constraint_forces(const constraint_system *held, const double *lambda, double *x, long long n)
 {
   memset(x, 0, sizeof(double) * (size_t)n);
   for (long long k = 0; k < held->count; k++)
@@ -94,7 +94,7 @@ static double push(double *x, const double *y, double by, const double *inverse_
 
 /* Status of a finished iteration. Constraints that are violated at converged positions contradict each other:
  * SINGULAR. */
-static int end_of_iteration(const progress *now, const held *held, solver_report *report)
+static int end_of_iteration(const progress *now, const constraint_system *held, solver_report *report)
 {
   const double left = product_of(held->right, held->right, held->count);
   const double rounding = product_of(held->rounding, held->rounding, held->count);
@@ -108,7 +108,7 @@ static int end_of_iteration(const progress *now, const held *held, solver_report
  * there. */
 static int solve_positions(const constrained_run *of, double h, double t, double *size)
 {
-  const held *held = &of->held;
+  const constraint_system *held = &of->held;
   const parts_of_work *parts = &of->parts;
   progress now = before_iterations();
   compute_constraint_forces(held, held->lambda, parts->R, of->n);
@@ -133,7 +133,7 @@ static int solve_positions(const constrained_run *of, double h, double t, double
 }
 
 /* right = -scale (rate + G x). */
-static void find_right(const held *held, const double *rate, const double *x, double scale)
+static void find_right(const constraint_system *held, const double *rate, const double *x, double scale)
 {
   for (long long k = 0; k < held->count; k++) {
     double sum = rate[k];
@@ -147,7 +147,7 @@ static void find_right(const held *held, const double *rate, const double *x, do
  * `unit` is compared with `size`. X contains the magnitudes of their terms. */
 static int project_momenta(const constrained_run *of, double by, double unit, double size)
 {
-  const held *held = &of->held;
+  const constraint_system *held = &of->held;
   const run_memory *run = of->run;
   progress now = before_iterations();
   for (int k = 0;; k++) {
@@ -172,7 +172,7 @@ static int project_momenta(const constrained_run *of, double by, double unit, do
 static int constrained_substep(const constrained_run *of, double h, double t)
 {
   const parts_of_work *parts = &of->parts;
-  const held *held = &of->held;
+  const constraint_system *held = &of->held;
   const run_memory *run = of->run;
   double size;
   int status;

@@ -112,11 +112,11 @@ typedef struct {
   double *g, *rate, *lambda, *right, *change, *preconditioned, *direction, *image, *rounding, *diagonal, *pivot;
   double *derivative, *next;
   double *entry, *factor;
-} held;
+} constraint_system;
 
-static held constraint_arrays(const run_memory *run, long long n)
+static constraint_system constraint_arrays(const run_memory *run, long long n)
 {
-  held found = {.of = pattern_of(run, n), .count = run->constraints, .entries = run->entries};
+  constraint_system found = {.of = pattern_of(run, n), .count = run->constraints, .entries = run->entries};
   double **const each[] = {&found.g, &found.rate, &found.lambda, &found.right, &found.change, &found.preconditioned,
       &found.direction,
       &found.image, &found.rounding, &found.diagonal, &found.pivot};
@@ -131,7 +131,7 @@ static held constraint_arrays(const run_memory *run, long long n)
 }
 
 /* Computes the row of a constraint: products of derivatives with respect to the same coordinates. */
-static void find_products(const held *held, const double *inverse_mass, int k)
+static void find_products(const constraint_system *held, const double *inverse_mass, int k)
 {
   const pattern *of = &held->of;
   held->diagonal[k] = 0.0;
@@ -155,7 +155,7 @@ static void find_products(const held *held, const double *inverse_mass, int k)
 }
 
 /* Computes a row of L from the rows above; returns 0 if the diagonal is not positive. */
-static int factorise_row(const held *held, int k)
+static int factorise_row(const constraint_system *held, int k)
 {
   const pattern *of = &held->of;
   double left = held->diagonal[k];
@@ -179,7 +179,7 @@ static int factorise_row(const held *held, int k)
 }
 
 /* Assembles and factorises the matrix of the derivatives at the state; returns 0 if a constraint has none. */
-static int assemble(const held *held, const double *inverse_mass)
+static int assemble(const constraint_system *held, const double *inverse_mass)
 {
   int sound = 1;
   for (int k = 0; k < held->count; k++) {
@@ -190,7 +190,7 @@ static int assemble(const held *held, const double *inverse_mass)
 }
 
 /* y = G M^-1 G^T x. */
-static void multiply(const held *held, const double *x, double *y)
+static void multiply(const constraint_system *held, const double *x, double *y)
 {
   const pattern *of = &held->of;
   for (int k = 0; k < held->count; k++) {
@@ -204,7 +204,7 @@ static void multiply(const held *held, const double *x, double *y)
 }
 
 /* y = (L D L^T)^-1 x. */
-static void precondition(const held *held, const double *x, double *y)
+static void precondition(const constraint_system *held, const double *x, double *y)
 {
   const pattern *of = &held->of;
   for (int k = 0; k < held->count; k++) {
@@ -233,7 +233,7 @@ static double product_of(const double *x, const double *y, long long n)
 }
 
 /* Bound of the rounding error of scale G x, per constraint. */
-static void compute_rounding(const held *held, const double *derivative, const double *x, double scale)
+static void compute_rounding(const constraint_system *held, const double *derivative, const double *x, double scale)
 {
   for (long long k = 0; k < held->count; k++) {
     double terms = 0.0;
@@ -244,7 +244,7 @@ static void compute_rounding(const held *held, const double *derivative, const d
 }
 
 /* Returns 1 if some residual exceeds its rounding error. */
-static int exceeds_rounding(const held *held)
+static int exceeds_rounding(const constraint_system *held)
 {
   int found = 0;
   for (long long k = 0; k < held->count; k++)
@@ -253,7 +253,7 @@ static int exceeds_rounding(const held *held)
 }
 
 /* change += step way, right -= step image; returns the squared norm of the residual. */
-static double move_on(const held *held, double step)
+static double move_on(const constraint_system *held, double step)
 {
   for (long long k = 0; k < held->count; k++) {
     held->change[k] += step * held->direction[k];
@@ -264,7 +264,7 @@ static double move_on(const held *held, double step)
 
 /* Solves (G M^-1 G^T) change = right to the relative tolerance or to rounding. Returns OK, NOT_CONVERGED, SINGULAR or
  * NOT_FINITE. */
-static int solve_constraint_system(const held *held, double tolerance, solver_report *report)
+static int solve_constraint_system(const constraint_system *held, double tolerance, solver_report *report)
 {
   const long long n = held->count;
   double size = product_of(held->right, held->right, n), derivative,

@@ -11,7 +11,7 @@
  * there. */
 static int project_positions(const constrained_run *of)
 {
-  const held *held = &of->held;
+  const constraint_system *held = &of->held;
   const parts_of_work *parts = &of->parts;
   const run_memory *run = of->run;
   progress now = before_iterations();
@@ -89,7 +89,7 @@ int NAME(multipliers)(run_memory *run, const problem *given, double *lambda)
 {
   solver_report report = {0};
   const constrained_run of = constrained_run_of(run, given, NULL, &report);
-  const held *held = &of.held;
+  const constraint_system *held = &of.held;
   double *F = of.parts.D, *pulled = of.parts.Y;
   int status = run->guess ? OK : begin(&of);
   if (status != OK)

@@ -25,10 +25,10 @@ static void end_time(const linearised_step *at, int back)
     rate_derivatives(place + n * f->arguments, step->t, step->parameters, &rate, derivative);
     for (int e = 0; e < RATE_DERIVATIVES; e++) {
       const int j = RATE_ENTRY[e];
-      flow(back, time, step->h * weight * derivative[e],
+      propagate(back, time, step->h * weight * derivative[e],
           j < f->arguments ? u + n * f->arguments + j : at->v + 2 * M + j - f->arguments);
     }
-    flow(back, time, weight * rate, at->v + INPUT_H);
+    propagate(back, time, weight * rate, at->v + INPUT_H);
   }
   if (back)
     arguments_wide(f, step->h, back, at->partials, at->v, at->dz, u);
@@ -55,7 +55,7 @@ int NAME(energy_gradient)(const real *q, const real *p, const real *parameters, 
 /* Derivative of the time at the end with respect to that at the start and h; back: its transpose. */
 static void end_time(const linearised_step *at, int back)
 {
-  flow(back, at->v + INPUT_H - 1, 1, at->v + INPUT_H);
+  propagate(back, at->v + INPUT_H - 1, 1, at->v + INPUT_H);
 }
 #endif
 
@@ -129,7 +129,7 @@ static void solve_forward(const linearised_step *at)
   solve_wide(at->data.factors, &at->shape, at->data.pivot, 0, at->x);
   memset(at->dz, 0, sizeof(wide) * N);
   for (int i = 0; i < N; i++)
-    flow(0, at->dz + i, -1, at->x + POSITION_IN_MATRIX[i / B] * B + i % B);
+    propagate(0, at->dz + i, -1, at->x + POSITION_IN_MATRIX[i / B] * B + i % B);
 }
 
 /* rows = -(transposed matrix)^-1 dz. */
@@ -137,7 +137,7 @@ static void solve_back(const linearised_step *at)
 {
   memset(at->x, 0, sizeof(wide) * N);
   for (int i = 0; i < N; i++)
-    flow(1, at->dz + i, -1, at->x + POSITION_IN_MATRIX[i / B] * B + i % B);
+    propagate(1, at->dz + i, -1, at->x + POSITION_IN_MATRIX[i / B] * B + i % B);
   solve_wide(at->data.factors, &at->shape, at->data.pivot, 1, at->x);
   for (int i = 0; i < N; i++)
     at->rows[i / B * (B + 1) + i % B] = at->x[POSITION_IN_MATRIX[i / B] * B + i % B];
@@ -149,8 +149,8 @@ static void end_position(const linearised_step *at, int back)
   const real h = at->step->h, *z = at->data.z;
   for (int i = 0; i < M; i++)
     for (int b = 0; b < B; b++) {
-      flow(back, at->v + i, h * END_POSITION[b], at->dz + i * B + b);
-      flow(back, at->v + i, END_POSITION[b] * z[i * B + b], at->v + INPUT_H);
+      propagate(back, at->v + i, h * END_POSITION[b], at->dz + i * B + b);
+      propagate(back, at->v + i, END_POSITION[b] * z[i * B + b], at->v + INPUT_H);
     }
 }
 
@@ -159,7 +159,7 @@ static void momentum_rows(const linearised_step *at, int back)
 {
   for (int i = 0; i < M; i++)
     for (int r = 0; r < B; r++)
-      flow(back, at->rows + i * (B + 1) + r, MOMENTUM_ROW[r], at->v + M + i);
+      propagate(back, at->rows + i * (B + 1) + r, MOMENTUM_ROW[r], at->v + M + i);
 }
 
 /* Derivative of p1 with respect to p0, the rows of its increment, and damping. */
@@ -171,17 +171,17 @@ static void end_momentum(const linearised_step *at, int back)
   for (int i = 0; i < M; i++) {
     wide *p = at->v + M + i;
     if (!back)
-      flow(0, p, 1, at->rows + i * (B + 1) + B);
+      propagate(0, p, 1, at->rows + i * (B + 1) + B);
 #ifdef DAMPED
     if (back)
-      flow(1, p, -at->p1[i], at->grown);
+      propagate(1, p, -at->p1[i], at->grown);
     for (int j = 0; j < WIDTH; j++)
       p->lane[j] *= factor;
     if (!back)
-      flow(0, p, -at->p1[i], at->grown);
+      propagate(0, p, -at->p1[i], at->grown);
 #endif
     if (back)
-      flow(1, p, 1, at->rows + i * (B + 1) + B);
+      propagate(1, p, 1, at->rows + i * (B + 1) + B);
   }
 }
 

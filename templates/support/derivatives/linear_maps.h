@@ -17,7 +17,7 @@ typedef struct {
 } wide;
 
 /* y += factor x; back: the transpose, x += factor y. */
-static inline void flow(int back, wide *y, real factor, wide *x)
+static inline void propagate(int back, wide *y, real factor, wide *x)
 {
   real *restrict to = back ? x->lane : y->lane;
   const real *restrict from = back ? y->lane : x->lane;
@@ -133,7 +133,7 @@ static void gather_wide(const stage_group *f, real h, int back, wide *dz, wide *
     for (int i = 0; i < loop->sites; i++)
       for (int b = 0; b < B; b++)
         for (int n = 0; n < f->points; n++)
-          flow(back, u + n * f->arguments + loop->offset + i, scale * loop->table[b * f->points + n],
+          propagate(back, u + n * f->arguments + loop->offset + i, scale * loop->table[b * f->points + n],
               dz + (loop->first + i) * B + b);
   }
 }
@@ -144,9 +144,9 @@ static void start_wide(const stage_group *f, int back, const real *by_h, wide *v
   for (int g = 0; g < f->gathers; g++)
     for (int n = 0; f->gather[g].from_state && n < f->points; n++)
       for (int i = 0; i < M; i++)
-        flow(back, u + n * f->arguments + f->gather[g].offset + i, 1, v + i);
+        propagate(back, u + n * f->arguments + f->gather[g].offset + i, 1, v + i);
   for (int i = 0; i < f->points * f->arguments; i++)
-    flow(back, u + i, by_h[i], v + INPUT_H);
+    propagate(back, u + i, by_h[i], v + INPUT_H);
 }
 
 /* From parameters, t and h to results. */
@@ -155,12 +155,12 @@ static void inputs_wide(const stage_group *f, int back, const real *by_h, const 
   for (int n = 0; n < f->points; n++)
     for (int e = 0; e < f->given; e++) {
       wide *result = value + n * f->results + f->input_pair[e][0], *from = v + 2 * M + f->input_pair[e][1];
-      flow(back, result, given[n * f->given + e], from);
+      propagate(back, result, given[n * f->given + e], from);
       if (from == v + INPUT_H - 1)
-        flow(back, result, given[n * f->given + e] * f->abscissa[n], v + INPUT_H);
+        propagate(back, result, given[n * f->given + e] * f->abscissa[n], v + INPUT_H);
     }
   for (int i = 0; i < f->points * f->results; i++)
-    flow(back, value + i, by_h[i], v + INPUT_H);
+    propagate(back, value + i, by_h[i], v + INPUT_H);
 }
 
 /* From arguments to results. */
@@ -169,7 +169,7 @@ static void multiply_wide(const stage_group *f, int back, const real *derivative
   for (int k = 0; k < f->blocks; k++)
     for (int n = 0; n < f->points; n++)
       for (int e = 0; e < f->block[k].count; e++)
-        flow(back, value + n * f->results + f->block[k].to + f->block[k].pair[e][0],
+        propagate(back, value + n * f->results + f->block[k].to + f->block[k].pair[e][0],
             derivative[n * f->partials + f->block[k].first + e],
             u + n * f->arguments + f->block[k].from + f->block[k].pair[e][1]);
 }
@@ -183,7 +183,7 @@ static void scatter_wide(const stage_group *f, real h, real growth, int back, in
     for (int i = 0; i < loop->sites; i++)
       for (int n = 0; n < f->points; n++)
         for (int r = first; r <= B; r++)
-          flow(back, rows + (loop->first + i) * (B + 1) + r,
+          propagate(back, rows + (loop->first + i) * (B + 1) + r,
               GROWN(f->weight[n], growth, f->abscissa[n]) * scale * loop->table[n * (B + 1) + r],
               value + n * f->results + loop->offset + i);
   }
@@ -222,7 +222,7 @@ static const real *through_group(const stage_group *f, const step_change *by, in
   if (v)
     inputs_wide(f, back, by_h, given, v, value);
   for (int i = 0; v && by->grown && i < f->points * f->results; i++)
-    flow(back, value + i, given[f->points * f->given + i], by->grown);
+    propagate(back, value + i, given[f->points * f->given + i], by->grown);
   if (back)
     arguments_wide(f, h, back, partials, v, dz, points);
   else
@@ -244,7 +244,7 @@ static void lower_wide(const real *a, const band *shape, const real *pivot, int 
   if (!back)
     swap_wide(x + k, x + (int)pivot[k]);
   for (int i = k + 1; i < least(k + shape->reach + 1, shape->rows); i++)
-    flow(back, x + i, -column[i], x + k);
+    propagate(back, x + i, -column[i], x + k);
   if (back)
     swap_wide(x + k, x + (int)pivot[k]);
 }
@@ -256,7 +256,7 @@ static void upper_wide(const real *a, const band *shape, int k, int back, wide *
   for (int j = 0; !back && j < WIDTH; j++)
     x[k].lane[j] *= column[k];
   for (int i = most(k - 2 * shape->reach, 0); i < k; i++)
-    flow(back, x + i, -column[i], x + k);
+    propagate(back, x + i, -column[i], x + k);
   for (int j = 0; back && j < WIDTH; j++)
     x[k].lane[j] *= column[k];
 }

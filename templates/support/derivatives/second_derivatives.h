@@ -159,7 +159,7 @@ static void hessian_of_step(const linearised_step *at, const second_order_memory
   memcpy(at->dz, to->by_dz, sizeof(wide) * N);
   vjp_with_unknowns(at);
   for (int i = 0; i < STEP_INPUTS; i++)
-    flow(0, at->v + i, 1, to->by_given + i);
+    propagate(0, at->v + i, 1, to->by_given + i);
   memcpy(to->adjoint_tangents, at->v, sizeof(wide) * STEP_INPUTS);
 }
 

@@ -77,11 +77,11 @@ PASS drift_words find_drift(const step_points *w, long long i)
  * include the low words, with the first forces. */
 #ifdef ARRAYS
 #define DRIFT_OF(w, i) find_drift(w, i)
-#define STRAIGHT(w, g, i, of) ((w)->step->q0[i] + DRIFT[g] * (of).high)
+#define STRAIGHT_LINE(w, g, i, of) ((w)->step->q0[i] + DRIFT[g] * (of).high)
 #define WITH_LOW_WORDS(w, g, i, x) (x)
 #else
 #define DRIFT_OF(w, i) ((w)->drifts[i])
-#define STRAIGHT(w, g, i, of) ((void)(of), (w)->base[(g) * M + (i)])
+#define STRAIGHT_LINE(w, g, i, of) ((void)(of), (w)->base[(g) * M + (i)])
 #define WITH_LOW_WORDS(w, g, i, x) ((x) + (w)->rests[(g) * M + (i)])
 #endif
 
@@ -164,7 +164,7 @@ PASS lanes improve_points(const step_points *w, section here)
     for (int g = 0; g < GROUPS; g++) {
       lanes *X = &w->X[g * OF_EACH * EXTENT(w->n) + i];
       const lanes curved = unit * SUM_OF_FORCES(PRODUCT, w, g, i);
-      const lanes x = STRAIGHT(w, g, i, of) + WITH_LOW_WORDS(w, g, i, curved);
+      const lanes x = STRAIGHT_LINE(w, g, i, of) + WITH_LOW_WORDS(w, g, i, curved);
       change = with_change(change, (x - *X) * w->inverse_size[i]);
       *X = x;
     }
@@ -249,7 +249,7 @@ static void first_points(const step_points *w, history past, long long steps)
       const lanes force = extrapolated(w->step, past, steps, g, i);
       if (VELOCITIES) /* the extrapolation is of forces, from which velocities follow, too */
         w->F[g * w->n + i] = force;
-      w->X[g * OF_EACH * w->n + i] = STRAIGHT(w, g, i, of);
+      w->X[g * OF_EACH * w->n + i] = STRAIGHT_LINE(w, g, i, of);
       if (!VELOCITIES && steps > 0)
         w->X[g * OF_EACH * w->n + i] += unit_of(w, i) * force;
     }

@@ -24,7 +24,7 @@ static int density_arguments(const step_data *step, real *u)
  * equation drho/dtau = -d(log g)/dt from the middle of one step to that of the next, so that the step sequence is
  * time-reversible if the method is (integrating controller; Hairer & Soederlind, SIAM J. Sci. Comput. 26, 2005). A step
  * that ends at a prescribed time is a part of tau and advances the density by as much. Requires: run.h, prepare and
- * solve of a solver, the kernel density, (1/g, -d(log g)/dt). Include before advance_to.h. */
+ * solve of a solver, the kernel step_density, (1/g, -d(log g)/dt). Include before advance_to.h. */
 
 #define LAST_STEP REAL(1e-6) /* relative to the step: a step that ends so near t_end ends at t_end */
 
@@ -54,7 +54,7 @@ static int next_density(const run_memory *run, trial *now)
   const int status = density_arguments(&now->step, u);
   if (status != OK)
     return status;
-  density(u, now->at.t, now->step.parameters, value);
+  step_density(u, now->at.t, now->step.parameters, value);
   now->growth = half * value[1];
   now->density = run->density > 0 ? run->density + halves * now->growth : value[0] + now->growth;
   return now->density > 0 && 0 * now->density == 0 ? OK : NOT_FINITE;
