@@ -78,7 +78,8 @@ static void add_combination(linear_system *of, triangle *all, int size)
 }
 
 /* Solves for the correction to LINEAR_TOLERANCE or LINEAR_GRAIN; returns the norm of the residual, which is larger if
- * further cycles do not reduce it. */
+ * further cycles do not reduce it. Rounding errors of large coordinates may exceed small ones, so the residual that is
+ * left at that level is corrected by the inverses of the coordinates. */
 static double find_correction(linear_system *of, solver_report *report)
 {
   const double size = sqrt(inner_product(of, of->residual, of->residual));
@@ -94,8 +95,13 @@ static double find_correction(linear_system *of, solver_report *report)
       add_multiple(of, left, -1.0, of->product);
     }
     all.rest[0] = sqrt(inner_product(of, left, left));
-    if (!(all.rest[0] > enough && all.rest[0] < INFINITY))
+    if (!(all.rest[0] > enough && all.rest[0] < INFINITY)) {
+      if (enough > LINEAR_TOLERANCE * size && !of->by_fourier) {
+        apply_inverses(of, left, of->product, of->own);
+        add_multiple(of, of->correction, 1.0, of->product);
+      }
       return all.rest[0];
+    }
     if (cycle > 0)
       choose_preconditioner(of, all.rest[0] / last);
     last = all.rest[0];
