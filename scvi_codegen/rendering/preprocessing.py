@@ -17,6 +17,9 @@ __all__ = ["preprocessed"]
 DIRECTIVE = re.compile(r"#(?P<word>ifdef|ifndef|if|elif|else|endif|define|undef|include)\b *(?P<rest>.*)$")
 DEFINED = re.compile(r"(?P<negated>!)?defined\((?P<macro>\w+)\)")
 COMPARED = re.compile(r"(?P<left>\w+)(?: (?P<sign>[<>=!]=|[<>]) (?P<right>\w+))?")
+OWN = re.compile(r'"(?:\.\./\w+/)?\w+\.h"')
+"""Headers of the same or of a sibling folder; others, as of XLA, are those of libraries."""
+SUPPORT = re.compile('"support/')
 GUARD = re.compile(r"#define (?P<macro>SUPPORT_\w+_H)")
 COMMENT = re.compile(r" *(?://.*|/\*.*)$")
 SIGNS: dict[str, Callable[[int, int], bool]] = {
@@ -108,8 +111,8 @@ class _Preprocessor:
             elif not any(chain.active is False for chain in self.chains):
                 if word in ("define", "undef"):
                     self.define(word, rest)
-                if word == "include" and rest.startswith('"'):
-                    yield from self.include(line, posixpath.normpath(posixpath.join(folder, rest.strip('"'))))
+                if word == "include" and (OWN if folder else SUPPORT).match(rest):
+                    yield from self.include(posixpath.normpath(posixpath.join(folder, rest.strip('"'))))
                 else:
                     yield line
 
@@ -120,10 +123,7 @@ class _Preprocessor:
         if word == "define":
             self.macros.values[name] = value.strip() if re.fullmatch(r" +\w+", value) else None
 
-    def include(self, line: str, name: str) -> Iterator[str]:
-        if not name.startswith("support/"):
-            yield line
-            return
+    def include(self, name: str) -> Iterator[str]:
         if name not in self.files:
             self.files[name] = self.read(name)
         yield from self.lines(self.files[name].removesuffix("\n"), posixpath.dirname(name))

@@ -58,6 +58,12 @@ def test_second_derivatives_compile_without_warnings(compiler, tmp_path):
     compile_with(compiler, ["-Wno-missing-prototypes"], source, tmp_path)
 
 
+def test_headers_of_libraries_remain_includes():
+    source = with_xla_flow(compile_stepper(*CASES["kepler"]).derivatives, "0")
+    assert source.amalgamated().code.count('#include "xla/ffi/api/c_api.h"') == 1
+    assert [name for name in source.files if "xla/" in name] == []
+
+
 def test_flows_compile_with_the_interface_of_xla(tmp_path):
     jax = pytest.importorskip("jax", reason="needs the extra 'jax'")
     stepper, flags = compile_stepper(*CASES["kepler"]), ["-isystem", jax.ffi.include_dir()]
