@@ -16,10 +16,12 @@ from scvi_codegen.models.model import Model
 if TYPE_CHECKING:
     from scvi_codegen.models.model_files.input_tables import InputTable
 
-__all__ = ["document_of", "motion_of"]
+__all__ = ["document_of", "motion_of", "with_files"]
 
 SHORT_VECTOR = 4
 TEXT_WIDTH = 100
+LONG_ARRAY = 1000
+"""Largest number of entries of an array that is written into a model file with tables."""
 STATE = {"q": "q", "p": "p", "q_dot": "velocity"}
 """Field of a model by key of ``[initial]``."""
 
@@ -97,7 +99,8 @@ def _state_by_array(model: Model, names: Sequence[str]) -> dict[str, Any]:
     """Return positions, and velocities or momenta, by the name of their array."""
     state = {key: getattr(model, name) for key, name in STATE.items() if getattr(model, name) is not None}
     if model.array_system is not None:
-        return {key: {name: _list(values) for name, values in arrays.items()} for key, arrays in state.items()}
+        by_array = {key: {name: _list(each) for name, each in arrays.items()} for key, arrays in state.items()}
+        return {key: each if len(each) > 1 else next(iter(each.values())) for key, each in by_array.items()}
     arrays = [array for array in model.system.arrays if set(array.elements) <= set(names)]
     by_name = {key: dict(zip(names, values, strict=True)) for key, values in state.items()}
     return {key: {array.name: _entries(array, values) for array in arrays} for key, values in by_name.items()}
@@ -146,3 +149,22 @@ def _wrapped(formula: str) -> str:
 def _named(names: Sequence[str], vector: Sequence[float]) -> list[float] | dict[str, float]:
     """Return a short vector as a list, a long one by name."""
     return list(vector) if len(vector) <= SHORT_VECTOR else dict(zip(names, vector, strict=True))
+
+
+def with_files(document: Mapping[str, Any], stem: str) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return the document with long arrays of one or two axes replaced by CSV files, and these by name."""
+    files: dict[str, str] = {}
+
+    def shortened(name: str, value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: shortened(f"{name}_{key.partition('[')[0]}", each) for key, each in value.items()}
+        if not isinstance(value, list) or np.size(value) <= LONG_ARRAY or np.ndim(value) > 2:
+            return value
+        rows = np.reshape(value, (len(value), -1)).tolist()
+        lines = [[f"c{k}" for k in range(len(rows[0]))], *([repr(x) for x in row] for row in rows)]
+        files[f"{name}.csv"] = "".join(f"{','.join(line)}\n" for line in lines)
+        return {"file": f"{name}.csv"}
+
+    sections = ("parameters", "tables", "initial")
+    shorter = {name: shortened(stem, document[name]) for name in sections if name in document}
+    return {**document, **shorter}, files

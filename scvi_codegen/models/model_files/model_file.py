@@ -61,6 +61,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -73,7 +74,7 @@ from scvi_codegen.mechanics.definition_checks import warn_of_mistakes
 from scvi_codegen.mechanics.time_transformation import time_rescaling_function, with_time_transformation
 from scvi_codegen.methods import fitted
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_files.document import document_of, motion_of
+from scvi_codegen.models.model_files.document import document_of, motion_of, with_files
 from scvi_codegen.models.model_files.sections import (
     Document,
     Section,
@@ -99,7 +100,7 @@ from scvi_codegen.validation.argument_types import PATH, checks_arguments, of
 if TYPE_CHECKING:
     from scvi_codegen.models.model_files.input_tables import InputTable
 
-__all__ = ["catalogue_model", "dump_model", "load_model", "parse_model", "save_model"]
+__all__ = ["catalogue_model", "dump_model", "load_model", "model_texts", "parse_model", "save_model"]
 
 SYSTEM_KEYS = ("name", "coordinates", "momenta", *FORMULAS, "inputs", "catalogue", "time_transformation")
 RUN_KEYS = ("step", "tolerance", "error", "controller", "span", "steps", "save_every")
@@ -132,10 +133,19 @@ def load_model(path: str | os.PathLike[str], changes: Document | None = None) ->
 def save_model(model: Model, path: str | os.PathLike[str]) -> None:
     """Write a model file atomically; reading it returns an equal model.
 
+    Arrays of more than 1000 numbers are written to CSV files beside it, ``NAME_q.csv``.
+
     Raises:
         ModelFileError: if the model cannot be represented exactly (a user-defined quadrature or tableau).
     """
-    text = dump_model(model)
+    target = Path(path)
+    name, *others = (texts := _written(model, target.stem))
+    for other in others:
+        _write(target.with_name(other), texts[other])
+    _write(target, texts[name])
+
+
+def _write(path: Path, text: str) -> None:
     write_atomically(path, lambda file: file.write(text.encode()))
 
 
@@ -164,15 +174,28 @@ def parse_model(text: str, changes: Document | None = None, *, folder: str | os.
 
 def dump_model(model: Model) -> str:
     """Return TOML text that :func:`parse_model` converts to an equal model. Raises as :func:`save_model`."""
+    return next(iter(_written(model, None).values()))
+
+
+def model_texts(model: Model, stem: str = "model") -> dict[str, str]:
+    """Return the model file and the CSV files of its long arrays, by file name; none if it cannot be represented."""
+    with suppress(ModelFileError):
+        return _written(model, stem)
+    return {}
+
+
+def _written(model: Model, stem: str | None) -> dict[str, str]:
+    """Return the model file, and with a stem of file names the tables of long arrays."""
     import tomli_w  # imported here: not needed for reading
 
     part = "system"
     for as_arrays in (True, False) if model.array_system is None else (True,):  # a derived system has another form
         document = document_of(model, as_arrays=as_arrays)
-        text = tomli_w.dumps(document, multiline_strings=True)
-        again = parse_model(text)
+        shortened, files = (document, {}) if stem is None else with_files(document, stem)
+        text = tomli_w.dumps(shortened, multiline_strings=True)
+        again = _read_model(document, {}) if files else parse_model(text)
         if again == model:
-            return text
+            return {f"{stem}.toml": text, **files}
         part = "method" if again.method != model.method else "system" if again.system != model.system else "state"
     raise ModelFileError(
         f"the {part} of this model cannot be represented in a file: quadratures, nodes and "

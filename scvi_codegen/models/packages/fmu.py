@@ -25,10 +25,11 @@ from scvi_codegen.errors import ModelFileError, PackageError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.formulas.inputs import PARTS
 from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_files.model_file import model_texts
 from scvi_codegen.models.packages.example import example_of
 from scvi_codegen.models.packages.fmu_description import build_description, model_description
 from scvi_codegen.models.packages.generated_folders import prefix_of
-from scvi_codegen.models.packages.package import MODEL, model_text
+from scvi_codegen.models.packages.package import MODEL
 from scvi_codegen.native.building import PORTABLE_FLAGS, load
 from scvi_codegen.native.cross import TARGETS, library_for
 from scvi_codegen.pipeline.sources import generate_source
@@ -114,12 +115,11 @@ def _texts(model: Model, prefix: str) -> tuple[Source, dict[str, bytes]]:
     indices = tuple(interface.parameters.index(f"{name}_{PARTS[0]}") for name in interface.inputs)
     token = _token(source.to_json(), interface, start)
     source = with_fmu(source, interface, start, by_velocity=by_velocity, input_indices=indices, token=token)
-    described = model_text(model)
     texts = {
         DESCRIPTION: model_description(interface, start, by_velocity=by_velocity, token=token),
         **{f"sources/{name}": text for name, text in source.files.items()},
         "sources/buildDescription.xml": build_description(prefix, [f"{each.prefix}.c" for each in source.sources]),
-        **({} if described is None else {"resources/model.toml": described}),
+        **{f"resources/{name}": text for name, text in model_texts(model).items()},
     }
     return source, {name: text.encode() for name, text in texts.items()}
 

@@ -23,7 +23,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from scvi_codegen.errors import ModelFileError, PackageError
+from scvi_codegen.errors import PackageError
 from scvi_codegen.models.packages.folders import CERTIFICATE_FILE, INTERFACE_FILE, record_text, write_folder
 from scvi_codegen.models.packages.generated_folders import damaged, prefix_of, read_record, source_in
 from scvi_codegen.rendering.source import Interface, Source, check_interface
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from scvi_codegen.models.model import Model
     from scvi_codegen.rendering.program_source import Embedded
 
-__all__ = ["CERTIFICATE_FILE", "MODEL", "MODEL_FILE", "generate_package", "load_package", "model_text"]
+__all__ = ["CERTIFICATE_FILE", "MODEL", "MODEL_FILE", "generate_package", "load_package"]
 
 MODEL_FILE = "model.toml"
 ADVANCE_TO = "_advance_to("
@@ -127,6 +127,7 @@ def _stepper_of_arrays(folder: Path) -> Stepper:
 
 def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
     """Return texts by file name, ``interface.json`` last."""
+    from scvi_codegen.models.model_files.model_file import model_texts
     from scvi_codegen.models.packages.example import example_of
     from scvi_codegen.models.packages.readme import package_template, readme_text
     from scvi_codegen.pipeline.sources import generate_source
@@ -146,11 +147,10 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
         source = source.amalgamated()
     texts = source.files
     texts |= render_example(interface, example_of(model, controlled=ADVANCE_TO in source.header), embedded or "double")
-    described = model_text(model)
-    if described is not None:
-        texts[MODEL_FILE] = described
+    described = model_texts(model)
+    texts |= described
     texts["README.md"] = readme_text(
-        interface, with_model=described is not None, embedded=embedded, controlled=ADVANCE_TO in source.header
+        interface, with_model=bool(described), embedded=embedded, controlled=ADVANCE_TO in source.header
     )
     if not embedded:
         texts["__init__.py"] = package_template("__init__.py")
@@ -159,6 +159,7 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
 
 def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
     """Return the texts of a model whose array sizes are known at run time."""
+    from scvi_codegen.models.model_files.model_file import model_texts
     from scvi_codegen.models.packages.example import array_example_of
     from scvi_codegen.models.packages.readme import package_template
     from scvi_codegen.pipeline.sources import generate_array_source
@@ -170,20 +171,10 @@ def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, si
     lines = {f"{name}.txt": "".join(f"{x!r}\n" for x in each.reshape(-1).tolist()) for name, each in arrays.items()}
     source = source.amalgamated() if single_file else source
     texts = {**source.files, **render_example(interface, example), **lines}
-    if (described := model_text(model)) is not None:
-        texts |= {MODEL_FILE: described, "__init__.py": package_template("__init__.py")}
+    if described := model_texts(model):
+        texts |= {**described, "__init__.py": package_template("__init__.py")}
     about = {"title": interface.title, "sizes": model.sizes, "declarations": source.declarations.split("\n")}
     return {**texts, INTERFACE_FILE: record_text(texts, **about)}
-
-
-def model_text(model: Model) -> str | None:
-    """Return the model file, or ``None`` for a method that a file cannot represent (a user-defined quadrature)."""
-    from scvi_codegen.models.model_files.model_file import dump_model
-
-    try:
-        return dump_model(model)
-    except ModelFileError:
-        return None
 
 
 def _interface_text(source: Source, interface: Interface, texts: Mapping[str, str]) -> str:
