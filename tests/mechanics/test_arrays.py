@@ -192,6 +192,15 @@ def test_unsupported_sympy_sums_are_rejected(index: str, limits: str) -> None:
         )
 
 
+def test_periodic_sympy_index_outside_a_sum_is_rejected() -> None:
+    """Mod(7, N) is no place of an array whose size is known only in a run."""
+    q, v = map(sympy.IndexedBase, ("q", "q_dot"))
+    i, N = sympy.symbols("i N", integer=True)
+    kinetic = sympy.Sum(v[i] ** 2 / 2, (i, 0, N - 1))
+    with pytest.raises(SystemDefinitionError, match=r"Mod\(7, N\) is not an index of a periodic axis"):
+        LagrangianSystem.from_sympy(name="x", coordinates=["q[N]"], lagrangian=kinetic - q[sympy.Mod(7, N)] ** 2)
+
+
 def test_momentum_maps_of_a_hamiltonian() -> None:
     """Shifts, turns of positions with their momenta, and phases."""
     bodies = HamiltonianSystem.from_text(

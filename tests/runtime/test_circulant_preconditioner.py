@@ -157,3 +157,16 @@ def test_systems_with_a_circulant_preconditioner(term, reach):
         lagrangian=f"sum(i in N, sum(a in 2, u_dot[i, a]**2/2)) - {term}",
     )
     assert lower(system, as_method("svi:2"), prefix="some", solver="newton").loops.reach == reach
+
+
+@pytest.mark.parametrize(("coordinates", "reach"), [(["u[N]"], 1), (["u[N]", "s"], 0), (["u[N]", "r[3]"], 0)])
+def test_circulant_preconditioner_requires_lattices_only(coordinates, reach):
+    system = sc.LagrangianSystem.from_text(
+        name="some",
+        coordinates=coordinates,
+        lagrangian="sum(i in N, u_dot[i]**2/2) - sum(i in N periodic, (u[i+1] - u[i])**2)"
+        + {1: "", 0: " + s_dot**2/2 - s**2" if "s" in coordinates else " + sum(a in 3, r_dot[a]**2/2 - r[a]**2)"}[
+            reach
+        ],
+    )
+    assert lower(system, as_method("svi:2"), prefix="some", solver="newton").loops.reach == reach

@@ -139,6 +139,7 @@ def test_velocities_are_derivatives_by_physical_time() -> None:
     assert list(frame.columns)
     dataset = made.integrate(q, v, h=0.1, steps=3).to_xarray()
     assert np.abs(dataset["velocity"][0] - v).max() < 1e-15
+    assert np.abs(dataset["velocity"].values - dataset["p"].values).max() < 1e-15  # of a unit mass
 
 
 @pytest.mark.parametrize("form", FORMS)
