@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from scvi_codegen.reproduce.laboratory.experiment import (
     Block,
     Comparison,
-    Experiment,
     Paragraph,
     Result,
     TableBlock,
     Verdict,
     common_verdict,
+    experiment,
 )
 
-__all__ = ["CLAIMS", "EVIDENCE", "EXPERIMENTS", "Claim"]
+__all__ = ["CLAIMS", "EVIDENCE", "Claim"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,12 +102,11 @@ EVIDENCE: tuple[str, ...] = (
 """Experiments whose checks are collected."""
 
 
+@experiment("claims", "The claims of the paper, one verdict each", needs=EVIDENCE)
 def claims(results: Mapping[str, Result]) -> Result:
     """Return a row for each claim, with the checks that decide it."""
     result = {key: tuple(_evidence(key, results)) for key in CLAIMS}
     return Result(
-        name="claims",
-        title="The claims of the paper, one verdict each",
         setting=(
             "Every check of a figure, table or theorem names the claims that it bears on; here they are collected.",
             "A claim holds if all its checks hold, does not hold if none does, and holds in part otherwise; a claim "
@@ -185,8 +184,3 @@ def _blocks(claim: Claim, evidence: tuple[tuple[str, Comparison], ...]) -> Itera
     yield Paragraph(f'"{claim.text}" ({claim.place}): {common_verdict(check for _, check in evidence).value}.')
     for name, check in evidence:
         yield Paragraph(f"{name}, {check.verdict.value}: {check.claim} {check.measured}")
-
-
-EXPERIMENTS: tuple[Experiment, ...] = (
-    Experiment(name="claims", title="The claims of the paper, one verdict each", run=claims, needs=EVIDENCE),
-)

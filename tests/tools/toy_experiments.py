@@ -126,10 +126,6 @@ def unportable(results: Mapping[str, Result]) -> Result:
     return Result(name="unportable", title="", setting=(), picture=Picture(draw=lambda figure: None))
 
 
-def misnamed(results: Mapping[str, Result]) -> Result:
-    return Result(name="another", title="", setting=())
-
-
 def slow(results: Mapping[str, Result]) -> Result:
     time.sleep(600.0)
     raise AssertionError("it was not interrupted")
@@ -145,7 +141,6 @@ _ALL = (
     Experiment(name="last", title="Cannot run either", run=shown, needs=("after-broken",)),
     Experiment(name="crash", title="Ends its process", run=crash),
     Experiment(name="unportable", title="Cannot travel", run=unportable),
-    Experiment(name="misnamed", title="Calls itself something else", run=misnamed),
     Experiment(name="slow", title="Takes a minute", run=slow),
 )
 EXPERIMENTS = {experiment.name: experiment for experiment in _ALL}

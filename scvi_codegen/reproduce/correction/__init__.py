@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from scvi_codegen.reproduce.correction.experiment import EXPERIMENTS
+from scvi_codegen.reproduce.correction import experiment
 
-__all__ = ["EXPERIMENTS"]
+__all__ = ["experiment"]

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from scvi_codegen.methods import SCVI, SpectralCollocation
 from scvi_codegen.reproduce.correction.example import largest_difference, multipliers_agree, two_points_agree
 from scvi_codegen.reproduce.correction.text import body
-from scvi_codegen.reproduce.kepler.step import Structure, structure_of
+from scvi_codegen.reproduce.kepler.orbits import Structure, structure_of
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
-from scvi_codegen.reproduce.laboratory.experiment import Comparison, Experiment, Picture, Result, TableBlock, holds
+from scvi_codegen.reproduce.laboratory.experiment import Comparison, Picture, Result, TableBlock, experiment, holds
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["EXPERIMENTS", "ROWS", "measured"]
+__all__ = ["ROWS", "measured"]
 
 ROWS = ((2, 2), (3, 2), (4, 3), (5, 4), (6, 5), (7, 6), (9, 7))
 """Numbers of points and of Gauss points."""
@@ -52,10 +52,10 @@ def _order_bound(points: int, gauss: int) -> int:
     return min(SpectralCollocation(points - 1).order or 0, 2 * gauss)
 
 
+@experiment("correction", "Why (34d) needs the chain-rule term, derived and measured")
 def _correction(_: Mapping[str, Result]) -> Result:
     results = {row: _both(*row) for row in ROWS}
     return Result(
-        name="correction",
         title="Why (34d) needs the chain-rule term",
         setting=SETTING,
         checks=(
@@ -186,9 +186,3 @@ def _draw_expected_orders(axes: Axes, s: NDArray[np.int_]) -> None:
 
 def _line(label: str) -> dict[str, Any]:
     return {"color": COLORS["exact"], "linewidth": 0.8, "label": label}
-
-
-EXPERIMENTS: tuple[Experiment, ...] = (
-    Experiment(name="correction", title="Why (34d) needs the chain-rule term, derived and measured", run=_correction),
-)
-"""The experiment of this package."""

@@ -14,24 +14,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.methods import SVI, SpectralCollocation
-from scvi_codegen.reproduce.kepler import more_points, smaller_steps
-from scvi_codegen.reproduce.kepler.drawing import draw_ellipse, draw_states
-from scvi_codegen.reproduce.kepler.exact_flow import (
+from scvi_codegen.reproduce.kepler.orbits import (
     SYSTEM,
     angular_momentum,
+    draw_ellipse,
+    draw_states,
     exact_flow,
     off_ellipse,
     perihelion,
     perihelion_turn,
 )
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels
-from scvi_codegen.reproduce.laboratory.experiment import Comparison, Experiment, Picture, Result, TableBlock, holds
+from scvi_codegen.reproduce.laboratory.experiment import (
+    Comparison,
+    Picture,
+    Result,
+    TableBlock,
+    experiment,
+    holds,
+    series_table,
+)
 from scvi_codegen.reproduce.laboratory.running import trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-__all__ = ["EXPERIMENTS"]
 
 Array = NDArray[np.float64]
 
@@ -97,20 +103,15 @@ def _table() -> TableBlock:
     )
 
 
-def _series(name: str, column: str, values: Mapping[str, Array]) -> TableBlock:
-    t = _run("SVI")[0]
-    return TableBlock(
-        name=name,
-        columns=("t", *(f"{column} {scheme}" for scheme in values)),
-        rows=tuple(zip(t.tolist(), *(v.tolist() for v in values.values()), strict=True)),
-        shown=False,
-    )
+def _series(column: str, values: Mapping[str, Array]) -> TableBlock:
+    named = {f"{column} {scheme}": series.tolist() for scheme, series in values.items()}
+    return series_table({"t": _run("SVI")[0].tolist(), **named})
 
 
+@experiment("figure-13", "Kepler, e = 0.5: orbits of SVI and SC over 318 revolutions")
 def _figure_13(_: Mapping[str, Result]) -> Result:
     svi, sc = numbers("SVI"), numbers("SC")
     return Result(
-        name="figure-13",
         title="Kepler two body, orbit",
         setting=SETTING,
         checks=(
@@ -149,11 +150,11 @@ def _draw_orbits(figure: Figure, runs: Mapping[str, tuple[Array, Array]]) -> Non
     distance.legend(loc="center right")
 
 
+@experiment("figure-14", "Kepler, e = 0.5: energy of SVI and SC over 318 revolutions")
 def _figure_14(_: Mapping[str, Result]) -> Result:
     svi, sc = numbers("SVI"), numbers("SC")
     energies = {scheme: _run(scheme)[3] for scheme in SCHEMES}
     return Result(
-        name="figure-14",
         title="Kepler two body, energy",
         setting=SETTING,
         checks=(
@@ -168,16 +169,16 @@ def _figure_14(_: Mapping[str, Result]) -> Result:
                 bears_on=("accuracy", "long-time"),
             ),
         ),
-        tables=(_table(), _series("series", "energy", energies)),
+        tables=(_table(), _series("energy", energies)),
         picture=Picture(draw=partial(_draw_invariant, t=_run("SVI")[0], values=energies, name="energy")),
     )
 
 
+@experiment("figure-15", "Kepler, e = 0.5: angular momentum of SVI and SC over 318 revolutions")
 def _figure_15(_: Mapping[str, Result]) -> Result:
     svi, sc = numbers("SVI"), numbers("SC")
     momenta = {scheme: angular_momentum(*_run(scheme)[1:3]) for scheme in SCHEMES}
     return Result(
-        name="figure-15",
         title="Kepler two body, momentum",
         setting=SETTING,
         checks=(
@@ -188,7 +189,7 @@ def _figure_15(_: Mapping[str, Result]) -> Result:
                 bears_on=("accuracy", "long-time"),
             ),
         ),
-        tables=(_table(), _series("series", "momentum", momenta)),
+        tables=(_table(), _series("momentum", momenta)),
         picture=Picture(draw=partial(_draw_invariant, t=_run("SVI")[0], values=momenta, name="angular momentum")),
     )
 
@@ -206,15 +207,3 @@ def _draw_invariant(figure: Figure, t: Array, values: Mapping[str, Array], name:
     left.ticklabel_format(useOffset=False)
     left.legend(loc="lower left")
     right.legend(loc="center right")
-
-
-EXPERIMENTS: tuple[Experiment, ...] = (
-    Experiment(name="figure-13", title="Kepler, e = 0.5: orbits of SVI and SC over 318 revolutions", run=_figure_13),
-    Experiment(name="figure-14", title="Kepler, e = 0.5: energy of SVI and SC over 318 revolutions", run=_figure_14),
-    Experiment(
-        name="figure-15", title="Kepler, e = 0.5: angular momentum of SVI and SC over 318 revolutions", run=_figure_15
-    ),
-    *more_points.EXPERIMENTS,
-    *smaller_steps.EXPERIMENTS,
-)
-"""Figs. 13-20."""

@@ -17,18 +17,32 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.methods import SCVI, SpectralCollocation
-from scvi_codegen.reproduce.kepler import many_points, phase_plane
-from scvi_codegen.reproduce.kepler.drawing import draw_ellipse, draw_states
-from scvi_codegen.reproduce.kepler.exact_flow import SYSTEM, angular_momentum, perihelion, perihelion_turn, revolutions
+from scvi_codegen.reproduce.kepler.orbits import (
+    SYSTEM,
+    angular_momentum,
+    draw_ellipse,
+    draw_states,
+    perihelion,
+    perihelion_turn,
+    revolutions,
+)
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels
-from scvi_codegen.reproduce.laboratory.experiment import Comparison, Experiment, Picture, Result, TableBlock, holds
+from scvi_codegen.reproduce.laboratory.experiment import (
+    Comparison,
+    Picture,
+    Result,
+    TableBlock,
+    experiment,
+    holds,
+    series_table,
+)
 from scvi_codegen.reproduce.laboratory.running import SECTION_4, stepper_of, trajectory
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["EXPERIMENTS", "periods", "segments", "two_points_fail_at"]
+__all__ = ["periods", "segments", "two_points_fail_at"]
 
 Array = NDArray[np.float64]
 
@@ -71,13 +85,13 @@ def _segment(part: Trajectory) -> TimeInterval:
     return TimeInterval(part.q, float(energy.min()), float(energy.max()), float(error.max()))
 
 
+@experiment("figure-23", "Kepler: SCVI with two points over 10000 periods")
 def _figure_23(_: Mapping[str, Result]) -> Result:
     parts = segments()
     first, last = parts[0], parts[-1]
     change = max(abs(last.lowest - first.lowest), abs(last.highest - first.highest)) / (first.highest - first.lowest)
     momentum = max(part.momentum for part in parts)
     return Result(
-        name="figure-23",
         title="Orbit of the Kepler problem computed using SCVI with 2 collocation points",
         setting=("Kepler's problem, e = 0.5, from the perihelion, h = pi/20, T = 20000 pi: 400000 steps.", QUADRATURE),
         checks=(
@@ -177,11 +191,11 @@ def two_points_fail_at() -> tuple[float, float]:
     return float(run.t[-1]), float(run.energy()[-1])
 
 
+@experiment("figure-24", "Kepler: orbits of SCVI with two points, SC with three")
 def _figure_24(_: Mapping[str, Result]) -> Result:
     scvi, sc = periods("SCVI"), periods("SC")
     time, energy = two_points_fail_at()
     return Result(
-        name="figure-24",
         title="Kepler problem, orbit of SCVI with 2 collocation points and of SC with 3",
         setting=SETTING,
         checks=(
@@ -247,11 +261,11 @@ def _draw_periods(figure: Figure, runs: Mapping[str, tuple[Array, Array]]) -> No
             panel.legend(loc="upper right")
 
 
+@experiment("figure-25", "Kepler: momentum of SCVI with two points, SC with three")
 def _figure_25(_: Mapping[str, Result]) -> Result:
     momenta = {scheme: angular_momentum(_run(scheme).q, _run(scheme).p) for scheme in COMPARED}
     error = {scheme: float(np.abs(m - m[0]).max()) for scheme, m in momenta.items()}
     return Result(
-        name="figure-25",
         title="Kepler problem, momentum of SCVI with 2 collocation points and of SC with 3",
         setting=SETTING,
         checks=(
@@ -281,13 +295,13 @@ def _draw_momenta(figure: Figure, t: Array, momenta: Mapping[str, Array]) -> Non
     right.legend(loc="center right")
 
 
+@experiment("figure-26", "Kepler: energies of SCVI with two points, SC with three")
 def _figure_26(_: Mapping[str, Result]) -> Result:
     energies = {scheme: _energies(scheme) for scheme in COMPARED}
     error = {scheme: np.abs(parts["total"] - parts["total"][0]) for scheme, parts in energies.items()}
     half = len(error["SCVI"]) // 2
     early, late = float(error["SCVI"][:half].max()), float(error["SCVI"][half:].max())
     return Result(
-        name="figure-26",
         title="Kepler problem, energy of SCVI with 2 collocation points and of SC with 3",
         setting=SETTING,
         checks=(
@@ -325,20 +339,4 @@ def _draw_energies(figure: Figure, t: Array, energies: Mapping[str, Mapping[str,
 
 
 def _series(columns: Mapping[str, Array]) -> TableBlock:
-    return TableBlock(
-        name="series",
-        columns=("t", *columns),
-        rows=tuple(zip(_run("SC").t.tolist(), *(series.tolist() for series in columns.values()), strict=True)),
-        shown=False,
-    )
-
-
-EXPERIMENTS: tuple[Experiment, ...] = (
-    Experiment(name="figure-23", title="Kepler: SCVI with two points over 10000 periods", run=_figure_23),
-    Experiment(name="figure-24", title="Kepler: orbits of SCVI with two points, SC with three", run=_figure_24),
-    Experiment(name="figure-25", title="Kepler: momentum of SCVI with two points, SC with three", run=_figure_25),
-    Experiment(name="figure-26", title="Kepler: energies of SCVI with two points, SC with three", run=_figure_26),
-    *phase_plane.EXPERIMENTS,
-    *many_points.EXPERIMENTS,
-)
-"""Figs. 23-30."""
+    return series_table({"t": _run("SC").t.tolist(), **{key: series.tolist() for key, series in columns.items()}})

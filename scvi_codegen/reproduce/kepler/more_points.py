@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.reproduce.kepler.one_step import (
+from scvi_codegen.reproduce.kepler.smaller_steps import (
     CIRCLE,
     ELLIPSE,
     LABELS,
@@ -25,7 +25,7 @@ from scvi_codegen.reproduce.kepler.one_step import (
     superiority,
 )
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
-from scvi_codegen.reproduce.laboratory.experiment import Comparison, Experiment, Picture, Result, TableBlock, judged
+from scvi_codegen.reproduce.laboratory.experiment import Comparison, Picture, Result, TableBlock, experiment, judged
 from scvi_codegen.reproduce.laboratory.geometric import (
     AGREEMENT_FACTOR,
     STRAIGHT,
@@ -39,7 +39,7 @@ from scvi_codegen.reproduce.laboratory.geometric import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["EXPERIMENTS", "bases"]
+__all__ = ["bases"]
 
 Array = NDArray[np.float64]
 
@@ -79,9 +79,8 @@ def bases(scheme: str, e: float, quantity: str) -> Line | None:
     return fitted_line(N, _errors(scheme, e, quantity))
 
 
-def _n_refinement(name: str, quantities: tuple[str, str], title: str, _: Mapping[str, Result]) -> Result:
+def _n_refinement(quantities: tuple[str, str], title: str, _: Mapping[str, Result]) -> Result:
     return Result(
-        name=name,
         title=title,
         setting=N_SETTING,
         checks=(
@@ -216,26 +215,17 @@ def _draw_n(figure: Figure, curves: Curves) -> None:
         axes.legend(loc="upper right" if e == CIRCLE else "best")
 
 
-EXPERIMENTS: tuple[Experiment, ...] = (
-    Experiment(
-        name="figure-16",
-        title="Kepler: error of q1 and q2 in one step h = 5 over the number of points",
-        run=partial(
-            _n_refinement,
-            "figure-16",
-            ("q1", "q2"),
-            "Kepler two body, error of q1 and q2 over a single step h = 5 with N-refinement",
-        ),
-    ),
-    Experiment(
-        name="figure-17",
-        title="Kepler: error of momentum and energy in one step h = 5 over the number of points",
-        run=partial(
-            _n_refinement,
-            "figure-17",
-            ("momentum", "energy"),
-            "Kepler two body, error of momentum and energy over a single step h = 5 with N-refinement",
-        ),
-    ),
+experiment("figure-16", "Kepler: error of q1 and q2 in one step h = 5 over the number of points")(
+    partial(
+        _n_refinement,
+        ("q1", "q2"),
+        "Kepler two body, error of q1 and q2 over a single step h = 5 with N-refinement",
+    )
 )
-"""Figs. 16 and 17."""
+experiment("figure-17", "Kepler: error of momentum and energy in one step h = 5 over the number of points")(
+    partial(
+        _n_refinement,
+        ("momentum", "energy"),
+        "Kepler two body, error of momentum and energy over a single step h = 5 with N-refinement",
+    )
+)

@@ -19,10 +19,10 @@ from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_orbit, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Cell,
     Comparison,
-    Experiment,
     Picture,
     Result,
     TableBlock,
+    experiment,
     holds,
     judged,
 )
@@ -38,14 +38,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["EXPERIMENTS"]
-
 Array = NDArray[np.float64]
 
-TITLES = {
-    "figure-1": "Kepler's problem, e = 0.6: explicit Euler, Stoermer-Verlet, symplectic Runge-Kutta, collocation",
-    "figure-2": "The trial curve of a step, its nodes and its quadrature points",
-}
 
 KEPLER = kepler()
 ECCENTRICITY = 0.6
@@ -92,6 +86,9 @@ def _area_change(run: Trajectory) -> float:
     return float(area[-count:].mean() / area[:count].mean()) - 1.0
 
 
+@experiment(
+    "figure-1", "Kepler's problem, e = 0.6: explicit Euler, Stoermer-Verlet, symplectic Runge-Kutta, collocation"
+)
 def _four_methods(_: Mapping[str, Result]) -> Result:
     runs = {name: _orbit(name) for name in RUNS}
     errors = {name: run.energy() - run.energy()[0] for name, run in runs.items()}
@@ -109,8 +106,6 @@ def _four_methods(_: Mapping[str, Result]) -> Result:
         "change of the area of the ellipse",
     )
     return Result(
-        name="figure-1",
-        title=TITLES["figure-1"],
         setting=(
             "e = 0.6, q(0) = (0.4, 0), p(0) = (0, 2), T = 100; steps as in the caption.",
             "The symplectic Runge-Kutta method is Gauss's of three stages; 5 collocation points are degree 4.",
@@ -189,6 +184,7 @@ RUNGE_COUNTS = range(3, 32, 4)
 FAMILY_STYLES = {"Legendre": ("SVI", "o"), "Chebyshev": ("SC", "s"), "equispaced": ("exact", "^")}
 
 
+@experiment("figure-2", "The trial curve of a step, its nodes and its quadrature points")
 def _points_of_a_step(_: Mapping[str, Result]) -> Result:
     solved = derived_step(planar_pendulum(), CURVE)([START], [MOMENTUM], CURVE_STEP)
     values = np.array([START, *map(float, solved.unknowns)])
@@ -201,8 +197,6 @@ def _points_of_a_step(_: Mapping[str, Result]) -> Result:
     rows = tuple(zip(counts, *(error.tolist() for error in errors.values()), strict=True))
     end = {name: float(error[-1]) for name, error in errors.items()}
     return Result(
-        name="figure-2",
-        title=TITLES["figure-2"],
         setting=(
             "The paper's drawing is a sketch. Here: one step of SVI for the pendulum, degree 4, five Chebyshev nodes, "
             f"five Gauss points, q = {START:g}, p = {MOMENTUM:g}, h = {CURVE_STEP:g}.",
@@ -292,9 +286,3 @@ def _draw_curve(axes: Axes, values: Array) -> None:
         xticks=(-1.0, 1.0), xticklabels=("kh", "(k+1)h"), ylabel="q", title="trial curve of one step", ylim=(0.0, 2.1)
     )
     axes.legend(loc="upper left")
-
-
-EXPERIMENTS = (
-    Experiment(name="figure-1", title=TITLES["figure-1"], run=_four_methods),
-    Experiment(name="figure-2", title=TITLES["figure-2"], run=_points_of_a_step),
-)

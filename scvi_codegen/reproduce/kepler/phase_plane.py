@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.methods import Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.methods.method import Method
-from scvi_codegen.reproduce.kepler.exact_flow import ellipse
-from scvi_codegen.reproduce.kepler.forms import (
+from scvi_codegen.reproduce.kepler.many_points import (
     ECCENTRICITY,
     FORMS,
     PRESERVED,
@@ -27,22 +26,21 @@ from scvi_codegen.reproduce.kepler.forms import (
     structure_check,
     structure_table,
 )
+from scvi_codegen.reproduce.kepler.orbits import ellipse
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
-    Experiment,
     Picture,
     Result,
     TableBlock,
     Verdict,
+    experiment,
     holds,
 )
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-__all__ = ["EXPERIMENTS"]
 
 Array = NDArray[np.float64]
 
@@ -66,10 +64,10 @@ SETTING = (
 )
 
 
+@experiment("figure-27", "Kepler: phase trajectories of four methods")
 def _figure_27(_: Mapping[str, Result]) -> Result:
     orbits = {name: orbit_of(method, h, SPAN) for name, (method, h, _) in METHODS.items()}
     return Result(
-        name="figure-27",
         title="Phase trajectories for the Kepler two-body problem",
         setting=SETTING,
         checks=(
@@ -159,9 +157,3 @@ def _draw_exact_phases(axes: Axes) -> None:
     r = 1 - ECCENTRICITY * cosine
     axes.plot(x, -sine / r, color="black", linewidth=0.7, label="exact")
     axes.plot(y, b * cosine / r, color="black", linewidth=0.7)
-
-
-EXPERIMENTS: tuple[Experiment, ...] = (
-    Experiment(name="figure-27", title="Kepler: phase trajectories of four methods", run=_figure_27),
-)
-"""Fig. 27."""

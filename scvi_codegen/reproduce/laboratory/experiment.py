@@ -7,9 +7,9 @@ by ``functools.partial``, a formula is SymPy.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from scvi_codegen.display.page.blocks import Block, Cell, Formula, Listing, Paragraph, TableBlock
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
+    "REGISTERED",
     "Block",
     "Cell",
     "Comparison",
@@ -29,8 +30,10 @@ __all__ = [
     "TableBlock",
     "Verdict",
     "common_verdict",
+    "experiment",
     "holds",
     "judged",
+    "series_table",
 ]
 
 
@@ -95,8 +98,8 @@ class Result:
     """Result of an experiment.
 
     Attributes:
-        name: name, as ``"figure-4"``.
-        title: the paper's title, one line.
+        name: name, as ``"figure-4"``; set by :meth:`Experiment.result`.
+        title: the paper's title, one line; by default that of the experiment.
         setting: what was run, and how details that the caption omits were chosen, a sentence each.
         checks: claims and measurements.
         tables: numbers; the first has no name.
@@ -104,9 +107,9 @@ class Result:
         body: text and formulas, in order, for experiments with a derivation.
     """
 
-    name: str
-    title: str
-    setting: tuple[str, ...]
+    name: str = ""
+    title: str = ""
+    setting: tuple[str, ...] = ()
     checks: tuple[Comparison, ...] = ()
     tables: tuple[TableBlock, ...] = ()
     picture: Picture | None = None
@@ -116,6 +119,9 @@ class Result:
     def verdict(self) -> Verdict:
         """Common verdict of all checks; ``PARTLY`` if they differ, ``SHOWN`` if there is none."""
         return common_verdict(self.checks)
+
+
+Run: TypeAlias = Callable[[Mapping[str, Result]], Result]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -131,5 +137,29 @@ class Experiment:
 
     name: str
     title: str
-    run: Callable[[Mapping[str, Result]], Result]
+    run: Run
     needs: tuple[str, ...] = ()
+
+    def result(self, needs: Mapping[str, Result]) -> Result:
+        """Return the result with the name of the experiment, and its title unless it has one."""
+        result = self.run(needs)
+        return replace(result, name=self.name, title=result.title or self.title)
+
+
+REGISTERED: dict[str, Experiment] = {}
+"""Experiments of all modules imported so far, by name."""
+
+
+def experiment(name: str, title: str, *, needs: tuple[str, ...] = ()) -> Callable[[Run], Run]:
+    """Return a decorator that registers a function as the experiment of a name."""
+
+    def register(run: Run) -> Run:
+        REGISTERED[name] = Experiment(name=name, title=title, run=run, needs=needs)
+        return run
+
+    return register
+
+
+def series_table(columns: Mapping[str, Iterable[Cell]], name: str = "series") -> TableBlock:
+    """Return a table, not shown on the page, of columns by heading."""
+    return TableBlock(name=name, columns=tuple(columns), rows=tuple(zip(*columns.values(), strict=True)), shown=False)

@@ -1,4 +1,9 @@
-"""Compiled steppers and trajectories with the settings of the paper's captions.
+"""Meanings of "N" in the captions of section 3: number of points, as they say, or degree, as in other figures.
+
+In both readings SVI has N Gauss points here, which the paper does not state: one more than the degree if N counts
+points.
+
+Compiled steppers and trajectories with the settings of the paper's captions.
 
 The paper ends the nonlinear iteration when max(|Q^{i+1} - Q^i|, |P^{i+1} - P^i|) < TOL with TOL = 1e-14 in section 3
 and 1e-12 in section 4, after at most 1000 iterations: :data:`SECTION_3` and :data:`SECTION_4`. Code is compiled with
@@ -8,17 +13,64 @@ flags that give the same bits on every machine.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods import SVI, SpectralCollocation
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
-__all__ = ["ROUNDOFF", "SECTION_3", "SECTION_4", "stepper_of", "steps_in", "trajectory"]
+__all__ = [
+    "BY_DEGREE",
+    "BY_POINTS",
+    "READINGS",
+    "ROUNDOFF",
+    "SCHEMES",
+    "SECTION_3",
+    "SECTION_4",
+    "Reading",
+    "stepper_of",
+    "steps_in",
+    "trajectory",
+]
+
+
+SCHEMES = ("SVI", "SC")
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """Meaning of N.
+
+    Attributes:
+        name: ``"by points"``.
+        meaning: description in a few words.
+        beyond_degree: N less the degree.
+    """
+
+    name: str
+    meaning: str
+    beyond_degree: int
+
+    def degree(self, n: int) -> int:
+        """Return the degree of the curves for N."""
+        return n - self.beyond_degree
+
+    def method(self, scheme: str, n: int, *, more: int = 0) -> Method:
+        """Return ``"SC"``, or ``"SVI"`` with N + ``more`` Gauss points."""
+        degree = self.degree(n)
+        return SVI(degree, f"gauss-legendre:{n + more}") if scheme == "SVI" else SpectralCollocation(degree)
+
+
+BY_POINTS = Reading("by points", "N Chebyshev points, degree N - 1", 1)
+"""Meaning in captions and on axes, on which verdicts are based."""
+BY_DEGREE = Reading("by degree", "N the degree, N + 1 Chebyshev points", 0)
+READINGS = (BY_POINTS, BY_DEGREE)
 
 SECTION_3 = SolverOptions(tolerance=1e-14, max_iterations=1000, absolute=True)
 SECTION_4 = SolverOptions(tolerance=1e-12, max_iterations=1000, absolute=True)

@@ -14,11 +14,11 @@ from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Cell,
     Comparison,
-    Experiment,
     Picture,
     Result,
     TableBlock,
     Verdict,
+    experiment,
     holds,
     judged,
 )
@@ -31,15 +31,22 @@ from scvi_codegen.reproduce.laboratory.geometric import (
     typical,
     within,
 )
-from scvi_codegen.reproduce.laboratory.readings import BY_DEGREE, BY_POINTS, READINGS, SCHEMES, Reading
-from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, stepper_of
+from scvi_codegen.reproduce.laboratory.running import (
+    BY_DEGREE,
+    BY_POINTS,
+    READINGS,
+    ROUNDOFF,
+    SCHEMES,
+    Reading,
+    stepper_of,
+)
 from scvi_codegen.reproduce.oscillators.one_degree import largest
 from scvi_codegen.reproduce.oscillators.oscillator import OSCILLATOR, POSITION, SYSTEM, VELOCITY
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["EXPERIMENTS", "convergence"]
+__all__ = ["convergence"]
 
 Array = NDArray[np.float64]
 
@@ -86,13 +93,12 @@ def _curve(reading: Reading, scheme: str, degrees: Sequence[int]) -> ErrorsOverN
     return ErrorsOverN(np.array(counts, dtype=float), *errors.T)
 
 
+@experiment("figure-6", "Harmonic oscillator: error over one step h = 20 with more and more points")
 def convergence(_: Mapping[str, Result], degrees: Mapping[str, Sequence[int]] = DEGREES) -> Result:
     """Return the figure, for some degrees."""
     curves = {(reading, scheme): _curve(reading, scheme, degrees[scheme]) for reading in READINGS for scheme in SCHEMES}
     formats = {"N": "g", "error of q": ".2e", "error of the energy": ".2e", "C": ".1e", "printed C": ".0e"}
     return Result(
-        name="figure-6",
-        title=TITLE,
         setting=(
             SYSTEM,
             "One step, h = 20, errors at its end.",
@@ -209,6 +215,3 @@ def _draw(curves: Curves, figure: Figure) -> None:
             axes.semilogy(curve.n, constant * base**curve.n, "--", color=COLORS[scheme], linewidth=0.9, label=label)
         axes.set(xlabel="N", ylabel=f"error of {what}", ylim=(1e-17, 1e4), title=reading.meaning)
         axes.legend()
-
-
-EXPERIMENTS = (Experiment(name="figure-6", title=TITLE, run=convergence),)

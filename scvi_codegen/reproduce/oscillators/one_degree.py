@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import MethodWarning
 from scvi_codegen.methods import SVI
 from scvi_codegen.reproduce.laboratory.drawing import largest_in_bins
-from scvi_codegen.reproduce.laboratory.experiment import Cell, TableBlock
+from scvi_codegen.reproduce.laboratory.experiment import Cell, TableBlock, series_table
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
@@ -120,5 +120,5 @@ def energy_table(runs: Mapping[str, Trajectory]) -> TableBlock:
 def curves_table(name: str, t: Array, errors: Mapping[str, Array], *, bins: int = 1000) -> TableBlock:
     """Return the curves of a plot of errors over time; the largest |error| in each bin for long ones."""
     columns = [largest_in_bins(t, error, bins=bins) for error in errors.values()]
-    rows = zip(columns[0][0].tolist(), *(values.tolist() for _, values in columns), strict=True)
-    return TableBlock(name=name, columns=("t", *errors), rows=tuple(map(tuple, rows)), shown=False)
+    named = {scheme: values.tolist() for scheme, (_, values) in zip(errors, columns, strict=True)}
+    return series_table({"t": columns[0][0].tolist(), **named}, name)

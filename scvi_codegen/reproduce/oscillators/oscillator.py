@@ -15,13 +15,14 @@ from scvi_codegen.models.systems import harmonic_oscillator
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
-    Experiment,
     Picture,
     Result,
     TableBlock,
     Verdict,
+    experiment,
     holds,
     judged,
+    series_table,
 )
 from scvi_codegen.reproduce.laboratory.running import trajectory
 from scvi_codegen.reproduce.oscillators.one_degree import (
@@ -36,18 +37,13 @@ from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["EXPERIMENTS", "OSCILLATOR", "POSITION", "VELOCITY"]
+__all__ = ["OSCILLATOR", "POSITION", "VELOCITY"]
 
 Array = NDArray[np.float64]
 
 OSCILLATOR = harmonic_oscillator()
 POSITION, VELOCITY = (0.0,), (1.0,)
 
-TITLES = {
-    "figure-3": "Harmonic oscillator: phase trajectories of SVI and SC, every fifth step",
-    "figure-4": "Harmonic oscillator: position error of SVI and SC",
-    "figure-5": "Harmonic oscillator: energy error of SVI and SC",
-}
 
 DEGREE = 8
 POINTS = (7, 8, 9)
@@ -79,6 +75,7 @@ def _position_error(scheme: str) -> Array:
     return error
 
 
+@experiment("figure-3", "Harmonic oscillator: phase trajectories of SVI and SC, every fifth step")
 def _phase_trajectories(_: Mapping[str, Result]) -> Result:
     runs = {"SVI": _run(SVI_LABEL, 100.0), "SC": _run("SC", 100.0)}
     difference = {
@@ -86,10 +83,8 @@ def _phase_trajectories(_: Mapping[str, Result]) -> Result:
         for scheme, run in runs.items()
     }
     points = {scheme: (run.q[::5, 0], run.p[::5, 0]) for scheme, run in runs.items()}
-    rows = zip(runs["SVI"].t[::5].tolist(), *(x.tolist() for pair in points.values() for x in pair), strict=True)
+    named = {f"{letter} {s}": x.tolist() for s, pair in points.items() for letter, x in zip("qp", pair, strict=True)}
     return Result(
-        name="figure-3",
-        title=TITLES["figure-3"],
         setting=(SYSTEM, "h = 1, T = 100.", NINE_POINTS, QUADRATURES, TOLERANCE),
         checks=(
             Comparison(
@@ -105,9 +100,7 @@ def _phase_trajectories(_: Mapping[str, Result]) -> Result:
                 bears_on=("accuracy",),
             ),
         ),
-        tables=(
-            TableBlock(columns=("t", "q SVI", "p SVI", "q SC", "p SC"), rows=tuple(map(tuple, rows)), shown=False),
-        ),
+        tables=(series_table({"t": runs["SVI"].t[::5].tolist(), **named}, ""),),
         picture=Picture(draw=partial(_draw_phase, points)),
     )
 
@@ -124,14 +117,13 @@ def _draw_phase(points: Mapping[str, tuple[Array, Array]], figure: Figure) -> No
         axes.legend(loc="center")
 
 
+@experiment("figure-4", "Harmonic oscillator: position error of SVI and SC")
 def _position_errors(_: Mapping[str, Result]) -> Result:
     errors = {scheme: _position_error(scheme) for scheme in METHODS}
     sizes = {scheme: largest(error) for scheme, error in errors.items()}
     early = {scheme: largest(error[:21]) for scheme, error in errors.items()}
     svi, sc = [scheme for scheme in METHODS if scheme != "SC"], "SC"
     return Result(
-        name="figure-4",
-        title=TITLES["figure-4"],
         setting=(SYSTEM, "h = 1, T = 100.", NINE_POINTS, QUADRATURES, TOLERANCE),
         checks=(
             Comparison(
@@ -178,13 +170,12 @@ def _draw_position(t: Array, errors: Mapping[str, Array], figure: Figure) -> Non
     figure.axes[0].set_ylabel("q - sin t")
 
 
+@experiment("figure-5", "Harmonic oscillator: energy error of SVI and SC")
 def _energy_errors(_: Mapping[str, Result]) -> Result:
     errors = {scheme: energy_error(_run(scheme, 500.0)) for scheme in METHODS}
     sizes = {scheme: largest(error) for scheme, error in errors.items()}
     svi = [scheme for scheme in METHODS if scheme != "SC"]
     return Result(
-        name="figure-5",
-        title=TITLES["figure-5"],
         setting=(SYSTEM, "h = 1, T = 500.", NINE_POINTS, QUADRATURES, TOLERANCE),
         checks=(
             Comparison(
@@ -224,11 +215,3 @@ def _draw_energy(t: Array, errors: Mapping[str, Array], figure: Figure) -> None:
 
 def _listed(sizes: Mapping[str, float]) -> str:
     return ", ".join(f"{scheme}: {size:.1e}" for scheme, size in sizes.items())
-
-
-RUNS = {
-    "figure-3": _phase_trajectories,
-    "figure-4": _position_errors,
-    "figure-5": _energy_errors,
-}
-EXPERIMENTS = tuple(Experiment(name=name, title=TITLES[name], run=run) for name, run in RUNS.items())

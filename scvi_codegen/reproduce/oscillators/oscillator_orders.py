@@ -16,16 +16,16 @@ from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_powers, panel
 from scvi_codegen.reproduce.laboratory.experiment import (
     Cell,
     Comparison,
-    Experiment,
     Picture,
     Result,
     TableBlock,
     Verdict,
+    experiment,
     holds,
     judged,
+    series_table,
 )
-from scvi_codegen.reproduce.laboratory.readings import BY_DEGREE, BY_POINTS, SCHEMES, Reading
-from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, stepper_of
+from scvi_codegen.reproduce.laboratory.running import BY_DEGREE, BY_POINTS, ROUNDOFF, SCHEMES, Reading, stepper_of
 from scvi_codegen.reproduce.oscillators.oscillator import OSCILLATOR, POSITION, SYSTEM, VELOCITY
 from scvi_codegen.tables.precision import Number, mp
 
@@ -33,14 +33,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["BEYOND", "DEGREES", "EXPERIMENTS", "POINTS", "Variant", "fitted_power", "refinement"]
+__all__ = ["BEYOND", "DEGREES", "POINTS", "Variant", "fitted_power", "refinement"]
 
 Array = NDArray[np.float64]
 
-TITLES = {
-    "figure-7": "Harmonic oscillator: error of q over one step of size h",
-    "figure-8": "Harmonic oscillator: error of the energy over one step of size h",
-}
 LEGEND = (2, 4, 6)
 """Values of N."""
 
@@ -155,12 +151,10 @@ def _curves(what: str, variant: Variant, steps: tuple[float, ...]) -> Curves:
     }
 
 
-def refinement(name: str, what: str, _: Mapping[str, Result], steps: tuple[float, ...] = STEPS) -> Result:
+def refinement(what: str, _: Mapping[str, Result], steps: tuple[float, ...] = STEPS) -> Result:
     """Return a figure, for some step sizes."""
     curves = {variant: _curves(what, variant, steps) for variant in SHOWN[what]}
     return Result(
-        name=name,
-        title=TITLES[name],
         setting=SETTING,
         checks=(_powers(what), _constants(what), _ahead(what, curves[POINTS], steps)),
         tables=(
@@ -183,15 +177,14 @@ def _rows(what: str) -> Iterator[tuple[Cell, ...]]:
 
 
 def _errors_table(curves: Mapping[Variant, Curves], steps: tuple[float, ...]) -> TableBlock:
-    columns = {}
+    columns: dict[str, list[float]] = {"h": list(steps)}
     for variant, of_variant in curves.items():
         for (scheme, n), curve in of_variant.items():
             label = f"{scheme}, N = {n}, {variant.title}"
-            columns[label] = curve.exact
+            columns[label] = curve.exact.tolist()
             if curve.compiled is not None:
-                columns[f"{label}, compiled"] = curve.compiled
-    rows = zip(steps, *(values.tolist() for values in columns.values()), strict=True)
-    return TableBlock(name="errors", columns=("h", *columns), rows=tuple(rows), shown=False)
+                columns[f"{label}, compiled"] = curve.compiled.tolist()
+    return series_table(columns, "errors")
 
 
 def _powers(what: str) -> Comparison:
@@ -289,7 +282,7 @@ def _draw_curve(axes: Axes, steps: tuple[float, ...], curve: ErrorsOverH, label:
         axes.plot(steps, np.where(curve.compiled > 0.0, curve.compiled, np.nan), mark, color=color, markersize=3)
 
 
-EXPERIMENTS = tuple(
-    Experiment(name=name, title=TITLES[name], run=partial(refinement, name, what))
-    for name, what in (("figure-7", "q"), ("figure-8", "energy"))
+experiment("figure-7", "Harmonic oscillator: error of q over one step of size h")(partial(refinement, "q"))
+experiment("figure-8", "Harmonic oscillator: error of the energy over one step of size h")(
+    partial(refinement, "energy")
 )

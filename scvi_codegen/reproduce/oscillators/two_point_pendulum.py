@@ -17,11 +17,11 @@ from scvi_codegen.methods.shooting import SCVI
 from scvi_codegen.reproduce.laboratory.experiment import (
     Block,
     Comparison,
-    Experiment,
     Formula,
     Paragraph,
     Result,
     TableBlock,
+    experiment,
     holds,
 )
 from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, stepper_of
@@ -30,8 +30,6 @@ from scvi_codegen.tables.basis import differentiation_matrix
 from scvi_codegen.tables.closed_forms import exact_points, exact_rule
 from scvi_codegen.tables.nodes import chebyshev_lobatto
 from scvi_codegen.tables.quadrature import gauss_legendre
-
-__all__ = ["EXPERIMENTS"]
 
 QUADRATURE = "gauss-legendre:2"
 METHOD = SCVI(1, QUADRATURE)
@@ -123,13 +121,12 @@ def printed_differentiation() -> sympy.Matrix:
     )
 
 
+@experiment("section-4.3", "The two-point SCVI of the planar pendulum")
 def section_4_3(results: Mapping[str, Result]) -> Result:
     """Return derivation, comparison, and a numerical check."""
     scheme = derived_scheme()
     rows = [_row(stepper_of(pendulum(), METHOD), *state) for state in STATES]
     return Result(
-        name="section-4.3",
-        title="The two-point SCVI of the planar pendulum",
         setting=(
             "m = l = g = 1, nodes -1 and 1, two Gauss points: the general derivation of SCVI, written with the names "
             "of section 4.3.1.",
@@ -278,8 +275,3 @@ def _scaled_row() -> sympy.ImmutableMatrix:
     """Return [a_0, A] from the package's differentiation matrix, on ascending nodes."""
     row = differentiation_matrix(chebyshev_lobatto(1).points)[1]
     return sympy.ImmutableMatrix([[2 * sympy.nsimplify(sympy.Float(str(x), 30)) / h for x in row]])
-
-
-EXPERIMENTS: tuple[Experiment, ...] = (
-    Experiment(name="section-4.3", title="The two-point SCVI of the planar pendulum", run=section_4_3),
-)

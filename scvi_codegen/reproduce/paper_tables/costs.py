@@ -22,11 +22,11 @@ from scvi_codegen.models.systems import duffing, planar_pendulum
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
-    Experiment,
     Picture,
     Result,
     TableBlock,
     Verdict,
+    experiment,
     holds,
 )
 from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, SECTION_3, steps_in
@@ -35,8 +35,6 @@ from scvi_codegen.runtime.core.stepper import Stepper
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-__all__ = ["EXPERIMENTS"]
 
 ROUNDS = 15
 """Number of timed runs of each scheme, in turn with the others."""
@@ -160,22 +158,11 @@ def _reference(setting: Setting, finer: int) -> NDArray[np.float64]:
     return end
 
 
-def table_6(results: Mapping[str, Result]) -> Result:
-    """Return Table 6: planar pendulum."""
-    return _result(SETTINGS[6])
-
-
-def table_7(results: Mapping[str, Result]) -> Result:
-    """Return Table 7: Duffing oscillator."""
-    return _result(SETTINGS[7])
-
-
-def _result(setting: Setting) -> Result:
+def _result(setting: Setting, _: Mapping[str, Result]) -> Result:
     result = costs(setting.number)
     names = {scheme: method.name for scheme, method in setting.methods.items()}
     doubt = float(np.abs(_reference(setting, FINER) - _reference(setting, 2 * FINER)).max())
     return Result(
-        name=f"table-{setting.number}",
         title=f"Computational cost of SRK, SVI and SC, {setting.problem}",
         setting=(
             f"{setting.problem.capitalize()}, h = {setting.h}, T = {setting.span:g} ({setting.steps} steps), "
@@ -327,7 +314,6 @@ def _draw_pairs(axes: Axes, dark: Sequence[float], pale: Sequence[float], colors
         axes.bar_label(drawn, fmt="{:.2g}", fontsize=7)
 
 
-EXPERIMENTS: tuple[Experiment, ...] = tuple(
-    Experiment(name=f"table-{number}", title=f"Computational cost, {SETTINGS[number].problem}", run=run)
-    for number, run in ((6, table_6), (7, table_7))
-)
+for setting in SETTINGS.values():
+    title = f"Computational cost, {setting.problem}"
+    experiment(f"table-{setting.number}", title)(partial(_result, setting))

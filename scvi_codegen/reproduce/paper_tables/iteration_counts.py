@@ -1,45 +1,182 @@
-"""Iteration counts on Kepler's problem: as printed in Tables 8 and 9, by Picard iteration, by the package's solvers."""
+"""Picard iteration on the equations of a step, from a constant guess: (18) of SC and (30) of SVI in NumPy.
+
+Both are Q = q0 + h c v0 + h^2 B f(E Q): E maps Q at the nodes to the points where forces are evaluated, the nodes
+themselves for SC, and B solves for Q. Unlike the package's solvers it starts anew in each step, as the counts of the
+paper do.
+
+Newton's method on the derived equations of a step, in Python: slow, and independent of the C solvers.
+
+Iteration counts on Kepler's problem: as printed in Tables 8 and 9, by Picard iteration, by the package's solvers.
+"""
 
 from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+import sympy
 from numpy.typing import NDArray
 
+from scvi_codegen.derivation.equations import StepEquations, derive
 from scvi_codegen.errors import StepFailedError
-from scvi_codegen.reproduce.kepler.exact_flow import SYSTEM, perihelion
-from scvi_codegen.reproduce.laboratory.picard import (
-    Equations,
-    NotSolvedError,
-    galerkin,
-    picard_step,
-    spectral_collocation,
-)
-from scvi_codegen.reproduce.laboratory.readings import BY_POINTS, SCHEMES, Reading
-from scvi_codegen.reproduce.laboratory.running import SECTION_3, steps_in, trajectory
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods.method import Method
+from scvi_codegen.reproduce.kepler.orbits import SYSTEM, perihelion
+from scvi_codegen.reproduce.laboratory.running import BY_POINTS, SCHEMES, SECTION_3, Reading, steps_in, trajectory
+from scvi_codegen.tables.basis import cardinal_derivatives, cardinal_values, differentiation_matrix
+from scvi_codegen.tables.nodes import chebyshev_lobatto
+from scvi_codegen.tables.quadrature import gauss_legendre
 
 __all__ = [
     "ECCENTRICITY",
     "SPAN",
-    "Agreement",
     "Count",
     "Counts",
+    "NotSolvedError",
     "Setting",
     "agreement",
     "attraction",
     "compiled_count",
     "compiled_counts",
+    "galerkin",
+    "newton_counts",
     "picard_counts",
+    "picard_step",
     "printed_counts",
+    "spectral_collocation",
 ]
 
+
 Array = NDArray[np.float64]
+Force: TypeAlias = Callable[[Array], Array]
+"""Function that returns accelerations (points, m) at positions (points, m); masses are 1."""
+
+
+class NotSolvedError(Exception):
+    """The iteration did not converge."""
+
+
+@dataclass(frozen=True, slots=True)
+class Equations:
+    """Step of h = 1 on nodes that end at c = 1.
+
+    Attributes:
+        c: (s,) nodes without the first, in [0, 1].
+        at: (points, s + 1) matrix from positions at all nodes to those where the force is evaluated.
+        solution: (s, points) B, from forces to their contribution to the positions.
+        momentum: (points,) from forces to their contribution to the momentum.
+    """
+
+    c: Array
+    at: Array
+    solution: Array
+    momentum: Array
+
+
+@lru_cache(maxsize=64)
+def spectral_collocation(degree: int) -> Equations:
+    """Return (18) on Chebyshev nodes: A^2 Q = F(Q) - a0 v0 - (A a0) q0."""
+    nodes = chebyshev_lobatto(degree).points
+    inverse = np.linalg.inv(2.0 * _array(differentiation_matrix(nodes))[1:, 1:])
+    return Equations(_unit(nodes), np.eye(degree + 1)[1:], inverse @ inverse, inverse[-1])
+
+
+@lru_cache(maxsize=64)
+def galerkin(degree: int, points: int) -> Equations:
+    """Return (30) on Chebyshev nodes with Gauss points: the first s rows of the stiffness (29), solved for Q."""
+    nodes, rule = chebyshev_lobatto(degree).points, gauss_legendre(points)
+    weights = _array([rule.weights])[0] / 2.0
+    values, derivatives = (_array(table(nodes, rule.points)) for table in (cardinal_values, cardinal_derivatives))
+    stiffness = 4.0 * (derivatives.T * weights) @ derivatives
+    return Equations(_unit(nodes), values, -np.linalg.solve(stiffness[:-1, 1:], (values.T * weights)[:-1]), weights)
+
+
+def picard_step(
+    equations: Equations, force: Force, q: Array, p: Array, *, h: float, tolerance: float, max_iterations: int
+) -> tuple[Array, Array, int]:
+    """Return (q, p) after a step of h, and the number of iterations until max |dQ| < tolerance.
+
+    Raises:
+        NotSolvedError: if there are more than ``max_iterations``, or numbers overflow.
+    """
+    line = q + h * np.outer(equations.c, p)
+    positions = np.tile(q, (len(line), 1))
+    for count in range(1, max_iterations + 1):
+        forces = force(equations.at @ np.vstack([q, positions]))
+        updated = line + h**2 * (equations.solution @ forces)
+        size = np.abs(updated - positions).max()
+        positions = updated
+        if size < tolerance:
+            forces = force(equations.at @ np.vstack([q, positions]))
+            return positions[-1], p + h * (equations.momentum @ forces), count
+        if not np.isfinite(size):
+            break
+    raise NotSolvedError
+
+
+def _array(table: object) -> Array:
+    return np.array(table, dtype=float)
+
+
+def _unit(nodes: object) -> Array:
+    return (_array([nodes])[0, 1:] + 1.0) / 2.0
+
+
+Function: TypeAlias = Callable[[Array, Sequence[float]], Array]
+"""Function of the unknowns and of (q_k, p_k, h)."""
+
+
+def newton_counts(
+    system: LagrangianSystem, method: Method, q: Sequence[float], p: Sequence[float], *, h: float, steps: int
+) -> list[int]:
+    """Return the iterations of every step: new Jacobian at every iterate, straight-line guess, until |dQ| < 1e-14.
+
+    For systems of unit masses without explicit time (velocity = momentum), and methods that end in Q^s. The end
+    momentum, a sum of large terms, is excluded from the criterion: its rounding alone is of the size of the tolerance.
+    """
+    derived = derive(system, method)
+    equations = sympy.Matrix([equation.residual for equation in derived.equations])
+    residual, jacobian_function = _function(derived, equations), _function(derived, sympy.Matrix(derived.jacobian))
+    end = _function(derived, sympy.Matrix([equation.residual for equation in derived.end_momentum]))
+    line = _function(derived, sympy.Matrix([derived.initial_guess[unknown] for unknown in derived.unknowns]))
+    position, momentum, counts = np.array(q, dtype=float), np.array(p, dtype=float), []
+    for _ in range(steps):
+        state = (*position, *momentum, h)
+        unknowns = line(np.zeros(len(derived.unknowns)), state).ravel()
+        unknowns, count = _solved(unknowns, state, residual, jacobian_function)
+        position, momentum = unknowns[-system.dimension :], end(unknowns, state).ravel()
+        counts.append(count)
+    return counts
+
+
+def _function(derived: StepEquations, expression: sympy.Matrix) -> Function:
+    q, p = derived.state
+    values = dict(zip(derived.system.parameters, map(sympy.Float, derived.system.defaults), strict=True))
+    values |= {entry.symbol: sympy.Float(str(entry.value), 17) for entry in derived.entries}
+    values |= {
+        sympy.Symbol(f"{coordinate.name}_dot_k", real=True): momentum
+        for coordinate, momentum in zip(derived.system.coordinates, p, strict=True)
+    }
+    arguments = [*derived.unknowns, *q, *p, derived.step]
+    function: Any = sympy.lambdify(arguments, expression.xreplace(values), "numpy", cse=True)
+    return lambda unknowns, state: np.array(function(*unknowns, *state), dtype=float)
+
+
+def _solved(
+    unknowns: Array, state: Sequence[float], residual: Function, jacobian_function: Function
+) -> tuple[Array, int]:
+    """Return the unknowns and the number of updates."""
+    count, size = 0, np.inf
+    while size >= SECTION_3.tolerance and count < SECTION_3.max_iterations:
+        update = np.linalg.solve(jacobian_function(unknowns, state), residual(unknowns, state).ravel())
+        unknowns, size, count = unknowns - update, np.abs(update).max(), count + 1
+    return unknowns, count
+
 
 SPAN = 100.0
 COUNTS = (2, 5, 10, 15, 20)

@@ -10,20 +10,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from scvi_codegen.reproduce.kepler.exact_flow import SYSTEM, perihelion
+from scvi_codegen.reproduce.kepler.orbits import SYSTEM, perihelion
 from scvi_codegen.reproduce.laboratory.drawing import panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
-    Experiment,
     Picture,
     Result,
     TableBlock,
     Verdict,
+    experiment,
     holds,
 )
-from scvi_codegen.reproduce.laboratory.full_newton import newton_counts
-from scvi_codegen.reproduce.laboratory.readings import BY_DEGREE, BY_POINTS, READINGS
-from scvi_codegen.reproduce.laboratory.running import SECTION_3, steps_in
+from scvi_codegen.reproduce.laboratory.running import BY_DEGREE, BY_POINTS, READINGS, SECTION_3, steps_in
 from scvi_codegen.reproduce.paper_tables.iteration_counts import (
     ECCENTRICITY,
     SPAN,
@@ -31,6 +29,7 @@ from scvi_codegen.reproduce.paper_tables.iteration_counts import (
     Counts,
     agreement,
     compiled_counts,
+    newton_counts,
     picard_counts,
     printed_counts,
 )
@@ -39,8 +38,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
-
-__all__ = ["EXPERIMENTS"]
 
 PICARD = "Picard, by points"
 """Iteration on which verdicts are based."""
@@ -67,7 +64,6 @@ def table(number: int, _: Mapping[str, Result]) -> Result:
     """Return Table 8 or 9."""
     e, printed, result = ECCENTRICITY[number], printed_counts(number), _all_counts(number)
     return Result(
-        name=f"table-{number}",
         title=f"Kepler problem, number of iterations with eccentricity e = {e}",
         setting=(
             f"Kepler's problem, e = {e}, T = {SPAN:g}, from perihelion; SVI has N Gauss points, which the paper leaves "
@@ -262,7 +258,5 @@ def _draw_tiles(axes: Axes, result: Counts, norm: LogNorm) -> None:
     axes.grid(False)
 
 
-EXPERIMENTS: tuple[Experiment, ...] = (
-    Experiment(name="table-8", title="Number of iterations, Kepler problem, e = 0.2", run=partial(table, 8)),
-    Experiment(name="table-9", title="Number of iterations, Kepler problem, e = 0.5", run=partial(table, 9)),
-)
+experiment("table-8", "Number of iterations, Kepler problem, e = 0.2")(partial(table, 8))
+experiment("table-9", "Number of iterations, Kepler problem, e = 0.5")(partial(table, 9))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
@@ -13,15 +14,13 @@ from scvi_codegen.pipeline.sources import generate_source
 from scvi_codegen.rendering.outline import Function, functions_of, outline
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
-    Experiment,
     Listing,
     Paragraph,
     Result,
     TableBlock,
+    experiment,
     holds,
 )
-
-__all__ = ["EXPERIMENTS"]
 
 DEGREE = 4
 PREFIX = "pendulum"
@@ -151,29 +150,13 @@ SCVI_STEPS = (
 )
 
 
-def table_5(results: Mapping[str, Result]) -> Result:
-    """Return Table 5: SVI."""
-    return _result("table-5", "The iterative algorithm of SVI", SVI(DEGREE), SVI_STEPS)
-
-
-def table_10(results: Mapping[str, Result]) -> Result:
-    """Return Table 10: SCVI."""
-    remark = (
-        "The multipliers, unknowns that the paper's algorithm does not have, make the derivative of L_d total: "
-        "with them the step is symplectic.",
-    )
-    return _result("table-10", "The iterative algorithm of SCVI", SCVI(DEGREE), SCVI_STEPS, remark)
-
-
-def _result(name: str, title: str, method: Method, steps: tuple[Step, ...], remark: tuple[str, ...] = ()) -> Result:
+def _result(method: Method, steps: tuple[Step, ...], remark: tuple[str, ...], _: Mapping[str, Result]) -> Result:
     code = generate_source(planar_pendulum(), method, solver="newton", prefix=PREFIX)[0].amalgamated().code
     functions = functions_of(code)
     missing = {step.number: _missing(step, code, functions) for step in steps}
     result = [number for number, fragments in missing.items() if not fragments]
     lost = "; ".join(f"STEP{number} lacks {', '.join(fragments)}" for number, fragments in missing.items() if fragments)
     return Result(
-        name=name,
-        title=title,
         setting=(
             f"C generated for the planar pendulum by {method.name}, Newton's method: {len(functions)} functions, "
             f"{len(code.splitlines())} lines.",
@@ -222,7 +205,9 @@ def _missing(step: Step, code: str, functions: Mapping[str, Function]) -> list[s
     ]
 
 
-EXPERIMENTS: tuple[Experiment, ...] = (
-    Experiment(name="table-5", title="The iterative algorithm of SVI", run=table_5),
-    Experiment(name="table-10", title="The iterative algorithm of SCVI", run=table_10),
+MULTIPLIERS = (
+    "The multipliers, unknowns that the paper's algorithm does not have, make the derivative of L_d total: "
+    "with them the step is symplectic.",
 )
+experiment("table-5", "The iterative algorithm of SVI")(partial(_result, SVI(DEGREE), SVI_STEPS, ()))
+experiment("table-10", "The iterative algorithm of SCVI")(partial(_result, SCVI(DEGREE), SCVI_STEPS, MULTIPLIERS))

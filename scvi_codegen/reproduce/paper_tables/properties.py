@@ -11,11 +11,11 @@ from scvi_codegen.methods.collocation import SpectralCollocation
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
-    Experiment,
     Picture,
     Result,
     TableBlock,
     Verdict,
+    experiment,
     holds,
 )
 from scvi_codegen.tables.tableau import (
@@ -31,8 +31,6 @@ from scvi_codegen.tables.tableau import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
-
-__all__ = ["EXPERIMENTS"]
 
 MOST_STAGES = 9
 FAMILIES: Mapping[str, tuple[Callable[[int], Tableau], int, str]] = {
@@ -90,12 +88,11 @@ def _all_properties() -> tuple[Properties, ...]:
     return (*methods, *collocation)
 
 
+@experiment("table-4", "Properties of different collocation methods")
 def table_4(results: Mapping[str, Result]) -> Result:
     """Return Table 4: properties of collocation methods."""
     result = _all_properties()
     return Result(
-        name="table-4",
-        title="Properties of different collocation methods",
         setting=(
             f"Every mark is computed from A, b, c in 60 digits for all numbers of stages up to {MOST_STAGES}.",
             "The paper names no points: 'Chebyshev methods' are taken to be collocation on the Chebyshev-Gauss and on "
@@ -196,8 +193,3 @@ def _square(x: float, y: float, color: str) -> Patch:
     from matplotlib.patches import Rectangle
 
     return Rectangle((x - 0.42, y - 0.42), 0.84, 0.84, facecolor=color, edgecolor="none")
-
-
-EXPERIMENTS: tuple[Experiment, ...] = (
-    Experiment(name="table-4", title="Properties of different collocation methods", run=table_4),
-)

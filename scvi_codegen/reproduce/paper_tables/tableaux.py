@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, TypeAlias
 
 import sympy
@@ -10,19 +11,17 @@ import sympy
 from scvi_codegen.reproduce.laboratory.experiment import (
     Block,
     Comparison,
-    Experiment,
     Formula,
     Paragraph,
     Result,
     TableBlock,
     Verdict,
+    experiment,
     holds,
 )
 from scvi_codegen.tables.closed_forms import exact_tableau
 from scvi_codegen.tables.precision import Number, mp
 from scvi_codegen.tables.tableau import Tableau, gauss
-
-__all__ = ["EXPERIMENTS"]
 
 Exact: TypeAlias = tuple[tuple[tuple[sympy.Expr, ...], ...], tuple[sympy.Expr, ...], tuple[sympy.Expr, ...]]
 AGREES = mp.mpf("1e-50")
@@ -69,28 +68,11 @@ LETTERS: Mapping[str, str] = {
 NAMES = {letter: sympy.Symbol(f"w_{letter[1]}" if letter[0] == "w" else f"w__'_{letter[1]}") for letter in LETTERS}
 
 
-def table_1(results: Mapping[str, Result]) -> Result:
-    """Return Table 1: Gauss method of order 4."""
-    return _gauss_table(1, 2)
-
-
-def table_2(results: Mapping[str, Result]) -> Result:
-    """Return Table 2: Gauss method of order 6."""
-    return _gauss_table(2, 3)
-
-
-def table_3(results: Mapping[str, Result]) -> Result:
-    """Return Table 3: Gauss method of order 8."""
-    return _gauss_table(3, 4)
-
-
-def _gauss_table(number: int, s: int) -> Result:
+def _gauss_table(number: int, s: int, _: Mapping[str, Result]) -> Result:
     exact = exact_tableau(gauss(s))
     assert exact is not None
     printed = _printed(number, _letter_values())
     return Result(
-        name=f"table-{number}",
-        title=f"Gauss method of order {2 * s}",
         setting=(
             f"Printed entries are evaluated in 60 digits and compared with the collocation integrals (23) on the {s} "
             "Gauss-Legendre points; they agree if they differ by less than 1e-50.",
@@ -244,8 +226,6 @@ def _typeset(number: int) -> Iterator[Block]:
             yield Formula(_expression(text, NAMES), NAMES[letter])
 
 
-EXPERIMENTS: tuple[Experiment, ...] = (
-    Experiment(name="table-1", title="Gauss method of order 4", run=table_1),
-    Experiment(name="table-2", title="Gauss method of order 6", run=table_2),
-    Experiment(name="table-3", title="Gauss method of order 8", run=table_3),
-)
+for number in PRINTED:
+    stages = number + 1
+    experiment(f"table-{number}", f"Gauss method of order {2 * stages}")(partial(_gauss_table, number, stages))

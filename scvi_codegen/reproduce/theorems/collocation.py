@@ -20,19 +20,17 @@ from numpy.typing import NDArray
 from scvi_codegen.methods import RungeKutta
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
-    Experiment,
     Formula,
     Paragraph,
     Result,
     TableBlock,
+    experiment,
     holds,
 )
 from scvi_codegen.reproduce.theorems.convergence import quick_stepper
 from scvi_codegen.tables.nodes import nodes_by_name
 from scvi_codegen.tables.precision import Vector, mp
 from scvi_codegen.tables.tableau import Tableau, collocation_tableau, radau_ia, tableau_by_name
-
-__all__ = ["EXPERIMENT"]
 
 Array: TypeAlias = NDArray[Any]
 Field: TypeAlias = Callable[[Array], Array]
@@ -186,6 +184,7 @@ def _body() -> tuple[Paragraph | Formula, ...]:
     )
 
 
+@experiment("theorem-2.1", "Collocation methods are Runge-Kutta methods")
 def _run(_: Mapping[str, Result]) -> Result:
     rows = [_row(family, tableau) for family, tableau in _tableaux()]
     control = [_row("radau-ia (not a collocation method)", radau_ia(s)) for s in (2, 3, 4)]
@@ -193,7 +192,6 @@ def _run(_: Mapping[str, Result]) -> Result:
     least_control = min(min(row[4:]) for row in control)
     compiled = max(_compiled_difference(family, "kepler") for family in FAMILIES)
     return Result(
-        name="theorem-2.1",
         title="Collocation methods are Runge-Kutta methods with the coefficients (23)",
         setting=(
             f"One step h = {mp.nstr(STEP, 3)} of Hamilton's equations of the pendulum from (q, p) = (0.7, 0.4) and of "
@@ -220,6 +218,3 @@ def _run(_: Mapping[str, Result]) -> Result:
         ),
         body=_body(),
     )
-
-
-EXPERIMENT = Experiment(name="theorem-2.1", title="Collocation methods are Runge-Kutta methods", run=_run)

@@ -16,17 +16,17 @@ from scvi_codegen.models.problems import problem
 from scvi_codegen.reproduce.laboratory.experiment import (
     Block,
     Comparison,
-    Experiment,
     Formula,
     Paragraph,
     Result,
     TableBlock,
     Verdict,
+    experiment,
     holds,
 )
 from scvi_codegen.tables.precision import mp
 
-__all__ = ["EXPERIMENT", "lemma_differences", "residual"]
+__all__ = ["lemma_differences", "residual"]
 
 TITLE = "Spectral collocation with Kronecker products, (18) and (21)"
 FORMS = {"position": "18", "phase-space": "21"}
@@ -99,13 +99,12 @@ def _scaled(matrix: sympy.Matrix, factor: sympy.Expr) -> sympy.Expr:
     return sympy.MatMul(factor, sympy.ImmutableMatrix(rational), evaluate=False)
 
 
+@experiment("section-2.1", "Spectral collocation with Kronecker products, (18) and (21)")
 def _run(_: Mapping[str, Result]) -> Result:
     rows = [(name, f"({FORMS[form]})", s, residual(name, form, s)) for name, form, s in product(STATES, FORMS, DEGREES)]
     first, second = lemma_differences()
     largest = max(row[-1] for row in rows)
     return Result(
-        name="section-2.1",
-        title=TITLE,
         setting=(
             f"One step h = {mp.nstr(STEP, 3)} of the pendulum and of the double pendulum, whose masses are not "
             f"constant, so that (18) and (21) are two methods; degree {DEGREES[0]} to {DEGREES[-1]}.",
@@ -133,6 +132,3 @@ def _run(_: Mapping[str, Result]) -> Result:
         tables=(TableBlock(columns=("problem", "form", "degree", "largest row"), rows=tuple(rows)),),
         body=tuple(_body()),
     )
-
-
-EXPERIMENT = Experiment(name="section-2.1", title=TITLE, run=_run)

@@ -11,12 +11,12 @@ import sympy
 from scvi_codegen.methods import SCVI, SVI, SpectralCollocation
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
-    Experiment,
     Formula,
     Paragraph,
     Picture,
     Result,
     TableBlock,
+    experiment,
     holds,
 )
 from scvi_codegen.reproduce.theorems.convergence import (
@@ -31,13 +31,13 @@ from scvi_codegen.reproduce.theorems.convergence import (
     SHOWN,
     START,
     TITLES,
+    Panel,
+    Series,
     cell,
+    draw_panels,
     errors,
     fitted_order,
 )
-from scvi_codegen.reproduce.theorems.pictures import Panel, Series, draw_panels
-
-__all__ = ["EXPERIMENT"]
 
 DEGREES = (1, 2, 3, 4, 5)
 STEPS = {
@@ -157,6 +157,7 @@ def _picture() -> Picture:
     return Picture(draw=partial(draw_panels, rows=2, columns=3, content=content, floor=PLATEAU), width=10.0, height=6.0)
 
 
+@experiment("theorem-4.1", "Order of shooting-based discrete Lagrangians")
 def _run(_: Mapping[str, Result]) -> Result:
     orders = _orders()
     columns = ("problem", "method", "s", "p", "q", "min(p, q)", "expected", "L_d", "Legendre transforms", "map")
@@ -174,8 +175,6 @@ def _run(_: Mapping[str, Result]) -> Result:
         for o in orders
     )
     return Result(
-        name="theorem-4.1",
-        title="Order of shooting-based discrete Lagrangians",
         setting=(
             START,
             f"{EXACT} Orders are exponents of h, less 1, of the errors in one step, fitted to the three smallest steps "
@@ -215,6 +214,3 @@ def _body(orders: list[Order]) -> tuple[Paragraph | Formula, ...]:
             f"of the map on Kepler's problem is {result}; the order expected is in parentheses."
         ),
     )
-
-
-EXPERIMENT = Experiment(name="theorem-4.1", title="Order of shooting-based discrete Lagrangians", run=_run)

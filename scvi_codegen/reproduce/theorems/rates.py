@@ -8,7 +8,7 @@ from functools import partial
 from typing import TypeAlias
 
 from scvi_codegen.methods import SpectralCollocation
-from scvi_codegen.reproduce.laboratory.experiment import Comparison, Experiment, Picture, Result, TableBlock, holds
+from scvi_codegen.reproduce.laboratory.experiment import Comparison, Picture, Result, TableBlock, experiment, holds
 from scvi_codegen.reproduce.theorems.convergence import (
     EXACT,
     FEW,
@@ -21,14 +21,14 @@ from scvi_codegen.reproduce.theorems.convergence import (
     SHOWN,
     START,
     TITLES,
+    Panel,
+    Series,
     cell,
+    draw_panels,
     errors,
     quadrature_error,
     rate,
 )
-from scvi_codegen.reproduce.theorems.pictures import Panel, Series, draw_panels
-
-__all__ = ["EXPERIMENTS"]
 
 DEGREES = (2, 3, 4, 5, 6, 8)
 STEP = {"planar-pendulum": 2.0, "kepler": 1.0}
@@ -109,6 +109,7 @@ def _rate_picture() -> Picture:
     return Picture(draw=draw, width=9.0, height=6.5)
 
 
+@experiment("theorem-4.2", "Geometric rates of map, Legendre transforms and L_d")
 def _run_rates(_: Mapping[str, Result]) -> Result:
     rates = _rates()
     rows = tuple((TITLES[name], label, QUANTITIES[key], *result) for (name, label, key), result in rates.items())
@@ -116,7 +117,6 @@ def _run_rates(_: Mapping[str, Result]) -> Result:
         (TITLES[name], label, QUANTITIES[key], *map(cell, _series(name, label, key))) for name, label, key in rates
     )
     return Result(
-        name="theorem-4.2",
         title="Geometric convergence of map, Legendre transforms and discrete Lagrangian",
         setting=(
             START,
@@ -190,6 +190,7 @@ def _bound_picture() -> Picture:
     return Picture(draw=partial(draw_panels, rows=2, columns=2, content=content, floor=PLATEAU), width=9.0, height=6.5)
 
 
+@experiment("theorem-4.3", "Geometric convergence of the SCVI discrete Lagrangian")
 def _run_bounds(_: Mapping[str, Result]) -> Result:
     columns = ("problem", "method", "error of", "C", "K", *(f"s = {s}" for s in DEGREES))
     rows = []
@@ -199,7 +200,6 @@ def _run_bounds(_: Mapping[str, Result]) -> Result:
                 by_degree = dict(zip(degrees, map(cell, values), strict=True))
                 rows.append((TITLES[name], label, part, *rate(degrees, values), *map(by_degree.get, DEGREES)))
     return Result(
-        name="theorem-4.3",
         title="Geometric convergence of the spectral-collocation discrete Lagrangian",
         setting=(
             START,
@@ -212,9 +212,3 @@ def _run_bounds(_: Mapping[str, Result]) -> Result:
         tables=(TableBlock(columns=columns, rows=tuple(rows), formats=dict.fromkeys(columns[5:], ".1e")),),
         picture=_bound_picture(),
     )
-
-
-EXPERIMENTS = (
-    Experiment(name="theorem-4.2", title="Geometric rates of map, Legendre transforms and L_d", run=_run_rates),
-    Experiment(name="theorem-4.3", title="Geometric convergence of the SCVI discrete Lagrangian", run=_run_bounds),
-)
