@@ -37,7 +37,7 @@ from scvi_codegen.files.cache import cache_info as cache_info
 from scvi_codegen.files.cache import clear_cache as clear_cache
 from scvi_codegen.frameworks.casadi import casadi_flow as casadi_flow
 from scvi_codegen.frameworks.casadi_step import casadi_step as casadi_step
-from scvi_codegen.frameworks.controlled_trajectory import ControlledMotion as ControlledMotion
+from scvi_codegen.frameworks.control_task import ControlledMotion as ControlledMotion
 from scvi_codegen.frameworks.jax import JaxFlow as JaxFlow
 from scvi_codegen.frameworks.jax import jax_flow as jax_flow
 from scvi_codegen.frameworks.optimal_control import optimal_control as optimal_control

@@ -1,18 +1,128 @@
-"""Verification, on the whole run, of the error for which a step size was recommended."""
+"""Estimate of the correct digits of a final state, by a second, more accurate run from a perturbed state.
+
+The second run uses another method, SVI(8) with adaptive step size, so that the difference includes all errors of the
+first run: truncation, round-off, and their growth along the trajectory.
+
+Verification, on the whole run, of the error for which a step size was recommended.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from scvi_codegen.advice.significant_digits import SECOND_RUN, Known, known_digits
-from scvi_codegen.errors import StateError
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import ScviCodegenError, StateError
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods import default_method
 from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
+from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
-__all__ = ["missed_tolerance"]
+__all__ = ["SECOND_RUN", "Known", "known_digits", "missed_tolerance"]
+
+
+Array = NDArray[np.float64]
+
+SECOND_RUN = 10_000
+"""Steps that a second run may take in addition to four times those of the first."""
+SAMPLES, LINEAR_DISTANCE = 1024, 0.01
+"""Number of states compared, and the distance relative to their size up to which linearised growth is assumed."""
+QUARTERS, DECADES = 4, 0.5
+"""Growth is exponential if the distance grows by ``DECADES`` decades in each quarter of the time."""
+PERTURBATION = 2.0**-50
+"""Relative perturbation of the initial positions."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Known:
+    """Error estimate of the last state of a run.
+
+    Attributes:
+        q, p: (m,) absolute errors.
+        tenfold: time in which neighbouring trajectories diverge tenfold; infinite unless they diverge exponentially.
+    """
+
+    q: Array
+    p: Array
+    tenfold: float
+
+    @property
+    def chaotic(self) -> bool:
+        """True if neighbouring trajectories diverge exponentially."""
+        return math.isfinite(self.tenfold)
+
+
+class _TooLongError(Exception):
+    """Raised if the second run would take too many steps."""
+
+
+@without_accuracy_warnings()
+def known_digits(
+    system: MechanicalSystem,
+    trajectory: Trajectory | DrivenTrajectory,
+    *,
+    most: int,
+    inputs: Mapping[str, Any] | None = None,
+) -> Known | None:
+    """Estimate the error of the last state of ``trajectory``, a trajectory of ``system`` with ``inputs``.
+
+    Returns ``None`` if a second run fails, would take more than about ``most`` steps, or time is transformed.
+    """
+    if system.clock is not None or len(trajectory) < 2:
+        return None
+
+    def count(steps: int) -> None:
+        if steps > most:
+            raise _TooLongError
+
+    chosen = np.unique(np.linspace(0, len(trajectory) - 1, SAMPLES).astype(int))
+    times = trajectory.t[chosen]
+    nudged = trajectory.q[0] * (1.0 + PERTURBATION * np.cos(np.arange(trajectory.q.shape[1])))
+    span: dict[str, Any] = {"t": float(times[0]), "t_end": float(times[-1])}
+    arguments = {**span, "parameters": trajectory.parameters, "progress": count}
+    try:
+        stepper = compile_stepper(system, default_method(system))
+        if system.inputs:
+            q, p = stepper.integrate(nudged, trajectory.p[0], inputs=inputs or {}, **arguments).at(times)
+        else:
+            second = stepper.integrate(nudged, trajectory.p[0], t_eval=times, **arguments)
+            q, p = second.q, second.p
+    except (ScviCodegenError, _TooLongError):
+        return None
+    size = math.sqrt(float(np.mean(np.sum(q**2, axis=1)))) or 1.0
+    q, p = np.abs(q - trajectory.q[chosen]), np.abs(p - trajectory.p[chosen])
+    tenfold = _tenfold(np.linalg.norm(q, axis=1) / size, abs(float(times[-1] - times[0])))
+    return Known(q=_final_error(q), p=_final_error(p), tenfold=tenfold)
+
+
+def _final_error(difference: Array) -> Array:
+    """Return the error at the last state, at least the mean over the last sixteenth, as zero crossings occur."""
+    late = difference[-max(1, len(difference) // 16) :]
+    error: Array = np.maximum(difference[-1], np.sqrt(np.mean(late**2, axis=0)))
+    return error
+
+
+def _tenfold(difference: Array, span: float) -> float:
+    """Return the time of tenfold growth from relative distances at equal times; infinity if not exponential."""
+    far = np.flatnonzero(difference > LINEAR_DISTANCE)
+    near = difference[1 : int(far[0]) if len(far) else len(difference)]
+    length = len(near) // QUARTERS
+    if length < 2:
+        return math.inf
+    means = [math.sqrt(float(np.mean(near[k * length : (k + 1) * length] ** 2))) for k in range(QUARTERS)]
+    if means[0] == 0.0:
+        return math.inf
+    gained = np.diff(np.log10(means))
+    if gained.min() < DECADES:
+        return math.inf
+    return float(span * length / (len(difference) - 1) / gained.mean())
+
 
 STEP_MARGIN = 10.0
 """Safety factor for the estimate of the local error, which is inaccurate for large steps."""

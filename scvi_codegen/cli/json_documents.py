@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.advice.significant_digits import Known
+from scvi_codegen.advice.tolerance_check import Known
 from scvi_codegen.cli.conservation import Balance, array_changes
 from scvi_codegen.cli.ensembles import EnsembleOutcome
 from scvi_codegen.cli.recording import RecordedOutcome

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from scvi_codegen.advice.significant_digits import SECOND_RUN, Known, known_digits
+from scvi_codegen.advice.tolerance_check import SECOND_RUN, Known, known_digits
 from scvi_codegen.cli.conservation import Balance, conserved_by_arrays, energy_report, momentum_report
 from scvi_codegen.cli.formatting import counted, duration, in_known_digits
 from scvi_codegen.cli.memory import check_memory, check_run_memory

@@ -22,9 +22,8 @@ from dataclasses import dataclass, replace
 
 import sympy
 
-from scvi_codegen.derivation.entries import entries
 from scvi_codegen.derivation.matrix_form import MatrixForm, matrix_form
-from scvi_codegen.derivation.notation import LARGEST_SHOWN, Equation, TableEntry, html, latex, text_lines
+from scvi_codegen.derivation.notation import LARGEST_SHOWN, Equation, TableEntry, entries, html, latex, text_lines
 from scvi_codegen.display.cards import card, listed, plain
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.derivatives import jacobian

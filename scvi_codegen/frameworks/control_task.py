@@ -1,4 +1,8 @@
-"""Optimal control problem as a nonlinear program: unknowns, constraints, cost and initial guess.
+"""Nonlinear program for IPOPT: named unknowns, their bounds, constraints and cost.
+
+Result of optimal control: a trajectory of the integrator, its inputs and their cost.
+
+Optimal control problem as a nonlinear program: unknowns, constraints, cost and initial guess.
 
 Unknowns are the states (q, p) between steps, the stages and inputs of each step, the velocities at both ends, and the
 duration. The program is a map of one step, so that CasADi differentiates a step and not the trajectory.
@@ -9,22 +13,139 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from scvi_codegen.errors import MethodError, StateError, closest
-from scvi_codegen.frameworks.casadi_ends import EndConditions
-from scvi_codegen.frameworks.casadi_step import casadi_step, straight
-from scvi_codegen.frameworks.controlled_trajectory import ControlledMotion
-from scvi_codegen.frameworks.nonlinear_program import NonlinearProgram
+from scvi_codegen.frameworks.casadi_step import EndConditions, casadi_step, straight
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.runtime.core.validation import Array
 
-__all__ = ["Conditions", "Task", "check_known", "interval"]
+if TYPE_CHECKING:
+    from scipy.interpolate import PPoly
+
+__all__ = ["Conditions", "ControlledMotion", "Task", "check_known", "interval"]
+
+
+QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False}
+"""Options that suppress the output of IPOPT."""
+
+
+@dataclass(frozen=True)
+class NonlinearProgram:
+    """Unknowns and constraints as symbols and expressions of CasADi, each a matrix.
+
+    Attributes:
+        ca: module ``casadi``.
+        unknowns: symbols by name.
+        limits: least and largest values of unknowns by name; other unknowns are unbounded.
+        constraints: expressions, each with least and largest value.
+        cost: expression to minimise.
+    """
+
+    ca: Any
+    unknowns: dict[str, Any]
+    limits: dict[str, tuple[Any, Any]]
+    constraints: list[tuple[Any, float, float]]
+    cost: Any
+
+    def solved(self, first: Mapping[str, Any], options: Mapping[str, Any]) -> tuple[Any, Mapping[str, Any]]:
+        """Solve by IPOPT from initial values by name; return the solution and the solver's statistics."""
+        program = {"x": self.x, "f": self.cost, "g": self.residual}
+        solver = self.ca.nlpsol("program", "ipopt", program, {**QUIET, **options})
+        low, high = (self._vector(self._limits(side)) for side in (0, 1))
+        least, largest = (self._spread(side) for side in (1, 2))
+        result = solver(x0=self._vector(first), lbx=low, ubx=high, lbg=least, ubg=largest)
+        return result, solver.stats()
+
+    def split(self, vector: Any) -> dict[str, Array]:
+        """Return the values of the unknowns by name, each in its shape."""
+        flat, result, begin = np.asarray(vector).ravel(), {}, 0
+        for name, each in self.unknowns.items():
+            result[name] = flat[begin : begin + each.numel()].reshape(each.shape, order="F")
+            begin += each.numel()
+        return result
+
+    @cached_property
+    def x(self) -> Any:
+        """Vector of all unknowns."""
+        return self.ca.veccat(*self.unknowns.values())
+
+    @cached_property
+    def residual(self) -> Any:
+        """Vector of all constraints."""
+        return self.ca.veccat(*(expression for expression, _, _ in self.constraints))
+
+    def _limits(self, side: int) -> dict[str, Any]:
+        return {name: self.limits.get(name, (-np.inf, np.inf))[side] for name in self.unknowns}
+
+    def _vector(self, values: Mapping[str, Any]) -> Array:
+        parts = [np.broadcast_to(values[name], each.shape).ravel("F") for name, each in self.unknowns.items()]
+        return np.concatenate(parts)
+
+    def _spread(self, side: int) -> Array:
+        return np.concatenate([np.full(each[0].numel(), each[side]) for each in self.constraints])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ControlledMotion:
+    """Trajectory of n steps with its inputs.
+
+    Attributes:
+        t, q, p: (n + 1,), (n + 1, m), (n + 1, m) times and states, those of the integrator with these inputs.
+        coefficients: (n, degree + 1) of each input by name, in Bernstein form, one row a step.
+        coordinates: names.
+        cost: minimum of the cost: the integral and the cost of the end.
+        costates: (n, 2 m) derivatives of the remaining cost with respect to q and p, at all times but the first.
+        iterations, status, solved: iterations of IPOPT, its return status, and True on success.
+        unknowns, equations: size of the nonlinear program; inequalities and end conditions count as equations.
+    """
+
+    t: Array
+    q: Array
+    p: Array
+    coefficients: dict[str, Array]
+    coordinates: tuple[str, ...]
+    cost: float
+    costates: Array
+    iterations: int
+    status: str
+    solved: bool
+    unknowns: int
+    equations: int
+
+    @property
+    def h(self) -> float:
+        """Step size."""
+        return float((self.t[-1] - self.t[0]) / (len(self.t) - 1))
+
+    @property
+    def inputs(self) -> dict[str, PPoly]:
+        """Inputs as functions of time, in the form that :meth:`Stepper.integrate` takes."""
+        from scipy.interpolate import BPoly, PPoly  # here: slow to import
+
+        return {
+            name: PPoly.from_bernstein_basis(BPoly(coefficients.T, self.t))
+            for name, coefficients in self.coefficients.items()
+        }
+
+    @property
+    def guess(self) -> dict[str, Any]:
+        """Positions, mean inputs of the steps and duration: an initial guess for a further problem."""
+        result: dict[str, Any] = dict(zip(self.coordinates, self.q.T, strict=True))
+        result |= {name: coefficients.mean(axis=1) for name, coefficients in self.coefficients.items()}
+        return {**result, "duration": float(self.t[-1] - self.t[0])}
+
+    def __repr__(self) -> str:
+        shown = np.format_float_scientific(self.cost, precision=6, trim="-") if self.cost else "0"
+        return (
+            f"<motion of {len(self.t) - 1} steps to t = {self.t[-1]:.6g}, cost {shown}, {self.iterations} iterations>"
+        )
+
 
 ZERO = 1e-16
 """Relative size below which components of the result are set to 0; constraints would otherwise be violated."""

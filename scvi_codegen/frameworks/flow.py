@@ -1,20 +1,33 @@
-"""Flow map, independent of the framework: a number of steps as a function of (q, p, parameters, t, h)."""
+"""Flow map, independent of the framework: a number of steps as a function of (q, p, parameters, t, h).
+
+Flow map as a function of the arrays of a framework.
+
+Flow map of many rows of numbers in compiled C, for frameworks that call it with arrays.
+"""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from functools import cached_property
+from typing import Any, Protocol, Self
+
+import numpy as np
 
 from scvi_codegen.errors import MissingLibraryError, StateError
+from scvi_codegen.native import building
+from scvi_codegen.native.binding import Binding
+from scvi_codegen.rendering.flow import with_flow_of_rows
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import check_inputs_given, parameter_index
+from scvi_codegen.validation.argument_types import checks_arguments
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["Flow", "imported"]
+__all__ = ["ArrayFlow", "Arrays", "Flow", "FlowOfRows", "imported"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,3 +116,93 @@ def imported(library: str, extra: str) -> Any:
         raise MissingLibraryError(
             f"this needs {library}, which is not installed: pip install 'scvi-codegen[{extra}]'"
         ) from error
+
+
+class Arrays(Protocol):
+    """Array operations of a framework that a flow needs."""
+
+    def binary64(self, value: Any, name: str) -> Any:
+        """Return an array in double precision; raise StateError for lower precision."""
+
+    def expanded(self, array: Any, shape: tuple[int, ...]) -> Any:
+        """Return the array broadcast to a shape."""
+
+    def joined(self, parts: Sequence[Any]) -> Any:
+        """Concatenate (.., n) arrays along the last axis."""
+
+
+class ArrayFlow(Flow):
+    """States of a trajectory as a differentiable function of a framework."""
+
+    @property
+    @abstractmethod
+    def _arrays(self) -> Arrays:
+        """Array operations of the framework."""
+
+    @abstractmethod
+    def _along(self, x: Any) -> Any:
+        """Return (.., saved, 2m) states of the flows from (.., n) arguments each."""
+
+    @checks_arguments(StateError)
+    def __call__(self, q: Any, p: Any, *, h: Any, t: Any = 0.0, parameters: Any = None) -> tuple[Any, Any]:
+        """Return the final state, or with ``save_every`` all saved states.
+
+        Args:
+            q, p: (.., m) initial positions and momenta. Leading axes are broadcast. States that violate the constraints
+                are not projected; the first step moves them onto the constraint manifold.
+            h: (..) step size.
+            t: (..) initial time.
+            parameters: by name, (..) each, others keep their defaults; or (.., k) in order.
+
+        Returns:
+            (q, p), (.., m) each; with ``save_every`` (.., n, m).
+
+        Raises:
+            StateError: for wrong shapes and names, and for anything but binary64.
+            StepFailedError: if a step fails; in JAX its own error, with the time of the step.
+        """
+        m, values = self.stepper.dimension, self.parameter_values(parameters)
+        count = len(self.stepper.parameters)
+        arguments = (
+            [self._number(value, "a parameter") for value in values]
+            if isinstance(values, list)
+            else [self._vector(values, count, "parameters")]
+        )
+        ends = [self._number(t, "t"), self._number(h, "h")]
+        result = self._along(self._concatenated(self._vector(q, m, "q"), self._vector(p, m, "p"), *arguments, *ends))
+        result = result if self.save_every else result[..., -1, :]
+        return result[..., :m], result[..., m:]
+
+    def _number(self, value: Any, name: str) -> Any:
+        """Return a number as an array (.., 1)."""
+        return self._arrays.binary64(value, name)[..., None]
+
+    def _vector(self, value: Any, length: int, name: str) -> Any:
+        array = self._arrays.binary64(value, name)
+        if tuple(array.shape[-1:]) != (length,):
+            raise StateError(f"{name} must have shape (.., {length}), not {tuple(array.shape)}")
+        return array
+
+    def _concatenated(self, *parts: Any) -> Any:
+        """Broadcast (.., n) arrays and concatenate them along the last axis."""
+        try:
+            batch = np.broadcast_shapes(*(tuple(part.shape[:-1]) for part in parts))
+        except ValueError as error:
+            raise StateError(f"the leading axes of q, p, parameters, t and h cannot be broadcast: {error}") from error
+        return self._arrays.joined([self._arrays.expanded(part, (*batch, part.shape[-1])) for part in parts])
+
+
+class FlowOfRows(Flow):
+    """Flow with its compiled C functions."""
+
+    @cached_property
+    def library(self) -> Binding:
+        """Values and derivatives, compiled on first use."""
+        source = with_flow_of_rows(self.derivatives)
+        return Binding(building.load(source, flags=self.stepper.flags), source.prefix)
+
+    @cached_property
+    def second_library(self) -> Binding:
+        """Values and derivatives up to second order, compiled on first use."""
+        source = with_flow_of_rows(self.second_derivatives, second=True)
+        return Binding(building.load(source, flags=self.stepper.flags), source.prefix)

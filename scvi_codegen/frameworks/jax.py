@@ -7,8 +7,7 @@ from functools import cached_property
 from typing import Any
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.frameworks.flow import imported
-from scvi_codegen.frameworks.flow_of_arrays import ArrayFlow, Arrays
+from scvi_codegen.frameworks.flow import ArrayFlow, Arrays, imported
 from scvi_codegen.native import building
 from scvi_codegen.rendering.flow import XLA_PARTS, XLA_SECOND_ORDER, with_xla_flow
 from scvi_codegen.rendering.source import Source

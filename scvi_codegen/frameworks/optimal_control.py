@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.errors import ControlError, MethodError, StateError
-from scvi_codegen.frameworks.casadi_ends import own_parameters
-from scvi_codegen.frameworks.control_task import Conditions, Task, check_known, interval
-from scvi_codegen.frameworks.controlled_trajectory import ControlledMotion
+from scvi_codegen.frameworks.casadi_step import own_parameters
+from scvi_codegen.frameworks.control_task import Conditions, ControlledMotion, Task, check_known, interval
 from scvi_codegen.frameworks.flow import imported
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method

@@ -6,9 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.frameworks.flow import imported
-from scvi_codegen.frameworks.flow_of_arrays import ArrayFlow, Arrays
-from scvi_codegen.frameworks.flow_of_rows import FlowOfRows
+from scvi_codegen.frameworks.flow import ArrayFlow, Arrays, FlowOfRows, imported
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.validation.argument_types import checks_arguments, of
 

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.frameworks.flow_of_rows import FlowOfRows
+from scvi_codegen.frameworks.flow import FlowOfRows
 from scvi_codegen.native.options import step_failure
 
 __all__ = ["StatesAlong"]

@@ -21,8 +21,7 @@ from xml.etree import ElementTree
 
 from markupsafe import Markup
 
-from scvi_codegen.display.page.environment import page_template, style_sheet
-from scvi_codegen.display.page.typesetting import SPACE
+from scvi_codegen.display.page.environment import SPACE, page_template, style_sheet
 from scvi_codegen.reproduce.laboratory.experiment import Result, TableBlock, Verdict
 from scvi_codegen.reproduce.writing import draw
 from scvi_codegen.version import __version__

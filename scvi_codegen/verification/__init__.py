@@ -35,9 +35,8 @@ from scvi_codegen.verification.certificate import Certificate, Check, Outcome, i
 from scvi_codegen.verification.convergence import convergence_checks
 from scvi_codegen.verification.derivatives import derivative_checks
 from scvi_codegen.verification.identities import identity_checks
-from scvi_codegen.verification.predictors import predictor_checks
 from scvi_codegen.verification.roundoff import roundoff_checks
-from scvi_codegen.verification.stepping import step_checks
+from scvi_codegen.verification.stepping import predictor_checks, step_checks
 from scvi_codegen.verification.structure import largest_step, structure_checks
 from scvi_codegen.verification.system_under_test import State, SystemUnderTest
 from scvi_codegen.verification.time_transformation_derivatives import time_transformation_derivative_checks

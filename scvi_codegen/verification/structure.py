@@ -15,8 +15,7 @@ from scvi_codegen.methods.discretise import is_conformally_symplectic, is_symple
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, checked, information
-from scvi_codegen.verification.linearisation import Jacobian
-from scvi_codegen.verification.system_under_test import EPSILON, State, SystemUnderTest
+from scvi_codegen.verification.system_under_test import EPSILON, Jacobian, State, SystemUnderTest
 
 __all__ = ["ROUNDINGS", "largest_step", "momentum_error", "structure_checks"]
 

@@ -11,8 +11,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 import scvi_codegen as sc
-from scvi_codegen.advice.significant_digits import known_digits
-from scvi_codegen.advice.tolerance_check import missed_tolerance
+from scvi_codegen.advice.tolerance_check import known_digits, missed_tolerance
 from scvi_codegen.cli import main
 from scvi_codegen.cli.formatting import in_known_digits
 

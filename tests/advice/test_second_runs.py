@@ -11,8 +11,7 @@ import pytest
 import scvi_codegen as sc
 from scvi_codegen.advice import tolerance_check
 from scvi_codegen.advice.advice import advise
-from scvi_codegen.advice.significant_digits import Known, _final_error, _tenfold, known_digits
-from scvi_codegen.advice.tolerance_check import missed_tolerance
+from scvi_codegen.advice.tolerance_check import Known, _final_error, _tenfold, known_digits, missed_tolerance
 
 T, SPAN = 2.5, 7.5
 STIFFER = {"k": 9.0, "a": 0.75}

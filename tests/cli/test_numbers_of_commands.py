@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from scipy.optimize import fsolve
 
 import scvi_codegen as sc
-from scvi_codegen.advice.significant_digits import Known
+from scvi_codegen.advice.tolerance_check import Known
 from scvi_codegen.cli import main
 from scvi_codegen.cli.running import final_state
 from scvi_codegen.methods import as_method

@@ -6,7 +6,7 @@ import pytest
 import sympy
 
 import scvi_codegen as sc
-from scvi_codegen.derivation.entries import table_entries
+from scvi_codegen.derivation.notation import table_entries
 from scvi_codegen.derivation.page.curve import curve_section, tables_section
 from scvi_codegen.derivation.page.document import paper_equations
 from scvi_codegen.display.page.blocks import Formula, TableBlock

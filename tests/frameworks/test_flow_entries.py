@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 from pumped_leapfrog import EVERY, ROWS, STEP_INPUTS, STEPS, hessian, partials, states, stepper, weights
 
-from scvi_codegen.frameworks.flow_of_rows import FlowOfRows
+from scvi_codegen.frameworks.flow import FlowOfRows
 from scvi_codegen.native import building
 from scvi_codegen.rendering.flow import casadi_name, with_casadi_flow, with_xla_flow
 

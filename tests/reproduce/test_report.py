@@ -23,7 +23,7 @@ from toy_experiments import EXPERIMENTS, GOOD
 
 from scvi_codegen.cli import main
 from scvi_codegen.cli.commands.reproduce import Reproduction, experiments_table, experiments_titles
-from scvi_codegen.display.page.typesetting import cell, prose
+from scvi_codegen.display.page.environment import cell, prose
 from scvi_codegen.errors import StateError
 from scvi_codegen.reproduce.laboratory.experiment import Picture, Result
 from scvi_codegen.reproduce.report import DARK_PAPER, color_variables, contrast, inline_svg, report_html, tally

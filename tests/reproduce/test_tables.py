@@ -54,13 +54,13 @@ def test_order_and_symplecticity_checks_are_exact_and_can_fail(s):
 
 
 def test_corrected_table_3_is_typeset():
-    formulas = [block for block in tableaux.table_3({}).body if hasattr(block, "right")]
+    formulas = [block for block in EXPERIMENTS["table-3"].result({}).body if hasattr(block, "right")]
     A = next(block.right for block in formulas if str(block.left) == "A")
     assert A[2, 3] == sympy.Symbol("w_1") + sympy.Symbol("w__'_3") - sympy.Symbol("w_4")
 
 
 def test_table_4_marks_are_computed_from_the_coefficients():
-    rows = {(family, stages): row for family, stages, *row in properties.table_4({}).tables[0].rows}
+    rows = {(family, stages): row for family, stages, *row in EXPERIMENTS["table-4"].result({}).tables[0].rows}
     assert rows["Gauss", 5] == [10, "yes", "yes", "yes", "yes"]
     assert rows["Chebyshev-Gauss", 1] == [2, "yes", "yes", "yes", "yes"]
     assert rows["Chebyshev-Lobatto", 5] == [6, "yes", "yes", "no", "no"]
@@ -163,7 +163,7 @@ def test_diverging_picard_iteration_is_reported():
 
 
 def test_table_of_contents_lists_exactly_the_steps():
-    for result in (outlines.table_5({}), outlines.table_10({})):
+    for result in (EXPERIMENTS["table-5"].result({}), EXPERIMENTS["table-10"].result({})):
         assert result.verdict is Verdict.HOLDS
         assert "newton(step, data" in result.body[1].text
     step = outlines.Step(number=1, text="", counterpart="", evidence={"f": ("g(",), "h": ("g(",)})

@@ -25,7 +25,7 @@ from scipy.optimize import brentq
 
 import scvi_codegen as sc
 from scvi_codegen.errors import StepFailedError
-from scvi_codegen.frameworks.flow_of_rows import FlowOfRows
+from scvi_codegen.frameworks.flow import FlowOfRows
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.results.recording import load_run, record_run, resume_run
 from scvi_codegen.runtime.run import memory, run_loop

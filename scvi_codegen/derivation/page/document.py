@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from scvi_codegen.derivation.entries import table_entries
+from scvi_codegen.derivation.notation import table_entries
 from scvi_codegen.derivation.page.curve import curve_section, tables_section
-from scvi_codegen.derivation.page.equations_of_motion import motion_section, system_section
-from scvi_codegen.derivation.page.functions import functions_section
 from scvi_codegen.derivation.page.jacobian import Start, jacobian_section
-from scvi_codegen.derivation.page.kernels import kernels_section, operations_section
+from scvi_codegen.derivation.page.kernels import functions_section, kernels_section, operations_section
 from scvi_codegen.derivation.page.stage_equations import (
     component_equations,
     component_equations_section,
     idel_section,
+    motion_section,
     stage_section,
+    system_section,
 )
 from scvi_codegen.display.page.blocks import Section
 from scvi_codegen.display.page.environment import page_template, style_sheet

@@ -1,22 +1,118 @@
-"""Jacobian of the stage equations: sparsity pattern, and values at the initial guess of a step."""
+"""Sparsity pattern of the Jacobian, from the tables and the derivatives of kernels.
+
+Jacobian of the stage equations: sparsity pattern, and values at the initial guess of a step.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
+from itertools import accumulate
 
 import sympy
 from sympy import Symbol
 
 from scvi_codegen.derivation.equations import StepEquations
 from scvi_codegen.derivation.page.elision import formulas
-from scvi_codegen.derivation.page.sparsity import Pattern, jacobian_pattern, pattern_drawing
-from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section
+from scvi_codegen.display.page.blocks import Content, Drawing, Formula, Paragraph, Section
+from scvi_codegen.formulas.derivatives import jacobian
 from scvi_codegen.ir.program import Program
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import StageSystem
 
-__all__ = ["Start", "entry_numbers", "jacobian_section"]
+__all__ = ["Start", "entry_numbers", "jacobian_pattern", "jacobian_section"]
+
+
+SIDE = 320
+"""Width of the picture in pixels."""
+LARGEST_DRAWN = 400
+"""Largest number of rows of a matrix of which every entry is drawn."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pattern:
+    """Sparsity pattern of a square matrix of ``size`` rows: by row, the ascending columns of nonzero entries."""
+
+    size: int
+    rows: tuple[tuple[int, ...], ...]
+
+    @property
+    def entries(self) -> int:
+        """Number of nonzero entries."""
+        return sum(map(len, self.rows))
+
+
+def jacobian_pattern(stages: StageSystem, dimension: int) -> Pattern:
+    """Return the pattern of the residuals with respect to the unknowns, in the order of the equations, by blocks."""
+    offsets = [0, *accumulate(stages.block_sizes(dimension))]
+    lines = [0, *accumulate(stages.row_sizes(dimension))]
+    columns: list[set[int]] = [set() for _ in range(lines[len(stages.rows)])]
+    for group in stages.stage_groups:
+        for scatter in group.scatters:
+            for gather in group.gathers:
+                pairs = jacobian(scatter.results, gather.arguments)
+                for r, b in _coupled_pairs(scatter.table.entries, gather.table.entries, len(stages.rows)):
+                    for i, j in pairs:
+                        columns[lines[r] + i].add(offsets[b] + j)
+    return Pattern(len(columns), tuple(tuple(sorted(row)) for row in columns))
+
+
+def _coupled_pairs(
+    rows: Iterable[tuple[object, ...]], blocks: Iterable[tuple[object, ...]], count: int
+) -> set[tuple[int, int]]:
+    """Return the pairs of rows and blocks that have a point in common."""
+    return {
+        (r, b - 1)
+        for row, block in zip(rows, blocks, strict=True)
+        for r in range(count)
+        if row[r] != 0
+        for b in range(1, len(block))
+        if block[b] != 0
+    }
+
+
+def pattern_drawing(pattern: Pattern, titles: Mapping[tuple[int, int], str] | None = None) -> Drawing | None:
+    """Return a picture of the matrix, ``None`` if it is too large; ``titles`` are tooltips."""
+    if pattern.size > LARGEST_DRAWN:
+        return None
+    cell = SIDE / pattern.size
+    runs = [
+        f"M{first * cell:.2f} {r * cell:.2f}h{length * cell:.2f}v{cell:.2f}h{-length * cell:.2f}z"
+        for r, row in enumerate(pattern.rows)
+        for first, length in _runs(row)
+    ]
+    share = 100 * pattern.entries / pattern.size**2
+    caption = (
+        f"The Jacobian: {pattern.size} rows and columns, {pattern.entries} entries that are not zero "
+        f"({share:.0f} per cent)."
+    )
+    svg = (
+        f'<svg viewBox="-1 -1 {SIDE + 2} {SIDE + 2}" role="img" aria-label="{caption}" '
+        f'style="--width: {SIDE}px; min-width: 0">'
+        f'<path d="{"".join(runs)}" fill="var(--link)"/>{"".join(_tooltips(titles or {}, cell))}'
+        f'<path d="M0 0H{SIDE}V{SIDE}H0z" fill="none" stroke="currentColor" opacity="0.5"/></svg>'
+    )
+    return Drawing(svg, caption)
+
+
+def _tooltips(titles: Mapping[tuple[int, int], str], cell: float) -> Iterator[str]:
+    """Yield the tooltips of entries."""
+    for (i, j), title in titles.items():
+        geometry = f'x="{j * cell:.2f}" y="{i * cell:.2f}" width="{cell:.2f}" height="{cell:.2f}"'
+        yield f'<rect class="entry" {geometry}><title>{escape(title)}</title></rect>'
+
+
+def _runs(columns: tuple[int, ...]) -> list[tuple[int, int]]:
+    """Return first column and length of every run of neighbours."""
+    runs: list[tuple[int, int]] = []
+    for column in columns:
+        if runs and sum(runs[-1]) == column:
+            runs[-1] = (runs[-1][0], runs[-1][1] + 1)
+        else:
+            runs.append((column, 1))
+    return runs
+
 
 LARGEST_SHOWN = 3
 """Largest number of rows of a Jacobian whose entries are typeset."""
