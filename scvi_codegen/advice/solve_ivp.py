@@ -139,27 +139,28 @@ def solve_ivp(
     q, p0 = _halves(y0) if velocity is None else (y0, None)
     requested_times = None if t_eval is None else times_of_run(t_eval, start, end)
     if error is not None:
-        others = {
-            "h": h,
-            "tolerance": tolerance,
-            "rtol": rtol,
-            "time_transformation": time_transformation,
-            "controller": controller,
-        }
-        checked_error(error, others)
+        others = {"time_transformation": time_transformation, "controller": controller}
+        checked_error(error, {"h": h, "tolerance": tolerance, "rtol": rtol, **others})
     request = _StepRequest(h, rtol, tolerance, error)
     stepper, uncompiled = _stepper(system, method, (time_transformation, controller), request)
     p = stepper._initial_momenta(q, p0, velocity, start, parameters)
     along: dict[str, Any] = {"t": start, "parameters": parameters, "options": options}
     plan = _plan(stepper, uncompiled, request, (q, p, end - start), along)
-    settings = {
-        **_steps(stepper, start, end, plan),
-        **along,
-        "events": events,
-        "t_eval": None if dense_output else requested_times,
-    }
+    settings = {**_steps(stepper, start, end, plan), **along, "events": events}
+    return _integrated(stepper, plan, (q, p), settings, requested_times, dense_output)
+
+
+def _integrated(
+    stepper: Stepper,
+    plan: _StepChoice,
+    initial: tuple[ArrayLike, ArrayLike],
+    settings: dict[str, Any],
+    requested_times: Array | None,
+    dense_output: bool,
+) -> OdeResult:
+    """Return the result of a run; one that fails ends before the step that failed."""
     try:
-        trajectory = stepper.integrate(q, p, **settings)
+        trajectory = stepper.integrate(*initial, **settings, t_eval=None if dense_output else requested_times)
         status, message = _outcome(trajectory, plan)
     except StepFailedError as error:
         trajectory, status, message = Trajectory.before(error), FAILED, str(error)

@@ -56,20 +56,20 @@ class CheckResult:
     Attributes:
         name: name of the check.
         status: ``"ok"``, ``"lacks"`` (an optional item is missing) or ``"fails"`` (a required item is missing).
-        found: description of what is installed.
+        result: description of what is installed.
         remedy: what to do if the status is not ``"ok"``, else ``""``.
     """
 
     name: str
     status: str
-    found: str
+    result: str
     remedy: str = ""
 
 
 def run_checks() -> Iterator[CheckResult]:
     """Yield the results of all checks one by one; the trial run, which compiles a stepper, takes some seconds."""
-    yield CheckResult(name="python", status=OK, found=f"{platform.python_version()}, {platform.platform()}")
-    yield CheckResult(name="cores", status=OK, found=_cores())
+    yield CheckResult(name="python", status=OK, result=f"{platform.python_version()}, {platform.platform()}")
+    yield CheckResult(name="cores", status=OK, result=_cores())
     yield _packages("", "libraries")
     yield from _compilation()
     yield _cache()
@@ -117,11 +117,11 @@ def _packages(extra: str, name: str) -> CheckResult:
         if _numbers(installed) < _numbers(wanted["least"]):
             absent.append(f"{wanted['name']} >= {wanted['least']}")
     if not absent:
-        return CheckResult(name=name, status=OK, found=", ".join(present))
+        return CheckResult(name=name, status=OK, result=", ".join(present))
     return CheckResult(
         name=name,
         status=MISSING if extra else FAILED,
-        found=", ".join(present) or "none installed",
+        result=", ".join(present) or "none installed",
         remedy=f"missing {', '.join(absent)}: pip install '{PACKAGE}{f'[{extra}]' if extra else ''}'",
     )
 
@@ -137,17 +137,17 @@ def _compilation() -> Iterator[CheckResult]:
         command = find_compiler()
         title = compiler_title()
     except (BuildError, OSError, subprocess.TimeoutExpired) as error:
-        yield CheckResult(name="compiler", status=FAILED, found="none", remedy=str(error))
+        yield CheckResult(name="compiler", status=FAILED, result="none", remedy=str(error))
         return
     why = (
         "" if not from_wheel(command) or os.environ.get("CC") else " (extra compiler: the PATH has no cc, gcc or clang)"
     )
-    yield CheckResult(name="compiler", status=OK, found=f"{' '.join(command)}: {title}{why}")
+    yield CheckResult(name="compiler", status=OK, result=f"{' '.join(command)}: {title}{why}")
     own_flags = os.environ.get(FLAGS_VARIABLE, "")
     yield CheckResult(
         name="flags",
         status=OK,
-        found=" ".join([*TUNED_FLAGS, *([own_flags, f"({FLAGS_VARIABLE})"] if own_flags else [])]),
+        result=" ".join([*TUNED_FLAGS, *([own_flags, f"({FLAGS_VARIABLE})"] if own_flags else [])]),
     )
     with tempfile.TemporaryDirectory(prefix="scvi-codegen-doctor-", ignore_cleanup_errors=True) as folder:
         trial = _trial(Path(folder))
@@ -172,7 +172,7 @@ def _trial(folder: Path) -> CheckResult:
             f"its relative energy error is {error:.0e}: compiler or flags violate IEEE 754 arithmetic"
         )
     took = f"compiled and run in {time.perf_counter() - began:.1f} s"
-    return CheckResult(name="trial", status=OK, found=f"a pendulum, {took}, relative energy error {error:.0e}")
+    return CheckResult(name="trial", status=OK, result=f"a pendulum, {took}, relative energy error {error:.0e}")
 
 
 def _trial_failure(why: str) -> CheckResult:
@@ -180,7 +180,7 @@ def _trial_failure(why: str) -> CheckResult:
     return CheckResult(
         name="trial",
         status=FAILED,
-        found="a pendulum could not be compiled and run",
+        result="a pendulum could not be compiled and run",
         remedy="\n".join([*last, f"use another compiler (CC=gcc, CC=clang), or check {FLAGS_VARIABLE}"]),
     )
 
@@ -196,11 +196,11 @@ def _exit_reason(status: int) -> str:
 def _vectors(folder: Path) -> CheckResult:
     """Check if the compiled library calls glibc's vector functions."""
     if any(VECTOR_CALL in library.read_bytes() for library in folder.glob("_scvi_*/*.so")):
-        return CheckResult(name="vectors", status=OK, found="libmvec: vectorised sines and exponentials")
+        return CheckResult(name="vectors", status=OK, result="libmvec: vectorised sines and exponentials")
     return CheckResult(
         name="vectors",
         status=MISSING,
-        found="no libmvec: scalar sines and exponentials",
+        result="no libmvec: scalar sines and exponentials",
         remedy="it requires glibc 2.22 or later on x86-64 and -march=native among the flags "
         "(Debian, Ubuntu: apt install libc6-dev)",
     )
@@ -213,11 +213,11 @@ def _cache() -> CheckResult:
     try:
         cache_text = str(cache_info()).replace("\n", ": ")
     except BuildError as error:
-        return CheckResult(name="cache", status=MISSING, found=str(folder), remedy=str(error))
+        return CheckResult(name="cache", status=MISSING, result=str(folder), remedy=str(error))
     if exposed(folder):
         remedy = f"the cache is not used, because {remedy_of(folder)}"
-        return CheckResult(name="cache", status=MISSING, found=cache_text, remedy=remedy)
+        return CheckResult(name="cache", status=MISSING, result=cache_text, remedy=remedy)
     if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
         remedy = f"the folder is not writable, nothing is cached: set {CACHE_VARIABLE} to another one"
-        return CheckResult(name="cache", status=MISSING, found=cache_text, remedy=remedy)
-    return CheckResult(name="cache", status=OK, found=cache_text)
+        return CheckResult(name="cache", status=MISSING, result=cache_text, remedy=remedy)
+    return CheckResult(name="cache", status=OK, result=cache_text)

@@ -33,13 +33,12 @@ from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.validation.argument_types import MAPPING, TEXT, TEXTS, checks_arguments, of
 from scvi_codegen.verification.certificate import Certificate, Check, Outcome, issued
 from scvi_codegen.verification.convergence import convergence_checks
-from scvi_codegen.verification.derivatives import derivative_checks
+from scvi_codegen.verification.derivatives import derivative_checks, time_transformation_derivative_checks
 from scvi_codegen.verification.identities import identity_checks
 from scvi_codegen.verification.roundoff import roundoff_checks
 from scvi_codegen.verification.stepping import predictor_checks, step_checks
 from scvi_codegen.verification.structure import largest_step, structure_checks
 from scvi_codegen.verification.system_under_test import State, SystemUnderTest
-from scvi_codegen.verification.time_transformation_derivatives import time_transformation_derivative_checks
 from scvi_codegen.verification.variable_steps import VariableSteps, at_fixed_energy, variable_step_checks
 
 __all__ = ["Certificate", "Check", "Outcome", "verify"]
@@ -113,12 +112,26 @@ def verify(
                 f"{name} is for arrays of run-time sizes: give p, and parameters as defaults of the system"
             )
     assert not isinstance(stepper, ArrayStepper)
-    began = time.perf_counter()
-    method = as_method(method, system)
     t, h = checked_number(t, "the time t"), None if h is None else checked_step(h)
+    began, method = time.perf_counter(), as_method(method, system)
     flags = tuple(flags if stepper is None else stepper.flags)
     stepper = stepper or compile_stepper(system, method, solver=solver, flags=flags)
-    start = _given(system, stepper, q, p, h, t)
+    start = _initial_state(system, stepper, q, p, h, t)
+    return _certificate(system, method, stepper, start, began, solver=solver, tolerance=tolerance)
+
+
+def _certificate(
+    system: MechanicalSystem,
+    method: Method,
+    stepper: Stepper,
+    start: State,
+    began: float,
+    *,
+    solver: str,
+    tolerance: float | None,
+) -> Certificate:
+    """Return the certificate of a stepper, measured at a state."""
+    flags = stepper.flags
     steps, single = stepper, at_fixed_energy(system, stepper.energy(start.q, start.p, start.t))
     if single is not system or stepper.interface.time_transformation:
         steps = compile_stepper(single, method, solver=solver, flags=flags)
@@ -186,18 +199,18 @@ def _newton(
     return compile_stepper(system, method, solver="newton", flags=flags)
 
 
-def _given(system: MechanicalSystem, stepper: Stepper, q: Any, p: Any, h: float | None, t: float) -> State:
+def _initial_state(system: MechanicalSystem, stepper: Stepper, q: Any, p: Any, h: float | None, t: float) -> State:
     if (q is None) != (p is None):
         raise StateError("only one of q and p was passed: give both, or neither")
     if q is None or p is None:
-        return _found(system, stepper, h, t)
+        return _random_state(system, stepper, h, t)
     position, momentum = checked_vector(stepper.interface, q, "q"), checked_vector(stepper.interface, p, "p")
     if system.constraints:
         position, momentum = stepper.project(position, momentum, t=t)
     return State(position, momentum, t, h if h else _step(stepper, position, momentum, t))
 
 
-def _found(system: MechanicalSystem, stepper: Stepper, h: float | None, t: float) -> State:
+def _random_state(system: MechanicalSystem, stepper: Stepper, h: float | None, t: float) -> State:
     """Return a random state of size 1 at which steps succeed and the energy is finite."""
     for seed in SEEDS:
         generator = np.random.default_rng(seed)

@@ -1,79 +1,154 @@
-"""Checks of the derivatives of a compiled step: Jacobian, its transpose, and second derivatives."""
+"""Checks of the derivatives of a compiled step: Jacobian, its transpose, and second derivatives.
+
+A step in transformed time, dt = g dtau, has its duration as a further result, and the energy as a further parameter.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import MethodError
+from scvi_codegen.exact.solution import exact_motion
+from scvi_codegen.exact.step import compiled_equations
+from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
-from scvi_codegen.tables.precision import mp
+from scvi_codegen.tables.precision import Number, mp
 from scvi_codegen.verification.certificate import Check, Finding, checked
 from scvi_codegen.verification.system_under_test import State, SystemUnderTest
+from scvi_codegen.verification.variable_steps import VariableSteps
 
-__all__ = ["derivative_checks"]
+__all__ = ["derivative_checks", "time_transformation_derivative_checks"]
 
 Array = NDArray[np.float64]
 
 BOUND = 1e-10
 """Bound on relative differences of directional derivatives, and of products relative to their largest terms."""
+JACOBIAN_ROUNDOFF = 1e-12
+"""Bound on the defect of J^T Omega J = Omega: round-off of an analytic derivative."""
 WIDTH = mp.mpf(10) ** -15
 """Relative perturbation of the arguments for differences in 60 digits."""
 MAX_HESSIAN_COORDINATES = 4
 """Largest number of coordinates for which second derivatives are compiled; it takes long for more."""
 
 
+@dataclass(frozen=True)
+class _Map:
+    """Step as a function of its arguments (q, p, parameters, t, h), at a state: compiled, and in 60 digits.
+
+    Attributes:
+        stepper: stepper with derivatives.
+        state: state and step size.
+        parameters: values of all parameters in order.
+        scales: sizes of the results.
+        outputs: indices of the results among the arguments.
+        end: results in 60 digits for arguments.
+    """
+
+    stepper: Stepper
+    state: State
+    parameters: Array
+    scales: Array
+    outputs: NDArray[np.int_]
+    end: Callable[[list[Number]], Array]
+
+    def direction(self, phase: float = 1.0) -> Array:
+        """Return a direction in which all arguments change, each scaled with its size."""
+        values, m = self.parameters, len(self.state.q)
+        h = self.state.h
+        sizes = np.concatenate([self.scales[: 2 * m], np.where(values, values, 1.0), [h, h]])
+        direction: Array = sizes * (1.5 + np.sin(phase + 1.7 * np.arange(len(sizes))))
+        return direction
+
+    def propagated(self, vector: Array, *, back: bool) -> Array:
+        """Return J v of the compiled Jacobian J, or J^T v."""
+        vectors = np.zeros((2, 1, len(vector)))
+        vectors[int(back)] = vector
+        self.stepper._propagate(_starts(self.state), vectors, self.parameters, None, transpose=back)
+        carried: Array = vectors[int(not back), 0]
+        return carried
+
+    def moved_end(self, change: Array) -> Array:
+        """Return the results for perturbed arguments, in 60 digits."""
+        return self.end((self.arguments + change).tolist())
+
+    @property
+    def arguments(self) -> Array:
+        """Arguments in 60 digits."""
+        values = (*self.state.z, *self.parameters, self.state.t, self.state.h)
+        return np.array([mp.mpf(float(x)) for x in values], dtype=object)
+
+    def derivative_error(self) -> float:
+        """Return the relative error of the derivative along :meth:`direction`, compared with differences."""
+        direction = self.direction()
+        result = self.propagated(direction, back=False)[self.outputs]
+        ends = [self.moved_end(direction * (sign * WIDTH)) for sign in (1, -1)]
+        exact = ((ends[0] - ends[1]) / (2 * WIDTH)).astype(float)
+        return float(np.abs((result - exact) / self.scales).max() / np.abs(exact / self.scales).max())
+
+    def transpose_error(self) -> float:
+        """Return the defect (J v, w) - (v, J^T w), where w weighs all components of the end alike."""
+        v = self.direction()
+        w = np.cos(2.0 + np.arange(len(v))) / np.abs(v)
+        forward, back = (self.propagated(vector, back=which) for vector, which in ((v, False), (w, True)))
+        size = max(np.abs(forward * w).max(), np.abs(v * back).max())
+        return float(abs(forward @ w - v @ back) / size)
+
+
+def _starts(state: State) -> Starts:
+    return Starts.chain(state.q, state.p, np.array([state.t]), np.array([state.h]))
+
+
+def _map_of(tested: SystemUnderTest, stepper: Stepper) -> _Map:
+    """Return the step of a stepper from the first state."""
+    state, m = tested.states[0], tested.system.dimension
+
+    def end(arguments: list[Number]) -> Array:
+        step = tested.derived().with_parameters(arguments[2 * m : -2])
+        result = step(arguments[:m], arguments[m : 2 * m], arguments[-1], arguments[-2])
+        return np.array([*result.q, *result.p], dtype=object)
+
+    values = np.array(list(tested.parameters.values()))
+    return _Map(stepper, state, values, tested.scales(state), np.arange(2 * m), end)
+
+
+def _map_in_tau(runs_tested: VariableSteps) -> _Map:
+    """Return the step of tau from the first state at its energy; its results include the time."""
+    tested, m = runs_tested.tested, runs_tested.system.dimension
+    state = tested.states[0]
+
+    def end(arguments: list[Number]) -> Array:
+        step = compiled_equations(runs_tested.transformed, tested.method).with_parameters(arguments[2 * m : -2])
+        q, p, h = arguments[:m], arguments[m : 2 * m], arguments[-1]
+        result = step(q, p, h)
+        return np.array([*result.q, *result.p, arguments[-2] + step.duration(result, q, p, h)], dtype=object)
+
+    values, scales = np.array(list(runs_tested.at_energy(state).values())), np.append(tested.scales(state), state.h)
+    return _Map(runs_tested.stepper, state, values, scales, np.asarray(runs_tested.stepper._output_indices), end)
+
+
 def derivative_checks(tested: SystemUnderTest) -> Iterator[Check]:
     """Yield the checks along one direction in which all arguments change."""
     statement = "derivatives with respect to state, parameters, t and h are those of the equations (60 digits)"
-    yield from checked("derivatives", statement, partial(_derivative, tested))
-    yield from checked("adjoint", "VJP is the transpose of JVP", partial(_transpose, tested))
+    yield from checked("derivatives", statement, partial(_largest, tested, _Map.derivative_error))
+    yield from checked("adjoint", "VJP is the transpose of JVP", partial(_largest, tested, _Map.transpose_error))
     statement = "second derivatives of a function of the end are those of the equations (differences, 60 digits)"
     yield from checked("second derivatives", statement, partial(_second, tested))
     yield from checked("Hessian", "the Hessian is symmetric", partial(_symmetry, tested))
 
 
-def _derivative(tested: SystemUnderTest) -> Finding | None:
-    """Compare the directional derivative of the end state with differences of the exact step."""
+def _largest(tested: SystemUnderTest, error: Callable[[_Map], float]) -> Finding | None:
+    """Return the largest error of the stepper under test and the one with Newton's method alone."""
     if not _differentiable(tested):
         return None
-    state = tested.states[0]
-    scales, direction = tested.scales(state), _direction(tested, state)
-    exact, m = _by_differences(tested, state, direction), len(state.q)
-    difference = 0.0
-    for stepper in _steppers(tested):
-        result = _propagated(tested, stepper, state, direction, back=False)[: len(scales)]
-        difference = max(
-            difference, *(np.abs((result - exact) / scales)[part].max() for part in (slice(m), slice(m, None)))
-        )
-    return Finding(float(difference / np.abs(exact / scales).max()), BOUND, "relative, along one direction")
-
-
-def _transpose(tested: SystemUnderTest) -> Finding | None:
-    """Return the defect (J v, w) - (v, J^T w), where w weighs all components of the end alike."""
-    if not _differentiable(tested):
-        return None
-    state = tested.states[0]
-    v = _direction(tested, state)
-    w = np.cos(2.0 + np.arange(len(v))) / np.abs(v)
-    difference = 0.0
-    for stepper in _steppers(tested):
-        forward, back = (
-            _propagated(tested, stepper, state, vector, back=which) for vector, which in ((v, False), (w, True))
-        )
-        size = max(np.abs(forward * w).max(), np.abs(v * back).max())
-        difference = max(difference, float(abs(forward @ w - v @ back) / size))
-    return Finding(difference, BOUND, "relative, along one direction")
-
-
-def _steppers(tested: SystemUnderTest) -> list[Stepper]:
-    """Return the stepper under test and the one with Newton's method alone, which factorises the Jacobian."""
     others = [tested.newton] if tested.newton and tested.newton is not tested.stepper else []
-    return [tested.stepper, *others]
+    errors = [error(_map_of(tested, stepper)) for stepper in (tested.stepper, *others)]
+    return Finding(max(errors), BOUND, "relative, along one direction")
 
 
 def _differentiable(tested: SystemUnderTest) -> bool:
@@ -88,10 +163,9 @@ def _second(tested: SystemUnderTest) -> Finding | None:
     """Compare the second derivative along two directions with differences of the exact step."""
     if not _has_second_derivatives(tested):
         return None
-    state = tested.states[0]
-    u, v = _direction(tested, state), _direction(tested, state, 2.3)
-    hessian = _hessian(tested, state)
-    exact = _second_derivative_by_differences(tested, state, u, v)
+    step = _map_of(tested, tested.stepper)
+    u, v, hessian = step.direction(), step.direction(2.3), _hessian(step)
+    exact = _second_derivative_by_differences(step, u, v)
     size = np.abs(u) @ np.abs(hessian) @ np.abs(v)
     return Finding(float(abs(u @ hessian @ v - exact) / size) if size else 0.0, BOUND, "relative, along two directions")
 
@@ -100,9 +174,9 @@ def _symmetry(tested: SystemUnderTest) -> Finding | None:
     """Return the largest asymmetry of the Hessian relative to its largest entry, in scaled arguments."""
     if not _has_second_derivatives(tested):
         return None
-    state = tested.states[0]
-    sizes = np.abs(_direction(tested, state))
-    hessian = _hessian(tested, state) * np.outer(sizes, sizes)
+    step = _map_of(tested, tested.stepper)
+    sizes = np.abs(step.direction())
+    hessian = _hessian(step) * np.outer(sizes, sizes)
     return Finding(
         float(np.abs(hessian - hessian.T).max() / (np.abs(hessian).max() or 1.0)), BOUND, "relative, all entries"
     )
@@ -119,64 +193,71 @@ def _has_second_derivatives(tested: SystemUnderTest) -> bool:
     return True
 
 
-def _weights(tested: SystemUnderTest, state: State) -> Array:
+def _weights(step: _Map) -> Array:
     """Return (2m,) weights of a scalar function of the end state, to which all components contribute alike."""
-    scales = tested.scales(state)
-    weights: Array = (1.3 + np.cos(2.0 + np.arange(len(scales)))) / scales
+    weights: Array = (1.3 + np.cos(2.0 + np.arange(len(step.scales)))) / step.scales
     return weights
 
 
-def _hessian(tested: SystemUnderTest, state: State) -> Array:
+def _hessian(step: _Map) -> Array:
     """Return the compiled Hessian (n, n) of the weighted sum of the end state, n the number of arguments."""
-    stepper, parameters = tested.stepper, np.array(list(tested.parameters.values()))
-    starts = Starts.chain(state.q, state.p, np.array([state.t]), np.array([state.h]))
-    size = stepper._input_size
+    size, starts = step.stepper._input_size, _starts(step.state)
     changes, vectors = np.zeros((2, size, size)), np.zeros((2, 2, size, size))
-    changes[0], vectors[1, 0, :, : 2 * len(state.q)] = np.eye(size), _weights(tested, state)
-    stepper._propagate(starts, changes, parameters, None)
-    stepper._second_order_adjoint(starts, changes, vectors, parameters, None)
+    changes[0], vectors[1, 0, :, : len(step.scales)] = np.eye(size), _weights(step)
+    step.stepper._propagate(starts, changes, step.parameters, None)
+    step.stepper._second_order_adjoint(starts, changes, vectors, step.parameters, None)
     hessian: Array = vectors[0, 1]
     return hessian
 
 
-def _second_derivative_by_differences(tested: SystemUnderTest, state: State, u: Array, v: Array) -> float:
+def _second_derivative_by_differences(step: _Map, u: Array, v: Array) -> float:
     """Return the second derivative of the weighted sum along u and v, by differences in 60 digits."""
-    weights = [mp.mpf(weight) for weight in _weights(tested, state)]
+    weights = [mp.mpf(weight) for weight in _weights(step)]
     total = mp.zero
     for sign, other in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-        total += sign * other * mp.fdot(weights, _end(tested, state, (sign * u + other * v) * WIDTH))
+        total += sign * other * mp.fdot(weights, step.moved_end((sign * u + other * v) * WIDTH))
     return float(total / (4 * WIDTH**2))
 
 
-def _direction(tested: SystemUnderTest, state: State, phase: float = 1.0) -> Array:
-    """Return a direction of (q, p, parameters, t, h), scaled with the size of each."""
-    values = np.array(list(tested.parameters.values()))
-    sizes = np.concatenate([tested.scales(state), np.where(values, values, 1.0), [state.h, state.h]])
-    direction: Array = sizes * (1.5 + np.sin(phase + 1.7 * np.arange(len(sizes))))
-    return direction
+def time_transformation_derivative_checks(runs_tested: VariableSteps) -> Iterator[Check]:
+    """Yield the checks along one direction in which all arguments change, among them the energy."""
+    statement = "derivatives of a step of tau and of its duration are those of the equations (differences, 60 digits)"
+    yield from checked("derivatives in tau", statement, partial(_in_tau, runs_tested, _Map.derivative_error))
+    statement = "derivatives of the energy of the start are those of its formula (60 digits)"
+    yield from checked("energy surface", statement, partial(_energy_derivative, runs_tested))
+    statement = "VJP is the transpose of JVP, times included"
+    yield from checked("adjoint in tau", statement, partial(_in_tau, runs_tested, _Map.transpose_error))
+    if is_symplectic(runs_tested.tested.method, runs_tested.transformed) and not runs_tested.transformed.constraints:
+        statement = "J^T Omega J = Omega, J the compiled Jacobian of a step of tau at fixed energy"
+        yield from checked("symplecticity in tau", statement, partial(_symplecticity, runs_tested))
 
 
-def _propagated(tested: SystemUnderTest, stepper: Stepper, state: State, vector: Array, *, back: bool) -> Array:
-    """Return J v of the compiled Jacobian J, or J^T v."""
-    starts = Starts.chain(state.q, state.p, np.array([state.t]), np.array([state.h]))
-    vectors = np.zeros((2, 1, len(vector)))
-    vectors[int(back)] = vector
-    stepper._propagate(starts, vectors, np.array(list(tested.parameters.values())), None, transpose=back)
-    carried: Array = vectors[int(not back), 0]
-    return carried
+def _in_tau(runs_tested: VariableSteps, error: Callable[[_Map], float]) -> Finding:
+    return Finding(error(_map_in_tau(runs_tested)), BOUND, "relative, along one direction")
 
 
-def _by_differences(tested: SystemUnderTest, state: State, direction: Array) -> Array:
-    """Return the directional derivative of the end state, by differences in 60 digits."""
-    ends = [_end(tested, state, direction * (sign * WIDTH)) for sign in (1, -1)]
-    derivative: Array = ((ends[0] - ends[1]) / (2 * WIDTH)).astype(float)
-    return derivative
+def _energy_derivative(runs_tested: VariableSteps) -> Finding:
+    """Compare the directional derivative of the energy of the state with differences; relative to its largest term."""
+    step = _map_in_tau(runs_tested)
+    state, direction, m = step.state, step.direction(), len(step.state.q)
+    terms = step.stepper._energy_gradient(state.q, state.p, step.parameters) * direction
+    motion, count = exact_motion(runs_tested.system), len(runs_tested.system.parameters)
+    energies = []
+    for sign in (1, -1):
+        moved = step.arguments + direction * (sign * WIDTH)
+        at = motion.with_parameters(moved[2 * m : 2 * m + count].tolist())
+        energies.append(at.energy(moved[:m], moved[m : 2 * m], mp.zero))
+    exact = float((energies[0] - energies[1]) / (2 * WIDTH))
+    return Finding(abs(float(terms.sum()) - exact) / float(np.abs(terms).max()), BOUND, "relative, along one direction")
 
 
-def _end(tested: SystemUnderTest, state: State, change: Array) -> Array:
-    """Return (2m,) the end state of a step from perturbed arguments, in 60 digits."""
-    step, m = tested.derived(), len(state.q)
-    arguments = np.array([mp.mpf(x) for x in (*state.z, *tested.parameters.values(), state.t, state.h)], dtype=object)
-    moved = (arguments + change).tolist()
-    end = step.with_parameters(moved[2 * m : -2])(moved[:m], moved[m : 2 * m], moved[-1], moved[-2])
-    return np.array([*end.q, *end.p], dtype=object)
+def _symplecticity(runs_tested: VariableSteps) -> Finding:
+    """Return the defect of J^T Omega J = Omega, in units of the areas of pairs of coordinates."""
+    state = runs_tested.tested.states[0]
+    parameters, scales, m = runs_tested.at_energy(state), runs_tested.tested.scales(state), len(state.q)
+    J = runs_tested.stepper.jacobian(state.q, state.p, state.h, state.t, parameters) * scales / scales[:, np.newaxis]
+    omega = np.kron([[0, 1], [-1, 0]], np.eye(m)) * np.outer(scales, scales)
+    areas = np.tile(scales[:m] * scales[m:], 2)
+    largest = float(np.abs(J).max()) ** 2
+    defect = float((np.abs(J.T @ omega @ J - omega) / np.sqrt(np.outer(areas, areas))).max())
+    return Finding(defect / largest, JACOBIAN_ROUNDOFF, "in units of the areas of coordinates")

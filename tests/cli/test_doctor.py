@@ -36,7 +36,7 @@ def findings(status: int = 0) -> dict[str, dict[str, Any]]:
 def without_trial(monkeypatch: pytest.MonkeyPatch) -> None:
     """Skip the trial compilation, where it does not matter."""
     monkeypatch.setattr(
-        diagnostics, "_trial", lambda folder: diagnostics.CheckResult(name="trial", status="lacks", found="")
+        diagnostics, "_trial", lambda folder: diagnostics.CheckResult(name="trial", status="lacks", result="")
     )
 
 
@@ -83,7 +83,7 @@ def test_output_of_a_failing_compiler_is_quoted(monkeypatch):
     assert found["trial"]["status"] == "fails"
     assert "no-such-flag" in found["trial"]["remedy"]
     assert "Traceback" not in found["trial"]["remedy"]
-    assert "-no-such-flag" in found["flags"]["found"]
+    assert "-no-such-flag" in found["flags"]["result"]
 
 
 def test_illegal_instructions_end_only_the_trial_process(tmp_path, monkeypatch):
@@ -128,7 +128,7 @@ def test_extras_are_listed_with_missing_packages(monkeypatch):
     extras = tomllib.loads(PROJECT.read_text())["project"]["optional-dependencies"]
     before = findings()
     assert {name.removeprefix("extra ") for name in before if name.startswith("extra ")} == set(extras)
-    assert f"numpy {importlib.metadata.version('numpy')}" in before["libraries"]["found"]
+    assert f"numpy {importlib.metadata.version('numpy')}" in before["libraries"]["result"]
 
     versions = {"matplotlib": "3.1", "distributed": None}
 

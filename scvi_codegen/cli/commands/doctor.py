@@ -40,5 +40,5 @@ def doctor() -> None:
 def _lines(finding: CheckResult) -> str:
     """Return a line with status, name and description of a check, and indented lines with the remedy."""
     indent = " " * (STATUS_WIDTH + NAME_WIDTH + 2)
-    first = f"{finding.status:{STATUS_WIDTH}} {finding.name:{NAME_WIDTH}} {finding.found}"
+    first = f"{finding.status:{STATUS_WIDTH}} {finding.name:{NAME_WIDTH}} {finding.result}"
     return "\n".join([first, *(f"{indent}{line}" for line in finding.remedy.splitlines())])

@@ -36,7 +36,7 @@ def check_symmetry(
     *,
     gauge: Expr | str | None = None,
     generator: Expr | str | None = None,
-    name: str = "given symmetry",
+    name: str = "symmetry",
 ) -> Symmetry:
     """Return the symmetry with the user's direction or generator, of any form, after verifying it.
 
@@ -55,7 +55,7 @@ def check_symmetry(
 
     >>> from scvi_codegen.models.systems import kepler
     >>> print(check_symmetry(kepler(), ["-q2", "q1"]))
-    given symmetry = q1*p_q2 - q2*p_q1
+    symmetry = q1*p_q2 - q2*p_q1
     """
     if generator is not None:
         if direction is not None or gauge is not None:
