@@ -16,7 +16,7 @@ from scvi_codegen.reproduce.kepler import orbits
 from scvi_codegen.reproduce.laboratory import running
 from scvi_codegen.reproduce.laboratory.experiment import Comparison, Result, Verdict
 from scvi_codegen.reproduce.oscillators import two_point_pendulum as two_point
-from scvi_codegen.reproduce.paper_tables import costs, iteration_counts, iterations, outlines, properties, tableaux
+from scvi_codegen.reproduce.paper_tables import costs, iteration_counts, iterations, outlines, tableaux
 from scvi_codegen.reproduce.writing import statement
 from scvi_codegen.tables.closed_forms import exact_tableau
 from scvi_codegen.tables.precision import mp
