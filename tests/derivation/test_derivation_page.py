@@ -31,9 +31,9 @@ from scvi_codegen.cli import main
 from scvi_codegen.derivation import Start, derivation_html
 from scvi_codegen.derivation.equations import derive
 from scvi_codegen.derivation.notation import table_entries
-from scvi_codegen.derivation.page.elision import formulas, operations
+from scvi_codegen.derivation.page.elision import MOST_LINES, formulas, operations
 from scvi_codegen.derivation.page.jacobian import entry_numbers, jacobian_pattern
-from scvi_codegen.derivation.page.kernels import ITERATIONS, MOST_LINES, kernels_of
+from scvi_codegen.derivation.page.kernels import ITERATIONS, kernels_of
 from scvi_codegen.display.page.blocks import Formula, Paragraph
 from scvi_codegen.display.page.environment import SPACE
 from scvi_codegen.ir import curve_iterations, iterations
