@@ -23,7 +23,7 @@ _HOMES = {
     "advice.advice": ("Advice", "advise"),
     "frameworks.casadi": ("casadi_flow",),
     "frameworks.casadi_step": ("casadi_step",),
-    "frameworks.controlled_trajectory": ("ControlledMotion",),
+    "frameworks.control_task": ("ControlledMotion",),
     "frameworks.optimal_control": ("optimal_control",),
     "frameworks.jax": ("JaxFlow", "jax_flow"),
     "frameworks.torch": ("TorchFlow", "torch_flow"),
