@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from functools import cached_property
-from typing import TYPE_CHECKING, cast, overload
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, cast, overload
 
 from numpy.typing import ArrayLike
 
@@ -144,7 +144,8 @@ def compile_stepper(
     if not known_sizes:
         from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 
-        return ArrayStepper(source, interface, variants=variants, flags=flags)
+        of_sizes = partial(compile_stepper, cast(Any, system), method, solver=solver, flags=flags, prefix=prefix)
+        return ArrayStepper(source, interface, variants=variants, flags=flags, of_sizes=of_sizes)
     cast(MechanicalSystem, system).store_key()
     return Stepper(source, interface, variants=variants, flags=flags, events=as_events(events))
 

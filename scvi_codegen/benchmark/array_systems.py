@@ -23,8 +23,8 @@ from scvi_codegen.benchmark.methods import fitted_rate
 from scvi_codegen.benchmark.report import OURS, ResultTable
 from scvi_codegen.benchmark.settings import Plan, ReportActivity, timed
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.runtime.arrays.run import ArrayRun
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
+from scvi_codegen.runtime.run.run import Run
 
 __all__ = ["run_energies", "run_thousand_bodies", "run_threads"]
 
@@ -160,11 +160,13 @@ def _thread_row(each: Lattice, method: str, h: float, numbers: list[int], plan: 
     return {"by": f"{OURS} {method}", "one_us": 1e6 * best[1]} | gained
 
 
-def _seconds(run: ArrayRun, steps: int) -> float:
+def _seconds(run: Run, steps: int) -> float:
     """Return the seconds per step of a call with ``steps`` steps."""
-    report = run.problem.binding.new("report *")
+    memory: Any = run._memory
+    binding = memory.binding.raw
+    report = binding.new("report *")
     began = time.perf_counter()
-    run.call("advance", run.problem.struct, steps, run.problem.binding.null, report)
+    binding.function("advance")(memory.run, memory.problem, steps, binding.null, report)
     return (time.perf_counter() - began) / steps
 
 
@@ -224,6 +226,7 @@ def _ours(each: Lattice, method: str, steps: int) -> Callable[[], State]:
 
     def settle() -> State:
         run = advanced(stepper, each, steps)
-        return run.q["r"], run.velocity["r"]
+        arrays = run.stepper.arrays
+        return arrays(run.q)["r"], arrays(run.velocity)["r"]
 
     return settle

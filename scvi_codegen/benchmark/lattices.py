@@ -23,9 +23,9 @@ from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.leapfrog_stages import kicks_and_drifts
 from scvi_codegen.native import building
 from scvi_codegen.rendering.source import Source
-from scvi_codegen.runtime.arrays.run import ArrayRun
 from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
+from scvi_codegen.runtime.run.run import Run
 
 __all__ = ["PLATFORMS", "reference_of", "rms", "run_growth", "run_lattices"]
 
@@ -158,14 +158,19 @@ def _contenders(each: Lattice, plan: Plan) -> dict[str, list[Callable[[], Array]
 
 def _ours(each: Lattice, method: Any, steps: int) -> Callable[[], Array]:
     stepper, name = compile_stepper(each.system, method), each.system.coordinates[0].name
-    return lambda: advanced(stepper, each, steps).q[name]
+    return lambda: positions_of(advanced(stepper, each, steps))[name]
 
 
-def advanced(stepper: ArrayStepper, each: Lattice, steps: int) -> ArrayRun:
+def advanced(stepper: ArrayStepper, each: Lattice, steps: int) -> Run:
     """Return a run at the end of the span."""
     run = stepper.start(each.q, velocity=each.v, h=each.span / steps, parameters=each.parameters)
     run.advance(steps)
     return run
+
+
+def positions_of(run: Run) -> dict[str, Array]:
+    """Return the positions of a run by the name of their array."""
+    return run.stepper.arrays(run.q)
 
 
 def _by_hand(each: Lattice, order: int, steps: int) -> Callable[[], Array]:

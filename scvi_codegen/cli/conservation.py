@@ -121,7 +121,7 @@ def array_changes(trajectory: Any, run: Any) -> tuple[float, float, dict[str, fl
     maps = np.vstack([trajectory.momentum_maps(), run.momentum_maps])
     change = float(np.abs(energies[:, 2] - energies[0, 2]).max())
     largest = float(np.max(np.abs(energies[:, :2]).sum(axis=1)))
-    names = [each.name for each in run.interface.layout.maps]
+    names = run.stepper.momentum_map_names
     return change, change / (largest or 1.0), dict(zip(names, np.abs(maps - maps[0]).max(axis=0).tolist(), strict=True))
 
 

@@ -100,7 +100,7 @@ def _array_numbers(model: Model, outcome: RunOutcome) -> dict[str, Any]:
     return {
         "sizes": model.sizes,
         "tolerance": model.allowed_error,
-        "iterations": outcome.run.iterations,
+        "iterations": int(outcome.trajectory.iterations.sum()) + outcome.run.iterations,
         "energy": outcome.trajectory.energy()[0],
         "energy_change": change,
         "energy_error": relative,

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, wa
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.arrays.trajectory import ArrayRecord
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.inputs.segments import with_final_state
 from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
@@ -96,7 +95,7 @@ def integrate_model(model: Model, *, options: SolverOptions | None = None, threa
     if model.in_transformed_time and model.ends_at_time:
         return _in_transformed_time(model, run, time.perf_counter() - began)
     preparation = time.perf_counter() - began
-    began, stopped, failure, recorder = time.perf_counter(), False, None, _recorder(model, run)
+    began, stopped, failure, recorder = time.perf_counter(), False, None, _Pieces(model, run)
     with interruptions() as caught, progress_bar(_length(model)) as show_progress:
 
         def look(_: int) -> None:
@@ -127,22 +126,8 @@ def integrate_model(model: Model, *, options: SolverOptions | None = None, threa
     )
 
 
-class _Recorder(Protocol):
-    """Recorder of the segments of a run."""
-
-    def record(self, steps: int | None, look: Callable[[int], None], stop: Callable[[], bool]) -> None:
-        """Advance by a segment and save its states; a StepFailedError leaves the states before."""
-
-    def trajectory(self) -> Any:
-        """Return the states saved."""
-
-
-def _recorder(model: Model, run: Any) -> _Recorder:
-    return _Pieces(model, run) if model.array_system is None else _Arrays(model, run)
-
-
 class _Pieces:
-    """Recorder of named coordinates: a trajectory of each segment."""
+    """Recorder of a trajectory of each segment."""
 
     def __init__(self, model: Model, run: Run) -> None:
         self.model, self.run, self.pieces = model, run, list[Trajectory]()
@@ -161,23 +146,6 @@ class _Pieces:
     def trajectory(self) -> Trajectory | DrivenTrajectory:
         pieces = self.pieces or [record(self.run, 0)]
         return DrivenTrajectory(tuple(pieces)) if self.model.has_segments else pieces[0]
-
-
-class _Arrays:
-    """Recorder of arrays whose sizes are known at run time."""
-
-    def __init__(self, model: Model, run: Any) -> None:
-        self.model, self.run, self.states = model, run, ArrayRecord(run)
-        self.states.take(keep=True)
-
-    def record(self, steps: int | None, look: Callable[[int], None], stop: Callable[[], bool]) -> None:
-        until = math.inf if steps is None else self.run.steps + steps
-        self.states.continue_recording(
-            until, self.model.save_every, progress=look, stop=stop, to_end=self.model.has_segments
-        )
-
-    def trajectory(self) -> Any:
-        return self.states.trajectory()
 
 
 def _in_transformed_time(model: Model, run: Run, preparation: float) -> RunOutcome:
@@ -286,7 +254,7 @@ def _speed(outcome: RunOutcome, model: Model) -> str:
     if model.array_system is not None:
         text += f", {duration(each / model.dimension)} a step and coordinate"
     saved = trajectory.t[-1] == outcome.end[0]  # else iterations are known up to the last saved state
-    watched = outcome.run.steps if saved or model.array_system else (len(trajectory) - 1) * model.save_every
+    watched = outcome.run.steps if saved else (len(trajectory) - 1) * model.save_every
     return f"{text}, {int(np.sum(trajectory.iterations)) / watched:.2f} iterations a step" if watched else text
 
 

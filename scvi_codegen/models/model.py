@@ -281,11 +281,9 @@ class Model(TimeSpan):
         """Return the inputs, and the scalar parameters as a function of time."""
         from scvi_codegen.runtime.inputs.segments import checked_inputs, parameters_at
 
-        interface = of.interface if hasattr(of, "interface") else of.stepper.interface
-        inputs = checked_inputs(interface, self.all_inputs())
-        values = {**dict(zip(interface.parameters, interface.defaults, strict=True)), **self.parameters}
-        numbers = np.array([values[name] for name in interface.parameters])
-        return inputs, partial(parameters_at, interface.parameters, numbers, inputs)
+        stepper = of.stepper if hasattr(of, "stepper") else of
+        inputs = checked_inputs(stepper.interface, self.all_inputs())
+        return inputs, partial(parameters_at, stepper.parameters, stepper._parameters(self.parameters), inputs)
 
     def start(
         self, stepper: Stepper | None = None, *, options: SolverOptions | None = None, threads: int | None = None

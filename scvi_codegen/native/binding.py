@@ -33,7 +33,12 @@ class Binding:
         workspace: doubles that a call requires.
         fallback: compiles the library with Newton's method, if the source uses a second library.
         origin: an object that can be pickled and the name of its attribute that is this binding.
+
+    Attributes:
+        reusable: whether memory of runs may be kept for later runs.
     """
+
+    reusable = True
 
     def __init__(
         self,

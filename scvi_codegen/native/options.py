@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -103,12 +102,14 @@ def step_failure(
     *,
     step: int,
     h: float,
-    failures: Mapping[str, tuple[str, str]] = FAILURES,
 ) -> StepFailedError:
-    """Return the exception for a failed step: number, time, step size (0: adaptive), cause and remedy."""
+    """Return the exception for a failed step: number, time, step size (0: adaptive), cause and remedy.
+
+    The report may have messages of its own, ``failures``.
+    """
     word = STATUS[status]
     length = f" with h = {h:g}" if h else ""
-    what, remedy = failures[word]
+    what, remedy = getattr(report, "failures", FAILURES)[word]
     if word == NOT_CONVERGED:
         what += f" (last update {report.change:.3g}; {report.iterations} iterations in this call)"
     message = f"step {step} at t = {report.t:.17g}{length} failed: {what}. {remedy}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -23,20 +22,23 @@ IN_SPACE = (2, 3)
 
 
 class ArrayMotion(Protocol):
-    """Trajectory to draw: times, and states by name of their array."""
+    """Trajectory to draw, of a system with arrays."""
 
     @property
     def t(self) -> NDArray[np.float64]: ...
 
     @property
-    def q(self) -> Mapping[str, NDArray[np.float64]]: ...
+    def q(self) -> NDArray[np.float64]: ...
+
+    @property
+    def stepper(self) -> Any: ...
 
     @property
     def observed(self) -> NDArray[np.float64] | None: ...
 
 
 @checks_arguments(
-    trajectory=ArgumentType("a trajectory of arrays", lambda arguments: hasattr(arguments, "energies")),
+    trajectory=ArgumentType("a trajectory of arrays", lambda value: hasattr(getattr(value, "q", None), "shapes")),
     array=TEXT,
     path=PATH,
     ax=CANVAS,
@@ -63,10 +65,11 @@ def plot_arrays(
         StateError: for an unknown array or one with more indices, and for a run with ``observe``.
         PlotError: without matplotlib.
     """
-    name = next(iter(trajectory.q)) if array is None else array
-    if name not in trajectory.q:
-        raise StateError(f"there is no array '{name}'{closest(name, trajectory.q)} Known: {', '.join(trajectory.q)}")
-    values = trajectory.q[name]
+    arrays = trajectory.stepper.arrays(trajectory.q)
+    name = next(iter(arrays)) if array is None else array
+    if name not in arrays:
+        raise StateError(f"there is no array '{name}'{closest(name, arrays)} Known: {', '.join(arrays)}")
+    values = arrays[name]
     if trajectory.observed is not None and values.ndim == 2:
         raise StateError(
             "a run with observe saves only its first and last state: run it without observe to draw this array"

@@ -278,11 +278,11 @@ def test_velocities_depend_on_masses() -> None:
     assert run.velocity["r"].shape == (4, 4, 2)
     assert run.velocity["r"][0] == pytest.approx(each.velocity, rel=1e-15)
     assert run.p["r"][0, 2] == pytest.approx(0.5 * each.velocity[2], rel=1e-15)
-    assert going.inverse_masses["r"][:, 0] == pytest.approx([1, 0.5, 2, 1])
+    assert going.stepper.inverse_masses(going.parameters)["r"][:, 0] == pytest.approx([1, 0.5, 2, 1])
     going.advance(3)
     assert np.array_equal(going.velocity["r"], run.velocity["r"][-1])
     shown = [repr(one) for one in (run, going, each.system)]
-    assert shown[0] == "<ArrayTrajectory of 3 steps of 0.05: r (4, 4, 2)>"
+    assert shown[0] == "<Trajectory of case, svi-2-gauss-legendre-2; 4 states from t = 0 to 0.15, 3 steps of 0.05>"
     assert shown[1].endswith("; t = 0.15 after 3 steps of 0.05, solver fixed-point>")
     assert shown[2] == "LagrangianSystem(name='case', coordinates=(r[N, 2]))"
 

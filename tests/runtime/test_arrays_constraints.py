@@ -101,8 +101,9 @@ def test_every_state_of_a_chain_satisfies_its_constraints(stepper, count):
 def test_chain_needs_one_product_per_correction(stepper):
     q, data = chain(500)
     run = stepper.start(q, h=1e-4, **data)
-    report = run.problem.binding.new("report *")
-    run.call("advance", run.problem.struct, 10, run.problem.binding.null, report)
+    memory, binding = run._memory, run.stepper.binding.raw
+    report = binding.new("report *")
+    binding.function("advance")(memory.run, memory.problem, 10, binding.null, report)
     assert report.products <= report.iterations
 
 

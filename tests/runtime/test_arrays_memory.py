@@ -82,10 +82,8 @@ class TestWhatACallerChangesLater:
         assert (found.q["q"][-1] == expected.q["q"][-1]).all()
 
     def test_arrays_of_a_run_are_read_only(self, chain: Any) -> None:
-        arrays = start(chain).problem.arrays
-        for array in (arrays.places["bonds"], arrays.fields["k"]):
-            with pytest.raises(ValueError, match="read-only"):
-                array[0] = 0
+        with pytest.raises(ValueError, match="read-only"):
+            start(chain).stepper.arrays.places["bonds"][0] = 0
 
     @pytest.mark.parametrize("table", [[[0, 1], [1]], [[0, [1]], [1, 2]], [[0, 2**70], [1, 2]], "ab"])
     def test_table_that_is_not_an_array_is_named(self, chain: Any, table: Any) -> None:
@@ -100,8 +98,9 @@ class TestPickles:
         run = start(chain, **given, options=sc.SolverOptions(max_iterations=40), threads=2)
         run.advance(3)
         other = copied(run)
-        for name in ("t", "h", "plan", "options", "steps", "iterations", "threads"):
+        for name in ("t", "h", "plan", "options", "steps", "iterations"):
             assert getattr(other, name) == getattr(run, name), name
+        assert other.stepper.threads == 2
         for each in (run, other):
             each.advance(5)
         assert (run.q["q"] == other.q["q"]).all()

@@ -49,8 +49,9 @@ def smooth(shape):
 def products_of(stepper, q, h, *, steps=1, **given):
     """Return the number of products of steps, which must converge."""
     run = stepper.start(q, h=h, **given)
-    report = run._binding.new("report *")
-    assert run._steps(steps, report) == 0
+    memory, binding = run._memory, run.stepper.binding.raw
+    report = binding.new("report *")
+    assert binding.function("advance")(memory.run, memory.problem, steps, binding.null, report) == 0
     return report.products
 
 

@@ -72,6 +72,6 @@ def test_display_of_array_runs():
         inputs=["u"],
     )
     run = sc.compile_stepper(chain, "svi:2").start(np.zeros(5), h=0.1)
-    assert repr(run).startswith("<ArrayRun of chain, svi-2")
+    assert repr(run).startswith("<Run of chain, svi-2")
     assert "; t = 0 after 0 steps of 0.1, solver" in repr(run)
     assert repr(run).endswith("inputs not set: u>")

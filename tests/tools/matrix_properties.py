@@ -28,7 +28,7 @@ from scvi_codegen.errors import StepFailedError
 from scvi_codegen.frameworks.flow import FlowOfRows
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.results.recording import load_run, record_run, resume_run
-from scvi_codegen.runtime.run import memory, run_loop
+from scvi_codegen.runtime.run import chunks, memory
 from scvi_codegen.runtime.sensitivity import gradients
 
 __all__ = ["PROPERTIES", "SITUATIONS", "Case"]
@@ -450,7 +450,7 @@ def controlled(case: Case) -> None:
     """Adaptive steps: ends, dense output, and the estimate of the worst step."""
     end = case.given.t + case.span
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run_loop, "CALL_SECONDS", 1e-9)
+        patch.setattr(chunks, "CALL_SECONDS", 1e-9)
         run = case.integrate(t_end=end, tolerance=1e-11)
     assert run.t[-1] == end
     near(run.q, case.truth.q(run.t), 1e-8)

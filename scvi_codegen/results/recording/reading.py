@@ -230,7 +230,6 @@ class RecordedRun:
         manifest, run = self.manifest, self._checkpointed_run
         taken = manifest.save_every * rows
         transformed = bool(manifest.interface.energy_parameter)
-        step_error, worst_step_time = run.step_error
         return Trajectory(
             t=t,
             q=q,
@@ -241,8 +240,8 @@ class RecordedRun:
             plan=manifest.plan,
             steps=run.steps,
             rejected_steps=run.rejected_steps,
-            step_error=step_error,
-            worst_step_time=worst_step_time,
+            step_error=run.step_error,
+            worst_step_time=run.worst_step_time,
             parameters=np.array(manifest.parameters),
             stepper=run.stepper,
             options=run.options,

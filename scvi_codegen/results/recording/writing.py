@@ -15,16 +15,18 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.errors import RecordingError, RecordingWarning, StateError, StepFailedError, warn
+from scvi_codegen.errors import MethodError, RecordingError, RecordingWarning, StateError, StepFailedError, warn
 from scvi_codegen.files.atomic import sync_folder
 from scvi_codegen.files.export import Piece, chunk_rows
+from scvi_codegen.indices import SIZES_REQUIRED
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.flags import check_flags
 from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states, read_chunk, unfinished, write_chunk
 from scvi_codegen.results.recording.manifest import MANIFEST, Build, Manifest, read_manifest, write_manifest
 from scvi_codegen.results.recording.reading import RecordedRun, load_run
+from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.run import Run
-from scvi_codegen.runtime.run.run_loop import drive, record
+from scvi_codegen.runtime.run.run_loop import record
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation.argument_types import FUNCTION, PATH, REAL, TEXT, checks_arguments, of
@@ -88,6 +90,8 @@ def record_run(
     if run.steps:
         raise StateError(f"record_run requires a run at its start, but this run has {run.steps} steps: start a new one")
     _check_inputs(run)
+    if run.stepper.interface.layout.coordinates:
+        raise MethodError(f"recorded runs are not available for {run!r}: {SIZES_REQUIRED}")
     check_flags(run.stepper.flags, StateError)
     manifest = Manifest(
         source=run.stepper.source,

@@ -8,26 +8,25 @@ a zero and leaves it: a ball that bounces and returns within a step is detected.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.errors import EventError, ScviCodegenError
 from scvi_codegen.indices import Array
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.interface import Numbers, check_accesses
-from scvi_codegen.runtime.arrays.memory import ArraySnapshot
-from scvi_codegen.runtime.arrays.run import ArrayRun
-from scvi_codegen.runtime.events.event import ACCUMULATED, Event
+from scvi_codegen.runtime.events.event import ACCUMULATED, Crossings, Event
+from scvi_codegen.runtime.run.memory import Memory
+from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 
 if TYPE_CHECKING:
     from scvi_codegen.formulas.arrays import ArrayTerm
 
-__all__ = ["ArrayCrossings", "ArraySearch"]
+__all__ = ["ArraySearch"]
 
 Sample: TypeAlias = tuple[float, float]
 """Fraction of a step, and the function value there."""
@@ -45,87 +44,86 @@ LEAST_DIFFERENCE, RELATIVE_DIFFERENCE = 2.0**-10, 2.0**-17
 """Increments of the finite differences: fraction of the first step, and relative to the coordinates."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ArrayCrossings:
-    """Crossings of one event, in the order of the run.
+class ArraySearch:
+    """Search for zeros of a stepper's event functions between consecutive states of runs over arrays.
+
+    Args:
+        stepper: the stepper, with its events.
+        crossed: numbers of earlier crossings of each event; none by default.
+        terminal: whether terminal events end the search.
 
     Attributes:
-        event: the event.
-        t: (k,) times.
-        q, p: (k, ..) positions and momenta by array name.
-    """
-
-    event: Event
-    t: Numbers
-    q: Mapping[str, Numbers]
-    p: Mapping[str, Numbers]
-
-    def __len__(self) -> int:
-        return len(self.t)
-
-    def chosen(self, which: NDArray[np.bool_]) -> ArrayCrossings:
-        """Return the crossings selected by a (k,) boolean mask."""
-        q, p = ({name: each[which] for name, each in part.items()} for part in (self.q, self.p))
-        return replace(self, t=self.t[which], q=q, p=p)
-
-
-class ArraySearch:
-    """Search for zeros of event functions along a run, step by step.
+        ended: whether a terminal event occurred; ``recorded[-1]`` is its crossing or one at the same time.
+        recorded: number of the event, t, q and p of each crossing, in the order of the run.
 
     Raises:
-        EventError: if a formula is invalid, an index leaves its array, or a function is not finite.
+        EventError: if a formula is invalid, or an index leaves its array.
     """
 
-    def __init__(self, run: ArrayRun, events: Sequence[Event]) -> None:
-        self.run, self.events = run, tuple(events)
-        self.functions = [_Function(run, event) for event in events]
-        self.remaining = [int(event.terminal) for event in events]
-        self.recorded: list[list[tuple[float, dict[str, Numbers], dict[str, Numbers]]]] = [[] for _ in events]
-        self.ended = False
-        self.values = self._values(run)
-        self.started = False
+    def __init__(self, stepper: Any, crossed: Sequence[int] = (), *, terminal: bool = True) -> None:
+        self.stepper, self.events = stepper, stepper.events
+        self.functions = [_Function(stepper, event) for event in self.events]
+        self.remaining = [
+            (int(event.terminal) - (crossed[k] if crossed and event.terminal else 0)) * terminal
+            for k, event in enumerate(self.events)
+        ]
+        self.recorded: list[tuple[int, float, Numbers, Numbers]] = []
+        self.ended = self.started = False
 
-    def step(self) -> None:
-        """Take one step of the run, or the part of it up to a terminal event."""
-        run, before, values = self.run, self.run.snapshot, self.values
-        run.advance(1)
-        self.values = self._values(run)
-        low = run._run.t_low - before.run_fields["t_low"]
-        h = (run.t - before.run_fields["t"]) + low if run.plan else run.h
+    @property
+    def last(self) -> tuple[float, Numbers, Numbers]:
+        """Time, positions and momenta of the last crossing."""
+        return self.recorded[-1][1:]
+
+    def search(self, part: SavedStates, first: int = 0) -> int:
+        """Search between consecutive states of a trajectory; return the number of steps before the search ended.
+
+        Raises:
+            EventError: if an event function is not finite.
+            StepFailedError: if a partial step fails.
+        """
+        values = self._values(_Step(part, 0), 0.0)
+        for number in range(len(part) - 1):
+            step = _Step(part, number)
+            before, values = values, self._values(step, 1.0)
+            if self._search_step(step, before, values):
+                self.ended = True
+                return number
+        return len(part) - 1
+
+    def _search_step(self, step: _Step, before: Sequence[float], after: Sequence[float]) -> bool:
+        """Record the crossings within a step; return whether a terminal event ends the run there."""
         zeros: list[tuple[float, int, bool]] = []
         for k, event in enumerate(self.events):
-            looked = [(0.0, values[k]), (1.0, self.values[k])]
-            if not self.started and (between := self._leaves_zero(before, k, h, looked)):
+            looked = [(0.0, before[k]), (1.0, after[k])]
+            if not self.started and (between := self._leaves_zero(step, k, looked)):
                 looked[1:1] = between
             pairs = [pair for pair in pairwise(looked) if _crosses(event, pair[0][1], pair[1][1])]
-            zeros += [(self._zero(before, k, h, *pair), k, pair[1][1] > pair[0][1]) for pair in pairs]
+            zeros += [(self._zero(step, k, *pair), k, pair[1][1] > pair[0][1]) for pair in pairs]
         self.started = True
         for number, (part, k, _) in enumerate(sorted(zeros)):
-            there = self._part(before, part * h) if part < 1.0 else run.copy_with_step(h)
-            if self._take(k, there):
+            if self._take(k, step, part):
                 for other, j, rises in sorted(zeros)[number + 1 :]:
-                    if other - part <= TIE and self._value(there, j) * (1.0 if rises else -1.0) >= 0.0:
-                        self._take(j, there)
-                self._end(before, there)
-                return
+                    if other - part <= TIE and self._value(step, part, j) * (1.0 if rises else -1.0) >= 0.0:
+                        self._take(j, step, part)
+                return True
+        return False
 
-    def _take(self, k: int, there: ArrayRun) -> bool:
+    def _take(self, k: int, step: _Step, part: float) -> bool:
         """Record a crossing; return whether it ends the run."""
-        self.recorded[k].append((there.t, there.q, there.p))
+        self.recorded.append((k, *step.state(part)))
         self.remaining[k] -= 1
         return self.remaining[k] == 0
 
-    def _leaves_zero(self, before: ArraySnapshot, k: int, h: float, ends: Sequence[Sample]) -> list[Sample]:
+    def _leaves_zero(self, step: _Step, k: int, ends: Sequence[Sample]) -> list[Sample]:
         """Return samples within a first step that begins at a zero, as if the run had come from the other side.
 
         Raises:
             EventError: if the run returns to a terminal event within a rounding error.
         """
         (_, old), (_, new) = ends
-        start = self.run.copy_with_step(h)
-        start.rollback(before)
-        noise = self._rounding(start, k, old)
-        change, doubt = self._first_change(before, start, k, h, noise)
+        noise = self._rounding(step, k, old)
+        change, doubt = self._first_change(step, k, noise)
         sign, size = 1.0 if change > 0.0 else -1.0, abs(change) + abs(new - old)
         if abs(old) > AT_ZERO * size + 8.0 * noise or sign * old > 0.0:
             return []
@@ -133,107 +131,120 @@ class ArraySearch:
             return []
         samples: list[Sample] = []
         for part in PROBES[:-1]:
-            value = self._value(self._part(before, part * h), k)
+            value = self._value(step, part, k)
             if samples or abs(value) > 8.0 * noise + 4.0 * abs(old):
                 samples.append((part, value))
             if len(samples) == 1 and sign * value < 0.0:
                 event = self.events[k]
                 if self.remaining[k] > 0 and event.direction != sign:
-                    raise EventError(ACCUMULATED.format(function=event.function, t=start.t))
+                    raise EventError(ACCUMULATED.format(function=event.function, t=step.t))
                 return []
         return samples
 
-    def _rounding(self, start: ArrayRun, k: int, old: float) -> float:
+    def _rounding(self, step: _Step, k: int, old: float) -> float:
         """Return the change of a function when coordinates change by one ulp up or down."""
         rng, largest = np.random.default_rng(0), 0.0
         for _ in range(4):
-            ulps = LAST_BIT * np.abs(start.state) * rng.choice([-1.0, 1.0], start.state.size)
-            largest = max(largest, abs(self._moved(start, k, start.t, ulps) - old))
+            ulps = LAST_BIT * np.abs(step.start) * rng.choice([-1.0, 1.0], step.start.size)
+            largest = max(largest, abs(self._moved(step, k, 0.0, ulps) - old))
         return largest
 
-    def _first_change(
-        self, before: ArraySnapshot, start: ArrayRun, k: int, h: float, noise: float
-    ) -> tuple[float, float]:
+    def _first_change(self, step: _Step, k: int, noise: float) -> tuple[float, float]:
         """Return h dg/dt at the start of a step and its uncertainty; zeros if g is undefined nearby."""
-        n, part, next_ = start.problem.count, RATE_PART, self._part(before, RATE_PART * h)
-        low = [np.concatenate([run._numbers["carry_q"], run._numbers["carry_p"]]) for run in (start, next_)]
-        along_q = ((next_.state - start.state) + (low[1] - low[0])) / part
+        n, run = step.start.size // 2, step.run(RATE_PART)
+        along_q = ((np.concatenate([run.q, run.p]) - step.start) + np.concatenate(run._compensation)) / RATE_PART
         along_p = along_q.copy()
         along_q[n:], along_p[:n] = 0.0, 0.0
         fast = np.abs(along_q).max() or 1.0
-        size = max(LEAST_DIFFERENCE, RELATIVE_DIFFERENCE * float(np.abs(start.state[:n]).max() / fast))
+        size = max(LEAST_DIFFERENCE, RELATIVE_DIFFERENCE * float(np.abs(step.start[:n]).max() / fast))
         try:
-            by_q = self._difference(start, k, 0.0, along_q, size)
-            by_rest = self._difference(start, k, h, along_p, LEAST_DIFFERENCE)
+            by_q = self._difference(step, k, 0.0, along_q, size)
+            by_rest = self._difference(step, k, step.h, along_p, LEAST_DIFFERENCE)
         except EventError:
             return 0.0, 0.0
         return by_q + by_rest, noise / size + (noise / LEAST_DIFFERENCE if by_rest else 0.0)
 
-    def _difference(self, start: ArrayRun, k: int, dt: float, along: Numbers, size: float) -> float:
+    def _difference(self, step: _Step, k: int, dt: float, along: Numbers, size: float) -> float:
         """Return the central difference of a function along a direction."""
-        above, below = (self._moved(start, k, start.t + part * dt, part * along) for part in (size, -size))
+        above, below = (self._moved(step, k, part * dt, part * along) for part in (size, -size))
         return (above - below) / (2.0 * size)
 
-    def _moved(self, start: ArrayRun, k: int, t: float, change: Numbers) -> float:
-        """Return a function at a perturbed state."""
-        state, when = start.state.copy(), start.t
-        start.state += change
-        start._run.t = t
-        try:
-            return self._value(start, k)
-        finally:
-            start.state[:] = state
-            start._run.t = when
+    def _moved(self, step: _Step, k: int, dt: float, change: Numbers) -> float:
+        """Return a function at a perturbed initial state."""
+        q, p = np.split(step.start + change, 2)
+        return self._at(k, step.t + dt, q, p, step.states.parameters)
 
-    def crossings(self) -> tuple[ArrayCrossings, ...]:
+    def crossings(self) -> tuple[Crossings, ...]:
         """Return the crossings by event."""
-        names = list(self.run.interface.coordinates)
+        named, empty = self.stepper.named, np.empty((0, self.stepper.dimension))
+        by_event: list[list[tuple[float, Numbers, Numbers]]] = [
+            [crossing[1:] for crossing in self.recorded if crossing[0] == k] for k in range(len(self.events))
+        ]
         return tuple(
-            ArrayCrossings(
+            Crossings(
                 event=event,
-                t=np.array([t for t, _, _ in points]),
-                q={name: np.array([q[name] for _, q, _ in points]) for name in names},
-                p={name: np.array([p[name] for _, _, p in points]) for name in names},
+                t=np.array([t for t, _, _ in mine]),
+                q=named(np.array([q for _, q, _ in mine]) if mine else empty),
+                p=named(np.array([p for _, _, p in mine]) if mine else empty),
             )
-            for event, points in zip(self.events, self.recorded, strict=True)
+            for event, mine in zip(self.events, by_event, strict=True)
         )
 
-    def _end(self, before: ArraySnapshot, there: ArrayRun) -> None:
-        """Leave the run at the state of a terminal event."""
-        self.run.rollback(before)
-        self.run.move_to(there)
-        self.ended = True
-
-    def _zero(self, before: ArraySnapshot, k: int, h: float, left: Sample, right: Sample) -> float:
+    def _zero(self, step: _Step, k: int, left: Sample, right: Sample) -> float:
         """Return the fraction of a step, between two samples, at which a function is 0 or first has its new sign."""
         from scipy.optimize import brentq  # here: slow to import
 
         known = dict((left, right))
 
         def value(part: float) -> float:
-            return known[part] if part in known else self._value(self._part(before, part * h), k)
+            return known[part] if part in known else self._value(step, part, k)
 
         part, width = float(brentq(value, left[0], right[0], xtol=LAST_BIT * right[0], rtol=4 * LAST_BIT)), LAST_BIT
         while part < right[0] and value(part) * left[1] > 0.0:
             part, width = min(right[0], part + width * right[0]), 2.0 * width
         return part
 
-    def _part(self, before: ArraySnapshot, h: float) -> ArrayRun:
-        """Return the state after a partial step."""
-        run = self.run.copy_with_step(h)
-        run.rollback(replace(before, run_fields={**before.run_fields, "h": h}))
-        run.plan = None
+    def _values(self, step: _Step, part: float) -> list[float]:
+        return [self._value(step, part, k) for k in range(len(self.events))]
+
+    def _value(self, step: _Step, part: float, k: int) -> float:
+        return self._at(k, *step.state(part), step.states.parameters)
+
+    def _at(self, k: int, t: float, q: Numbers, p: Numbers, parameters: Numbers) -> float:
+        value = self.functions[k].value(t, q, p, parameters)
+        if not np.isfinite(value):
+            raise EventError(f"the event function '{self.events[k].function}' is not finite at t = {t:.17g}")
+        return value
+
+
+class _Step:
+    """One step between two saved states, and states within it."""
+
+    def __init__(self, states: SavedStates, number: int) -> None:
+        self.states, self.number, self.t = states, number, float(states.t[number])
+        self.start = np.concatenate([states.q[number], states.p[number]])
+        controlled = states.plan is not None or number + 1 == len(states)
+        self.h = (
+            0.0
+            if number + 1 == len(states)
+            else float(states.t[number + 1] - self.t if controlled else states.step_sizes[number])
+        )
+
+    def state(self, part: float) -> tuple[float, Numbers, Numbers]:
+        """Return t, q and p after a fraction of the step."""
+        if part in (0.0, 1.0):
+            row = self.number + int(part)
+            return float(self.states.t[row]), np.array(self.states.q[row]), np.array(self.states.p[row])
+        run = self.run(part)
+        return run.t, run.q, run.p
+
+    def run(self, part: float) -> Memory:
+        """Return a run after a fraction of the step."""
+        q, p = np.split(self.start, 2)
+        given: dict[str, Any] = {"t": self.t, "parameters": self.states.parameters, "options": self.states.options}
+        run = Memory.started(self.states.stepper, q, p, h=part * self.h, **given)
         run.advance(1)
         return run
-
-    def _values(self, run: ArrayRun) -> list[float]:
-        return [self._value(run, k) for k in range(len(self.events))]
-
-    def _value(self, run: ArrayRun, k: int) -> float:
-        value = self.functions[k].value(run)
-        if not np.isfinite(value):
-            raise EventError(f"the event function '{self.events[k].function}' is not finite at t = {run.t:.17g}")
-        return value
 
 
 def _crosses(event: Event, old: float, new: float) -> bool:
@@ -244,29 +255,41 @@ def _crosses(event: Event, old: float, new: float) -> bool:
 class _Function:
     """Event function of the state."""
 
-    def __init__(self, run: ArrayRun, event: Event) -> None:
-        interface, arrays = run.interface, run.problem.arrays
-        self.terms = _terms(interface, event)
+    def __init__(self, stepper: Any, event: Event) -> None:
+        self.stepper, self.interface, arrays = stepper, stepper.origin.interface, stepper.problem
+        self.terms = _terms(self.interface, event)
         accesses = tuple((access, term.loops) for term in self.terms for _, access in term.slots)
         try:
-            check_accesses(replace(interface.layout, accesses=accesses), arrays.sizes, arrays.places)
+            check_accesses(replace(self.interface.layout, accesses=accesses), arrays.sizes, arrays.places)
         except ScviCodegenError as error:
             raise EventError(f"the event function '{event.function}': {error}") from error
         self.needs = {access.array.name for access, _ in accesses}
 
-    def value(self, run: ArrayRun) -> float:
+    def value(self, t: float, q: Numbers, p: Numbers, parameters: Numbers) -> float:
         from scvi_codegen.formulas.numpy_values import Elements  # here, because it imports SymPy
         from scvi_codegen.formulas.symbols import TIME, symbol
 
-        stored = run.problem.arrays
-        numbers: dict[Any, float] = {symbol(TIME): run.t}
-        numbers |= {symbol(name): x for name, x in zip(run.interface.parameters, stored.numbers, strict=True)}
-        arrays = _arrays_of(run, self.needs)
+        known, stored = self.stepper.parameters_by_name(parameters), self.stepper.problem
+        numbers: dict[Any, float] = {symbol(TIME): t}
+        numbers |= {symbol(name): known[name] for name in self.interface.parameters}
+        arrays = self._arrays(t, q, p, parameters) | known
         values = (
             Elements(term.loops, stored.sizes, stored.places).values(term.formula, term.slots, arrays, numbers)
             for term in self.terms
         )
         return float(sum(np.sum(value) for value in values))
+
+    def _arrays(self, t: float, q: Numbers, p: Numbers, parameters: Numbers) -> dict[str, Any]:
+        """Return the arrays of a state that the function uses."""
+        stepper = self.stepper
+        arrays: dict[str, Any] = stepper.arrays(q)
+        momenta, velocities = _momenta(self.interface), _velocities(self.interface)
+        if self.needs & set(momenta.values()):
+            arrays |= {momenta[name]: each for name, each in stepper.arrays(p).items()}
+        if self.needs & set(velocities.values()):
+            moving = stepper.arrays(stepper.velocity(q, p, t, parameters))
+            arrays |= {velocities[name]: each for name, each in moving.items()}
+        return arrays
 
 
 def _velocities(interface: Interface) -> dict[str, str]:
@@ -293,13 +316,3 @@ def _terms(interface: Interface, event: Event) -> tuple[ArrayTerm, ...]:
         return parse_sums(str(event.function), known, symbols, interface.layout.tables)
     except ScviCodegenError as error:
         raise EventError(f"the event function '{event.function}': {error}") from error
-
-
-def _arrays_of(run: ArrayRun, names: set[str]) -> dict[str, NDArray[np.float64]]:
-    """Return the arrays of a state that occur in ``names``."""
-    arrays = {**run.q, **run.problem.arrays.fields}
-    for others, state in ((_velocities(run.interface), "velocity"), (_momenta(run.interface), "p")):
-        if names & set(others.values()):
-            values = getattr(run, state)
-            arrays |= {other: values[name] for name, other in others.items()}
-    return arrays

@@ -13,10 +13,15 @@ from scvi_codegen.errors import StateError, closest
 from scvi_codegen.indices import Array, Loop, Place
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.rendering.source import ArrayLayout, Interface
+from scvi_codegen.runtime.core.named_arrays import NamedState
 
 __all__ = [
     "Numbers",
     "RunArrays",
+    "field_values",
+    "first_state",
+    "flat",
+    "number_values",
     "read_arrays",
     "read_state",
     "table_limits",
@@ -64,6 +69,21 @@ def read_arrays(
     return RunArrays(sizes=sizes, state=state, numbers=numbers, fields=fields, places=index_tables)
 
 
+def first_state(interface: Interface, argument: Any) -> tuple[Any, Any]:
+    """Return the first of several states (k, ..) by name, and all of them as (k, m) numbers; ``None`` for one state."""
+    if isinstance(argument, NamedState):
+        return (argument, None) if argument.ndim == 1 else (argument[0], np.asarray(argument))
+    first = interface.layout.coordinates[0]
+    values = argument.get(first.name) if isinstance(argument, Mapping) else argument
+    if values is None or np.ndim(values) <= len(first.axes):
+        return argument, None
+    arrays = argument if isinstance(argument, Mapping) else {first.name: argument}
+    every = {name: real_array(each, "q") for name, each in arrays.items()}
+    one = {name: each[0] for name, each in every.items()}
+    rows = [flat(read_state(interface, {n: x[k] for n, x in every.items()}, "positions")) for k in range(len(values))]
+    return one, np.array(rows)
+
+
 def read_state(interface: Interface, argument: ArrayLike | Mapping[str, ArrayLike], what: str) -> dict[str, Numbers]:
     """Return the coordinate arrays (or velocities, momenta) by name, from a mapping or a single array.
 
@@ -71,6 +91,8 @@ def read_state(interface: Interface, argument: ArrayLike | Mapping[str, ArrayLik
         StateError: if a name, a number of axes or a value is invalid.
     """
     names = list(interface.coordinates)
+    if isinstance(argument, NamedState):
+        argument = dict(argument.items())
     if not isinstance(argument, Mapping):
         if len(names) > 1:
             raise StateError(f"{what} must be given by name, as {{'{names[0]}': .., '{names[1]}': ..}}")
@@ -80,6 +102,11 @@ def read_state(interface: Interface, argument: ArrayLike | Mapping[str, ArrayLik
         array.name: _of_axes(array, real_array(argument[array.name], what), what)
         for array in interface.layout.coordinates
     }
+
+
+def flat(state: Mapping[str, Numbers]) -> Numbers:
+    """Return arrays as one vector."""
+    return np.concatenate([array.reshape(-1) for array in state.values()])
 
 
 def number_values(interface: Interface, argument: Mapping[str, ArrayLike]) -> list[float]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,7 +11,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.runtime.arrays.interface import Numbers
 
-__all__ = ["RUN_FIELDS", "STATE", "ArraySnapshot", "aligned", "constraint_memory"]
+__all__ = ["COMPUTED", "REAL_FIELDS", "RUN_FIELDS", "STATE", "aligned", "constraint_memory"]
 
 STEP_CONTROL_FIELDS = (
     "grid_level",
@@ -32,19 +30,14 @@ RUN_FIELDS = (
     *("largest_q", "largest_p", "steps_from_rest", *STEP_CONTROL_FIELDS),
 )
 """Scalar fields of the C struct of a run."""
+REAL_FIELDS = ("t", "t_low", "h", "error", "error_t", "largest_q", "largest_p", "error_before")
+"""Those of them that are no whole numbers."""
+COMPUTED = ("inverse_mass", "places", "columns")
+"""Arrays computed from the problem and not restored: foreign indices could address memory out of bounds."""
 STATE = ("q", "p", "carry_q", "carry_p")
 """Arrays of the state: positions, momenta and their compensation terms."""
 ALIGNMENT = 64
 """Alignment in bytes, the size of the widest SIMD register."""
-
-
-@dataclass(frozen=True, slots=True)
-class ArraySnapshot:
-    """Snapshot of a run: arrays, scalar fields and total solver iterations."""
-
-    arrays: Mapping[str, Numbers]
-    run_fields: Mapping[str, Any]
-    iterations: int
 
 
 def aligned(count: int) -> Numbers:

@@ -6,7 +6,7 @@ import hashlib
 import io
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import StateError
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.interface import RunArrays, read_arrays
-from scvi_codegen.runtime.arrays.memory import RUN_FIELDS, STATE
+from scvi_codegen.runtime.arrays.memory import COMPUTED, RUN_FIELDS, STATE
+from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["damage_as_state_error", "read_saved", "restore_memory", "saved_arrays", "saved_bytes"]
+__all__ = ["read_saved", "saved_bytes"]
 
 RANGES = {
     **dict.fromkeys(("step", "rejected", "avoiding", "steps_from_rest", "steps_to_compare"), (0, 2**53)),
@@ -28,16 +29,28 @@ RANGES = {
 """Smallest and largest values of whole numbers that C uses as indices or states."""
 FINITE = ("t", "t_low", "h")
 """Fields that are finite in every run; error estimates may be NaN."""
-COMPUTED = ("inverse_mass", "places", "columns")
-"""Arrays computed from the problem and not restored: foreign indices could address memory out of bounds."""
 CHECKSUM = "checksum"
 
 
-def saved_bytes(run: Mapping[str, Any], arrays: RunArrays, interface: Interface) -> bytes:
-    """Return the data and the arrays of a run as NumPy's format (.npz), with a checksum."""
-    saved: dict[str, Any] = {f"table {name}": array for name, array in arrays.places.items()}
-    saved |= {f"field {name}": array for name, array in arrays.fields.items()}
-    saved |= {"integrator": _integrator(interface), "parameters": arrays.numbers, **run}
+class SavedRun(NamedTuple):
+    """Saved run: sizes and tables, the bytes of its memory, and the parameters that are set."""
+
+    arrays: RunArrays
+    state: bytes
+    parameters: dict[str, Any]
+
+
+def saved_bytes(stepper: Any, run: Any) -> bytes:
+    """Return a run with its problem as NumPy's format (.npz), with a checksum."""
+    interface, memory, layout = stepper.origin.interface, run._memory, stepper.origin.interface.layout
+    known = stepper.parameters_by_name(run.parameters)
+    saved: dict[str, Any] = {f"table {name}": array for name, array in stepper.problem.places.items()}
+    saved |= {f"field {field.name}": known[field.name] for field in layout.fields}
+    saved |= {"integrator": _integrator(interface), "parameters": [known[name] for name in interface.parameters]}
+    saved |= {f"state {name}": array for name, array in stepper.arrays(run.q).items()}
+    saved |= {f"memory {name}": array for name, array in memory.numbers.items()}
+    saved |= {"moments": [float(getattr(memory.run, name)) for name in RUN_FIELDS], "iterations": run.iterations}
+    saved |= {"unset_inputs": np.array(run._unset_inputs, dtype=str), "to a time": run.plan is not None}
     arrays_saved: dict[str, Any] = {name: np.asarray(array) for name, array in saved.items()}
     file = io.BytesIO()
     arrays_saved[CHECKSUM] = _checksum(arrays_saved)
@@ -45,8 +58,8 @@ def saved_bytes(run: Mapping[str, Any], arrays: RunArrays, interface: Interface)
     return file.getvalue()
 
 
-def read_saved(saved: bytes, interface: Interface, *, to_a_time: bool) -> dict[str, NDArray[Any]]:
-    """Return the arrays of :func:`saved_bytes`.
+def read_saved(saved: bytes, interface: Interface, *, to_a_time: bool) -> SavedRun:
+    """Return the run of :func:`saved_bytes`.
 
     Raises:
         StateError: if the bytes are invalid or damaged or belong to another integrator or another kind of steps.
@@ -59,22 +72,23 @@ def read_saved(saved: bytes, interface: Interface, *, to_a_time: bool) -> dict[s
             raise StateError(f"the saved run is one of '{arrays['integrator']}', not of '{_integrator(interface)}'")
         if str(arrays.pop(CHECKSUM)) != _checksum(arrays):
             raise StateError("invalid saved run: the checksum differs. Save the run again")
-        if bool(arrays["to a time"]) == to_a_time:
-            return arrays
-    raise StateError(
-        "the saved run has fixed steps: omit t_end" if to_a_time else "the saved run has adaptive steps: give t_end"
-    )
-
-
-def saved_arrays(arrays: Mapping[str, NDArray[Any]], interface: Interface) -> RunArrays:
-    """Return the validated problem data of a saved run."""
-    numbers = dict(zip(interface.parameters, arrays["parameters"].tolist(), strict=True))
-    return read_arrays(
-        interface,
-        {array.name: arrays[f"state {array.name}"] for array in interface.layout.coordinates},
-        numbers | {field.name: arrays[f"field {field.name}"] for field in interface.layout.fields},
-        {table.name: arrays[f"table {table.name}"] for table in interface.layout.tables},
-    )
+        if bool(arrays["to a time"]) != to_a_time:
+            raise StateError(
+                "the saved run has fixed steps: omit t_end"
+                if to_a_time
+                else "the saved run has adaptive steps: give t_end"
+            )
+        known = dict(zip(interface.parameters, arrays["parameters"].tolist(), strict=True))
+        known |= {field.name: arrays[f"field {field.name}"] for field in interface.layout.fields}
+        problem = read_arrays(
+            interface,
+            {array.name: arrays[f"state {array.name}"] for array in interface.layout.coordinates},
+            known,
+            {table.name: arrays[f"table {table.name}"] for table in interface.layout.tables},
+        )
+        unset = arrays["unset_inputs"].tolist()
+        parameters = {name: value for name, value in known.items() if name.removesuffix("_0") not in unset}
+        return SavedRun(problem, _state_bytes(arrays, sum(each.size for each in problem.state.values())), parameters)
 
 
 @contextmanager
@@ -88,28 +102,26 @@ def damage_as_state_error() -> Iterator[None]:
         raise _not_saved(repr(error)) from error
 
 
-def restore_memory(run: Any, arrays: Mapping[str, NDArray[Any]], saved: Mapping[str, NDArray[Any]]) -> None:
-    """Copy validated saved values into the C struct and the arrays of a run.
-
-    Raises:
-        StateError: if a value is impossible in a run.
-    """
+def _state_bytes(saved: Mapping[str, NDArray[Any]], n: int) -> bytes:
+    """Return the validated memory of n coordinates as bytes; raise StateError if a value is impossible in a run."""
     moments = dict(zip(RUN_FIELDS, np.asarray(saved["moments"], dtype=float).tolist(), strict=True))
     for name, value in moments.items():
         if name in RANGES and not (value.is_integer() and RANGES[name][0] <= value <= RANGES[name][1]):
             raise _not_saved(f"{name} is {value:g}, not a whole number from {RANGES[name][0]} to {RANGES[name][1]}")
         if name in FINITE and not np.isfinite(value):
             raise _not_saved(f"{name} is {value:g}")
-        setattr(run, name, int(value) if name in RANGES else value)
+    iterations = checked_count(saved["iterations"].item(), "iterations", least=0)
+    fields = [*moments.values(), iterations, saved["to a time"].item()]
+    arrays = {name.removeprefix("memory "): array for name, array in saved.items() if name.startswith("memory ")}
     for name, array in arrays.items():
-        if name in COMPUTED:
-            continue
-        values = saved[f"memory {name}"]
-        if values.shape != array.shape or values.dtype != array.dtype:
-            raise _not_saved(f"{name} has the shape {values.shape}, not {array.shape}")
-        if name in STATE and not np.isfinite(values).all():
+        if array.dtype != float and name not in COMPUTED:
+            raise _not_saved(f"{name} has the type {array.dtype}")
+        if name in STATE and array.shape != (n,):
+            raise _not_saved(f"{name} has the shape {array.shape}, not {(n,)}")
+        if name in STATE and not np.isfinite(array).all():
             raise _not_saved(f"{name} is not finite")
-        array[:] = values
+    stored = (array.tobytes() for name, array in arrays.items() if name not in COMPUTED)
+    return b"".join([np.array(fields, dtype=float).tobytes(), *stored])
 
 
 def _not_saved(reason: object) -> StateError:

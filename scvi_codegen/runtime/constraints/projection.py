@@ -16,7 +16,6 @@ from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import (
     Array,
     Parameters,
-    checked_parameters,
     checked_states,
     checked_vector,
     inputs_not_given,
@@ -25,7 +24,8 @@ from scvi_codegen.runtime.core.validation import (
 
 __all__ = ["check_reachable", "consistent", "constraint_values", "multipliers", "projected"]
 
-MOST_SHOWN = 4
+MOST_SHOWN, MOST_DENSE = 4, 64
+"""Largest numbers of positions and constraints in a message, and of those whose rank is checked at run-time sizes."""
 
 
 def constraint_values(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayLike, parameters: Parameters) -> Array:
@@ -59,12 +59,12 @@ def projected(
     q0, p0 = checked_vector(stepper.interface, q, "q"), checked_vector(stepper.interface, p, "p")
     _of_constrained(stepper, q0, p0, t)
     binding, q1, p1 = stepper.binding, np.empty_like(q0), np.empty_like(p0)
-    values = checked_parameters(stepper.interface, parameters)
+    values = stepper._parameters(parameters)
     status = binding.function("project")(
         checked_number(t, "the time t"), *map(binding.pointer, (q0, p0, values, q1, p1)), binding.workspace()
     )
     if status:
-        if wrong := rank_deficiency(stepper.constraints, q0, _linearised(stepper, t, parameters), nearest=True):
+        if wrong := _dependent(stepper, q0, t, parameters, nearest=True):
             raise StateError(f"projection onto the constraints failed near q = {_shown(q0)}: {wrong}")
         _refuse(stepper, status, q0)
     apart = np.empty(2)
@@ -88,7 +88,7 @@ def consistent(
             raise missing_input(name)
     q0, p0 = checked_vector(stepper.interface, q, "q"), checked_vector(stepper.interface, p, "p")
     q1, p1, apart = projected(stepper, q0, p0, t, parameters)
-    if check_rank and (wrong := rank_deficiency(stepper.constraints, q1, _linearised(stepper, t, parameters))):
+    if check_rank and (wrong := _dependent(stepper, q1, t, parameters)):
         raise StateError(f"{wrong} (q = {_shown(q1)})")
     moved = float(apart.max())
     if moved <= ROUNDING_UNITS * np.finfo(float).eps:
@@ -144,12 +144,19 @@ def _call(
     stepper: Integrator, name: str, times: Array, q: Array, p: Array, parameters: Parameters, *results: Array
 ) -> None:
     pointer = stepper.binding.pointer
-    values = checked_parameters(stepper.interface, parameters)
+    values = stepper._parameters(parameters)
     status = stepper.binding.function(name)(
         len(times), *map(pointer, (times, q, p, values, *results)), stepper.binding.workspace()
     )
     if status:
         _refuse(stepper, status, q)
+
+
+def _dependent(stepper: Integrator, q: Array, t: float, parameters: Parameters, *, nearest: bool = False) -> str:
+    """Return the message of :func:`rank_deficiency`; "" for run-time sizes too large for dense linear algebra."""
+    if stepper.interface.layout.coordinates and max(stepper.dimension, len(stepper.constraints)) > MOST_DENSE:
+        return ""
+    return rank_deficiency(stepper.constraints, q, _linearised(stepper, t, parameters), nearest=nearest)
 
 
 def _linearised(stepper: Integrator, t: float, parameters: Parameters) -> Jacobian:

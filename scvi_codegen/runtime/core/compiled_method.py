@@ -13,9 +13,8 @@ from scvi_codegen.native import building
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.representation import LONGEST, clipped
-from scvi_codegen.runtime.core.validation import (
-    Array,
-)
+from scvi_codegen.runtime.core.named_arrays import named, shapes_of
+from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.events.event import Event, EventLike, as_events
 
 __all__ = ["CompiledMethod", "Variants"]
@@ -84,9 +83,23 @@ class CompiledMethod:
         self._event_variants: dict[tuple[Event, ...], Self] = {}
         self._released_runs: list[Any] = []
         self._plain = source
-        self.source = _event_variant(source, interface, events) if events else source
-        library = building.load(self.source, flags=flags)
+        self.shapes = shapes_of(interface)
+        self._load()
+
+    def _load(self) -> None:
+        """Load the library with the events."""
+        interface, events = self.interface, self.events
+        self.source = _event_variant(self._plain, interface, events) if events else self._plain
+        library = building.load(self.source, flags=self.flags)
         self.binding = Binding(library, interface.prefix, interface.workspace, fallback=self._load_fallback)
+
+    def _copy(self, source: Source, events: tuple[Event, ...]) -> Self:
+        """Return the integrator with another source or other events."""
+        return type(self)(source, self.interface, variants=self._variants, flags=self.flags, events=events)
+
+    def named(self, values: Array) -> Array:
+        """Return (.., m) numbers of states that arrays of coordinates index by name; without arrays unchanged."""
+        return values if self.shapes is None else named(values, self.shapes)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {clipped(self.title, LONGEST - 20)}>"
@@ -247,17 +260,8 @@ class CompiledMethod:
         if wanted not in self._event_variants:
             while len(self._event_variants) >= MOST_EVENT_SETS:
                 self._event_variants.pop(next(iter(self._event_variants)), None)
-            self._event_variants[wanted] = self._made_with_events(wanted)
+            self._event_variants[wanted] = self._copy(self._plain, wanted)
         return self._event_variants[wanted]
-
-    def _made_with_events(self, wanted: tuple[Event, ...]) -> Self:
-        return type(self)(
-            self._plain,
-            self.interface,
-            variants=self._variants,
-            flags=self.flags,
-            events=wanted,
-        )
 
     def _adaptive(self) -> Self:
         """Return the integrator with adaptive steps, loaded once; raise ``MethodError`` if the method has none."""
@@ -275,13 +279,7 @@ class CompiledMethod:
             )
         if source == self._plain:
             return self
-        return type(self)(
-            source,
-            self.interface,
-            variants=self._variants,
-            flags=self.flags,
-            events=self.events,
-        )
+        return self._copy(source, self.events)
 
 
 def _event_variant(source: Source, interface: Interface, events: tuple[Event, ...]) -> Source:

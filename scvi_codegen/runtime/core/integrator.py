@@ -68,7 +68,7 @@ class Integrator(LinearisedMethod):
         q1, p1 = np.empty_like(q0), np.empty_like(p0)
         arrays = (q0, p0, self._parameters_at(q0, p0, parameters))
         self._solve(self.binding, "step", t, h, arrays, options, (q1, p1))
-        return q1, p1
+        return self.named(q1), self.named(p1)
 
     def _solve(
         self,
@@ -128,7 +128,7 @@ class Integrator(LinearisedMethod):
         Returns:
             (m,), or (n, m) for (n, m) states with one time or (n,) times.
         """
-        return self._transform("velocity", q, p, t, parameters, "p")
+        return self.named(self._transform("velocity", q, p, t, parameters, "p"))
 
     def _initial_momenta(
         self, q: ArrayLike, p: ArrayLike | None, velocity: ArrayLike | None, t: float, parameters: Parameters
@@ -186,6 +186,12 @@ class Integrator(LinearisedMethod):
         times, positions, momenta = checked_states(self.interface, q, p, t)
         result = self._energies_of(times, positions, momenta, self._parameters(parameters))
         return float(result[0]) if np.ndim(q) == 1 else result
+
+    def _energy_parts(self, q: Array, p: Array, t: Array, parameters: Array) -> Array:
+        """Return (n, 3) kinetic, potential and total energies of (n, m) states; parts of run-time sizes, else NaN."""
+        parts = np.full((len(q), 3), np.nan)
+        parts[:, 2] = self.energy(q, p, t, parameters)
+        return parts
 
     def _energies_of(self, t: Array, q: Array, p: Array, parameters: Array) -> Array:
         """Return (n,) energies of unchecked contiguous arrays of shapes (n,), (n, m), (n, m) and (k,).
@@ -400,5 +406,21 @@ class Integrator(LinearisedMethod):
     def _vector(self, value: ArrayLike, name: str) -> Array:
         return checked_vector(self.interface, value, name)
 
-    def _parameters(self, parameters: Parameters) -> Array:
+    def _parameters(self, parameters: Parameters, base: Array | None = None) -> Array:
+        """Return the (k,) parameters; those that are not passed by name are those of ``base``, or defaults."""
+        if base is not None and isinstance(parameters, Mapping):
+            parameters = {**self.parameters_by_name(base), **parameters}
         return checked_parameters(self.interface, parameters)
+
+    def parameters_by_name(self, values: Array) -> dict[str, Any]:
+        """Return (k,) parameters by name."""
+        return dict(zip(self.interface.parameters, values.tolist(), strict=True))
+
+    def constraint_arrays(self, values: Array) -> Any:
+        """Return numbers of all constraints in the form of :attr:`Run.multipliers`: unchanged."""
+        return values
+
+    def _checkpoint(self, run: Any) -> bytes:
+        """Return a run as bytes."""
+        saved: bytes = run.snapshot
+        return saved

@@ -53,23 +53,38 @@ from scvi_codegen.validation.counts import checked_count
 __all__ = ["Stepper"]
 
 
-class Settings(TypedDict, total=False):
-    """Keyword arguments that :meth:`Stepper.integrate` takes with and without inputs."""
+class RunSettings(TypedDict, total=False):
+    """Keyword arguments of :meth:`Stepper.integrate` but for the data of the system."""
 
-    velocity: ArrayLike | None
     h: float | None
     steps: int | None
     t_end: float | None
     tolerance: float | None
     save_every: int
     t: float
-    parameters: Parameters
     options: SolverOptions | None
     progress: Callable[[int], None] | None
     t_eval: ArrayLike | None
+    observe: Callable[[Run], ArrayLike] | None
     events: EventLike | Sequence[EventLike] | None
     error: float | None
     check_growth: bool | None
+
+
+class Settings(RunSettings, total=False):
+    """Keyword arguments that :meth:`Stepper.integrate` takes with and without inputs."""
+
+    velocity: ArrayLike | None
+    parameters: Parameters
+
+
+class Output(TypedDict):
+    """Keyword arguments of :func:`_recorded`."""
+
+    save_every: int
+    t_eval: ArrayLike | None
+    progress: Callable[[int], None] | None
+    observe: Callable[[Run], ArrayLike] | None
 
 
 class Stepper(Integrator):
@@ -86,7 +101,7 @@ class Stepper(Integrator):
     def integrate(
         self, q: ArrayLike, p: ArrayLike | None = None, *, inputs: Mapping[str, Any], **settings: Unpack[Settings]
     ) -> DrivenTrajectory: ...
-    @checks_arguments(StateError, progress=FUNCTION, inputs=MAPPING)
+    @checks_arguments(StateError, progress=FUNCTION, observe=FUNCTION, inputs=MAPPING)
     def integrate(
         self,
         q: ArrayLike,
@@ -104,6 +119,7 @@ class Stepper(Integrator):
         options: SolverOptions | None = None,
         progress: Callable[[int], None] | None = None,
         t_eval: ArrayLike | None = None,
+        observe: Callable[[Run], ArrayLike] | None = None,
         events: EventLike | Sequence[EventLike] | None = None,
         error: float | None = None,
         check_growth: bool | None = None,
@@ -130,6 +146,8 @@ class Stepper(Integrator):
             progress: called with the number of completed steps.
             t_eval: (n,) output times, sorted in the direction of the run, instead of ``save_every``; see
                 :meth:`Trajectory.at`. Not with inputs.
+            observe: function of the run that returns the data to save instead of the states, a number or an array of
+                constant shape, in ``observed`` of the trajectory. Not with inputs.
             events: zero crossings to record in ``events`` of the trajectory; a terminal one ends the run. One or
                 several :class:`~scvi_codegen.runtime.events.event.Event` or functions of (q, v, p, t) as text or SymPy
                 expression, compiled once with the integrator. By default those of :func:`compile_stepper`.
@@ -158,9 +176,12 @@ class Stepper(Integrator):
         data = None if inputs is None else checked_inputs(self.interface, inputs)
         if data is not None and t_eval is not None:
             raise StateError("t_eval is not supported with inputs: omit t_eval")
+        if observe is not None and (data is not None or t_eval is not None):
+            raise StateError("observe is not supported with inputs or t_eval: omit observe")
         if error is not None:
+            alternatives = {"h": h, "steps": steps, "tolerance": tolerance, "observe": observe}
             return confirmed_run(
-                checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance}, has_tau=self._has_tau),
+                checked_error(error, alternatives, has_tau=self._has_tau),
                 partial(stepper.integrate, inputs=inputs),
                 partial(stepper.with_events(()).integrate, inputs=inputs),
                 (q, p, velocity),
@@ -172,7 +193,8 @@ class Stepper(Integrator):
             plan = h, t_end if to_end else None, tolerance
             run = stepper._started(q, p, velocity, plan, t, parameters, options, reuse=True)
             check = GrowthCheck(run, check_growth)
-            trajectory = _recorded(run, h, steps, t_end, save_every=save_every, t_eval=t_eval, progress=progress)
+            output: Output = {"save_every": save_every, "t_eval": t_eval, "progress": progress, "observe": observe}
+            trajectory = _recorded(run, h, steps, t_end, **output)
             check.warn(trajectory)
             run._release()
             return trajectory
@@ -424,7 +446,7 @@ class Stepper(Integrator):
             q, p, np.zeros(self.dimension) if p is velocity is None else velocity, t, parameters
         )
         q1, p1, _ = projected(self, q, momenta, t, parameters)
-        return q1, p1
+        return self.named(q1), self.named(p1)
 
     def multipliers(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
         """Return the Lagrange multipliers lambda of the constraint forces G^T lambda at states: (c,), or (n, c).
@@ -455,6 +477,7 @@ def _recorded(
     save_every: int,
     t_eval: ArrayLike | None,
     progress: Callable[[int], None] | None,
+    observe: Callable[[Run], ArrayLike] | None,
 ) -> Trajectory:
     """Return the states of a run without inputs; arguments as of :meth:`Stepper.integrate`."""
     interface = run.stepper.interface
@@ -462,11 +485,11 @@ def _recorded(
     if h is not None and t_end is not None and not interface.time_transformation:
         whole = None if clocked or steps is not None else steps_to(run.t, t_end, h)
         if whole is None or whole % checked_count(save_every, "save_every", least=1):
-            return _with_warnings(observed_until(run, t_end, steps, save_every, t_eval, progress))
+            return _with_warnings(observed_until(run, t_end, steps, save_every, t_eval, progress, observe))
         steps = whole
     _check_number(run, steps)
     if t_eval is None:
-        return _with_warnings(run._recorded(steps, save_every=save_every, progress=progress))
+        return _with_warnings(run._recorded(steps, save_every=save_every, progress=progress, observe=observe))
     if clocked:
         raise StateError("t_eval requires t_end instead of steps in transformed time")
     times = times_of_run(t_eval, run.t, _end_of(run, steps))

@@ -39,8 +39,9 @@ from scvi_codegen.runtime.inputs.segments import (
     planned_segments,
     time_after_steps,
 )
+from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.memory import Memory
-from scvi_codegen.runtime.run.run_loop import drive, record
+from scvi_codegen.runtime.run.run_loop import record
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation.counts import checked_count

@@ -19,7 +19,7 @@ from scvi_codegen.native.arguments import real_array
 from scvi_codegen.pictures.residuals import ResidualPlot
 from scvi_codegen.representation import summary
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.core.validation import Array, checked_parameters, checked_vector
+from scvi_codegen.runtime.core.validation import Array, checked_vector
 from scvi_codegen.runtime.estimation.measurements import Measurements, distinct, state_names
 from scvi_codegen.runtime.estimation.multiple_shooting import LOOSE, TIGHT, Chain, Limits, chained, joined
 from scvi_codegen.runtime.inputs.segments import checked_inputs
@@ -241,7 +241,7 @@ class _Model:
                 f"parameters must be values, as {{'{next(iter(parameters))}': 1.0}}, not names: name those to estimate "
                 f"in unknown={list(parameters)}"
             )
-        values = checked_parameters(stepper.interface, parameters)
+        values = stepper._parameters(parameters)
         momenta = stepper._initial_momenta(q, p, velocity, measurements.start, values)
         unknown_indices = [2 * m + stepper.parameters.index(name) for name in wanted]
         names = (*wanted, *state_names(stepper)) if fit_initial_state else tuple(wanted)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,12 @@ from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.events.event import ACCUMULATED, Crossings
 from scvi_codegen.runtime.trajectory.dense_output import grid_tolerance
-from scvi_codegen.runtime.trajectory.saved_states import SavedStates
+from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
 
-__all__ = ["CrossingSearch", "crossings_of"]
+if TYPE_CHECKING:
+    from scvi_codegen.runtime.arrays.events import ArraySearch
+
+__all__ = ["CrossingSearch", "crossings_of", "search_of"]
 
 INITIAL_CAPACITY = 256
 """Initial number of crossings that one call can return; doubled when exceeded."""
@@ -28,19 +31,21 @@ class CrossingSearch:
     Args:
         stepper: the stepper, with its events.
         crossed: numbers of earlier crossings of each event; none by default.
+        terminal: whether terminal events end the search.
 
     Attributes:
         ended: whether a terminal event occurred; ``found[-1]`` then contains its crossing.
         recorded: structured arrays (t, function, q, p), in the order of the run.
     """
 
-    def __init__(self, stepper: Integrator, crossed: Sequence[int] = ()) -> None:
+    def __init__(self, stepper: Integrator, crossed: Sequence[int] = (), *, terminal: bool = True) -> None:
         self.stepper, self.binding = stepper, stepper.binding
         self.recorded: list[NDArray[Any]] = []
         self.watch = self.binding.new("watch *")
         for number, event in enumerate(stepper.events):
             self.watch.direction[number] = event.direction
-            self.watch.remaining[number] = int(event.terminal) - (crossed[number] if crossed and event.terminal else 0)
+            if terminal and event.terminal:
+                self.watch.remaining[number] = int(event.terminal) - (crossed[number] if crossed else 0)
         m = stepper.dimension
         numbers = [("t", float), ("fraction", float), ("function", np.int32), ("direction", np.int32)]
         fields = [*numbers, ("q", float, (m,)), ("p", float, (m,))]
@@ -104,14 +109,29 @@ class CrossingSearch:
             return EventError(ACCUMULATED.format(function=function, t=report.t))
         return step_failure(status, report, step=step, h=h)
 
+    @property
+    def last(self) -> tuple[float, Array, Array]:
+        """Time, positions and momenta of the last crossing."""
+        crossing = self.recorded[-1][-1]
+        return float(crossing["t"]), crossing["q"], crossing["p"]
+
     def crossings(self) -> tuple[Crossings, ...]:
         """Return the crossings by event."""
-        records = np.concatenate([np.empty(0, self._record), *self.recorded])
+        records, named = np.concatenate([np.empty(0, self._record), *self.recorded]), self.stepper.named
         return tuple(
-            Crossings(event=event, t=mine["t"].copy(), q=mine["q"].copy(), p=mine["p"].copy())
+            Crossings(event=event, t=mine["t"].copy(), q=named(mine["q"].copy()), p=named(mine["p"].copy()))
             for number, event in enumerate(self.stepper.events)
             for mine in [records[records["function"] == number]]
         )
+
+
+def search_of(stepper: Any, crossed: Sequence[int] = (), *, terminal: bool = True) -> CrossingSearch | ArraySearch:
+    """Return the search for the events of a stepper; arguments as of :class:`CrossingSearch`."""
+    if stepper.interface.layout.coordinates:
+        from scvi_codegen.runtime.arrays.events import ArraySearch  # here: not needed for known sizes
+
+        return ArraySearch(stepper, crossed, terminal=terminal)
+    return CrossingSearch(stepper, crossed, terminal=terminal)
 
 
 def crossings_of(stepper: Integrator, states: SavedStates) -> tuple[Crossings, ...]:
@@ -128,8 +148,6 @@ def crossings_of(stepper: Integrator, states: SavedStates) -> tuple[Crossings, .
             "events require all states, but this trajectory has save_every > 1 or t_eval: integrate with save_every=1"
         )
     lengths[:-1][short] = spans[short]  # an event ended the last step
-    search = CrossingSearch(stepper)
-    for number in range(len(stepper.events)):
-        search.watch.remaining[number] = 0
+    search = search_of(stepper, terminal=False)
     search.search(replace(states, step_sizes=lengths))
     return search.crossings()

@@ -89,17 +89,17 @@ class DrivenTrajectory(DerivativesWithInputs, Confirmed):
     @property
     def q(self) -> Array:
         """(n, m) positions."""
-        return self._joined(lambda piece: piece.q)
+        return self.stepper.named(self._joined(lambda piece: piece.q))
 
     @property
     def p(self) -> Array:
         """(n, m) momenta."""
-        return self._joined(lambda piece: piece.p)
+        return self.stepper.named(self._joined(lambda piece: piece.p))
 
     @property
     def velocity(self) -> Array:
         """(n, m) velocities."""
-        return self._joined(lambda piece: piece.velocity)
+        return self.stepper.named(self._joined(lambda piece: piece.velocity))
 
     @property
     def iterations(self) -> NDArray[np.int32]:
@@ -148,6 +148,15 @@ class DrivenTrajectory(DerivativesWithInputs, Confirmed):
         """Return (n,) energies p.v - L."""
         return self._joined(lambda piece: piece.energy())
 
+    @property
+    def observed(self) -> None:
+        """``None``: runs with inputs save all states."""
+
+    @property
+    def energies(self) -> Array:
+        """(n, 3) energies, as of :class:`Trajectory`."""
+        return self._joined(lambda piece: piece.energies)
+
     def momentum_maps(self) -> Array:
         """Return (n, k) values of the conserved quantities."""
         return self._joined(lambda piece: piece.momentum_maps())
@@ -189,7 +198,8 @@ class DrivenTrajectory(DerivativesWithInputs, Confirmed):
         number = np.minimum(np.searchsorted(ends, forward * flat), len(ends) - 1)
         for k in np.unique(number):
             q[number == k], p[number == k] = self.pieces[k].at(flat[number == k])
-        return q.reshape(*times.shape, m), p.reshape(*times.shape, m)
+        named = self.stepper.named
+        return named(q.reshape(*times.shape, m)), named(p.reshape(*times.shape, m))
 
     @property
     def plot(self) -> Plots:

@@ -25,7 +25,6 @@ from scvi_codegen.runtime.core.validation import (
     Array,
     Parameters,
     check_inputs_given,
-    checked_parameters,
     checked_vector,
 )
 from scvi_codegen.runtime.estimation.measurements import state_names
@@ -179,7 +178,7 @@ class _OrbitSearch:
             energy=None if energy is None else checked_number(energy, "the energy"),
             gain=np.zeros(stepper.dimension) if gain is None else checked_vector(interface, gain, "gain"),
             t=checked_number(t, "the time t"),
-            parameters=checked_parameters(interface, parameters),
+            parameters=stepper._parameters(parameters),
             options=options,
         )
 

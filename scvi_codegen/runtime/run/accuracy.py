@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from itertools import islice
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from scvi_codegen.runtime.core.integrator import Integrator
 
 __all__ = [
-    "FIXED_STEP_REMEDY",
-    "GROSS_ERROR",
     "TOLERABLE_ERROR",
     "warn_of_energies",
     "warn_of_energy_error",
@@ -68,11 +67,9 @@ class StepData(Protocol):
     def worst_step_time(self) -> float: ...
 
 
-class EnergyData(Protocol):
+class EnergyData(StepData, Protocol):
     """States of a trajectory, including the first and the last."""
 
-    @property
-    def plan(self) -> StepPlan | None: ...
     @property
     def stepper(self) -> Integrator: ...
     @property
@@ -126,12 +123,21 @@ def warn_of_large_steps(trajectory: StepData, *, before: float = 0.0, remedy: st
 
 
 def warn_of_energy_error(trajectory: EnergyData) -> None:
-    """Issue an :class:`AccuracyWarning` if an adaptive run does not conserve an energy that the system conserves."""
+    """Issue an :class:`AccuracyWarning` if an adaptive run does not conserve an energy that the system conserves.
+
+    Runs over arrays of run-time sizes with fixed steps and no error estimate are checked for gross errors.
+    """
     plan, stepper = trajectory.plan, trajectory.stepper
-    if plan is None or plan.tau or not stepper.interface.conserves_energy or not _warnings_enabled.get():
+    if stepper.interface.layout.coordinates and plan is None and math.isnan(trajectory.step_error):
+        limits: dict[str, Any] = {"tolerable": GROSS_ERROR, "why": FIXED_STEP_REMEDY}
+    elif plan is None or plan.tau:
+        return
+    else:
+        limits = {}
+    if not stepper.interface.conserves_energy or not _warnings_enabled.get():
         return
     if energies := _changed_energies(stepper, trajectory.t, trajectory.q, trajectory.p, trajectory.parameters):
-        warn_of_energies(*energies)
+        warn_of_energies(*energies, **limits)
 
 
 def warn_of_energy_errors(ensemble: EnsembleEnergyData) -> None:

@@ -8,7 +8,7 @@ perturbed in its last place. The repeated run stores no states and has a bounded
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, Protocol
 
@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
-from scvi_codegen.runtime.arrays.run import ArrayRun
 from scvi_codegen.runtime.constraints.projection import projected
 from scvi_codegen.runtime.run.accuracy import warnings_wanted
 from scvi_codegen.runtime.run.memory import Memory
@@ -55,9 +54,9 @@ class ComparedStates(Protocol):
     @property
     def t(self) -> Array: ...
     @property
-    def q(self) -> Any: ...
+    def q(self) -> Array: ...
     @property
-    def p(self) -> Any: ...
+    def p(self) -> Array: ...
 
 
 class GrowthCheck:
@@ -74,7 +73,7 @@ class GrowthCheck:
     """
 
     def __init__(
-        self, run: Memory | ArrayRun, requested: bool | None, advance_until: Callable[[float], None] | None = None
+        self, run: Memory, requested: bool | None, advance_until: Callable[[float], None] | None = None
     ) -> None:
         adaptive = run.plan is not None and not run.plan.tau
         if requested and not adaptive:
@@ -86,7 +85,7 @@ class GrowthCheck:
         self.wanted = adaptive and requested is not False and warnings_wanted()
         if self.wanted:
             self.start: Any = run.snapshot
-            self.parameters = run.parameters if isinstance(run, Memory) else None  # inputs change them during the run
+            self.parameters = run.parameters  # inputs change them during the run
 
     def warn(self, states: ComparedStates) -> None:
         """Repeat the run and warn if its states differ by more than is tolerable; the run is left where that ends."""
@@ -139,31 +138,24 @@ class GrowthCheck:
     def _last(self, states: ComparedStates, steps: int) -> int:
         """Return the index of the last state to compare; 0 unless all states of the run are saved."""
         count = len(states.t) - 1
-        if len(self._rows(states.q, 0, len(states.t))) != len(states.t):
+        if len(states.q) != len(states.t):
             return 0
-        most = float(min(MOST_STEPS, MOST_NUMBERS // len(self._positions_and_momenta()[0])))
+        most = float(min(MOST_STEPS, MOST_NUMBERS // len(self.run._q)))
         return count if self.requested or steps <= most else int(count * most / steps)
-
-    def _positions_and_momenta(self) -> tuple[Array, Array]:
-        """Return views of the positions and momenta of the run."""
-        if isinstance(self.run, Memory):
-            return self.run._q, self.run._p
-        q, p = np.split(self.run.state, 2)
-        return q, p
 
     def _begin(self, nudge: float, tolerance: float) -> None:
         """Reset the run to its perturbed initial state, on its constraints, with another local tolerance."""
         run = self.run
         run.rollback(self.start)
-        if isinstance(run, Memory):
-            run._parameters[:] = self.parameters
+        run._parameters[:] = self.parameters
+        run._pass_parameters()
         assert run.plan is not None  # by construction
         run.plan = StepPlan(t_end=run.plan.t_end, tolerance=tolerance)
-        q, p = self._positions_and_momenta()
+        q, p = run._q, run._p
         factors = _factors(len(q), nudge)
         q *= factors[0]
         p *= factors[1]
-        if isinstance(run, Memory) and run.stepper.interface.constraints:
+        if run.stepper.interface.constraints:
             q[:], p[:], _ = projected(run.stepper, q.copy(), p.copy(), run.t, run.parameters)
 
     def _to(self, t: float) -> None:
@@ -179,28 +171,20 @@ class GrowthCheck:
         If the difference relative to the state itself is at most ``small``, this cheaper bound is returned.
         """
         ratios = []
-        for mine, each in zip(self._positions_and_momenta(), (states.q, states.p), strict=True):
-            row = self._rows(each, k, k + 1)[0]
+        for mine, each in zip((self.run._q, self.run._p), (states.q, states.p), strict=True):
+            row = each[k]
             difference = mine - row
             largest = float(np.abs(row).max())
             apart = size = 0.0
             if SMALLEST < max(largest, float(np.abs(difference).max())) < 1.0 / SMALLEST:  # squares do not overflow
                 apart, size = math.sqrt(difference @ difference), math.sqrt(row @ row)
             if not (size > 0.0 and apart <= small * size):
-                rows = self._rows(each, 0, k + 1)
+                rows = each[: k + 1]
                 unit = float(np.abs(rows).max()) or 1.0
                 size = float(np.linalg.norm(rows / unit, axis=1).max())
                 apart = float(np.linalg.norm(difference / unit))
             ratios.append(apart / size if apart and size else apart)
         return max(ratios)
-
-    @staticmethod
-    def _rows(values: Any, first: int, end: int) -> Array:
-        """Return states as rows; several arrays are concatenated."""
-        if isinstance(values, Mapping):
-            parts = [each[first:end] for each in values.values()]
-            return np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
-        return np.asarray(values)[first:end]
 
     @staticmethod
     def _report(nudge: float, difference_text: str) -> None:

@@ -249,7 +249,7 @@ def _accurate(
 
 def _compared(run: Callable[[float], Any], trajectory: Any, start: float) -> tuple[Array, Array]:
     """Return times, and the relative differences of the returned run and another one that ends at the last time."""
-    q, p = _rows(trajectory.q), _rows(trajectory.p)
+    q, p = np.asarray(trajectory.q), np.asarray(trajectory.p)
     most = max(2, min(MOST_SAMPLES, MOST_NUMBERS // q.shape[1]))
     chosen = np.unique(np.linspace(0, len(trajectory.t) - 1, most).astype(int))
     t, q, p = trajectory.t[chosen], q[chosen], p[chosen]
@@ -266,18 +266,11 @@ def _compared(run: Callable[[float], Any], trajectory: Any, start: float) -> tup
     reached = (forward * (t - first.t[-1]) <= 0.0) & (forward * (t - first.t[0]) >= 0.0)
     differences = np.full(len(t), np.inf)
     if reached.any():
-        moved = [_rows(each) for each in first.at(t[reached])]
+        moved = first.at(t[reached])
         early = abs(t - start) <= EARLY * abs(end - start)
         parts = [_relative(a, b[reached], _sizes(b, early)[reached]) for a, b in zip(moved, (q, p), strict=True)]
         differences[reached] = np.maximum(*parts)
     return t, differences
-
-
-def _rows(values: Any) -> Array:
-    """Return states as rows; several arrays are concatenated."""
-    if isinstance(values, Mapping):
-        return np.concatenate([each.reshape(len(each), -1) for each in values.values()], axis=1)
-    return np.asarray(values)
 
 
 def _sizes(states: Array, early: NDArray[np.bool_]) -> Array:

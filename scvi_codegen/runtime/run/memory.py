@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from typing import Any, Self
 
 import numpy as np
@@ -16,13 +16,13 @@ from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import (
     Array,
     Parameters,
-    checked_parameters,
     checked_vector,
     inputs_not_given,
     missing_input,
     no_input,
     parameter_index,
 )
+from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.one_thread import OneThread, alone, in_use
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.validation.counts import LARGEST_COUNT, checked_count
@@ -30,11 +30,11 @@ from scvi_codegen.validation.counts import LARGEST_COUNT, checked_count
 __all__ = ["Memory", "fill"]
 
 
-STEPS_PER_CALL = 10**5
-"""Largest number of steps per call into C, between checks for Ctrl-C."""
+STEPS_PER_CALL, MOST_UNTIMED = 10**5, 2**10
+"""Largest number of steps per call into C, between checks for Ctrl-C, and of coordinates of which it is not timed."""
 GRID_FIELDS, MOST_GRID_LEVEL = ("grid_level", "change", "change_before", "direction", "failed", "avoiding"), 2**16
 """Fields of adaptive steps that index tables of the step-size grid; a bound beyond all exponents of a double."""
-FUNCTIONS = ("start", "advance", "advance_to", "step_error")
+FUNCTIONS = ("start", "set_parameters", "advance", "advance_to", "step_error")
 """Functions of C that take a run; sources of version 0.1 have no error estimate."""
 NO_OUTPUT = LARGEST_COUNT
 """Output stride that saves no state."""
@@ -106,6 +106,7 @@ class Memory(OneThread):
         self, values: Array, options: SolverOptions | None, plan: StepPlan | None, unset_inputs: tuple[str, ...]
     ) -> None:
         self._parameters[:], self.plan = values, plan
+        self._pass_parameters()
         if options is not self._options:
             self._arguments, self._options = (self._arguments[0], self.stepper.binding.options(options)), options
         self._unset_inputs, self.longest = unset_inputs, 0.0
@@ -138,7 +139,7 @@ class Memory(OneThread):
             )
         if not stepper._has_energy(parameters):
             raise StateError("a saved run in transformed time requires its energy: give parameters=run.parameters")
-        values = checked_parameters(stepper.interface, parameters)
+        values = stepper._parameters(parameters)
         run._set(values, checked_options(options), plan, inputs_not_given(stepper.interface, parameters))
         return run
 
@@ -188,11 +189,8 @@ class Memory(OneThread):
         """
         interface = self.stepper.interface
         missing = inputs_not_given(interface, parameters)
-        if isinstance(parameters, Mapping):
-            known = dict(zip(interface.parameters, self._parameters.tolist(), strict=True))
-            parameters = {**known, **parameters}
         if parameters is not None:
-            self._set_parameters(checked_parameters(interface, parameters))
+            self._set_parameters(self.stepper._parameters(parameters, self._parameters))
             self._unset_inputs = tuple(name for name in self._unset_inputs if name in missing)
         if h is not None and checked_step(h) != self._memory.h:
             self._memory.h, self._memory.guess = h, 0
@@ -223,6 +221,12 @@ class Memory(OneThread):
         if self.stepper.interface.constraints:
             check_reachable(self.stepper, self.q, self.p, self.t, values)
         self._parameters[:] = values
+        self._pass_parameters()
+
+    def _pass_parameters(self) -> None:
+        """Pass the parameters to C where the functions of steps do not take them."""
+        if "set_parameters" in self._functions:
+            self._functions["set_parameters"](self._parameters)
 
     @property
     def steps(self) -> int:
@@ -231,18 +235,19 @@ class Memory(OneThread):
 
     @property
     def q(self) -> Array:
-        """(m,) positions."""
-        return self._q.copy()
+        """(m,) positions; arrays by name, ``q["u"]``."""
+        return self.stepper.named(self._q.copy())
 
     @property
     def p(self) -> Array:
-        """(m,) momenta."""
-        return self._p.copy()
+        """(m,) momenta; arrays by name, ``p["u"]``."""
+        return self.stepper.named(self._p.copy())
 
     @property
     def _compensation(self) -> tuple[Array, Array]:
         """(m,) compensation terms of :attr:`q` and of :attr:`p`, added in the following steps."""
-        return np.array(list(self._memory.carry_q)), np.array(list(self._memory.carry_p))
+        carries = self._memory.carry_q, self._memory.carry_p
+        return self.stepper.named(np.array(list(carries[0]))), self.stepper.named(np.array(list(carries[1])))
 
     @alone
     def _resume_at(self, steps: int, time: tuple[float, float], carries: tuple[Array, Array]) -> None:
@@ -260,7 +265,7 @@ class Memory(OneThread):
     @alone
     def checkpoint(self) -> bytes:
         """Return a bitwise copy of the run for :meth:`Stepper.from_checkpoint` on the same kind of machine."""
-        return self.snapshot
+        return self.stepper._checkpoint(self)
 
     def check_inputs(self) -> None:
         """Raise :class:`StateError` if an input is not set."""
@@ -272,8 +277,19 @@ class Memory(OneThread):
         """Restore the state saved by :meth:`save`."""
         self.stepper.binding.buffer(self._memory)[:] = saved
 
-    def advance(self, steps: int) -> None:
+    def advance(
+        self,
+        steps: int,
+        *,
+        progress: Callable[[int], None] | None = None,
+        stop: Callable[[], bool] | None = None,
+    ) -> None:
         """Take ``steps`` steps; adaptive steps end at the target time.
+
+        Args:
+            steps: number of steps.
+            progress: called after each chunk with the number of steps of the run.
+            stop: called as often; the run ends early if it returns true.
 
         Raises:
             StepFailedError: if a step fails; the run is left at the state before it.
@@ -282,12 +298,25 @@ class Memory(OneThread):
         if not self._lock.acquire(False):  # as ``alone``, at half the cost
             raise in_use()
         try:
-            while left > 0 and not self.arrived:
-                if status := self._advance(min(left, STEPS_PER_CALL), NO_OUTPUT, self._discarded):
-                    raise step_failure(status, self._report, step=self.steps, h=self.h)
-                left -= STEPS_PER_CALL
+            if progress is None and stop is None and len(self._q) <= MOST_UNTIMED:
+                while left > 0 and not self.arrived:
+                    left -= self._taken(min(left, STEPS_PER_CALL))
+                return
+            drive(
+                self._taken,
+                left,
+                ended=lambda: self.arrived or bool(stop and stop()),
+                progress=progress and (lambda _: progress(self.steps)),
+            )
         finally:
             self._lock.release()
+
+    def _taken(self, steps: int) -> int:
+        """Take steps in one C call and return their number."""
+        if status := self._advance(steps, NO_OUTPUT, self._discarded):
+            raise step_failure(status, self._report, step=self.steps, h=self.h)
+        taken: int = self._report.steps
+        return taken
 
     def _run_to_target(self) -> None:
         """Advance to the target time without saving intermediate states."""
@@ -327,12 +356,17 @@ class Memory(OneThread):
         return int(self._memory.rejected) if self._plan is not None and not self._plan.tau else 0
 
     @property
-    def step_error(self) -> tuple[float, float]:
-        """Estimated relative error of the worst step and its start time; NaN without an estimate."""
+    def step_error(self) -> float:
+        """Estimated relative error of the worst step; NaN without an estimate."""
         if "step_error" not in self._functions:
-            return np.nan, np.nan
-        error = self._functions["step_error"]()
-        return (error, self._memory.error_t) if error >= 0.0 else (np.nan, np.nan)
+            return np.nan
+        error: float = self._functions["step_error"]()
+        return error if error >= 0.0 else np.nan
+
+    @property
+    def worst_step_time(self) -> float:
+        """Start time of the worst step; NaN without an error estimate."""
+        return float(self._memory.error_t) if self.step_error >= 0.0 else np.nan
 
     @property
     def _leaving(self) -> bool:

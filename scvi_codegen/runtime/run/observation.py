@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.native.arguments import checked_number
-from scvi_codegen.runtime.events.detection import CrossingSearch
+from scvi_codegen.native.arguments import checked_number, real_array
+from scvi_codegen.runtime.events.detection import search_of
+from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.memory import Memory
-from scvi_codegen.runtime.run.run_loop import drive, record, trajectory_of
+from scvi_codegen.runtime.run.run_loop import record, trajectory_of
 from scvi_codegen.runtime.run.singular_time import ProgressWatch
 from scvi_codegen.runtime.run.times import WHOLE
 from scvi_codegen.runtime.trajectory.dense_output import states_and_steps_at, step_sizes_at, times_of_run
@@ -40,16 +43,26 @@ class Observation:
         save_every: without ``times``, save the present state and those whose step number is a multiple of this.
         times: (n,) output times, sorted in the direction of the run.
         end: final time of fixed steps, also in transformed time; the last step is shorter.
+        observe: function of the run that returns the data to save instead of the states between first and last.
     """
 
     def __init__(
-        self, run: Memory, *, save_every: int = 1, times: Array | None = None, end: float | None = None
+        self,
+        run: Memory,
+        *,
+        save_every: int = 1,
+        times: Array | None = None,
+        end: float | None = None,
+        observe: Callable[[Any], ArrayLike] | None = None,
     ) -> None:
         self.run, self.save_every, self.times = run, checked_count(save_every, "save_every", least=1), times
-        self.search = CrossingSearch(run.stepper, run._crossed) if run.stepper.events else None
+        self.search = search_of(run.stepper, run._crossed) if run.stepper.events else None
         self.end, self.arrived, self.partial_steps = end, False, 0
         self.states: list[tuple[Array, Array, Array, Array, Array, NDArray[np.int64]]] = []
-        self.iterations = 0
+        self.iterations, self.observe = 0, observe
+        self.observed: list[Array] = []
+        self.conserved: list[Array] = []
+        self.ends: list[tuple[Array, Array]] = []
 
     @property
     def ended(self) -> bool:
@@ -80,7 +93,7 @@ class Observation:
 
         def advance(size: int) -> int:
             before, number = run.t, run.steps
-            self._advance_chunk(size)
+            self._advance_chunk(size if self.observe is None else min(size, self.save_every - number % self.save_every))
             if watch is not None:
                 watch.check_progress(before, run.t, run.steps - number, run.steps)
             return run.steps - number
@@ -104,7 +117,7 @@ class Observation:
 
     def _advance_chunk(self, size: int) -> None:
         """Advance by one chunk, search it for events and save it; a failure after a terminal event is ignored."""
-        before, failure = self.run.checkpoint(), None
+        before, failure = self.run.snapshot, None
         try:
             part = record(self.run, size)
         except StepFailedError as error:
@@ -124,9 +137,9 @@ class Observation:
     def _ended(self, part: Trajectory) -> Trajectory:
         """Return the chunk with the state of the terminal event appended."""
         assert self.search is not None
-        last = self.search.recorded[-1][-1]
-        _, _, tau = self._state_within_step(part, float(last["t"]))
-        return self._with_state(part, part.step_sizes, last["t"], last["q"], last["p"], tau)
+        t, q, p = self.search.last
+        _, _, tau = self._state_within_step(part, t)
+        return self._with_state(part, part.step_sizes, t, q, p, tau)
 
     def _arrived(self, part: Trajectory, before: bytes) -> Trajectory:
         """Return the chunk up to the final time, with a shorter last step; the run is left before that step."""
@@ -183,7 +196,28 @@ class Observation:
         wanted[0] = first
         wanted[-1] |= self.ended or self.run.arrived
         q, p = part.q[wanted], part.p[wanted]
+        if self.observe is not None and len(q):
+            self.observed.append(self._observation(part))
+            end, stepper = part[-1:], self.run.stepper
+            maps = end.momentum_maps() if stepper.momentum_map_names else np.empty((1, 0))
+            self.conserved.append(np.concatenate([end.energies, maps], axis=1)[0])
+            self.ends = [*self.ends[:1], (q[-1], p[-1])]
+            q, p = q[:0], p[:0]
         self.states.append((part.t[wanted], q, p, part.step_sizes[wanted], part.stepped[wanted], total[wanted]))
+
+    def _observation(self, part: Trajectory) -> Array:
+        """Return the data to save of the last state of a chunk; a state within a step is that of a run from there."""
+        run = self.run
+        if self.ended:
+            here = {"t": part.t[-1], "parameters": run.parameters, "options": run.options}
+            run = type(run).started(run.stepper, part.q[-1], part.p[-1], h=run.plan or run.h, **here)
+        assert self.observe is not None  # by the caller
+        array, when = real_array(self.observe(run), "the result of observe"), f"at t = {run.t:g}"
+        if self.observed and array.shape != self.observed[0].shape:
+            raise StateError(
+                f"the result of observe must keep its shape: {array.shape} {when}, {self.observed[0].shape} before"
+            )
+        return array
 
     def _keep_times(self, part: Trajectory, total: NDArray[np.int64], *, first: bool) -> None:
         assert self.times is not None
@@ -198,7 +232,12 @@ class Observation:
     def trajectory(self) -> Trajectory:
         """Return all states saved so far."""
         t, q, p, lengths, stepped, total = (np.concatenate(arrays) for arrays in zip(*self.states, strict=True))
-        return self._made(t, q, p, np.diff(total, prepend=total[:1]).astype(np.int32), lengths, stepped)
+        iterations = np.diff(total, prepend=total[:1]).astype(np.int32)
+        if self.observe is None:
+            return self._made(t, q, p, iterations, lengths, stepped)
+        q, p = (np.array(each) for each in zip(*self.ends, strict=True))
+        trajectory = self._made(t, q, p, iterations, lengths, stepped)
+        return replace(trajectory, observed=np.array(self.observed), conserved=np.array(self.conserved))
 
     def _made(
         self, t: Array, q: Array, p: Array, iterations: NDArray[np.int32], lengths: Array, stepped: Array
@@ -216,6 +255,7 @@ def observed_until(
     save_every: int,
     t_eval: ArrayLike | None,
     progress: Callable[[int], None] | None,
+    observe: Callable[[Any], ArrayLike] | None = None,
 ) -> Trajectory:
     """Return the trajectory of a run with fixed steps to t_end, with the requested output."""
     end = checked_number(t_end, "the time t_end")
@@ -224,4 +264,4 @@ def observed_until(
     if (end - run.t) * run.h < 0.0:
         raise StateError(f"h = {run.h:g} has the wrong sign for a run from t = {run.t:g} to t_end = {end:g}")
     times = None if t_eval is None else times_of_run(t_eval, run.t, end)
-    return Observation(run, save_every=save_every, times=times, end=end).advance(None, progress)
+    return Observation(run, save_every=save_every, times=times, end=end, observe=observe).advance(None, progress)

@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Self
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.constraints.projection import constraint_values, multipliers
 from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.core.validation import Parameters
+from scvi_codegen.runtime.core.validation import Array, Parameters
 from scvi_codegen.runtime.run.accuracy import warn_of_energy_error, warn_of_large_steps
 from scvi_codegen.runtime.run.descriptions import describe_run, short_title
 from scvi_codegen.runtime.run.memory import Memory
@@ -43,14 +47,16 @@ class Run(Memory):
 
     def _release(self) -> None:
         """Let :meth:`_reused` return this run; the caller drops it. Large memory is freed instead."""
-        if len(self._workspace) <= MOST_KEPT:
+        if self.stepper.binding.reusable and len(self._workspace) <= MOST_KEPT:
             self.stepper._released_runs.append(self)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        known = dict(zip(self.stepper.parameters, self._parameters.tolist(), strict=True))
+        known = self.stepper.parameters_by_name(self._parameters)
         for name in self._unset_inputs:
             del known[f"{name}_0"]
-        return (_restored, (self.stepper, self.checkpoint(), known, self._options, self.plan, self.longest))
+        with self.alone():
+            saved = self.snapshot
+        return (_restored, (self.stepper, saved, known, self._options, self.plan, self.longest))
 
     @alone
     def record(
@@ -67,7 +73,7 @@ class Run(Memory):
             StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
             EventError: if an event function is not finite.
         """
-        before = 0.0 if self._leaving else self.step_error[0]
+        before = 0.0 if self._leaving else self.step_error
         trajectory = self._recorded(steps, save_every=save_every, progress=progress)
         if not self._leaving:
             warn_of_large_steps(trajectory, before=before)
@@ -75,12 +81,54 @@ class Run(Memory):
         return trajectory
 
     def _recorded(
-        self, steps: int | None, *, save_every: int = 1, progress: Callable[[int], None] | None = None
+        self,
+        steps: int | None,
+        *,
+        save_every: int = 1,
+        progress: Callable[[int], None] | None = None,
+        observe: Callable[[Run], ArrayLike] | None = None,
     ) -> Trajectory:
         """Return the states as :meth:`record` does, without its warnings and its lock."""
-        if self.stepper.events:
-            return Observation(self, save_every=save_every).advance(steps, progress)
+        if self.stepper.events or observe is not None:
+            return Observation(self, save_every=save_every, observe=observe).advance(steps, progress)
         return record(self, steps, save_every=save_every, progress=progress)
+
+    @property
+    def velocity(self) -> Array:
+        """(m,) velocities."""
+        return self.stepper.velocity(self.q, self.p, self.t, self._parameters)
+
+    @property
+    def energy(self) -> float:
+        """Energy of the present state."""
+        return float(self.stepper.energy(self.q, self.p, self.t, self._parameters))
+
+    @property
+    def energies(self) -> tuple[float, float, float]:
+        """Kinetic, potential and total energy in double-double arithmetic; of run-time sizes only, else NaN, NaN, E."""
+        now = self._q[np.newaxis], self._p[np.newaxis], np.array([self.t])
+        kinetic, potential, total = self.stepper._energy_parts(*now, self._parameters)[0].tolist()
+        return kinetic, potential, total
+
+    @property
+    def momentum_maps(self) -> Array:
+        """Conserved quantities of the present state, in the order of ``stepper.momentum_map_names``."""
+        return self.stepper.momentum_maps(self.q, self.p, self.t, self._parameters)
+
+    @property
+    def multipliers(self) -> Any:
+        """Lagrange multipliers of the present state; of run-time sizes an array over the loops of each constraint.
+
+        Raises:
+            MethodError: if the system has no constraints.
+        """
+        return self.stepper.constraint_arrays(multipliers(self.stepper, self.q, self.p, self.t, self._parameters)[0])
+
+    @property
+    def constraint_values(self) -> tuple[Any, Any]:
+        """Constraint residuals and their rates, in the form of :attr:`multipliers`; raises as these."""
+        values = constraint_values(self.stepper, self.q, self.p, self.t, self._parameters)[:, 0]
+        return self.stepper.constraint_arrays(values[0]), self.stepper.constraint_arrays(values[1])
 
 
 def _restored(

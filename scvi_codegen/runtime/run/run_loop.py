@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from struct import Struct
 
@@ -15,6 +14,7 @@ from scvi_codegen.native.arguments import empty_array
 from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.core.validation import BINARY64, Array
 from scvi_codegen.runtime.events.event import Crossings
+from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.singular_time import ProgressWatch, check_energy_surface
 from scvi_codegen.runtime.run.step_plan import StepPlan
@@ -22,47 +22,11 @@ from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["CALL_SECONDS", "drive", "first_step_size", "record", "trajectory_of"]
+__all__ = ["first_step_size", "record", "trajectory_of"]
 
 NATIVE_DOUBLE = Struct("d")
-CALL_SECONDS = 0.1
-"""Target duration of a C call in seconds; bounds the delay of Ctrl-C and of ``progress``."""
 FIRST_STEPS = 256
 """Number of saved states of the first C call, before the speed of the steps is known."""
-
-
-def drive(
-    advance: Callable[[int], int],
-    steps: float,
-    *,
-    first: int = 1,
-    most: float = math.inf,
-    growth: float = 2.0,
-    seconds: float | None = None,
-    ended: Callable[[], bool],
-    progress: Callable[[int], None] | None = None,
-) -> None:
-    """Take steps in chunks of bounded duration, so that Python regains control regularly.
-
-    Args:
-        advance: function that takes a number of steps and returns how many it took.
-        steps: number of steps, possibly infinite.
-        first, most: steps of the first chunk, and largest chunk size.
-        growth: largest ratio of successive chunk sizes.
-        seconds: target duration of a chunk, by default ``CALL_SECONDS``.
-        ended: function that returns whether the run has ended; called before each chunk.
-        progress: called with the number of steps after each chunk.
-    """
-    done, size, began, wanted = 0, first, -math.inf, CALL_SECONDS if seconds is None else seconds
-    while done < steps and not ended():
-        now = time.perf_counter()
-        if done:
-            faster = min(growth, wanted / max(now - began, 1e-6))
-            size = max(1, int(min(size * faster, most)))
-        size, began = int(min(size, steps - done)), now
-        done += advance(size)
-        if progress is not None:
-            progress(done)
 
 
 def record(
@@ -193,8 +157,9 @@ def trajectory_of(
     tau: Array | None = None,
 ) -> Trajectory:
     """Return a trajectory of these states with the data of the run; by default each precedes a step of h."""
-    plan, h = memory._plan, memory.h
-    step_error, worst_step_time = memory.step_error
+    plan, h, stepper, step_error = memory._plan, memory.h, memory.stepper, memory.step_error
+    if stepper.shapes is not None:
+        q, p = stepper.named(q), stepper.named(p)
     return Trajectory(
         t=t,
         q=q,
@@ -206,9 +171,9 @@ def trajectory_of(
         steps=memory.steps if steps is None else steps,
         rejected_steps=memory.rejected_steps,
         step_error=step_error,
-        worst_step_time=worst_step_time,
+        worst_step_time=memory._memory.error_t if step_error >= 0.0 else np.nan,
         parameters=memory.parameters,
-        stepper=memory.stepper,
+        stepper=stepper,
         options=memory.options,
         events=events,
         tau=tau,

@@ -66,6 +66,10 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
             error is relative to the state, or to the largest state of the run near rest at the origin; NaN for methods
             without an error estimate.
         confirmation: the comparison with a second run if ``error=`` was passed, else ``None``.
+        observed: (n, ..) values that ``observe`` returned, else ``None``; q and p are then those of both ends.
+        conserved: (n, 3 + k) energies and momentum maps with ``observe``, else ``None``.
+
+    Positions and momenta of arrays are also indexed by name: ``q["u"]`` has the shape (n, *shape of u).
     """
 
     iterations: NDArray[np.int32]
@@ -75,6 +79,8 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
     step_error: float = np.nan
     worst_step_time: float = np.nan
     confirmation: GlobalError | None = field(default=None, repr=False)
+    observed: Array | None = field(default=None, repr=False)
+    conserved: Array | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         return describe_states(self, describe_step_size(self.h, self.plan, tau=self.tau is not None))
@@ -91,6 +97,7 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
         Raises:
             IndexError: if an index is out of range, or a slice is empty or descending.
         """
+        self._check_saved()
         if not isinstance(rows, slice):
             k = checked_row(rows, len(self))
             return float(self.t[k]), self.q[k].copy(), self.p[k].copy()
@@ -107,6 +114,11 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
             events=tuple(crossings.chosen((crossings.t >= low) & (crossings.t <= high)) for crossings in self.events),
         )
 
+    def _check_saved(self) -> None:
+        """Raise :class:`StateError` if states were not saved."""
+        if self.observed is not None:
+            raise StateError("a run with observe saves no states: omit observe")
+
     @classmethod
     def before(cls, failure: StepFailedError) -> Self:
         """Return the trajectory before a failed step; raise StateError if that was a single step."""
@@ -116,11 +128,28 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
 
     def energy(self) -> Array:
         """Return (n,) energies p.v - L, constant along exact trajectories if L does not depend on time."""
+        if self.conserved is not None:
+            return self.conserved[:, 2]
         energies: Array = self.stepper.energy(self.q, self.p, self.t, self.parameters)
         return energies
 
+    @property
+    def energies(self) -> Array:
+        """(n, 3) kinetic, potential and total energy; parts of arrays of run-time sizes only, else NaN."""
+        if self.conserved is not None:
+            return self.conserved[:, :3]
+        return self.stepper._energy_parts(self.q, self.p, self.t, self.parameters)
+
+    def energy_error(self) -> float:
+        """Return the largest change of the energy, relative to the largest sum of its absolute parts if known."""
+        energies = np.abs(self.energies)
+        sizes = energies[:, :2].sum(axis=1) if np.isfinite(energies[0, 0]) else energies[:, 2]
+        return float(np.max(np.abs(self.energy() - self.energy()[0]))) / (float(np.max(sizes)) or 1.0)
+
     def momentum_maps(self) -> Array:
         """Return (n, k) conserved quantities, in the order of ``stepper.momentum_map_names``."""
+        if self.conserved is not None:
+            return self.conserved[:, 3:]
         return self.stepper.momentum_maps(self.q, self.p, self.t, self.parameters)
 
     def momentum_errors(self) -> Array:
@@ -205,9 +234,10 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
         Raises:
             StateError: if a time is outside the trajectory, or this was made with ``t_eval``.
         """
-        times = checked_times(t, "t")
+        self._check_saved()
+        times, shape = checked_times(t, "t"), (*np.shape(t), self.stepper.dimension)
         q, p = states_at(self, times.ravel())
-        return q.reshape(*times.shape, self.stepper.dimension), p.reshape(*times.shape, self.stepper.dimension)
+        return self.stepper.named(q.reshape(shape)), self.stepper.named(p.reshape(shape))
 
     def crossings(self, events: EventLike | Sequence[EventLike]) -> tuple[Crossings, ...]:
         """Return the zero crossings of functions along a trajectory with all states (``save_every=1``).

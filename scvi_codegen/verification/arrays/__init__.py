@@ -86,7 +86,7 @@ def verify_arrays(
     stepper = stepper or compile_stepper(system, chosen, flags=tuple(flags))
     run = stepper.start(q, p, velocity=velocity, h=h, t=t, parameters=parameters, tables=tables)
     arrays = read_arrays(stepper.interface, q, parameters, tables)
-    start = WholeStart(system, chosen, stepper, arrays, run.p, run.h, run.t)
+    start = WholeStart(system, chosen, stepper, arrays, run.stepper.arrays(run.p), run.h, run.t)
     tested = _subject(start)
     checks = (
         *checked(

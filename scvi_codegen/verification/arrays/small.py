@@ -16,8 +16,8 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.interface import RunArrays, check_accesses
-from scvi_codegen.runtime.arrays.run import ArrayRun
 from scvi_codegen.runtime.arrays.stepper import ArrayStepper
+from scvi_codegen.runtime.run.run import Run
 
 __all__ = ["SmallStepper", "small_start"]
 
@@ -188,19 +188,17 @@ class SmallStepper:
 
     def velocity(self, q: Numbers, p: Numbers, t: float = 0.0, parameters: Any = None) -> Numbers:
         """Return the velocities (m,) of a state; raises StateError for a Hamiltonian."""
-        return _joined(self._run(q, p, 1.0, t, parameters, None).velocity)
+        return np.asarray(self._run(q, p, 1.0, t, parameters, None).velocity)
 
     def momentum(self, q: Numbers, v: Numbers, t: float = 0.0, parameters: Any = None) -> Numbers:
         """Return the momenta (m,) of positions and velocities."""
-        return v / _joined(self._run(q, v, 1.0, t, parameters, None).inverse_masses)
+        return np.asarray(self._run(q, v, 1.0, t, parameters, None).stepper.momentum(q, v, t, self._values(parameters)))
 
     def energy(self, q: Numbers, p: Numbers, t: float = 0.0, parameters: Any = None) -> float:
         """Return the energy of a state."""
         return self._run(q, p, 1.0, t, parameters, None).energy
 
-    def _run(
-        self, q: Numbers, p: Numbers, h: float, t: float, parameters: Any, options: SolverOptions | None
-    ) -> ArrayRun:
+    def _run(self, q: Numbers, p: Numbers, h: float, t: float, parameters: Any, options: SolverOptions | None) -> Run:
         values = self._values(parameters)
         return self.stepper.start(
             self._arrays(q),
@@ -231,8 +229,8 @@ class SmallStepper:
             start += values.size
         return result
 
-    def _flat(self, run: ArrayRun) -> tuple[Numbers, Numbers]:
-        return _joined(run.q), _joined(run.p)
+    def _flat(self, run: Run) -> tuple[Numbers, Numbers]:
+        return np.asarray(run.q), np.asarray(run.p)
 
 
 def _joined(arrays: Mapping[str, Numbers]) -> Numbers:

@@ -18,8 +18,8 @@ from scvi_codegen.indices import Access, Loop
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runtime.arrays.interface import RunArrays
-from scvi_codegen.runtime.arrays.run import ArrayRun
 from scvi_codegen.runtime.arrays.stepper import ArrayStepper
+from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.verification.certificate import Check, Finding, checked, information
 
 __all__ = ["WholeStart", "whole_checks"]
@@ -64,11 +64,11 @@ class WholeStart:
         """Return all index values of loops."""
         return Elements(loops, self.arrays.sizes, self.arrays.places)
 
-    def run(self, h: float | None = None) -> ArrayRun:
+    def run(self, h: float | None = None) -> Run:
         """Start a run at the initial state, optionally with another step size."""
         return self.begin(self.arrays.state, self.p, self.h if h is None else h, self.t)
 
-    def begin(self, q: Mapping[str, Numbers], p: Mapping[str, Numbers], h: float, t: float) -> ArrayRun:
+    def begin(self, q: Mapping[str, Numbers], p: Mapping[str, Numbers], h: float, t: float) -> Run:
         """Start a run at a state."""
         names = [parameter.name for parameter in self.system.parameters]
         numbers = dict(zip(names, self.arrays.numbers, strict=True))
@@ -93,8 +93,10 @@ def _rates(start: WholeStart) -> Finding:
     run, worst = start.run(start.h * SHORT), 0.0
     run.advance(1)
     expected, nudged = _numpy_rates(start), _numpy_rates(_perturbed(start))
-    ends = ((start.arrays.state, run.q), (start.p, run.p))
-    for (before, after), low, derivatives, others in zip(ends, run._compensation, expected, nudged, strict=True):
+    named = run.stepper.arrays
+    ends = ((start.arrays.state, named(run.q)), (start.p, named(run.p)))
+    lows = map(named, run._compensation)
+    for (before, after), low, derivatives, others in zip(ends, lows, expected, nudged, strict=True):
         size = max((float(np.abs(each).max(initial=0.0)) for each in derivatives.values()), default=0.0)
         noise = max(
             (float(np.abs(each - others[name]).max(initial=0.0)) for name, each in derivatives.items()), default=0.0
@@ -173,14 +175,17 @@ def _reversal(start: WholeStart) -> Finding:
     """Return the defect of a step forward and back, relative to the largest coordinate or increment."""
     run = start.run()
     run.advance(1)
-    back = start.begin(run.q, run.p, -run.h, run.t)
+    q1, p1 = run.stepper.arrays(run.q), run.stepper.arrays(run.p)
+    back = start.begin(q1, p1, -run.h, run.t)
     back.advance(1)
-    inverse = run.inverse_masses or {name: np.ones(()) for name in start.p}
-    lengths = [np.abs(each) for each in (*start.arrays.state.values(), *run.q.values())]
-    lengths += [np.abs(run.h * p * inverse[name]) for state in (start.p, run.p) for name, p in state.items()]
+    q2, p2 = back.stepper.arrays(back.q), back.stepper.arrays(back.p)
+    masses = {} if start.system.momenta else _masses(start)
+    inverse = {name: 1.0 / masses[name] if masses else np.ones(()) for name in start.p}
+    lengths = [np.abs(each) for each in (*start.arrays.state.values(), *q1.values())]
+    lengths += [np.abs(run.h * p * inverse[name]) for state in (start.p, p1) for name, p in state.items()]
     size = max(float(each.max(initial=0.0)) for each in lengths) or 1.0
-    difference = [np.abs(back.q[name] - q).max(initial=0.0) for name, q in start.arrays.state.items()]
-    difference += [np.abs(run.h * inverse[name] * (back.p[name] - p)).max(initial=0.0) for name, p in start.p.items()]
+    difference = [np.abs(q2[name] - q).max(initial=0.0) for name, q in start.arrays.state.items()]
+    difference += [np.abs(run.h * inverse[name] * (p2[name] - p)).max(initial=0.0) for name, p in start.p.items()]
     return Finding(float(max(difference)) / size, ROUNDINGS * EPSILON, "relative to the largest coordinate")
 
 
@@ -221,5 +226,5 @@ def _map_sizes(start: WholeStart) -> float:
     q = np.concatenate([np.abs(values).reshape(-1) for values in start.arrays.state.values()])
     moved = start.run()
     moved.advance(1)
-    p = p + np.concatenate([np.abs(values).reshape(-1) for values in moved.p.values()])
+    p = p + np.concatenate([np.abs(values).reshape(-1) for values in moved.stepper.arrays(moved.p).values()])
     return float(np.sum(p) + np.sum(p * q) + np.sum(p**2 + q**2) * bool(start.system.momenta))

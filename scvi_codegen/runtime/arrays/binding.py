@@ -1,0 +1,379 @@
+"""Binding of arrays whose sizes are known at run time, with the functions of a binding of known sizes.
+
+The C functions of arrays take the data of the problem and a run whose arrays lie in memory of the caller. Here they
+have the arguments of the functions of known sizes, so that steppers, runs and trajectories are the same for both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.native.binding import Binding
+from scvi_codegen.native.building import Library
+from scvi_codegen.native.options import FAILURES, NOT_CONVERGED
+from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.arrays.interface import Numbers, RunArrays
+from scvi_codegen.runtime.arrays.maps import momentum_of
+from scvi_codegen.runtime.arrays.memory import COMPUTED, REAL_FIELDS, RUN_FIELDS, STATE, aligned, constraint_memory
+
+__all__ = ["ArrayBinding", "ArrayMemory"]
+
+FAILURES_BY_SOLVER = {
+    "fixed-point": FAILURES
+    | {
+        NOT_CONVERGED: (
+            "the fixed-point iteration did not converge",
+            "It converges if h times the highest frequency is below about 1 to 3. Use a smaller h, or "
+            "solver='newton' if the fast modes are not excited (stiff bonds, short waves on a lattice)",
+        )
+    },
+    "newton": FAILURES | {NOT_CONVERGED: ("Newton-GMRES did not converge", "Use a smaller h")},
+    "rattle": FAILURES
+    | {
+        NOT_CONVERGED: ("the iteration on the constraints did not converge", "Use a smaller h"),
+        "singular": (
+            "the constraints are contradictory or redundant there",
+            "Remove the constraints that follow from others",
+        ),
+    },
+}
+
+
+class ArrayMemory:
+    """Memory of a run over n coordinates: the C structs of problem and run, and the arrays to which they point.
+
+    Attributes:
+        run, problem: the C structs; scalar fields of ``run`` are also attributes of the memory.
+        numbers: arrays of ``run`` by name.
+        iterations: solver iterations since the last saved state.
+        adaptive: whether steps are adaptive; ``h`` is then 0.
+        parameters: current scalar parameters and fields, in one vector.
+        ready: whether they are set.
+    """
+
+    binding: ArrayBinding
+    run: Any
+    problem: Any
+    numbers: dict[str, NDArray[Any]]
+    parameters: Numbers
+    iterations: int
+    adaptive: bool
+    ready: bool
+
+    def __init__(self, binding: ArrayBinding) -> None:
+        n, vector = binding.count, dict[str, NDArray[Any]]()
+        run, problem = binding.raw.new("run *"), binding.raw.new("problem *")
+        self.__dict__.update(binding=binding, run=run, problem=problem, iterations=0, adaptive=False)
+        for k, name in enumerate(binding.interface.layout.sizes):
+            problem.size[k] = binding.arrays.sizes[name]
+        for k, table in enumerate(binding.interface.layout.tables):
+            problem.table[k] = binding.raw.pointer(binding.arrays.places[table.name].reshape(-1))
+        state, rest_of = aligned(2 * n), aligned(2 * n)  # Hamiltonian kernels expect p directly after q
+        vector |= {"q": state[:n], "p": state[n:], "carry_q": rest_of[:n], "carry_p": rest_of[n:]}
+        vector |= {"inverse_mass": aligned(n), "work": aligned(n * binding.raw.constant("WORK"))}
+        if binding.interface.layout.constraints:
+            vector |= constraint_memory(binding.raw, run, problem, n)
+        for name, array in vector.items():
+            setattr(run, name, binding.raw.pointer(array))
+        run.threads = binding.threads
+        self.__dict__.update(numbers=vector, parameters=np.zeros(binding.parameter_count), ready=False)
+
+    def __getattr__(self, name: str) -> Any:
+        if name in STATE:
+            return self.numbers[name]
+        if name == "h" and self.adaptive:
+            return 0.0
+        return getattr(self.run, name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in self.__dict__:
+            self.__dict__[name] = value
+        else:
+            setattr(self.run, name, value)
+
+    def set_parameters(self, values: Numbers) -> bool:
+        """Set scalar parameters and fields; return whether there were others.
+
+        Reused forces are then discarded; an extrapolated predictor is kept.
+
+        Raises:
+            StateError: if a coordinate has no positive mass.
+        """
+        binding, problem = self.binding, self.problem
+        changed = self.ready
+        if changed and np.array_equal(values, self.parameters):
+            return False
+        self.parameters[:], self.ready = values, True
+        scalars = len(binding.interface.parameters)
+        problem.parameters[0:scalars] = self.parameters[:scalars].tolist()
+        for k, (first, end) in enumerate(binding.field_rows):
+            problem.field[k] = binding.raw.pointer(self.parameters[first:end])
+        if changed:
+            self.run.guess *= binding.interface.layout.continued
+        inverse = self.numbers["inverse_mass"]
+        if binding.raw.function("inverse_masses")(problem, self.run.inverse_mass):
+            index = int(np.argmin(np.where((inverse > 0) & np.isfinite(inverse), 1.0, -1.0)))
+            what = f"coordinate {index} of {len(inverse)}"
+            raise StateError(f"{what} has no positive mass: add its kinetic energy to L, or check the parameters")
+        return changed
+
+    def start(self, t: float, h: float, q: Numbers, p: Numbers) -> None:
+        """Start at a state; nothing of an earlier run remains."""
+        for name in RUN_FIELDS:
+            setattr(self.run, name, 0)
+        self.run.t, self.run.h, self.iterations, self.adaptive = t, h, 0, h == 0.0
+        self.numbers["q"][:], self.numbers["p"][:] = q, p
+        self.numbers["carry_q"][:] = self.numbers["carry_p"][:] = 0.0
+
+    def state_bytes(self) -> bytes:
+        """Return scalar fields and arrays as bytes."""
+        fields = np.array([float(getattr(self.run, name)) for name in RUN_FIELDS] + [self.iterations, self.adaptive])
+        return b"".join([fields.tobytes(), *(array.tobytes() for _, array in self._stored())])
+
+    def set_state_bytes(self, saved: bytes) -> None:
+        """Restore the state of :meth:`state_bytes`."""
+        fields = np.frombuffer(saved, count=len(RUN_FIELDS) + 2)
+        for name, value in zip(RUN_FIELDS, fields.tolist(), strict=False):
+            setattr(self.run, name, value if name in REAL_FIELDS else int(value))
+        self.iterations, self.adaptive, first = int(fields[-2]), bool(fields[-1]), fields.nbytes
+        for _, array in self._stored():
+            array[:] = np.frombuffer(saved, array.dtype, array.size, first)
+            first += array.nbytes
+
+    def size(self) -> int:
+        """Return the number of bytes of the state."""
+        return 8 * (len(RUN_FIELDS) + 2) + sum(array.nbytes for _, array in self._stored())
+
+    def _stored(self) -> list[tuple[str, NDArray[Any]]]:
+        return [(name, array) for name, array in self.numbers.items() if name not in COMPUTED]
+
+
+class _StateBytes:
+    """Bytes of the state of an :class:`ArrayMemory`, readable and assignable as a whole."""
+
+    def __init__(self, memory: ArrayMemory) -> None:
+        self.memory = memory
+
+    def __len__(self) -> int:
+        return self.memory.size()
+
+    def __bytes__(self) -> bytes:
+        return self.memory.state_bytes()
+
+    def __setitem__(self, _: slice, saved: bytes) -> None:
+        self.memory.set_state_bytes(saved)
+
+
+class ArrayBinding(Binding):
+    """Binding of arrays of given sizes and tables; states and parameters are vectors, as for known sizes.
+
+    Args:
+        library: the compiled source.
+        interface: interface of the source.
+        arrays: sizes and tables.
+        threads: number of threads per step.
+    """
+
+    reusable = False
+
+    def __init__(self, library: Library, interface: Interface, arrays: RunArrays, threads: int) -> None:
+        super().__init__(library, interface.prefix)
+        self.raw = Binding(library, interface.prefix)
+        self.interface, self.arrays, self.threads, self._unused = interface, arrays, threads, list[ArrayMemory]()
+        self.count = sum(int(np.prod(array.shape(arrays.sizes))) for array in interface.layout.coordinates)
+        ends = np.cumsum([int(np.prod(field.shape(arrays.sizes))) for field in interface.layout.fields], dtype=int)
+        first = len(interface.parameters)
+        self.field_rows = [(first + start, first + end) for start, end in zip([0, *ends], ends, strict=False)]
+        self.parameter_count = first + (int(ends[-1]) if len(ends) else 0)
+
+    def new(self, what: str) -> Any:
+        """Return memory of a run, or a report, as :meth:`Binding.new` does."""
+        if what == "run *":
+            return ArrayMemory(self)
+        failures = FAILURES_BY_SOLVER[self.interface.solver]
+        return SimpleNamespace(steps=0, stored=0, iterations=0, change=0.0, t=0.0, failures=failures)
+
+    def buffer(self, struct: Any) -> Any:
+        """Return the state of a run as bytes, writable; arrays as they are."""
+        return _StateBytes(struct) if isinstance(struct, ArrayMemory) else struct
+
+    def has(self, name: str) -> bool:
+        """Return whether there is such a function."""
+        if name in ("advance_to", "project"):
+            return bool(super().has(name))
+        return hasattr(self, f"_{name}")
+
+    def function(self, name: str, memory: Any = None) -> Callable[..., Any]:
+        """Return a function with the arguments of the C function of known sizes, bound to the memory of a run."""
+        function = getattr(self, f"_{name}")
+        return function if memory is None else partial(function, memory)
+
+    def _set_parameters(self, memory: ArrayMemory, values: Numbers) -> None:
+        if memory.set_parameters(values) and self.interface.layout.constraints:  # rates may jump, positions may not
+            q = memory.q.copy()
+            self.raw.function("project")(memory.run, memory.problem, self.null, self.raw.new("report *"))
+            memory.q[:] = q
+
+    def _start(self, memory: ArrayMemory, t: float, h: float, q: Any, p: Any) -> None:
+        memory.start(t, h, self._vector(q), self._vector(p))
+
+    def _step_error(self, memory: ArrayMemory) -> float:
+        return float(self.raw.function("step_error")(memory.run))
+
+    def _advance(self, memory: ArrayMemory, *arguments: Any) -> int:
+        return self._advance_plan(memory, None, *arguments)
+
+    def _advance_to(self, memory: ArrayMemory, t_end: float, tolerance: float, *arguments: Any) -> int:
+        return self._advance_plan(memory, (t_end, tolerance), *arguments)
+
+    def _advance_plan(
+        self,
+        memory: ArrayMemory,
+        plan: tuple[float, float] | None,
+        steps: int,
+        save_every: int,
+        _: Any,
+        options: Any,
+        t: Any,
+        q: Any,
+        p: Any,
+        iterations: Any,
+        report: Any,
+        __: Any,
+    ) -> int:
+        """Take steps and store every ``save_every``-th state, and the state at the target time."""
+        made, done, row, status = self.raw.new("report *"), 0, 0, 0
+        function = self.raw.function("advance" if plan is None else "advance_to", memory.run)
+        arrived = plan is not None and _arrived(memory, plan[0])
+        while done < steps and not (status or arrived):
+            size = min(save_every - memory.step % save_every, steps - done)
+            status = function(memory.problem, *(plan or ()), size, options, made)
+            done, memory.iterations = done + made.steps, memory.iterations + made.iterations
+            arrived = plan is not None and _arrived(memory, plan[0])
+            if not status and (memory.step % save_every == 0 or arrived):
+                t[row], iterations[row] = memory.t, memory.iterations
+                for target, name in ((q, "q"), (p, "p")):
+                    self._ffi.memmove(target + row * self.count, getattr(memory.run, name), 8 * self.count)
+                row, memory.iterations = row + 1, 0
+        report.steps, report.stored, report.iterations = done, row, made.iterations
+        report.change, report.t = made.change, made.t
+        return status
+
+    def _step(
+        self, t: float, h: float, q: Any, p: Any, parameters: Any, options: Any, q1: Any, p1: Any, report: Any, _: Any
+    ) -> int:
+        with self._at(t, q, p, parameters, h) as memory:
+            unused = self.numbers("double *"), self.numbers("int *")
+            return self._advance(memory, 1, 1, None, options, unused[0], q1, p1, unused[1], report, None)
+
+    def _energies(self, count: int, t: Any, q: Any, p: Any, parameters: Any, result: Any, _: Any) -> int:
+        self._vector(result, count)[:] = self.energy_parts(count, t, q, p, parameters)[:, 2]
+        return 0
+
+    def energy_parts(self, count: int, t: Any, q: Any, p: Any, parameters: Any) -> Numbers:
+        """Return (n, 3) kinetic, potential and total energies in double-double arithmetic; 0, H, H of a Hamiltonian."""
+        parts, n = np.empty((count, 3)), self.count
+        with self._at(0.0, q, p, parameters) as memory:
+            for k, row in enumerate(parts):
+                memory.q[:], memory.p[:] = self._vector(q + k * n), self._vector(p + k * n)
+                arrays = (memory.run.q, memory.run.p, memory.run.inverse_mass, self.raw.pointer(row))
+                self.raw.function("energies")(memory.problem, t[k], *arrays)
+        return parts
+
+    def inverse_masses(self, parameters: Numbers) -> Numbers:
+        """Return 1/m of every coordinate."""
+        zeros = self.raw.pointer(np.zeros(self.count))
+        with self._at(0.0, zeros, zeros, self.raw.pointer(parameters)) as memory:
+            return np.array(memory.numbers["inverse_mass"])
+
+    def _velocity(self, t: float, q: Any, p: Any, parameters: Any, result: Any, _: Any) -> int:
+        with self._at(t, q, p, parameters) as memory:
+            self._vector(result)[:] = memory.p * memory.numbers["inverse_mass"]
+        return 0
+
+    def _momentum(self, t: float, q: Any, v: Any, parameters: Any, result: Any, _: Any) -> int:
+        with self._at(t, q, v, parameters) as memory:
+            self._vector(result)[:] = memory.p / memory.numbers["inverse_mass"]
+        return 0
+
+    def _momentum_maps(self, count: int, t: Any, q: Any, p: Any, parameters: Any, values: Any, sizes: Any) -> int:
+        maps, n = self.interface.layout.maps, self.count
+        for k in range(count):
+            states = [self.by_name(self._vector(each + k * n)) for each in (q, p)]
+            absolute = [{name: np.abs(each) for name, each in state.items()} for state in states]
+            for j, each in enumerate(maps):
+                values[k * len(maps) + j] = momentum_of(states[0][each.array], states[1][each.array], each)
+                size = momentum_of(absolute[0][each.array], absolute[1][each.array], each, absolute=True)
+                sizes[k * len(maps) + j] = size
+        return 0
+
+    def _constraint_values(self, count: int, t: Any, q: Any, p: Any, parameters: Any, g: Any, rate: Any, _: Any) -> int:
+        for k, memory in self._states(count, t, q, p, parameters):
+            row = k * memory.constraints
+            self.raw.function("constraint_values")(memory.run, memory.problem, g + row, rate + row)
+        return 0
+
+    def _multipliers(self, count: int, t: Any, q: Any, p: Any, parameters: Any, values: Any, _: Any) -> int:
+        for k, memory in self._states(count, t, q, p, parameters):
+            multipliers = self.raw.function("multipliers")
+            if status := multipliers(memory.run, memory.problem, values + k * memory.constraints):
+                return int(status)
+        return 0
+
+    def _project(self, t: float, q: Any, p: Any, parameters: Any, q1: Any, p1: Any, _: Any) -> int:
+        with self._at(t, q, p, parameters) as memory:
+            report = self.raw.new("report *")
+            status = int(self.raw.function("project")(memory.run, memory.problem, self.null, report))
+            self._vector(q1)[:], self._vector(p1)[:] = memory.q, memory.p
+        return status
+
+    def _apart(self, t: float, q: Any, p: Any, q1: Any, p1: Any, parameters: Any, result: Any, _: Any) -> int:
+        """Compute the distances of two states, relative to their largest numbers."""
+        for k, pair in enumerate(((q, q1), (p, p1))):
+            before, after = map(self._vector, pair)
+            size = float(max(np.abs(before).max(initial=0.0), np.abs(after).max(initial=0.0)))
+            result[k] = float(np.abs(after - before).max(initial=0.0)) / (size or 1.0)
+        return 0
+
+    def by_name(self, values: Numbers) -> dict[str, Numbers]:
+        """Return a vector of coordinates as arrays by name."""
+        arrays, first = {}, 0
+        for array in self.interface.layout.coordinates:
+            shape = array.shape(self.arrays.sizes)
+            size = int(np.prod(shape))
+            arrays[array.name] = values[first : first + size].reshape(shape)
+            first += size
+        return arrays
+
+    def _states(self, count: int, t: Any, q: Any, p: Any, parameters: Any) -> Iterator[tuple[int, ArrayMemory]]:
+        for k in range(count):
+            with self._at(t[k], q + k * self.count, p + k * self.count, parameters) as memory:
+                yield k, memory
+
+    @contextmanager
+    def _at(self, t: float, q: Any, p: Any, parameters: Any, h: float = 0.0) -> Iterator[ArrayMemory]:
+        """Provide memory of a run at a state; it may be used by one thread at a time."""
+        memory = self._unused.pop() if self._unused else ArrayMemory(self)
+        memory.start(t, h, self._vector(q), self._vector(p))
+        memory.set_parameters(self._vector(parameters, self.parameter_count))
+        try:
+            yield memory
+        finally:
+            self._unused.append(memory)
+
+    def _vector(self, pointer: Any, count: int | None = None) -> Numbers:
+        """Return the numbers at a pointer."""
+        size = self.count if count is None else count
+        return np.frombuffer(self._ffi.buffer(pointer, 8 * size)) if size else np.empty(0)
+
+
+def _arrived(memory: ArrayMemory, t_end: float) -> bool:
+    return bool(memory.t == t_end and memory.t_low == 0.0)

@@ -1,0 +1,46 @@
+"""Loop that advances runs in chunks of bounded duration; the only one that looks at the clock."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+__all__ = ["CALL_SECONDS", "drive"]
+
+CALL_SECONDS = 0.1
+"""Target duration of a C call in seconds; bounds the delay of Ctrl-C and of ``progress``."""
+
+
+def drive(
+    advance: Callable[[int], int],
+    steps: float,
+    *,
+    first: int = 1,
+    most: float = math.inf,
+    growth: float = 2.0,
+    seconds: float | None = None,
+    ended: Callable[[], bool],
+    progress: Callable[[int], None] | None = None,
+) -> None:
+    """Take steps in chunks of bounded duration, so that Python regains control regularly.
+
+    Args:
+        advance: function that takes a number of steps and returns how many it took.
+        steps: number of steps, possibly infinite.
+        first, most: steps of the first chunk, and largest chunk size.
+        growth: largest ratio of successive chunk sizes.
+        seconds: target duration of a chunk, by default ``CALL_SECONDS``.
+        ended: function that returns whether the run has ended; called before each chunk.
+        progress: called with the number of steps after each chunk.
+    """
+    done, size, began, wanted = 0, first, -math.inf, CALL_SECONDS if seconds is None else seconds
+    while done < steps and not ended():
+        now = time.perf_counter()
+        if done:
+            faster = min(growth, wanted / max(now - began, 1e-6))
+            size = max(1, int(min(size * faster, most)))
+        size, began = int(min(size, steps - done)), now
+        done += advance(size)
+        if progress is not None:
+            progress(done)
