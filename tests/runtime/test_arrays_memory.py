@@ -83,7 +83,7 @@ class TestWhatACallerChangesLater:
 
     def test_arrays_of_a_run_are_read_only(self, chain: Any) -> None:
         with pytest.raises(ValueError, match="read-only"):
-            start(chain).stepper.arrays.places["bonds"][0] = 0
+            start(chain).stepper.problem.places["bonds"][0] = 0
 
     @pytest.mark.parametrize("table", [[[0, 1], [1]], [[0, [1]], [1, 2]], [[0, 2**70], [1, 2]], "ab"])
     def test_table_that_is_not_an_array_is_named(self, chain: Any, table: Any) -> None:
