@@ -200,9 +200,9 @@ class Integrator(LinearisedMethod):
             StateError: if a state is outside the domain of L.
         """
         result, binding = np.empty(len(t)), self.binding
-        status = binding.function("energies")(
-            len(t), *map(binding.pointer, (t, q, p, parameters, result)), binding.workspace()
-        )
+        at, positions, momenta, energies = binding.pointers(t, q, p, result)
+        values, workspace = binding.pointer(parameters), binding.workspace()
+        status = binding.function("energies")(len(t), at, positions, momenta, values, energies, workspace)
         if status:
             raise StateError(f"the energy of a state cannot be computed: {REASONS[status]}")
         if name := self.interface.energy_parameter:

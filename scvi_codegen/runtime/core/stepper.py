@@ -78,15 +78,6 @@ class Settings(RunSettings, total=False):
     parameters: Parameters
 
 
-class Output(TypedDict):
-    """Keyword arguments of :func:`_recorded`."""
-
-    save_every: int
-    t_eval: ArrayLike | None
-    progress: Callable[[int], None] | None
-    observe: Callable[[Run], ArrayLike] | None
-
-
 class Stepper(Integrator):
     """Compiled integrator of one system: :class:`Integrator` with integrations, runs, ensembles and projections."""
 
@@ -193,8 +184,7 @@ class Stepper(Integrator):
             plan = h, t_end if to_end else None, tolerance
             run = stepper._started(q, p, velocity, plan, t, parameters, options, reuse=True)
             check = GrowthCheck(run, check_growth)
-            output: Output = {"save_every": save_every, "t_eval": t_eval, "progress": progress, "observe": observe}
-            trajectory = _recorded(run, h, steps, t_end, **output)
+            trajectory = _recorded(run, h, steps, t_end, save_every, t_eval, progress, observe)
             check.warn(trajectory)
             run._release()
             return trajectory
@@ -473,7 +463,6 @@ def _recorded(
     h: float | None,
     steps: int | None,
     t_end: float | None,
-    *,
     save_every: int,
     t_eval: ArrayLike | None,
     progress: Callable[[int], None] | None,

@@ -61,7 +61,7 @@ def checked_vector(interface: Interface, value: ArrayLike, name: str) -> Array:
         and value.dtype is BINARY64
         and value.shape == (len(interface.coordinates),)
         and len(value) <= FEW  # faster than NumPy's functions
-        and all(map(math.isfinite, value.tolist()))
+        and math.isfinite(sum(value.tolist()))  # else an entry, or only the sum, is not finite
     ):
         return value.copy()
     array, coordinates = real_array(flat_state(interface, value, name), name), interface.coordinates

@@ -189,8 +189,8 @@ def _changed_energies(
 
     ``None`` is also returned outside the domain of L. Velocities are computed only if the energies differ.
     """
-    apart = max(1, len(t) - 1)
-    t, q, p = t[::apart].copy(), q[::apart].copy(), p[::apart].copy()
+    if (apart := len(t) - 1) > 1:
+        t, q, p = t[::apart].copy(), q[::apart].copy(), p[::apart].copy()
     try:
         energies = stepper._energies_of(t, q, p, parameters)
         first, last = float(energies[0]), float(energies[-1])

@@ -24,7 +24,7 @@ from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["first_step_size", "record", "trajectory_of"]
 
-NATIVE_DOUBLE = Struct("d")
+NATIVE_DOUBLE, INT32 = Struct("d"), np.dtype(np.int32)
 FIRST_STEPS = 256
 """Number of saved states of the first C call, before the speed of the steps is known."""
 
@@ -45,7 +45,7 @@ def record(
     Raises:
         StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
     """
-    count = None if steps is None and memory.plan is not None else checked_count(steps, "steps", least=0)
+    count = None if steps is None and memory._plan is not None else checked_count(steps, "steps", least=0)
     save_every = checked_count(save_every, "save_every", least=1)
     recorder = _StateRecorder(memory, save_every, count)
     try:
@@ -88,8 +88,8 @@ class _StateRecorder:
     def _allocate(self, rows: int) -> None:
         m, binding = len(self.memory._q), self.memory.stepper.binding
         self.t, self.q, self.p = empty_array((rows,)), empty_array((rows, m)), empty_array((rows, m))
-        self.iterations, self.filled = np.zeros(rows, dtype=np.int32), 0
-        self.starts = *binding.pointers(self.t, self.q, self.p), binding.pointer(self.iterations)
+        self.iterations, self.filled = np.zeros(rows, INT32), 0
+        self.starts = *binding.pointers(self.t, self.q, self.p), binding.integers(self.iterations)
 
     def advance(self, size: int) -> int:
         """Take ``size`` steps, fewer if the target time is reached; return their number."""
@@ -130,11 +130,13 @@ class _StateRecorder:
         if self.earlier:
             blocks = zip(*self.earlier, (t, q, p, iterations), strict=True)
             t, q, p, iterations = map(np.concatenate, blocks)
-        if memory.plan is not None:
+        if memory._plan is not None:
             step_sizes = np.empty(len(t))
-            step_sizes.fill(np.nan)
             if save_every == 1:
-                np.subtract(t[1:], t[:-1], out=step_sizes[:-1])
+                np.subtract(t[1:], t[:-1], step_sizes[:-1])
+                step_sizes[-1] = math.nan
+            else:
+                step_sizes.fill(math.nan)
             return trajectory_of(memory, t, q, p, iterations, step_sizes=step_sizes)
         tau = None
         if memory.stepper.interface.energy_parameter:
@@ -174,7 +176,7 @@ def trajectory_of(
         worst_step_time=memory._memory.error_t if step_error >= 0.0 else np.nan,
         parameters=memory.parameters,
         stepper=stepper,
-        options=memory.options,
+        options=memory._options,
         events=events,
         tau=tau,
     )
