@@ -205,6 +205,17 @@ def test_unread_system_equals_one_that_is_read(made):
         _ = unread.momenta
 
 
+def test_source_is_derived_again_if_only_the_key_of_the_system_is_left(made, tmp_path):
+    first = sc.compile_stepper(spring(), sc.SVI(2))
+    source = max((tmp_path / "texts").iterdir(), key=lambda each: each.stat().st_size)
+    source.unlink()
+    unread = spring()
+    assert hasattr(unread, "_key")
+    assert sc.compile_stepper(unread, sc.SVI(2)).source == first.source
+    assert len(made) == 2
+    assert source.exists()
+
+
 def test_text_with_warnings_is_always_read(made):
     for _ in range(2):
         with pytest.warns(sc.SystemDefinitionWarning, match="parameter 'c' is not used"):
