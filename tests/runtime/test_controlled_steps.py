@@ -418,6 +418,24 @@ def test_a_singular_time_inside_a_run_is_resolved_or_its_error_reported():
         assert error < 10.0 * run.step_error <= 1e3 * wanted, tolerance
 
 
+def test_step_that_ends_within_a_millionth_of_t_end_ends_there():
+    system = sc.LagrangianSystem.from_text(name="unit", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
+    stepper = sc.compile_stepper(system, "svi:4", flags=("-O0",))
+
+    def times(t_end):
+        return stepper.integrate([1.0], [0.0], t_end=t_end, tolerance=1e-8).t
+
+    t_end = 3.0
+    for _ in range(2):  # until the last two steps are equal
+        found = times(t_end)
+        length = found[-2] - found[-3]
+        t_end = found[-2] + length
+    for change, more in ((-1e-3, 0), (-5e-7, 0), (-1e-9, 0), (0.0, 0), (1e-9, 0), (5e-7, 0), (1e-3, 1)):
+        changed = times(t_end + change * length)
+        assert changed[-1] == t_end + change * length
+        assert len(changed) == len(found) + more
+
+
 def test_spurious_newton_solutions_are_rejected():
     stepper = sc.compile_stepper(sc.problem("cart-pole").system, sc.SCVI(2))
     start = [1.1906153181856531, 1.6868254287493736], [-1.1281634410206784, -1.1565320090084121]
