@@ -88,6 +88,26 @@ def test_forced_oscillator_with_nonzero_initial_time():
     assert largest_difference(flow.p1, [du1 - x * mp.sin(h) + v * mp.cos(h)]) < mp.mpf("1e-30")
 
 
+def test_generalised_forces_act_on_the_exact_flow():
+    """q'' = -q - c q' + f: a damped rotation about f."""
+    system = LagrangianSystem.from_text(
+        name="damped",
+        coordinates=["x"],
+        parameters={"c": 0.5, "f": 0.25},
+        lagrangian="(x_dot**2 - x**2)/2",
+        forces={"x": "f - c*x_dot"},
+    )
+    c, f, h, x, v = mp.mpf("0.5"), mp.mpf("0.25"), mp.mpf("0.9"), mp.mpf("0.625"), mp.mpf("-0.375")
+    w, decay = mp.sqrt(1 - c**2 / 4), mp.exp(-c * h / 2)
+    a, b = x - f, (v + c * (x - f) / 2) / w
+    cosine, sine = mp.cos(w * h), mp.sin(w * h)
+    end = decay * (a * cosine + b * sine)
+    rate = decay * w * (b * cosine - a * sine) - c / 2 * end
+    flow = exact_map(system, ["0.625"], ["-0.375"], h)
+    assert largest_difference(flow.q1, [f + end]) < mp.mpf("1e-30")
+    assert largest_difference(flow.p1, [rate]) < mp.mpf("1e-30")
+
+
 CASES = {
     "double-pendulum": (problem("double-pendulum").system, (0.9, -0.6), (0.5, 1.2), 0.2),
     "relativistic-particle": (problem("relativistic-particle").system, (0.5,), (0.6,), 0.8),
