@@ -8,7 +8,7 @@ from sympy import Expr, latex
 
 from scvi_codegen.formulas.array_latex import latex_entry, latex_sums
 from scvi_codegen.ir.equations import ConstrainedSteps
-from scvi_codegen.ir.iterations import HamiltonianIteration, SeparableIteration, Splitting
+from scvi_codegen.ir.iteration import FixedPointIteration, Splitting
 from scvi_codegen.ir.numbers import Number
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.program import lower
@@ -82,10 +82,8 @@ def _step(program: Program, method: Method) -> Iterator[str]:
         yield from _held(program.loops.constrained)
     elif program.splitting:
         yield from _splitting(program.splitting)
-    elif isinstance(program.fixed_point, SeparableIteration):
-        yield from _separable(program.fixed_point)
-    elif isinstance(program.fixed_point, HamiltonianIteration):
-        yield from _hamiltonian(program.fixed_point)
+    elif program.fixed_point:
+        yield from (_separable if program.fixed_point.name == "separable" else _hamiltonian)(program.fixed_point)
 
 
 def _held(of: ConstrainedSteps) -> Iterator[str]:
@@ -104,26 +102,28 @@ def _splitting(of: Splitting) -> Iterator[str]:
             yield f"  q += h*({_number(drift)})*p/m"
 
 
-def _separable(of: SeparableIteration) -> Iterator[str]:
+def _separable(of: FixedPointIteration) -> Iterator[str]:
     yield "(m its mass, F_n the force on it at the points X_n of all):"
+    (drift,), (abscissae,), product = of.numbers("DRIFT"), of.numbers("ABSCISSA"), of.numbers("PRODUCT")
     for n in range(of.points):
-        terms = _combination(of.product[n], "F", of.points)
-        yield f"  X_{n} = q + h*({_number(of.drift[n])})*p/m + h**2/m*({terms}) at t + h*({_number(of.abscissae[n])})"
-    yield f"  q' = q + h*p/m + h**2/m*({_combination(of.end_position, 'F', of.points)})"
-    yield f"  p' = p + h*({_combination(of.end_momentum, 'F', of.points)})"
+        terms = _combination(product[n], "F", of.points)
+        yield f"  X_{n} = q + h*({_number(drift[n])})*p/m + h**2/m*({terms}) at t + h*({_number(abscissae[n])})"
+    q1, p1 = (_combination(of.numbers(f"POINT_END_{name}")[0], "F", of.points) for name in ("POSITION", "MOMENTUM"))
+    yield f"  q' = q + h*p/m + h**2/m*({q1})"
+    yield f"  p' = p + h*({p1})"
 
 
-def _hamiltonian(of: HamiltonianIteration) -> Iterator[str]:
+def _hamiltonian(of: FixedPointIteration) -> Iterator[str]:
     yield "(V_n = H_p and F_n = -H_q at the points Q_n, P_n of all):"
-    rows = (("Q", "q", of.position, of.position_weights, "V"), ("P", "p", of.momentum, of.momentum_weights, "F"))
+    kinds = (("Q", "q", "POSITION", "V"), ("P", "p", "MOMENTUM", "F"))
+    weights = {name: of.numbers(f"{name}_WEIGHT")[0] for _, _, name, _ in kinds}
     for n in range(of.points):
-        for letter, start, table, weights, rate in rows:
-            yield f"  {letter}_{n} = {start} + h*({_combination(_weighted(table[n], weights), rate, of.points)})"
-    for start, end, weights, rate in (
-        ("q", of.end_position, of.position_weights, "V"),
-        ("p", of.end_momentum, of.momentum_weights, "F"),
-    ):
-        yield f"  {start}' = {start} + h*({_combination(_weighted(end, weights), rate, of.points)})"
+        for letter, start, name, rate in kinds:
+            row = _weighted(of.numbers(name)[n], weights[name])
+            yield f"  {letter}_{n} = {start} + h*({_combination(row, rate, of.points)})"
+    for _, start, name, rate in kinds:
+        end = _weighted(of.numbers(f"POINT_END_{name}")[0], weights[name])
+        yield f"  {start}' = {start} + h*({_combination(end, rate, of.points)})"
 
 
 def _weighted(row: Sequence[Number], weights: Sequence[Number]) -> list[Number]:

@@ -1,12 +1,11 @@
-"""Common interface of the fixed-point iterations: kernels, tables, stored values; adaptive step sizes."""
+"""Iterations of a step as data: fixed-point iterations, explicit splittings, adaptive step sizes."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, replace
 from enum import Enum, auto
-from typing import Any, ClassVar
+from typing import Literal, TypeAlias
 
 from scvi_codegen.ir.kernel import Kernel, LoopedKernel
 from scvi_codegen.ir.numbers import Number, NumberTable
@@ -15,12 +14,16 @@ __all__ = [
     "AdaptivePredictor",
     "Control",
     "FixedPointIteration",
+    "IterationName",
     "IterationTable",
     "PredictorTables",
+    "Splitting",
     "StoredValues",
-    "printed",
     "transposed",
 ]
+
+
+IterationName: TypeAlias = Literal["separable", "Hamiltonian", "coupled", "collocation", "shooting"]
 
 
 class StoredValues(Enum):
@@ -45,11 +48,6 @@ class IterationTable:
         return isinstance(self.numbers[0], tuple)
 
 
-def printed(name: str, *, in_two_parts: bool = False) -> Mapping[str, Any]:
-    """Return the metadata of a field that is printed as a table of this name in C."""
-    return {"name": name, "in_two_parts": in_two_parts}
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictorTables:
     """(lanes, lanes) predictor tables for values at the points: ``last_alone``, or ``last`` and ``before``.
@@ -64,90 +62,75 @@ class PredictorTables:
     degree: int
     highest: tuple[Number, ...]
     next: tuple[Number, ...]
-    last_alone: NumberTable = field(metadata=printed("LAST_ALONE"))
-    last: NumberTable = field(metadata=printed("LAST"))
-    before: NumberTable = field(metadata=printed("BEFORE"))
+    last_alone: NumberTable
+    last: NumberTable
+    before: NumberTable
 
 
-class FixedPointIteration(ABC):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FixedPointIteration:
     """Fixed-point iteration whose kernels are evaluated at points on SIMD lanes: data, from which C is rendered.
 
     Attributes:
+        name: of the equations: separable, Hamiltonian, coupled, collocation or shooting.
+        points: real points; lanes beyond repeat the last one and have weight 0.
         lanes: a power of two, the number of points or more.
+        own_tables: padded to ``lanes``, in the order in which they are printed, without those of the predictor.
         guess: predictor of the stored values.
-        mass_entries: (i, j), i >= j, of the derivatives of the kernel that computes the mass, if any.
+        kernels: evaluated on SIMD lanes.
+        forces: names of the kernels whose first values are the forces L_q, if these enter nowhere else.
         kept: values at the points of a step.
+        stored: number of doubles kept from step to step per coordinate.
+        parts: support headers of its C, in order, after those of the meaning of a lane.
+        macros: names and values of macros that these require.
+        mass_entries: (i, j), i >= j, of the derivatives of the kernel that computes the mass, if any.
+        constant_mass: kernel of the masses if they are constant and diagonal.
+        damping: kernel of the rate of a uniform damping, a function of the parameters, if there is one.
+        predictor_matrix: table between the stored values and the predicted ones; empty if they are the same.
+        derivatives_part: support header of tangent and adjoint vectors by fixed-point iteration; ``""`` without one.
+        derivatives_tables: tables that this header requires besides :attr:`tables`.
+        serves_many: whether lanes may be trajectories.
         final_iterations: number of iterations after the one that converges.
         in_groups: whether its C supports several vectors for the points of a step, besides one.
     """
 
-    __slots__ = ()
-
+    name: IterationName
+    points: int
     lanes: int
+    own_tables: tuple[IterationTable, ...]
     guess: PredictorTables
-    mass_entries: tuple[tuple[int, int], ...]
-    kept: ClassVar[StoredValues]
-    final_iterations: ClassVar[int] = 0
-    in_groups: ClassVar[bool] = True
-
-    @property
-    @abstractmethod
-    def kernels(self) -> tuple[Kernel, ...]:
-        """Kernels that are evaluated on SIMD lanes."""
+    kernels: tuple[Kernel, ...]
+    forces: tuple[str, ...] = ()
+    kept: StoredValues
+    stored: int
+    parts: tuple[str, ...]
+    macros: tuple[tuple[str, int], ...] = ()
+    mass_entries: tuple[tuple[int, int], ...] = ()
+    constant_mass: Kernel | None = None
+    damping: Kernel | None = None
+    predictor_matrix: NumberTable = ()
+    derivatives_part: str = ""
+    derivatives_tables: tuple[IterationTable, ...] = ()
+    serves_many: bool = False
+    final_iterations: int = 0
+    in_groups: bool = True
 
     @property
     def tables(self) -> Iterator[IterationTable]:
         """All tables, in the order in which they are printed: those of the predictor last."""
-        yield from _tables(self)
-        yield from _tables(self.guess)
+        yield from self.own_tables
+        for name in ("last_alone", "last", "before"):
+            yield IterationTable(name.upper(), getattr(self.guess, name))
 
-    @property
-    @abstractmethod
-    def parts(self) -> tuple[str, ...]:
-        """Support headers of its C, in order, after those of the meaning of a lane."""
-
-    @abstractmethod
-    def memory(self, dimension: int) -> int:
-        """Return the number of doubles kept from step to step."""
+    def numbers(self, name: str) -> NumberTable:
+        """Return the numbers of a table, those of a vector as the only row."""
+        table = next(each for each in self.own_tables if each.name == name)
+        return table.numbers if table.is_matrix else (table.numbers,)
 
     def with_forces(self, forces: tuple[LoopedKernel, ...]) -> FixedPointIteration | None:
         """Return the iteration with further forces L_q of positions; ``None`` if these also enter otherwise."""
-        return None
-
-    @property
-    def facts(self) -> Mapping[str, int]:
-        """Macros that its support headers require."""
-        return {}
-
-    @property
-    def constant_mass(self) -> Kernel | None:
-        """Kernel of the masses if they are constant and diagonal."""
-        return None
-
-    @property
-    def derivatives_part(self) -> str:
-        """Support header of tangent and adjoint vectors by fixed-point iteration; ``""`` if there is none."""
-        return ""
-
-    @property
-    def derivatives_tables(self) -> tuple[IterationTable, ...]:
-        """Tables that this header requires besides :attr:`tables`."""
-        return ()
-
-    @property
-    def damping(self) -> Kernel | None:
-        """Kernel of the rate of a uniform damping, a function of the parameters, if there is one."""
-        return None
-
-    @property
-    def predictor_matrix(self) -> NumberTable:
-        """Table between the stored values and the predicted ones; empty if they are the same."""
-        return ()
-
-    @property
-    def serves_many(self) -> bool:
-        """True if lanes may be trajectories."""
-        return False
+        added = (each.with_sums(forces) if each.name in self.forces else each for each in self.kernels)
+        return replace(self, kernels=tuple(added)) if self.forces else None
 
     @property
     def error_power(self) -> int:
@@ -160,9 +143,9 @@ class FixedPointIteration(ABC):
         return all(i == j for i, j in self.mass_entries)
 
     @property
-    def mass_facts(self) -> Mapping[str, int]:
-        """Macro DIAGONAL_MASS if the mass matrix is diagonal."""
-        return {"DIAGONAL_MASS": 1} if self.diagonal else {}
+    def facts(self) -> Mapping[str, int]:
+        """Macros that its support headers require, DIAGONAL_MASS among them if the mass matrix is diagonal."""
+        return {**dict(self.macros), **({"DIAGONAL_MASS": 1} if self.mass_entries and self.diagonal else {})}
 
 
 def transposed(table: NumberTable, points: int) -> NumberTable:
@@ -172,14 +155,35 @@ def transposed(table: NumberTable, points: int) -> NumberTable:
     return (*((*column, *padding) for column in columns), *((0,) * len(table) for _ in padding))
 
 
-def _tables(data: Any) -> Iterator[IterationTable]:
-    """Yield the nonempty tables among the fields of data, and of groups of tables in them."""
-    for each in fields(data):
-        value = getattr(data, each.name)
-        if each.metadata and value:
-            yield IterationTable(numbers=value, **each.metadata)
-        elif is_dataclass(value) and each.name != "guess":
-            yield from _tables(value)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Splitting:
+    """An explicit step: kick 0, drift 0, kick 1, drift 1, .., without those of weight 0.
+
+    Attributes:
+        kicks: (n,) p += h kicks[n] L_q.
+        drifts: (n,) q += h drifts[n] v.
+        abscissae: (n,) c_n of the kicks.
+        force: L_q at (q, t).
+        drift: the constant diagonal of M (no arguments), v = M^-1 p, or v = H_p at p.
+        by_masses: True for M^-1 p.
+    """
+
+    kicks: tuple[Number, ...]
+    drifts: tuple[Number, ...]
+    abscissae: tuple[Number, ...]
+    force: Kernel
+    drift: Kernel
+    by_masses: bool
+
+    @property
+    def kernels(self) -> tuple[Kernel, ...]:
+        """Kernels of kicks and drifts."""
+        return (self.force, self.drift)
+
+    @property
+    def acts(self) -> bool:
+        """True if it has a discrete Lagrangian in closed form: a single drift, whose velocity is (q1 - q0) / h."""
+        return self.by_masses and sum(x != 0 for x in self.drifts) == 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 from scvi_codegen.indices import Array
 from scvi_codegen.ir.equations import ConstrainedSteps, Constraints, LoweredStageGroup, Rattle
-from scvi_codegen.ir.iteration import FixedPointIteration
-from scvi_codegen.ir.iterations import Splitting
+from scvi_codegen.ir.iteration import FixedPointIteration, Splitting
 from scvi_codegen.ir.kernel import Kernel, LoopedKernel
 from scvi_codegen.ir.numbers import Number, NumberTable
 
@@ -309,7 +308,7 @@ class Program:
         """Numbers that a run stores of its last steps to predict the next."""
         if self.splitting:
             return self.dimension
-        points = self.fixed_point.memory(self.dimension) if self.fixed_point else 0
+        points = self.dimension * self.fixed_point.stored if self.fixed_point else 0
         return max(points, self.equations.unknowns + self.point if self.newton else 0)
 
     @property

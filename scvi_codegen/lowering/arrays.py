@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from scvi_codegen.errors import MethodError, ScviCodegenError
 from scvi_codegen.ir.equations import ConstrainedSteps
-from scvi_codegen.ir.iteration import FixedPointIteration
-from scvi_codegen.ir.iterations import HamiltonianIteration, SeparableIteration, Splitting
+from scvi_codegen.ir.iteration import FixedPointIteration, Splitting
 from scvi_codegen.ir.program import LoopedTerms
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
@@ -46,7 +45,7 @@ def check_solver_of_arrays(
             f"{method.name} does not support velocity-dependent forces of array systems: use an SVI or a "
             "Runge-Kutta method"
         )
-    iterated = isinstance(chosen, SeparableIteration | HamiltonianIteration)
+    iterated = isinstance(chosen, FixedPointIteration) and chosen.name in ("separable", "Hamiltonian")
     if solver == "newton" and (not loops.products or system.momenta or system.velocities or not iterated):
         raise MethodError(
             "Newton's method for array systems requires a Lagrangian with a potential that is not linear, forces of "

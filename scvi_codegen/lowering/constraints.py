@@ -88,12 +88,14 @@ def rattle_of(system: MechanicalSystem, stages: StageSystem) -> Rattle | None:
     )
 
 
-def constrained_steps(system: ArraySystem, stages: StageSystem, method: Method) -> ConstrainedSteps:
-    """Return the kernels and fractions of constrained steps.
+def constrained_steps(system: ArraySystem, stages: StageSystem, method: Method) -> ConstrainedSteps | None:
+    """Return the kernels and fractions of constrained steps; ``None`` without constraints.
 
     Raises:
         MethodError: for other methods, and for velocity-dependent forces.
     """
+    if not system.constraints:
+        return None
     if system.velocities:
         raise MethodError(
             "velocity-dependent forces are not supported for array systems with constraints: remove "

@@ -75,30 +75,27 @@ def lower(
     Raises:
         MethodError: if the solver is not available for the method and the system.
     """
-    arrays = isinstance(system, ArraySystem)
+    arrays = system if isinstance(system, ArraySystem) else None
     one = one_coordinate(system) if isinstance(system, ArraySystem) else system
-    stages = discretise(one, method)
+    stages, velocities = discretise(one, method), bool(arrays and arrays.velocities)
     explicit = arrays or solver in ("auto", "explicit")
     splitting = splitting_of(one, method) if explicit and not (system.constraints or one.integrands) else None
     iterated = not system.constraints if arrays else lanes and solver in ("auto", "fixed-point")
-    velocities = isinstance(system, ArraySystem) and bool(system.velocities)
     fixed_point = iteration_of(one, stages, velocities=velocities) if iterated and splitting is None else None
     program = partial(
         Program,
         prefix=prefix,
         title=comment_text(f"{system.name}: {method.title}"),
-        notes=_notes(method, one, forced=isinstance(system, ArraySystem) and bool(system.applied_forces)),
+        notes=_notes(method, one, forced=bool(arrays and arrays.applied_forces)),
         order=method.order or len(stages.blocks),
         layout=_layout(system),
         fixed_point=fixed_point,
         splitting=splitting,
     )
     if isinstance(system, ArraySystem):
-        constrained = constrained_steps(system, stages, method) if system.constraints else None
-        loops = looped_terms(system, constrained, newton=solver == "newton")
-        check_solver_of_arrays(system, method, solver, splitting or constrained or fixed_point, loops)
-        points = len(fixed_point.guess.abscissae) if fixed_point else 0
-        return program(loops=loops, polynomial_curves=points > 1 or (points == 1 and not velocities))
+        loops = looped_terms(system, constrained_steps(system, stages, method), newton=solver == "newton")
+        check_solver_of_arrays(system, method, solver, splitting or loops.constrained or fixed_point, loops)
+        return program(loops=loops, polynomial_curves=bool(fixed_point and (fixed_point.points > 1 or not velocities)))
     check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else fixed_point)
     alone = fixed_point is not None and not fallback and not system.integrands
     newton = solver in ("auto", "newton") and splitting is None and not alone

@@ -675,8 +675,9 @@ def iteration_numbers(name: str) -> tuple[int, dict[str, Any]]:
     found: dict[str, Any] = {"h": mp.mpf(h), "q_k": numbers(q), "p_k": numbers(p), "q_k+1": end[0], "p_k+1": end[1]}
     found["v_0"] = known.get("v_0", velocity_of(case, q, p, t))
     stage_groups = [f for f in step.stages.stage_groups if f.name != "derivative_1"]
-    places = stage_groups[-1] if hasattr(fixed_point, "nodes") and len(stage_groups) > 1 else stage_groups[0]
-    places = next((f for f in stage_groups if f.name == "node"), places) if hasattr(fixed_point, "nodes") else places
+    curve = fixed_point is not None and fixed_point.name in ("collocation", "shooting")
+    places = stage_groups[-1] if curve and len(stage_groups) > 1 else stage_groups[0]
+    places = next((f for f in stage_groups if f.name == "node"), places) if curve else places
     first = int(places.weight_names[0].rpartition("_")[2] or 1)
     for n in range(1, len(places.abscissae) + 1):
         given = step.arguments(places, n, str(n - 1 + first), known)
@@ -696,9 +697,8 @@ def iteration_numbers(name: str) -> tuple[int, dict[str, Any]]:
         )
         for letter in ("P_", "L_q,", "F_"):  # points of a quadrature weigh so much
             found[f"{letter}{n}"] = found[f"{letter}{n}"] * growth
-    if getattr(fixed_point, "blocks", len(places.abscissae)) != len(
-        places.abscissae
-    ):  # V_j are then those of the curve
+    projected = fixed_point is not None and any(each.name == "PROJECTION" for each in fixed_point.own_tables)
+    if projected and len(fixed_point.guess.abscissae) != len(places.abscissae):  # V_j are then those of the curve
         found |= {f"V_{n}": known.get(f"V^{n}", numbers([0, 0])) for n in range(1, len(places.abscissae) + 1)}
     found |= {"g": mp.mpf(len(places.abscissae)), "p_k+1": end[1] * known["growth"]}
     return len(places.abscissae), found | step.tables | tables_of(fixed_point, len(places.abscissae), case)
@@ -707,25 +707,24 @@ def iteration_numbers(name: str) -> tuple[int, dict[str, Any]]:
 def tables_of(fixed_point: Any, count: int, case: Case) -> dict[str, Any]:
     """Return the tables of a fixed-point iteration by their names on the page; constant masses are inverted."""
     found: dict[str, Any] = {"M^−1": np.array([1 / mp.mpf(PARAMETERS["m"]), 1 / mp.mpf(3)], dtype=object)}
-    if getattr(fixed_point, "projection", ()):
-        found["projection"] = fixed_point.projection
-    if hasattr(fixed_point, "product"):
+    tables = {each.name: each.numbers for each in fixed_point.own_tables} if fixed_point else {}
+    if "PROJECTION" in tables:
+        found["projection"] = tables["PROJECTION"]
+    if "PRODUCT" in tables:
         for n in range(count):
-            found |= {f"a_{n + 1},{j + 1}": of_package(x) for j, x in enumerate(fixed_point.product[n])}
+            found |= {f"a_{n + 1},{j + 1}": of_package(x) for j, x in enumerate(tables["PRODUCT"][n])}
             found |= {
-                f"β_{n + 1}": of_package(fixed_point.end_position[n]),
-                f"b_{n + 1}": of_package(fixed_point.end_momentum[n]),
+                f"β_{n + 1}": of_package(tables["POINT_END_POSITION"][n]),
+                f"b_{n + 1}": of_package(tables["POINT_END_MOMENTUM"][n]),
             }
-    elif hasattr(fixed_point, "position"):
+    elif "POSITION" in tables:
         for n in range(count):
-            w, u = (
-                list(map(of_package, each)) for each in (fixed_point.position_weights, fixed_point.momentum_weights)
-            )
-            found |= {f"a_{n + 1},{j + 1}": of_package(x) * w[j] for j, x in enumerate(fixed_point.position[n])}
-            found |= {f"A_{n + 1},{j + 1}": of_package(x) * u[j] for j, x in enumerate(fixed_point.momentum[n])}
+            w, u = (list(map(of_package, each)) for each in (tables["POSITION_WEIGHT"], tables["MOMENTUM_WEIGHT"]))
+            found |= {f"a_{n + 1},{j + 1}": of_package(x) * w[j] for j, x in enumerate(tables["POSITION"][n])}
+            found |= {f"A_{n + 1},{j + 1}": of_package(x) * u[j] for j, x in enumerate(tables["MOMENTUM"][n])}
             found |= {
-                f"b_{n + 1}": of_package(fixed_point.end_position[n]) * w[n],
-                f"B_{n + 1}": of_package(fixed_point.end_momentum[n]) * u[n],
+                f"b_{n + 1}": of_package(tables["POINT_END_POSITION"][n]) * w[n],
+                f"B_{n + 1}": of_package(tables["POINT_END_MOMENTUM"][n]) * u[n],
             }
     return found
 

@@ -231,7 +231,14 @@ MUTATIONS = (
         case("kepler/printed"),
         curves,
         "_printed_ends",
-        changed_result(lambda ends: replace(ends, start_force=ends.end_force, end_force=ends.start_force)),
+        changed_result(
+            lambda ends: (
+                replace(ends[0], numbers=ends[2].numbers),
+                ends[1],
+                replace(ends[2], numbers=ends[0].numbers),
+                ends[3],
+            )
+        ),
     ),
     # Round-off: what compensated sums and low parts of coefficients promise.
     *(

@@ -50,7 +50,7 @@ def states(system: LagrangianSystem, force: Kernel | None) -> tuple[np.ndarray, 
     program = program_of(system, method, solver="fixed-point", prefix="chain")
     assert program.fixed_point is not None
     if force is not None:
-        program = replace(program, fixed_point=replace(program.fixed_point, force=force))
+        program = replace(program, fixed_point=replace(program.fixed_point, kernels=(force,)))
     stepper = Stepper(
         render(program),
         describe(program, system, method),
@@ -77,7 +77,7 @@ def test_the_code_of_a_loop_does_not_grow_with_its_table() -> None:
         program = program_of(system, SVI(2), solver="fixed-point", prefix="chain")
         assert program.fixed_point is not None
         force = looped_force(system, "force_lanes", bonds)
-        code = render(replace(program, fixed_point=replace(program.fixed_point, force=force))).code
+        code = render(replace(program, fixed_point=replace(program.fixed_point, kernels=(force,)))).code
         start = code.index("void bond(")
         sizes.append(code[start : code.index("void mass(", start)].count(";"))
     assert sizes[1] - sizes[0] == 64 - 8  # a value set to 0 for each mass

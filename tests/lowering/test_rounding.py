@@ -60,7 +60,7 @@ def test_coefficients_are_rounded_once_to_nearest():
 
 def test_program_has_more_digits_than_a_double():
     fixed_point = program_of(kepler(), SVI(3)).fixed_point
-    product = [x for row in fixed_point.product for x in row[: fixed_point.points]]
+    product = [x for row in fixed_point.numbers("PRODUCT") for x in row[: fixed_point.points]]
     assert all(mp.mpf(DOUBLE.rounded(x)) != x for x in product)
 
 

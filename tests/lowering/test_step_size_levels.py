@@ -25,10 +25,10 @@ def test_coefficients_have_106_bits(method):
         return [mp.mpf(DOUBLE.rounded(x)) + mp.mpf(DOUBLE.rounded(DOUBLE.rest(x))) for x in numbers]
 
     c, b, q = (
-        printed(table)[: fixed_point.points]
-        for table in (fixed_point.drift, fixed_point.end_momentum, fixed_point.end_position)
+        printed(fixed_point.numbers(name)[0])[: fixed_point.points]
+        for name in ("DRIFT", "POINT_END_MOMENTUM", "POINT_END_POSITION")
     )
-    product = list(map(printed, fixed_point.product))[: fixed_point.points]
+    product = list(map(printed, fixed_point.numbers("PRODUCT")))[: fixed_point.points]
     for k in range(method.degree if isinstance(method, sc.SVI) else 5):
         powers = [x**k for x in c]
         assert abs(mp.fdot(b, powers) - mp.mpf(1) / (k + 1)) < 1e-31

@@ -110,14 +110,14 @@ from scvi_codegen.pipeline.program import program_of
 from scvi_codegen.models.problems import problem
 given = problem("kepler")
 method = SCVI(4, abscissae="gauss")
-print(*(type(program_of(given.system, each).fixed_point).__name__ for each in (method, SCVI(4))))
+print(*(program_of(given.system, each).fixed_point.name for each in (method, SCVI(4))))
 ends = []
 for solver in ("fixed-point", "newton"):
     run = compile_stepper(given.system, method, solver=solver).integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=50)
     ends.append(np.array([*run.q[-1], *run.p[-1]]))
 print(abs(ends[0] - ends[1]).max() < 1e-13)
 """
-    assert run(extended, script).split() == ["SeparableIteration", "ShootingIteration", "True"]
+    assert run(extended, script).split() == ["separable", "shooting", "True"]
 
 
 # Blocks of another size than the coordinates: multipliers of constraints.

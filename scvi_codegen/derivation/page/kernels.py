@@ -17,9 +17,6 @@ from scvi_codegen.derivation.page.elision import MOST_FORMULAS, formulas, lines,
 from scvi_codegen.derivation.page.stage_equations import stage_group_contents
 from scvi_codegen.derivation.page.sums import end_formulas, row_formulas
 from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section, SideBySide, TableBlock
-from scvi_codegen.ir.curve_iterations import CollocationIteration, ShootingIteration
-from scvi_codegen.ir.iteration import FixedPointIteration
-from scvi_codegen.ir.iterations import CoupledIteration, HamiltonianIteration, SeparableIteration
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
 from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, multipliers
@@ -169,7 +166,7 @@ def _formulas(name: str, system: MechanicalSystem, stages: StageSystem, program:
     elif name == "newton":
         yield from _newton()
     elif name == "fixed_point" and program.fixed_point is not None:
-        yield from ITERATIONS[type(program.fixed_point)]
+        yield from ITERATIONS[program.fixed_point.name]
     elif name == "gather":
         yield Formula(sympy.Sum(Symbol("table_j_n") * Symbol("z_j"), (j, 1, Symbol("B"))), Symbol("u_n"))
 
@@ -197,14 +194,14 @@ def _sum(coefficient: str, value: sympy.Expr) -> sympy.Expr:
     return sympy.Sum(Symbol(coefficient) * value, (j, 1, g))
 
 
-ITERATIONS: dict[type[FixedPointIteration], tuple[Content, ...]] = {
-    SeparableIteration: (
+ITERATIONS: dict[str, tuple[Content, ...]] = {
+    "separable": (
         Paragraph("Positions q_n at the points, F the forces L_q, M the constant masses; iterated to convergence:"),
         Formula(q + h * Symbol("c_n") * v0 + h**2 * _sum("a_n_j", inverse_mass * Symbol("F_j")), Symbol("q_n")),
         Formula(q + h * v0 + h**2 * _sum("beta_j", inverse_mass * Symbol("F_j")), Symbol("q_k+1")),
         Formula(p + h * _sum("b_j", Symbol("F_j")), Symbol("p_k+1")),
     ),
-    CoupledIteration: (
+    "coupled": (
         Paragraph("Velocities V_n at the points, corrected to convergence; M = L_vv there:"),
         Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
         Formula(p + h * _sum("A_n_j", Symbol("L_q_j")), Symbol("P_n")),
@@ -216,7 +213,7 @@ ITERATIONS: dict[type[FixedPointIteration], tuple[Content, ...]] = {
         Formula(q + h * _sum("b_j", Symbol("V_j")), Symbol("q_k+1")),
         Formula(p + h * _sum("B_j", Symbol("L_q_j")), Symbol("p_k+1")),
     ),
-    HamiltonianIteration: (
+    "Hamiltonian": (
         Paragraph("Positions, forces, momenta and velocities V_n = H_p at the points, in turn to convergence:"),
         Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
         Formula(-Applied("H_q")(Symbol("q_n"), Symbol("P_n")), Symbol("F_n")),
@@ -225,7 +222,7 @@ ITERATIONS: dict[type[FixedPointIteration], tuple[Content, ...]] = {
         Formula(q + h * _sum("b_j", Symbol("V_j")), Symbol("q_k+1")),
         Formula(p + h * _sum("B_j", Symbol("F_j")), Symbol("p_k+1")),
     ),
-    ShootingIteration: (
+    "shooting": (
         Paragraph(
             "Scaled accelerations z_n at the nodes, corrected by the Euler-Lagrange residuals E; then p_(k+1), the "
             "velocity v_0 at the start and the multipliers, in turn to convergence:"
@@ -234,7 +231,7 @@ ITERATIONS: dict[type[FixedPointIteration], tuple[Content, ...]] = {
         Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
         Formula(Symbol("z_n") - h * inverse_mass * Symbol("E_n"), Symbol("z_n_new")),
     ),
-    CollocationIteration: (
+    "collocation": (
         Paragraph("Scaled accelerations z_n at the nodes, F = L_q - L_vq v - L_vt, M = L_vv; iterated to convergence:"),
         Formula(v0 + _sum("a_n_j", Symbol("z_j")), Symbol("V_n")),
         Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),

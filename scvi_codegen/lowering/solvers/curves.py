@@ -1,19 +1,33 @@
-"""Tables of the fixed-point solvers with accelerations as unknowns: the nodes of a curve, and points along it."""
+"""Fixed-point solvers on the accelerations of a curve, in SIMD lanes: nodes, and quadrature points along it.
+
+With z = h a the curves are V = v0 + A z and q = q0 + h A V at the nodes, q1 = q0 + h sum b V and v1 = v0 + sum b z; at
+the points q = q0 + h a V and v = l V, V being the velocities at the nodes.
+
+**Collocation.** The Euler-Lagrange equations at the nodes of a curve from q0: z = h M^-1 (L_q - L_vq V - L_vt) is
+iterated to convergence. Without points, p0 and p1 are L_v at the ends of the curve, and v0 is known; in the printed
+form of the paper they are sums over the points, and v0 is corrected after z by M^-1 times the residual of p0:
+
+    p0 = -sum (h start_force L_q + start_momentum L_v),     p1 = p0 + sum (h end_force L_q + end_momentum L_v),
+
+the weights being w l_0, w l_0', w (l_0 + l_s), w (l_0' + l_s'), l_0 of the first node.
+
+**Shooting.** Unknowns: v0, z at the nodes and the scaled multipliers m_i. One iteration is
+
+    z -= h M^-1 E(q, V, z / h),          p1 = p0 + h sum w L_q + h^2 sum (m . E)_q,
+    gamma = h a^T w L_q + l^T w L_v + h (m . E)_v + h^2 A^T (m . E)_q - b p1,
+    v0 -= M^-1 sum gamma,                m = -M^-1 A^T (gamma - l^T w sum gamma).
+
+The order of the updates (accelerations, then the action along the new curve, then momentum, initial velocity and
+multipliers) makes it converge twice as fast as a simultaneous update. The equations are those of
+``methods/shooting.py`` in these unknowns.
+"""
 
 from __future__ import annotations
-
-from collections.abc import Iterable
 
 from sympy import S
 
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.ir.curve_iterations import (
-    CollocationIteration,
-    NodeTables,
-    PointTables,
-    PrintedEnds,
-    ShootingIteration,
-)
+from scvi_codegen.ir.iteration import FixedPointIteration, IterationName, IterationTable, StoredValues
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.tables import (
@@ -25,6 +39,7 @@ from scvi_codegen.lowering.solvers.tables import (
     predictor_tables_of,
 )
 from scvi_codegen.mechanics.derived_expressions import accelerations, forms_of, multipliers
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_structure import Accelerations, PrintedCurve, ShotCurve
 from scvi_codegen.tables.basis import (
@@ -34,64 +49,29 @@ from scvi_codegen.tables.basis import (
     matrix_product,
     transpose,
 )
-from scvi_codegen.tables.precision import Number, mp
+from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.tableau import Tableau
 
-__all__ = ["node_tables", "point_tables", "position_iteration", "printed_iteration", "shooting_iteration"]
+__all__ = ["position_iteration", "printed_iteration", "shooting_iteration"]
+
+LARGEST_DIMENSION = 8
+"""Largest number of coordinates of shooting; beyond, the kernels take longer to compile than they save."""
 
 
-def node_tables(tableau: Tableau, lanes: int) -> NodeTables:
-    """Return the nodes of a curve: the stages of a tableau."""
-    size = len(tableau.b)
-    return NodeTables(
-        count=size,
-        abscissae=pad_vector(tableau.c, lanes, repeat=True),
-        collocation=pad_matrix(tableau.A, lanes),
-        end=pad_vector(tableau.b, lanes, repeat=True),
-        mask=pad_vector((mp.one,) * size, lanes),
-    )
-
-
-def point_tables(system: MechanicalSystem, tableau: Tableau, rule: Quadrature, lanes: int) -> PointTables:
-    """Return the points of a quadrature along a curve whose velocity is a polynomial through the nodes."""
-    forms = forms_of(system)
-    return PointTables(
-        abscissae=pad_vector(rule.abscissae, lanes, repeat=True),
-        position=pad_matrix(cardinal_integrals(tableau.c, rule.abscissae, 0), lanes),
-        velocity=pad_matrix(cardinal_values(tableau.c, rule.abscissae), lanes),
-        action=system_kernel(
-            system,
-            "action_lanes",
-            (*forms.force, *forms.momentum),
-            of=(*system.coordinates, *system.velocities),
-            purpose="L_q and L_v at all points, u = (q, v).",
-        ),
-    )
-
-
-def position_iteration(problem: StepProblem) -> CollocationIteration | None:
+def position_iteration(problem: StepProblem) -> FixedPointIteration | None:
     """Return the fixed-point iteration of a tableau in position form; ``None`` with too many stages."""
     system, shape = problem.lagrangian, problem.shape
     if system is None or not isinstance(shape, Accelerations):
         return None
-    tableau = shape.tableau
-    lanes = lane_count(len(tableau.b))
+    lanes = lane_count(len(shape.tableau.b))
     if lanes > MOST_LANES:
         return None
-    return CollocationIteration(
-        lanes=lanes,
-        nodes=node_tables(tableau, lanes),
-        guess=predictor_tables_of(tableau.c, lanes),
-        points=None,
-        kernel=_node_kernel(system),
-        mass_entries=tuple(forms_of(system).lower_mass),
-        ends=None,
-        hamiltonian=bool(problem.system.auxiliaries),
-    )
+    macros = (("HAMILTONIAN", int(bool(problem.system.auxiliaries))),)
+    return _curve_iteration("collocation", system, shape.tableau, None, lanes, macros=macros)
 
 
-def printed_iteration(problem: StepProblem) -> CollocationIteration | None:
+def printed_iteration(problem: StepProblem) -> FixedPointIteration | None:
     """Return the fixed-point iteration of an SCVI as printed, of degree 2 or more; ``None`` with too many points."""
     system, shape = problem.lagrangian, problem.shape
     if system is None or not isinstance(shape, PrintedCurve):
@@ -99,31 +79,101 @@ def printed_iteration(problem: StepProblem) -> CollocationIteration | None:
     lanes = lane_count(max(len(shape.tableau.b), len(shape.rule)))
     if lanes > MOST_LANES:
         return None
-    return CollocationIteration(
+    ends = _printed_ends(shape.tableau, shape.rule, lanes)
+    return _curve_iteration("collocation", system, shape.tableau, shape.rule, lanes, further=ends)
+
+
+def shooting_iteration(problem: StepProblem) -> FixedPointIteration | None:
+    """Return the fixed-point iteration of a variational SCVI of degree 2 or more; ``None`` if it would be too large."""
+    system, shape = problem.lagrangian, problem.shape
+    if system is None or not isinstance(shape, ShotCurve):
+        return None
+    tableau, rule = shape.tableau, shape.rule
+    lanes = lane_count(max(len(tableau.b), len(rule)))
+    if lanes > MOST_LANES or system.dimension > LARGEST_DIMENSION:
+        return None
+    position = cardinal_integrals(tableau.c, rule.abscissae, 0)
+    velocity = cardinal_values(tableau.c, rule.abscissae)
+    consistency = matrix_product((rule.unit_weights,), velocity)[0]
+    further = (
+        IterationTable("COLLOCATION_T", pad_matrix(transpose(tableau.A), lanes)),
+        IterationTable("POINT_POSITION_T", pad_matrix(transpose(position), lanes)),
+        IterationTable("POINT_VELOCITY_T", pad_matrix(transpose(velocity), lanes)),
+        IterationTable("POINT_WEIGHT", pad_vector(rule.unit_weights, lanes)),
+        IterationTable("NODE_CONSISTENCY", pad_vector(consistency, lanes, repeat=True)),
+    )
+    return _curve_iteration("shooting", system, tableau, rule, lanes, further=further)
+
+
+def _curve_iteration(
+    name: IterationName,
+    system: LagrangianSystem,
+    tableau: Tableau,
+    rule: Quadrature | None,
+    lanes: int,
+    *,
+    further: tuple[IterationTable, ...] = (),
+    macros: tuple[tuple[str, int], ...] = (),
+) -> FixedPointIteration:
+    """Return the iteration on a curve through the stages of a tableau, with the points of a rule, if there is one."""
+    size, shooting = len(tableau.b), name == "shooting"
+    nodes = (
+        IterationTable("NODE_TIME", pad_vector(tableau.c, lanes, repeat=True)),
+        IterationTable("COLLOCATION", pad_matrix(tableau.A, lanes)),
+        IterationTable("NODE_END", pad_vector(tableau.b, lanes, repeat=True)),
+        IterationTable("NODE_MASK", pad_vector((mp.one,) * size, lanes)),
+    )
+    kernel = _residual_kernel(system) if shooting else _node_kernel(system)
+    return FixedPointIteration(
+        name=name,
+        points=size,
         lanes=lanes,
-        nodes=node_tables(shape.tableau, lanes),
-        guess=predictor_tables_of(shape.tableau.c, lanes),
-        points=point_tables(system, shape.tableau, shape.rule, lanes),
-        kernel=_node_kernel(system),
+        own_tables=(*nodes, *(_point_tables(tableau, rule, lanes) if rule else ()), *further),
+        guess=predictor_tables_of(tableau.c, lanes),
+        kernels=(kernel, _action_kernel(system)) if rule else (kernel,),
+        kept=StoredValues.ACCELERATIONS,
+        stored=(3 if shooting else 2) * lanes + 1,
+        parts=("mass_matrix", "curve", f"{name}_iteration"),
+        macros=macros or (("NODES", size),),
         mass_entries=tuple(forms_of(system).lower_mass),
-        ends=_printed_ends(shape.tableau, shape.rule, lanes),
-        hamiltonian=bool(problem.system.auxiliaries),
+        in_groups=False,
     )
 
 
-def _printed_ends(tableau: Tableau, rule: Quadrature, lanes: int) -> PrintedEnds:
+def _point_tables(tableau: Tableau, rule: Quadrature, lanes: int) -> tuple[IterationTable, ...]:
+    """Return the points of a quadrature along a curve whose velocity is a polynomial through the nodes."""
+    return (
+        IterationTable("POINT_TIME", pad_vector(rule.abscissae, lanes, repeat=True)),
+        IterationTable("POINT_POSITION", pad_matrix(cardinal_integrals(tableau.c, rule.abscissae, 0), lanes)),
+        IterationTable("POINT_VELOCITY", pad_matrix(cardinal_values(tableau.c, rule.abscissae), lanes)),
+    )
+
+
+def _printed_ends(tableau: Tableau, rule: Quadrature, lanes: int) -> tuple[IterationTable, ...]:
     """Return the weights times the cardinal functions of the nodes at both ends, (34d) and (34e)."""
     nodes = (0, *tableau.c)
     values, partials = (cardinals(nodes, rule.abscissae) for cardinals in (cardinal_values, cardinal_derivatives))
+    weighted = {
+        "START_FORCE": [line[0] for line in values],
+        "START_MOMENTUM": [line[0] for line in partials],
+        "END_FORCE": [line[0] + line[-1] for line in values],
+        "END_MOMENTUM": [line[0] + line[-1] for line in partials],
+    }
+    return tuple(
+        IterationTable(name, pad_vector(tuple(w * x for w, x in zip(rule.unit_weights, line, strict=True)), lanes))
+        for name, line in weighted.items()
+    )
 
-    def weighted(numbers: Iterable[Number]) -> tuple[Number, ...]:
-        return pad_vector(tuple(w * x for w, x in zip(rule.unit_weights, numbers, strict=True)), lanes)
 
-    return PrintedEnds(
-        start_force=weighted(line[0] for line in values),
-        start_momentum=weighted(line[0] for line in partials),
-        end_force=weighted(line[0] + line[-1] for line in values),
-        end_momentum=weighted(line[0] + line[-1] for line in partials),
+def _action_kernel(system: MechanicalSystem) -> Kernel:
+    """Return the kernel of L_q and L_v."""
+    forms = forms_of(system)
+    return system_kernel(
+        system,
+        "action_lanes",
+        (*forms.force, *forms.momentum),
+        of=(*system.coordinates, *system.velocities),
+        purpose="L_q and L_v at all points, u = (q, v).",
     )
 
 
@@ -136,36 +186,6 @@ def _node_kernel(system: MechanicalSystem) -> Kernel:
         of=(*system.coordinates, *system.velocities),
         partials=forms_of(system).lower_mass.values(),
         purpose="L_q - L_vq v - L_vt and the lower triangle of L_vv at all nodes, u = (q, v).",
-    )
-
-
-LARGEST_DIMENSION = 8
-"""Largest number of coordinates; beyond, the kernels take longer to compile than they save."""
-
-
-def shooting_iteration(problem: StepProblem) -> ShootingIteration | None:
-    """Return the fixed-point iteration of a variational SCVI of degree 2 or more; ``None`` if it would be too large."""
-    system, shape = problem.lagrangian, problem.shape
-    if system is None or not isinstance(shape, ShotCurve):
-        return None
-    tableau, rule = shape.tableau, shape.rule
-    lanes = lane_count(max(len(tableau.b), len(rule)))
-    if lanes > MOST_LANES or system.dimension > LARGEST_DIMENSION:
-        return None
-    position = cardinal_integrals(tableau.c, rule.abscissae, 0)
-    velocity = cardinal_values(tableau.c, rule.abscissae)
-    return ShootingIteration(
-        lanes=lanes,
-        nodes=node_tables(tableau, lanes),
-        guess=predictor_tables_of(tableau.c, lanes),
-        points=point_tables(system, tableau, rule, lanes),
-        collocation_transposed=pad_matrix(transpose(tableau.A), lanes),
-        position_transposed=pad_matrix(transpose(position), lanes),
-        velocity_transposed=pad_matrix(transpose(velocity), lanes),
-        weights=pad_vector(rule.unit_weights, lanes),
-        consistency=pad_vector(matrix_product((rule.unit_weights,), velocity)[0], lanes, repeat=True),
-        kernel=_residual_kernel(system),
-        mass_entries=tuple(forms_of(system).lower_mass),
     )
 
 

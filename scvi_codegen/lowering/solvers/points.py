@@ -2,10 +2,20 @@
 
 **Separable systems.** With a constant diagonal mass and forces of position and time the two tables of a method
 (positions from velocities, momenta from forces) are multiplied into one, q_n = q0 + h c_n v0 + h^2 sum_j product[n][j]
-F_j / m, for every SVI, for the Runge-Kutta methods, and for spectral collocation and the position forms as well; no
-matrix is factorised. A variational method is symplectic because its tables are adjoint; rounded to 53 bits they are not
-exactly, and the energy drifts. So they have 106 bits, including the powers of h. The low words are only used where they
-matter: in the last evaluation of the points and in the increments.
+F_j / m, for every SVI, for the Runge-Kutta methods, and for spectral collocation and the position forms as well:
+
+    q_n = q0 + h drift[n] v0 + h^2 sum_j product[n][j] F_j / m,     v0 = p0 / m,
+    q1 = q0 + h v0 + h^2 sum_j end_position[j] F_j / m,             p1 = p0 + h sum_j end_momentum[j] F_j,
+    V_n = v0 + h sum_j velocity[n][j] F_j / m,                      if forces depend on velocities;
+
+no matrix is factorised. A variational method is symplectic because its tables are adjoint; rounded to 53 bits they are
+not exactly, and the energy drifts. So they have 106 bits, including the powers of h. The low words are only used where
+they matter: in the last evaluation of the points and in the increments.
+
+**Other systems** have velocities as unknowns, and scaled weights h w_j, F being L_q (-H_q) at the points:
+
+    q_n = q0 + sum_j position[n][j] (h position_weights[j] V_j),    q1 = q0 + sum_j end_position[j] (h .. V_j),
+    P_n = p0 + sum_j momentum[n][j] (h momentum_weights[j] F_j),    p1 = p0 + sum_j end_momentum[j] (h .. F_j).
 
 **Hamiltonians.** No mass matrix, no Legendre transform: with positions and momenta at the points, one iteration
 computes forces, momenta, velocities and positions in turn, each from the latest of the others (Gauss-Seidel). Its
@@ -26,11 +36,16 @@ rounded map still has a generating function: its energy error does not drift.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from typing import Any
+
 import sympy
 from sympy import Expr
 
 from scvi_codegen.formulas.derivatives import jacobian
-from scvi_codegen.ir.iterations import CoupledIteration, HamiltonianIteration, SeparableIteration
+from scvi_codegen.ir.iteration import FixedPointIteration, IterationName, IterationTable, StoredValues, transposed
+from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.numbers import Number, NumberTable
 from scvi_codegen.lowering.kernels import damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.lowering.solvers.tables import (
     MOST_LANES,
@@ -53,7 +68,7 @@ from scvi_codegen.tables.precision import Matrix, Vector, mp
 __all__ = ["coupled_iteration", "hamiltonian_iteration", "over", "separable_iteration", "weighted_tables"]
 
 
-def separable_iteration(problem: StepProblem, *, velocities: bool = False) -> SeparableIteration | None:
+def separable_iteration(problem: StepProblem, *, velocities: bool = False) -> FixedPointIteration | None:
     """Return the fixed-point iteration of a separable system; ``None`` for others, and with too many points.
 
     With ``velocities`` it has the table of those at the points, and predicts forces instead of positions. Systems with
@@ -70,57 +85,112 @@ def separable_iteration(problem: StepProblem, *, velocities: bool = False) -> Se
     return _separable(system, tables, velocities=velocities) if tables else None
 
 
-def _separable(system: LagrangianSystem, tables: VelocityTables, *, velocities: bool) -> SeparableIteration | None:
-    lanes = lane_count(len(tables.abscissae))
+def _separable(system: LagrangianSystem, tables: VelocityTables, *, velocities: bool) -> FixedPointIteration | None:
+    points = len(tables.abscissae)
+    lanes = lane_count(points)
     if lanes > MOST_LANES:
         return None
     product = matrix_product(tables.position, tables.momentum)
     drift = tuple(mp.fsum(line) for line in tables.position)
-    highest = min(len(tables.abscissae), len(tables.blocks)) - 1
-    guess = predictor_tables_of(tables.abscissae, lanes, through=None if velocities else product, degree=highest)
+    end_position = matrix_product((tables.end_position,), tables.momentum)[0]
+    highest = min(points, len(tables.blocks)) - 1
     at_points = matrix_product(tables.velocity, tables.momentum) if tables.velocity else tables.momentum
-    forms = forms_of(system)
-    return SeparableIteration(
-        points=len(tables.abscissae),
+    forms, padded = forms_of(system), pad_matrix(product, lanes)
+    return FixedPointIteration(
+        name="separable",
+        points=points,
         lanes=lanes,
-        abscissae=pad_vector(tables.abscissae, lanes, repeat=True),
-        drift=pad_vector(drift, lanes, repeat=True),
-        product=pad_matrix(product, lanes),
-        end_position=pad_vector(matrix_product((tables.end_position,), tables.momentum)[0], lanes),
-        end_momentum=pad_vector(tables.end_momentum, lanes),
-        guess=guess,
-        force=system_kernel(system, "force_lanes", forms.force, of=system.coordinates, purpose="L_q at all points."),
-        mass=system_kernel(system, "mass", forms.mass.values(), of=(), purpose="The constant masses."),
-        velocity=pad_matrix(at_points, lanes) if velocities else (),
+        own_tables=(
+            IterationTable("ABSCISSA", pad_vector(tables.abscissae, lanes, repeat=True)),
+            IterationTable("DRIFT", pad_vector(drift, lanes, repeat=True), in_two_parts=True),
+            IterationTable("PRODUCT", padded, in_two_parts=True),
+            IterationTable("POINT_END_POSITION", pad_vector(end_position, lanes), in_two_parts=True),
+            IterationTable("POINT_END_MOMENTUM", pad_vector(tables.end_momentum, lanes), in_two_parts=True),
+            *((IterationTable("VELOCITY", pad_matrix(at_points, lanes)),) if velocities else ()),
+        ),
+        guess=predictor_tables_of(tables.abscissae, lanes, through=None if velocities else product, degree=highest),
+        kernels=(
+            system_kernel(system, "force_lanes", forms.force, of=system.coordinates, purpose="L_q at all points."),
+        ),
+        forces=("force_lanes",),
+        kept=StoredValues.FORCES,
+        stored=2 * lanes,
+        parts=("separable_iteration",),
+        constant_mass=system_kernel(system, "mass", forms.mass.values(), of=(), purpose="The constant masses."),
+        predictor_matrix=padded,
+        derivatives_part="" if velocities else "separable_derivatives",
+        derivatives_tables=(IterationTable("PRODUCT_BACK", transposed(padded, points)),),
+        serves_many=True,
+        final_iterations=1,  # the final one, with double-double coefficients
     )
 
 
-def hamiltonian_iteration(problem: StepProblem) -> HamiltonianIteration | None:
+def _point_iteration(
+    name: IterationName, tables: VelocityTables, lanes: int, kernels: Iterable[Kernel | None], **further: Any
+) -> FixedPointIteration:
+    """Return an iteration on velocities at the points; ``kernels``: without those that are ``None``."""
+    names = ("POSITION", "POSITION_WEIGHT", "MOMENTUM", "MOMENTUM_WEIGHT")
+    position, position_weights, momenta, momentum_weights = weighted_tables(tables)
+    padded = (
+        pad_matrix(position, lanes),
+        pad_vector(position_weights, lanes),
+        pad_matrix(momenta, lanes),
+        pad_vector(momentum_weights, lanes),
+    )
+    points, extra = len(tables.abscissae), (("VELOCITY", tables.velocity), ("PROJECTION", tables.projection))
+    weighed = {
+        "CHANGE_POSITION": _weighed(padded[0], padded[1]),
+        "CHANGE_MOMENTUM": _weighed(padded[2], padded[3]),
+    }
+    return FixedPointIteration(
+        name=name,
+        points=points,
+        lanes=lanes,
+        own_tables=(
+            IterationTable("ABSCISSA", pad_vector(tables.abscissae, lanes, repeat=True)),
+            *map(IterationTable, names, padded),
+            IterationTable("POINT_END_POSITION", pad_vector(over(tables.end_position, position_weights), lanes)),
+            IterationTable("POINT_END_MOMENTUM", pad_vector(over(tables.end_momentum, momentum_weights), lanes)),
+            *(IterationTable(each, pad_matrix(table, lanes)) for each, table in extra if table),
+        ),
+        guess=predictor_tables_of(tables.blocks, lanes, degree=resolved_degree(tables)),
+        kernels=tuple(kernel for kernel in kernels if kernel),
+        kept=StoredValues.VELOCITIES,
+        derivatives_tables=(
+            *(IterationTable(each, table) for each, table in weighed.items()),
+            *(IterationTable(f"{each}_BACK", transposed(table, points)) for each, table in weighed.items()),
+        ),
+        **further,
+    )
+
+
+def _weighed(table: NumberTable, weights: Sequence[Number]) -> NumberTable:
+    """Return the columns times weights."""
+    return tuple(tuple(x * weight for x, weight in zip(row, weights, strict=True)) for row in table)
+
+
+def hamiltonian_iteration(problem: StepProblem) -> FixedPointIteration | None:
     """Return the fixed-point iteration of a Hamiltonian; ``None`` with too many or other points than velocities."""
     system = problem.system
     tables = velocity_tables(problem.shape) if system.auxiliaries else None
     if tables is None or tables.velocity or system.damping != 0:
         return None
-    lanes = lane_count(len(tables.abscissae))
+    lanes, forms = lane_count(len(tables.abscissae)), forms_of(system)
     if lanes > MOST_LANES:
         return None
-    position, position_weights, momenta, momentum_weights = weighted_tables(tables)
-    forms = forms_of(system)
     of = forms.legendre_arguments
-    return HamiltonianIteration(
-        points=len(tables.abscissae),
-        lanes=lanes,
-        abscissae=pad_vector(tables.abscissae, lanes, repeat=True),
-        position=pad_matrix(position, lanes),
-        position_weights=pad_vector(position_weights, lanes),
-        momentum=pad_matrix(momenta, lanes),
-        momentum_weights=pad_vector(momentum_weights, lanes),
-        end_position=pad_vector(over(tables.end_position, position_weights), lanes),
-        end_momentum=pad_vector(over(tables.end_momentum, momentum_weights), lanes),
-        guess=predictor_tables_of(tables.blocks, lanes, degree=resolved_degree(tables)),
-        kernel=system_kernel(system, "velocity_lanes", forms.legendre, of=of, purpose="H_p at all points, u = (q, p)."),
-        force=system_kernel(system, "force_lanes", forms.force, of=of, purpose="-H_q at all points, u = (q, p)."),
-        integrands=integrand_kernel(system, "integrand_lanes", of),
+    return _point_iteration(
+        "Hamiltonian",
+        tables,
+        lanes,
+        (
+            system_kernel(system, "velocity_lanes", forms.legendre, of=of, purpose="H_p at all points, u = (q, p)."),
+            system_kernel(system, "force_lanes", forms.force, of=of, purpose="-H_q at all points, u = (q, p)."),
+            integrand_kernel(system, "integrand_lanes", of),
+        ),
+        forces=("force_lanes",),
+        stored=4 * lanes,
+        parts=("point_weights", "hamiltonian_iteration"),
     )
 
 
@@ -129,49 +199,48 @@ MOST_LINEARISED = 8
 """Largest number of coordinates with linearised forces; beyond, their derivatives cost more than they save."""
 
 
-def coupled_iteration(problem: StepProblem) -> CoupledIteration | None:
+def coupled_iteration(problem: StepProblem) -> FixedPointIteration | None:
     """Return the fixed-point iteration of a Lagrangian; ``None`` with too many points."""
     system, tables = problem.lagrangian, velocity_tables(problem.shape)
     return _coupled(system, tables) if system and tables else None
 
 
-def _coupled(system: LagrangianSystem, tables: VelocityTables) -> CoupledIteration | None:
-    points, blocks = len(tables.abscissae), len(tables.blocks)
-    lanes = lane_count(max(points, blocks))
+def _coupled(system: LagrangianSystem, tables: VelocityTables) -> FixedPointIteration | None:
+    lanes = lane_count(max(len(tables.abscissae), len(tables.blocks)))
     if lanes > MOST_LANES:
         return None
-    position, position_weights, momenta, momentum_weights = weighted_tables(tables)
-    guess = predictor_tables_of(tables.blocks, lanes, degree=resolved_degree(tables))
-    forms, of = forms_of(system), (*system.coordinates, *system.velocities)
+    forms, of, projected = forms_of(system), (*system.coordinates, *system.velocities), bool(tables.velocity)
     followed = () if tables.projection else _linearised_forces(system)
     evaluated = "L_q, L_v, their derivatives F_q, F_v and L_vq" if followed else "L_q, L_v"
-    return CoupledIteration(
-        points=points,
-        blocks=blocks,
-        lanes=lanes,
-        abscissae=pad_vector(tables.abscissae, lanes, repeat=True),
-        position=pad_matrix(position, lanes),
-        position_weights=pad_vector(position_weights, lanes),
-        momentum=pad_matrix(momenta, lanes),
-        momentum_weights=pad_vector(momentum_weights, lanes),
-        end_position=pad_vector(over(tables.end_position, position_weights), lanes),
-        end_momentum=pad_vector(over(tables.end_momentum, momentum_weights), lanes),
-        velocity=pad_matrix(tables.velocity, lanes) if tables.velocity else (),
-        projection=pad_matrix(tables.projection, lanes) if tables.projection else (),
-        guess=guess,
-        kernel=system_kernel(
-            system,
-            "point_lanes",
-            (*forms.force, *forms.momentum, *followed),
-            of=of,
-            partials=forms.lower_mass.values(),
-            purpose=f"{evaluated} and the lower triangle of L_vv at all points, u = (q, v).",
+    force = system_kernel(system, "force_lanes", forms.force, of=of, purpose="L_q at all points.")
+    integrands, damping = integrand_kernel(system, "integrand_lanes", of), damping_kernel(system)
+    return _point_iteration(
+        "coupled",
+        tables,
+        lanes,
+        (
+            system_kernel(
+                system,
+                "point_lanes",
+                (*forms.force, *forms.momentum, *followed),
+                of=of,
+                partials=forms.lower_mass.values(),
+                purpose=f"{evaluated} and the lower triangle of L_vv at all points, u = (q, v).",
+            ),
+            None if followed else force,
+            integrands,
         ),
-        force=system_kernel(system, "force_lanes", forms.force, of=of, purpose="L_q at all points."),
+        forces=() if followed else ("point_lanes", "force_lanes"),
+        stored=2 * lanes,
+        parts=(
+            *(("damped_points",) if damping else ()),
+            *("point_weights", "mass_matrix", "corrections", "coupled_iteration"),
+        ),
+        macros=tuple((name, 1) for name, holds in (("PROJECTED", projected), ("FOLLOWED", followed)) if holds),
         mass_entries=tuple(forms.lower_mass),
-        followed=bool(followed),
-        integrands=integrand_kernel(system, "integrand_lanes", of),
-        damping=damping_kernel(system),
+        damping=damping,
+        derivatives_part="" if projected or damping or integrands else "coupled_derivatives",
+        serves_many=not projected,
     )
 
 

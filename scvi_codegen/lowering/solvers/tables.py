@@ -1,10 +1,9 @@
 """Common interface and tables of the fixed-point solvers.
 
-A solver is a function from a problem to an iteration, or ``None``, a line in ``FIXED_POINTS``
-(:mod:`scvi_codegen.lowering.solvers.selection`), and a subclass of
-:class:`~scvi_codegen.ir.iteration.FixedPointIteration`, plain data, which declares the tables and the support headers
-from which :mod:`scvi_codegen.rendering.kernels.simd` renders C. Solvers share only the problem. They may rely on the
-following:
+A solver is a function from a problem to a :class:`~scvi_codegen.ir.iteration.FixedPointIteration`, or ``None``, and a
+line in ``FIXED_POINTS`` (:mod:`scvi_codegen.lowering.solvers.selection`). The iteration is plain data, with the tables
+and the support headers from which :mod:`scvi_codegen.rendering.kernels.simd` renders C. Solvers share only the problem.
+They may rely on the following:
 
 * the tables of a shape are numbers of the method in 60 digits, also in the iteration; they are rounded when they are
   printed, as double-double numbers if one rounding is not accurate enough;

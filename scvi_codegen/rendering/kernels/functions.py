@@ -6,12 +6,13 @@ A kernel that is divided calls its parts, separate functions with only the argum
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
+from typing import TypeAlias
 
 from scvi_codegen.indices import Access, Place
 from scvi_codegen.ir.iteration import FixedPointIteration
 from scvi_codegen.ir.kernel import Constant, Kernel, Load, LoopedKernel, Part, parts
+from scvi_codegen.ir.program import Layout
 from scvi_codegen.rendering.kernels.loop_nests import Nest
 from scvi_codegen.rendering.kernels.printer import ARRAYS, print_lane_statements, print_statements
 from scvi_codegen.rendering.kernels.simd import Lanes
@@ -26,64 +27,34 @@ UNFORMATTED = "  /* clang-format off */\n{}\n  /* clang-format on */"
 PART = "static SCVI_NOINLINE"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Form:
-    """Form of a kernel in C.
-
-    Attributes:
-        real, time, parameter: types of arguments and values, of the time, and of parameters.
-        storage: of the function.
-        sources: loads that differ between lanes; none for numbers.
-        target: scalar type of the constants.
-        statements: function that prints those of a kernel or a part.
-    """
-
-    real: str
-    time: str
-    parameter: str
-    storage: str
-    sources: Sequence[str]
-    target: Target
-    statements: Callable[[Kernel | Part], list[str]]
-
-    @property
-    def declared(self) -> dict[str, str]:
-        """Declarations of the arguments by name."""
-        declared = {name: f"{self.real} *{name}" for name in ARRAYS}
-        declared |= {"u": f"const {self.real} *u", "t": f"{self.time} t", "kept": f"{self.real} *restrict kept"}
-        return declared | {"parameters": f"const {self.parameter} *parameters"}
+Printed: TypeAlias = Callable[[Kernel | Part], list[str]]
+"""Function that prints the statements of a kernel or of a part."""
 
 
 def kernel_text(kernel: Kernel, target: Target, *, partials: bool = False) -> str:
     """Return a function of numbers, with its comment; ``partials``: always with the argument for derivatives."""
-    real, statements = target.scalar, partial(print_statements, target=target)
-    form = _Form(
-        real=real, time=real, parameter=real, storage="static", sources=(), target=target, statements=statements
-    )
-    return _text(kernel, form, partials=partials)
+    return _text(kernel, target, None, partial(print_statements, target=target), partials=partials)
 
 
 def lane_kernel_text(kernel: Kernel, fixed_point: FixedPointIteration, lanes: Lanes) -> str:
     """Return a function of vectors."""
-    form = _Form(
-        real="lanes",
-        time=lanes.type_of("t"),
-        parameter=lanes.type_of("parameters"),
-        storage="static inline",
-        sources=lanes.sources,
-        target=DOUBLE,
-        statements=partial(print_lane_statements, fixed_point=fixed_point, sources=lanes.sources),
-    )
-    return _text(kernel, form)
+    printed = partial(print_lane_statements, fixed_point=fixed_point, sources=lanes.sources)
+    return _text(kernel, DOUBLE, lanes, printed)
 
 
-def _text(kernel: Kernel, form: _Form, *, partials: bool = False) -> str:
-    """Return a kernel, after its parts and the terms of its loops with their tables."""
-    texts = [_function(PART, part, _used(part, form.declared), form.statements(part)) for part in _parts(kernel)]
-    texts += [text for each in kernel.sums for text in (_text(each.kernel, form), *_tables(each, form.target))]
-    statements = [*form.statements(kernel), *(line for each in kernel.sums for line in _Rows(each, form).lines())]
-    arguments = _arguments(kernel, form.declared, partials=partials)
-    return "\n\n".join([*texts, _whole(form.storage, kernel, arguments, statements)])
+def _text(kernel: Kernel, target: Target, lanes: Lanes | None, printed: Printed, *, partials: bool = False) -> str:
+    """Return a function of numbers or lanes, after its parts and the terms of its loops with their tables."""
+    real = "lanes" if lanes else target.scalar
+    time, parameter = (lanes.type_of(name) if lanes else real for name in ("t", "parameters"))
+    declared = {name: f"{real} *{name}" for name in ARRAYS} | {"u": f"const {real} *u", "t": f"{time} t"}
+    declared |= {"parameters": f"const {parameter} *parameters", "kept": f"{real} *restrict kept"}
+    texts = [_function(PART, part, _used(part, declared), printed(part)) for part in _parts(kernel)]
+    texts += [
+        text for each in kernel.sums for text in (_text(each.kernel, target, lanes, printed), *_tables(each, target))
+    ]
+    statements = [*printed(kernel), *(line for each in kernel.sums for line in _Rows(each, real, parameter).lines())]
+    storage = "static inline" if lanes else "static"
+    return "\n\n".join([*texts, _whole(storage, kernel, _arguments(kernel, declared, partials=partials), statements)])
 
 
 def lane_mass_text(kernel: Kernel, fixed_point: FixedPointIteration, lanes: Lanes, target: Target) -> str:
@@ -110,32 +81,32 @@ def _named(each: LoopedKernel, name: str) -> str:
 class _Rows(Nest):
     """Loop of a kernel over the rows of constant tables: entries of ``u`` are read, and values added."""
 
-    def __init__(self, looped: LoopedKernel, form: _Form) -> None:
-        super().__init__(looped)
-        self.form, self.columns = form, dict(looped.columns)
+    def __init__(self, looped: LoopedKernel, real: str, parameter: str) -> None:
+        super().__init__(Layout(coordinates=(), parameters=(), defaults=()), looped, real, "u")
+        self.parameter, self.columns = parameter, dict(looped.columns)
 
     def lines(self) -> list[str]:
         """Return the statements."""
-        kernel, targets = self.looped.kernel, enumerate(self.looped.writes)
-        added = [f"value[{self.place(target)}] += term[{k}];" for k, target in targets]
-        return self.text(innermost=[f"{kernel.name}(slot, t, parameters, term);", *added])
+        call = f"{self.looped.kernel.name}(slot, t, parameters, term);"
+        added = (f"value[{self.place(target)}] += term[{k}];" for k, target in enumerate(self.looped.writes))
+        return self.text(innermost=[call, *added])
 
     def known(self, depth_of: int) -> Iterator[str]:
-        """Yield the lines known at a level: the declarations of arguments and values, then the arguments."""
+        """Yield the declarations of arguments and values, then the arguments."""
         if depth_of:
-            yield f"{self.form.real} slot[{self.looped.kernel.arguments}], term[{self.looped.kernel.values}];"
+            yield f"{self.scalar} slot[{self.looped.kernel.arguments}], term[{self.looped.kernel.values}];"
         yield from super().known(depth_of)
 
     def read(self, k: int, slot: Access) -> str:
         """Return the assignment of an argument."""
-        return f"slot[{k}] = u[{self.place(slot)}];"
+        return f"slot[{k}] = {self.source}[{self.place(slot)}];"
 
     def constant(self, k: int, access: Access) -> str:
-        """Return the assignment of a constant of a row, the last arguments."""
+        """Return the assignment of a constant of a row, one of the last arguments."""
         name, is_number = access.array.name, isinstance(self.columns[access.array.name][0], Constant)
         table = f"{_named(self.looped, name)}[index_e]"
         text = table if is_number else f"parameters[{table}]"
-        alike = self.form.real == "lanes" and (is_number or "parameters" not in self.form.sources)
+        alike = self.scalar == "lanes" and (is_number or self.parameter == "double")
         return f"slot[{len(self.looped.reads) + k}] = {f'lanes_of({text})' if alike else text};"
 
     def table_entry(self, place: Place) -> str:

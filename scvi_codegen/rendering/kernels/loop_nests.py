@@ -14,20 +14,18 @@ additions on sizes, never on the number of threads.
 from __future__ import annotations
 
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Sequence
 from enum import Enum, auto
 from typing import TypeAlias
 
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
 from scvi_codegen.ir.kernel import LoopedKernel
-from scvi_codegen.ir.program import Program
+from scvi_codegen.ir.program import Layout
 from scvi_codegen.rendering.layout import wrapped, wrapped_comment
 
 __all__ = [
     "DIRECTION",
     "MOST_THREADS",
-    "ArrayNest",
     "Lines",
     "Nest",
     "Sharing",
@@ -62,9 +60,9 @@ def size_text(size: Size) -> str:
     return f"size_{size.name}{f' {number[0]} {number[1:]}' if size.number else ''}" if size.name else str(size.number)
 
 
-def sizes_text(program: Program, text: str) -> Iterator[str]:
+def sizes_text(layout: Layout, text: str) -> Iterator[str]:
     """Yield declarations of the sizes that occur in a source."""
-    for k, name in enumerate(program.layout.sizes):
+    for k, name in enumerate(layout.sizes):
         if re.search(rf"\bsize_{name}\b", text):
             yield f"const long long size_{name} = given->size[{k}];"
 
@@ -132,43 +130,59 @@ Lines: TypeAlias = Callable[[int], list[str]]
 """Function that returns the lines of a slot, by its number."""
 
 
-def _starts(program: Program) -> Iterator[tuple[str, str]]:
+def _starts(layout: Layout) -> Iterator[tuple[str, str]]:
     """Yield the offset of each array in the state: coordinates, then momenta of a Hamiltonian, or velocities."""
     sizes: list[str] = []
-    for array in (*program.layout.coordinates, *program.layout.momenta, *program.layout.velocities):
+    for array in (*layout.coordinates, *layout.momenta, *layout.velocities):
         yield array.name, " + ".join(sizes) or "0"
         sizes.append(product_text(array))
 
 
-class Nest(ABC):
+class Nest:
     """Loops of a kernel, with arguments and parameters assigned in the outermost loop in which they are known.
 
     A kernel without loops becomes straight code. The innermost loop is divided into parts if necessary. On each part
     the neighbours across a periodic boundary have constant distances from the index, so that no element needs a test.
 
     Args:
+        layout: the arrays.
         looped: the kernel.
+        scalar: type of the arguments.
+        source: array that they are read from; empty if there are none.
         chunked: whether all values of a part are computed before any is added, in loops without conflicts, which a
             compiler vectorises.
         sharing: how threads share it; without sharing, one task covers all.
     """
 
-    def __init__(self, looped: LoopedKernel, *, chunked: bool = False, sharing: Sharing = Sharing.ALONE) -> None:
-        self.looped, self.chunked, self.sharing = looped, chunked, sharing
+    def __init__(
+        self,
+        layout: Layout,
+        looped: LoopedKernel,
+        scalar: str,
+        source: str,
+        *,
+        chunked: bool = False,
+        sharing: Sharing = Sharing.ALONE,
+    ) -> None:
+        self.layout, self.looped, self.scalar, self.source = layout, looped, scalar, source
+        self.chunked, self.sharing = chunked, sharing
         self.levels = {loop.index: depth for depth, loop in enumerate(looped.loops, 1)}
         self.loops = {loop.index: loop for loop in looped.loops}
+        self.scalars = len(layout.parameters)
 
-    @abstractmethod
     def read(self, k: int, slot: Access) -> str:
-        """Return the assignment of argument k; empty if there are none."""
+        """Return the assignment of an argument: an entry of the state, or of a direction."""
+        source = self.source if k < len(self.looped.reads) - self.looped.along else DIRECTION
+        return f"u[{k}] = {source}[{self.place_of(slot)}];"
 
-    @abstractmethod
     def constant(self, k: int, access: Access) -> str:
-        """Return the assignment of constant k of an element."""
+        """Return the assignment of a parameter: an entry of a field."""
+        return f"parameters[{self.scalars + k}] = field_{access.array.name}[{self.place(access)}];"
 
-    @abstractmethod
     def table_entry(self, place: Place) -> str:
-        """Return an index in a table."""
+        """Return an index in a table of the problem."""
+        columns = next(table for table in self.layout.tables if table.name == place.table).axes[1].number
+        return f"table_{place.table}[index_{place.index} * {columns} + {place.column}]"
 
     def depth_of(self, access: Access) -> int:
         """Return the depth of the innermost loop on whose index an entry depends."""
@@ -283,15 +297,15 @@ class Nest(ABC):
         if depth_of == len(self.looped.loops):
             yield from self._passed_over()
         for k, slot in enumerate(self.looped.reads):
-            if self.depth_of(slot) == depth_of and (line := self.read(k, slot)):
-                yield line
+            if self.depth_of(slot) == depth_of and self.source:
+                yield self.read(k, slot)
         for k, access in enumerate(self.looped.given):
             if self.depth_of(access) == depth_of:
                 yield self.constant(k, access)
 
     def place_of(self, access: Access) -> str:
-        """Return the index of an entry in the array that holds those of all arrays."""
-        return self.place(access)
+        """Return the index of an entry in the state."""
+        return f"start_{access.array.name} + {self.place(access)}"
 
     def place(self, access: Access) -> str:
         """Return the index of an entry in its array, in row-major order."""
@@ -316,54 +330,10 @@ class Nest(ABC):
             return f"{name} + {_shift(place.index, offset)}"
         return f"wrapped_index({name} + {offset}, {size_text(loop.end)})".replace("+ -", "- ")
 
-
-class ArrayNest(Nest):
-    """Loops over the arrays of a program.
-
-    Args:
-        program: with the arrays.
-        looped: the kernel.
-        scalar: type of the arguments.
-        source: array that they are read from; empty if there are none.
-        chunked, sharing: as of :class:`Nest`.
-    """
-
-    def __init__(
-        self,
-        program: Program,
-        looped: LoopedKernel,
-        scalar: str,
-        source: str,
-        *,
-        chunked: bool = False,
-        sharing: Sharing = Sharing.ALONE,
-    ) -> None:
-        super().__init__(looped, chunked=chunked, sharing=sharing)
-        self.program, self.scalar, self.source = program, scalar, source
-        self.scalars = len(program.layout.parameters)
-
-    def read(self, k: int, slot: Access) -> str:
-        """Return the assignment of an argument: an entry of the state, or of a direction."""
-        source = self.source if k < len(self.looped.reads) - self.looped.along else DIRECTION
-        return f"u[{k}] = {source}[{self.place_of(slot)}];" if self.source else ""
-
-    def constant(self, k: int, access: Access) -> str:
-        """Return the assignment of a parameter: an entry of a field."""
-        return f"parameters[{self.scalars + k}] = field_{access.array.name}[{self.place(access)}];"
-
-    def table_entry(self, place: Place) -> str:
-        """Return an index in a table of the problem."""
-        columns = next(table for table in self.program.layout.tables if table.name == place.table).axes[1].number
-        return f"table_{place.table}[index_{place.index} * {columns} + {place.column}]"
-
-    def place_of(self, access: Access) -> str:
-        """Return the index of an entry in the state."""
-        return f"start_{access.array.name} + {self.place(access)}"
-
     def function(self, head: str, arguments: Sequence[str], lines: Sequence[str], *, values: str = "") -> str:
         """Return the loops as a function; without values no kernel is evaluated."""
         known = [*self._arrays("\n".join(lines)), *self._unknowns(), *self._parameters(values)]
-        body = [*sizes_text(self.program, "\n".join([*known, *lines])), *known, *lines]
+        body = [*sizes_text(self.layout, "\n".join([*known, *lines])), *known, *lines]
         text = "\n".join(wrapped(line.strip(), indent=2 + len(line) - len(line.lstrip())) for line in body)
         whole = (argument.replace(" ", "\0") for argument in arguments)
         signature = wrapped(f"{head}({', '.join(whole)})", indent=0)
@@ -386,12 +356,12 @@ class ArrayNest(Nest):
 
     def _arrays(self, text: str) -> Iterator[str]:
         """Yield the offsets of the arrays that occur."""
-        for name, start in _starts(self.program):
+        for name, start in _starts(self.layout):
             if re.search(rf"\bstart_{name}\b", text):
                 yield f"const long long start_{name} = {start};"
         for kind, arrays, number in (
-            ("field", self.program.layout.fields, "double"),
-            ("table", self.program.layout.tables, "int"),
+            ("field", self.layout.fields, "double"),
+            ("table", self.layout.tables, "int"),
         ):
             for k, array in enumerate(arrays):
                 if f"{kind}_{array.name}[" in text:

@@ -16,7 +16,7 @@ from scvi_codegen.rendering.kernels.functions import kernel_text
 from scvi_codegen.rendering.kernels.loop_nests import (
     DIRECTION,
     MOST_THREADS,
-    ArrayNest,
+    Nest,
     Sharing,
     count_text,
     product_text,
@@ -104,7 +104,7 @@ def _force_text(program: Program, looped: LoopedKernel) -> str:
     """Return a function that adds to the forces; for an explicit method, with a factor."""
     explicit = program.fixed_point is None
     chunked, sharing = explicit and bool(looped.loops), sharing_of(looped)
-    nest = ArrayNest(program, looped, "lanes", "X", chunked=chunked, sharing=sharing)
+    nest = Nest(program.layout, looped, "lanes", "X", chunked=chunked, sharing=sharing)
     slots = range(len(looped.writes))
     inner = [nest.is_innermost(target) for target in looped.writes]
 
@@ -143,7 +143,7 @@ def _force_text(program: Program, looped: LoopedKernel) -> str:
 def _sharing_text(program: Program, looped: LoopedKernel) -> str:
     """Return a function that describes how threads share a term group."""
     how = sharing_text(looped)
-    known = [*sizes_text(program, how), *(f"(void){name};" for name in ("run", "given", "n"))]
+    known = [*sizes_text(program.layout, how), *(f"(void){name};" for name in ("run", "given", "n"))]
     head = f"static sharing share_{looped.kernel.name}(const run_memory *run, const problem *given, long long n)"
     lines = "\n".join(f"  {line}" for line in [*known, f"return {how};"])
     return f"/* Its rounds of tasks. */\n{head}\n{{\n{lines}\n}}"
@@ -160,7 +160,7 @@ def _function(
     source: str = "X",
 ) -> str:
     """Return a function of numbers with the same statements for every element."""
-    nest = ArrayNest(program, looped, "double", source)
+    nest = Nest(program.layout, looped, "double", source)
     text = ["(void)given;", *nest.text(innermost=lines)]
     declared = f"double value[{values}]" if values else ""
     return nest.function(f"static void {name}", ["const problem *given", *arguments], text, values=declared)
@@ -175,7 +175,7 @@ def _energy_text(program: Program, looped: LoopedKernel, kernel: Kernel) -> str:
 
 def _mass_text(program: Program, looped: LoopedKernel) -> str:
     """Return a function that adds to the masses."""
-    name, place = looped.kernel.name, ArrayNest(program, looped, "", "").place_of(looped.writes[0])
+    name, place = looped.kernel.name, Nest(program.layout, looped, "", "").place_of(looped.writes[0])
     lines = [f"{name}(NULL, 0.0, parameters, value);", f"mass[{place}] += value[0];"]
     return _function(program, looped, f"add_{name}", ["double *mass"], lines, source="")
 
@@ -191,7 +191,7 @@ def _constraint_context(program: Program, held: ConstrainedSteps | None) -> dict
         "functions": [text for pair in pairs for text in _constraint_texts(program, *pair)],
         "conditions": [each.kernel.name for each in held.conditions],
         "curvatures": [each.kernel.name for each in held.curvatures],
-        "sizes": list(sizes_text(program, " ".join(counts))),
+        "sizes": list(sizes_text(program.layout, " ".join(counts))),
         "count": " + ".join(counts),
         "entries": " + ".join(entries),
     }
@@ -214,7 +214,7 @@ def _constraint_texts(program: Program, condition: LoopedKernel, curvature: Loop
     arguments = [X, f"const double *restrict {DIRECTION}", "double t", now]
     yield _function(program, curvature, f"find_{second}", arguments, lines)
     bare = replace(condition, reads=(), given=())
-    places = map(ArrayNest(program, bare, "", "").place_of, condition.writes)
+    places = map(Nest(program.layout, bare, "", "").place_of, condition.writes)
     lines = [
         "now->first[now->count++] = (int)now->entries;",
         *(f"now->place[now->entries++] = (int)({place});" for place in places),
@@ -237,7 +237,7 @@ def _lattice_context(program: Program) -> dict[str, Any]:
         "lattices": lines,
         "axes": max(map(_axes, program.layout.coordinates)),
         "components": sum(map(_components, program.layout.coordinates)),
-        "sizes": list(sizes_text(program, " ".join(lines))),
+        "sizes": list(sizes_text(program.layout, " ".join(lines))),
     }
 
 
