@@ -34,7 +34,6 @@ _HOMES = {
     "runtime.ensemble.result": ("EnsembleTrajectory",),
     "exact.discrete_lagrangian": ("ExactStep", "exact_discrete_lagrangian", "exact_map"),
     "runtime.chaos.indicators": ("ChaosIndicators",),
-    "runtime.inputs.trajectory_with_inputs": ("DrivenTrajectory",),
     "runtime.events.event": ("Crossings", "Event"),
     "runtime.estimation.fitting": ("Fit", "fit"),
     "runtime.sensitivity.gradients": ("Gradient",),

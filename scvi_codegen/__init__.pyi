@@ -105,7 +105,6 @@ from scvi_codegen.runtime.estimation.fitting import Fit as Fit
 from scvi_codegen.runtime.estimation.fitting import fit as fit
 from scvi_codegen.runtime.events.event import Crossings as Crossings
 from scvi_codegen.runtime.events.event import Event as Event
-from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory as DrivenTrajectory
 from scvi_codegen.runtime.orbits.periodic_orbit import PeriodicOrbit as PeriodicOrbit
 from scvi_codegen.runtime.orbits.solver import periodic_orbit as periodic_orbit
 from scvi_codegen.runtime.run.run import Run as Run

@@ -20,7 +20,6 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import ScviCodegenError, StateError
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import default_method
-from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
@@ -65,7 +64,7 @@ class _TooLongError(Exception):
 @without_accuracy_warnings()
 def known_digits(
     system: MechanicalSystem,
-    trajectory: Trajectory | DrivenTrajectory,
+    trajectory: Trajectory,
     *,
     most: int,
     inputs: Mapping[str, Any] | None = None,
@@ -138,7 +137,7 @@ REMEDY = "use adaptive step size (t_end, --tolerance)"
 
 def missed_tolerance(
     system: MechanicalSystem,
-    trajectory: Trajectory | DrivenTrajectory,
+    trajectory: Trajectory,
     tolerance: float,
     known: Known | None = None,
 ) -> str:
@@ -166,13 +165,13 @@ def missed_tolerance(
     return f"{message}: a second run with other steps differs by {error:.1e} at the end; {REMEDY}"
 
 
-def _late_size(trajectory: Trajectory | DrivenTrajectory) -> float:
+def _late_size(trajectory: Trajectory) -> float:
     """Return the size of the last states, whose errors a second run measures."""
     late = trajectory.q[-max(1, len(trajectory.q) // 16) :]
     return float(np.linalg.norm(np.maximum(np.abs(late[-1]), np.sqrt(np.mean(late**2, axis=0)))))
 
 
-def _worst_step(trajectory: Trajectory | DrivenTrajectory, tolerance: float) -> str:
+def _worst_step(trajectory: Trajectory, tolerance: float) -> str:
     if not trajectory.step_error > STEP_MARGIN * tolerance:
         return ""
     return (
@@ -181,7 +180,7 @@ def _worst_step(trajectory: Trajectory | DrivenTrajectory, tolerance: float) -> 
     )
 
 
-def _lost_energy(system: MechanicalSystem, trajectory: Trajectory | DrivenTrajectory, tolerance: float) -> str:
+def _lost_energy(system: MechanicalSystem, trajectory: Trajectory, tolerance: float) -> str:
     if system.changes_energy:
         return ""
     try:

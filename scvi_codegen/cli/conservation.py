@@ -12,7 +12,6 @@ from scvi_codegen.errors import MethodWarning, ScviCodegenError, StateError, war
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.model import Model
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
-from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 __all__ = [
@@ -41,7 +40,7 @@ class Balance(NamedTuple):
     error: float
 
 
-def energy_balance(system: MechanicalSystem, trajectory: Trajectory | DrivenTrajectory, steps: int) -> Balance | None:
+def energy_balance(system: MechanicalSystem, trajectory: Trajectory, steps: int) -> Balance | None:
     """Return the energy balance of a run; ``None`` if the method has none or computing it would take long.
 
     Args:
@@ -59,9 +58,7 @@ def energy_balance(system: MechanicalSystem, trajectory: Trajectory | DrivenTraj
     return Balance(float(work[-1]), float(np.abs(energy - energy[0] - work).max()))
 
 
-def energy_report(
-    system: MechanicalSystem, trajectory: Trajectory | DrivenTrajectory, balance: Balance | None = None
-) -> str:
+def energy_report(system: MechanicalSystem, trajectory: Trajectory, balance: Balance | None = None) -> str:
     """Return one line: largest relative energy error and its linear drift, or the energy balance of forces."""
     energy = trajectory.energy()
     scale = abs(float(energy[0]))
@@ -94,7 +91,7 @@ def _drift(t: Array, error: Array) -> float:
     return float(centred @ error / (centred @ centred))
 
 
-def momentum_report(result: Trajectory | DrivenTrajectory | EnsembleTrajectory) -> Iterator[str]:
+def momentum_report(result: Trajectory | EnsembleTrajectory) -> Iterator[str]:
     """Yield a line for each momentum map: its largest change, relative to the largest size of its terms."""
     described = result.stepper.interface
     try:

@@ -17,7 +17,6 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.models.model import Model
 from scvi_codegen.results.recording import RecordedRun
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
-from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 __all__ = ["ensemble_numbers", "failure_text", "recorded_numbers", "run_numbers"]
@@ -118,7 +117,7 @@ def _by_name(names: Sequence[str], vector: np.ndarray[Any, Any]) -> dict[str, fl
     return dict(zip(names, vector.tolist(), strict=True))
 
 
-def _conserved(result: Trajectory | DrivenTrajectory | EnsembleTrajectory) -> dict[str, Any]:
+def _conserved(result: Trajectory | EnsembleTrajectory) -> dict[str, Any]:
     """Return the largest changes of the energy and of the momentum maps, these relative to the size of their terms."""
     values_by_name: dict[str, Any] = {"energy_change": None, "energy": None, "momentum_errors": None}
     try:

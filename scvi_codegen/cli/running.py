@@ -21,12 +21,12 @@ from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.inputs.segments import with_final_state
-from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
 from scvi_codegen.runtime.run.accuracy import TOLERABLE_ERROR, without_accuracy_warnings
 from scvi_codegen.runtime.run.largest_step import accuracy_message
 from scvi_codegen.runtime.run.observation import Observation
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.run_loop import record
+from scvi_codegen.runtime.trajectory.joining import joined
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 __all__ = [
@@ -61,7 +61,7 @@ class RunOutcome:
         missed: message if the steps of tau miss the tolerance that they were chosen for, else ``None``.
     """
 
-    trajectory: Trajectory | DrivenTrajectory
+    trajectory: Trajectory
     run: Run
     preparation: float
     seconds: float
@@ -143,9 +143,9 @@ class _Pieces:
     def _add(self, piece: Trajectory) -> None:
         self.pieces.append(with_final_state(piece, self.run) if self.model.has_segments else piece)
 
-    def trajectory(self) -> Trajectory | DrivenTrajectory:
+    def trajectory(self) -> Trajectory:
         pieces = self.pieces or [record(self.run, 0)]
-        return DrivenTrajectory(tuple(pieces)) if self.model.has_segments else pieces[0]
+        return joined(pieces) if self.model.has_segments else pieces[0]
 
 
 def _in_transformed_time(model: Model, run: Run, preparation: float) -> RunOutcome:
@@ -173,7 +173,7 @@ def _in_transformed_time(model: Model, run: Run, preparation: float) -> RunOutco
     )
 
 
-def _missed(model: Model, trajectory: Trajectory | DrivenTrajectory) -> str | None:
+def _missed(model: Model, trajectory: Trajectory) -> str | None:
     """Return a message if later steps exceed the error for which the step of tau was chosen at the start."""
     allowed = model.allowed_error
     if allowed is None or not model.has_time_transformation:
@@ -258,7 +258,7 @@ def _speed(outcome: RunOutcome, model: Model) -> str:
     return f"{text}, {int(np.sum(trajectory.iterations)) / watched:.2f} iterations a step" if watched else text
 
 
-def conserved(model: Model, trajectory: Trajectory | DrivenTrajectory, balance: Balance | None = None) -> Iterator[str]:
+def conserved(model: Model, trajectory: Trajectory, balance: Balance | None = None) -> Iterator[str]:
     """Yield a line for each quantity that should be conserved, with its error."""
     try:
         yield energy_report(model.system, trajectory, balance)
@@ -267,7 +267,7 @@ def conserved(model: Model, trajectory: Trajectory | DrivenTrajectory, balance: 
     yield from momentum_report(trajectory)
 
 
-def worst_step(trajectory: Trajectory | DrivenTrajectory) -> Iterator[str]:
+def worst_step(trajectory: Trajectory) -> Iterator[str]:
     """Yield a line with the largest error estimate of a step; warn if that step is too large.
 
     The warning does not depend on options such as ``--quiet``.

@@ -20,7 +20,6 @@ from scvi_codegen.runtime.arrays.interface import first_state, flat, read_arrays
 from scvi_codegen.runtime.arrays.saving import read_saved
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.stepper import RunSettings, Stepper
-from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation.argument_types import MAPPING, checks_arguments
@@ -198,7 +197,7 @@ class ArrayStepper:
         threads: int | None = None,
         inputs: Mapping[str, Any] | None = None,
         **settings: Unpack[RunSettings],
-    ) -> Trajectory | DrivenTrajectory:
+    ) -> Trajectory:
         """Return the trajectory of a run, as :meth:`Stepper.integrate`, whose other arguments it has.
 
         Args:

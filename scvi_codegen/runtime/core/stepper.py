@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, TypedDict, Unpack, overload
+from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,7 +37,6 @@ from scvi_codegen.runtime.inputs.segments import (
     parameters_of,
     record_pieces,
 )
-from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
 from scvi_codegen.runtime.run.accuracy import warn_of_energy_error, warn_of_energy_errors, warn_of_large_steps
 from scvi_codegen.runtime.run.error_growth import GrowthCheck
 from scvi_codegen.runtime.run.global_error import checked_error, confirmed_run, warn_of_unconfirmed
@@ -71,27 +70,12 @@ class RunSettings(TypedDict, total=False):
     check_growth: bool | None
 
 
-class Settings(RunSettings, total=False):
-    """Keyword arguments that :meth:`Stepper.integrate` takes with and without inputs."""
-
-    velocity: ArrayLike | None
-    parameters: Parameters
-
-
 class Stepper(Integrator):
     """Compiled integrator of one system: :class:`Integrator` with integrations, runs, ensembles and projections."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (_rebuild, (self._plain, self.interface, self._variants, self.flags, self.events))
 
-    @overload
-    def integrate(
-        self, q: ArrayLike, p: ArrayLike | None = None, *, inputs: None = None, **settings: Unpack[Settings]
-    ) -> Trajectory: ...
-    @overload
-    def integrate(
-        self, q: ArrayLike, p: ArrayLike | None = None, *, inputs: Mapping[str, Any], **settings: Unpack[Settings]
-    ) -> DrivenTrajectory: ...
     @checks_arguments(StateError, progress=FUNCTION, observe=FUNCTION, inputs=MAPPING)
     def integrate(
         self,
@@ -114,7 +98,7 @@ class Stepper(Integrator):
         events: EventLike | Sequence[EventLike] | None = None,
         error: float | None = None,
         check_growth: bool | None = None,
-    ) -> Trajectory | DrivenTrajectory:
+    ) -> Trajectory:
         """Integrate ``steps`` steps of h, or to t_end, and save every ``save_every``-th state and the initial one.
 
         Args:
@@ -152,8 +136,8 @@ class Stepper(Integrator):
                 than 1e-7 (relative). ``True``: all steps, without a coarse run; ``False``: no check.
 
         Returns:
-            A :class:`Trajectory` of steps // save_every + 1 states, fewer if an event ended it; with inputs a
-            :class:`DrivenTrajectory`, whose states at breakpoints are additional. An
+            A :class:`Trajectory` of steps // save_every + 1 states, fewer if an event ended it; with inputs states
+            at breakpoints are additional, and ``pieces`` are the trajectories between them. An
             :class:`~scvi_codegen.AccuracyWarning` reports the worst step if it is too large for the motion.
 
         Raises:

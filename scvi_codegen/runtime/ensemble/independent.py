@@ -32,7 +32,6 @@ from scvi_codegen.runtime.inputs.segments import (
     parameters_at,
     prepared_segments,
 )
-from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.run.global_error import GlobalError
 from scvi_codegen.runtime.run.memory import Memory
@@ -40,6 +39,7 @@ from scvi_codegen.runtime.run.observation import Observation
 from scvi_codegen.runtime.run.run_loop import record
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
+from scvi_codegen.runtime.trajectory.joining import joined
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation.counts import checked_count
 
@@ -229,8 +229,8 @@ class AdaptiveEnsemble:
             pieces.extend(record(run, steps, save_every=self.save_every, progress=check_stop) for steps in segments)
         except StepFailedError as failure:
             last = Trajectory.before(failure)
-            return DrivenTrajectory((*pieces, last)) if pieces else last, failure.status
-        return DrivenTrajectory(tuple(pieces or [record(run, 0)])), OK
+            return joined([*pieces, last]), failure.status
+        return joined(pieces or [record(run, 0)]), OK
 
     def result(self) -> EnsembleTrajectory:
         """Return the trajectories; incomplete ones are ``"interrupted"`` after their initial state."""

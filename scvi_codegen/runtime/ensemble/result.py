@@ -21,8 +21,8 @@ from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.run.descriptions import short_title
 from scvi_codegen.runtime.run.global_error import ConfirmedEnsemble, GlobalError
 from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.trajectory.joining import relative_changes
 from scvi_codegen.runtime.trajectory.quantities import quantities
-from scvi_codegen.runtime.trajectory.trajectory import relative_changes
 from scvi_codegen.validation.argument_types import MAPPING, PATH, checks_arguments
 
 if TYPE_CHECKING:

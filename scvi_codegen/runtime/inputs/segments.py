@@ -15,13 +15,13 @@ import numpy as np
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.runtime.core.validation import Array, TakesInputs, check_left_to_inputs, no_input
-from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
 from scvi_codegen.runtime.run.accuracy import warn_of_large_steps
 from scvi_codegen.runtime.run.descriptions import DescribedRun
 from scvi_codegen.runtime.run.memory import STEPS_PER_CALL
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.dense_output import checked_times
+from scvi_codegen.runtime.trajectory.joining import joined
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation.counts import checked_count
 
@@ -189,7 +189,7 @@ def record_pieces(
     save_every: int,
     values: Callable[[float], Array],
     progress: Callable[[int], None] | None,
-) -> DrivenTrajectory:
+) -> Trajectory:
     """Integrate to t_end, piece by piece.
 
     Args:
@@ -213,7 +213,7 @@ def record_pieces(
             break
     if run._leaving and pieces:
         warn_of_large_steps(pieces[-1])
-    return DrivenTrajectory(tuple(pieces or [run.record(0)]))
+    return joined(pieces or [run.record(0)])
 
 
 def prepared_segments(

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import StateError
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
 from scvi_codegen.runtime.chaos.tangent_propagation import InitialTangents, along
+from scvi_codegen.runtime.sensitivity.derivatives_with_inputs import DerivativesWithInputs
 from scvi_codegen.runtime.sensitivity.gradients import Gradient, sensitivity, tangent_vectors, vector_jacobian_product
 from scvi_codegen.runtime.sensitivity.hessians import hessian_product
 from scvi_codegen.runtime.sensitivity.step_derivatives import Sensitivity
@@ -28,17 +29,32 @@ class TrajectoryDerivatives(SavedStates):
     steps of tau are fixed and the times of states vary, except the final time of a run (t_end or an event).
     """
 
+    @property
+    def _pieces(self) -> tuple[SavedStates, ...]:
+        """Trajectories between the breakpoints of inputs; empty without inputs."""
+        pieces: tuple[SavedStates, ...] = getattr(self, "pieces", ())
+        return pieces
+
+    @property
+    def _with_inputs(self) -> DerivativesWithInputs:
+        return DerivativesWithInputs(self._pieces)
+
+    def _check_without_inputs(self, what: str) -> None:
+        if self._pieces:
+            raise StateError(f"{what} is not available for runs with inputs: use tangent or pullback, or run.pieces")
+
     def tangent(self, directions: ArrayLike | None = None) -> Array:
         """Return (n, 2m, k) tangent vectors at the states, from (2m, k) initial directions of (q, p), by default all.
 
         They are exact derivatives of the computed states at fixed step sizes (:meth:`Stepper.jacobian`). Directions
-        may also be (2m + parameters + 2, k), of (q, p, parameters, t, h). In transformed time the energy is that of
+        may also be (2m + parameters + 2, k), of (q, p, parameters, t, h), with zeros for the parameters of inputs and,
+        with inputs, for h. In transformed time the energy is that of
         the first state and varies with it; a direction of the energy parameter is added.
 
         Raises:
             StateError: if the directions have another shape, or the states are not at whole steps.
         """
-        return tangent_vectors(self, directions)
+        return self._with_inputs.tangent(directions) if self._pieces else tangent_vectors(self, directions)
 
     def sensitivity(self) -> Sensitivity:
         """Return the derivatives of all states with respect to the initial state, the parameters, t and h.
@@ -47,6 +63,7 @@ class TrajectoryDerivatives(SavedStates):
         :meth:`pullback` is cheaper. In transformed time ``times`` contains the derivatives of the times. Raises as
         :meth:`tangent`.
         """
+        self._check_without_inputs("sensitivity")
         return sensitivity(self)
 
     def pullback(self, cotangents: ArrayLike) -> Gradient:
@@ -62,7 +79,7 @@ class TrajectoryDerivatives(SavedStates):
         Raises:
             StateError: if the shape is another, or the states are not at whole steps.
         """
-        return vector_jacobian_product(self, cotangents)
+        return self._with_inputs.pullback(cotangents) if self._pieces else vector_jacobian_product(self, cotangents)
 
     def hessian_product(
         self, cotangents: ArrayLike, directions: ArrayLike, curvatures: ArrayLike | None = None
@@ -84,6 +101,8 @@ class TrajectoryDerivatives(SavedStates):
             MethodError: if time is transformed, or the system is damped.
             StateError: if a shape is another, or the states are not at whole steps.
         """
+        if self._pieces:
+            return self._with_inputs.hessian_product(cotangents, directions, curvatures)
         return hessian_product(self, cotangents, directions, curvatures)
 
     def chaos_indicators(self, count: int | None = None, *, directions: ArrayLike | None = None) -> ChaosIndicators:
@@ -98,6 +117,7 @@ class TrajectoryDerivatives(SavedStates):
             MethodError: if time is transformed.
             StateError: if the run has no steps, a shape is another, or the states are not at whole steps.
         """
+        self._check_without_inputs("chaos_indicators")
         if len(self) < 2:
             raise StateError("deviations require a run of at least one step")
         return along(self, InitialTangents.checked(self.stepper, count, directions))

@@ -7,7 +7,8 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Self, overload
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Self, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,13 +18,15 @@ from scvi_codegen.errors import EventError, StateError, StepFailedError
 from scvi_codegen.files.export import States, to_dataframe, write_states
 from scvi_codegen.files.labelled_arrays import checked_units, to_dataset
 from scvi_codegen.runtime.constraints.projection import constraint_values, multipliers
+from scvi_codegen.runtime.core.validation import columns_of_inputs
 from scvi_codegen.runtime.events.detection import crossings_of
 from scvi_codegen.runtime.events.event import Crossings, Event, EventLike, as_events
 from scvi_codegen.runtime.run.accuracy import TOLERABLE_ERROR
 from scvi_codegen.runtime.run.descriptions import describe_states, describe_step_size
 from scvi_codegen.runtime.run.global_error import Confirmed, GlobalError
 from scvi_codegen.runtime.sensitivity.trajectory_derivatives import TrajectoryDerivatives
-from scvi_codegen.runtime.trajectory.dense_output import checked_times, states_at
+from scvi_codegen.runtime.trajectory.dense_output import checked_times, states_at, within
+from scvi_codegen.runtime.trajectory.joining import Number, concatenated, joined, joined_crossings, relative_changes
 from scvi_codegen.runtime.trajectory.quantities import quantities
 from scvi_codegen.runtime.trajectory.saved_states import Array, checked_row, checked_rows
 from scvi_codegen.runtime.trajectory.work_and_impulses import work_and_impulses_until
@@ -36,7 +39,7 @@ if TYPE_CHECKING:
     from scvi_codegen.pictures.animation import Film
     from scvi_codegen.pictures.plots import Plots
 
-__all__ = ["Trajectory", "relative_changes"]
+__all__ = ["Trajectory"]
 
 MOST_DRAWN, MOST_CURVES = 400, 6
 """Largest numbers of states and of coordinates in the plot of a notebook."""
@@ -68,6 +71,8 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
         confirmation: the comparison with a second run if ``error=`` was passed, else ``None``.
         observed: (n, ..) values that ``observe`` returned, else ``None``; q and p are then those of both ends.
         conserved: (n, 3 + k) energies and momentum maps with ``observe``, else ``None``.
+        pieces: with inputs, the trajectories between their breakpoints, each with its parameters; the first state of
+            each is the last of the previous one. ``parameters`` are then those of the first.
 
     Positions and momenta of arrays are also indexed by name: ``q["u"]`` has the shape (n, *shape of u).
     """
@@ -81,8 +86,11 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
     confirmation: GlobalError | None = field(default=None, repr=False)
     observed: Array | None = field(default=None, repr=False)
     conserved: Array | None = field(default=None, repr=False)
+    pieces: tuple[Self, ...] = field(default=(), repr=False)
 
     def __repr__(self) -> str:
+        if self.pieces:
+            return describe_states(self, f", breakpoints between: {len(self.pieces) - 1}")
         return describe_states(self, describe_step_size(self.h, self.plan, tau=self.tau is not None))
 
     @overload
@@ -93,6 +101,7 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
         """Return a trajectory for a slice, or (t, q, p) of one state for an index.
 
         Events outside the times of a slice are omitted; ``steps`` and ``step_error`` remain those of the whole run.
+        Slices of a run with inputs must have stride 1, since pieces share the states at breakpoints.
 
         Raises:
             IndexError: if an index is out of range, or a slice is empty or descending.
@@ -102,6 +111,8 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
             k = checked_row(rows, len(self))
             return float(self.t[k]), self.q[k].copy(), self.p[k].copy()
         first, last, stride = checked_rows(rows, len(self))
+        if self.pieces:
+            return self._slice_of_pieces(first, last, stride, rows)
         lengths = self.step_sizes[rows]
         if stride > 1 and self.plan is not None:  # the next saved state is not the end of the step
             lengths = np.full_like(lengths, np.nan)
@@ -113,6 +124,32 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
             step_sizes=lengths,
             events=tuple(crossings.chosen((crossings.t >= low) & (crossings.t <= high)) for crossings in self.events),
         )
+
+    def _slice_of_pieces(self, first: int, last: int, stride: int, rows: slice) -> Self:
+        if stride > 1:
+            raise IndexError(
+                f"a slice of a run with inputs must have stride 1, unlike {rows}: omit the stride, or slice the arrays "
+                "t, q and p"
+            )
+        chosen: list[Self] = []
+        start = 0
+        for piece in self.pieces:
+            low, high = max(first - start, 0), min(last - start, len(piece))
+            start += len(piece) - 1
+            if high - low > 1 or (high - low == 1 == last - first and not chosen):
+                chosen.append(piece[low:high])
+        return replace(joined(chosen), confirmation=self.confirmation)
+
+    def _joined(self, part: Callable[[Self], NDArray[Number]]) -> NDArray[Number]:
+        """Return a quantity of the states, computed with the parameters of each piece."""
+        return part(self) if not self.pieces else concatenated([part(piece) for piece in self.pieces])
+
+    def _summed(self, part: Callable[[Self], Array]) -> Array:
+        """Return a quantity that accumulates along the run."""
+        parts = [part(piece) for piece in self.pieces or (self,)]
+        for before, after in pairwise(parts):
+            after += before[-1]
+        return concatenated(parts)
 
     def _check_saved(self) -> None:
         """Raise :class:`StateError` if states were not saved."""
@@ -130,15 +167,14 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
         """Return (n,) energies p.v - L, constant along exact trajectories if L does not depend on time."""
         if self.conserved is not None:
             return self.conserved[:, 2]
-        energies: Array = self.stepper.energy(self.q, self.p, self.t, self.parameters)
-        return energies
+        return self._joined(lambda piece: piece.stepper.energy(piece.q, piece.p, piece.t, piece.parameters))
 
     @property
     def energies(self) -> Array:
         """(n, 3) kinetic, potential and total energy; parts of arrays of run-time sizes only, else NaN."""
         if self.conserved is not None:
             return self.conserved[:, :3]
-        return self.stepper._energy_parts(self.q, self.p, self.t, self.parameters)
+        return self._joined(lambda piece: piece.stepper._energy_parts(piece.q, piece.p, piece.t, piece.parameters))
 
     def energy_error(self) -> float:
         """Return the largest change of the energy, relative to the largest sum of its absolute parts if known."""
@@ -150,11 +186,15 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
         """Return (n, k) conserved quantities, in the order of ``stepper.momentum_map_names``."""
         if self.conserved is not None:
             return self.conserved[:, 3:]
-        return self.stepper.momentum_maps(self.q, self.p, self.t, self.parameters)
+        return self._joined(lambda piece: piece.stepper.momentum_maps(piece.q, piece.p, piece.t, piece.parameters))
 
     def momentum_errors(self) -> Array:
         """Return (n, k) changes of the momentum maps since the first state, relative to their largest term."""
-        values, sizes = self.stepper._momentum_maps_and_sizes(self.q, self.p, self.t, self.parameters)
+        maps = [
+            each.stepper._momentum_maps_and_sizes(each.q, each.p, each.t, each.parameters)
+            for each in self.pieces or (self,)
+        ]
+        values, sizes = (concatenated(part) for part in zip(*maps, strict=True))
         return relative_changes(values, sizes)
 
     def work(self) -> Array:
@@ -167,7 +207,7 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
             MethodError: if no forces act, or the method has no curve of positions.
             StateError: if the states are not at whole steps.
         """
-        return work_and_impulses_until(self)[:, 0]
+        return self._summed(lambda piece: work_and_impulses_until(piece)[:, 0])
 
     def impulses(self) -> Array:
         """Return (n, k) changes by forces of the quantities that L alone conserves, ``stepper.impulse_names``.
@@ -175,7 +215,7 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
         They equal J_n - J_0 to round-off for SVI and related methods, to order s + 1 for SCVI. Raises as
         :meth:`work`.
         """
-        return work_and_impulses_until(self)[:, 1:]
+        return self._summed(lambda piece: work_and_impulses_until(piece)[:, 1:])
 
     def multipliers(self) -> Array:
         """Return (n, c) Lagrange multipliers of the constraints; the constraint forces are g_q^T lambda.
@@ -183,26 +223,36 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
         Raises:
             MethodError: if the system has no constraints.
         """
-        return multipliers(self.stepper, self.q, self.p, self.t, self.parameters)
+        return self._joined(lambda piece: multipliers(piece.stepper, piece.q, piece.p, piece.t, piece.parameters))
 
     def constraint_values(self) -> tuple[Array, Array]:
         """Return (n, c) constraint residuals and (n, c) rates at the states, zero up to rounding."""
-        g, rate = constraint_values(self.stepper, self.q, self.p, self.t, self.parameters)
+        values = [
+            constraint_values(each.stepper, each.q, each.p, each.t, each.parameters) for each in self.pieces or (self,)
+        ]
+        g, rate = (concatenated(part) for part in zip(*values, strict=True))
         return g, rate
 
     def states(self, units: Mapping[str, str] | None = None) -> States:
         """Return the states for :mod:`scvi_codegen.files.export`."""
-        interface = self.stepper.interface
-        piece = (self.t, self.q, self.p, self.iterations)
+        interface, piece = self.stepper.interface, (self.t, self.q, self.p, self.iterations)
+        known = dict(zip(interface.parameters, map(float, self.parameters), strict=True))
+        derived: Callable[..., Any] = partial(quantities, self.stepper, self.parameters)
+        if self.pieces:
+            for k in columns_of_inputs(interface):
+                del known[interface.parameters[k]]
+            by_piece = [quantities(each.stepper, each.parameters, each.t, each.q, each.p) for each in self.pieces]
+            whole = {name: concatenated([each[name] for each in by_piece]) for name in by_piece[0]}
+            derived = lambda *_: whole  # noqa: E731  (computed once)
         return States(
             count=len(self),
             pieces=lambda: iter([piece]),
             coordinates=interface.coordinates,
-            parameters=dict(zip(interface.parameters, map(float, self.parameters), strict=True)),
+            parameters=known,
             h=self.h,
             about=interface.about(),
             maps=interface.map_names,
-            quantities=partial(quantities, self.stepper, self.parameters),
+            quantities=derived,
             units=checked_units(units),
         )
 
@@ -217,7 +267,8 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
     @property
     def velocity(self) -> Array:
         """(n, m) velocities of the states."""
-        return self.stepper.velocity(self.q, self.p, self.t, self.parameters)
+        values = self._joined(lambda piece: piece.stepper.velocity(piece.q, piece.p, piece.t, piece.parameters))
+        return self.stepper.named(values)
 
     def at(self, t: ArrayLike) -> tuple[Array, Array]:
         """Return dense output at times t, by partial steps: as accurate as the method and continuous in t.
@@ -236,8 +287,20 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
         """
         self._check_saved()
         times, shape = checked_times(t, "t"), (*np.shape(t), self.stepper.dimension)
-        q, p = states_at(self, times.ravel())
+        q, p = self._states_at(times.ravel())
         return self.stepper.named(q.reshape(shape)), self.stepper.named(p.reshape(shape))
+
+    def _states_at(self, times: Array) -> tuple[Array, Array]:
+        if not self.pieces:
+            return states_at(self, times)
+        flat = within(times, self.t[0], self.t[-1])
+        q, p = np.empty((2, len(flat), self.stepper.dimension))
+        forward = self.pieces[0].forward
+        ends = forward * np.array([piece.t[-1] for piece in self.pieces])
+        number = np.minimum(np.searchsorted(ends, forward * flat), len(ends) - 1)
+        for k in np.unique(number):
+            q[number == k], p[number == k] = self.pieces[k].at(flat[number == k])
+        return q, p
 
     def crossings(self, events: EventLike | Sequence[EventLike]) -> tuple[Crossings, ...]:
         """Return the zero crossings of functions along a trajectory with all states (``save_every=1``).
@@ -247,7 +310,9 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
         """
         if not (asked := as_events(events)):
             raise EventError("crossings requires at least one event, such as 'q' or Event('q', direction=1)")
-        return crossings_of(self.stepper.with_events(asked), self)
+        stepper = self.stepper.with_events(asked)
+        by_piece = [crossings_of(stepper, each) for each in self.pieces or (self,)]
+        return tuple(map(joined_crossings, zip(*by_piece, strict=True)))
 
     def _repr_html_(self) -> str:
         save_every = max(1, -(-len(self) // MOST_DRAWN))
@@ -281,9 +346,7 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
     def _energies(self, save_every: int) -> Array | None:
         """Return the energies of every ``save_every``-th state, ``None`` outside the domain of L."""
         try:
-            energies: Array = self.stepper.energy(
-                self.q[::save_every], self.p[::save_every], self.t[::save_every], self.parameters
-            )
+            energies: Array = self.energy()[::save_every]
         except StateError:
             return None
         return energies
@@ -346,14 +409,6 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
             MissingLibraryError: if pandas is not installed (extra ``data``).
         """
         return to_dataframe(self.states())
-
-
-def relative_changes(values: Array, sizes: Array) -> Array:
-    """Return changes since the first value along axis 0, relative to the largest size; NaN if sizes overflow."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        scales = np.fmax.reduce(sizes, axis=0)
-        changes: Array = (values - values[0]) / np.where(scales > 0.0, scales, 1.0)
-    return np.where(np.isinf(scales), np.nan, changes)
 
 
 def _range(values: Array) -> Html:

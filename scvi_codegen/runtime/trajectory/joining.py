@@ -1,0 +1,58 @@
+"""Joining of the trajectories of consecutive segments of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.runtime.events.event import Crossings
+from scvi_codegen.runtime.trajectory.saved_states import Array
+
+__all__ = ["Number", "concatenated", "joined", "joined_crossings", "relative_changes"]
+
+Number = TypeVar("Number", bound=np.generic)
+Result = TypeVar("Result")
+
+
+def joined(pieces: Sequence[Result]) -> Result:
+    """Return the trajectory of consecutive segments of a run, each with its parameters."""
+    every: Sequence[Any] = pieces
+    first, last = every[0], every[-1]
+    states: dict[str, Any] = {
+        name: concatenated([getattr(piece, name) for piece in pieces]) for name in ("t", "q", "p", "iterations")
+    }
+    states |= {name: first.stepper.named(states[name]) for name in "qp"}
+    same = ("plan", "steps", "rejected_steps", "step_error", "worst_step_time")
+    whole: Result = replace(
+        first,
+        **states,
+        **{name: getattr(last, name) for name in same},
+        step_sizes=np.concatenate([*(piece.step_sizes[:-1] for piece in every), last.step_sizes[-1:]]),
+        events=tuple(map(joined_crossings, zip(*(piece.events for piece in every), strict=True))),
+        pieces=tuple(pieces),
+    )
+    return whole
+
+
+def concatenated(parts: Sequence[NDArray[Number]]) -> NDArray[Number]:
+    """Concatenate arrays of successive pieces; the first state of each repeats the last of the previous one."""
+    first, *others = parts
+    return np.concatenate([first, *(other[1:] for other in others)]) if others else first
+
+
+def joined_crossings(crossings: Sequence[Crossings]) -> Crossings:
+    """Concatenate the crossings of one event over all pieces."""
+    t, q, p = (np.concatenate([getattr(each, name) for each in crossings]) for name in ("t", "q", "p"))
+    return Crossings(event=crossings[0].event, t=t, q=q, p=p)
+
+
+def relative_changes(values: Array, sizes: Array) -> Array:
+    """Return changes since the first value along axis 0, relative to the largest size; NaN if sizes overflow."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        scales = np.fmax.reduce(sizes, axis=0)
+        changes: Array = (values - values[0]) / np.where(scales > 0.0, scales, 1.0)
+    return np.where(np.isinf(scales), np.nan, changes)
