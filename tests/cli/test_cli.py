@@ -102,6 +102,12 @@ class TestHelp:
             else:
                 output_of(*words)
 
+    @pytest.mark.parametrize("command", ABOUT)
+    def test_options_show_the_form_of_their_values(self, command):
+        """Neither TEXT nor FLOAT says whether a value is a time, a list or an expression."""
+        options = re.findall(r"^ +((?:-\w, )?--[\w-]+) +(TEXT|FLOAT)\b", output_of(command, "--help"), re.MULTILINE)
+        assert options == []
+
     def test_version(self):
         from scvi_codegen import __version__
 
