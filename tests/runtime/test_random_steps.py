@@ -185,3 +185,26 @@ def test_comparison_with_half_steps_does_not_change_an_array_run(solver, steps):
         assert np.array_equal(found.q["x"], wanted.q["x"])
         assert np.array_equal(found.p["x"], wanted.p["x"])
         assert found.step_error >= wanted.step_error
+
+
+def test_spurious_solutions_are_recognised_in_every_unit_of_mass():
+    """Newton's iteration takes the place of a fixed-point iteration that fails in steps of about a period."""
+    quartic = sc.LagrangianSystem.from_text(
+        name="quartic",
+        coordinates=["x"],
+        lagrangian="m*(x_dot**2/2 - x**2/2 - x**4/4)",
+        parameters={"m": 1.0},
+    )
+    stepper, random = sc.compile_stepper(quartic, sc.SVI(2), flags=("-O0",)), np.random.default_rng(5)
+
+    def status(q, v, h, m):
+        try:
+            stepper.integrate([q], [m * v], h=h, steps=1, parameters={"m": m}, check_growth=False)
+        except sc.StepFailedError as failed:
+            return failed.status
+        return "ok"
+
+    steps = [(*random.uniform(-2.0, 2.0, size=2), random.uniform(0.5, 2.5)) for _ in range(60)]
+    found = [[status(*step, m) for step in steps] for m in (1.0, 2.0**20, 2.0**-20)]
+    assert found[0] == found[1] == found[2]
+    assert found[0].count("spurious solution") > 3
