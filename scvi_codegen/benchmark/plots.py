@@ -9,19 +9,17 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from scvi_codegen.benchmark.cases.unforced import Array
 from scvi_codegen.benchmark.report import OURS, CaseResult
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.mechanics.time_transformation import reparametrise
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.models.problems import problem
-from scvi_codegen.pictures.canvas import COLORS, STYLE, check_plot_path
+from scvi_codegen.pictures.canvas import COLORS, check_plot_path, save, style
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -51,16 +49,8 @@ def save_figure(draw: Callable[[], Figure], path: str | os.PathLike[str]) -> Non
         PlotError: without matplotlib.
     """
     check_plot_path(path)
-    import matplotlib as mpl
-
-    kind = Path(path).suffix.lower().removeprefix(".")
-    metadata = {"Date": None} if kind == "svg" else {"Software": None}
-
-    def write(file: IO[bytes]) -> None:
-        draw().savefig(file, format=kind, dpi=150, metadata=metadata)
-
-    with mpl.rc_context(STYLE):
-        write_atomically(path, write)
+    with style():
+        save(draw(), path)
 
 
 def draw_curves(results: Sequence[CaseResult]) -> Figure:

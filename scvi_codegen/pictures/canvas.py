@@ -16,7 +16,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["COLORS", "PICTURES", "STYLE", "check_plot_path", "color", "new_figure", "panel", "plain", "save", "style"]
+__all__ = [
+    "COLORS",
+    "PICTURES",
+    "STYLE",
+    "check_plot_path",
+    "color",
+    "new_figure",
+    "panel",
+    "plain",
+    "save",
+    "style",
+    "write_figure",
+]
 
 PICTURES = (".png", ".svg")
 COLORS = ("#1f5fa8", "#d1495b", "#2e8b57", "#b8860b", "#7a4fa3", "#2b8c9e", "#8c564b", "#555555")
@@ -88,14 +100,15 @@ def panel(
 
 
 def save(figure: Any, path: str | os.PathLike[str]) -> None:
-    """Write a figure to a file atomically; equal figures give equal bytes."""
+    """Write a figure to a file atomically."""
     kind = Path(path).suffix.lower().removeprefix(".")
+    write_atomically(path, lambda file: write_figure(figure, file, kind))
+
+
+def write_figure(figure: Any, file: IO[bytes], kind: str) -> None:
+    """Write a figure in a format, ``"svg"`` or ``"png"``; equal figures give equal bytes."""
     metadata = {"Date": None} if kind == "svg" else {"Software": None}
-
-    def write(file: IO[bytes]) -> None:
-        figure.savefig(file, format=kind, dpi=150, metadata=metadata)
-
-    write_atomically(path, write)
+    figure.savefig(file, format=kind, dpi=150, metadata=metadata)
 
 
 def color(number: int) -> str:

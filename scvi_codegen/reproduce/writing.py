@@ -6,9 +6,9 @@ import csv
 import io
 import textwrap
 from pathlib import Path
-from typing import IO
 
 from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.pictures.canvas import write_figure
 from scvi_codegen.reproduce.laboratory.drawing import STYLE
 from scvi_codegen.reproduce.laboratory.experiment import (
     Block,
@@ -23,7 +23,6 @@ from scvi_codegen.reproduce.laboratory.experiment import (
 __all__ = ["csv_text", "draw", "statement", "write_result"]
 
 WIDTH = 100
-DOTS_PER_INCH = 150
 
 
 def write_result(result: Result, folder: Path) -> list[Path]:
@@ -49,14 +48,12 @@ def draw(picture: Picture, kind: str) -> bytes:
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    metadata = {"Date": None} if kind == "svg" else {"Software": None}
-    file: IO[bytes] = io.BytesIO()
+    file = io.BytesIO()
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(picture.width, picture.height))
         picture.draw(figure)
-        figure.savefig(file, format=kind, dpi=DOTS_PER_INCH, metadata=metadata)
-    file.seek(0)
-    return file.read()
+        write_figure(figure, file, kind)
+    return file.getvalue()
 
 
 def csv_text(table: TableBlock) -> str:

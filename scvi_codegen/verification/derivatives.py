@@ -146,8 +146,7 @@ def _largest(tested: SystemUnderTest, error: Callable[[_Map], float]) -> Finding
     """Return the largest error of the stepper under test and the one with Newton's method alone."""
     if not _differentiable(tested):
         return None
-    others = [tested.newton] if tested.newton and tested.newton is not tested.stepper else []
-    errors = [error(_map_of(tested, stepper)) for stepper in (tested.stepper, *others)]
+    errors = [error(_map_of(tested, stepper)) for stepper in tested.steppers]
     return Finding(max(errors), BOUND, "relative, along one direction")
 
 

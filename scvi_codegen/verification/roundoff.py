@@ -85,11 +85,6 @@ def _has_compensation(tested: SystemUnderTest) -> bool:
     return leaps or tested.stepper.interface.has_fallback
 
 
-def _steppers(tested: SystemUnderTest) -> tuple[Stepper, ...]:
-    newton = tested.newton
-    return (tested.stepper,) if newton is None or newton is tested.stepper else (tested.stepper, newton)
-
-
 def _advanced(
     tested: SystemUnderTest, stepper: Stepper, state: State, steps: int, carry: Array | None = None
 ) -> tuple[Array, Array]:
@@ -105,7 +100,7 @@ def _sums(tested: SystemUnderTest) -> Finding:
     first = tested.states[0]
     m, worst = len(first.q), 0.0
     selected = slice(None) if _compensated(tested) else slice(m)
-    for stepper in _steppers(tested):
+    for stepper in tested.steppers:
         short = State(first.q, first.p, first.t, first.h * SHORT)
         whole = State(first.q, first.p, first.t, short.h * SHORT_STEPS)
         ways = [_advanced(tested, stepper, *way) for way in ((short, SHORT_STEPS), (whole, 1))]

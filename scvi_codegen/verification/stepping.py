@@ -177,7 +177,7 @@ def _convergence_rate(tested: SystemUnderTest) -> Finding:
 
 def _run(tested: SystemUnderTest) -> Finding:
     """Compare the steps of a run, with predictor and compensation, with single steps from the same states."""
-    worst = max(_run_of(tested, stepper) for stepper in {tested.stepper, tested.newton or tested.stepper})
+    worst = max(_run_of(tested, stepper) for stepper in tested.steppers)
     return Finding(worst, ROUNDINGS, f"in units of rounding, {RUN_STEPS} steps, also with Newton's method alone")
 
 
@@ -278,7 +278,7 @@ def predictor_checks(tested: SystemUnderTest) -> Iterator[Check]:
 
 
 def _predictor(tested: SystemUnderTest) -> Finding | None:
-    result = [_worst(tested, stepper) for stepper in {tested.stepper, tested.newton or tested.stepper}]
+    result = [_worst(tested, stepper) for stepper in tested.steppers]
     seen = [each for each in result if each is not None]
     if not seen:
         return None

@@ -61,10 +61,13 @@ def _symplecticity(tested: SystemUnderTest) -> Finding:
         around = tested.linearised(state)
         if around is None:
             raise StateError("steps from neighbouring states fail")
-        shrunk = math.exp(-tested.damping * state.h)
-        defect, noise = _defect(around, shrunk)
+        m, shrunk = len(state.q), math.exp(-tested.damping * state.h)
+        areas = around.scales[:m] * around.scales[m:]
         if tested.system.constraints:
-            defect, noise = _on_constraint_manifold(tested.tangents(state), around, shrunk)
+            defect, noise = _defect(around, tested.tangents(state), float(np.median(areas)), shrunk)
+        else:
+            units = np.sqrt(np.outer(np.tile(areas, 2), np.tile(areas, 2)))
+            defect, noise = _defect(around, np.eye(2 * m), units, shrunk)
         if noise.max() > TOO_ROUGH:
             raise StateError(f"finite differences have noise {noise.max():.1g}: use a smaller step size")
         index = np.unravel_index(np.argmax(defect / noise), defect.shape)
@@ -73,30 +76,18 @@ def _symplecticity(tested: SystemUnderTest) -> Finding:
     return worst
 
 
-def _defect(around: Jacobian, shrunk: float) -> tuple[Array, Array]:
-    """Return (2m, 2m) absolute values of J^T Omega J - Omega, and their noise, scaled by the areas of coordinate pairs.
+def _defect(around: Jacobian, tangents: Array, units: Array | float, shrunk: float) -> tuple[Array, Array]:
+    """Return absolute values of J^T Omega J - Omega on pairs of tangents, and their noise, in units of areas.
 
     ``shrunk`` is the factor exp(-gamma h) of Omega for a damped system.
     """
-    m, J = len(around.scales) // 2, around.matrix
-    omega = np.kron([[0, 1], [-1, 0]], np.eye(m)) * np.outer(around.scales, around.scales)
-    areas = np.tile(around.scales[:m] * around.scales[m:], 2)
-    units = np.sqrt(np.outer(areas, areas))
-    error = np.full_like(J, SPREAD * (around.uncertainty + EPSILON * ROUNDINGS))
-    # First-order bound |dJ^T Omega J + J^T Omega dJ| for an error |dJ| <= error of the differences.
-    half = error.T @ np.abs(omega) @ np.abs(J)
-    return np.abs(J.T @ omega @ J - shrunk * omega) / units, (half + half.T) / units
-
-
-def _on_constraint_manifold(tangents: Array, around: Jacobian, shrunk: float) -> tuple[Array, Array]:
-    """Return the defect and its noise on the constrained phase space, in units of the areas of its directions."""
-    m, scale = len(around.scales) // 2, around.scales
-    omega = np.kron([[0, 1], [-1, 0]], np.eye(m)) * np.outer(scale, scale)
-    unit = np.median(scale[:m] * scale[m:])
+    m, scales = len(around.scales) // 2, around.scales
+    omega = np.kron([[0, 1], [-1, 0]], np.eye(m)) * np.outer(scales, scales)
     error = np.full_like(around.matrix, SPREAD * (around.uncertainty + EPSILON * ROUNDINGS))
     ends = around.matrix @ tangents
+    # First-order bound |dJ^T Omega J + J^T Omega dJ| for an error |dJ| <= error of the differences.
     half = np.abs(tangents.T) @ error.T @ np.abs(omega) @ np.abs(ends)
-    return np.abs(ends.T @ omega @ ends - shrunk * tangents.T @ omega @ tangents) / unit, (half + half.T) / unit
+    return np.abs(ends.T @ omega @ ends - shrunk * tangents.T @ omega @ tangents) / units, (half + half.T) / units
 
 
 def _constraints(tested: SystemUnderTest) -> Finding:

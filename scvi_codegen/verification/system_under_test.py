@@ -128,6 +128,12 @@ class SystemUnderTest:
     newton: Stepper | None
     initial: State
 
+    @property
+    def steppers(self) -> tuple[Stepper, ...]:
+        """Stepper as built, and the one with Newton's method alone if that is another."""
+        newton = self.newton
+        return (self.stepper,) if newton is None or newton is self.stepper else (self.stepper, newton)
+
     @cached_property
     def parameters(self) -> dict[str, float]:
         """Values slightly off the defaults, if steps succeed: equal masses would hide interchanged ones."""

@@ -14,14 +14,13 @@ import numpy as np
 from scvi_codegen.benchmark.cases.unforced import (
     Bodies,
     Case,
-    Formulation,
     Vector,
     case,
     gravitation,
-    kepler,
+    hand_solved,
+    kepler_case,
     rotated,
     scaled,
-    second_order,
 )
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.models.problems import problem
@@ -52,17 +51,9 @@ def adaptive_case(name: str) -> Case:
 def _kepler_case(eccentricity: float) -> Case:
     """Return the Kepler problem started at the apocentre, where the velocity is small."""
     speed = math.sqrt((1.0 - eccentricity) / (1.0 + eccentricity))
-    return Case(
-        name="kepler",
-        system=problem("kepler").system,
-        formulations=(Formulation(name="hand-solved accelerations", rates=second_order(kepler)),),
-        q=rotated((1.0 + eccentricity, 0.0), 2),
-        velocity=rotated((0.0, speed), 2),
-        span=KEPLER_SPAN,
-        step=0.1,
-        fine=0.1,
-        bodies=Bodies(masses=(0.0,), gravity=1.0, fixed_centre=True, axes=2),
-    )
+    q, velocity = rotated((1.0 + eccentricity, 0.0), 2), rotated((0.0, speed), 2)
+    plain = kepler_case(eccentricity, step=0.1, fine=0.1)
+    return replace(plain, name="kepler", q=q, velocity=velocity, span=KEPLER_SPAN)
 
 
 def atwood(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
@@ -82,7 +73,7 @@ def _atwood_case() -> Case:
     return Case(
         name="atwood",
         system=system,
-        formulations=(Formulation(name="hand-solved accelerations", rates=second_order(atwood)),),
+        formulations=hand_solved(atwood),
         q=scaled((1.1, 0.8), 0.01),
         velocity=scaled((0.0, 0.2), 0.01),
         span=100.0,
@@ -114,7 +105,7 @@ def gravitating(masses: Sequence[float], q: Sequence[float], velocity: Sequence[
     )
     return Case(
         system=system,
-        formulations=(Formulation(name="hand-solved accelerations", rates=second_order(gravitation)),),
+        formulations=hand_solved(gravitation),
         q=rotated(q, 3),
         velocity=rotated(velocity, 3),
         bodies=Bodies(masses=tuple(masses), gravity=gravity, fixed_centre=False, axes=3),

@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.benchmark.cases.unforced import Array, Case, Formulation, Vector, scaled, second_order
+from scvi_codegen.benchmark.cases.unforced import Array, Case, Formulation, Vector, hand_solved, scaled, second_order
 from scvi_codegen.benchmark.contenders.ours import our_contenders
 from scvi_codegen.benchmark.report import Contender
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -198,7 +198,7 @@ def _from_rest(
     return Case(
         name=f"forced:{name}",
         system=system,
-        formulations=(Formulation(name="hand-solved accelerations", rates=second_order(accelerations)),),
+        formulations=hand_solved(accelerations),
         q=scaled(q, 0.05),
         velocity=scaled(q, 0.05) * 0.0,
         span=span,

@@ -28,6 +28,8 @@ __all__ = [
     "Formulation",
     "case",
     "gravitation",
+    "hand_solved",
+    "kepler_case",
     "rotated",
     "scaled",
     "second_order",
@@ -237,23 +239,24 @@ def _small_case(name: str, rates: tuple[Formulation, ...], **changes: Any) -> Ca
     )
 
 
-def _hand_solved(accelerations: Callable[..., list[Any]]) -> tuple[Formulation, ...]:
+def hand_solved(accelerations: Callable[..., list[Any]]) -> tuple[Formulation, ...]:
+    """Return the formulation in (q, v) with these accelerations."""
     return (Formulation(name="hand-solved accelerations", rates=second_order(accelerations)),)
 
 
 def _pendulum_case() -> Case:
-    return _small_case("planar-pendulum", _hand_solved(pendulum), span=1000.0, fine=0.5, q=(0.5,), step=0.8)
+    return _small_case("planar-pendulum", hand_solved(pendulum), span=1000.0, fine=0.5, q=(0.5,), step=0.8)
 
 
 def _duffing_case() -> Case:
-    return _small_case("duffing", _hand_solved(duffing), span=2000.0, fine=0.25)
+    return _small_case("duffing", hand_solved(duffing), span=2000.0, fine=0.25)
 
 
 def _henon_heiles_case() -> Case:
     """Return the problem at energy 0.055, where motion is regular."""
     return _small_case(
         "henon-heiles",
-        _hand_solved(henon_heiles),
+        hand_solved(henon_heiles),
         span=1000.0,
         fine=0.375,
         q=(0.0, 0.1),
@@ -264,7 +267,7 @@ def _henon_heiles_case() -> Case:
 def _double_pendulum_case() -> Case:
     return _small_case(
         "double-pendulum",
-        _hand_solved(double_pendulum),
+        hand_solved(double_pendulum),
         span=1000.0,
         fine=0.25,
         q=(0.5, 0.5),
@@ -273,13 +276,14 @@ def _double_pendulum_case() -> Case:
     )
 
 
-def _kepler_case(eccentricity: float, *, step: float, fine: float) -> Case:
+def kepler_case(eccentricity: float, *, step: float, fine: float) -> Case:
+    """Return the Kepler problem started at the perihelion, in eight orientations."""
     entry = problem("kepler")
     speed = math.sqrt((1.0 + eccentricity) / (1.0 - eccentricity))
     return Case(
         name=f"kepler:{eccentricity}",
         system=entry.system,
-        formulations=_hand_solved(kepler),
+        formulations=hand_solved(kepler),
         q=rotated((1.0 - eccentricity, 0.0), 2),
         velocity=rotated((0.0, speed), 2),
         span=2000.0,
@@ -297,7 +301,7 @@ def _outer_solar_system() -> Case:
     return Case(
         name="outer-solar-system",
         system=entry.system,
-        formulations=_hand_solved(gravitation),
+        formulations=hand_solved(gravitation),
         q=rotated(entry.q, 3),
         velocity=rotated(entry.velocity, 3),
         span=entry.span,
@@ -310,19 +314,19 @@ def _outer_solar_system() -> Case:
 
 def _chain_case(n: int, *, step: float, fine: float) -> Case:
     loops = CHAIN_LOOPS.format(n=n, beta=1.0)
-    return _small_case(f"fput-chain:{n}", _hand_solved(chain), span=1000.0, fine=fine, step=step, loops=loops)
+    return _small_case(f"fput-chain:{n}", hand_solved(chain), span=1000.0, fine=fine, step=step, loops=loops)
 
 
 def _relativistic_case() -> Case:
     momenta = Formulation(name="Hamilton's equations", rates=relativistic_in_momenta, momenta=True)
-    return _small_case("relativistic-particle", (*_hand_solved(relativistic), momenta), span=1000.0, fine=0.25)
+    return _small_case("relativistic-particle", (*hand_solved(relativistic), momenta), span=1000.0, fine=0.25)
 
 
 CASES: Mapping[str, Callable[[], Case]] = {
     "planar-pendulum": _pendulum_case,
     "duffing": _duffing_case,
-    "kepler:0.2": partial(_kepler_case, 0.2, step=0.5, fine=0.375),
-    "kepler:0.5": partial(_kepler_case, 0.5, step=0.25, fine=0.1875),
+    "kepler:0.2": partial(kepler_case, 0.2, step=0.5, fine=0.375),
+    "kepler:0.5": partial(kepler_case, 0.5, step=0.25, fine=0.1875),
     "henon-heiles": _henon_heiles_case,
     "outer-solar-system": _outer_solar_system,
     "double-pendulum": _double_pendulum_case,

@@ -18,7 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StepFailedError
+from scvi_codegen.exact.step import derived_step
 from scvi_codegen.methods import SVI, Gauss, SpectralCollocation
+from scvi_codegen.methods.method import Method
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.reproduce.kepler.orbits import SYSTEM, angular_momentum, exact_flow, perihelion
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
@@ -35,7 +37,6 @@ from scvi_codegen.reproduce.laboratory.experiment import (
 )
 from scvi_codegen.reproduce.laboratory.running import BY_DEGREE, BY_POINTS, stepper_of
 from scvi_codegen.tables.precision import DIGITS, Number, mp
-from scvi_codegen.tables.tableau import Tableau
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -93,48 +94,25 @@ def orders(scheme: str, degree: int, e: float) -> tuple[float | None, ...]:
     Steps are computed in 60 digits, as Runge-Kutta methods: an SVI with as many Gauss points as its degree is Gauss
     collocation, SC is collocation on its nodes.
     """
-    tableau = Gauss(degree).tableau if scheme == "SVI" else SpectralCollocation(degree).tableau
+    method = Gauss(degree) if scheme == "SVI" else SpectralCollocation(degree, form="phase-space")
     scale = (1 - mp.mpf(e)) ** 1.5
-    larger, smaller = (_precise_errors(tableau, e, scale * mp.mpf(h)) for h in ORDER_STEPS)
+    larger, smaller = (_precise_errors(method, e, scale * mp.mpf(h)) for h in ORDER_STEPS)
     return tuple(
         None if min(pair) < NEGLIGIBLE else float(mp.log(pair[0] / pair[1]) / mp.log(2))
         for pair in zip(larger, smaller, strict=True)
     )
 
 
-def _precise_errors(tableau: Tableau, e: float, h: Number) -> tuple[Number, ...]:
+def _precise_errors(method: Method, e: float, h: Number) -> tuple[Number, ...]:
     exact_e = mp.mpf(e)
     start = (1 - exact_e, mp.zero), (mp.zero, mp.sqrt((1 + exact_e) / (1 - exact_e)))
-    (x, y), (vx, vy) = _runge_kutta(tableau, *start, h)
+    end = derived_step(SYSTEM, method)(*start, h)
+    (x, y), (vx, vy) = end.q, end.p
     anomaly = mp.findroot(lambda E: E - exact_e * mp.sin(E) - h, h / (1 - exact_e))
     q1, q2 = mp.cos(anomaly) - exact_e, mp.sqrt(1 - exact_e**2) * mp.sin(anomaly)
     energy = (vx**2 + vy**2) / 2 - 1 / mp.hypot(x, y)
     momentum = x * vy - y * vx - mp.sqrt(1 - exact_e**2)
     return abs(x - q1), abs(y - q2), abs(momentum), abs(energy + mp.mpf(1) / 2)
-
-
-Vector = tuple[Number, Number]
-
-
-def _runge_kutta(tableau: Tableau, q: Vector, v: Vector, h: Number) -> tuple[Vector, Vector]:
-    """Return one step of q'' = -q / |q|^3 by fixed-point iteration, which gains at least two digits per iteration."""
-    rows = [*tableau.A, tableau.b]
-    accelerations = [(mp.zero, mp.zero)] * len(tableau.b)
-    for _ in range(DIGITS // 2):
-        velocities = [_moved(v, row, accelerations, h) for row in rows]
-        positions = [_moved(q, row, velocities[:-1], h) for row in rows]
-        accelerations = [_attraction(position) for position in positions[:-1]]
-    return positions[-1], velocities[-1]
-
-
-def _moved(start: Vector, row: tuple[Number, ...], rates: list[Vector], h: Number) -> Vector:
-    x, y = (mp.fdot(row, [rate[i] for rate in rates]) for i in (0, 1))
-    return start[0] + h * x, start[1] + h * y
-
-
-def _attraction(q: Vector) -> Vector:
-    cube = mp.hypot(*q) ** 3
-    return -q[0] / cube, -q[1] / cube
 
 
 def shares_won(svi: Array, sc: Array, *, roundoff: float = ROUNDOFF) -> tuple[int, int]:
