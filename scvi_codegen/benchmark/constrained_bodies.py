@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from scvi_codegen.benchmark.cases.rods import rods_in_angles
 from scvi_codegen.benchmark.cases.unforced import Array
 from scvi_codegen.benchmark.report import FLOOR, OURS, Point, ResultTable, error_at
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
@@ -133,19 +134,10 @@ def our_motion(linkage: Linkage, method: str) -> Callable[[float, int], Contende
 
 
 def motion_in_angles(linkage: Linkage, method: str) -> Callable[[float, int], ContenderRun]:
-    """Return a run of an open chain in the angles of its rods, without constraints."""
+    """Return a run of an open chain of equal masses and rods in the angles of these, without constraints."""
     n = len(linkage.masses)
-    lengths, angles = [linkage.length(i, j) for i, j in linkage.rods], [f"a{k}" for k in range(n)]
-    kinetic, height = [], []
-    for mass, last in zip(linkage.masses, range(1, n + 1), strict=True):
-        pairs = list(zip(lengths[:last], angles[:last], strict=True))
-        speeds = [" + ".join(f"{length!r}*{turn}({a})*{a}_dot" for length, a in pairs) for turn in ("cos", "sin")]
-        kinetic.append(f"{mass!r}/2*(({speeds[0]})**2 + ({speeds[1]})**2)")
-        height += [f"{mass * GRAVITY * length!r}*cos({a})" for length, a in pairs]
-    system = LagrangianSystem.from_text(
-        name=f"{linkage.name} in angles", coordinates=angles, lagrangian=" + ".join([*kinetic, *height])
-    )
-    stepper = compile_stepper(system, method)
+    values = {"m": linkage.masses[0], "l": linkage.length(*linkage.rods[0]), "g": GRAVITY}
+    stepper = compile_stepper(rods_in_angles(n, parameters=values), method)
     along = [linkage.point(j) - linkage.point(i) for i, j in linkage.rods]
     q = np.array([np.arctan2(x, -y) for x, y in along])
     return _by(stepper, q, np.zeros(n), lambda x: 0.0)

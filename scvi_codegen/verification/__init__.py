@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import MethodError, StateError, StepFailedError
+from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import as_method
@@ -105,7 +105,9 @@ def verify(
     """
     more: dict[str, Any] = {"velocity": velocity, "parameters": parameters, "tables": tables}
     if isinstance(system, ArraySystem):
-        return _of_arrays(system, method, q, p, h=h, t=t, stepper=stepper, tolerance=tolerance, flags=flags, **more)
+        from scvi_codegen.verification.arrays import verify_arrays  # imported here: it imports modules of this package
+
+        return verify_arrays(system, method, q, p, h=h, t=t, stepper=stepper, tolerance=tolerance, flags=flags, **more)
     for name, value in more.items():
         if value is not None:
             raise StateError(
@@ -164,21 +166,6 @@ def _certificate(
         checks=checks,
         seconds=time.perf_counter() - began,
     )
-
-
-def _of_arrays(
-    system: ArraySystem, method: Method | str, q: Any, p: Any, *, h: Any, tolerance: float | None, **others: Any
-) -> Certificate:
-    from scvi_codegen.verification.arrays import verify_arrays  # imported here: it imports modules of this package
-
-    if tolerance is not None:
-        raise MethodError(
-            f"tolerance is not available for arrays of '{system.name}', whose sizes are known at run time only: verify "
-            "unroll_sums(system, sizes)"
-        )
-    if q is None or h is None:
-        raise StateError(f"verify requires q and h for arrays of '{system.name}': their shapes determine the sizes")
-    return verify_arrays(system, method, q, p, h=h, **others)
 
 
 def _in_transformed_time(system: MechanicalSystem) -> MechanicalSystem:

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from scvi_codegen.exact.step import derived_step
 from scvi_codegen.methods import SVI, ExplicitEuler, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.systems import kepler, planar_pendulum
+from scvi_codegen.models.systems import planar_pendulum
+from scvi_codegen.reproduce.kepler.orbits import SYSTEM, angular_momentum, perihelion
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_orbit, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Cell,
@@ -41,10 +42,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-KEPLER = kepler()
 ECCENTRICITY = 0.6
-POSITION = (1.0 - ECCENTRICITY, 0.0)
-VELOCITY = (0.0, math.sqrt((1.0 + ECCENTRICITY) / (1.0 - ECCENTRICITY)))
+POSITION, VELOCITY = perihelion(ECCENTRICITY)
 PERIOD = 2.0 * math.pi
 
 
@@ -70,13 +69,12 @@ SAME_AREA = 0.03
 @lru_cache
 def _orbit(name: str) -> Trajectory:
     run = RUNS[name]
-    return trajectory(KEPLER, run.method, POSITION, VELOCITY, h=run.h, span=100.0)
+    return trajectory(SYSTEM, run.method, POSITION, VELOCITY, h=run.h, span=100.0)
 
 
 def _ellipse_area(run: Trajectory) -> Array:
     """Return the area pi a b of the osculating ellipse of each state: a = -1/(2 E), b = M sqrt(a)."""
-    momentum = run.q[:, 0] * run.p[:, 1] - run.q[:, 1] * run.p[:, 0]
-    area: Array = np.pi * np.abs(momentum) * (-2.0 * run.energy()) ** -1.5
+    area: Array = np.pi * np.abs(angular_momentum(run.q, run.p)) * (-2.0 * run.energy()) ** -1.5
     return area
 
 

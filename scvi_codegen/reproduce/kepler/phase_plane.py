@@ -33,9 +33,9 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     Picture,
     Result,
     TableBlock,
-    Verdict,
     experiment,
     holds,
+    judged,
 )
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def _kept_check(orbits: Mapping[str, Orbit], names: list[str], more: str = "") -
     return Comparison(
         claim=f"The phase trajectories are preserved by {', '.join(names)}.",
         measured=f"Largest errors: {'; '.join(parts)}.{more}",
-        verdict=Verdict.PARTLY if any(preserved) and not all(preserved) else holds(all(preserved)),
+        verdict=judged(*preserved),
         bears_on=("scvi-structure",) if any("SCVI" in name for name in names) else (),
     )
 

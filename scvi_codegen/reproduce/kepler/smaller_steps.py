@@ -33,6 +33,7 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     Verdict,
     experiment,
     holds,
+    judged,
     series_table,
 )
 from scvi_codegen.reproduce.laboratory.running import BY_DEGREE, BY_POINTS, stepper_of
@@ -187,14 +188,13 @@ def _check_powers() -> Comparison:
         for quantity in PAPER_POWERS
     }
     drawn = {quantity: {round(power) for _, power in lines} for quantity, lines in PAPER_POWERS.items()}
-    same = sum(result[quantity] == drawn[quantity] for quantity in drawn)
     return Comparison(
         claim="The errors of q1 fall like h^2, h^4, h^6, h^8, h^12, those of q2 like h^3, h^5, h^7, h^10.",
         measured=(
             f"With N points: q1 {_listed(result['q1'])} and q2 {_listed(result['q2'])}; h^11 is a line of SVI with six "
             f"points, whose order is 10. With N the degree: {_partials_text('q1', 1)}; {_partials_text('q2', 1)}."
         ),
-        verdict=Verdict.PARTLY if 0 < same < len(drawn) else holds(same == len(drawn)),
+        verdict=judged(*(result[quantity] == drawn[quantity] for quantity in drawn)),
     )
 
 

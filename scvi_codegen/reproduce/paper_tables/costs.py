@@ -28,6 +28,7 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     Verdict,
     experiment,
     holds,
+    judged,
 )
 from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, SECTION_3, steps_in
 from scvi_codegen.runtime.core.stepper import Stepper
@@ -256,7 +257,7 @@ def _checks(setting: Setting, result: Mapping[str, Cost]) -> Sequence[Comparison
             claim="SVI is more accurate than SRK at the same step.",
             measured=f"Energy error {svi.energy:.1e}, that of SRK {srk.energy:.1e}; error of the final position "
             f"{svi.position:.1e}, that of SRK {srk.position:.1e}.",
-            verdict=_both(svi.energy < srk.energy, svi.position < srk.position),
+            verdict=judged(svi.energy < srk.energy, svi.position < srk.position),
             bears_on=("svi-cheaper", "efficiency"),
         ),
         Comparison(
@@ -275,7 +276,7 @@ def _checks(setting: Setting, result: Mapping[str, Cost]) -> Sequence[Comparison
             claim="SVI is much more accurate than SC over the long run.",
             measured=f"Energy error {svi.energy:.1e}, that of SC {sc.energy:.1e}; error of the final position "
             f"{svi.position:.1e}, that of SC {sc.position:.1e}.",
-            verdict=_both(svi.energy < sc.energy / 10.0, svi.position < sc.position / 10.0),
+            verdict=judged(svi.energy < sc.energy / 10.0, svi.position < sc.position / 10.0),
             bears_on=("accuracy", "efficiency"),
         ),
     )
@@ -289,10 +290,6 @@ def _of_a_digit(cost: Cost) -> str:
 def _cheaper(ratio: float) -> Verdict:
     """Return the verdict for a ratio of times; in part if the times are equal."""
     return Verdict.PARTLY if abs(ratio - 1.0) <= SAME else holds(ratio < 1.0)
-
-
-def _both(one: bool, other: bool) -> Verdict:
-    return Verdict.PARTLY if one != other else holds(one)
 
 
 def draw_costs(bars: Sequence[Bars], figure: Figure) -> None:

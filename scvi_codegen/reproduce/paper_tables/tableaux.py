@@ -17,7 +17,7 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     TableBlock,
     Verdict,
     experiment,
-    holds,
+    judged,
 )
 from scvi_codegen.tables.closed_forms import exact_tableau
 from scvi_codegen.tables.precision import Number, mp
@@ -171,7 +171,7 @@ def _order_check(printed: Exact, exact: Exact, s: int) -> Comparison:
         claim=f"The method has order {2 * s}.",
         measured=f"{zero} of the {len(residuals)} conditions B({2 * s}), C({s}), D({s}), which together give order "
         f"{2 * s}, hold exactly for the closed form; the entries as printed give order {order}.",
-        verdict=_common(zero == len(residuals), order == 2 * s),
+        verdict=judged(zero == len(residuals), order == 2 * s),
     )
 
 
@@ -182,12 +182,8 @@ def _symplectic_check(printed: Exact, exact: Exact) -> Comparison:
         claim="Gauss methods are symplectic.",
         measured=f"{zero} of the {len(residuals)} conditions b_i a_ij + b_j a_ji = b_i b_j hold exactly for the closed "
         f"form; the entries as printed {'satisfy' if satisfied else 'do not satisfy'} them.",
-        verdict=_common(zero == len(residuals), satisfied),
+        verdict=judged(zero == len(residuals), satisfied),
     )
-
-
-def _common(exact: bool, printed: bool) -> Verdict:
-    return Verdict.PARTLY if exact != printed else holds(exact)
 
 
 def order_residuals(exact: Exact) -> Iterator[sympy.Expr]:

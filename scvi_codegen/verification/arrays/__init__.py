@@ -8,26 +8,23 @@ compared with NumPy, and conserved quantities are measured along a run.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import MethodError
+from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.lowering.arrays import one_coordinate
 from scvi_codegen.mechanics.arrays.rolling import unroll_sums
-from scvi_codegen.mechanics.arrays.system import ARRAYS, ArraySystem
+from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
-from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.runtime.arrays.interface import read_arrays
 from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
-from scvi_codegen.validation.argument_types import MAPPING, checks_arguments, of
+from scvi_codegen.validation.argument_types import check_kind, of
 from scvi_codegen.verification.arrays.small import SmallStepper, small_start
 from scvi_codegen.verification.arrays.whole import WholeStart, whole_checks
 from scvi_codegen.verification.certificate import Certificate, Finding, checked, issued
@@ -43,39 +40,32 @@ ROUNDINGS = 16.0 * SMALL_STEPS
 """Bound on the deviation after ``SMALL_STEPS`` steps, in units of rounding."""
 
 
-@checks_arguments(system=ARRAYS, parameters=MAPPING, tables=MAPPING, stepper=of("an ArrayStepper", ArrayStepper))
-@without_accuracy_warnings()
 def verify_arrays(
     system: ArraySystem,
     method: Method | str,
-    q: ArrayLike | Mapping[str, ArrayLike],
-    p: ArrayLike | Mapping[str, ArrayLike] | None = None,
+    q: Any,
+    p: Any,
     *,
-    velocity: ArrayLike | Mapping[str, ArrayLike] | None = None,
-    h: float,
-    t: float = 0.0,
-    parameters: Mapping[str, ArrayLike] | None = None,
-    tables: Mapping[str, ArrayLike] | None = None,
-    stepper: ArrayStepper | None = None,
-    flags: Sequence[str] = TUNED_FLAGS,
+    h: float | None,
+    t: float,
+    stepper: Stepper | ArrayStepper | None,
+    tolerance: float | None,
+    flags: Sequence[str],
+    **arrays_of_run: Any,
 ) -> Certificate:
-    """Measure the guaranteed properties of the integrator of arrays of run-time sizes and return a certificate.
+    """Return the certificate of arrays of run-time sizes; arguments as of :func:`~scvi_codegen.verify`.
 
     Properties are measured on a few indices of the arrays first, then at full size.
-
-    Args:
-        system: array system.
-        method: method, or its name.
-        q, p, velocity, h, t, parameters, tables: as of :meth:`ArrayStepper.integrate`; the state of the certificate
-            is that of the few indices.
-        stepper: stepper under test; by default compiled now.
-        flags: flags of the C compiler.
-
-    Raises:
-        BuildError: without a C compiler.
-        MethodError: for a method without fixed-point iteration, and for constraints.
-        StateError: for arrays that do not fit.
     """
+    if tolerance is not None:
+        raise MethodError(
+            f"tolerance is not available for arrays of '{system.name}', whose sizes are known at run time only: verify "
+            "unroll_sums(system, sizes)"
+        )
+    if q is None or h is None:
+        raise StateError(f"verify requires q and h for arrays of '{system.name}': their shapes determine the sizes")
+    if stepper is not None:
+        check_kind(of("an ArrayStepper", ArrayStepper), stepper, "stepper", StateError)
     began = time.perf_counter()
     chosen = as_method(method, one_coordinate(system))
     if system.constraints:
@@ -84,8 +74,9 @@ def verify_arrays(
             "unroll_sums(system, sizes) by SVI(1, 'gauss-lobatto:2')"
         )
     stepper = stepper or compile_stepper(system, chosen, flags=tuple(flags))
-    run = stepper.start(q, p, velocity=velocity, h=h, t=t, parameters=parameters, tables=tables)
-    arrays = read_arrays(stepper.interface, q, parameters, tables)
+    assert isinstance(stepper, ArrayStepper)
+    run = stepper.start(q, p, h=h, t=t, **arrays_of_run)
+    arrays = read_arrays(stepper.interface, q, arrays_of_run["parameters"], arrays_of_run["tables"])
     start = WholeStart(system, chosen, stepper, arrays, run.stepper.arrays(run.p), run.h, run.t)
     tested = _subject(start)
     checks = (
