@@ -211,39 +211,7 @@ def test_position_and_phase_space_form_agree_only_for_constant_mass(sample, comp
         assert difference < ROUND_OFF if same else difference > 1e-9
 
 
-# 6. Reversibility.
-
-SYMMETRIC = ("gauss-legendre:3", "gauss-lobatto:3", "clenshaw-curtis:4", "fejer:5")
-
-
-def reversal_defect(sample, compiled, name, method, h=H):
-    stepper, state = compiled(name, method), sample(name).state
-    return distance(stepper.step(*stepper.step(*state, h, T), -h, T + h), state)
-
-
-@pytest.mark.covering
-@pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole"])
-@pytest.mark.parametrize("quadrature", SYMMETRIC)
-def test_svi_with_a_symmetric_quadrature_is_reversible(sample, compiled, name, quadrature):
-    assert reversal_defect(sample, compiled, name, SVI(3, quadrature)) < ROUND_OFF
-
-
-@pytest.mark.covering
-@pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole"])
-@pytest.mark.parametrize("family", ["gauss", "lobatto-iiia", "chebyshev-gauss", "chebyshev-lobatto"])
-def test_scvi_on_symmetric_abscissae_is_reversible(sample, compiled, name, family):
-    method = SCVI(3, abscissae=family)
-    assert method.symmetric
-    assert reversal_defect(sample, compiled, name, method) < ROUND_OFF
-
-
-@pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole"])
-def test_other_methods_are_not_reversible(sample, compiled, name):
-    for method in (SVI(2, "gauss-radau-left:2"), SCVI(2), SpectralCollocation(2), SCVI(2, variational=False)):
-        assert reversal_defect(sample, compiled, name, method) > 1e-8
-
-
-# 9. SCVI on abscissae.
+# 6. SCVI on abscissae.
 
 
 @pytest.mark.parametrize("name", SOME)
@@ -285,7 +253,7 @@ def test_invalid_abscissae_are_rejected(arguments, message):
         SCVI(3, **arguments)
 
 
-# 8. Total time derivatives.
+# 7. Total time derivatives.
 
 
 def with_gauge(name, order):

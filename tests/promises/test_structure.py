@@ -134,7 +134,9 @@ METHODS = (
     SCVI(1, "gauss-radau-left:2"),
     SCVI(2, nodes="equispaced"),
     *(SCVI(s, variational=False) for s in (1, 2, 3)),
+    *(SVI(3, rule) for rule in ("gauss-lobatto:3", "clenshaw-curtis:4", "fejer:5")),
     *(SCVI(2, abscissae=family) for family in ("gauss", "radau-iia", "lobatto-iiia", "chebyshev-gauss")),
+    *(SCVI(3, abscissae=family) for family in ("gauss", "lobatto-iiia", "chebyshev-gauss", "chebyshev-lobatto")),
     SCVI(2, "gauss-radau-left:3", abscissae="gauss"),
     *(SpectralCollocation(s, form=form) for s in (1, 2, 3) for form in ("position", "phase-space")),
     *(family(2, form="position") for family in (Gauss, RadauIIA, LobattoIIIA, ChebyshevGauss)),
@@ -163,6 +165,13 @@ def test_claims_of_symmetry_and_symplecticity_agree_with_measurement(sample, com
     reversal, defect = reversal_defect(stepper, q, p, 0.15), symplecticity_defect(stepper, q, p, 0.15)
     assert reversal < 1e-12 if method.symmetric else reversal > 1e-7
     assert defect < FINITE_DIFFERENCES if method.symplectic else defect > 1e-6
+
+
+@pytest.mark.parametrize("method", first_of_each(METHODS, family), ids=lambda method: method.name)
+def test_symmetric_methods_alone_are_reversible_in_a_time_dependent_system(sample, compiled, method):
+    q, p = sample("pumped-cart-pole").state
+    reversal = reversal_defect(compiled("pumped-cart-pole", method), q, p, 0.15, 0.4)
+    assert reversal < 1e-12 if method.symmetric else reversal > 1e-10
 
 
 @pytest.mark.parametrize("family", [SCVI, SpectralCollocation])
