@@ -2,21 +2,12 @@
 #define SUPPORT_ARRAY_HAMILTONIAN_ITERATION_H
 
 /* Fixed-point iteration of a step of an array Hamiltonian system: positions and momenta y at the points are updated
- * from their rates until they converge. Requires: one_trajectory.h, the tables, forces_at, which computes the rates at
- * the points: -H_q of the momenta, then H_p of the positions. Momenta follow positions in memory. */
+ * from their rates until they converge. Requires: one_trajectory.h, point_weights.h, the tables, forces_at, which
+ * computes the rates at the points: -H_q of the momenta, then H_p of the positions. Momenta follow positions in
+ * memory. */
 
 #define SUDDEN_GROWTH 1e20 /* of the largest coordinate in one iteration: a larger one changes the whole state */
 #define KEPT_FIRST(apart) ((apart) / 2) /* velocities follow forces */
-
-typedef struct {
-  int unused;
-} iteration_data;
-
-static void prepare_iteration(const step_data *step, iteration_data *data)
-{
-  (void)step;
-  data->unused = 0;
-}
 
 /* Work of a step: y, then rates. */
 static history history_in(const step_data *step)
@@ -32,14 +23,11 @@ typedef struct {
   double largest;
 } half_state;
 
-/* Increments at the points of coordinate i. */
-static inline void increments_at(const step_data *step, const half_state *of, long long i, lanes *increment)
+/* Rates of coordinate i at the points times the weights. */
+static inline void weighted_rates(const half_state *of, long long apart, long long i, lanes *scaled)
 {
-  lanes kick[GROUPS];
   for (int g = 0; g < GROUPS; g++)
-    kick[g] = step->h * of->weights[g] * of->rates[g * 2 * step->n + i];
-  for (int g = 0; g < GROUPS; g++)
-    increment[g] = contribution_of_points(of->table, g, kick, 1);
+    scaled[g] = of->weights[g] * of->rates[g * apart + i];
 }
 
 /* Updates y from its rates; returns the mean of the squared changes relative to the size of each coordinate. */
@@ -50,11 +38,13 @@ static double improve(const step_data *step, half_state *of, const solver_option
   sums all;
   begin_blocks(&all, step);
   EACH_BLOCK (all) {
-    lanes total = lanes_of(0.0), increment[GROUPS];
+    lanes total = lanes_of(0.0), increment[GROUPS], scaled[GROUPS];
     double largest = 0.0;
     for (long long i = all.here.first; i < all.here.end; i++) {
       double size, inverse;
-      increments_at(step, of, i, increment);
+      weighted_rates(of, 2 * step->n, i, scaled);
+      for (int g = 0; g < GROUPS; g++)
+        increment[g] = contribution_of_points(of->table, g, scaled, 1);
       size = fabs(of->start[i]) + fabs(at_point(increment, 1, POINTS - 1));
       inverse = options->absolute ? 1.0 : 1.0 / (size + least);
       largest = larger(largest, size);
@@ -79,8 +69,7 @@ static void find_increments(const step_data *step, const half_state *of, double 
   const section own = own_part(step);
   for (long long i = own.first; i < own.end; i++) {
     lanes scaled[GROUPS];
-    for (int g = 0; g < GROUPS; g++)
-      scaled[g] = step->h * of->weights[g] * of->rates[g * 2 * step->n + i];
+    weighted_rates(of, 2 * step->n, i, scaled);
     increment[i] = weigh_apart(of->end, scaled, 1);
   }
 }
@@ -94,12 +83,11 @@ static int fixed_point(const step_data *step, const iteration_data *data, histor
   const long long n = step->n;
   const section own = own_part(step);
   lanes *X = (lanes *)step->run->work;
-  half_state q = {step->q0, step->carry_q, X, past.now + n, POSITION, POINT_END_POSITION, POSITION_WEIGHT, 0.0};
-  half_state p = {step->p0, step->carry_p, X + n, past.now, MOMENTUM, POINT_END_MOMENTUM, MOMENTUM_WEIGHT, 0.0};
+  half_state q = {step->q0, step->carry_q, X, past.now + n, POSITION, POINT_END_POSITION, data->position_weight, 0.0};
+  half_state p = {step->p0, step->carry_p, X + n, past.now, MOMENTUM, POINT_END_MOMENTUM, data->momentum_weight, 0.0};
   progress now = before_iterations();
   double last = 0.0;
   int status;
-  (void)data;
   for (int g = 0; g < GROUPS; g++)
     for (long long half = 0; half < 2 * n; half += n)
       for (long long i = half + own.first; i < half + own.end; i++)

@@ -6,7 +6,7 @@
  * Coefficients are double-double: the sum of a table and its _LOW partner. Values at the points are in flat arrays,
  * [group of points][coordinate], whose groups are EXTENT(n) elements apart: M coordinates or, if ARRAYS is defined, n,
  * which is known at run time. Requires: points.h or trajectories.h with what they require, the tables, the kernels
- * force_lanes and mass; with ARRAYS forces and VELOCITIES, 1 if they depend on velocities, too. */
+ * force_lanes and mass; with ARRAYS forces_at, and FORCES_OF_VELOCITIES if forces depend on velocities, too. */
 
 #ifdef ARRAYS
 #define EXTENT(n) (n)
@@ -14,6 +14,11 @@
 #else
 #define EXTENT(n) M
 #define PASS static inline __attribute__((always_inline))
+#endif
+
+#ifdef FORCES_OF_VELOCITIES
+#define VELOCITIES 1
+#else
 #define VELOCITIES 0
 #endif
 
@@ -214,7 +219,7 @@ static void forces(const step_points *w)
   forces_at(w->step, w->X, OF_EACH * w->n, w->F);
 }
 
-#if VELOCITIES
+#ifdef FORCES_OF_VELOCITIES
 /* Updates the velocities at the points from the forces; returns the sum of the squared relative changes times h. */
 static lanes improve_velocities(const step_points *w, section here)
 {
