@@ -88,7 +88,6 @@ class FixedPointIteration:
         damping: kernel of the rate of a uniform damping, a function of the parameters, if there is one.
         predictor_matrix: table between the stored values and the predicted ones; empty if they are the same.
         derivatives_part: support header of tangent and adjoint vectors by fixed-point iteration; ``""`` without one.
-        derivatives_tables: tables that this header requires besides :attr:`tables`.
         serves_many: whether lanes may be trajectories.
         final_iterations: number of iterations after the one that converges.
         in_groups: whether its C supports several vectors for the points of a step, besides one.
@@ -110,7 +109,6 @@ class FixedPointIteration:
     damping: Kernel | None = None
     predictor_matrix: NumberTable = ()
     derivatives_part: str = ""
-    derivatives_tables: tuple[IterationTable, ...] = ()
     serves_many: bool = False
     final_iterations: int = 0
     in_groups: bool = True
@@ -121,6 +119,21 @@ class FixedPointIteration:
         yield from self.own_tables
         for name in ("last_alone", "last", "before"):
             yield IterationTable(name.upper(), getattr(self.guess, name))
+
+    @property
+    def derivatives_tables(self) -> tuple[IterationTable, ...]:
+        """Tables of tangent and adjoint vectors: positions from forces, or from velocities and momenta from forces."""
+        if self.name == "separable":
+            return (IterationTable("PRODUCT_BACK", transposed(self.numbers("PRODUCT"), self.points)),)
+        changes = {}
+        for name in ("POSITION", "MOMENTUM"):
+            (weights,) = self.numbers(f"{name}_WEIGHT")
+            rows = self.numbers(name)
+            changes[name] = tuple(tuple(x * w for x, w in zip(row, weights, strict=True)) for row in rows)
+        return (
+            *(IterationTable(f"CHANGE_{name}", table) for name, table in changes.items()),
+            *(IterationTable(f"CHANGE_{name}_BACK", transposed(table, self.points)) for name, table in changes.items()),
+        )
 
     def numbers(self, name: str) -> NumberTable:
         """Return the numbers of a table, those of a vector as the only row."""

@@ -36,16 +36,15 @@ rounded map still has a generating function: its energy error does not drift.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import sympy
 from sympy import Expr
 
 from scvi_codegen.formulas.derivatives import jacobian
-from scvi_codegen.ir.iteration import FixedPointIteration, IterationName, IterationTable, StoredValues, transposed
+from scvi_codegen.ir.iteration import FixedPointIteration, IterationName, IterationTable, StoredValues
 from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.numbers import Number, NumberTable
 from scvi_codegen.lowering.kernels import damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.lowering.solvers.tables import (
     MOST_LANES,
@@ -119,7 +118,6 @@ def _separable(system: LagrangianSystem, tables: VelocityTables, *, velocities: 
         constant_mass=system_kernel(system, "mass", forms.mass.values(), of=(), purpose="The constant masses."),
         predictor_matrix=padded,
         derivatives_part="" if velocities else "separable_derivatives",
-        derivatives_tables=(IterationTable("PRODUCT_BACK", transposed(padded, points)),),
         serves_many=True,
         final_iterations=1,  # the final one, with double-double coefficients
     )
@@ -137,14 +135,10 @@ def _point_iteration(
         pad_matrix(momenta, lanes),
         pad_vector(momentum_weights, lanes),
     )
-    points, extra = len(tables.abscissae), (("VELOCITY", tables.velocity), ("PROJECTION", tables.projection))
-    weighed = {
-        "CHANGE_POSITION": _weighed(padded[0], padded[1]),
-        "CHANGE_MOMENTUM": _weighed(padded[2], padded[3]),
-    }
+    extra = (("VELOCITY", tables.velocity), ("PROJECTION", tables.projection))
     return FixedPointIteration(
         name=name,
-        points=points,
+        points=len(tables.abscissae),
         lanes=lanes,
         own_tables=(
             IterationTable("ABSCISSA", pad_vector(tables.abscissae, lanes, repeat=True)),
@@ -156,17 +150,8 @@ def _point_iteration(
         guess=predictor_tables_of(tables.blocks, lanes, degree=resolved_degree(tables)),
         kernels=tuple(kernel for kernel in kernels if kernel),
         kept=StoredValues.VELOCITIES,
-        derivatives_tables=(
-            *(IterationTable(each, table) for each, table in weighed.items()),
-            *(IterationTable(f"{each}_BACK", transposed(table, points)) for each, table in weighed.items()),
-        ),
         **further,
     )
-
-
-def _weighed(table: NumberTable, weights: Sequence[Number]) -> NumberTable:
-    """Return the columns times weights."""
-    return tuple(tuple(x * weight for x, weight in zip(row, weights, strict=True)) for row in table)
 
 
 def hamiltonian_iteration(problem: StepProblem) -> FixedPointIteration | None:
