@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 
-__all__ = ["SIZES_REQUIRED", "Access", "Array", "ArrayMap", "Loop", "Place", "Size"]
+__all__ = ["SIZES_REQUIRED", "Access", "Array", "ArrayDeclarations", "ArrayMap", "Loop", "Place", "Size"]
 
 SIZES_REQUIRED = (
     "the sizes of its arrays are known at run time only. Give them when compiling, "
@@ -78,6 +78,24 @@ class Array:
     def elements(self) -> tuple[str, ...]:
         """Names of the entries of an array of known sizes, ``q_0``, .., the last axis running fastest."""
         return tuple("_".join([self.name, *map(str, index)]) for index in product(*map(range, self.shape({}))))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArrayDeclarations:
+    """Arrays of a system: declarations and sizes.
+
+    Attributes:
+        coordinates: arrays of coordinates.
+        momenta: of a Hamiltonian, after the coordinates in the state.
+        fields, tables: arrays of parameters and of indices.
+        sizes: names of the sizes, in the order of the C struct.
+    """
+
+    coordinates: tuple[Array, ...] = ()
+    momenta: tuple[Array, ...] = ()
+    fields: tuple[Array, ...] = ()
+    tables: tuple[Array, ...] = ()
+    sizes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

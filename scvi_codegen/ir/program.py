@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from scvi_codegen.indices import Array
+from scvi_codegen.indices import Array, ArrayDeclarations
 from scvi_codegen.ir.equations import ConstrainedSteps, Constraints, LoweredStageGroup, Rattle
 from scvi_codegen.ir.iteration import FixedPointIteration, Splitting
 from scvi_codegen.ir.kernel import Kernel, LoopedKernel
@@ -80,27 +80,18 @@ class StageCurve:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Layout:
+class Layout(ArrayDeclarations):
     """Arrays and parameters of a system; a named coordinate is an array without axes.
 
     Attributes:
-        coordinates: arrays of coordinates.
-        momenta: of a Hamiltonian of arrays, after the coordinates in the state.
         velocities: on which forces depend, after the coordinates at the points.
-        fields, tables: arrays of parameters and of indices.
-        sizes: names of the sizes of arrays.
         parameters, defaults: names and default values of the numbers.
         inputs: index of the first of the five parameters of each tabulated input, by name.
     """
 
-    coordinates: tuple[Array, ...]
-    momenta: tuple[Array, ...] = ()
     velocities: tuple[Array, ...] = ()
-    fields: tuple[Array, ...] = ()
-    tables: tuple[Array, ...] = ()
-    sizes: tuple[str, ...] = ()
-    parameters: tuple[str, ...]
-    defaults: tuple[float, ...]
+    parameters: tuple[str, ...] = ()
+    defaults: tuple[float, ...] = ()
     inputs: tuple[tuple[str, int], ...] = ()
 
     @property

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from scvi_codegen.indices import Access, Array, ArrayMap, Loop
+from scvi_codegen.indices import Access, ArrayDeclarations, ArrayMap, Loop
 from scvi_codegen.rendering.names import with_own_names
 from scvi_codegen.rendering.preprocessing import preprocessed
 from scvi_codegen.version import __version__
@@ -168,13 +168,10 @@ def included(code: str, read: Callable[[str], str]) -> tuple[tuple[str, str], ..
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ArrayLayout:
+class ArrayLayout(ArrayDeclarations):
     """Arrays of an integrator, whose sizes follow from those of a run.
 
     Attributes:
-        sizes: names of sizes, in the order of the C struct.
-        coordinates, fields, tables: array declarations, in that order.
-        momenta: momentum arrays of a Hamiltonian system.
         field_defaults: fill values of fields that are not passed.
         maps: momentum maps.
         accesses: every array access, with the loops around it.
@@ -183,11 +180,6 @@ class ArrayLayout:
         continued: whether the predictor extrapolates previous steps instead of reusing the forces at their end.
     """
 
-    sizes: tuple[str, ...] = ()
-    coordinates: tuple[Array, ...] = ()
-    momenta: tuple[Array, ...] = ()
-    fields: tuple[Array, ...] = ()
-    tables: tuple[Array, ...] = ()
     field_defaults: tuple[float, ...] = ()
     maps: tuple[ArrayMap, ...] = ()
     accesses: tuple[tuple[Access, tuple[Loop, ...]], ...] = ()

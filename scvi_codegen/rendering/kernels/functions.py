@@ -82,7 +82,7 @@ class _Rows(Nest):
     """Loop of a kernel over the rows of constant tables: entries of ``u`` are read, and values added."""
 
     def __init__(self, looped: LoopedKernel, real: str, parameter: str) -> None:
-        super().__init__(Layout(coordinates=(), parameters=(), defaults=()), looped, real, "u")
+        super().__init__(Layout(), looped, real, "u")
         self.parameter, self.columns = parameter, dict(looped.columns)
 
     def lines(self) -> list[str]:
