@@ -185,12 +185,12 @@ class CachedSources:
 
         def derive() -> str:
             source, interface = self.derived.integrator()
-            return json.dumps([source.to_json(), interface.to_json()])
+            return json.dumps([source.to_record(), interface.to_record()])
 
         source, interface = json.loads(cached_source((*self.key, "integrator"), derive))
         if hasattr(self.system, "REQUIRES_SIZES"):  # JSON cannot represent arrays
-            return Source.from_json(source), self.derived.interface
-        return Source.from_json(source), Interface.from_json(interface)
+            return Source.from_record(source), self.derived.interface
+        return Source.from_record(source), Interface.from_record(interface)
 
     def variant(self, name: str) -> Source | None:
         """Return the source of a variant (:class:`Variants`)."""

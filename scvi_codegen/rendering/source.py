@@ -259,20 +259,18 @@ class Interface:
         """Names of the momenta: those of a Hamiltonian, else ``p_`` and the coordinate's name."""
         return self.momentum_names or tuple(f"p_{name}" for name in self.coordinates)
 
-    def to_json(self) -> str:
-        """Return text for :meth:`from_json`, which supports named coordinates only."""
-        record = {name: value for name, value in asdict(self).items() if name != "layout"}
-        return json.dumps(record, indent=2, ensure_ascii=True) + "\n"
+    def to_record(self) -> dict[str, Any]:
+        """Return the fields for :meth:`from_record`, which supports named coordinates only."""
+        return {name: value for name, value in asdict(self).items() if name != "layout"}
 
     @classmethod
-    def from_json(cls, text: str) -> Interface:
-        """Return the interface from :meth:`to_json`.
+    def from_record(cls, record: Mapping[str, Any]) -> Interface:
+        """Return the interface from :meth:`to_record`, also from its JSON.
 
         Raises:
             ValueError, TypeError: for other fields, and values of other types.
         """
-        found: dict[str, Any] = json.loads(text)
-        arguments: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in found.items()}
+        arguments: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in record.items()}
         for each in fields(cls):
             if each.name in arguments and not KINDS[str(each.type)](arguments[each.name]):
                 raise ValueError(f"{each.name} is {arguments[each.name]!r:.60}: it must be of type {each.type}")

@@ -241,7 +241,7 @@ from test_c_text import METHODS, generated
 names = "svi-1-gauss-legendre-1", "scvi-2-chebyshev-lobatto-gauss-legendre-2", "gauss-2", "sc-3-chebyshev-lobatto"
 for method in names:
     for name, (source, interface) in generated(method).items():
-        text = "".join(source.files.values()) + source.declarations + interface.to_json()
+        text = "".join(source.files.values()) + source.declarations + repr(interface.to_record())
         print(method, name, hashlib.sha256(text.encode()).hexdigest())
 """
 

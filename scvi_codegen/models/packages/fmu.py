@@ -139,7 +139,7 @@ def _start(model: Model) -> ExampleRun:
 
 def _token(text: str, interface: Interface, start: ExampleRun) -> str:
     """Return the instantiation token, a hash of everything that determines library and description."""
-    made_from = "\0".join([__version__, text, interface.to_json(), repr(start)])
+    made_from = "\0".join([__version__, text, repr(interface.to_record()), repr(start)])
     return f"{{{uuid.uuid5(uuid.NAMESPACE_URL, made_from)}}}"
 
 

@@ -16,7 +16,6 @@ The name of the folder is the prefix of all C names. Importing it compiles the C
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from dataclasses import replace
@@ -98,7 +97,7 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
             )
         if "interface" not in record:
             return _stepper_of_arrays(target)
-        interface = Interface.from_json(json.dumps(record["interface"]))
+        interface = Interface.from_record(record["interface"])
     except (ValueError, KeyError, TypeError) as error:
         if isinstance(error, PackageError):
             raise
@@ -178,5 +177,5 @@ def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, si
 
 
 def _interface_text(source: Source, interface: Interface, texts: Mapping[str, str]) -> str:
-    described = {"interface": json.loads(interface.to_json()), "declarations": source.declarations.split("\n")}
+    described = {"interface": interface.to_record(), "declarations": source.declarations.split("\n")}
     return record_text(texts, **described)

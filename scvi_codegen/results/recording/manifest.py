@@ -154,7 +154,7 @@ class Manifest:
             "options": None if self.options is None else asdict(self.options),
             **({"plan": asdict(self.plan)} if self.plan else {}),
             "builds": [asdict(build) for build in self.builds],
-            "interface": json.loads(self.interface.to_json()),
+            "interface": self.interface.to_record(),
             "source": self.source.to_record(),
             **({"fallback": self.fallback.to_record()} if self.fallback else {}),
         }
@@ -176,7 +176,7 @@ class Manifest:
             options=None if options is None else SolverOptions(**options),
             plan=None if plan is None else StepPlan(**plan),
             builds=tuple(Build(**build) for build in document["builds"]),
-            interface=Interface.from_json(json.dumps(document["interface"])),
+            interface=Interface.from_record(document["interface"]),
             source=Source.from_record(document["source"]),
             fallback=Source.from_record(document["fallback"]) if "fallback" in document else None,
         )

@@ -46,10 +46,14 @@ from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.run.times import steps_to, times_after
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-from scvi_codegen.validation.argument_types import FUNCTION, MAPPING, checks_arguments
+from scvi_codegen.validation.argument_types import FUNCTION, MAPPING, ArgumentType, checks_arguments
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["Stepper"]
+__all__ = ["STEPPER", "Stepper", "of_known_sizes"]
+
+
+STEPPER = ArgumentType("a compiled stepper", lambda value: isinstance(value, Stepper) or hasattr(value, "bind"))
+"""Type check of steppers, also of those for arrays of any size."""
 
 
 class RunSettings(TypedDict, total=False):
@@ -486,6 +490,12 @@ def _with_warnings(trajectory: Trajectory) -> Trajectory:
 
 def _end_of(run: Run, steps: int | None) -> float:
     return run.plan.t_end if run.plan else float(times_after(run.t, run.h, checked_count(steps, "steps", least=0))[0])
+
+
+def of_known_sizes(stepper: Any, q: ArrayLike, parameters: Parameters = None) -> Stepper:
+    """Return a stepper for arrays of any size compiled with the sizes of these positions, and others as they are."""
+    known: Stepper = stepper.bind(q, parameters)[0].known if hasattr(stepper, "bind") else stepper
+    return known
 
 
 def _rebuild(

@@ -18,12 +18,12 @@ from scvi_codegen.errors import AccuracyWarning, FitError, StateError, StepFaile
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.pictures.residuals import ResidualPlot
 from scvi_codegen.representation import summary
-from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import STEPPER, Stepper, of_known_sizes
 from scvi_codegen.runtime.core.validation import Array, checked_vector
 from scvi_codegen.runtime.estimation.measurements import Measurements, distinct, state_names
 from scvi_codegen.runtime.estimation.multiple_shooting import LOOSE, TIGHT, Chain, Limits, chained, joined
 from scvi_codegen.runtime.inputs.segments import checked_inputs
-from scvi_codegen.validation.argument_types import MAPPING, NAMES, SWITCH, checks_arguments, of
+from scvi_codegen.validation.argument_types import MAPPING, NAMES, SWITCH, checks_arguments
 from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["Fit", "fit"]
@@ -99,7 +99,7 @@ class Fit:
 
 @checks_arguments(
     StateError,
-    stepper=of("a compiled stepper", Stepper),
+    stepper=STEPPER,
     unknown=NAMES,
     fit_initial_state=SWITCH,
     observed=NAMES,
@@ -157,6 +157,7 @@ def fit(
         StateError: if a shape, name or number is invalid.
         StepFailedError: if a step of the initial guess fails.
     """
+    stepper = of_known_sizes(stepper, q, parameters)
     measurements = Measurements.checked(
         stepper, t, measured, observed, deviations, start, h, checked_inputs(stepper.interface, inputs)
     )

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.errors import MethodError, OrbitError, StateError, StepFailedError, closest
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import STEPPER, Stepper, of_known_sizes
 from scvi_codegen.runtime.core.validation import (
     Array,
     Parameters,
@@ -31,7 +31,7 @@ from scvi_codegen.runtime.estimation.measurements import state_names
 from scvi_codegen.runtime.orbits.periodic_orbit import PeriodicOrbit
 from scvi_codegen.runtime.run.times import steps_within, times_after
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
-from scvi_codegen.validation.argument_types import NAMES, SWITCH, checks_arguments, of
+from scvi_codegen.validation.argument_types import NAMES, SWITCH, checks_arguments
 from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["periodic_orbit"]
@@ -55,7 +55,7 @@ EQUILIBRIUM_MOTION = 1e-6
 """Motion over a period, relative to the size of the state, below which an orbit counts as an equilibrium."""
 
 
-@checks_arguments(StateError, stepper=of("a compiled stepper", Stepper), fixed=NAMES, fixed_period=SWITCH)
+@checks_arguments(StateError, stepper=STEPPER, fixed=NAMES, fixed_period=SWITCH)
 def periodic_orbit(
     stepper: Stepper,
     q: ArrayLike,
@@ -101,6 +101,7 @@ def periodic_orbit(
         StateError: if a shape, name or number is invalid, or an input is not set.
         StepFailedError: if a step from the initial guess fails.
     """
+    stepper = of_known_sizes(stepper, q, parameters)
     search = _OrbitSearch.checked(
         stepper,
         period=period,
