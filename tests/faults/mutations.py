@@ -44,11 +44,11 @@ from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.methods import (
     acceleration_stages,
     composition,
-    runge_kutta,
+    galerkin_stages,
+    leapfrog_stages,
     shooting_stages,
     stage_system,
 )
-from scvi_codegen.methods import method as method_room
 from scvi_codegen.rendering.kernels import printer as c_printer
 from scvi_codegen.tables import quadrature, tableau
 from scvi_codegen.tables.precision import mp
@@ -263,7 +263,7 @@ MUTATIONS = (
     function(
         "two weights exchanged",
         case("double/lobatto-svi"),
-        method_room,
+        stage_system,
         "unit_sum",
         changed_result(lambda w: (w[1], w[0], *w[2:])),
     ),
@@ -302,7 +302,7 @@ MUTATIONS = (
     here(
         "momentum by A for A^T",
         case("kepler/sc-phase-space"),
-        runge_kutta,
+        galerkin_stages,
         "_transposed",
         changed_result(lambda table: replace(table, entries=transposed(table.entries), names=transposed(table.names))),
     ),
@@ -330,7 +330,7 @@ MUTATIONS = (
     function(
         "one kick in place of two halves",
         case("pendulum/verlet"),
-        composition,
+        leapfrog_stages,
         "kicks_and_drifts",
         changed_result(lambda parts: ((mp.one, mp.zero), parts[1])),
     ),
@@ -374,7 +374,7 @@ MUTATIONS = (
         "another potential, consistently",
         case("double/svi"),
         stage_system.ScalarStageGroup,
-        "partials",
+        "derivatives",
         of_another_system,
     ),
     function("L_vq v lost", case("double/sc"), mechanics, "_along", without_rates_of("theta1", "theta2")),

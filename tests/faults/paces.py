@@ -22,7 +22,7 @@ STEP_SIZE_FAULTS = (
         "transformed time at another energy",
         case("slowed/svi-3"),
         Integrator,
-        "parameters_at",
+        "_parameters_at",
         lambda original: lambda self, q, p, parameters=None: original(self, q, 1.01 * p, parameters),
     ),
     text(

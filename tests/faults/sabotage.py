@@ -20,6 +20,7 @@ from samples import QUICK_FLAGS
 from scvi_codegen import compiler
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import Method
+from scvi_codegen.rendering import program_source
 from scvi_codegen.verification import Certificate, verify
 
 __all__ = ["Case", "Make", "Sabotage", "certified", "changed_property", "changed_result", "of_entries"]
@@ -80,7 +81,7 @@ class Sabotage:
             return rendered
 
         for render in ("render", "render_ensemble", "render_derivatives"):
-            self.replace(compiler, render, make)
+            self.replace(program_source, render, make)
 
 
 def changed_result(change: Make) -> Make:
