@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 __all__ = ["preprocessed"]
 
-DIRECTIVE = re.compile(r"#(?P<word>ifdef|ifndef|if|elif|else|endif|define|undef|include)\b *(?P<rest>.*)$")
+DIRECTIVE = re.compile(r"#(?P<word>ifdef|ifndef|if|elif|else|endif|define|undef|include|error)\b *(?P<rest>.*)$")
 DEFINED = re.compile(r"(?P<negated>!)?defined\((?P<macro>\w+)\)")
 COMPARED = re.compile(r"(?P<left>\w+)(?: (?P<sign>[<>=!]=|[<>]) (?P<right>\w+))?")
 OWN = re.compile(r'"(?:\.\./\w+/)?\w+\.h"')
@@ -34,18 +34,33 @@ SIGNS: dict[str, Callable[[int, int], bool]] = {
 
 @dataclass
 class _Macros:
-    """Macros after the lines so far: values of those defined, ``None`` for unknown; names of those defined perhaps."""
+    """Macros after the lines so far.
+
+    Attributes:
+        values: of those that are defined, ``None`` for unknown.
+        uncertain: names of those that are defined under conditions that remain.
+        failed: whether the lines end the compilation by ``#error``.
+    """
 
     values: dict[str, str | None] = field(default_factory=dict)
     uncertain: set[str] = field(default_factory=set)
+    failed: bool = False
 
     def copy(self) -> _Macros:
         return _Macros(dict(self.values), set(self.uncertain))
 
     def joined(self, other: _Macros) -> _Macros:
         """Return the macros after alternatives of which either was compiled."""
+        if self.failed or other.failed:
+            return other if self.failed else self
         both = {name: v if v == other.values[name] else None for name, v in self.values.items() if name in other.values}
         return _Macros(both, (self.values.keys() | other.values | self.uncertain | other.uncertain) - both.keys())
+
+    def resume(self, branch: _Macros | None) -> None:
+        """Continue a branch whose condition was opened before: macros that are uncertain are as at its end."""
+        for name in self.uncertain & branch.values.keys() if branch else ():
+            self.uncertain.discard(name)
+            self.values[name] = branch.values[name] if branch else None
 
     def is_defined(self, name: str) -> bool | None:
         """Return whether a macro is defined; ``None`` if that is not known here."""
@@ -87,11 +102,13 @@ class _Chain:
         chosen: whether an earlier alternative, or the present one, is compiled for certain.
         before: macros before the alternatives that remain conditions.
         after: macros after those so far.
+        opened: line of the first alternative.
     """
 
     active: bool | None
     chosen: bool
     before: _Macros
+    opened: str
     after: _Macros | None = None
 
 
@@ -101,6 +118,7 @@ class _Preprocessor:
         self.files: dict[str, str] = {}
         self.macros = _Macros()
         self.chains: list[_Chain] = []
+        self.branches: dict[str, _Macros] = {}
 
     def lines(self, text: str, folder: str) -> Iterator[str]:
         for line in text.split("\n"):
@@ -111,6 +129,7 @@ class _Preprocessor:
             elif not any(chain.active is False for chain in self.chains):
                 if word in ("define", "undef"):
                     self.define(word, rest)
+                self.macros.failed |= word == "error"
                 if word == "include" and (OWN if folder else SUPPORT).match(rest):
                     yield from self.include(posixpath.normpath(posixpath.join(folder, rest.strip('"'))))
                 else:
@@ -140,13 +159,15 @@ class _Preprocessor:
         if word.startswith("if"):
             skipped = any(chain.active is False for chain in self.chains)
             holds = False if skipped else self.macros.holds(word, rest)
-            self.chains.append(_Chain(holds, skipped or holds is True, self.macros.copy()))
+            self.chains.append(_Chain(holds, skipped or holds is True, self.macros.copy(), line))
             if holds is None:
+                self.macros.resume(self.branches.get(line))
                 yield line
             return
         chain = self.chains[-1]
         undecided = chain.active is None or chain.after is not None
         if undecided and chain.active is not False:
+            self.branches[chain.opened] = self.macros.copy()
             chain.after = self.macros.joined(chain.after) if chain.after else self.macros
         self.macros = chain.before.copy() if undecided else self.macros
         holds = False if chain.chosen else word == "else" or self.macros.holds(word, rest)

@@ -17,6 +17,7 @@ from scvi_codegen.rendering.source import Source
 HEAD = """#include "band.h"
 #include <math.h>
 #include <stddef.h>
+#define SUPPORT_NUMBERS_H
 typedef double real;
 #define MATH(f) f
 static int BAND;
@@ -58,7 +59,7 @@ def library() -> Any:
         header=DECLARATIONS,
         code=HEAD + CODE,
         declarations=DECLARATIONS,
-        support=(("support/newton/band.h", text),),
+        support=(("support/newton/band.h", text), ("support/core/numbers.h", "")),
     )
     return load(source, flags=QUICK_FLAGS)
 

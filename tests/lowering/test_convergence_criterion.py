@@ -92,6 +92,7 @@ VERDICTS = """
 enum {{ M = 3, FINAL_ITERATIONS = {after} }};
 typedef double number;
 typedef struct {{ double tolerance; long long max_iterations; int absolute; }} solver_options;
+#define SUPPORT_NUMBERS_H
 static double larger(double a, double b) {{ return a > b ? a : b; }}
 static double largest_number(const number *x) {{ return larger(x[0], larger(x[1], x[2])); }}
 static double number_of(double x) {{ return x; }}

@@ -51,6 +51,8 @@ def written(source: Source, folder: Path) -> str:
 
 LEVELS = """
 #include <stdio.h>
+#define SUPPORT_POINTS_H
+#define SUPPORT_STEP_H
 typedef double real;
 typedef struct { int guess; long long change, change_before; } run_memory;
 struct predictor_tables_of { const real *alone, *last, *before; };

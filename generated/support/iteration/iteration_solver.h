@@ -1,6 +1,9 @@
 #ifndef SUPPORT_ITERATION_SOLVER_H
 #define SUPPORT_ITERATION_SOLVER_H
 
+#include "../core/status_codes.h"
+#include "one_trajectory.h"
+
 /* Step by fixed-point iteration, with a fallback. Requires: a fixed-point iteration, and fall_back. */
 typedef iteration_data solver_data;
 

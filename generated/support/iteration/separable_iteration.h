@@ -1,6 +1,8 @@
 #ifndef SUPPORT_SEPARABLE_ITERATION_H
 #define SUPPORT_SEPARABLE_ITERATION_H
 
+#include "../core/vectors.h"
+
 /* Fixed-point iteration of a step for constant diagonal masses and forces F(q, t) (Li, Wu & Leok, eqs. (25)-(30)): X_n
  * = q0 + h c_n v0 + h^2 sum_j (a A)_nj F(X_j) / m, with the quadrature points or the trajectories as SIMD lanes.
  * Coefficients are double-double: the sum of a table and its _LOW partner. Values at the points are in flat arrays,

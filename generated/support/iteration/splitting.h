@@ -1,6 +1,9 @@
 #ifndef SUPPORT_SPLITTING_H
 #define SUPPORT_SPLITTING_H
 
+#include "../core/status_codes.h"
+#include "../core/step.h"
+
 /* Explicit splitting method: drifts by constant masses (BY_MASSES) or by velocities v(p, t), and kicks. */
 #ifdef BY_MASSES
 /* Drift of splitting methods with constant masses: dq += h part M^-1 p. Requires: step.h, the kernel mass. */

@@ -1,6 +1,8 @@
 #ifndef SUPPORT_NEWTON_FROM_LINE_H
 #define SUPPORT_NEWTON_FROM_LINE_H
 
+#include "newton.h"
+
 /* Newton's method without previous steps. Requires: newton.h. */
 
 /* Initial guess: q moves on a straight line with its initial velocity. */

@@ -1,6 +1,9 @@
 #ifndef SUPPORT_NEWTON_SOLVER_H
 #define SUPPORT_NEWTON_SOLVER_H
 
+#include "newton_from_line.h"
+#include "stages.h"
+
 /* Step by Newton's method. Requires: newton.h, the table EXTRAPOLATION: the predictor is sum_c EXTRAPOLATION[c][b] z_c
  * of the previous step; for multipliers the rows from B on. */
 typedef struct {

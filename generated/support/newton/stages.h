@@ -1,6 +1,8 @@
 #ifndef SUPPORT_STAGES_H
 #define SUPPORT_STAGES_H
 
+#include "../core/numbers.h"
+
 /* Interpolation from the unknowns z to values at points. Requires: real, B, MOST_POINTS. Unknown b of site i is z[i B +
  * b]. */
 

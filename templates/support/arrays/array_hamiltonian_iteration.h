@@ -1,6 +1,11 @@
 #ifndef SUPPORT_ARRAY_HAMILTONIAN_ITERATION_H
 #define SUPPORT_ARRAY_HAMILTONIAN_ITERATION_H
 
+#include "../core/progress.h"
+#include "../iteration/one_trajectory.h"
+#include "../iteration/point_weights.h"
+#include "arrays.h"
+
 /* Fixed-point iteration of a step of an array Hamiltonian system: positions and momenta y at the points are updated
  * from their rates until they converge. Requires: one_trajectory.h, point_weights.h, the tables, forces_at, which
  * computes the rates at the points: -H_q of the momenta, then H_p of the positions. Momenta follow positions in

@@ -1,6 +1,12 @@
 #ifndef SUPPORT_ARRAY_NEWTON_H
 #define SUPPORT_ARRAY_NEWTON_H
 
+#include "../core/points.h"
+#include "../core/step.h"
+#include "../iteration/convergence.h"
+#include "../iteration/separable_iteration.h"
+#include "arrays.h"
+
 /* Linear systems of Newton's method for the points of a step of an array system: (1 - h^2 A F' / m) dX = the change
  * by one fixed-point iteration, where A is PRODUCT and F' the Jacobian of the forces at the points, which is only
  * multiplied by vectors, term group by term group. Requires: separable_iteration.h, jacobian_times,

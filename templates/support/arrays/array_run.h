@@ -1,6 +1,9 @@
 #ifndef SUPPORT_ARRAY_RUN_H
 #define SUPPORT_ARRAY_RUN_H
 
+#include "../core/step.h"
+#include "arrays.h"
+
 /* Worker threads. They are started by a call and joined at its end, so that none exists when a process forks. Requires:
  * arrays.h, MOST_THREADS, is_worth_sharing. */
 #ifdef SCVI_THREADS

@@ -1,6 +1,9 @@
 #ifndef SUPPORT_ARRAY_SPLITTING_H
 #define SUPPORT_ARRAY_SPLITTING_H
 
+#include "../core/step.h"
+#include "arrays.h"
+
 /* Splitting step of an array system: kicks h KICK[n] F, each followed by a drift h DRIFT[n] v. Requires:
  * arrays.h, add_forces, LEAPS, CHUNK, the tables. */
 

@@ -1,6 +1,9 @@
 #ifndef SUPPORT_ARRAY_STEP_H
 #define SUPPORT_ARRAY_STEP_H
 
+#include "../step_size/observed_error.h"
+#include "arrays.h"
+
 /* Runs of array systems whose steps are solved by iteration. Requires: prepare and solve of a solver,
  * observed_error.h. */
 

@@ -1,6 +1,10 @@
 #ifndef SUPPORT_LATTICE_TRANSFORM_H
 #define SUPPORT_LATTICE_TRANSFORM_H
 
+#include "../core/points.h"
+#include "../core/step.h"
+#include "arrays.h"
+
 /* Fast Fourier transforms along the axes of lattices, at all points of a step, with one pass per factor of the size,
  * each from one array into another (Stockham autosort; C. Van Loan, Computational Frameworks for the Fast Fourier
  * Transform, 1992, section 1.7). Requires: array_newton.h. */

@@ -1,6 +1,11 @@
 #ifndef SUPPORT_NEWTON_GMRES_H
 #define SUPPORT_NEWTON_GMRES_H
 
+#include "../core/progress.h"
+#include "../iteration/one_trajectory.h"
+#include "array_newton.h"
+#include "preconditioner.h"
+
 /* Restarted GMRES with right preconditioning (Y. Saad, Iterative Methods for Sparse Linear Systems, 2003, algorithm
  * 9.5) on vectors over all points of all coordinates. Requires: array_newton.h; linear_system with count, state,
  * basis, residual, correction and product; multiply, precondition and reconsider. */

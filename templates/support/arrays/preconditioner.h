@@ -1,6 +1,8 @@
 #ifndef SUPPORT_PRECONDITIONER_H
 #define SUPPORT_PRECONDITIONER_H
 
+#include "array_newton.h"
+
 /* Preconditioner for Newton-GMRES: by Fourier modes (ON_LATTICES) or from the diagonal of F'. */
 #ifdef ON_LATTICES
 /* Mean stencil of h^2 F' / m on a lattice by stencil probing: probes are placed so far apart that their responses do

@@ -1,6 +1,9 @@
 #ifndef SUPPORT_CONSTRAINED_STEP_H
 #define SUPPORT_CONSTRAINED_STEP_H
 
+#include "../core/progress.h"
+#include "constraint_matrix.h"
+
 /* Constrained step: RATTLE substeps (H. C. Andersen, J. Comput. Phys. 52, 1983; Hairer, Lubich & Wanner, Geometric
  * Numerical Integration, sec. VII.1.4), composed with the coefficients PART. Requires: arrays.h, add_forces,
  * evaluate_constraints, constraint_matrix.h, progress.h, PARTS of a step, PART and their ends, PART_END. */

@@ -1,6 +1,9 @@
 #ifndef SUPPORT_CONSTRAINT_MATRIX_H
 #define SUPPORT_CONSTRAINT_MATRIX_H
 
+#include "../arrays/arrays.h"
+#include "../core/step.h"
+
 /* Sparsity pattern of G M^-1 G^T below its diagonal, by rows: which constraints act on the same coordinates. Requires:
  * arrays.h, list_coordinates. */
 

@@ -1,6 +1,8 @@
 #ifndef SUPPORT_CONSTRAINT_PROJECTION_H
 #define SUPPORT_CONSTRAINT_PROJECTION_H
 
+#include "constrained_step.h"
+
 /* Projection onto the constraints, their values, and their Lagrange multipliers. Requires: constrained_step.h,
  * array_run.h. */
 

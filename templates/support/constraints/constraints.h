@@ -1,6 +1,9 @@
 #ifndef SUPPORT_CONSTRAINTS_H
 #define SUPPORT_CONSTRAINTS_H
 
+#include "../core/status_codes.h"
+#include "../newton/band.h"
+
 /* Projection onto holonomic constraints g(q, t) = 0 or linear velocity constraints A(q, t) v + b = 0, and Lagrange
  * multipliers. For the latter, g = 0 and A v + b is the constraint rate.
  *

@@ -1,6 +1,8 @@
 #ifndef SUPPORT_RATTLE_H
 #define SUPPORT_RATTLE_H
 
+#include "../newton/newton.h"
+
 /* Constrained steps on Lobatto points for constant diagonal masses (RATTLE for two points; Lobatto IIIA-IIIB: L.
  * Jay, SIAM J. Numer. Anal. 33, 1996), without the full Newton matrix: simplified Newton iteration for the
  * multipliers that give g = 0 at the points, with the factors at their initial guess, in which the forces are

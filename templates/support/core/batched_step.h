@@ -1,6 +1,8 @@
 #ifndef SUPPORT_BATCHED_STEP_H
 #define SUPPORT_BATCHED_STEP_H
 
+#include "vectors.h"
+
 /* Arguments and report of a batched step. Requires: the header, NAME, STATUS, vectors.h. */
 enum {
   OK = STATUS(OK),

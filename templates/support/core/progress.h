@@ -1,6 +1,10 @@
 #ifndef SUPPORT_PROGRESS_H
 #define SUPPORT_PROGRESS_H
 
+#include "../iteration/convergence.h"
+#include "status_codes.h"
+#include "step.h"
+
 /* Termination of the iteration of one trajectory. Requires: convergence.h, step.h. */
 
 /* Progress of the iteration of a step: the first change, the last three; the change that was amplified by

@@ -1,6 +1,9 @@
 #ifndef SUPPORT_TRAJECTORIES_H
 #define SUPPORT_TRAJECTORIES_H
 
+#include "numbers.h"
+#include "vectors.h"
+
 /* SIMD lanes are trajectories: a vector contains values of LANES trajectories at one point. points.h defines the same
  * names. Requires: vectors.h. */
 enum { GROUPS = S }; /* vectors for all points */

@@ -1,6 +1,12 @@
 #ifndef SUPPORT_COUPLED_DERIVATIVES_H
 #define SUPPORT_COUPLED_DERIVATIVES_H
 
+#include "../iteration/mass_matrix.h"
+#include "../iteration/one_trajectory.h"
+#include "../iteration/point_weights.h"
+#include "jvp_and_vjp.h"
+#include "vector_convergence.h"
+
 /* Derivatives of a step solved by coupled_iteration.h and their transpose, by fixed-point iteration. With the tables A
  * (positions from velocities) and W (momenta from forces), the variations x, v, f, p of positions, velocities, forces
  * and momenta at the points satisfy

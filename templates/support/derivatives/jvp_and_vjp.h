@@ -1,6 +1,9 @@
 #ifndef SUPPORT_JVP_AND_VJP_H
 #define SUPPORT_JVP_AND_VJP_H
 
+#include "../newton/newton_from_line.h"
+#include "linearised.h"
+
 /* Tangent and adjoint vectors over a step solved by Newton's method; TIME_TRANSFORMATION: time depends on the state. */
 #ifdef TIME_TRANSFORMATION
 /* Linearised time of a time-transformed system: time is an integral along the curve, by the weights of the first

@@ -1,6 +1,10 @@
 #ifndef SUPPORT_LINEAR_MAPS_H
 #define SUPPORT_LINEAR_MAPS_H
 
+#include "../core/step.h"
+#include "../newton/band.h"
+#include "../newton/stages.h"
+
 /* Linear maps between tangent vectors of the inputs of a step, of its unknowns, of the arguments and results of kernels
  * at points, and of the rows of its equations; and their transposes. Requires: real, M, B, STEP_INPUTS, WIDTH, band.h,
  * stages.h; if DAMPED, damping.h. */

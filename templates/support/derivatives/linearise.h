@@ -1,6 +1,8 @@
 #ifndef SUPPORT_LINEARISE_H
 #define SUPPORT_LINEARISE_H
 
+#include "vectors_by_newton.h"
+
 /* Tangent or adjoint vectors over many steps: each by Newton's method, or several at once (VECTORS_BY_ITERATION). */
 #ifndef VECTORS_BY_ITERATION
 /* Tangent and adjoint vectors over steps that are each solved by Newton's method. Requires: vectors_by_newton.h. */

@@ -1,6 +1,9 @@
 #ifndef SUPPORT_LINEARISED_H
 #define SUPPORT_LINEARISED_H
 
+#include "../newton/newton.h"
+#include "linear_maps.h"
+
 /* Linearisation of a step. Requires: newton.h, linear_maps.h, and STAGE_GROUPS. */
 
 enum {

@@ -1,6 +1,8 @@
 #ifndef SUPPORT_SECOND_DERIVATIVES_H
 #define SUPPORT_SECOND_DERIVATIVES_H
 
+#include "jvp_and_vjp.h"
+
 /* Second derivatives of a step by forward-over-reverse differentiation: the tangent of the adjoint. The stage equations
  * times the adjoint multipliers are a function of the inputs and the unknowns; its Hessian times a tangent vector is
  * the source of the tangents of the multipliers, which are solved for with the same factors. Requires: jvp_and_vjp.h,

@@ -1,6 +1,11 @@
 #ifndef SUPPORT_SEPARABLE_DERIVATIVES_H
 #define SUPPORT_SEPARABLE_DERIVATIVES_H
 
+#include "../core/status_codes.h"
+#include "../iteration/one_trajectory.h"
+#include "../iteration/separable_iteration.h"
+#include "vector_convergence.h"
+
 /* Derivatives of a step solved by separable_iteration.h and their transpose, by fixed-point iteration. With D = X - q0,
  * the derivatives K = F_q at the points, s = h^2 / m and P the table PRODUCT, the variations x of the points and the
  * adjoint variables y of the forces are the fixed points of

@@ -1,6 +1,8 @@
 #ifndef SUPPORT_VECTOR_CONVERGENCE_H
 #define SUPPORT_VECTOR_CONVERGENCE_H
 
+#include "../iteration/convergence.h"
+
 /* Convergence criterion for the fixed-point iterations of tangent and adjoint vectors. Requires: convergence.h. */
 
 #define MOVED_BY_ROUNDING (4.0 * DBL_EPSILON * DBL_EPSILON) /* squared: relative change that rounding alone may cause */

@@ -1,6 +1,8 @@
 #ifndef SUPPORT_VECTORS_BY_ITERATION_H
 #define SUPPORT_VECTORS_BY_ITERATION_H
 
+#include "vectors_by_newton.h"
+
 /* Tangent and adjoint vectors over steps that are solved by fixed-point iteration. Blocks of STEPS_AT_ONCE steps are
  * solved first, each with a predictor from the previous one; then the vectors are propagated, forward or backward.
  * Requires: vectors_by_newton.h, which takes over where an iteration fails; iteration, store_step, linearise_points,

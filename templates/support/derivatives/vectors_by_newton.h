@@ -1,6 +1,8 @@
 #ifndef SUPPORT_VECTORS_BY_NEWTON_H
 #define SUPPORT_VECTORS_BY_NEWTON_H
 
+#include "jvp_and_vjp.h"
+
 /* Tangent and adjoint vectors over steps solved by Newton's method. Requires: jvp_and_vjp.h. */
 
 /* Steps and the vectors propagated over them, of shape (steps + 1, count, STEP_INPUTS). */

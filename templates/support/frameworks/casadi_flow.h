@@ -1,6 +1,8 @@
 #ifndef SUPPORT_CASADI_FLOW_H
 #define SUPPORT_CASADI_FLOW_H
 
+#include "flow.h"
+
 /* Flow of FLOW_STEPS steps with a state stored every FLOW_EVERY steps, and its derivatives, under the names by which
  * CasADi finds external functions. Requires: flow.h; EXTERNAL, which forms these names. */
 

@@ -1,6 +1,9 @@
 #ifndef SUPPORT_FLOW_H
 #define SUPPORT_FLOW_H
 
+#include "../core/status_codes.h"
+#include "../core/step.h"
+
 /* Flow of many steps as one function, from (q, p, parameters, t, h) to the states (q, p) at the start and after every
  * `every` steps, with JVPs and VJPs along it. Requires: run.h, jvp_and_vjp.h. */
 #include <stdlib.h>

@@ -1,6 +1,8 @@
 #ifndef SUPPORT_ROWS_FLOW_H
 #define SUPPORT_ROWS_FLOW_H
 
+#include "flow.h"
+
 /* Flow of many rows, for callers with arrays. Requires: flow.h. */
 
 /* part: 0 states, 1 tangent vectors of the states (JVP), 2 gradients with respect to the inputs (VJP); of rows x

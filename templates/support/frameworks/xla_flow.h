@@ -1,6 +1,8 @@
 #ifndef SUPPORT_XLA_FLOW_H
 #define SUPPORT_XLA_FLOW_H
 
+#include "flow.h"
+
 /* Flow as XLA custom calls through the XLA FFI. Requires: flow.h. */
 #include <stdio.h>
 

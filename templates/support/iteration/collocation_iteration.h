@@ -1,6 +1,8 @@
 #ifndef SUPPORT_COLLOCATION_ITERATION_H
 #define SUPPORT_COLLOCATION_ITERATION_H
 
+#include "curve.h"
+
 /* Fixed-point iteration of a collocation method: momenta at the ends, by quadrature of the action (NODES) or by the
  * Legendre transform, and the iteration. */
 #ifdef NODES

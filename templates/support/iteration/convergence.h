@@ -1,6 +1,8 @@
 #ifndef SUPPORT_CONVERGENCE_H
 #define SUPPORT_CONVERGENCE_H
 
+#include "../core/numbers.h"
+
 /* Convergence criterion of the fixed-point iteration. Requires: FINAL_ITERATIONS, the number of iterations after the
  * last one that is measured. Changes are squared, and so are the thresholds here. */
 

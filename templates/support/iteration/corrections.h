@@ -1,6 +1,9 @@
 #ifndef SUPPORT_CORRECTIONS_H
 #define SUPPORT_CORRECTIONS_H
 
+#include "mass_matrix.h"
+#include "point_weights.h"
+
 /* Arguments of forces and momenta. Requires: points.h or trajectories.h, the tables; PROJECTED if the unknowns are not
  * the velocities at the points. */
 

@@ -1,6 +1,9 @@
 #ifndef SUPPORT_COUPLED_ITERATION_H
 #define SUPPORT_COUPLED_ITERATION_H
 
+#include "convergence.h"
+#include "corrections.h"
+
 /* Fixed-point iteration of a step for any regular Lagrangian. Requires: points.h or trajectories.h with what they
  * require, point_weights.h, a mass, corrections.h, velocity corrections, the tables, the kernel point_lanes. */
 

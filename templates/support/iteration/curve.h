@@ -1,6 +1,11 @@
 #ifndef SUPPORT_CURVE_H
 #define SUPPORT_CURVE_H
 
+#include "../core/status_codes.h"
+#include "convergence.h"
+#include "mass_matrix.h"
+#include "one_trajectory.h"
+
 /* Collocation curve of a step: its initial velocity, known from p0 (HAMILTONIAN) or an unknown, and with NODES its
  * quadrature points. */
 #ifdef HAMILTONIAN

@@ -11,7 +11,9 @@ static int fall_back(int status, const step_data *step, double *dq, double *dp, 
   return status;
 }
 #else
-/* Fallback to Newton's method when the fixed-point iteration fails. Requires: newton.h, newton_from_line.h. */
+#include "../newton/newton_from_line.h"
+
+/* Fallback to Newton's method when the fixed-point iteration fails. */
 
 static SELDOM int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
     solver_report *report, double *workspace)

@@ -1,6 +1,10 @@
 #ifndef SUPPORT_HAMILTONIAN_ITERATION_H
 #define SUPPORT_HAMILTONIAN_ITERATION_H
 
+#include "../core/progress.h"
+#include "one_trajectory.h"
+#include "point_weights.h"
+
 /* Fixed-point iteration of a step for any Hamiltonian (Li, Wu & Leok, eq. (35)). Requires: one_trajectory.h,
  * point_weights.h, the tables, the kernels velocity_lanes and force_lanes. */
 

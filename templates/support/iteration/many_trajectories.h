@@ -1,6 +1,10 @@
 #ifndef SUPPORT_MANY_TRAJECTORIES_H
 #define SUPPORT_MANY_TRAJECTORIES_H
 
+#include "../core/batched_step.h"
+#include "../core/trajectories.h"
+#include "convergence.h"
+
 /* Fixed-point iteration of many trajectories, which are SIMD lanes: predictor and termination. A step fails for single
  * trajectories, which become inactive, never for all. Requires: trajectories.h, convergence.h, and the tables
  * LAST_ALONE, LAST, BEFORE, which extrapolate stored values into the next step. */

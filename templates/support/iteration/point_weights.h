@@ -1,6 +1,8 @@
 #ifndef SUPPORT_POINT_WEIGHTS_H
 #define SUPPORT_POINT_WEIGHTS_H
 
+#include "../core/vectors.h"
+
 /* Quadrature weights times h, constant during a run. Requires: the tables; with damping, damped_points.h. */
 typedef struct {
   weight position_weight[GROUPS], momentum_weight[GROUPS]; /* h beta, h w: the same rounded numbers everywhere */

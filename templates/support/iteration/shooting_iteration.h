@@ -1,6 +1,10 @@
 #ifndef SUPPORT_SHOOTING_ITERATION_H
 #define SUPPORT_SHOOTING_ITERATION_H
 
+#include "../core/progress.h"
+#include "curve.h"
+#include "mass_matrix.h"
+
 /* Fixed-point iteration of a step of a shooting-based variational method (SCVI; Li, Wu & Leok, eqs. (33)-(34), in the
  * stationary form, with multipliers of the collocation equations). Requires: curve.h, the tables, the kernels
  * node_lanes and action_lanes. */

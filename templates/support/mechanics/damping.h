@@ -1,6 +1,8 @@
 #ifndef SUPPORT_DAMPING_H
 #define SUPPORT_DAMPING_H
 
+#include "../core/step.h"
+
 /* Uniform damping at a rate gamma, from the Lagrangian e^(gamma t) L: point n is weighted by e^(gamma c_n h), c_n h the
  * time since the step began, and the sums then give e^(gamma h) p1. Since time is measured from the start of each step,
  * no factor grows from step to step. Requires: real, M, step.h, the kernel damping. */

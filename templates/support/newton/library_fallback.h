@@ -1,6 +1,9 @@
 #ifndef SUPPORT_LIBRARY_FALLBACK_H
 #define SUPPORT_LIBRARY_FALLBACK_H
 
+#include "../core/status_codes.h"
+#include "../core/step.h"
+
 /* Newton solver that one library provides to another, which has only the fixed-point iteration. Requires: step.h. */
 
 /* Computes the increments of a step with their low words, and the relative error of its end if the stages determine it,

@@ -1,6 +1,10 @@
 #ifndef SUPPORT_NEWTON_H
 #define SUPPORT_NEWTON_H
 
+#include "../core/status_codes.h"
+#include "../core/step.h"
+#include "band.h"
+
 /* Newton's method for the stage equations, with reuse of the Jacobian's factors (simplified Newton; Hairer & Wanner,
  * Solving ODEs II, sec. IV.8). Requires: stages.h, the tables END_POSITION, MOMENTUM_ROW, STRAIGHT, MOMENTA and MOVES,
  * and evaluate, which computes the equations and their Jacobian; if DAMPED, damping.h. */

@@ -1,6 +1,8 @@
 #ifndef SUPPORT_ADVANCE_TO_H
 #define SUPPORT_ADVANCE_TO_H
 
+#include "run.h"
+
 /* Adaptive integration to a given time t_end.
  *
  * Stores every `every`-th state and the one at t_end, and returns after at most `steps` steps. On failure the run is

@@ -1,6 +1,8 @@
 #ifndef SUPPORT_ENSEMBLE_RUN_H
 #define SUPPORT_ENSEMBLE_RUN_H
 
+#include "../iteration/many_trajectories.h"
+
 /* Ensemble runs with compensated sums; trajectories are SIMD lanes. Requires: many_trajectories.h, numbers.h, and
  * prepare_iteration and iteration of a solver, which compute the increments of a step. */
 

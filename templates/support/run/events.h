@@ -1,6 +1,9 @@
 #ifndef SUPPORT_EVENTS_H
 #define SUPPORT_EVENTS_H
 
+#include "../core/numbers.h"
+#include "../core/status_codes.h"
+
 /* Events: zero crossings of functions along the steps of a run; TIME_TRANSFORMATION: h is a step in tau. */
 #ifdef TIME_TRANSFORMATION
 /* Velocities dq/dt as arguments of event functions of a time-transformed system, whose integrator has dq/dtau, and the

@@ -1,6 +1,8 @@
 #ifndef SUPPORT_INPUTS_H
 #define SUPPORT_INPUTS_H
 
+#include "../core/step.h"
+
 /* Inputs: piecewise polynomials of time. A run ends a step at their breakpoints and continues with the parameters of
  * the next pieces. Requires: step.h, and INPUT_INDEX, the indices of the parameters of each input. */
 

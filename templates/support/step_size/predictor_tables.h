@@ -1,6 +1,9 @@
 #ifndef SUPPORT_PREDICTOR_TABLES_H
 #define SUPPORT_PREDICTOR_TABLES_H
 
+#include "../core/points.h"
+#include "../core/step.h"
+
 /* Predictor tables for steps of different sizes. Requires: PREDICTOR_ALONE, PREDICTOR_LAST, PREDICTOR_BEFORE.
  *
  * Step sizes are roots of 2 to the power of a level, so that few tables extrapolate the curve of former steps: from the

@@ -1,6 +1,9 @@
 #ifndef SUPPORT_STAGE_ERROR_H
 #define SUPPORT_STAGE_ERROR_H
 
+#include "../core/step.h"
+#include "../newton/band.h"
+
 /* Error estimate of a step by Newton's method from the leading coefficient of its curve, as in curve_error.h. Requires:
  * stages.h, the tables STAGE_HIGHEST, STAGE_NEXT, STAGE_CURVATURE and STAGE_OTHER_CURVATURE; STAGE_POWER. */
 

@@ -1,6 +1,8 @@
 #ifndef SUPPORT_STEP_SIZE_LEVELS_H
 #define SUPPORT_STEP_SIZE_LEVELS_H
 
+#include "../core/numbers.h"
+
 /* Step-size control. Step sizes of adaptive steps are roots of 2 to the power of a grid level, and the error estimate
  * of a step determines the level of the next. Requires: MANTISSA; GROWTH, the factor of the error estimate per level;
  * ERROR_POWER. Include before a trial of a step and trials.h. */

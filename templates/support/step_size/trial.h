@@ -1,6 +1,9 @@
 #ifndef SUPPORT_TRIAL_H
 #define SUPPORT_TRIAL_H
 
+#include "observed_error.h"
+#include "step_size_levels.h"
+
 /* Trial of an adaptive step, by fixed-point iteration or by Newton's method (NEWTON_ALONE; for arrays
  * NEWTON_KRYLOV). */
 #ifdef ARRAYS
@@ -11,6 +14,8 @@ typedef struct {
   double t, t_low, *q, *p, *carry_q, *carry_p;
 } state;
 #else
+#include "../run/run.h"
+
 #define SHARE_OF_TRIAL EACH
 #endif
 

@@ -1,6 +1,8 @@
 #ifndef SUPPORT_TRIALS_H
 #define SUPPORT_TRIALS_H
 
+#include "trial.h"
+
 /* Trials of an adaptive step until its error estimate is admissible, and comparison with two half steps. Requires:
  * step_size_levels.h, sizes.h; the type trial with at.t, at.t_low, t_end, limits, change, error, guess, last
  * and apart; try_step, which sets error, guess and last; compare_trial, which compares a trial with its half steps,

@@ -1,0 +1,127 @@
+"""Support headers have guards and include what they need: each compiles alone after the generated part of a source.
+
+The generated part consists of macros, sizes, tables and kernels, and requires the types of ``core`` and a few others.
+Where a source chooses one header among several, as the kind of iteration, users of the choice cannot include it.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from functools import cache
+from pathlib import Path
+
+import golden_cells
+import pytest
+from programs import needs
+
+from scvi_codegen import SVI, SpectralCollocation, compile_stepper, problem
+from scvi_codegen.files.templates import template_folder
+from scvi_codegen.rendering.flow import with_casadi_flow, with_flow_of_rows
+from scvi_codegen.rendering.preprocessing import preprocessed
+from scvi_codegen.rendering.source import Source
+
+FOLDER = template_folder()
+HEADERS = sorted(str(path.relative_to(FOLDER)) for path in FOLDER.glob("support/*/*.h"))
+ELSEWHERE = {
+    "support/frameworks/fmu.h": "tests/models/test_fmu.py",
+    "support/frameworks/xla_flow.h": "tests/rendering/test_flow_text.py",
+    "support/run/inputs.h": "tests/models/test_package_inputs.py",
+}
+"""Headers that require those of libraries or a model, and the tests that compile them."""
+CELLS = (
+    "kepler_monitor",
+    "double_adaptive",
+    "kepler_many",
+    "double_tangent",
+    "kepler_shooting",
+    "kepler_composition",
+    "vibration",
+    "damped",
+    "rods",
+    "ring_adaptive",
+    "ring_newton",
+    "ring_composition",
+    "rotors",
+    "swings",
+)
+GENERATED = (
+    r"core/|newton/stages|newton/band|arrays/arrays|arrays/lattice_transform|derivatives/linear|mechanics/damping"
+)
+"""Headers with types that the generated part uses."""
+CHOSEN = (
+    r"iteration/\w*(?:_iteration|trajectory|trajectories|_solver|fallback|splitting)|newton/newton_solver"
+    r"|newton/library_fallback|arrays/array_hamiltonian_iteration|arrays/newton_gmres"
+    r"|derivatives/(?:separable|coupled)_derivatives|step_size/(?:trials|density)"
+)
+"""Headers of which a source chooses one of several with the same functions."""
+KEPT = re.compile(rf'#include "support/(?:{GENERATED}|{CHOSEN}|\w+_predictor)')
+
+
+@cache
+def sources() -> tuple[Source, ...]:
+    """Sources that use every header but those tested elsewhere."""
+    made: list[Source] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(golden_cells, "of_source", lambda source, main: made.append(source))
+        for name in CELLS:
+            golden_cells.CELLS[name](name)
+    kepler = compile_stepper(problem("kepler").system, SVI(2))
+    oscillator = compile_stepper(problem("harmonic-oscillator").system, SVI(1), events=["q"])
+    made.append(compile_stepper(problem("double-pendulum").system, SpectralCollocation(3)).source)
+    made.append(with_casadi_flow(kepler.second_derivatives, 10, 5, second=True))
+    made.append(with_flow_of_rows(kepler.derivatives))
+    return (*made, *oscillator.source.sources)
+
+
+@cache
+def first_uses(source: Source) -> dict[str, int]:
+    """The line of a source that includes a header first, by the header's name."""
+    lines, found = source.code.split("\n"), dict[str, int]()
+    for i, line in enumerate(lines):
+        if line.startswith('#include "support/'):
+            text = "\n".join(lines[: i + 1])
+            for name in preprocessed(text, dict(source.support).__getitem__)[1]:
+                found.setdefault(name, i)
+    return found
+
+
+def alone(source: Source, header: str) -> str:
+    """The generated part of a source before its first use of a header, and this header."""
+    lines = source.code.split("\n")[: first_uses(source)[header]]
+    kept = [line for line in lines if not line.startswith('#include "support/') or KEPT.match(line)]
+    open_conditions = sum(line.startswith("#if") - line.startswith("#endif") for line in kept)
+    return "\n".join([*kept, f'#include "{header}"', *["#endif"] * open_conditions, ""])
+
+
+@pytest.mark.parametrize("header", sorted(set(HEADERS) - set(ELSEWHERE)))
+def test_header_compiles_alone(header, tmp_path):
+    users = [source for source in sources() if header in first_uses(source)]
+    assert users
+    errors = []
+    for source in users[:3]:
+        for other in sources():
+            (tmp_path / f"{other.prefix}.h").write_text(other.header)
+        source.write(tmp_path)
+        (tmp_path / "alone.c").write_text(alone(source, header))
+        command = [needs("cc"), "-std=c99", "-w", "-Werror=implicit-function-declaration", "-fsyntax-only", "alone.c"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        errors.append(done.stderr)
+        if done.returncode == 0:
+            return
+    pytest.fail("\n".join(errors))
+
+
+@pytest.mark.parametrize("header", HEADERS)
+def test_header_has_a_guard(header):
+    guard = f"SUPPORT_{Path(header).stem.upper()}_H"
+    text = (FOLDER / header).read_text()
+    assert text.startswith(f"#ifndef {guard}\n#define {guard}\n")
+    assert text.endswith("\n#endif\n")
+
+
+def test_header_without_an_integrator_names_what_is_missing(tmp_path):
+    (tmp_path / "alone.c").write_text(f'#include "{FOLDER}/support/newton/newton.h"\n')
+    command = [needs("cc"), "-std=c99", "-fsyntax-only", "alone.c"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "NAME is not defined" in done.stderr
