@@ -105,6 +105,7 @@ def of_entries(change: Make) -> Make:
 
 def certified(case: Case, apply: Callable[[Sabotage], None] | None = None, *, edits_text: bool = False) -> Certificate:
     """The certificate of a case with a fault in force, or without one."""
+    assert case.system.formula is not None  # read before the fault is in force
     flags = QUICK_FLAGS if apply is None else (*QUICK_FLAGS, f"-DFAULT_{next(_numbers)}")
     with _sabotaged(apply) as sabotage:
         stepper = compiler.compile_stepper(
