@@ -9,11 +9,11 @@
  * kernels of second derivatives, HESSIAN_ARGUMENTS, HESSIAN_VALUES. */
 
 /* Memory for WIDTH tangent and adjoint vectors. Tangent vectors of the inputs (change) and of the unknowns (dz);
- * adjoint variables (partials), their tangents (adjoint_tangents), and the contributions of the nonlinear terms with
- * respect to inputs (by_given) and unknowns (by_dz); at the points of a stage group, arguments and results:
+ * adjoint variables (input_adjoints), their tangents (adjoint_tangents), and the contributions of the nonlinear terms
+ * with respect to inputs (by_given) and unknowns (by_dz); at the points of a stage group, arguments and results:
  * tangents, adjoint variables, and tangents of these. Last, the arguments u. */
 typedef struct {
-  wide *change, *dz, *partials, *adjoint_tangents, *by_given, *by_dz;
+  wide *change, *dz, *input_adjoints, *adjoint_tangents, *by_given, *by_dz;
   wide *tangents, *adjoints, *tangents_of_adjoints;
   real *u;
 } second_order_memory;
@@ -22,8 +22,8 @@ static second_order_memory second_order_in(const linearised_step *at)
 {
   second_order_memory to;
   to.change = at->points + MOST_AT_POINTS;
-  to.partials = to.change + STEP_INPUTS;
-  to.adjoint_tangents = to.partials + STEP_INPUTS;
+  to.input_adjoints = to.change + STEP_INPUTS;
+  to.adjoint_tangents = to.input_adjoints + STEP_INPUTS;
   to.by_given = to.adjoint_tangents + STEP_INPUTS;
   to.dz = to.by_given + STEP_INPUTS;
   to.by_dz = to.dz + N;
@@ -137,8 +137,8 @@ static void add_end_hessian(const second_order_memory *to)
 {
   for (int i = 0; i < M; i++)
     for (int b = 0; b < B; b++) {
-      add_product(to->by_dz + i * B + b, END_POSITION[b], to->partials + i, to->change + INPUT_H);
-      add_product(to->by_given + INPUT_H, END_POSITION[b], to->partials + i, to->dz + i * B + b);
+      add_product(to->by_dz + i * B + b, END_POSITION[b], to->input_adjoints + i, to->change + INPUT_H);
+      add_product(to->by_given + INPUT_H, END_POSITION[b], to->input_adjoints + i, to->dz + i * B + b);
     }
 }
 
@@ -149,14 +149,14 @@ static void hessian_of_step(const linearised_step *at, const second_order_memory
   memcpy(at->v, to->change, sizeof(wide) * STEP_INPUTS);
   jvp_step(at);
   memcpy(to->dz, at->dz, sizeof(wide) * N);
-  memcpy(at->v, to->partials, sizeof(wide) * STEP_INPUTS);
+  memcpy(at->v, to->input_adjoints, sizeof(wide) * STEP_INPUTS);
   vjp_step(at);
   memset(to->by_given, 0, sizeof(wide) * STEP_INPUTS);
   memset(to->by_dz, 0, sizeof(wide) * N);
   for (int f = 0; f < COUNT_OF_GROUPS; f++)
     partials = add_group_hessian(STAGE_GROUPS + f, at, to, partials);
   add_end_hessian(to);
-  memcpy(to->partials, at->v, sizeof(wide) * STEP_INPUTS);
+  memcpy(to->input_adjoints, at->v, sizeof(wide) * STEP_INPUTS);
   memcpy(at->v, to->adjoint_tangents, sizeof(wide) * STEP_INPUTS);
   memcpy(at->dz, to->by_dz, sizeof(wide) * N);
   vjp_with_unknowns(at);
@@ -188,10 +188,10 @@ static int hessian_of_vectors(const linearised_step *at, int count, const real *
   for (int first = 0; first < count; first += WIDTH) {
     const int own = least(WIDTH, count - first), here = first * STEP_INPUTS, beside = (count + first) * STEP_INPUTS;
     read_lanes(of.change, own, changes + here);
-    read_lanes(of.partials, own, from + here);
+    read_lanes(of.input_adjoints, own, from + here);
     read_lanes(of.adjoint_tangents, own, from + beside);
     hessian_of_step(at, &of);
-    add_lanes(of.partials, own, to + here);
+    add_lanes(of.input_adjoints, own, to + here);
     add_lanes(of.adjoint_tangents, own, to + beside);
   }
   return all_finite(to, 2 * count * STEP_INPUTS) ? OK : NOT_FINITE;
