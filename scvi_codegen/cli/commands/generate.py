@@ -64,7 +64,7 @@ def generate(
     With --embedded the C code is small: Newton's method alone, or an explicit method; a macro bounds the iterations.
 
     For an array model the folder has C code for any array sizes and the initial state as text files; with --embedded
-    and --fmu the C code is for the sizes of the model.
+    and --fmu, and with adaptive steps, the C code is for the sizes of the model.
 
     With --fmu the output is one file for Modelica tools, Simulink and FMPy: the compiled library, the C code, and the
     description of its variables.
@@ -80,8 +80,8 @@ def generate(
         raise click.UsageError("--fmu excludes --embedded and --single-file")
     if platforms and not fmu:
         raise click.UsageError("--platform requires --fmu: C code in a folder is for any platform")
-    if fmu or embedded:
-        model = with_known_sizes(model, "--fmu" if fmu else "--embedded")
+    for option, needed in (("--fmu", fmu), ("--embedded", embedded), ("an adaptive step size", model.h is None)):
+        model = with_known_sizes(model, option) if needed else model
     if fmu:
         folder, python = generate_fmu(model, output, platforms=platforms, force=force), ""
     else:

@@ -10,7 +10,14 @@ import click
 
 from scvi_codegen import verification
 from scvi_codegen.cli.command_group import FAILURE, CommandFailure, check_writable, note, reporting, tell
-from scvi_codegen.cli.model_options import METHOD_CHOICES, SOLVER_OPTION, ModelOptions, model_arguments, read_model
+from scvi_codegen.cli.model_options import (
+    METHOD_CHOICES,
+    SOLVER_OPTION,
+    ModelOptions,
+    model_arguments,
+    read_model,
+    with_known_sizes,
+)
 from scvi_codegen.errors import PackageError
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.model_file import load_model
@@ -65,6 +72,8 @@ def _verified(name: str, choices: ModelOptions) -> Certificate:
     folder = Path(name)
     if not folder.is_dir():
         model = read_model(name, choices)
+        if model.array_system is not None and (model.h is None or model.array_system.constraints):
+            model = with_known_sizes(model, "verify (adaptive steps, constraints)")
         return _certificate(model, model.stepper())
     if choices.solver != "auto" or any(getattr(choices, choice) is not None for choice in METHOD_CHOICES):
         raise click.UsageError(f"'{name}' is a generated folder: its method and solver are those it was generated with")

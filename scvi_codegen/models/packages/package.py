@@ -57,7 +57,8 @@ def generate_package(
     Obsolete files of an older integrator, and the verification report of other code, are removed.
 
     Args:
-        model: system, method, and the initial state and step size of the example.
+        model: system, method, and the initial state and step size of the example. The code for arrays of run-time
+            sizes is for any sizes, unless steps are adaptive.
         folder: target; its name becomes the prefix of the C names and the name of the Python package.
         solver: of the stage equations, as for ``compile_stepper``; by default that of the model.
         force: overwrite files of the same names that were edited or not generated.
@@ -76,7 +77,8 @@ def generate_package(
     target = Path(folder)
     prefix = prefix_of(target)
     model = model if solver == "auto" else replace(model, solver=solver)
-    write = _texts_of_arrays if model.array_system and not embedded else _texts
+    of_any_sizes = model.array_system is not None and model.h is not None and not embedded
+    write = _texts_of_arrays if of_any_sizes else _texts
     write_folder(target, write(model, prefix, embedded, single_file=single_file), force=force)
     return target
 
