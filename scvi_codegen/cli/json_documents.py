@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.advice.tolerance_check import Known
-from scvi_codegen.cli.conservation import Balance, array_changes
+from scvi_codegen.cli.conservation import Balance
 from scvi_codegen.cli.ensembles import EnsembleOutcome
 from scvi_codegen.cli.recording import RecordedOutcome
 from scvi_codegen.cli.running import RunOutcome
@@ -30,13 +30,14 @@ def run_numbers(
     t, q, p = outcome.end
     return {
         **_about(model),
-        **(_array_numbers(model, outcome) if model.array_system else _conserved(trajectory)),
+        **(_array_numbers(model, outcome) if model.array_system else {}),
         "steps": trajectory.steps,
         "rejected_steps": run.rejected_steps,
         "h": run.plan.tau or None if run.plan else model.h or run.h,
         "states": len(trajectory),
         "seconds": outcome.seconds,
         "preparation_seconds": outcome.preparation,
+        **_conserved(trajectory),
         "work": None if balance is None else balance.work,
         "energy_balance": None if balance is None else balance.error,
         "step_error": trajectory.step_error,
@@ -94,22 +95,14 @@ def _about(model: Model) -> dict[str, Any]:
 
 
 def _array_numbers(model: Model, outcome: RunOutcome) -> dict[str, Any]:
-    """Return the numbers of a run over arrays whose sizes are known at run time."""
-    change, relative, maps = array_changes(outcome.trajectory, outcome.run)
-    return {
-        "sizes": model.sizes,
-        "tolerance": model.allowed_error,
-        "iterations": int(outcome.trajectory.iterations.sum()) + outcome.run.iterations,
-        "energy": outcome.trajectory.energy()[0],
-        "energy_change": change,
-        "energy_error": relative,
-        "momentum_changes": maps,
-    }
+    """Return further numbers of a run over arrays whose sizes are known at run time."""
+    iterations = int(np.sum(outcome.trajectory.iterations)) + outcome.run.iterations
+    return {"sizes": model.sizes, "tolerance": model.allowed_error, "iterations": iterations}
 
 
 def _named(model: Model, vector: Any) -> dict[str, Any]:
     if model.array_system is not None:
-        return dict(vector)
+        return {array.name: vector[array.name] for array in model.array_system.coordinates}
     return _by_name([coordinate.name for coordinate in model.system.coordinates], vector)
 
 

@@ -6,12 +6,11 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from scvi_codegen.advice.tolerance_check import SECOND_RUN, Known, known_digits
-from scvi_codegen.cli.conservation import Balance, conserved_by_arrays, energy_report, momentum_report
+from scvi_codegen.cli.conservation import Balance, energy_report, momentum_report
 from scvi_codegen.cli.formatting import counted, duration, in_known_digits
 from scvi_codegen.cli.memory import check_memory, check_run_memory
 from scvi_codegen.cli.progress import BAR_LENGTH, interruptions, progress_bar
@@ -41,10 +40,6 @@ __all__ = [
 
 SHOWN_COORDINATES = 6
 """Largest number of coordinates that the final state lists."""
-
-
-SHOWN_ENTRIES = 4
-"""Largest number of entries of an array that the final state lists."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,10 +87,8 @@ def integrate_model(model: Model, *, options: SolverOptions | None = None, threa
     check_memory(model)
     began = time.perf_counter()
     run = model.start(options=options, threads=threads)
-    if model.in_transformed_time and model.ends_at_time:
-        return _in_transformed_time(model, run, time.perf_counter() - began)
     preparation = time.perf_counter() - began
-    began, stopped, failure, recorder = time.perf_counter(), False, None, _Pieces(model, run)
+    began, stopped, failure, recorder = time.perf_counter(), False, None, _Recorder(model, run)
     with interruptions() as caught, progress_bar(_length(model)) as show_progress:
 
         def look(_: int) -> None:
@@ -104,7 +97,7 @@ def integrate_model(model: Model, *, options: SolverOptions | None = None, threa
 
         def stop() -> bool:
             nonlocal stopped
-            stopped = bool(caught)
+            stopped = bool(caught) and not recorder.ended
             return stopped
 
         try:
@@ -126,15 +119,25 @@ def integrate_model(model: Model, *, options: SolverOptions | None = None, threa
     )
 
 
-class _Pieces:
-    """Recorder of a trajectory of each segment."""
+class _Recorder:
+    """Recorder of a trajectory of each segment; in transformed time of one to the end of the time span."""
 
     def __init__(self, model: Model, run: Run) -> None:
         self.model, self.run, self.pieces = model, run, list[Trajectory]()
+        end = model.t + model.covered if model.in_transformed_time and model.ends_at_time else None
+        self.observed = None if end is None else Observation(run, save_every=model.save_every, end=end)
+
+    @property
+    def ended(self) -> bool:
+        """Return whether the time span ended within a step."""
+        return self.observed is not None and self.observed.ended
 
     def record(self, steps: int | None, look: Callable[[int], None], stop: Callable[[], bool]) -> None:
         try:
-            piece = record(self.run, steps, save_every=self.model.save_every, progress=look, stop=stop)
+            if self.observed is not None:
+                piece = self.observed.advance(None, look, stop)
+            else:
+                piece = record(self.run, steps, save_every=self.model.save_every, progress=look, stop=stop)
         except StepFailedError as error:
             self._add(Trajectory.before(error))
             raise
@@ -146,31 +149,6 @@ class _Pieces:
     def trajectory(self) -> Trajectory:
         pieces = self.pieces or [record(self.run, 0)]
         return joined(pieces) if self.model.has_segments else pieces[0]
-
-
-def _in_transformed_time(model: Model, run: Run, preparation: float) -> RunOutcome:
-    """Integrate with steps of tau, dt = g dtau, to the end of the model's time span."""
-    end, began, failure = model.t + model.covered, time.perf_counter(), None
-    observed = Observation(run, save_every=model.save_every, end=end)
-    with interruptions() as caught, progress_bar(BAR_LENGTH) as show_progress:
-
-        def look(_: int) -> None:
-            check_run_memory(model, run.steps)
-            show_progress(min(BAR_LENGTH, int(BAR_LENGTH * (run.t - model.t) / model.covered)))
-
-        try:
-            trajectory = observed.advance(None, look, lambda: bool(caught))
-        except StepFailedError as error:
-            failure, trajectory = error, Trajectory.before(error)
-    return RunOutcome(
-        trajectory=trajectory,
-        run=run,
-        preparation=preparation,
-        seconds=time.perf_counter() - began,
-        failure=failure,
-        interrupted=bool(caught) and not observed.ended,
-        missed=_missed(model, trajectory),
-    )
 
 
 def _missed(model: Model, trajectory: Trajectory) -> str | None:
@@ -188,7 +166,7 @@ def _length(model: Model) -> int:
 
 def _reached(model: Model, run: Run) -> int:
     """Return the progress in units of :func:`_length`."""
-    return int(BAR_LENGTH * (run.t - model.t) / model.covered) if _by_time(model) else run.steps
+    return min(BAR_LENGTH, int(BAR_LENGTH * (run.t - model.t) / model.covered)) if _by_time(model) else run.steps
 
 
 def _by_time(model: Model) -> bool:
@@ -211,10 +189,8 @@ def summary(model: Model, outcome: RunOutcome, known: Known | None, balance: Bal
     if run.steps:
         lines.append(f"{_speed(outcome, model)}; prepared in {outcome.preparation:.2f} s")
         with np.errstate(all="ignore"):
-            lines += conserved_by_arrays(model, trajectory, run) if arrays else conserved(model, trajectory, balance)
+            lines += conserved(model, trajectory, balance)
         lines += worst_step(trajectory)
-    if arrays:
-        return "\n".join([*lines, *_final_arrays(outcome.end[1])])
     return "\n".join([*lines, *final_state(run.stepper.coordinates, *outcome.end[1:], known)])
 
 
@@ -296,14 +272,6 @@ def final_state(names: Sequence[str], positions: Array, momenta: Array, known: K
         yield f"  {name:{width}} = {in_known_digits(q, known_q):24} p_{name:{width}} = {in_known_digits(p, known_p)}"
     if len(names) > SHOWN_COORDINATES:
         yield f"  and {len(names) - SHOWN_COORDINATES} more coordinates"
-
-
-def _final_arrays(arrays: Any) -> Iterator[str]:
-    """Yield lines with the first entries of each array at the end."""
-    yield "final state"
-    for name, values in arrays.items():
-        shown = ", ".join(f"{x:.9g}" for x in values.reshape(-1)[:SHOWN_ENTRIES])
-        yield f"  {name} = {shown}{', ..' if values.size > SHOWN_ENTRIES else ''}"
 
 
 def _how_known(known: Known | None) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -52,8 +51,7 @@ round-off. --span and all times are of t. For systems with explicit time or forc
 time-reversible step-size controller.
 
 An array model (array coordinates, q[N]) takes sizes from its arrays, [sizes] or --size; its plot is an image over
-index and time. With --ensemble, --advise, --time-transformation, and an output other than an .npz file, it is compiled
-for its sizes.
+index and time. With --ensemble, --advise, --time-transformation, and a folder as output, it is compiled for its sizes.
 
 A system with inputs (measured or commanded signals) takes their values from the section [inputs] of its file or from
 --input: a table with columns t and value. Steps end at breakpoints of the inputs.
@@ -176,7 +174,7 @@ def run(
     for option, needed in (
         ("--ensemble", ensemble is not None),
         ("--advise", advise is not None),
-        (f"-o {output}", output is not None and Path(output).suffix.lower() != ".npz"),
+        (f"-o {output}", recorded),
     ):
         model = with_known_sizes(model, option) if needed else model
     if threads is not None and model.array_system is None:
@@ -271,7 +269,7 @@ def _run_one(
     known = known_at_end(model, outcome)
     balance = None if model.array_system else energy_balance(model.system, outcome.trajectory, outcome.run.steps)
     tell(summary(model, outcome, known, balance), **run_numbers(model, outcome, known, balance))
-    written = _write_outputs(outcome, output, plot)
+    written = _write_outputs(model, outcome, output, plot)
     tell(written=written)
     if outcome.failure is not None:
         raise CommandFailure(f"{outcome.failure}\n{_kept(outcome, written)}", FAILURE)
@@ -321,11 +319,11 @@ def _run_ensemble(model: Model, path: str, output: str | None, options: SolverOp
         tell(f"wrote {output}", written=[output])
 
 
-def _write_outputs(outcome: RunOutcome, output: str | None, plot: str | None) -> list[str]:
+def _write_outputs(model: Model, outcome: RunOutcome, output: str | None, plot: str | None) -> list[str]:
     if output is not None:
         outcome.trajectory.save(output)
     if plot is not None:
-        draw: Any = plot_arrays if isinstance(outcome.trajectory.q, Mapping) else plot_trajectory
+        draw: Any = plot_trajectory if model.array_system is None else plot_arrays
         draw(outcome.trajectory, plot)
     return [path for path in (output, plot) if path is not None]
 
