@@ -66,7 +66,7 @@ def test_adaptive_run_of_an_array_system(ring: str) -> None:
     assert found["energy_change"] < 1e-7
     assert "rejected) from t = 0 to t = 2;" in invoke("run", ring, "--tolerance", "1e-9").stdout
     Path("own.toml").write_text(RING.replace("step = 0.1\nsteps = 20", "tolerance = 1e-9\nspan = 2.0"))
-    assert invoke("verify", "own.toml").exit_code == 0
+    assert invoke("verify", "own.toml", "--size", "N=3").exit_code == 0
     assert invoke("generate", "own.toml", "-o", "own_svi").exit_code == 0
     printed = subprocess.run(["make", "-s", "run"], cwd="own_svi", check=True, capture_output=True, text=True).stdout
     last = [float(word) for word in printed.splitlines()[-2].split()]
