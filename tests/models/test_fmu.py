@@ -219,7 +219,7 @@ def test_all_unsupported_functions_are_errors_with_their_name(fmu):
     exported = {name.decode()[4:] for name in re.findall(rb"fmi3[A-Z]\w+", library.read_bytes())}
     text = next(
         text
-        for name, text in fmu_module._texts(pushed(), "push", "auto")[1].items()
+        for name, text in fmu_module._texts(pushed(), "push")[1].items()
         if name.endswith("support/frameworks/fmu.h")
     ).decode()
     absent = set(re.findall(r"^(?:ABSENT|NO_MODE)\((\w+)", text, re.MULTILINE))
@@ -265,7 +265,7 @@ def test_the_instantiation_token_identifies_the_model():
     """The token is the same for equal models, and another for another state, step size, parameter or method."""
 
     def token(model):
-        files = fmu_module._texts(model, "push", "auto")[1]
+        files = fmu_module._texts(model, "push")[1]
         found = ElementTree.fromstring(files["modelDescription.xml"]).get("instantiationToken")
         assert any(found.encode() in text for name, text in files.items() if name.startswith("sources/"))
         return found
