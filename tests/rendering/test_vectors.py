@@ -38,8 +38,7 @@ def test_inverse_roots_are_right_to_two_units(tmp_path, k, flags):
         name="power", coordinates=["q"], lagrangian=f"q_dot**2/2 - q**({2 - k}/2)", parameters={}
     )
     source, _ = sc.generate_source(system, sc.SVI(8), prefix="power")
-    (tmp_path / "power.h").write_text(source.header)
-    (tmp_path / "power.c").write_text(source.amalgamated().code)
+    source.write(tmp_path)
     (tmp_path / "check.c").write_text(CHECK % k)
     command = [compiler, *flags.split(), "-shared", "-fPIC", "check.c", "-o", "check.so", "-lm"]
     subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
