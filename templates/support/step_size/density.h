@@ -1,7 +1,6 @@
 #ifndef SUPPORT_DENSITY_H
 #define SUPPORT_DENSITY_H
 
-#include "../iteration/iteration_solver.h"
 #include "../run/run.h"
 
 /* Reversible step-size control by an integrated step density; HAMILTONIAN_SYSTEM: the density depends on momenta,
