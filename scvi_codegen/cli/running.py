@@ -88,7 +88,7 @@ def integrate_model(model: Model, *, options: SolverOptions | None = None, threa
     began = time.perf_counter()
     run = model.start(options=options, threads=threads)
     preparation = time.perf_counter() - began
-    began, stopped, failure, recorder = time.perf_counter(), False, None, _Recorder(model, run)
+    began, stopped, failure, recorder = time.perf_counter(), False, None, _FileRecorder(model, run)
     with interruptions() as caught, progress_bar(_length(model)) as show_progress:
 
         def look(_: int) -> None:
@@ -119,7 +119,7 @@ def integrate_model(model: Model, *, options: SolverOptions | None = None, threa
     )
 
 
-class _Recorder:
+class _FileRecorder:
     """Recorder of a trajectory of each segment; in transformed time of one to the end of the time span."""
 
     def __init__(self, model: Model, run: Run) -> None:

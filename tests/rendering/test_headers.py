@@ -55,7 +55,7 @@ CHOSEN = (
     r"|derivatives/(?:separable|coupled)_derivatives|step_size/(?:trials|density)"
 )
 """Headers of which a source chooses one of several with the same functions."""
-KEPT = re.compile(rf'#include "support/(?:{GENERATED}|{CHOSEN}|\w+_predictor)')
+NEEDED = re.compile(rf'#include "support/(?:{GENERATED}|{CHOSEN}|\w+_predictor)')
 
 
 @cache
@@ -89,9 +89,9 @@ def first_uses(source: Source) -> dict[str, int]:
 def alone(source: Source, header: str) -> str:
     """The generated part of a source before its first use of a header, and this header."""
     lines = source.code.split("\n")[: first_uses(source)[header]]
-    kept = [line for line in lines if not line.startswith('#include "support/') or KEPT.match(line)]
-    open_conditions = sum(line.startswith("#if") - line.startswith("#endif") for line in kept)
-    return "\n".join([*kept, f'#include "{header}"', *["#endif"] * open_conditions, ""])
+    needed = [line for line in lines if not line.startswith('#include "support/') or NEEDED.match(line)]
+    open_conditions = sum(line.startswith("#if") - line.startswith("#endif") for line in needed)
+    return "\n".join([*needed, f'#include "{header}"', *["#endif"] * open_conditions, ""])
 
 
 @pytest.mark.parametrize("header", sorted(set(HEADERS) - set(ELSEWHERE)))
