@@ -1,9 +1,6 @@
 #ifndef SUPPORT_DAMPED_POINTS_H
 #define SUPPORT_DAMPED_POINTS_H
 
-#include "../core/points.h"
-#include "../core/step.h"
-
 /* Uniform damping at points that are SIMD lanes, or of trajectories that are; see damping.h. Requires: points.h or
  * trajectories.h, the table ABSCISSA, the kernel damping. */
 #define DAMPED
