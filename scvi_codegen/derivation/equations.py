@@ -32,7 +32,7 @@ from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, symmetries
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.collocation import SpectralCollocation
-from scvi_codegen.methods.discretise import paper_equations
+from scvi_codegen.methods.discretise import discretised_form, paper_equations
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import Block, Row, StageGroup, StageSystem, Table
 from scvi_codegen.representation import LONGEST, clipped
@@ -174,6 +174,7 @@ def derive(system: MechanicalSystem, method: Method | str, *, radicals: bool = F
         radicals: replace table entries by radicals if they have a short form.
     """
     method = as_method(method, system)
+    system = discretised_form(system, method)
     stages = paper_equations(system, method)
     writer = _Writer(system, stages)
     equations = writer.equations()

@@ -70,7 +70,11 @@ class ExactMotion:
 
     @cached_property
     def _by_second(self) -> Tape:
-        return Tape(self._momentum_expressions, self.symbols)
+        """Legendre transform dL/dv, or dH/dp with the gauge energy of the system."""
+        gauge = getattr(self.system, "gauge", sympy.S.Zero)
+        return Tape(
+            [f + gauge.diff(x) for f, x in zip(self._momentum_expressions, self.second, strict=True)], self.symbols
+        )
 
     @cached_property
     def _curvature(self) -> list[list[sympy.Expr]]:

@@ -261,7 +261,7 @@ def _legendre_kernel(system: MechanicalSystem) -> Kernel:
     return system_kernel(
         system,
         "legendre",
-        forms.legendre,
+        forms.regular_legendre,
         of=forms.legendre_arguments,
         partials=forms.legendre_jacobian.values(),
         purpose="H_p and H_pp at u = (q, p)."

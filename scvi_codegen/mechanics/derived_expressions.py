@@ -100,9 +100,18 @@ class Forms:
         return self._gradient_tuple(self.system.formula, self.system.auxiliaries)
 
     @cached_property
+    def regular_legendre(self) -> tuple[Expr, ...]:
+        """Legendre transform with the energy of the gauge motion, by which it is invertible: (H + gauge)_p, or L_v."""
+        energy = getattr(self.system, "gauge", sympy.S.Zero)
+        if energy == 0:
+            return self.legendre
+        gauge = self._gradient_tuple(energy, self.system.auxiliaries)
+        return tuple(map(sympy.Add, self.legendre, gauge))
+
+    @cached_property
     def legendre_jacobian(self) -> Entries:
-        """Jacobian of ``legendre``: L_vv, or H_pp."""
-        return jacobian(self.legendre, self.system.auxiliaries) if self.system.auxiliaries else self.mass
+        """Jacobian of ``regular_legendre``: L_vv, or H_pp."""
+        return jacobian(self.regular_legendre, self.system.auxiliaries) if self.system.auxiliaries else self.mass
 
     @cached_property
     def energy(self) -> Expr:

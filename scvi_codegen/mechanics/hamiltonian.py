@@ -8,12 +8,12 @@ methods that do not require a regular one (:attr:`~scvi_codegen.methods.method.M
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.mechanics.system import MechanicalSystem, zero
 from scvi_codegen.representation import summary
 from scvi_codegen.validation.argument_types import (
     FORMULA,
@@ -43,6 +43,8 @@ class HamiltonianSystem(MechanicalSystem):
         name, coordinates, time, parameters, defaults: see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
         momenta: the m momenta, parallel to ``coordinates``.
         hamiltonian: H, exact: it contains no floating-point numbers.
+        gauge: energy of a gauge motion, such as the scaling of quaternions, which is zero on the states considered and
+            makes H + gauge regular in p; used by Legendre transforms only.
 
     Raises:
         SystemDefinitionError: naming the symbol at fault.
@@ -50,6 +52,7 @@ class HamiltonianSystem(MechanicalSystem):
 
     momenta: tuple[Symbol, ...]
     hamiltonian: Expr
+    gauge: Expr = field(default_factory=zero)
 
     __repr__ = summary("name", "coordinates", "momenta")
 
@@ -76,6 +79,8 @@ class HamiltonianSystem(MechanicalSystem):
         coordinates=NAMES,
         hamiltonian=TEXT,
         momenta=NAMES,
+        rotations=MAPPING,
+        spins=NAMES,
         parameters=MAPPING,
         damping=FORMULA,
         constraints=TEXTS,
@@ -85,9 +90,11 @@ class HamiltonianSystem(MechanicalSystem):
     def from_text(
         cls,
         name: str,
-        coordinates: Sequence[str],
-        hamiltonian: str,
+        coordinates: Sequence[str] = (),
+        hamiltonian: str = "",
         *,
+        rotations: Mapping[str, str] | None = None,
+        spins: Sequence[str] = (),
         momenta: Sequence[str] | None = None,
         parameters: Mapping[str, float] | None = None,
         forces: Mapping[str, str] | None = None,
@@ -104,6 +111,9 @@ class HamiltonianSystem(MechanicalSystem):
             name: name of the system.
             coordinates: names of the coordinates, and declarations of arrays, ``["x", "q[N]"]``.
             hamiltonian: the formula; it may span several lines.
+            rotations: as of :meth:`LagrangianSystem.from_text`, but with the name of the angular momentum in the body
+                frame, ``{"R": "Pi"}``.
+            spins: names of vectors of constant length with the brackets {s_1, s_2} = s_3 and cyclic.
             momenta: names of the momenta, declared as the coordinates are; by default ``p_`` before the name of the
                 coordinate.
             parameters: default value by name, or of all entries by declaration of an array.
@@ -122,7 +132,8 @@ class HamiltonianSystem(MechanicalSystem):
         """
         arguments = {"name": name, "coordinates": coordinates, "hamiltonian": hamiltonian, "momenta": momenta}
         acting = {"parameters": parameters, "forces": forces, "damping": damping, "constraints": constraints}
-        return cls._of_text(arguments | acting | {"inputs": inputs, "tables": tables})
+        turning = {"rotations": rotations, "spins": spins}
+        return cls._of_text(arguments | acting | {"inputs": inputs, "tables": tables} | turning)
 
     @classmethod
     @checks_arguments(

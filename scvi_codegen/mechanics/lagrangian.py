@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from sympy import Expr, Symbol
     from sympy.physics.mechanics import KanesMethod, LagrangesMethod, System
 
+    from scvi_codegen.mechanics.rotations.names import Reduced
+
 __all__ = ["LagrangianSystem"]
 
 LAGRANGES_METHOD = ArgumentType("a LagrangesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "lam_vec"))
@@ -42,6 +44,7 @@ class LagrangianSystem(MechanicalSystem):
     Attributes:
         name, coordinates, time, parameters, defaults: see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
         lagrangian: L, exact: it contains no floating-point numbers.
+        reduced: of a system with rotations or directions, its formulas in the names of these.
 
     Raises:
         SystemDefinitionError: naming the symbol at fault, if a name is invalid or used twice, L contains an unknown
@@ -50,6 +53,7 @@ class LagrangianSystem(MechanicalSystem):
     """
 
     lagrangian: Expr
+    reduced: Reduced | None = None
 
     __repr__ = summary("name", "coordinates")
 
@@ -74,6 +78,10 @@ class LagrangianSystem(MechanicalSystem):
         name=TEXT,
         coordinates=NAMES,
         lagrangian=TEXT,
+        rotations=MAPPING,
+        directions=NAMES,
+        torques=MAPPING,
+        torques_space=MAPPING,
         parameters=MAPPING,
         forces=MAPPING,
         dissipation=TEXT,
@@ -85,11 +93,15 @@ class LagrangianSystem(MechanicalSystem):
     def from_text(
         cls,
         name: str,
-        coordinates: Sequence[str],
-        lagrangian: str,
+        coordinates: Sequence[str] = (),
+        lagrangian: str = "",
         *,
+        rotations: Mapping[str, str] | None = None,
+        directions: Sequence[str] = (),
         parameters: Mapping[str, float] | None = None,
-        forces: Mapping[str, str] | None = None,
+        forces: Mapping[str, Any] | None = None,
+        torques: Mapping[str, Sequence[str]] | None = None,
+        torques_space: Mapping[str, Sequence[str]] | None = None,
         dissipation: str | None = None,
         damping: str | float | None = None,
         constraints: Sequence[str] = (),
@@ -108,8 +120,14 @@ class LagrangianSystem(MechanicalSystem):
             coordinates: names of the coordinates, and declarations of arrays, ``["x", "q[N]", "r[N, 3]"]``, whose sizes
                 are names or whole numbers; the velocity of ``q`` is written ``q_dot``, time ``t``.
             lagrangian: the formula; it may span several lines.
+            rotations: name of the angular velocity in the body frame by name of the rotation: ``{"R": "omega"}``
+                declares the entries ``R_11`` to ``R_33`` of the matrix from body to space, ``omega_1`` to ``omega_3``,
+                ``rotate_k(R, a, b, c)``, component k of R (a, b, c), and ``unrotate_k`` of its inverse
+                (:mod:`scvi_codegen.mechanics.rotations.members`).
+            directions: names of unit vectors: ``n`` has components ``n_1`` to ``n_3`` and velocities ``n_1_dot`` ...
             parameters: default value by name, or of all entries by declaration of an array, ``{"k": 1, "m[N]": 1}``.
             forces: formula by coordinate, in coordinates, velocities and time (:mod:`scvi_codegen.mechanics.forces`).
+            torques, torques_space: three formulas by rotation, components in the body frame and in the space frame.
             dissipation: Rayleigh's function D(q, q_dot, t), whose forces -dD/dq_dot are added to them.
             damping: damping rate of all momenta, a number or a formula of parameters
                 (:mod:`scvi_codegen.mechanics.forces`).
@@ -132,7 +150,9 @@ class LagrangianSystem(MechanicalSystem):
         """
         arguments = {"name": name, "coordinates": coordinates, "lagrangian": lagrangian, "parameters": parameters}
         acting = {"forces": forces, "dissipation": dissipation, "damping": damping, "constraints": constraints}
-        return cls._of_text(arguments | acting | {"inputs": inputs, "tables": tables})
+        acting |= {"torques": torques, "torques_space": torques_space}
+        turning = {"rotations": rotations, "directions": directions}
+        return cls._of_text(arguments | acting | {"inputs": inputs, "tables": tables} | turning)
 
     @classmethod
     @checks_arguments(

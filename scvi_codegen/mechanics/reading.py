@@ -9,7 +9,6 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, name_of_key, number, symbol
 from scvi_codegen.formulas.translation import Translation, sympy_expression
@@ -19,10 +18,31 @@ from scvi_codegen.mechanics.constraints import constraints_of
 from scvi_codegen.mechanics.deferred import are_arrays
 from scvi_codegen.mechanics.definition_checks import warn_of_mistakes
 from scvi_codegen.mechanics.forces import damping_rate, dissipative_forces, forces_by_coordinate
+from scvi_codegen.mechanics.rotations.names import Reduced, RotationNames
 
 __all__ = ["default_momenta", "system_from_sympy", "system_from_text"]
 
 Read = Callable[[Any], Expr]
+
+TURNING = ("rotations", "directions", "spins")
+TORQUES = ("torques", "torques_space")
+"""Arguments of ``from_text`` of systems with rotations."""
+DEFINING = (
+    *(
+        "coordinates",
+        *TURNING,
+        "momenta",
+        "lagrangian",
+        "hamiltonian",
+        "dissipation",
+        "damping",
+        "constraints",
+        "inputs",
+        "forces",
+    ),
+    *TORQUES,
+)
+"""Arguments that are written to model files as they are."""
 
 
 def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]:
@@ -30,35 +50,52 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
 
     Systems of arrays of run-time sizes are returned as they are, others with their entries as coordinates.
     """
-    coordinates, parameters, inputs = (arguments[each] for each in ("coordinates", "parameters", "inputs"))
-    if are_arrays(coordinates, parameters or (), arguments["tables"]):
-        return _of_arrays(cls, ArraySystem.from_text(**arguments)), True
+    ordinary, parameters, inputs = (arguments[each] for each in ("coordinates", "parameters", "inputs"))
     of_momenta = "momenta" in arguments
+    names = RotationNames.declared(*(arguments.get(each) for each in TURNING), momentum=of_momenta)
+    if are_arrays(ordinary, parameters or (), arguments["tables"]):
+        if names.members:
+            raise SystemDefinitionError(
+                f"'{arguments['name']}' has arrays and rotations, which are not supported together: declare each "
+                "coordinate by its name"
+            )
+        plain = {each: value for each, value in arguments.items() if each not in (*TURNING, *TORQUES)}
+        return _of_arrays(cls, ArraySystem.from_text(**plain)), True
+    coordinates = (*ordinary, *names.coordinates)
     momenta = arguments.get("momenta", ())
-    momenta = default_momenta(coordinates) if momenta is None else tuple(momenta)
+    momenta = default_momenta(ordinary) if momenta is None else tuple(momenta)
+    momenta = (*momenta, *default_momenta(names.coordinates)) if of_momenta else momenta
     values = with_inputs(parameters or {}, inputs)
-    check_names(coordinates, (*values, *inputs), momenta)
+    check_names(coordinates, (*values, *inputs, *names.symbols), momenta)
     velocities = () if of_momenta else tuple(coordinate + DOT for coordinate in coordinates)
     symbols = {each: symbol(each) for each in (*coordinates, *velocities, *momenta, TIME, *values, *inputs)}
+    symbols |= names.symbols
     driven = input_formulas(inputs, symbols[TIME])
 
     def read(text: str) -> Expr:
-        return parse_expression(text, symbols).xreplace(driven)
+        return names.read(text, symbols).xreplace(driven)
 
     variables = tuple(symbols[each] for each in coordinates)
     conjugate = {"momenta": tuple(symbols[each] for each in momenta)} if of_momenta else {}
     function = "hamiltonian" if of_momenta else "lagrangian"
+    constants = tuple(symbols[each] for each in values)
+    applied, friction = arguments["forces"], arguments.get("dissipation")
+    if names.members:
+        torques, torques_space = (arguments.get(each) for each in TORQUES)
+        forces: Any = names.forces_by_name(ordinary, read, applied, torques, torques_space, friction)
+    else:
+        forces = _forces(variables, applied, friction, read)
+    constraints = constraints_of(arguments["constraints"], read)
     system = cls(
         name=arguments["name"],
         coordinates=variables,
         **conjugate,
+        **_formulas(names, function, read(arguments[function]), forces, constraints, coordinates, constants),
+        definition=_definition(arguments) if names.members else {},
         time=symbols[TIME],
-        parameters=tuple(symbols[each] for each in values),
+        parameters=constants,
         defaults=tuple(number(each, value) for each, value in values.items()),
-        **{function: read(arguments[function])},
-        forces=_forces(variables, arguments["forces"], arguments.get("dissipation"), read),
         damping=damping_rate(arguments["damping"], lambda formula: read(str(formula))),
-        constraints=constraints_of(arguments["constraints"], read),
         inputs=tuple(inputs),
     )
     return system, warn_of_mistakes(system)
@@ -137,6 +174,42 @@ def system_from_sympy(
     )
     warn_of_mistakes(system)
     return system
+
+
+def _definition(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of a system with rotations that are not empty, for model files."""
+    return {key: arguments[key] for key in DEFINING if arguments.get(key)}
+
+
+def _formulas(
+    names: RotationNames,
+    function: str,
+    formula: Expr,
+    forces: Any,
+    constraints: tuple[Expr, ...],
+    variables: Sequence[str],
+    parameters: Sequence[Symbol],
+) -> dict[str, Any]:
+    """Return the fields of a system that are formulas, those of rotations as functions of their coordinates.
+
+    Args:
+        names: rotations, directions and spins.
+        function: ``"lagrangian"`` or ``"hamiltonian"``.
+        formula, constraints: in the names of formulas.
+        forces: on all coordinates; with rotations by name (:meth:`RotationNames.forces_by_name`).
+        variables, parameters: names of all coordinates, symbols of the parameters.
+    """
+    if not names.members:
+        return {function: formula, "forces": forces, "constraints": constraints}
+    fields = {
+        "forces": names.forces(forces, variables),
+        "constraints": tuple(map(names.in_coordinates, constraints)),
+        "rotations": names.members,
+    }
+    if function == "hamiltonian":
+        return {function: names.in_coordinates(formula), "gauge": names.gauge(), **fields}
+    reduced = Reduced(formula, forces, constraints)
+    return {function: names.lagrangian(formula, parameters), "reduced": reduced, **fields}
 
 
 def default_momenta(coordinates: Sequence[str]) -> tuple[str, ...]:

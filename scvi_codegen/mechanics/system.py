@@ -33,7 +33,9 @@ from scvi_codegen.validation.argument_types import of
 if TYPE_CHECKING:
     from sympy import Expr, Symbol
 
-__all__ = ["SYSTEM", "MechanicalSystem", "TimeTransformation"]
+    from scvi_codegen.mechanics.rotations.members import Homogeneous
+
+__all__ = ["SYSTEM", "MechanicalSystem", "TimeTransformation", "zero"]
 
 MAX_OPERATIONS = 200
 """Maximum number of operations of a formula shown in a notebook."""
@@ -57,7 +59,8 @@ class TimeTransformation:
     plain: MechanicalSystem | None = field(default=None, compare=False, repr=False)
 
 
-def _zero() -> Expr:
+def zero() -> Expr:
+    """Return SymPy's 0, the default value of fields."""
     from sympy import S
 
     return S.Zero
@@ -82,7 +85,9 @@ class MechanicalSystem(Deferred, ABC):
         constraints: expressions in (q, t), or linear in v, that are 0 along trajectories of a Lagrangian
             (:mod:`scvi_codegen.mechanics.constraints`).
         arrays: declarations of the arrays of known sizes whose entries are coordinates and parameters.
-        definition: the text with arrays that the system was read from, for model files; empty without arrays.
+        definition: the text with arrays or rotations that the system was read from, for model files; else empty.
+        rotations: rotations, directions and spins, whose coordinates follow the ordinary ones
+            (:mod:`scvi_codegen.mechanics.rotations.members`).
     """
 
     name: str
@@ -94,9 +99,10 @@ class MechanicalSystem(Deferred, ABC):
     forces: tuple[Expr, ...] = ()
     constraints: tuple[Expr, ...] = ()
     inputs: tuple[str, ...] = ()
-    damping: Expr = field(default_factory=_zero)
+    damping: Expr = field(default_factory=zero)
     arrays: tuple[Array, ...] = field(default=(), compare=False)
     definition: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    rotations: tuple[Homogeneous, ...] = ()
 
     @property
     @abstractmethod
@@ -171,7 +177,7 @@ class MechanicalSystem(Deferred, ABC):
 
     def _constraints_work(self) -> bool:
         """Return whether constraints can do work: they contain time, or A v + b = 0 with non-zero b."""
-        at_rest = dict.fromkeys(self.velocities, _zero())
+        at_rest = dict.fromkeys(self.velocities, zero())
         rolling = [g for g in self.constraints if g.free_symbols & set(self.velocities)]
         return any(self.time in g.free_symbols for g in self.constraints) or any(g.xreplace(at_rest) for g in rolling)
 

@@ -22,6 +22,8 @@ from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.mechanics.constraints import nonholonomic_expressions
 from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.rotations.hamiltonian import hamiltonian_of_rotations
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.constraints import with_constraints
 from scvi_codegen.methods.method import Method
@@ -30,12 +32,23 @@ from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, Stage
 from scvi_codegen.tables.basis import identity_matrix, next_step
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
-__all__ = ["discretise", "is_conformally_symplectic", "is_symplectic", "paper_equations"]
+__all__ = ["discretise", "discretised_form", "is_conformally_symplectic", "is_symplectic", "paper_equations"]
 
 NUMBERS = {"34a": "35a", "34c": "35c", "34d": "35d", "34e": "35e"}
 """Equation numbers of the paper for the shooting method in phase space, by those for Lagrangians."""
 BLOCK_NAMES = {"quadrature": "P", "derivative": "P", "stage": "P", "node": "N", "start": "S", "end": "E", "drift": "P"}
 """Names of the momenta at the points, by group of points."""
+
+
+def discretised_form(system: MechanicalSystem, method: Method) -> MechanicalSystem:
+    """Return the form of a system that a method discretises: of one with rotations the Hamiltonian, if it serves.
+
+    The Hamiltonian needs about half of the operations; it is singular in p
+    (:mod:`scvi_codegen.mechanics.rotations.hamiltonian`).
+    """
+    if not isinstance(system, LagrangianSystem) or not system.rotations or not method.symplectic:
+        return system
+    return system if method.needs_regular else hamiltonian_of_rotations(system) or system
 
 
 def discretise(system: MechanicalSystem, method: Method) -> StageSystem:

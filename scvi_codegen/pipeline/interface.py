@@ -47,6 +47,7 @@ def describe(
         inputs=system.inputs,
         conserves_energy=not system.changes_energy and not system.inputs,
         arrays=_arrays_of(system),
+        rotations=tuple(each.declaration for each in system.rotations),
         energy_parameter=system.clock.energy.name if system.clock else "",
         solver=_solver_of(program),
     )

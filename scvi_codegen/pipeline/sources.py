@@ -37,7 +37,7 @@ from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES, Symmetry
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.mechanics.variational import with_tangent_vectors
 from scvi_codegen.methods import as_method
-from scvi_codegen.methods.discretise import discretise
+from scvi_codegen.methods.discretise import discretise, discretised_form
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.announcements import announced
 from scvi_codegen.pipeline.interface import describe, describe_arrays
@@ -70,6 +70,7 @@ class Sources:
         symmetries: Sequence[Symmetry],
         g: str | Expr | None,
     ) -> None:
+        system = discretised_form(system, method)
         self.system, self.method, self.solver, self.g = system, method, solver, g
         self._derived = partial(program_of, system, method, prefix=prefix, symmetries=symmetries)
         self._programs: dict[bool, Program] = {}
@@ -239,6 +240,7 @@ def generate_source(
             events are combined with ``embedded``.
     """
     method = as_method(method, system)
+    system = discretised_form(system, method)
     functions = tuple(event.function for event in as_events(events))
     _check_embedded(embedded, solver, functions)
     program = program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None)

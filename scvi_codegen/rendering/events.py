@@ -31,6 +31,7 @@ from scvi_codegen.formulas.symbols import DOT, TIME, identifier, symbol
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import lower_matrix, lower_vector
+from scvi_codegen.mechanics.rotations.names import RotationNames
 from scvi_codegen.rendering.program_source import EventSearch, render_events
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.tables.nodes import chebyshev_lobatto, to_unit
@@ -59,9 +60,10 @@ def with_events(source: Source, interface: Interface, functions: tuple[str | Exp
 
 def _kernel(interface: Interface, functions: Sequence[str | Expr]) -> tuple[Kernel, bool]:
     """Return the kernel of the functions at u = (q, p, v), and whether any velocity occurs in them."""
-    names = _names(interface)
+    turning = RotationNames.of_declarations(interface.rotations)
+    names = turning.symbols | _names(interface)
     input_values = input_formulas(interface.inputs, symbol(TIME))
-    values = [_expression(function, names).xreplace(input_values) for function in functions]
+    values = [turning.in_coordinates(_expression(function, names)).xreplace(input_values) for function in functions]
     q = [symbol(name) for name in interface.coordinates]
     v = [symbol(name + DOT) for name in interface.coordinates]
     taken = {*q, *v, symbol(TIME), *(symbol(name) for name in interface.parameters)}

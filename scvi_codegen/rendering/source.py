@@ -216,6 +216,8 @@ class Interface:
             those whose entries are parameters; none without arrays.
         solver: of the stage equations, as in ``compile_stepper``, with or without a fallback; unknown for folders of
             version 0.1.
+        rotations: declarations of rotations, directions and spins, ``"rotation R omega"``, ``"direction n"``, ``"spin
+            s"``, in the order of their coordinates, which follow the ordinary ones.
         layout: of arrays whose sizes are known at run time; the coordinates are their names.
     """
 
@@ -243,6 +245,7 @@ class Interface:
     conserves_energy: bool = False
     solver: str = ""
     arrays: tuple[str, ...] = ()
+    rotations: tuple[str, ...] = ()
     layout: ArrayLayout = ArrayLayout()
 
     @property

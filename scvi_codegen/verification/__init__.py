@@ -23,6 +23,7 @@ from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import as_method
+from scvi_codegen.methods.discretise import discretised_form
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.building import TUNED_FLAGS
@@ -116,6 +117,7 @@ def verify(
     assert not isinstance(stepper, ArrayStepper)
     t, h = checked_number(t, "the time t"), None if h is None else checked_step(h)
     began, method = time.perf_counter(), as_method(method, system)
+    system = discretised_form(system, method)
     flags = tuple(flags if stepper is None else stepper.flags)
     stepper = stepper or compile_stepper(system, method, solver=solver, flags=flags)
     start = _initial_state(system, stepper, q, p, h, t)

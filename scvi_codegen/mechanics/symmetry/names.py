@@ -7,7 +7,14 @@ from collections.abc import Mapping, Sequence
 import sympy
 from sympy import Expr
 
-from scvi_codegen.mechanics.symmetry.ansatz import Terms, bodies_of, planes_of, turn
+from scvi_codegen.mechanics.symmetry.ansatz import (
+    Terms,
+    bodies_of,
+    planes_of,
+    rotation_columns,
+    total_angular_momentum,
+    turn,
+)
 from scvi_codegen.mechanics.symmetry.bodies import AXES
 from scvi_codegen.mechanics.system import MechanicalSystem
 
@@ -16,9 +23,11 @@ __all__ = ["name_of"]
 NAMED_TERMS = 4
 
 
-def name_of(system: MechanicalSystem, terms: Terms) -> tuple[str, int]:
-    """Return the name of a momentum map, and the sign with which it has this name."""
+def name_of(system: MechanicalSystem, terms: Terms) -> tuple[str, Expr | int]:
+    """Return the name of a momentum map, and the factor (a sign without rotations) with which it has this name."""
     m = system.dimension
+    if system.rotations and (named := _rotation_name(system, terms)):
+        return named
     turning = {a: x for a, x in terms.items() if len(a.factors) == 2 and a.factors[0] < m <= a.factors[1]}
     shifting = {
         k: {a.factors[0] - m: x for a, x in terms.items() if a.power == k and len(a.factors) == 1 and a.factors[0] >= m}
@@ -30,6 +39,16 @@ def name_of(system: MechanicalSystem, terms: Terms) -> tuple[str, int]:
         if shifting[k]:
             return _shifting_name(system, kind, shifting[k]), -1 if k else 1
     return ("linear" if all(len(a.factors) <= 1 for a in terms) else "quadratic") + " invariant", 1
+
+
+def _rotation_name(system: MechanicalSystem, terms: Terms) -> tuple[str, Expr] | None:
+    """Return the name of an angular momentum of all or one of the rotations and bodies, and the factor for it."""
+    for name, known in {**total_angular_momentum(system), **rotation_columns(system)}.items():
+        first, value = next(iter(known.items()))
+        factor = terms.get(first, sympy.S.Zero) / value
+        if factor != 0 and terms == {monomial: factor * x for monomial, x in known.items()}:
+            return name, 1 / factor
+    return None
 
 
 def _turning_name(system: MechanicalSystem, turning: Terms) -> tuple[str, int]:

@@ -43,6 +43,7 @@ from scvi_codegen.mechanics.symmetry.ansatz import (
     monomial_columns,
     polynomial_in,
     rigid_columns,
+    rotation_columns,
 )
 from scvi_codegen.mechanics.symmetry.group_forces import terms_among_few_bodies
 from scvi_codegen.mechanics.symmetry.invariants import Monomial, Polynomial, confirmed, conserved
@@ -171,6 +172,8 @@ def all_symmetries(system: MechanicalSystem, additional: Sequence[Symmetry]) -> 
 
 def _found(system: MechanicalSystem) -> list[Terms]:
     """Return the momentum maps as polynomials."""
+    if system.rotations:
+        return _of_rotations(system)
     if system.dimension > MAX_SEARCHED_COORDINATES:
         return _rigid(system)
     motion = rates_of(system)
@@ -182,6 +185,22 @@ def _found(system: MechanicalSystem) -> list[Terms]:
     if not system.is_regular or not mixed:
         return independent(mixed)
     return independent(mixed, first=_spanned(system, motion, curved=False), trivial=_energy(system))
+
+
+def _of_rotations(system: MechanicalSystem) -> list[Terms]:
+    """Return momentum maps that turn rotations and directions and change ordinary coordinates; scalings are gauge."""
+    motion = rates_of(system)
+    if not motion.closed:
+        return []
+    m, turning = system.dimension, {name for each in system.rotations for name in each.coordinates}
+    ordinary = [i for i, q in enumerate(system.coordinates) if q.name not in turning]
+    state = [*ordinary, *(m + i for i in ordinary)]
+    columns: list[Polynomial] = [
+        {Monomial(a.power, tuple(state[i] for i in a.factors)): x for a, x in column.items()}
+        for column in monomial_columns(len(ordinary), curved=False)
+    ]
+    columns = [*columns, *rotation_columns(system).values()]
+    return _combined(conserved(system, motion, columns), columns)
 
 
 def _rigid(system: MechanicalSystem) -> list[Terms]:
@@ -266,10 +285,12 @@ def _term_text(coefficient: Expr, factors: list[Expr]) -> str:
 def _symmetry(system: MechanicalSystem, terms: Terms) -> Symmetry:
     """Return the named symmetry, with the sign of its name and an integer direction at t = 0."""
     m = system.dimension
-    name, sign = name_of(system, terms)
+    name, scale = name_of(system, terms)
     degrees = {monomial: sum(i >= m for i in monomial.factors) for monomial in terms}
     numbers = [x.as_coeff_Mul()[0] for a, x in terms.items() if degrees[a] == 1 and a.power == 0]
-    factor = sign * sympy.ilcm(1, 1, *(number.q for number in numbers if number.is_Rational))
+    factor = scale * sympy.ilcm(1, 1, *(number.q for number in numbers if number.is_Rational))
+    if system.rotations:
+        factor = scale  # angular momenta of quaternions have the coefficients 1/2
     signed = {monomial: factor * coefficient for monomial, coefficient in terms.items()}
     J, p = polynomial_in(system, signed), system.momentum_symbols
     derivatives = gradient(J, p)

@@ -33,7 +33,9 @@ def document_of(model: Model, *, as_arrays: bool = True) -> dict[str, Any]:
     names = [] if model.array_system else [coordinate.name for coordinate in system.coordinates]
     if model.array_system and not system.definition:
         raise ModelFileError(f"'{system.name}' was not read from text: give its formula to from_text to write a file")
-    if as_arrays and system.definition:
+    if system.definition and not model.array_system and system.rotations:
+        document, parameters, motion = _of_rotations(system), model.parameters, motion_of(model, names)
+    elif as_arrays and system.definition:
         document, parameters = _definition(system), _declared_parameters(model)
         motion = motion_of(model, names) | {"initial": {"t": model.t, **_state_by_array(model, names)}}
     else:
@@ -60,6 +62,16 @@ def _definition(system: MechanicalSystem) -> dict[str, Any]:
             texts[key] = _wrapped(texts[key])
     forces = system.definition.get("forces")
     return {"system": {"name": system.name, **texts}, **({"forces": dict(forces)} if forces else {})}
+
+
+def _of_rotations(system: MechanicalSystem) -> dict[str, Any]:
+    """Return the sections of a system that was read from text with rotations, directions or spins."""
+    document, definition = _definition(system), dict(system.definition)
+    for key in ("torques", "torques_space"):
+        document["system"].pop(key, None)
+        if key in definition:
+            document[key] = definition[key]
+    return document
 
 
 def _formulas(system: MechanicalSystem, names: Sequence[str]) -> dict[str, Any]:

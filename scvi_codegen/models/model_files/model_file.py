@@ -11,9 +11,13 @@
     # damping = "gamma"                                 # damping rate of all momenta, or a number; default: 0
     # constraints = ["x**2 + y**2 = l**2"]              # g(q, t) = 0, or equations
     # inputs = ["u"]                                    # functions of time given as data
+    # rotations = { R = "omega" }                       # rigid bodies: R_11, .., omega_1, ..; directions, spins: names
 
     [forces]                                            # on coordinates; default: 0
     q = "F*cos(w*t)"
+
+    # [torques]                                         # on rotations, in the body frame; [torques_space] in space
+    # R = ["0", "0", "-c*omega_3"]
 
     [inputs]                                            # of the inputs named above; see input_files.py
     # u = { file = "u.csv", kind = "cubic" }            # relative to this file; or constant, linear (default)
@@ -87,6 +91,8 @@ from scvi_codegen.models.model_files.sections import (
 )
 from scvi_codegen.models.model_files.system_section import (
     FORMULAS,
+    TORQUES,
+    TURNING,
     check_complete,
     check_used,
     has_arrays,
@@ -102,10 +108,10 @@ if TYPE_CHECKING:
 
 __all__ = ["catalogue_model", "dump_model", "load_model", "model_texts", "parse_model", "save_model"]
 
-SYSTEM_KEYS = ("name", "coordinates", "momenta", *FORMULAS, "inputs", "catalogue", "time_transformation")
+SYSTEM_KEYS = ("name", "coordinates", *TURNING, "momenta", *FORMULAS, "inputs", "catalogue", "time_transformation")
 RUN_KEYS = ("step", "tolerance", "error", "controller", "span", "steps", "save_every")
 KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
-SECTIONS = ("system", "forces", "inputs", "sizes", "parameters", "tables", "initial", "method", "run")
+SECTIONS = ("system", "forces", *TORQUES, "inputs", "sizes", "parameters", "tables", "initial", "method", "run")
 ARRAY_SECTIONS = ("sizes", "tables")
 """Sections of systems with arrays."""
 

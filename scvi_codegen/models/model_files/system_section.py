@@ -24,9 +24,23 @@ from scvi_codegen.models.model_files.sections import (
 from scvi_codegen.models.problems import Problem, problem
 from scvi_codegen.models.time_span import real
 
-__all__ = ["FORMULAS", "check_complete", "check_used", "has_arrays", "is_number", "read_catalogue", "read_system"]
+__all__ = [
+    "FORMULAS",
+    "TORQUES",
+    "TURNING",
+    "check_complete",
+    "check_used",
+    "has_arrays",
+    "is_number",
+    "read_catalogue",
+    "read_system",
+]
 
 FORMULAS = ("lagrangian", "hamiltonian", "dissipation", "damping", "constraints")
+TURNING = ("rotations", "directions", "spins")
+"""Keys of [system] that declare coordinates of another kind."""
+TORQUES = ("torques", "torques_space")
+"""Sections with three formulas by rotation, in the body frame and in the space frame."""
 REQUIRED = {"system": ("name", "coordinates", "lagrangian"), "initial": ("q", "q_dot"), "run": ("span",)}
 """Required keys, or their alternatives."""
 
@@ -50,7 +64,7 @@ def check_complete(document: Document) -> None:
     for name, keys in REQUIRED.items():
         for key in keys:
             choice = next((choice for choice in ALTERNATIVES if key in choice), {key})
-            if choice.isdisjoint(document.get(name, {})) and not (key == "q_dot" and has_arrays(document, "[A-Za-z_]")):
+            if choice.isdisjoint(document.get(name, {})) and not _is_optional(document, key):
                 missing.append(f"{' or '.join(sorted(choice))} in [{name}]")
     if missing:
         at_rest = "p or q_dot in [initial]" in missing
@@ -58,11 +72,20 @@ def check_complete(document: Document) -> None:
         raise ModelFileError(f"there is no {', no '.join(missing)}{rest}")
 
 
+def _is_optional(document: Document, key: str) -> bool:
+    """Return whether a required key may be missing: velocities of arrays and spins, coordinates beside rotations."""
+    section = document.get("system", {})
+    if key == "coordinates":
+        return not section.keys().isdisjoint(TURNING)
+    return key == "q_dot" and (has_arrays(document, "[A-Za-z_]") or "spins" in section)
+
+
 def check_used(document: Document, parameters: Section) -> None:
     """Raise an error for an added parameter that no formula contains."""
     section = document["system"]
     formulas = [section.get(key, "") for key in (*FORMULAS, "time_transformation")]
-    formula = " ".join(map(str, (*formulas, *document.get("forces", {}).values())))
+    acting = [formula for name in ("forces", *TORQUES) for formula in document.get(name, {}).values()]
+    formula = " ".join(map(str, (*formulas, *acting)))
     for name in parameters:
         if name not in re.findall(r"\w+", formula):
             raise ModelFileError(f"the system has no parameter '{name}'")
@@ -90,7 +113,8 @@ def read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
     check_one(section, "system", "lagrangian", "hamiltonian")
     arguments: dict[str, Any] = {
         "name": text_of(section, "name", "[system]"),
-        "coordinates": names_of(section, "coordinates"),
+        "coordinates": names_of(section, "coordinates") if "coordinates" in section else (),
+        **_turning(document),
         "parameters": values,
         "forces": {key: formula_of(forces, key, "[forces]") for key in forces},
         "damping": formula_of(section, "damping", "[system]") if "damping" in section else None,
@@ -107,6 +131,15 @@ def read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
     arguments["lagrangian"] = text_of(section, "lagrangian", "[system]")
     arguments["dissipation"] = text_of(section, "dissipation", "[system]") if "dissipation" in section else None
     return in_section("[system]", lambda: LagrangianSystem.from_text(**arguments, constraints=constraints))
+
+
+def _turning(document: Document) -> dict[str, Any]:
+    """Return the arguments that declare rotations, directions, spins and torques."""
+    arguments = {key: document["system"][key] for key in TURNING if key in document["system"]}
+    for key in TORQUES:
+        if document.get(key):
+            arguments[key] = {name: list(map(str, formulas)) for name, formulas in document[key].items()}
+    return arguments
 
 
 def _scalars(document: Document) -> dict[str, float]:

@@ -97,6 +97,7 @@ def read_values(
     if isinstance(any_system, ArraySystem):
         return system, _values_of_arrays(document, any_system, entries, folder) | time
     names = [coordinate.name for coordinate in system.coordinates]
+    section = _by_coordinate(section, system)
     known = [array for array in system.arrays if array.axes and set(array.elements) <= set(names)]
     for key in STATE:
         value: Any = section.get(key)
@@ -116,6 +117,20 @@ def read_values(
         if key in section
     }
     return (system.with_parameters(**changed) if changed else system), {**vectors, **time}
+
+
+def _by_coordinate(section: Section, system: MechanicalSystem) -> Section:
+    """Return the initial state with rotations, directions and spins as homogeneous coordinates."""
+    from scvi_codegen.runtime.rotations.states import members_of, state_of  # not needed for other systems
+
+    q = section.get("q")
+    members = members_of(system.dimension, [each.declaration for each in system.rotations])
+    if not isinstance(q, dict) or not any(member.name in q for member in members):
+        return section
+    names = [coordinate.name for coordinate in system.coordinates]
+    state = in_section("[initial]", lambda: state_of(names, members, q, section.get("p"), section.get("q_dot")))
+    vectors = {key: value for key, value in zip(("q", "p", "q_dot"), state, strict=True) if value is not None}
+    return {**section, **{key: np.asarray(value, dtype=float).tolist() for key, value in vectors.items()}}
 
 
 def _values_of_arrays(

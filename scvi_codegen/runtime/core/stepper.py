@@ -37,6 +37,7 @@ from scvi_codegen.runtime.inputs.segments import (
     parameters_of,
     record_pieces,
 )
+from scvi_codegen.runtime.rotations.states import homogeneous_state
 from scvi_codegen.runtime.run.accuracy import warn_of_energy_error, warn_of_energy_errors, warn_of_large_steps
 from scvi_codegen.runtime.run.error_growth import GrowthCheck
 from scvi_codegen.runtime.run.global_error import checked_error, confirmed_run, warn_of_unconfirmed
@@ -157,6 +158,7 @@ class Stepper(Integrator):
             raise StateError("t_eval is not supported with inputs: omit t_eval")
         if observe is not None and (data is not None or t_eval is not None):
             raise StateError("observe is not supported with inputs or t_eval: omit observe")
+        q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
         if error is not None:
             alternatives = {"h": h, "steps": steps, "tolerance": tolerance, "observe": observe}
             return confirmed_run(
@@ -207,6 +209,7 @@ class Stepper(Integrator):
         options: SolverOptions | None = None,
     ) -> Run:
         """Return a run from (q, p), or q and a velocity, at t, with fixed steps h or adaptive steps to t_end."""
+        q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
         return self._started(q, p, velocity, (h, t_end, tolerance), t, parameters, options)
 
     def _started(
@@ -319,6 +322,7 @@ class Stepper(Integrator):
         Raises:
             StateError: if a shape, name or number is invalid.
         """
+        q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
         if error is not None:
             others = {"h": h, "steps": steps, "tolerance": tolerance}
             tau = self.interface.energy_parameter or self.interface.time_transformation
@@ -387,6 +391,7 @@ class Stepper(Integrator):
             MethodError: if time is transformed.
             StateError: if a shape, name or number is invalid.
         """
+        q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
         p = momenta_of_each(self, q, p, velocity, t, parameters)
         work = ChaosIndicatorsEnsemble(
             self,

@@ -18,6 +18,7 @@ from scvi_codegen.files.labelled_arrays import Labelled, checked_units, to_datas
 from scvi_codegen.representation import one_line
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.run.descriptions import short_title
 from scvi_codegen.runtime.run.global_error import ConfirmedEnsemble, GlobalError
 from scvi_codegen.runtime.run.step_plan import StepPlan
@@ -37,7 +38,7 @@ Span: TypeAlias = tuple[slice, slice, Callable[[slice], Array]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EnsembleTrajectory(ConfirmedEnsemble):
+class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
     """States of k trajectories, the initial state first.
 
     Attributes:

@@ -21,6 +21,7 @@ from scvi_codegen.runtime.constraints.projection import constraint_values, multi
 from scvi_codegen.runtime.core.validation import columns_of_inputs
 from scvi_codegen.runtime.events.detection import crossings_of
 from scvi_codegen.runtime.events.event import Crossings, Event, EventLike, as_events
+from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.run.accuracy import TOLERABLE_ERROR
 from scvi_codegen.runtime.run.descriptions import describe_states, describe_step_size
 from scvi_codegen.runtime.run.global_error import Confirmed, GlobalError
@@ -46,7 +47,7 @@ MOST_DRAWN, MOST_CURVES = 400, 6
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
-class Trajectory(TrajectoryDerivatives, Confirmed):
+class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
     """States along a run, the initial state first.
 
     Attributes:

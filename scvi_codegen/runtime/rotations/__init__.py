@@ -1,0 +1,1 @@
+"""States of rotations and directions at run time."""

@@ -1,0 +1,178 @@
+"""Attitudes as quaternions: conversion of initial values, and matrices, Euler angles and angular velocities.
+
+A quaternion is (w, x, y, z), scalar part first, of any non-zero length; R(q) v = q v q^-1 takes components in the body
+frame to components in the space frame. Formulas: :mod:`scvi_codegen.mechanics.rotations`. Euler angles are those of
+``scipy.spatial.transform.Rotation`` (lower case: rotations about axes of space; upper case: about axes of the body).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import real_array
+
+__all__ = [
+    "angular_velocity",
+    "body_momentum",
+    "euler_angles",
+    "matrices",
+    "momenta_of_body",
+    "quaternions",
+    "unit_quaternions",
+    "velocities_of_body",
+]
+
+Array = NDArray[np.float64]
+
+ACCEPTED = (
+    "a quaternion (w, x, y, z), a rotation matrix (3, 3), {'euler': 'zxz', 'angles': [..]}, {'axis': [..], 'angle': "
+    "..}, or a scipy Rotation"
+)
+ORTHOGONAL = 1e-8
+"""Largest deviation of R^T R from the identity of an initial matrix, which is then projected."""
+
+
+def quaternions(value: Any, name: str) -> Array:
+    """Return (.., 4) unit quaternions of an initial attitude.
+
+    Args:
+        value: (.., 4) quaternions; (.., 3, 3) matrices; a mapping with ``euler`` (axes) and ``angles`` in radians, or
+            with ``axis`` and ``angle``; or a ``scipy.spatial.transform.Rotation``.
+        name: of the rotation, for messages.
+
+    Raises:
+        StateError: if the value is none of these, a quaternion is zero, or a matrix is not a rotation.
+    """
+    if hasattr(value, "as_quat"):
+        return np.roll(np.asarray(value.as_quat(), dtype=float), 1, axis=-1)
+    if isinstance(value, Mapping):
+        return _of_angles(value, name)
+    array = real_array(value, name)
+    if array.ndim >= 2 and array.shape[-2:] == (3, 3):
+        return _of_matrices(array, name)
+    if not array.ndim or array.shape[-1] != 4:
+        raise StateError(f"the rotation '{name}' must be {ACCEPTED}, not an array of the shape {array.shape}")
+    lengths = np.linalg.norm(array, axis=-1, keepdims=True)
+    if not (np.isfinite(lengths) & (lengths > 0)).all():
+        raise StateError(f"the quaternion of '{name}' must be finite and not zero, not {array.tolist()}")
+    return np.asarray(array / lengths)
+
+
+def _of_angles(value: Mapping[str, Any], name: str) -> Array:
+    from scipy.spatial.transform import Rotation  # imported on use: the core does without SciPy
+
+    if set(value) == {"euler", "angles"}:
+        try:
+            rotation = Rotation.from_euler(value["euler"], real_array(value["angles"], name))
+        except (ValueError, TypeError) as error:
+            raise StateError(f"the Euler angles of '{name}' are invalid: {error}") from error
+    elif set(value) == {"axis", "angle"}:
+        axis = real_array(value["axis"], name)
+        length = np.linalg.norm(axis)
+        if axis.shape != (3,) or not length > 0:
+            raise StateError(f"the axis of '{name}' must be three numbers, not all zero, not {value['axis']!r}")
+        rotation = Rotation.from_rotvec(axis / length * float(value["angle"]))
+    else:
+        raise StateError(f"the rotation '{name}' must be {ACCEPTED}; the mapping has the keys {', '.join(value)}")
+    return np.roll(np.asarray(rotation.as_quat(), dtype=float), 1, axis=-1)
+
+
+def _of_matrices(matrix: Array, name: str) -> Array:
+    """Return the quaternions of rotation matrices (S. W. Shepperd, J. Guidance Control 1 (1978), 223-224)."""
+    defect = np.abs(np.swapaxes(matrix, -1, -2) @ matrix - np.eye(3)).max()
+    if not defect <= ORTHOGONAL or not (np.linalg.det(matrix) > 0).all():
+        raise StateError(
+            f"the matrix of '{name}' is not a rotation: R^T R differs from the identity by {defect:.1e}, or det R is "
+            "negative. Give an orthogonal matrix with determinant 1"
+        )
+    m = matrix
+    squares = np.stack(
+        [
+            1 + m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2],
+            1 + m[..., 0, 0] - m[..., 1, 1] - m[..., 2, 2],
+            1 - m[..., 0, 0] + m[..., 1, 1] - m[..., 2, 2],
+            1 - m[..., 0, 0] - m[..., 1, 1] + m[..., 2, 2],
+        ],
+        axis=-1,
+    )  # 4 (w^2, x^2, y^2, z^2)
+    products = np.empty((*m.shape[:-2], 4, 4))  # row i: 4 q_i (w, x, y, z)
+    for i in range(4):
+        products[..., i, i] = squares[..., i]
+    for i, (j, k) in enumerate(((2, 1), (0, 2), (1, 0)), start=1):  # w with x, y, z
+        products[..., 0, i] = products[..., i, 0] = m[..., j, k] - m[..., k, j]
+    for i, j in ((1, 2), (1, 3), (2, 3)):
+        products[..., i, j] = products[..., j, i] = m[..., i - 1, j - 1] + m[..., j - 1, i - 1]
+    largest = squares.argmax(axis=-1)[..., None, None]
+    row = np.take_along_axis(products, largest, axis=-2)[..., 0, :]
+    return np.asarray(row / np.linalg.norm(row, axis=-1, keepdims=True))
+
+
+def unit_quaternions(q: Array) -> Array:
+    """Return (.., 4) quaternions of length 1 along a run, whose sign is continuous as that of q is."""
+    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
+
+
+def matrices(q: Array) -> Array:
+    """Return (.., 3, 3) rotation matrices of quaternions of any length."""
+    w, x, y, z = np.moveaxis(unit_quaternions(q), -1, 0)
+    rows = [
+        [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def euler_angles(q: Array, axes: str) -> Array:
+    """Return (.., 3) Euler angles in radians."""
+    from scipy.spatial.transform import Rotation  # imported on use: the core does without SciPy
+
+    flat = np.roll(unit_quaternions(q).reshape(-1, 4), -1, axis=-1)
+    try:
+        angles = Rotation.from_quat(flat).as_euler(axes)
+    except ValueError as error:
+        raise StateError(f"the Euler axes {axes!r} are invalid: {error}") from error
+    return np.asarray(angles).reshape(*q.shape[:-1], 3)
+
+
+def angular_velocity(q: Array, v: Array) -> Array:
+    """Return (.., 3) angular velocities in the body frame, 2 E(q)^T v/|q|^2."""
+    return np.asarray(2 * _transposed(q, v) / (q * q).sum(axis=-1, keepdims=True))
+
+
+def body_momentum(q: Array, p: Array) -> Array:
+    """Return (.., 3) angular momenta in the body frame, E(q)^T p/2."""
+    return np.asarray(_transposed(q, p) / 2)
+
+
+def velocities_of_body(q: Array, rate: Array) -> Array:
+    """Return (.., 4) velocities E(q) omega/2 of an angular velocity in the body frame."""
+    return np.asarray(_rotated(q, rate) / 2)
+
+
+def momenta_of_body(q: Array, momentum: Array) -> Array:
+    """Return (.., 4) momenta 2 E(q) Pi/|q|^2 of an angular momentum in the body frame."""
+    return np.asarray(2 * _rotated(q, momentum) / (q * q).sum(axis=-1, keepdims=True))
+
+
+def _transposed(q: Array, p: Array) -> Array:
+    """Return E(q)^T p."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    a, b, c, d = np.moveaxis(p, -1, 0)
+    return np.stack(
+        [-x * a + w * b + z * c - y * d, -y * a - z * b + w * c + x * d, -z * a + y * b - x * c + w * d], axis=-1
+    )
+
+
+def _rotated(q: Array, r: Array) -> Array:
+    """Return E(q) r."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    a, b, c = np.moveaxis(r, -1, 0)
+    return np.stack(
+        [-x * a - y * b - z * c, w * a - z * b + y * c, z * a + w * b - x * c, -y * a + x * b + w * c], axis=-1
+    )

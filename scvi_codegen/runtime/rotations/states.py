@@ -1,0 +1,181 @@
+"""States of systems with rotations, directions and spins by name, as homogeneous coordinates and momenta."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import StateError, closest
+from scvi_codegen.native.arguments import real_array
+from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.rotations.attitudes import (
+    matrices,
+    momenta_of_body,
+    quaternions,
+    velocities_of_body,
+)
+
+__all__ = ["Member", "homogeneous_state", "members_of", "state_of"]
+
+Array = NDArray[np.float64]
+
+SIZES = {"rotation": 4, "direction": 3, "spin": 2}
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """Rotation, direction or spin of a compiled system.
+
+    Attributes:
+        kind: ``"rotation"``, ``"direction"`` or ``"spin"``.
+        name, rate: its name, and that of its angular velocity or, in a Hamiltonian, momentum.
+        columns: its homogeneous coordinates among all.
+        momentum: whether ``rate`` names a momentum.
+    """
+
+    kind: str
+    name: str
+    rate: str
+    columns: slice
+    momentum: bool = False
+
+    def moving_name(self, what: str) -> str:
+        """Return the name of its velocity (``what`` is ``"velocity"``) or momentum in states by name."""
+        return self.rate if self.kind == "rotation" and (self.momentum or what == "velocity") else self.name
+
+
+def members_of(dimension: int, declarations: Sequence[str]) -> tuple[Member, ...]:
+    """Return the rotations, directions and spins of a system, whose coordinates follow the ordinary ones.
+
+    Args:
+        dimension: number of all coordinates.
+        declarations: as of :attr:`~scvi_codegen.rendering.source.Interface.rotations`.
+    """
+    parts = [text.split() for text in declarations]
+    first = dimension - sum(SIZES[kind] for kind, *_ in parts)
+    members = []
+    for kind, name, *rate in parts:
+        columns = slice(first, first + SIZES[kind])
+        members.append(Member(kind, name, rate[0] if rate else "", columns, momentum=len(rate) > 1))
+        first += SIZES[kind]
+    return tuple(members)
+
+
+def homogeneous_state(interface: Interface, q: Any, p: Any, velocity: Any) -> tuple[Any, Any, Any]:
+    """Return (q, p, velocity) with states by name as (.., m) numbers, and numbers as they are; see :func:`state_of`."""
+    members = members_of(interface.dimension, interface.rotations)
+    if not members or not isinstance(q, Mapping):
+        return q, p, velocity
+    return state_of(interface.coordinates, members, q, p, velocity)
+
+
+def state_of(
+    coordinates: Sequence[str], members: Sequence[Member], q: Mapping[str, Any], p: Any, velocity: Any
+) -> tuple[Any, Any, Any]:
+    """Return (q, p, velocity) with states by name as (.., m) numbers, and momenta and velocities as they are.
+
+    Args:
+        coordinates: names of all coordinates.
+        members: rotations, directions and spins.
+        q: by name: ordinary coordinates, rotations as of :func:`quaternions`, unit vectors (.., 3), spins (.., 3).
+        p: by name: momenta of ordinary coordinates, angular momentum of a rotation in the body frame under its name
+            (that of its momentum in a Hamiltonian), or in the space frame under this name with ``_space``.
+        velocity: by name: of ordinary coordinates and directions, and the angular velocity under its own name (body
+            frame) or with ``_space``.
+
+    Raises:
+        StateError: naming what is unknown, missing or invalid.
+    """
+    ordinary = coordinates[: members[0].columns.start]
+    _check(q, [*ordinary, *(member.name for member in members)], "q")
+    parts = [_column(q, name, "q") for name in ordinary]
+    own = {member.name: _coordinates(member, q) for member in members}
+    state = _joined([*parts, *(own[member.name][0] for member in members)])
+    if p is None and velocity is None and not ordinary and all(member.kind == "spin" for member in members):
+        p = {}
+    if isinstance(velocity, Mapping):
+        velocity = _joined(_moving(ordinary, members, velocity, own, "velocity"))
+    if isinstance(p, Mapping):
+        p = _joined(_moving(ordinary, members, p, own, "p"))
+    return state, p, velocity
+
+
+def _coordinates(member: Member, q: Mapping[str, Any]) -> tuple[Array, Array]:
+    """Return (.., k) homogeneous coordinates and, of a spin, momenta."""
+    value = q[member.name]
+    if member.kind == "rotation":
+        return quaternions(value, member.name), np.zeros(0)
+    vector = real_array(value, member.name)
+    length = np.linalg.norm(vector, axis=-1, keepdims=True) if vector.ndim else np.zeros(1)
+    if not vector.ndim or vector.shape[-1] != 3 or not (length > 0).all():
+        raise StateError(f"'{member.name}' must have three components, not all zero, not {value!r}")
+    if member.kind == "direction":
+        return np.asarray(vector / length), np.zeros(0)
+    return _hopf(vector, length)
+
+
+def _hopf(s: Array, length: Array) -> tuple[Array, Array]:
+    """Return coordinates and momenta (.., 2) of a spin: a real and positive, or b where s points down."""
+    transverse, up = s[..., 0] + 1j * s[..., 1], s[..., 2]
+    size = length[..., 0]
+    north = up >= 0
+    large = np.sqrt(2 * (size + np.abs(up)))
+    small = 2 * transverse / large
+    a = np.where(north, large, np.conj(small))
+    b = np.where(north, small, large)
+    return np.stack([a.real, b.real], axis=-1), np.stack([a.imag, b.imag], axis=-1)
+
+
+def _moving(
+    ordinary: Sequence[str],
+    members: Sequence[Member],
+    values: Mapping[str, Any],
+    own: Mapping[str, tuple[Array, Array]],
+    what: str,
+) -> list[Array]:
+    """Return the parts of momenta or velocities."""
+    names = {member.name: member.moving_name(what) for member in members}
+    known = [*ordinary, *(names[m.name] for m in members if m.kind != "spin")]
+    _check(values, known, what, also=[f"{names[m.name]}_space" for m in members if m.kind == "rotation"])
+    parts = [_column(values, name, what) for name in ordinary]
+    for member in members:
+        q, p = own[member.name]
+        name = names[member.name]
+        if member.kind == "spin":
+            parts.append(p)
+            continue
+        in_space = member.kind == "rotation" and f"{name}_space" in values
+        vector = real_array(values[f"{name}_space" if in_space else name], f"{what}: '{name}'")
+        if not vector.ndim or vector.shape[-1] != 3:
+            raise StateError(f"{what}: '{name}' must have three components, not the shape {vector.shape}")
+        if member.kind == "direction":
+            parts.append(np.asarray(vector - q * (q * vector).sum(axis=-1, keepdims=True)))
+            continue
+        body = np.einsum("...ji,...j->...i", matrices(q), vector) if in_space else vector
+        q, body = np.broadcast_arrays(q, np.concatenate([body, body[..., :1]], axis=-1))
+        parts.append((velocities_of_body if what == "velocity" else momenta_of_body)(q, body[..., :3]))
+    return parts
+
+
+def _check(values: Mapping[str, Any], known: Sequence[str], what: str, also: Sequence[str] = ()) -> None:
+    for name in values:
+        if name not in known and name not in also:
+            raise StateError(
+                f"there is no '{name}' in {what}{closest(str(name), [*known, *also])} Known: {', '.join(known)}"
+            )
+    for name in known:
+        if name not in values and f"{name}_space" not in set(also) & set(values):
+            raise StateError(f"'{name}' is missing in {what}")
+
+
+def _column(values: Mapping[str, Any], name: str, what: str) -> Array:
+    return real_array(values[name], f"{what}: '{name}'")[..., None]
+
+
+def _joined(parts: Sequence[Array]) -> Array:
+    shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
+    return np.concatenate([np.broadcast_to(part, (*shape, part.shape[-1])) for part in parts], axis=-1)

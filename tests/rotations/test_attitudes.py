@@ -1,0 +1,74 @@
+"""Quaternions, matrices, Euler angles and angular velocities, against SciPy's rotations and finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.runtime.rotations.attitudes import (
+    angular_velocity,
+    body_momentum,
+    euler_angles,
+    matrices,
+    momenta_of_body,
+    quaternions,
+    velocities_of_body,
+)
+
+MANY = Rotation.random(40, random_state=1)
+
+
+def test_matrices_are_those_of_scipy():
+    q = quaternions(MANY, "R")
+    np.testing.assert_allclose(matrices(q), MANY.as_matrix(), atol=1e-14)
+    np.testing.assert_allclose(matrices(-3.0 * q), MANY.as_matrix(), atol=1e-14)
+
+
+def test_quaternions_of_matrices_are_those_of_scipy_near_every_half_turn():
+    turns = [Rotation.from_rotvec(axis * np.pi * (1 - 1e-9)) for axis in np.eye(3)]
+    rotations = Rotation.concatenate([MANY, *turns, Rotation.identity()])
+    found = quaternions(rotations.as_matrix(), "R")
+    np.testing.assert_allclose(np.abs((found * quaternions(rotations, "R")).sum(axis=1)), 1.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("axes", ["zxz", "ZYX", "xyz", "YXY"])
+def test_euler_angles_are_those_of_scipy(axes):
+    angles = [0.4, 0.9, -0.3]
+    q = quaternions({"euler": axes, "angles": angles}, "R")
+    np.testing.assert_allclose(matrices(q), Rotation.from_euler(axes, angles).as_matrix(), atol=1e-15)
+    np.testing.assert_allclose(euler_angles(q, axes), angles, atol=1e-14)
+
+
+def test_axis_and_angle_turn_about_the_axis():
+    turned = matrices(quaternions({"axis": [0, 0, 2], "angle": np.pi / 2}, "R"))
+    np.testing.assert_allclose(turned @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+
+
+def test_angular_velocity_in_the_body_frame_moves_the_matrix():
+    rng = np.random.default_rng(2)
+    q, omega, h = 1.7 * quaternions(MANY, "R"), rng.normal(size=(40, 3)), 1e-6
+    v = velocities_of_body(q, omega)
+    rate = (matrices(q + h * v) - matrices(q - h * v)) / (2 * h)
+    cross = np.cross(np.eye(3)[None], omega[:, None, :]) * -1.0  # columns e_k: omega x e_k
+    np.testing.assert_allclose(rate, matrices(q) @ np.swapaxes(cross, 1, 2), atol=1e-8)
+    np.testing.assert_allclose(angular_velocity(q, v), omega, atol=1e-14)
+    np.testing.assert_allclose(body_momentum(q, momenta_of_body(q, omega)), omega, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ([0, 0, 0, 0], "must be finite and not zero"),
+        ([1, 2, 3], r"a quaternion \(w, x, y, z\), a rotation matrix"),
+        (2 * np.eye(3), "differs from the identity by 3.0e"),
+        (-np.eye(3), "det R is negative"),
+        ({"euler": "zz", "angles": [1, 2]}, "Euler angles of 'R' are invalid"),
+        ({"axis": [0, 0, 0], "angle": 1}, "not all zero"),
+        ({"angle": 1}, "has the keys angle"),
+    ],
+)
+def test_values_that_are_no_rotation_are_rejected_by_name(value, message):
+    with pytest.raises(StateError, match=message):
+        quaternions(value, "R")

@@ -1,0 +1,99 @@
+"""Model files with rotations, torques, directions and spins, read, run, written and read again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.cli import main
+from scvi_codegen.errors import ModelFileError
+from scvi_codegen.models.model_files.model_file import dump_model, parse_model
+
+TOP = """
+[system]
+name = "driven top"
+coordinates = ["x"]
+rotations = { R = "omega" }
+lagrangian = "x_dot**2/2 - x**2/2 + (omega_1**2 + 2*omega_2**2 + 3*omega_3**2)/2 - w*R_33*x"
+
+[torques]
+R = ["0", "0", "-c*omega_3"]
+
+[torques_space]
+R = [0, "c", 0]
+
+[parameters]
+w = 1.5
+c = 0.01
+
+[initial]
+q = { x = 0.1, R = { euler = "zxz", angles = [0.0, 0.3, 0.0] } }
+q_dot = { x = 0.0, omega = [0.1, 0.0, 2.0] }
+
+[method]
+method = "svi"
+degree = 3
+
+[run]
+step = 0.05
+steps = 20
+"""
+
+SPINS = """
+[system]
+name = "two spins"
+spins = ["a", "b"]
+hamiltonian = "a_1*b_1 + a_2*b_2 + 1.5*a_3*b_3"
+
+[initial]
+q = { a = [1, 0, 0], b = [0, 0.6, 0.8] }
+
+[run]
+step = 0.1
+steps = 20
+"""
+
+
+def test_a_file_with_rotations_runs_as_the_system_built_in_python():
+    model = parse_model(TOP)
+    system = sc.LagrangianSystem.from_text(
+        "driven top",
+        ["x"],
+        "x_dot**2/2 - x**2/2 + (omega_1**2 + 2*omega_2**2 + 3*omega_3**2)/2 - w*R_33*x",
+        rotations={"R": "omega"},
+        parameters={"w": 1.5, "c": 0.01},
+        torques={"R": ["0", "0", "-c*omega_3"]},
+        torques_space={"R": ["0", "c", "0"]},
+    )
+    assert model.system == system
+    run = sc.compile_stepper(system, "svi:3").integrate(
+        {"x": 0.1, "R": {"euler": "zxz", "angles": [0.0, 0.3, 0.0]}},
+        velocity={"x": 0.0, "omega": [0.1, 0.0, 2.0]},
+        h=0.05,
+        steps=20,
+    )
+    np.testing.assert_allclose(model.integrate().q, run.q, atol=1e-15)
+
+
+@pytest.mark.parametrize("text", [TOP, SPINS], ids=["rotation", "spins"])
+def test_a_model_is_written_with_its_rotations(text):
+    model = parse_model(text)
+    written = dump_model(model)
+    assert ("rotations" in written) == ("rotations" in text)
+    assert ("spins" in written) == ("spins" in text)
+    assert parse_model(written) == model
+
+
+def test_the_command_line_runs_a_file_with_rotations(tmp_path):
+    path = tmp_path / "top.toml"
+    path.write_text(TOP)
+    with pytest.raises(SystemExit) as ended:
+        main(["run", str(path), "-o", str(tmp_path / "out.csv")])
+    assert ended.value.code == 0
+    assert "R_w" in (tmp_path / "out.csv").read_text()
+
+
+def test_an_unknown_rotation_in_the_initial_state_is_named():
+    with pytest.raises(ModelFileError, match="no 'omeg' in velocity"):
+        parse_model(TOP.replace("omega = [0.1", "omeg = [0.1"))
