@@ -129,6 +129,7 @@ class StepEquations:
     def _heading(self) -> Iterator[str]:
         q, p = self.state
         yield f"{self.system.name}: {self.method.title}"
+        yield from (each.description for each in self.system.rotations)
         yield f"{'H' if self.system.auxiliaries else 'L'} = {format_expression(self.system.formula)}"
         for g in self.system.constraints:
             yield f"0 = {format_expression(g)}"

@@ -397,3 +397,11 @@ def test_a_bound_of_the_global_error_is_confirmed_for_attitudes():
     run = compiled(TOP, "svi:6").integrate({"R": ATTITUDE}, velocity={"omega": OMEGA}, t_end=2.0, error=1e-9)
     assert error_of(run, reference(gravity, 2.0)) < 3e-9
     assert run.confirmed_digits >= 9
+
+
+def test_the_derivation_shows_the_form_that_is_stepped():
+    by_momenta, by_velocities = sc.derive(TOP, "svi:2").to_text(), sc.derive(TOP, "scvi:2").to_text()
+    for text in (by_momenta, by_velocities):
+        assert "rotation R = R(q), quaternion q = (R_w, R_x, R_y, R_z) of any length" in text
+    assert "\nH = " in by_momenta
+    assert "\nL = " in by_velocities

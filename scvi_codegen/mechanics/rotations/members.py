@@ -57,6 +57,14 @@ class Rotation:
         return f"rotation {self.name} {self.rate}{' momentum' * self.momentum}"
 
     @property
+    def description(self) -> str:
+        """Definition in one line."""
+        rate = "E(q)^T p/2" if self.momentum else "2 E(q)^T q_dot/|q|^2"
+        names = ", ".join(self.coordinates)
+        quaternion = f"quaternion q = ({names}) of any length"
+        return f"rotation {self.name} = R(q), {quaternion}, {self.rate} = {rate} in the body frame"
+
+    @property
     def coordinates(self) -> tuple[str, ...]:
         """Names of the four components of the quaternion, scalar part first."""
         return tuple(f"{self.name}_{letter}" for letter in "wxyz")
@@ -113,6 +121,11 @@ class Direction:
     def declaration(self) -> str:
         """Kind and names in one line."""
         return f"direction {self.name}"
+
+    @property
+    def description(self) -> str:
+        """Definition in one line."""
+        return f"direction {self.name} = r/|r|, vector r = ({', '.join(self.coordinates)}) of any length"
 
     @property
     def coordinates(self) -> tuple[str, ...]:
@@ -172,6 +185,15 @@ class Spin:
     def declaration(self) -> str:
         """Kind and names in one line."""
         return f"spin {self.name}"
+
+    @property
+    def description(self) -> str:
+        """Definition in one line."""
+        a, b = self.coordinates
+        s = self.name
+        return (
+            f"spin {s}: {s}_1 + i {s}_2 = conj(a) b/2, {s}_3 = (|a|^2 - |b|^2)/4, a = {a} + i p_{a}, b = {b} + i p_{b}"
+        )
 
     @property
     def coordinates(self) -> tuple[str, ...]:
