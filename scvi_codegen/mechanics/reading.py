@@ -10,6 +10,7 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
+from scvi_codegen.formulas.rotations.names import Reduced, RotationNames
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, name_of_key, number, symbol
 from scvi_codegen.formulas.translation import Translation, sympy_expression
 from scvi_codegen.mechanics.arrays.elements import unrolled_fields
@@ -18,7 +19,6 @@ from scvi_codegen.mechanics.constraints import constraints_of
 from scvi_codegen.mechanics.deferred import are_arrays
 from scvi_codegen.mechanics.definition_checks import warn_of_mistakes
 from scvi_codegen.mechanics.forces import damping_rate, dissipative_forces, forces_by_coordinate
-from scvi_codegen.mechanics.rotations.names import Reduced, RotationNames
 
 __all__ = ["default_momenta", "system_from_sympy", "system_from_text"]
 

@@ -33,7 +33,7 @@ from scvi_codegen.validation.argument_types import of
 if TYPE_CHECKING:
     from sympy import Expr, Symbol
 
-    from scvi_codegen.mechanics.rotations.members import Homogeneous
+    from scvi_codegen.formulas.rotations.members import Homogeneous
 
 __all__ = ["SYSTEM", "MechanicalSystem", "TimeTransformation", "zero"]
 
@@ -87,7 +87,7 @@ class MechanicalSystem(Deferred, ABC):
         arrays: declarations of the arrays of known sizes whose entries are coordinates and parameters.
         definition: the text with arrays or rotations that the system was read from, for model files; else empty.
         rotations: rotations, directions and spins, whose coordinates follow the ordinary ones
-            (:mod:`scvi_codegen.mechanics.rotations.members`).
+            (:mod:`scvi_codegen.formulas.rotations.members`).
     """
 
     name: str

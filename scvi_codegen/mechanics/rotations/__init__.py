@@ -1,1 +1,1 @@
-"""Rotations, directions and spins in homogeneous coordinates."""
+"""Hamiltonian form of systems with rotations."""

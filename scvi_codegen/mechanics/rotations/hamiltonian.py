@@ -1,6 +1,6 @@
 """Hamiltonian of a system with rotations whose mass matrix is constant.
 
-In the notation of :mod:`scvi_codegen.mechanics.rotations.members`, with the velocities u = (x_dot, omega), their
+In the notation of :mod:`scvi_codegen.formulas.rotations.members`, with the velocities u = (x_dot, omega), their
 momenta mu = (p_x, E(q)^T p_q/2) and l = u^T M u/2 + b . u - V,
 
     H = (mu - b)^T M^-1 (mu - b)/2 + V(x, R2(q)/|q|^2, t).
@@ -18,11 +18,11 @@ import sympy
 from sympy import Expr, Matrix, S, Symbol
 
 from scvi_codegen.formulas.derivatives import gradient, hessian
+from scvi_codegen.formulas.rotations.names import RotationNames
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.regularity import coupled_blocks
-from scvi_codegen.mechanics.rotations.names import RotationNames
 
 __all__ = ["hamiltonian_of_rotations"]
 

@@ -14,8 +14,8 @@ import numpy as np
 import sympy
 from sympy import Expr, prime
 
+from scvi_codegen.formulas.rotations.members import Spin
 from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.rotations.members import Spin
 from scvi_codegen.mechanics.symmetry.bodies import AXES, Body, bodies
 from scvi_codegen.mechanics.symmetry.invariants import Column, Monomial, Polynomial
 from scvi_codegen.mechanics.system import MechanicalSystem

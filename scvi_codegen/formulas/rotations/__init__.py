@@ -1,0 +1,1 @@
+"""Rotations, directions and spins in formulas, as functions of homogeneous coordinates."""
