@@ -159,6 +159,8 @@ class LagrangianSystem(MechanicalSystem):
         SystemDefinitionError,
         name=TEXT,
         coordinates=FORMULAS,
+        rotations=MAPPING,
+        directions=NAMES,
         velocities=FORMULAS,
         parameters=MAPPED,
         forces=MAPPED,
@@ -171,11 +173,15 @@ class LagrangianSystem(MechanicalSystem):
         *,
         name: str,
         lagrangian: Expr,
-        coordinates: Sequence[Expr | str],
+        coordinates: Sequence[Expr | str] = (),
+        rotations: Mapping[str, str] | None = None,
+        directions: Sequence[str] = (),
         velocities: Sequence[Expr] | None = None,
         time: Symbol | None = None,
         parameters: Mapping[Any, float] | None = None,
-        forces: Mapping[Expr | str, Expr] | None = None,
+        forces: Mapping[Expr | str, Any] | None = None,
+        torques: Mapping[str, Sequence[Expr]] | None = None,
+        torques_space: Mapping[str, Sequence[Expr]] | None = None,
         dissipation: Expr | None = None,
         damping: Expr | float | None = None,
         constraints: Sequence[Expr] = (),
@@ -191,6 +197,8 @@ class LagrangianSystem(MechanicalSystem):
             name: name of the system.
             lagrangian: L.
             coordinates: symbols, or functions of time such as ``dynamicsymbols`` returns.
+            rotations, directions, torques, torques_space: as of :meth:`from_text`; the names in formulas are symbols,
+                ``Symbol("R_33")``, ``Symbol("omega_1")``.
             velocities: parallel to ``coordinates``; by default ``Derivative(q(t), t)`` for a function of time, the
                 symbol called ``q_dot`` for a symbol ``q``.
             time: the symbol for time; by default the argument of the coordinates, or the symbol called ``t``.
@@ -229,6 +237,10 @@ class LagrangianSystem(MechanicalSystem):
             constraints=constraints,
             inputs=inputs,
             tables=tables,
+            rotations=rotations,
+            directions=directions,
+            torques=torques,
+            torques_space=torques_space,
         )
         return system
 

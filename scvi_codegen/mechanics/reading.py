@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import sympy
@@ -118,11 +118,13 @@ def system_from_sympy(
     constraints: Sequence[Any] = (),
     inputs: Sequence[Any] = (),
     tables: Sequence[str] = (),
+    **turning: Any,
 ) -> Any:
     """Return the system of a SymPy expression, its ``function`` ``"Lagrangian"`` or ``"Hamiltonian"``.
 
-    Other arguments are those of ``cls.from_sympy``.
+    Other arguments are those of ``cls.from_sympy``; ``turning`` are those of ``TURNING`` and ``TORQUES``.
     """
+    names = RotationNames.declared(*(turning.get(each) for each in TURNING), momentum=momenta is not None)
     if function == "Lagrangian" and are_arrays(each for each in coordinates if isinstance(each, str)):
         if any(each for each in (velocities, forces, dissipation, damping, constraints, inputs)):
             raise SystemDefinitionError(
@@ -137,8 +139,12 @@ def system_from_sympy(
         }
         return _of_arrays(cls, ArraySystem.from_sympy(lagrangian=formula, **named))
     formula = sympy_expression(formula, function)
-    applied = {q: sympy_expression(f, f"force on {q}") for q, f in (forces or {}).items()}
+    applied = {q: _components(f, f"force on {q}") for q, f in (forces or {}).items()}
+    torques, torques_space = (
+        {name: _components(f, f"torque on {name}") for name, f in (turning.get(each) or {}).items()} for each in TORQUES
+    )
     friction = None if dissipation is None else sympy_expression(dissipation, "dissipation")
+    acting = [f for each in (applied, torques, torques_space) for f in each.values()]
     rate = damping_rate(damping, lambda each: sympy_expression(each, "damping"))
     conditions = constraints_of(constraints, lambda g: sympy_expression(g, "constraint"))
     input_names = tuple(name_of_key(each) for each in inputs)
@@ -146,7 +152,7 @@ def system_from_sympy(
     translation = Translation(
         formula,
         coordinates,
-        (*applied.values(), *(() if friction is None else (friction,)), rate, *conditions),
+        (*_flat(acting), *(() if friction is None else (friction,)), rate, *conditions),
         velocities=velocities,
         momenta=momenta or (),
         time=time,
@@ -159,21 +165,54 @@ def system_from_sympy(
         return lambda each: translation.apply(each, what).xreplace(driven)
 
     by_symbol = {translation.rules.get(q, q): f for q, f in applied.items()}
+    ordinary = [q.name for q in translation.coordinates]
+    variables = (*translation.coordinates, *map(symbol, names.coordinates))
+    if names.members:
+        by_name = {name_of_key(q): f for q, f in by_symbol.items()}
+        forces_of_all = names.forces_by_name(ordinary, reader("forces"), by_name, torques, torques_space, friction)
+    else:
+        forces_of_all = _forces(variables, by_symbol, friction, reader("forces"))
+    conditions = constraints_of(conditions, reader("constraints"))
+    coordinate_names = [q.name for q in variables]
     system = cls(
         name=name,
-        coordinates=translation.coordinates,
-        **({} if momenta is None else {"momenta": translation.momenta}),
+        coordinates=variables,
+        **(
+            {}
+            if momenta is None
+            else {"momenta": (*translation.momenta, *map(symbol, default_momenta(names.coordinates)))}
+        ),
         time=symbol(TIME),
         parameters=translation.parameters,
         defaults=tuple(number(parameter, value) for parameter, value in constants.items()),
-        **{function.lower(): reader(function)(formula)},
-        forces=_forces(translation.coordinates, by_symbol, friction, reader("forces")),
+        **_formulas(
+            names,
+            function.lower(),
+            reader(function)(formula),
+            forces_of_all,
+            conditions,
+            coordinate_names,
+            translation.parameters,
+        ),
         damping=reader("damping")(rate),
-        constraints=constraints_of(conditions, reader("constraints")),
         inputs=input_names,
     )
     warn_of_mistakes(system)
     return system
+
+
+def _components(force: Any, what: str) -> Any:
+    """Return a force as an expression, or its components as a tuple."""
+    return (
+        tuple(sympy_expression(f, what) for f in force)
+        if isinstance(force, tuple | list)
+        else sympy_expression(force, what)
+    )
+
+
+def _flat(forces: Iterable[Any]) -> list[Expr]:
+    """Return expressions and the entries of tuples."""
+    return [each for force in forces for each in (force if isinstance(force, tuple) else (force,))]
 
 
 def _definition(arguments: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import sympy
 from samples import QUICK_FLAGS
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
@@ -434,3 +435,32 @@ def test_terms_linear_in_the_angular_velocity_act(method):
     )
     expected = reference(lambda matrix, rate, t: np.cross(rotor, rate), 2.0)
     assert orders(compiled(system, method), (16, 32), 2.0, expected) == pytest.approx(6, abs=0.3)
+
+
+def test_a_system_in_sympy_is_that_in_text():
+    t = sympy.Symbol("t")
+    x = sympy.Function("x")(t)
+    omega = sympy.symbols("omega_1:4")
+    R_33, k = sympy.Symbol("R_33"), sympy.Symbol("k")
+    by_sympy = sc.LagrangianSystem.from_sympy(
+        name="top on a spring",
+        coordinates=[x],
+        rotations={"R": "omega"},
+        lagrangian=x.diff(t) ** 2 / 2
+        - k * x**2
+        + (omega[0] ** 2 + 2 * omega[1] ** 2 + 3 * omega[2] ** 2) / 2
+        - x * R_33,
+        parameters={k: 1.5},
+        torques={"R": (0, 0, -omega[2] / 5)},
+        forces={x: -x.diff(t)},
+    )
+    by_text = sc.LagrangianSystem.from_text(
+        "top on a spring",
+        ["x"],
+        "x_dot**2/2 - k*x**2 + (omega_1**2 + 2*omega_2**2 + 3*omega_3**2)/2 - x*R_33",
+        rotations={"R": "omega"},
+        parameters={"k": 1.5},
+        torques={"R": ["0", "0", "-omega_3/5"]},
+        forces={"x": "-x_dot"},
+    )
+    assert by_sympy == by_text

@@ -132,11 +132,11 @@ class RotationNames:
     def forces_by_name(
         self,
         coordinates: Sequence[str],
-        read: Callable[[str], Expr],
+        read: Callable[[Any], Expr],
         forces: Mapping[str, Any] | None,
-        torques: Mapping[str, Sequence[str]] | None,
-        torques_space: Mapping[str, Sequence[str]] | None,
-        dissipation: str | None,
+        torques: Mapping[str, Sequence[Any]] | None,
+        torques_space: Mapping[str, Sequence[Any]] | None,
+        dissipation: Any,
     ) -> Forces:
         """Return the forces by name of a coordinate (one), rotation or direction (three components)."""
         rotating = {member.name: member for member in self.rotations}
@@ -156,7 +156,7 @@ class RotationNames:
                     raise SystemDefinitionError(
                         f"there is a {what} on '{name}'{closest(name, known)} Possible: {', '.join(known) or 'none'}"
                     )
-                texts = [formulas] if isinstance(formulas, str) else list(formulas)
+                texts = [formulas] if isinstance(formulas, str | Expr) else list(formulas)
                 if len(texts) != (1 if name in coordinates else len(AXES)):
                     raise SystemDefinitionError(f"the {what} on '{name}' must have three components, not {formulas!r}")
                 force = Matrix([read(text) for text in texts])
