@@ -43,7 +43,7 @@ class Kind:
         """Return the system with a further kinetic energy, and other arguments of from_text."""
         moving, springs = (
             self.sum("y_dot**2/2 + z_dot**2/2", "q_dot[i]**2/2"),
-            self.sum("(y - x)**2/2 + (z - x)**2/2", "(q[i] - x)**2/2"),
+            self.sum("((y - x)**2/2 + (z - x)**2/2)", "(q[i] - x)**2/2"),
         )
         text = f"x_dot**2/2 + {moving} - k*x**2/2 - x**4/9 - {springs}{kinetic}"
         arguments = {"parameters": {"k": 1}, **arguments}
@@ -69,7 +69,7 @@ class Kind:
     def model(self, folder: Path) -> Any:
         """Return the model of a file."""
         text = self.system().to_text() if self.named else None
-        springs = self.sum("(y - x)**2/2 + (z - x)**2/2", "(q[i] - x)**2/2")
+        springs = self.sum("((y - x)**2/2 + (z - x)**2/2)", "(q[i] - x)**2/2")
         text = text or f"x_dot**2/2 + {self.sum('', 'q_dot[i]**2/2')} - k*x**2/2 - x**4/9 - {springs}"
         numbers = ", ".join(f"{name} = {value}" for name, value in self.q.items())
         path = folder / "model.toml"
