@@ -322,7 +322,7 @@ class TestRun:
         model = load_model(path, {"run": {"step": 0.3, "span": 1.0}})
         whole = model.stepper().integrate(model.q, velocity=model.velocity, h=0.3, t_end=1.0)
         with np.load("r.npz") as saved:
-            assert saved["q_q"][-1] == pytest.approx(whole.q["q"][-1], abs=1e-15)
+            assert saved["q"][-1] == pytest.approx(whole.q["q"][-1], abs=1e-15)
         assert model.integrate().t[-1] == 1.0
 
     def test_equal_steps_of_recorded_runs_and_programs_end_elsewhere_with_a_warning(self):

@@ -165,7 +165,7 @@ def test_a_catalogue_reference_may_be_changed():
             "[[events]]\nfunction = 'q'\n[system]",
             "section 'events' in the file; events are supported in Python only",
         ),
-        ("[method]", "[zzz]", "Known: system, forces, inputs, sizes, parameters, tables, initial, method, run"),
+        ("[method]", "[zzz]", "Known: system, forces, torques, torques_space, inputs, sizes, "),
         ("lagrangian", "lagrangain", "unknown key 'lagrangain' in [system]; did you mean 'lagrangian'?"),
         ("degree", "degre", "unknown key 'degre' in [method] for svi; did you mean 'degree'?"),
         ("save_every", "save_evry", "unknown key 'save_evry' in [run]; did you mean 'save_every'?"),

@@ -72,7 +72,7 @@ def test_error_estimate_of_a_fallback_step_is_equal(start):
     for stepper in both(SVI(4)):
         run = stepper.start(*start, h=LONG)
         run.advance(6)
-        errors.append(run.step_error)
+        errors.append((run.step_error, run.worst_step_time))
     assert errors[0][0] == pytest.approx(errors[1][0], rel=1e-12)
     assert errors[0][1] == errors[1][1]
 

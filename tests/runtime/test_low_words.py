@@ -125,11 +125,11 @@ class Begun:
     def words(self) -> tuple[Any, ...]:
         """q, p and their low words; of an array those of the run itself."""
         if self.array:
-            return tuple(self.run._numbers[name].ravel() for name in ("q", "p", "carry_q", "carry_p"))
+            return tuple(self.run._memory.numbers[name].ravel() for name in ("q", "p", "carry_q", "carry_p"))
         return self.run.q, self.run.p, *self.run._compensation
 
     def time(self) -> Fraction:
-        memory = self.run._run if self.array else self.run._memory
+        memory = self.run._memory
         return exact(memory.t, memory.t_low)
 
     def invariants(self) -> tuple[Fraction, Fraction]:

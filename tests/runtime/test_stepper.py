@@ -515,7 +515,7 @@ def test_the_discrete_lagrangian_of_an_explicit_step_is_the_trapezoidal_sum(syst
         f(x[:1], x[1:], h, t[0])[1] for f in (stepper.discrete_legendre_minus, stepper.discrete_legendre_plus)
     )
     assert [*start, *end] == pytest.approx([2 * v - h / 2 * force[0], 2 * v + h / 2 * force[1]], rel=1e-14)
-    assert "newton" not in stepper.source.code
+    assert "newton_solver" not in stepper.source.code
 
 
 def test_undefined_action_is_an_error(compiled):

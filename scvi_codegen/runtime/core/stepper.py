@@ -158,7 +158,8 @@ class Stepper(Integrator):
             raise StateError("t_eval is not supported with inputs: omit t_eval")
         if observe is not None and (data is not None or t_eval is not None):
             raise StateError("observe is not supported with inputs or t_eval: omit observe")
-        q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
+        if self.interface.rotations:
+            q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
         if error is not None:
             alternatives = {"h": h, "steps": steps, "tolerance": tolerance, "observe": observe}
             return confirmed_run(
@@ -209,7 +210,8 @@ class Stepper(Integrator):
         options: SolverOptions | None = None,
     ) -> Run:
         """Return a run from (q, p), or q and a velocity, at t, with fixed steps h or adaptive steps to t_end."""
-        q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
+        if self.interface.rotations:
+            q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
         return self._started(q, p, velocity, (h, t_end, tolerance), t, parameters, options)
 
     def _started(
@@ -322,7 +324,8 @@ class Stepper(Integrator):
         Raises:
             StateError: if a shape, name or number is invalid.
         """
-        q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
+        if self.interface.rotations:
+            q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
         if error is not None:
             others = {"h": h, "steps": steps, "tolerance": tolerance}
             tau = self.interface.energy_parameter or self.interface.time_transformation
@@ -391,7 +394,8 @@ class Stepper(Integrator):
             MethodError: if time is transformed.
             StateError: if a shape, name or number is invalid.
         """
-        q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
+        if self.interface.rotations:
+            q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
         p = momenta_of_each(self, q, p, velocity, t, parameters)
         work = ChaosIndicatorsEnsemble(
             self,
