@@ -208,6 +208,7 @@ def test_generate_for_an_array_system(ring: str) -> None:
     assert invoke("generate", ring, "-o", "ring_svi", "--force").exit_code == 0
 
 
+@pytest.mark.full
 def test_newton_for_an_array_system(ring: str) -> None:
     """Newton is selected by the option or the model; the generated folder retains it."""
     by_option, iterations = (json.loads(invoke("run", ring, "--json", *words).stdout) for words in (NEWTON, ()))
@@ -234,6 +235,7 @@ def test_newton_for_an_array_system(ring: str) -> None:
     assert "are those it was generated with" in invoke("verify", "ring_newton", "--solver", "fixed-point").output
 
 
+@pytest.mark.full
 def test_folder_is_verified_with_its_own_files(ring: str, tmp_path: Path) -> None:
     """Also with arrays from files, which are elsewhere later; a fault in its C is found."""
     np.save("start.npy", np.sin(np.arange(8.0)))
