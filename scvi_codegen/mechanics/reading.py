@@ -126,25 +126,15 @@ def system_from_sympy(
     """
     names = RotationNames.declared(*(turning.get(each) for each in TURNING), momentum=momenta is not None)
     if function == "Lagrangian" and are_arrays(each for each in coordinates if isinstance(each, str)):
-        if any(each for each in (velocities, forces, dissipation, damping, constraints, inputs)):
-            raise SystemDefinitionError(
-                "from_sympy reads the Lagrangian, parameters and tables of a system with arrays: give the rest "
-                "as text to from_text"
-            )
-        named: dict[str, Any] = {
-            "name": name,
-            "coordinates": list(coordinates),
-            "parameters": parameters,
-            "tables": tables,
-        }
-        return _of_arrays(cls, ArraySystem.from_sympy(lagrangian=formula, **named))
+        others = (velocities, forces, dissipation, damping, constraints, inputs, *turning.values())
+        return _arrays_from_sympy(cls, formula, others, name, list(coordinates), parameters, tables)
     formula = sympy_expression(formula, function)
     applied = {q: _components(f, f"force on {q}") for q, f in (forces or {}).items()}
     torques, torques_space = (
         {name: _components(f, f"torque on {name}") for name, f in (turning.get(each) or {}).items()} for each in TORQUES
     )
     friction = None if dissipation is None else sympy_expression(dissipation, "dissipation")
-    acting = [f for each in (applied, torques, torques_space) for f in each.values()]
+    acted = [f for each in (applied, torques, torques_space) for f in each.values()]
     rate = damping_rate(damping, lambda each: sympy_expression(each, "damping"))
     conditions = constraints_of(constraints, lambda g: sympy_expression(g, "constraint"))
     input_names = tuple(name_of_key(each) for each in inputs)
@@ -152,7 +142,7 @@ def system_from_sympy(
     translation = Translation(
         formula,
         coordinates,
-        (*_flat(acting), *(() if friction is None else (friction,)), rate, *conditions),
+        (*_flat(acted), *(() if friction is None else (friction,)), rate, *conditions),
         velocities=velocities,
         momenta=momenta or (),
         time=time,
@@ -165,40 +155,45 @@ def system_from_sympy(
         return lambda each: translation.apply(each, what).xreplace(driven)
 
     by_symbol = {translation.rules.get(q, q): f for q, f in applied.items()}
-    ordinary = [q.name for q in translation.coordinates]
     variables = (*translation.coordinates, *map(symbol, names.coordinates))
     if names.members:
-        by_name = {name_of_key(q): f for q, f in by_symbol.items()}
-        forces_of_all = names.forces_by_name(ordinary, reader("forces"), by_name, torques, torques_space, friction)
+        by_name, ordinary = (
+            {name_of_key(q): f for q, f in by_symbol.items()},
+            [q.name for q in translation.coordinates],
+        )
+        acting = names.forces_by_name(ordinary, reader("forces"), by_name, torques, torques_space, friction)
     else:
-        forces_of_all = _forces(variables, by_symbol, friction, reader("forces"))
-    conditions = constraints_of(conditions, reader("constraints"))
-    coordinate_names = [q.name for q in variables]
+        acting = _forces(variables, by_symbol, friction, reader("forces"))
+    expression, conditions = reader(function)(formula), constraints_of(conditions, reader("constraints"))
+    parts = names, function.lower(), expression, acting, conditions, [q.name for q in variables]
     system = cls(
         name=name,
         coordinates=variables,
-        **(
-            {}
-            if momenta is None
-            else {"momenta": (*translation.momenta, *map(symbol, default_momenta(names.coordinates)))}
-        ),
+        **({} if momenta is None else {"momenta": translation.momenta}),
         time=symbol(TIME),
         parameters=translation.parameters,
         defaults=tuple(number(parameter, value) for parameter, value in constants.items()),
-        **_formulas(
-            names,
-            function.lower(),
-            reader(function)(formula),
-            forces_of_all,
-            conditions,
-            coordinate_names,
-            translation.parameters,
-        ),
+        **_formulas(*parts, translation.parameters),
         damping=reader("damping")(rate),
         inputs=input_names,
     )
     warn_of_mistakes(system)
     return system
+
+
+def _arrays_from_sympy(
+    cls: Any, formula: Any, others: Iterable[Any], name: str, coordinates: list[Any], parameters: Any, tables: Any
+) -> Any:
+    """Return the system of a Lagrangian with arrays; ``others`` are arguments that must be empty."""
+    if any(others):
+        raise SystemDefinitionError(
+            "from_sympy reads the Lagrangian, parameters and tables of a system with arrays: give the rest "
+            "as text to from_text"
+        )
+    arrays = ArraySystem.from_sympy(
+        name=name, lagrangian=formula, coordinates=coordinates, parameters=parameters, tables=tables
+    )
+    return _of_arrays(cls, arrays)
 
 
 def _components(force: Any, what: str) -> Any:

@@ -19,7 +19,7 @@ from scvi_codegen.rendering.names import with_own_names
 from scvi_codegen.rendering.preprocessing import preprocessed
 from scvi_codegen.version import __version__
 
-__all__ = ["ArrayLayout", "Interface", "Source", "check_interface", "included"]
+__all__ = ["COMPONENTS", "ArrayLayout", "Interface", "Source", "check_interface", "included"]
 
 
 TEXTS = ("header", "code", "declarations")
@@ -122,6 +122,11 @@ class Source:
     def from_json(cls, text: str) -> Source:
         """Return the source from :meth:`to_json`."""
         return cls.from_record(json.loads(text))
+
+
+COMPONENTS = {"rotation": 4, "direction": 3, "spin": 2}
+"""Number of homogeneous coordinates by kind."""
+DECLARED = re.compile(r"rotation [A-Za-z]\w* [A-Za-z]\w*( momentum)?|(direction|spin) [A-Za-z]\w*", re.ASCII)
 
 
 def _is_number(value: Any) -> bool:
@@ -277,4 +282,8 @@ class Interface:
         for each in fields(cls):
             if each.name in arguments and not KINDS[str(each.type)](arguments[each.name]):
                 raise ValueError(f"{each.name} is {arguments[each.name]!r:.60}: it must be of type {each.type}")
-        return cls(**arguments)
+        interface = cls(**arguments)
+        kinds = [kind for kind, *_ in map(str.split, filter(DECLARED.fullmatch, interface.rotations))]
+        if len(kinds) < len(interface.rotations) or sum(COMPONENTS[kind] for kind in kinds) > interface.dimension:
+            raise ValueError(f"rotations is {interface.rotations!r:.60}: it must declare some of the coordinates")
+        return interface

@@ -56,12 +56,14 @@ DAMPING = (
     text("a momentum that is not damped", case("damped/svi"), r"data->damping\.shrunk \* dp\[i\] \+ .*;", "dp[i];"),
     text("damping by 1 - gamma h", case("damped/svi"), r"exponential_less_1\(-growth\)", "-growth"),
     text(
-        "slopes by the rate lost",
+        "derivatives by the rate lost",
         case("damped/svi"),
         r"propagate\(back, growth, step->h \* slope\[e\].*;",
         ";",
     ),
-    text("slopes of what grows by h alone", case("damped/svi"), r"propagate\(0, p, -at->p1\[i\], at->grown\);", ";"),
+    text(
+        "derivatives of what grows by h alone", case("damped/svi"), r"propagate\(0, p, -at->p1\[i\], at->grown\);", ";"
+    ),
 )
 
 RATTLES = tuple(
@@ -75,7 +77,11 @@ RATTLES = tuple(
 ) + tuple(
     text(f"{what}, rods/lobatto-svi", case("rods/lobatto-svi"), *edit)
     for what, *edit in (
-        ("slopes of the next point", r"slope = now->slope \+ e \* B, \*own", "slope = now->slope + e * B + 1, *own"),
+        (
+            "derivatives of the next point",
+            r"slope = now->slope \+ e \* B, \*own",
+            "slope = now->slope + e * B + 1, *own",
+        ),
         (
             "positions off by 1e-12 of a step",
             r"RATTLE_POSITION\[b\]\[r\] \* z",
@@ -321,7 +327,7 @@ PARTS = (
     *HAMILTONIANS,
     *CONSTRAINTS,
     here(
-        "a slope by a parameter off by 1e-6",
+        "a derivative by a parameter off by 1e-6",
         case("double/svi"),
         lowered_derivatives,
         "jacobian",

@@ -134,14 +134,14 @@ MUTATIONS = (
         changed_result(lambda loop: replace(loop, power=loop.power - 1) if loop.name.endswith("_0") else loop),
     ),
     function(
-        "a slope five per cent off",
+        "a derivative five per cent off",
         case("double/svi"),
         stage_groups,
         "_derivative_blocks",
         partials(lambda k, derivative: derivative * sympy.Rational(21, 20) if k == 0 else derivative),
     ),
     function(
-        "a slope lost",
+        "a derivative lost",
         case("double/sc"),
         stage_groups,
         "_derivative_blocks",
@@ -164,7 +164,7 @@ MUTATIONS = (
         "",
         within="quadrature_slope",
     ),
-    text("a factor in a slope", case("driven/svi"), r"3\.0 \*", "2.0 *", within="quadrature_slope"),
+    text("a factor in a derivative", case("driven/svi"), r"3\.0 \*", "2.0 *", within="quadrature_slope"),
     text("h for h^2", case("driven/svi"), r"data->square = h \* h;", "data->square = h;"),
     text(
         "a run one step ahead in time",

@@ -33,14 +33,14 @@ STEP_SIZE_FAULTS = (
         within="end_time",
     ),
     text(
-        "the slopes of the rate of time without the length of the step",
+        "the derivatives of the rate of time without the length of the step",
         case("slowed/svi-3"),
         r"step->h \* weight \* slope\[e\]",
         "weight * slope[e]",
         within="end_time",
     ),
     text(
-        "time that has no slopes by positions on the way back",
+        "time that has no derivatives by positions on the way back",
         case("slowed/svi-3"),
         r"\n  if \(back\)\n    arguments_wide",
         "\n  if (0)\n    arguments_wide",

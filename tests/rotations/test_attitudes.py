@@ -67,6 +67,7 @@ def test_angular_velocity_in_the_body_frame_moves_the_matrix():
         ({"euler": "zz", "angles": [1, 2]}, "Euler angles of 'R' are invalid"),
         ({"axis": [0, 0, 0], "angle": 1}, "not all zero"),
         ({"angle": 1}, "has the keys angle"),
+        ({"axis": [0, 0, 1], "angle": "much"}, "R"),
     ],
 )
 def test_values_that_are_no_rotation_are_rejected_by_name(value, message):

@@ -9,6 +9,7 @@ import scvi_codegen as sc
 from scvi_codegen.cli import main
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
+from scvi_codegen.rendering.source import Interface
 
 TOP = """
 [system]
@@ -97,3 +98,13 @@ def test_the_command_line_runs_a_file_with_rotations(tmp_path):
 def test_an_unknown_rotation_in_the_initial_state_is_named():
     with pytest.raises(ModelFileError, match="no 'omeg' in velocity"):
         parse_model(TOP.replace("omega = [0.1", "omeg = [0.1"))
+
+
+@pytest.mark.parametrize("wrong", ["spin", "rotation R", "motion R omega", "rotation R omega; x", "rotation R omega"])
+def test_declarations_in_data_are_checked(wrong):
+    """Also one that declares more coordinates than there are."""
+    interface = sc.compile_stepper(parse_model(SPINS).system, "svi:2").interface
+    record = interface.to_record() | {"rotations": [wrong] * 3}
+    with pytest.raises(ValueError, match="it must declare some of the coordinates"):
+        Interface.from_record(record)
+    assert Interface.from_record(interface.to_record()) == interface

@@ -299,12 +299,12 @@ def test_spins_precess_and_keep_their_length():
 
     def rates(_, y):
         s = y.reshape(count, 3)
-        slope = np.zeros_like(s)
-        slope[:-1] += weights * s[1:]
-        slope[1:] += weights * s[:-1]
-        slope[0, 2] += 0.2
-        slope[1, 1] += 0.25
-        return np.cross(slope, s).ravel()
+        gradient = np.zeros_like(s)
+        gradient[:-1] += weights * s[1:]
+        gradient[1:] += weights * s[:-1]
+        gradient[0, 2] += 0.2
+        gradient[1, 1] += 0.25
+        return np.cross(gradient, s).ravel()
 
     expected = solve_ivp(rates, (0, 1), start.ravel(), method="DOP853", rtol=3e-14, atol=1e-15).y[:, -1].reshape(-1, 3)
     stepper, errors = compiled(chain, "svi:2"), []

@@ -269,6 +269,12 @@ def newton(of: Kind, _: Path) -> Any:
     return of.run(of.compiled(of.system(), solver="newton"))
 
 
+def rotations(of: Kind, _: Path) -> Any:
+    system = of.system(kinetic=" + omega_1**2 + omega_2**2 + omega_3**2 - x*R_33", rotations={"R": "omega"})
+    rest = {**of.p, "omega": [0, 0, 1]}
+    return of.compiled(system).integrate({**of.q, "R": [1, 0, 0, 0]}, velocity=rest, h=0.1, steps=4).rotation()
+
+
 FEATURES: dict[str, Callable[[Kind, Path], Any]] = {
     "SVI, spectral collocation, Runge-Kutta": lambda of, _: of.run(),
     "SCVI": scvi,
@@ -276,6 +282,7 @@ FEATURES: dict[str, Callable[[Kind, Path], Any]] = {
     "Hamiltonians": hamiltonians,
     "any kinetic energy": full_masses,
     "forces, Rayleigh dissipation": forces,
+    "rotations, directions, spins": rotations,
     "uniform damping": damping,
     "holonomic constraints": holonomic,
     "nonholonomic constraints": nonholonomic,

@@ -107,7 +107,7 @@ def _hamilton(system: MechanicalSystem) -> Iterator[Content]:
     yield from formulas(kicks, "equation")
     yield Paragraph(
         "Methods see the function L = p . v - H of q, v and p (Hamilton's principle in phase space, section 1.1): it "
-        "is what L stands for below."
+        "is denoted by L below."
     )
 
 

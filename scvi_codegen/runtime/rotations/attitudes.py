@@ -72,11 +72,11 @@ def _of_angles(value: Mapping[str, Any], name: str) -> Array:
         except (ValueError, TypeError) as error:
             raise StateError(f"the Euler angles of '{name}' are invalid: {error}") from error
     elif set(value) == {"axis", "angle"}:
-        axis = real_array(value["axis"], name)
+        axis, angle = real_array(value["axis"], name), real_array(value["angle"], name)
         length = np.linalg.norm(axis)
-        if axis.shape != (3,) or not length > 0:
-            raise StateError(f"the axis of '{name}' must be three numbers, not all zero, not {value['axis']!r}")
-        rotation = Rotation.from_rotvec(axis / length * float(value["angle"]))
+        if axis.shape != (3,) or angle.ndim or not length > 0:
+            raise StateError(f"the axis of '{name}' must be three numbers, not all zero, and the angle one number")
+        rotation = Rotation.from_rotvec(axis / length * angle)
     else:
         raise StateError(f"the rotation '{name}' must be {ACCEPTED}; the mapping has the keys {', '.join(value)}")
     return np.roll(np.asarray(rotation.as_quat(), dtype=float), 1, axis=-1)

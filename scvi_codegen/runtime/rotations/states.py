@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.native.arguments import real_array
-from scvi_codegen.rendering.source import Interface
+from scvi_codegen.rendering.source import COMPONENTS, Interface
 from scvi_codegen.runtime.rotations.attitudes import (
     matrices,
     momenta_of_body,
@@ -22,8 +22,6 @@ from scvi_codegen.runtime.rotations.attitudes import (
 __all__ = ["Member", "homogeneous_state", "members_of", "state_of"]
 
 Array = NDArray[np.float64]
-
-SIZES = {"rotation": 4, "direction": 3, "spin": 2}
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,20 +54,20 @@ def members_of(dimension: int, declarations: Sequence[str]) -> tuple[Member, ...
         declarations: as of :attr:`~scvi_codegen.rendering.source.Interface.rotations`.
     """
     parts = [text.split() for text in declarations]
-    first = dimension - sum(SIZES[kind] for kind, *_ in parts)
+    first = dimension - sum(COMPONENTS[kind] for kind, *_ in parts)
     members = []
     for kind, name, *rate in parts:
-        columns = slice(first, first + SIZES[kind])
+        columns = slice(first, first + COMPONENTS[kind])
         members.append(Member(kind, name, rate[0] if rate else "", columns, momentum=len(rate) > 1))
-        first += SIZES[kind]
+        first += COMPONENTS[kind]
     return tuple(members)
 
 
 def homogeneous_state(interface: Interface, q: Any, p: Any, velocity: Any) -> tuple[Any, Any, Any]:
     """Return (q, p, velocity) with states by name as (.., m) numbers, and numbers as they are; see :func:`state_of`."""
-    members = members_of(interface.dimension, interface.rotations)
     if not isinstance(q, Mapping):
         return q, p, velocity
+    members = members_of(interface.dimension, interface.rotations)
     return state_of(interface.coordinates, members, q, p, velocity)
 
 
