@@ -58,7 +58,7 @@ DAMPING = (
     text(
         "derivatives by the rate lost",
         case("damped/svi"),
-        r"propagate\(back, growth, step->h \* slope\[e\].*;",
+        r"propagate\(back, growth, step->h \* derivative\[e\].*;",
         ";",
     ),
     text(
@@ -79,8 +79,8 @@ RATTLES = tuple(
     for what, *edit in (
         (
             "derivatives of the next point",
-            r"slope = now->slope \+ e \* B, \*own",
-            "slope = now->slope + e * B + 1, *own",
+            r"derivative = now->derivative \+ e \* B, \*own",
+            "derivative = now->derivative + e * B + 1, *own",
         ),
         (
             "positions off by 1e-12 of a step",

@@ -202,8 +202,8 @@ MUTATIONS = (
     text(
         "momenta of a run advanced by dq",
         case("kepler/svi-3"),
-        r"add_compensated\(now\.p, now\.carry_p, dp\)",
-        "add_compensated(now.p, now.carry_p, dq)",
+        r"add_increments\(now\.p, now\.carry_p, dp\)",
+        "add_increments(now.p, now.carry_p, dq)",
     ),
     text(
         "a kick of the wrong size", case("kepler/composition"), r"dp\[i\] \+= step->h", "dp[i] += 1.0000001 * step->h"

@@ -28,15 +28,15 @@ STEP_SIZE_FAULTS = (
     text(
         "time held where h changes",
         case("slowed/svi-3"),
-        r"flow\(back, time, weight \* rate, at->v \+ INPUT_H\);",
+        r"propagate\(back, time, weight \* rate, at->v \+ INPUT_H\);",
         "",
         within="end_time",
     ),
     text(
         "the derivatives of the rate of time without the length of the step",
         case("slowed/svi-3"),
-        r"step->h \* weight \* slope\[e\]",
-        "weight * slope[e]",
+        r"step->h \* weight \* derivative\[e\]",
+        "weight * derivative[e]",
         within="end_time",
     ),
     text(
