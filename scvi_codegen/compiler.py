@@ -42,8 +42,6 @@ if TYPE_CHECKING:
     from scvi_codegen.pipeline.sources import ArraySources, Sources
     from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 
-__all__ = ["compile_stepper"]
-
 SYSTEM_OR_ARRAYS = ArgumentType(
     "a LagrangianSystem or a HamiltonianSystem", lambda value: isinstance(value, MechanicalSystem)
 )

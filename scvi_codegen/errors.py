@@ -8,33 +8,6 @@ import warnings
 from collections.abc import Iterable
 from typing import Any
 
-__all__ = [
-    "AccuracyWarning",
-    "ArgumentError",
-    "BuildError",
-    "CacheWarning",
-    "ControlError",
-    "EventError",
-    "ExpressionError",
-    "FitError",
-    "MethodError",
-    "MethodWarning",
-    "MissingLibraryError",
-    "ModelFileError",
-    "OrbitError",
-    "PackageError",
-    "PlotError",
-    "RecordingError",
-    "RecordingWarning",
-    "ScviCodegenError",
-    "StateError",
-    "StepFailedError",
-    "SystemDefinitionError",
-    "SystemDefinitionWarning",
-    "closest",
-    "warn",
-]
-
 PACKAGE = __name__.partition(".")[0]
 
 

@@ -18,8 +18,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 
-__all__ = ["SIZES_REQUIRED", "Access", "Array", "ArrayDeclarations", "ArrayMap", "Loop", "Place", "Size"]
-
 SIZES_REQUIRED = (
     "the sizes of its arrays are known at run time only. Give them when compiling, "
     "compile_stepper(system, method, sizes={'N': 8}), or use unroll_sums(system, {'N': 8})"

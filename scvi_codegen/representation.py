@@ -6,8 +6,6 @@ import numbers
 from collections.abc import Callable, Mapping
 from typing import Any
 
-__all__ = ["LONGEST", "clipped", "one_line", "summary"]
-
 LONGEST = 100
 LONGEST_VALUE = 40
 

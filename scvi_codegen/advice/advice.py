@@ -32,8 +32,6 @@ from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.validation.argument_types import SWITCH, TEXT, checks_arguments
 
-__all__ = ["Advice", "Evidence", "advise"]
-
 DEGREES = (2, 4, 6, 8, 10, 12)
 """Degrees, or numbers of stages, among which ``advise`` chooses."""
 SAFETY = 2.0

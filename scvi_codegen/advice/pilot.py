@@ -24,8 +24,6 @@ from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.methods import Method
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
-__all__ = ["Pilot", "PilotRun", "run_pilot"]
-
 Array = NDArray[np.float64]
 Integrate = Callable[..., Trajectory]
 

@@ -29,8 +29,6 @@ from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation.argument_types import SWITCH, checks_arguments, of
 
-__all__ = ["OdeResult", "solve_ivp"]
-
 Array = NDArray[np.float64]
 Solution: TypeAlias = Callable[[ArrayLike], Array]
 REACHED, EVENT, FAILED, MISSED = 0, 1, -1, -2

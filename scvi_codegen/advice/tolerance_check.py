@@ -23,9 +23,6 @@ from scvi_codegen.methods import default_method
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
-__all__ = ["SECOND_RUN", "Known", "known_digits", "missed_tolerance"]
-
-
 Array = NDArray[np.float64]
 
 SECOND_RUN = 10_000

@@ -38,8 +38,6 @@ from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 
-__all__ = ["adaptive_reference", "kepler_ends", "run_adaptive"]
-
 TOLERANCES = (None, 1e-15, 1e-14, 1e-13, 1e-12, 1e-10, 1e-8)
 PEERS = ("heyoka", "rebound")
 FIXED = tuple(2.0 ** (k / 2) for k in range(-2, 9))

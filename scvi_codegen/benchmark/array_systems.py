@@ -26,9 +26,6 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.run.run import Run
 
-__all__ = ["run_energies", "run_thousand_bodies", "run_threads"]
-
-
 STEPS, QUICK_STEPS = 100_000, 2000
 SAMPLES = 500
 PARTS = 10

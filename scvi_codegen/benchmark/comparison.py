@@ -27,9 +27,6 @@ from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.errors import ScviCodegenError
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 
-__all__ = ["ENSEMBLES", "Makers", "race", "run_case", "run_constrained", "run_ensemble", "run_forced"]
-
-
 ENSEMBLES = ("planar-pendulum", "kepler:0.2", "outer-solar-system")
 """Names of the cases that are run as ensembles."""
 

@@ -30,9 +30,6 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.runtime.core.stepper import Stepper
 
-__all__ = ["LINKAGES", "motion_in_angles", "mujoco_motion", "our_motion", "run_constrained_bodies"]
-
-
 GRAVITY = 9.81
 PARTS = 10
 """Number of parts of a run; energies are computed after each."""

@@ -32,9 +32,6 @@ from scvi_codegen.benchmark.cases.texts import (
 from scvi_codegen.benchmark.report import OURS, Point, ResultTable, time_at
 from scvi_codegen.benchmark.settings import Plan, ReportActivity, output_of_process
 
-__all__ = ["run_cold_start", "run_compile_times", "run_mechanisms"]
-
-
 FIRST_STEP_OF_KEPLER = """
 import json, sys, time
 began = time.perf_counter()

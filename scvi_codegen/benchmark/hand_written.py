@@ -27,9 +27,6 @@ from scvi_codegen.tables.basis import cardinal_integrals, continuation, extrapol
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.quadrature import gauss_legendre
 
-__all__ = ["run_control_loop", "run_hand_written"]
-
-
 HAND_WRITTEN = {"planar-pendulum": 0.8, "kepler:0.2": 0.5, "kepler:0.5": 0.2}
 """Cases with a step size."""
 

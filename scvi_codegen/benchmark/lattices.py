@@ -27,9 +27,6 @@ from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.run.run import Run
 
-__all__ = ["PLATFORMS", "reference_of", "rms", "run_growth", "run_lattices"]
-
-
 ERRORS = (1e-4, 1e-7, 1e-10)
 OWN = "composition"
 METHODS = ("svi:2", "svi:4", "svi:6", "svi:8")

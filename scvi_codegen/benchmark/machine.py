@@ -32,9 +32,6 @@ from scvi_codegen.native.compilers import find_compiler
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.version import __version__
 
-__all__ = ["machine", "machine_limits", "run_compilers"]
-
-
 PACKAGES = ("numpy", "scipy", "sympy", "heyoka", "rebound", "CyRK", "numba", "jitcode", "symengine", "pydy")
 
 

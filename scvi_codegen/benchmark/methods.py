@@ -41,9 +41,6 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 
-__all__ = ["fitted_rate", "run_compositions", "run_drift", "run_paper_tables"]
-
-
 DRIFTS = {"kepler:0.2": (0.5, 0.35, 0.2), "kepler:0.5": (0.2, 0.15, 0.1)}
 """Three step sizes for each case, from the largest without a visible truncation error down."""
 

@@ -26,9 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["draw_curves", "plot_curves", "plot_step_sizes", "step_sizes"]
-
-
 COLUMNS = 3
 PANEL, LINE = (4.6, 3.8), 0.25
 """Sizes in inches: of a panel; height of a line of the legend."""

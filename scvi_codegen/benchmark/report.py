@@ -15,23 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "FLOOR",
-    "LEGEND",
-    "OURS",
-    "CaseResult",
-    "Contender",
-    "Measurement",
-    "Point",
-    "ResultTable",
-    "common_error",
-    "error_at",
-    "frontier",
-    "header_lines",
-    "rows",
-    "time_at",
-]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResultTable:

@@ -17,8 +17,6 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native import building
 
-__all__ = ["Plan", "ReportActivity", "output_of_process", "seconds_in_turn", "set_variable", "timed"]
-
 Result = TypeVar("Result")
 
 QUICK_SHARE = 0.05

@@ -34,20 +34,6 @@ from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.models.model_files.key_hints import EVENTS
 from scvi_codegen.native.announcements import announce_to
 
-__all__ = [
-    "FAILURE",
-    "INTERRUPTED",
-    "USAGE",
-    "CommandFailure",
-    "Commands",
-    "check_writable",
-    "emit",
-    "is_quiet",
-    "note",
-    "reporting",
-    "tell",
-]
-
 Command = TypeVar("Command", bound=Callable[..., Any])
 REPORT, QUIET = f"{__name__}.report", f"{__name__}.quiet"
 """Keys of click's context for the document of ``--json`` and for the flag of ``--quiet``."""

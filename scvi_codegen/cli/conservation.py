@@ -13,8 +13,6 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
-__all__ = ["Balance", "energy_balance", "energy_report", "momentum_report"]
-
 Array = NDArray[np.float64]
 
 MAX_LISTED = 12

@@ -22,8 +22,6 @@ from scvi_codegen.native.building import FLAGS_VARIABLE, TUNED_FLAGS
 from scvi_codegen.native.compilers import compiler_title, find_compiler, from_wheel
 from scvi_codegen.native.processes import running
 
-__all__ = ["FAILED", "MISSING", "OK", "CheckResult", "run_checks"]
-
 OK, MISSING, FAILED = "ok", "lacks", "fails"
 PACKAGE = "scvi-codegen"
 REQUIREMENT = re.compile(

@@ -23,8 +23,6 @@ from scvi_codegen.runtime.ensemble.lockstep import Ensemble
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 from scvi_codegen.runtime.ensemble.selection import ensemble_work
 
-__all__ = ["EnsembleOutcome", "ensemble_summary", "integrate_states"]
-
 SHOWN_FAILURES = 8
 """Largest number of failed trajectories that are listed."""
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-__all__ = ["counted", "duration", "in_known_digits", "table"]
-
 
 def counted(count: int, what: str) -> str:
     """Return a number with its noun, in the plural unless the number is 1."""

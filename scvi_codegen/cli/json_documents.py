@@ -19,8 +19,6 @@ from scvi_codegen.results.recording import RecordedRun
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
-__all__ = ["ensemble_numbers", "failure_text", "recorded_numbers", "run_numbers"]
-
 
 def run_numbers(
     model: Model, outcome: RunOutcome, known: Known | None, balance: Balance | None = None

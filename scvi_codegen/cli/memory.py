@@ -11,8 +11,6 @@ from pathlib import Path
 from scvi_codegen.errors import StateError
 from scvi_codegen.models.model import Model
 
-__all__ = ["check_memory", "check_run_memory", "check_state_memory", "usable_memory"]
-
 COPIES = 2
 """Copies of the states that exist at once: the segments, and the arrays that join them."""
 CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")

@@ -20,16 +20,6 @@ from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.model_file import catalogue_model, load_model
 from scvi_codegen.models.problems import PROBLEMS, problem
 
-__all__ = [
-    "METHOD_CHOICES",
-    "SOLVER_OPTION",
-    "ModelOptions",
-    "complete_model",
-    "model_arguments",
-    "read_model",
-    "with_known_sizes",
-]
-
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 METHOD_CHOICES = (

@@ -13,8 +13,6 @@ import click
 
 from scvi_codegen.cli.command_group import is_quiet
 
-__all__ = ["BAR_LENGTH", "interruptions", "progress_bar"]
-
 BAR_LENGTH = 1000
 """Length of the progress bar of a run whose number of steps is not known in advance."""
 

@@ -26,8 +26,6 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.results.recording import RecordedRun, load_run, record_run, resume_run
 from scvi_codegen.runtime.run.run import Run
 
-__all__ = ["RecordedOutcome", "Recording", "check_format", "check_resumed", "describe_progress", "is_run_folder"]
-
 SUFFIX = ".run"
 MAX_STATES = 10_000
 """Largest number of states used to summarise what was conserved."""

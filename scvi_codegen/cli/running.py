@@ -28,16 +28,6 @@ from scvi_codegen.runtime.run.run_loop import record
 from scvi_codegen.runtime.trajectory.joining import joined
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
-__all__ = [
-    "RunOutcome",
-    "conserved",
-    "final_state",
-    "integrate_model",
-    "known_at_end",
-    "summary",
-    "worst_step",
-]
-
 SHOWN_COORDINATES = 6
 """Largest number of coordinates that the final state lists."""
 

@@ -17,8 +17,6 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.run.global_error import GlobalError
 from scvi_codegen.validation.counts import check_tolerance
 
-__all__ = ["model_with_adaptive_steps", "model_with_advised_step", "model_with_global_error"]
-
 ROUND_OFF = 2.0**-52
 """Unit in the last place of 1 in double precision; smaller tolerances mean "as accurate as doubles allow"."""
 MAX_STEPS = 10**9

@@ -17,8 +17,6 @@ from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.arrays.terms import constraint_text, force_of
 from scvi_codegen.methods.method import Method
 
-__all__ = ["derive_sums"]
-
 DIGITS = 17
 
 

@@ -39,8 +39,6 @@ from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.tables.precision import Number
 from scvi_codegen.validation.argument_types import SWITCH, checks_arguments
 
-__all__ = ["StepEquations", "derive"]
-
 MOST_SHOWN = 12
 """Largest number of equations that a notebook shows."""
 

@@ -13,8 +13,6 @@ from scvi_codegen.methods.collocation import SpectralCollocation
 from scvi_codegen.tables.basis import differentiation_matrix
 from scvi_codegen.tables.precision import Number
 
-__all__ = ["MatrixForm", "matrix_form"]
-
 Symbols = Sequence[sympy.Symbol]
 
 

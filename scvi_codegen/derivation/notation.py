@@ -23,9 +23,6 @@ from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.radicals import radical_basis, recognised
 from scvi_codegen.tables.tableau import Tableau
 
-__all__ = ["LARGEST_SHOWN", "Equation", "TableEntry", "entries", "html", "latex", "table_entries", "text_lines"]
-
-
 LARGEST_SHOWN = 400
 """Largest number of operations of an equation that a notebook shows."""
 

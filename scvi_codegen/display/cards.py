@@ -6,8 +6,6 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from typing import NewType
 
-__all__ = ["Html", "card", "grid", "listed", "plain", "sparkline"]
-
 Html = NewType("Html", str)
 WIDTH, HEIGHT = 180, 28
 """Width and height of a small picture, in pixels."""

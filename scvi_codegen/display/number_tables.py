@@ -17,8 +17,6 @@ from scvi_codegen.tables.precision import Number, Vector, mp
 from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.tableau import Tableau
 
-__all__ = ["NumberTable", "Part", "decimal", "number_table", "numbers_html", "positions", "short"]
-
 Part: TypeAlias = Nodes | Quadrature | Tableau
 """Parts of a method with numbers."""
 _Column: TypeAlias = tuple[str, Vector, Sequence[sympy.Expr] | None]

@@ -22,8 +22,6 @@ from scvi_codegen.tables.basis import cardinal_integrals
 from scvi_codegen.tables.precision import Number, mp
 from scvi_codegen.tables.quadrature import gauss_legendre
 
-__all__ = ["Curve", "Grid"]
-
 BITS = 240
 """Precision of fixed-point numbers in bits (72 digits)."""
 CONJUGATE = 1e-11

@@ -25,8 +25,6 @@ from scvi_codegen.tables.precision import Number, Vector, mp
 from scvi_codegen.validation.argument_types import MAPPING, NUMBERS, ArgumentType, checks_arguments, of
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["ExactStep", "exact_discrete_lagrangian", "exact_map"]
-
 MOST_DIGITS = 50
 POINTS = (10, 15, 22, 32)
 """Gauss points per piece; all are tried on the fewest pieces for which a solution is found, then only the last."""

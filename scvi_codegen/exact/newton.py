@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from scvi_codegen.tables.precision import Number, mp
 
-__all__ = ["Array", "Floats", "NotConvergedError", "Solve", "inverse", "largest", "newton", "scaled", "solver"]
-
 Array: TypeAlias = NDArray[Any]
 """Array of mpmath numbers."""
 Floats: TypeAlias = NDArray[np.float64]

@@ -29,8 +29,6 @@ from scvi_codegen.methods.stage_structure import Velocities
 from scvi_codegen.methods.stage_system import StageGroup, StageSystem
 from scvi_codegen.tables.precision import Number, mp
 
-__all__ = ["DerivedStep", "SolvedStep", "compiled_equations", "derived_step"]
-
 DIGITS = 45
 """Digits to which the equations are solved."""
 WIDTH = mp.mpf(10) ** -30

@@ -10,8 +10,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-__all__ = ["remove", "replaced", "sync_folder", "write_atomically"]
-
 
 def write_atomically(path: str | os.PathLike[str], write: Callable[[IO[bytes]], object]) -> None:
     """Write a temporary file in the folder of ``path``, then rename it, so that ``path`` is always complete."""

@@ -25,23 +25,6 @@ import platformdirs
 from scvi_codegen.errors import BuildError, CacheWarning, warn
 from scvi_codegen.files.atomic import remove
 
-__all__ = [
-    "CACHE_VARIABLE",
-    "SIZE_VARIABLE",
-    "CacheInfo",
-    "cache_folder",
-    "cache_info",
-    "clear_cache",
-    "discard",
-    "exposed",
-    "make_folder",
-    "make_room",
-    "remedy_of",
-    "size_limit",
-    "touch",
-    "trusted_folder",
-]
-
 CACHE_VARIABLE = "SCVI_CODEGEN_CACHE"
 SIZE_VARIABLE = "SCVI_CODEGEN_CACHE_SIZE"
 DEFAULT_SIZE = "1G"

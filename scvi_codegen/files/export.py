@@ -26,8 +26,6 @@ from scvi_codegen.files.labelled_arrays import CHUNK_BYTES, Labelled, imported, 
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["LABELLED", "Piece", "States", "check_format", "chunk_rows", "to_dataframe", "write_states", "write_whole"]
-
 Array = NDArray[np.float64]
 Piece: TypeAlias = tuple[Array, Array, Array, NDArray[np.int32]]
 """Chunk of consecutive states: t (n,), q (n, m), p (n, m), iterations (n,)."""

@@ -23,8 +23,6 @@ from scvi_codegen.errors import MissingLibraryError, StateError
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["CHUNK_BYTES", "Labelled", "checked_units", "imported", "missing", "to_dataset", "write_hdf5", "write_zarr"]
-
 CHUNK_BYTES = 2**24
 """Size of chunks in memory and in files."""
 Arrays: TypeAlias = Mapping[str, NDArray[Any]]

@@ -8,8 +8,6 @@ from typing import IO, Any
 
 import numpy as np
 
-__all__ = ["loaded"]
-
 
 @contextmanager
 def loaded(file: Any | IO[bytes]) -> Iterator[Any]:

@@ -20,8 +20,6 @@ from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.cache import cache_folder, exposed, make_folder, make_room, touch, trusted_folder
 from scvi_codegen.files.templates import PACKAGE, template_folder
 
-__all__ = ["cached_source", "store_text", "stored_text"]
-
 
 def cached_source(key: Sequence[str], make: Callable[[], str]) -> str:
     """Return the result of ``make`` for this key, from the cache if it was made before."""

@@ -8,8 +8,6 @@ from typing import Any
 
 from scvi_codegen.errors import ModelFileError
 
-__all__ = ["read_toml"]
-
 MAX_CHARACTERS = 1_000_000
 MAX_BITS = 4096
 """Maximum number of bits of an integer: Python does not print longer ones. TOML's have 64."""

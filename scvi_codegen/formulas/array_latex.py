@@ -8,8 +8,6 @@ from scvi_codegen.formulas.arrays import ArrayTerm
 from scvi_codegen.formulas.symbols import DOT
 from scvi_codegen.indices import Access, Loop, Place
 
-__all__ = ["latex_entry", "latex_sum", "latex_sums"]
-
 
 def latex_sum(term: ArrayTerm) -> str:
     r"""Return a term in LaTeX.

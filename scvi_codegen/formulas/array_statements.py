@@ -22,9 +22,6 @@ from scvi_codegen.formulas.arrays import ArrayParser, ArrayTerm, Bound, term_of
 from scvi_codegen.formulas.grammar import parsed
 from scvi_codegen.indices import Access, Array, Loop, Size
 
-__all__ = ["ArrayForce", "parse_constraint", "parse_force"]
-
-
 _FOR = re.compile(r"\bfor\b")
 
 

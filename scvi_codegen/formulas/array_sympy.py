@@ -17,8 +17,6 @@ from sympy.printing.str import StrPrinter
 
 from scvi_codegen.errors import SystemDefinitionError
 
-__all__ = ["array_text"]
-
 
 def array_text(expression: Expr) -> str:
     """Return the text of a sum of sums.

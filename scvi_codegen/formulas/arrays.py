@@ -21,8 +21,6 @@ from scvi_codegen.formulas.grammar import Parser, Token, parsed
 from scvi_codegen.formulas.symbols import check_name, symbol
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
 
-__all__ = ["ArrayParser", "ArrayTerm", "Bound", "parse_array", "parse_coordinate", "parse_sums", "term_of"]
-
 _TOKEN = re.compile(
     r"(?P<number>(?:\d+(?:\.(?!\.)\d*)?|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
     r"|(?P<operator>\*\*|\.\.|[-+*/(),\[\]<])",

@@ -12,17 +12,6 @@ from sympy.core.function import AppliedUndef
 from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.formulas.vocabulary import CONSTANTS, FUNCTIONS, LARGEST, NAME_OF, shortened
 
-__all__ = [
-    "MAX_BITS",
-    "MAX_DIGITS",
-    "NODES",
-    "beyond_double",
-    "bits",
-    "evaluated",
-    "exponent_problem",
-    "unsupported_part",
-]
-
 MAX_EXPONENT = 64
 MAX_EXPONENT_DENOMINATOR = 10_000
 MAX_BITS = 2048

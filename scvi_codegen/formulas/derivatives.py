@@ -12,8 +12,6 @@ from functools import lru_cache
 
 from sympy import Add, Expr, Function, Mul, Pow, S, Symbol, log
 
-__all__ = ["gradient", "hessian", "jacobian"]
-
 _Gradient = dict[int, Expr]
 
 

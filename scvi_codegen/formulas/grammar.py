@@ -34,8 +34,6 @@ from scvi_codegen.formulas.canonical import (
 from scvi_codegen.formulas.symbols import DOT
 from scvi_codegen.formulas.vocabulary import CONSTANTS, FUNCTIONS
 
-__all__ = ["Parser", "Token", "parse_expression", "parsed"]
-
 MAX_CHARACTERS = 1_000_000
 """Length limit; parsing time grows with length times bracket depth (fifty atoms in a gas: 212 000 characters)."""
 MAX_DEPTH = 100

@@ -17,8 +17,6 @@ from sympy import Basic, Expr, Integer, Symbol
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.symbols import check_name, symbol
 
-__all__ = ["PARTS", "input_formulas", "input_parameters", "inputs_by_name", "with_inputs"]
-
 PARTS = ("0", "1", "2", "3", "t")
 """Suffixes of the five parameters of an input: coefficients by power, and the breakpoint."""
 

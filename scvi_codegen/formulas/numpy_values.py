@@ -14,8 +14,6 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.formulas.vocabulary import NAME_OF
 from scvi_codegen.indices import Access, Loop, Place
 
-__all__ = ["Elements", "on_arrays"]
-
 
 def on_arrays(formula: Expr, known: Mapping[Expr, Any]) -> Any:
     """Return the values of a formula, with the broadcast shape of the arrays in ``known``.

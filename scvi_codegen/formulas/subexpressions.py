@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import sympy
 
-__all__ = ["identity", "key_of", "parts"]
-
 
 def parts(*expressions: sympy.Basic) -> dict[sympy.Basic, None]:
     """Return all distinct subexpressions, beginning with the expressions themselves."""

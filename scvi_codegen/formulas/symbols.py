@@ -21,8 +21,6 @@ from scvi_codegen.errors import SystemDefinitionError
 if TYPE_CHECKING:
     from sympy import Symbol
 
-__all__ = ["C_KEYWORDS", "DOT", "TIME", "check_name", "check_names", "identifier", "name_of_key", "number", "symbol"]
-
 C_KEYWORDS = frozenset(
     """
     alignas alignof auto bool break case char const constexpr continue default do double else enum extern false float

@@ -12,8 +12,6 @@ from scvi_codegen.formulas.subexpressions import parts
 from scvi_codegen.formulas.vocabulary import LARGEST, NAME_OF, shortened
 from scvi_codegen.tables.precision import Number, mp
 
-__all__ = ["Tape", "evaluate"]
-
 CONSTANTS = {sympy.S.Pi: mp.mpf(mp.pi), sympy.S.Exp1: mp.mpf(mp.e)}
 
 

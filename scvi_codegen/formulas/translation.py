@@ -13,8 +13,6 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.canonical import evaluated
 from scvi_codegen.formulas.symbols import DOT, TIME, identifier, symbol
 
-__all__ = ["Translation", "sympy_expression"]
-
 
 def sympy_expression(value: Any, what: str) -> Expr:
     """Return a SymPy expression; numbers are converted.

@@ -8,8 +8,6 @@ from typing import Any
 import sympy
 from sympy import Expr, S
 
-__all__ = ["CONSTANTS", "FUNCTIONS", "LARGEST", "NAME_OF", "shortened"]
-
 LARGEST = 1.7976931348623157e308
 """Largest finite C double."""
 

@@ -8,8 +8,6 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.vocabulary import NAME_OF
 
-__all__ = ["format_expression"]
-
 
 def format_expression(expression: Expr) -> str:
     """Return an expression as text of the grammar, from which ``parse_expression`` rebuilds it node by node.

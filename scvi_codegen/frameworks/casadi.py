@@ -11,8 +11,6 @@ from scvi_codegen.rendering.flow import casadi_name, with_casadi_flow
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.validation.argument_types import SWITCH, checks_arguments, of
 
-__all__ = ["casadi_flow"]
-
 ARGUMENTS = ("q", "p", "parameters", "t", "h")
 
 

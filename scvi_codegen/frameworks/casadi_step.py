@@ -35,8 +35,6 @@ from scvi_codegen.methods.stage_system import StageGroup, StageSystem, Table
 from scvi_codegen.validation.argument_types import SWITCH, TEXTS, checks_arguments
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["EndConditions", "casadi_step", "own_parameters", "read", "straight"]
-
 
 @dataclass(frozen=True)
 class EndConditions:

@@ -28,9 +28,6 @@ from scvi_codegen.runtime.core.validation import Array
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly
 
-__all__ = ["Conditions", "ControlledMotion", "Task", "check_known", "interval"]
-
-
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False}
 """Options that suppress the output of IPOPT."""
 

@@ -27,8 +27,6 @@ from scvi_codegen.runtime.core.validation import check_inputs_given, parameter_i
 from scvi_codegen.validation.argument_types import checks_arguments
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["ArrayFlow", "Arrays", "Flow", "FlowOfRows", "imported"]
-
 
 @dataclass(frozen=True, eq=False)
 class Flow:

@@ -14,8 +14,6 @@ from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.validation.argument_types import checks_arguments, of
 
-__all__ = ["JaxFlow", "jax_flow"]
-
 _registered: set[str] = set()
 
 

@@ -19,8 +19,6 @@ from jax.interpreters import ad, batching, mlir
 
 from scvi_codegen.errors import MethodError
 
-__all__ = ["states_along"]
-
 STATIC = ("target", "steps", "save_every", "size")
 SECOND: dict[str, Callable[[], str]] = {}
 """Functions that return the target with second derivatives, by name of the target."""

@@ -24,8 +24,6 @@ from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.validation.argument_types import MAPPING, TEXT, checks_arguments
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["optimal_control"]
-
 
 @checks_arguments(
     StateError,

@@ -16,8 +16,6 @@ from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.validation.argument_types import checks_arguments, of
 
-__all__ = ["GravitatingBodies", "from_rebound", "to_rebound"]
-
 AXES = "xyz"
 NEWTON = ("basic", "compensated")
 """REBOUND's names of pairwise gravity by direct summation."""

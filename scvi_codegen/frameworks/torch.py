@@ -10,8 +10,6 @@ from scvi_codegen.frameworks.flow import ArrayFlow, Arrays, FlowOfRows, imported
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.validation.argument_types import checks_arguments, of
 
-__all__ = ["TorchFlow", "torch_flow"]
-
 
 @checks_arguments(StateError, stepper=of("a compiled stepper", Stepper))
 def torch_flow(stepper: Stepper, *, steps: int, save_every: int | None = None) -> TorchFlow:

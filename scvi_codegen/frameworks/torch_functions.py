@@ -16,8 +16,6 @@ from scvi_codegen.errors import MethodError
 from scvi_codegen.frameworks.flow import FlowOfRows
 from scvi_codegen.native.options import step_failure
 
-__all__ = ["StatesAlong"]
-
 STATES, PUSH, PULL = range(3)
 NO_MEMORY = 6
 

@@ -26,8 +26,6 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
 from scvi_codegen.ir.numbers import exact_number
 
-__all__ = ["lower_kernel"]
-
 FUNCTIONS = {
     sympy.sin: "sin",
     sympy.cos: "cos",

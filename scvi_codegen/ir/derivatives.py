@@ -8,8 +8,6 @@ from scvi_codegen.ir.equations import LoweredStageGroup
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
 
-__all__ = ["Derivatives", "InputDerivatives", "PointDerivatives", "TimeDerivatives"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InputDerivatives:

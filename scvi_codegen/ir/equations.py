@@ -12,16 +12,6 @@ from dataclasses import dataclass
 from scvi_codegen.ir.kernel import Kernel, LoopedKernel
 from scvi_codegen.ir.numbers import Number, NumberTable
 
-__all__ = [
-    "ConstrainedSteps",
-    "Constraints",
-    "DerivativeBlock",
-    "GatherLoop",
-    "LoweredStageGroup",
-    "Rattle",
-    "ScatterLoop",
-]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GatherLoop:

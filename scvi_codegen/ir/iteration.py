@@ -10,19 +10,6 @@ from typing import Literal, TypeAlias
 from scvi_codegen.ir.kernel import Kernel, LoopedKernel
 from scvi_codegen.ir.numbers import Number, NumberTable
 
-__all__ = [
-    "AdaptivePredictor",
-    "Control",
-    "FixedPointIteration",
-    "IterationName",
-    "IterationTable",
-    "PredictorTables",
-    "Splitting",
-    "StoredValues",
-    "transposed",
-]
-
-
 IterationName: TypeAlias = Literal["separable", "Hamiltonian", "coupled", "collocation", "shooting"]
 
 

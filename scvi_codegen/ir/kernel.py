@@ -25,23 +25,6 @@ from scvi_codegen.ir.numbers import Number
 if TYPE_CHECKING:
     import sympy
 
-__all__ = [
-    "LARGEST_PART",
-    "Constant",
-    "Expression",
-    "Kernel",
-    "Load",
-    "LoopedKernel",
-    "Operation",
-    "Part",
-    "Statement",
-    "is_divided",
-    "kept_length",
-    "loads",
-    "operations",
-    "parts",
-]
-
 
 @dataclass(frozen=True, slots=True)
 class Constant:

@@ -10,8 +10,6 @@ import sympy
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.tables.precision import DIGITS, Matrix, Vector, mp, settled
 
-__all__ = ["Number", "NumberTable", "exact_number", "lower_matrix", "lower_vector"]
-
 TABLE_DIGITS = 50
 """Digits of a table; the last of the 60 that it is computed with are rounding errors, and a 1 has to be exactly 1."""
 

@@ -17,18 +17,6 @@ from scvi_codegen.ir.iteration import FixedPointIteration, Splitting
 from scvi_codegen.ir.kernel import Kernel, LoopedKernel
 from scvi_codegen.ir.numbers import Number, NumberTable
 
-__all__ = [
-    "FEW_UNKNOWNS",
-    "Integrals",
-    "Layout",
-    "LoopedTerms",
-    "MomentumMap",
-    "Program",
-    "Quantities",
-    "StageCurve",
-    "StageEquations",
-]
-
 LEAST_REUSED_UNKNOWNS = 32
 """Number of unknowns from which on factors of the Newton matrix are reused in later steps.
 

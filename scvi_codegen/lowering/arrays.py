@@ -12,8 +12,6 @@ from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 
-__all__ = ["SOLVERS", "check_solver", "check_solver_of_arrays", "one_coordinate"]
-
 SOLVERS = ("fixed-point", "newton")
 """Solvers of the equations of a step of an array system."""
 

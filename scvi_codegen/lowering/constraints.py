@@ -60,8 +60,6 @@ from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.tables.basis import matrix_product, transpose
 from scvi_codegen.tables.precision import Vector, mp
 
-__all__ = ["constrained_steps", "lowered_constraints", "rattle_of"]
-
 
 def rattle_of(system: MechanicalSystem, stages: StageSystem) -> Rattle | None:
     """Return the tables of such steps; ``None`` if they are not applicable."""

@@ -29,9 +29,6 @@ from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.time_transformation import time_rescaling_function
 
-__all__ = ["control_of", "density_of", "predictor_of"]
-
-
 LEVELS_PER_BINADE, REACH = 4, 2
 """Levels per factor of two, and the largest change of level for which the predictor is available."""
 MANTISSAS = tuple(round(2.0 ** (k / LEVELS_PER_BINADE + 32)) / 2.0**32 for k in range(LEVELS_PER_BINADE))

@@ -22,8 +22,6 @@ from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import StageGroup, StageSystem
 
-__all__ = ["derivatives_of", "point_derivatives_of"]
-
 
 def derivatives_of(
     system: MechanicalSystem, stages: StageSystem, program: Program, *, second: bool = False

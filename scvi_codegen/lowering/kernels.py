@@ -15,8 +15,6 @@ from scvi_codegen.ir.kernel import Kernel, LoopedKernel
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 
-__all__ = ["comment_text", "damping_kernel", "integrand_kernel", "looped_kernel", "system_kernel"]
-
 
 def integrand_kernel(system: MechanicalSystem, name: str, of: Iterable[Symbol]) -> Kernel | None:
     """Return the kernel of the functions that a run integrates along its curve; ``None`` if there are none."""

@@ -23,8 +23,6 @@ from scvi_codegen.mechanics.arrays.terms import entries_of, force_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.term_groups import SplitSystem, TermGroup
 
-__all__ = ["looped_terms", "reach_of", "with_sums"]
-
 
 def looped_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, newton: bool) -> LoopedTerms:
     """Return the kernels of the terms of a system of arrays; ``newton``: with the Jacobian of the forces."""

@@ -43,9 +43,6 @@ from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.tables.basis import cardinal_values, legendre_functional
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
-__all__ = ["lower"]
-
-
 SOLVERS = ("auto", "explicit", "fixed-point", "newton")
 
 

@@ -28,16 +28,6 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Gather, StageGroup, StageSystem
 from scvi_codegen.tables.precision import mp
 
-__all__ = [
-    "UnknownLayout",
-    "argument_name",
-    "bandwidth",
-    "bandwidth_ordering",
-    "has_action",
-    "layout_of",
-    "lowered_stage_group",
-]
-
 
 @dataclass(frozen=True, slots=True)
 class UnknownLayout:

@@ -26,19 +26,6 @@ from scvi_codegen.mechanics.regularity import row_rank, sample_points
 if TYPE_CHECKING:
     from scvi_codegen.mechanics.system import MechanicalSystem
 
-__all__ = [
-    "check_constraints",
-    "constraint_jacobian",
-    "constraint_multipliers",
-    "constraint_rates",
-    "constraints_of",
-    "holonomic",
-    "holonomic_expressions",
-    "nonholonomic_expressions",
-    "time_derivatives",
-    "with_constraint_forces",
-]
-
 
 def constraints_of(constraints: Iterable[Any] | None, read: Callable[[Any], Expr]) -> tuple[Expr, ...]:
     """Return g of each formula; an equation, ``left = right`` or SymPy's ``Eq``, becomes left - right."""

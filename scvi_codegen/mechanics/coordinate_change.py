@@ -15,8 +15,6 @@ from scvi_codegen.formulas.symbols import DOT, check_names, symbol
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.validation.argument_types import MAPPING, NAMES, checks_arguments, of
 
-__all__ = ["change_coordinates"]
-
 
 @checks_arguments(system=of("a LagrangianSystem", LagrangianSystem), old=MAPPING, coordinates=NAMES)
 def change_coordinates(

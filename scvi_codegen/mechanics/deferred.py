@@ -16,8 +16,6 @@ from typing import TYPE_CHECKING, Any, Self
 from scvi_codegen.files.source_cache import store_text, stored_text
 from scvi_codegen.formulas.subexpressions import key_of
 
-__all__ = ["Deferred", "are_arrays"]
-
 
 class Deferred:
     """Base of frozen dataclasses with slots: fields without a value are read from text when they are first accessed.

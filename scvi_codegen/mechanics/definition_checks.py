@@ -21,8 +21,6 @@ from scvi_codegen.mechanics.regularity import null_direction, singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Number, mp
 
-__all__ = ["check_definition", "check_lagrangian", "warn_of_mistakes", "warn_of_negative", "warn_of_unused"]
-
 REQUIRED = "A regular Lagrangian is required: d2L/dv2 must be invertible."
 REDUNDANT = (
     "Add the missing kinetic energy, or use fewer coordinates: as many as there are independent motions with inertia"

@@ -21,8 +21,6 @@ from sympy import Expr, Symbol
 from scvi_codegen.formulas.derivatives import gradient, jacobian
 from scvi_codegen.mechanics.system import MechanicalSystem
 
-__all__ = ["Entries", "Forms", "accelerations", "auxiliary_multipliers", "curve_rates", "forms_of", "multipliers"]
-
 Entries = dict[tuple[int, int], Expr]
 """The non-zero entries of a matrix by (row, column), ascending."""
 

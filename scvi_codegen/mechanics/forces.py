@@ -39,8 +39,6 @@ from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.symbols import name_of_key
 
-__all__ = ["check_damping", "damping_rate", "dissipative_forces", "forces_by_coordinate"]
-
 
 def forces_by_coordinate(
     coordinates: Sequence[Symbol], by_name: Mapping[Any, Any], read: Callable[[Any], Expr]

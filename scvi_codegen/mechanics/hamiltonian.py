@@ -29,8 +29,6 @@ from scvi_codegen.validation.argument_types import (
 if TYPE_CHECKING:
     from sympy import Expr, Symbol
 
-__all__ = ["HamiltonianSystem"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HamiltonianSystem(MechanicalSystem):

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     from scvi_codegen.formulas.rotations.names import Reduced
 
-__all__ = ["LagrangianSystem"]
-
 LAGRANGES_METHOD = ArgumentType("a LagrangesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "lam_vec"))
 KANES_METHOD = ArgumentType("a KanesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "kindiffdict"))
 BODIES = ArgumentType("a System of sympy.physics.mechanics", lambda value: hasattr(value, "actuators"))

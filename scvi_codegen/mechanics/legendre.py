@@ -28,8 +28,6 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.validation.argument_types import NAMES, TEXTS, checks_arguments, of
 
-__all__ = ["equivalent_lagrangian", "hamiltonian_of", "lagrangian_of", "legendre_dual", "positive_parameters"]
-
 LARGEST_INVERSE = 3
 """Largest number of coupled momenta (velocities) whose quadratic form is inverted symbolically."""
 NEGLIGIBLE = mp.mpf(10) ** -30

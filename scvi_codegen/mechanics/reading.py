@@ -20,8 +20,6 @@ from scvi_codegen.mechanics.deferred import are_arrays
 from scvi_codegen.mechanics.definition_checks import warn_of_mistakes
 from scvi_codegen.mechanics.forces import damping_rate, dissipative_forces, forces_by_coordinate
 
-__all__ = ["default_momenta", "system_from_sympy", "system_from_text"]
-
 Read = Callable[[Any], Expr]
 
 TURNING = ("rotations", "directions", "spins")

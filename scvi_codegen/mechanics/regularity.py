@@ -14,8 +14,6 @@ from scvi_codegen.formulas.derivatives import hessian
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.tables.precision import Number, mp
 
-__all__ = ["Entries", "coupled_blocks", "null_direction", "row_rank", "sample_points", "singular_part"]
-
 Entries = Mapping[tuple[int, int], Expr]
 
 NEGLIGIBLE = mp.mpf(10) ** -40

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
     from scvi_codegen.formulas.rotations.members import Homogeneous
 
-__all__ = ["SYSTEM", "MechanicalSystem", "TimeTransformation", "zero"]
-
 MAX_OPERATIONS = 200
 """Maximum number of operations of a formula shown in a notebook."""
 

@@ -19,8 +19,6 @@ from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.system import MechanicalSystem
 
-__all__ = ["MAX_GROUPS", "MIN_GROUP_SIZE", "SimilarTerms", "SplitSystem", "TermGroup", "rolled", "similar_terms"]
-
 MIN_GROUP_SIZE = 300
 """Minimum number of terms of a group; smaller ones are unrolled, which is short enough and shares subexpressions."""
 MAX_GROUPS = 64

@@ -47,9 +47,6 @@ from scvi_codegen.mechanics.legendre import positive_parameters
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem, TimeTransformation
 from scvi_codegen.validation.argument_types import checks_arguments
 
-__all__ = ["CONTROLLERS", "TIME_RESCALINGS", "reparametrise", "time_rescaling_function", "with_time_transformation"]
-
-
 CONTROLLERS = ("symplectic", "reversible")
 """Uses of a time-rescaling function: transform the time of a system, or control the step sizes of its runs."""
 

@@ -22,8 +22,6 @@ from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.validation.argument_types import checks_arguments
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["variational_system", "with_tangent_vectors"]
-
 
 @checks_arguments(system=SYSTEM)
 def variational_system(system: MechanicalSystem, count: int) -> LagrangianSystem:

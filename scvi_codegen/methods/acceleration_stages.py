@@ -27,19 +27,6 @@ from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
 from scvi_codegen.tables.tableau import Tableau
 
-__all__ = [
-    "VELOCITY_BLOCK",
-    "acceleration_extrapolation",
-    "acceleration_gathers",
-    "acceleration_unknowns",
-    "nodal_blocks",
-    "nodal_collocation",
-    "nodal_gathers",
-    "position_system",
-    "residual_group",
-    "single_point",
-]
-
 VELOCITY_BLOCK = Block(name="v_0", power=1, straight=(mp.zero, mp.one))
 
 

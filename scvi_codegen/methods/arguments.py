@@ -7,8 +7,6 @@ from scvi_codegen.tables.nodes import Nodes, nodes_by_name
 from scvi_codegen.tables.quadrature import Quadrature, gauss_legendre, quadrature_by_name
 from scvi_codegen.tables.spaces import CurveSpace, Polynomials, space_by_name
 
-__all__ = ["resolve_nodes", "resolve_quadrature", "resolve_space"]
-
 
 def resolve_quadrature(quadrature: Quadrature | str | None, degree: int) -> Quadrature:
     """Return a quadrature from an object or a name; by default ``degree`` Gauss points."""

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from scvi_codegen.display.number_tables import Part
     from scvi_codegen.methods.stage_system import StageSystem
 
-__all__ = ["SpectralCollocation"]
-
 
 @dataclass(frozen=True, slots=True)
 class SpectralCollocation(Method):

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from scvi_codegen.display.number_tables import Part
     from scvi_codegen.methods.stage_system import StageSystem
 
-__all__ = ["Composition", "StoermerVerlet"]
-
 KICK_DRIFT_KICK, DRIFT_KICK_DRIFT = "kick-drift-kick", "drift-kick-drift"
 """Sequences of a leapfrog step: forces at both ends, shared between steps, or forces in the middle."""
 

@@ -48,8 +48,6 @@ from scvi_codegen.tables.basis import cardinal_values
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 from scvi_codegen.tables.quadrature import gauss_legendre
 
-__all__ = ["END_VELOCITY", "with_constraints"]
-
 END_VELOCITY = "v_1"
 """Name of the unknown velocity that corresponds to the momentum at the end."""
 

@@ -32,8 +32,6 @@ from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, Stage
 from scvi_codegen.tables.basis import identity_matrix, next_step
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
-__all__ = ["discretise", "discretised_form", "is_conformally_symplectic", "is_symplectic", "paper_equations"]
-
 NUMBERS = {"34a": "35a", "34c": "35c", "34d": "35d", "34e": "35e"}
 """Equation numbers of the paper for the shooting method in phase space, by those for Lagrangians."""
 BLOCK_NAMES = {"quadrature": "P", "derivative": "P", "stage": "P", "node": "N", "start": "S", "end": "E", "drift": "P"}

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from scvi_codegen.display.number_tables import Part
     from scvi_codegen.methods.stage_system import StageSystem
 
-__all__ = ["SVI"]
-
 
 @dataclass(frozen=True, slots=True)
 class SVI(Method):

@@ -35,15 +35,6 @@ from scvi_codegen.tables.precision import Matrix, Vector, mp
 from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.tableau import Tableau
 
-__all__ = [
-    "action_groups",
-    "galerkin_system",
-    "lagrangian_scatters",
-    "nodal_quadrature_group",
-    "phase_space_system",
-    "position_block",
-]
-
 
 def galerkin_system(
     system: MechanicalSystem,

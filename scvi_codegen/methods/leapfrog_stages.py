@@ -13,8 +13,6 @@ from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, Stage
 from scvi_codegen.tables.basis import identity_matrix
 from scvi_codegen.tables.precision import Vector, mp
 
-__all__ = ["kicks_and_drifts", "leapfrog_system"]
-
 
 def leapfrog_system(system: MechanicalSystem, method: Method) -> StageSystem:
     """Return the leapfrog steps of a method, one after the other; unknowns are the velocities V_k of the drifts.

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
     from scvi_codegen.methods.stage_system import StageSystem
 
-__all__ = ["Exactness", "Method", "Specification", "degree_count"]
-
 degree_count = partial(checked_count, least=1, most=MAX_STAGES, error=MethodError)
 """Validation of a degree or a number of stages."""
 

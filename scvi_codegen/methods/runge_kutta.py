@@ -32,20 +32,6 @@ if TYPE_CHECKING:
     from scvi_codegen.display.number_tables import Part
     from scvi_codegen.methods.stage_system import StageSystem
 
-__all__ = [
-    "TABLEAU_METHODS",
-    "ChebyshevGauss",
-    "ChebyshevLobatto",
-    "CollocationRK",
-    "ExplicitEuler",
-    "Gauss",
-    "LobattoIIIA",
-    "RadauIA",
-    "RadauIIA",
-    "RungeKutta",
-    "check_form",
-]
-
 FORMS = ("phase-space", "position")
 
 

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from scvi_codegen.display.number_tables import Part
     from scvi_codegen.methods.stage_system import StageSystem
 
-__all__ = ["SCVI"]
-
 COLLOCATION_TABLEAUX = ("gauss", "radau-iia", "lobatto-iiia", "chebyshev-gauss", "chebyshev-lobatto")
 """Families of tableaux that are collocation methods."""
 

@@ -43,8 +43,6 @@ from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.spaces import Polynomials
 from scvi_codegen.tables.tableau import Tableau
 
-__all__ = ["printed_increments", "printed_nodal", "shooting_increments", "shooting_nodal"]
-
 
 def shooting_increments(
     system: MechanicalSystem, tableau: Tableau, rule: Quadrature, *, rounded: bool = True

@@ -14,8 +14,6 @@ from scvi_codegen.tables.precision import Matrix, Vector
 from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.tableau import Tableau
 
-__all__ = ["Accelerations", "PrintedCurve", "ShotCurve", "Velocities"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Velocities(Shape):

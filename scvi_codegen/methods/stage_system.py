@@ -31,22 +31,6 @@ import sympy
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
 
-__all__ = [
-    "Block",
-    "Gather",
-    "Row",
-    "ScalarStageGroup",
-    "Scatter",
-    "Shape",
-    "StageGroup",
-    "StageSystem",
-    "Table",
-    "dyadic",
-    "stationary_increments",
-    "stationary_nodal",
-    "unit_sum",
-]
-
 DYADIC_BITS = 52
 ROUNDING = mp.mpf("1e-50")
 """Bound below which entries are set to 0: round-off of sums that are 0."""

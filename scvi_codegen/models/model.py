@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from scvi_codegen.runtime.run.run import Run
     from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
-__all__ = ["DEFAULT_METHOD", "Model"]
-
 DEFAULT_METHOD = SVI(8)
 """Default method for the problems of the catalogue."""
 STATE = ("q", "p", "velocity")

@@ -28,8 +28,6 @@ from scvi_codegen.models.systems import (
 from scvi_codegen.representation import summary
 from scvi_codegen.validation.argument_types import TEXT, checks_arguments
 
-__all__ = ["PROBLEMS", "Problem", "problem"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Problem:

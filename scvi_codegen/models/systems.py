@@ -8,22 +8,6 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 
-__all__ = [
-    "cart_pole",
-    "charged_particle",
-    "double_pendulum",
-    "duffing",
-    "fput_chain",
-    "harmonic_oscillator",
-    "henon_heiles",
-    "kepler",
-    "outer_solar_system",
-    "planar_pendulum",
-    "point_vortices",
-    "relativistic_particle",
-    "spherical_pendulum",
-]
-
 MAX_CHAIN = 1024
 
 

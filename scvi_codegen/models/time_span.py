@@ -11,8 +11,6 @@ from typing import Any
 from scvi_codegen.errors import MethodWarning, ModelFileError, warn
 from scvi_codegen.validation.counts import LARGEST_COUNT, check_tolerance, checked_count
 
-__all__ = ["TimeSpan", "check_length", "check_one_of", "real", "whole_steps_in"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TimeSpan:

@@ -12,8 +12,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
-__all__ = ["announce_to", "announced", "tell"]
-
 PATIENCE_SECONDS = 1.0
 LOGGER = logging.getLogger("scvi_codegen")
 

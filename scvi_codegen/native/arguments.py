@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError
 
-__all__ = ["checked_number", "checked_step", "empty_array", "real_array"]
-
 LONGEST_SHOWN = 60
 REAL_KINDS = "iufO"
 """Accepted kinds of numbers: not complex ones, whose imaginary part would be lost, dates, text or truth values."""

@@ -17,8 +17,6 @@ from scvi_codegen.errors import MethodError
 from scvi_codegen.native.building import Library
 from scvi_codegen.native.options import FALLBACK_REQUIRED, SolverOptions, checked_options
 
-__all__ = ["Binding"]
-
 DOUBLE_SIZE = np.dtype(np.float64).itemsize
 WITHOUT_STEPS = frozenset(("start", "step_error", "energies"))
 """Frequent functions that never request the fallback."""

@@ -15,8 +15,6 @@ from typing import Any
 
 from scvi_codegen.errors import BuildError
 
-__all__ = ["another_compiler", "compiler_title", "compiler_version", "find_compiler", "from_wheel", "words_of"]
-
 WHEEL = "take one from a wheel: pip install 'scvi-codegen[compiler]' (ziglang)"
 
 

@@ -12,8 +12,6 @@ from scvi_codegen.native.announcements import announced
 from scvi_codegen.native.building import run_compiler
 from scvi_codegen.rendering.source import Source
 
-__all__ = ["TARGETS", "library_for"]
-
 TARGETS = {
     "aarch64-darwin": "aarch64-macos",
     "aarch64-linux": "aarch64-linux-gnu.2.17",

@@ -14,8 +14,6 @@ import _cffi_backend
 from scvi_codegen.native.compilers import compiler_version, find_compiler
 from scvi_codegen.rendering.source import Source
 
-__all__ = ["FLAGS_VARIABLE", "fingerprint"]
-
 FLAGS_VARIABLE = "SCVI_CODEGEN_CFLAGS"
 """Variable of further flags; not ``CFLAGS``, where package managers may set an ``-march`` that overrides the tuning."""
 

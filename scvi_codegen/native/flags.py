@@ -9,8 +9,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-__all__ = ["check_flags"]
-
 ALLOWED = re.compile(
     r"-O([0123sgz]|fast)?|-g[0123]?|-W(no-)?[a-z][a-z-]*|-pthread"
     r"|-m(arch|tune|cpu)=[\w.+-]+|-m(no-)?(avx[\w.-]*|sse[\w.]*|fma4?|f16c|bmi2?|prefer-vector-width=\d+)"

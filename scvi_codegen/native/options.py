@@ -10,8 +10,6 @@ from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.rendering.convergence import MAX_ITERATIONS, TOLERANCE
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["FAILURES", "NOT_CONVERGED", "REASONS", "STATUS", "SolverOptions", "checked_options", "step_failure"]
-
 STATUS = {
     1: "not converged",
     2: "singular",

@@ -11,8 +11,6 @@ from pathlib import Path
 
 from scvi_codegen.errors import BuildError
 
-__all__ = ["running"]
-
 GUARDED = 'exec 3<&0 </dev/null; (read -r end <&3; kill -KILL 0) >/dev/null 2>&1 & exec 3<&-; exec "$@"'
 """Shell command that runs a program and kills its process group when the pipe from Python closes."""
 

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
     from matplotlib.axes import Axes
 
-__all__ = ["FILMS", "Film", "animate"]
-
 FILMS = (".gif", ".html", ".mp4")
 FRAMES_PER_SECOND = 25
 TRAIL = 0.15

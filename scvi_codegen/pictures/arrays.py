@@ -15,8 +15,6 @@ from scvi_codegen.validation.argument_types import CANVAS, PATH, TEXT, ArgumentT
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["plot_arrays"]
-
 IN_SPACE = (2, 3)
 """Lengths of the last axis of arrays of positions in space."""
 

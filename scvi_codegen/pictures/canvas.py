@@ -16,20 +16,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "COLORS",
-    "PICTURES",
-    "STYLE",
-    "check_plot_path",
-    "color",
-    "new_figure",
-    "panel",
-    "plain",
-    "save",
-    "style",
-    "write_figure",
-]
-
 PICTURES = (".png", ".svg")
 COLORS = ("#1f5fa8", "#d1495b", "#2e8b57", "#b8860b", "#7a4fa3", "#2b8c9e", "#8c564b", "#555555")
 STYLE = {

@@ -16,8 +16,6 @@ from scvi_codegen.validation.argument_types import CANVAS, PATH, checks_argument
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["draw_energy_error", "largest_in_bins", "plot_energy", "plot_momentum_maps"]
-
 BINS = 600
 
 

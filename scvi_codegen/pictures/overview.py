@@ -15,8 +15,6 @@ from scvi_codegen.validation.argument_types import PATH, checks_arguments
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["plot_trajectory"]
-
 
 @checks_arguments(trajectory=MOTION, path=PATH)
 def plot_trajectory(trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None) -> tuple[Axes, ...]:

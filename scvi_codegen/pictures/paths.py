@@ -17,8 +17,6 @@ from scvi_codegen.validation.argument_types import CANVAS, NAMES, PATH, checks_a
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["draw_paths", "path_panels", "plot_motion", "plot_phase"]
-
 MAX_POINTS = 20_000
 MAX_CURVES = 6
 

@@ -15,8 +15,6 @@ from scvi_codegen.pictures.trajectory_interface import DrawnMotion
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Plots"]
-
 Path = str | os.PathLike[str] | None
 
 

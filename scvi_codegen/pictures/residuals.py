@@ -14,8 +14,6 @@ from scvi_codegen.pictures.canvas import color, panel, plain
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["ResidualPlot"]
-
 Array = NDArray[np.float64]
 
 

@@ -13,8 +13,6 @@ from scvi_codegen.validation.argument_types import CANVAS, NAMES, PATH, checks_a
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["plot_section"]
-
 FEW_POINTS = 2000
 DIRECTION_TEXT = {1: ", rising", 0: "", -1: ", falling"}
 

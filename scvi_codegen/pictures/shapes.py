@@ -13,8 +13,6 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.mechanics.symmetry.bodies import bodies
 from scvi_codegen.pictures.trajectory_interface import Array, DrawnMotion
 
-__all__ = ["MovingPoints", "shape_of"]
-
 NUMBERED = re.compile(r"(.*?)_?(\d+)")
 LENGTHS = ("l", "L", "length")
 """Names of parameters that are rod lengths, alone or followed by a number."""

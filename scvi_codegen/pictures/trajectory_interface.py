@@ -14,19 +14,6 @@ from scvi_codegen.validation.argument_types import ArgumentType
 if TYPE_CHECKING:
     from scvi_codegen.rendering.source import Interface
 
-__all__ = [
-    "HISTORIES",
-    "MOTION",
-    "MOTIONS",
-    "Array",
-    "DrawnMotion",
-    "EnergyHistory",
-    "Motions",
-    "Mover",
-    "column",
-    "several",
-]
-
 Drawn = TypeVar("Drawn")
 
 Array: TypeAlias = NDArray[np.float64]

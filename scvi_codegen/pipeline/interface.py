@@ -12,8 +12,6 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.rendering.program_source import workspace_size
 from scvi_codegen.rendering.source import ArrayLayout, Interface
 
-__all__ = ["describe", "describe_arrays"]
-
 
 def describe(
     program: Program,

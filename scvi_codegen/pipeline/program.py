@@ -14,8 +14,6 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.term_groups import rolled
 from scvi_codegen.methods.method import Method
 
-__all__ = ["c_identifier", "program_of"]
-
 LONGEST_PREFIX = 64
 C_HEADERS = frozenset(
     """

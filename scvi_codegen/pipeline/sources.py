@@ -55,8 +55,6 @@ from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.events.event import EventLike, as_events
 from scvi_codegen.validation.argument_types import SWITCH, TEXT, checks_arguments
 
-__all__ = ["ArraySources", "Sources", "generate_array_source", "generate_source", "sources_of"]
-
 
 class Sources:
     """C sources of one integrator and its variants; the equations are derived on first use."""

@@ -1,7 +1,5 @@
 """Default convergence criteria of iterations, used by the C and by its callers."""
 
-__all__ = ["INPUT_PRECISION", "LARGEST_VIOLATION", "MAX_ITERATIONS", "ROUNDING_UNITS", "TOLERANCE"]
-
 TOLERANCE = 2.0**-52
 """Default relative update below which an iteration has converged: the round-off unit of binary64."""
 

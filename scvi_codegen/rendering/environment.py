@@ -16,8 +16,6 @@ from scvi_codegen.rendering.kernels.functions import kernel_text, lane_kernel_te
 from scvi_codegen.rendering.kernels.printer import print_number
 from scvi_codegen.rendering.layout import table, wrapped, wrapped_comment, wrapped_comment_lines, wrapped_prototypes
 
-__all__ = ["support_text", "template_environment"]
-
 Rows: TypeAlias = Sequence[Sequence[Number]]
 
 

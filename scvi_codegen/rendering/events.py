@@ -37,8 +37,6 @@ from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.tables.nodes import chebyshev_lobatto, to_unit
 from scvi_codegen.tables.precision import mp
 
-__all__ = ["with_events"]
-
 DEGREE = 4
 
 

@@ -12,8 +12,6 @@ from dataclasses import replace
 from scvi_codegen.rendering.environment import support_text
 from scvi_codegen.rendering.source import Source, included
 
-__all__ = ["casadi_name", "with_casadi_flow", "with_flow_of_rows", "with_xla_flow"]
-
 XLA_PARTS = ("states", "jvp", "vjp")
 """XLA handlers: states, tangent vectors of states (JVP), gradients with respect to inputs (VJP)."""
 XLA_SECOND_ORDER = "vjp_derivative"

@@ -6,16 +6,6 @@ import re
 import textwrap
 from collections.abc import Sequence
 
-__all__ = [
-    "WIDTH",
-    "table",
-    "wrapped",
-    "wrapped_comment",
-    "wrapped_comment_lines",
-    "wrapped_prototype",
-    "wrapped_prototypes",
-]
-
 WIDTH = 120
 CONTINUATION = 4
 OPERATOR = re.compile(r" ([-+*/=]) ")

@@ -11,8 +11,6 @@ import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-__all__ = ["Function", "functions_of", "outline", "reached"]
-
 HEAD = re.compile(
     r"(?:^/\*(?P<comment>(?:[^*]|\*(?!/))*)\*/\n)?"
     r"^(?P<text>(?!typedef|struct|enum)[a-z_](?:[\w *]|__attribute__\(\(\w+\)\))*?[ *](?P<name>(?!__attribute__)\w+)"

@@ -12,8 +12,6 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-__all__ = ["preprocessed"]
-
 DIRECTIVE = re.compile(r"#(?P<word>ifdef|ifndef|if|elif|else|endif|define|undef|include|error)\b *(?P<rest>.*)$")
 DEFINED = re.compile(r"(?P<negated>!)?defined\((?P<macro>\w+)\)")
 COMPARED = re.compile(r"(?P<left>\w+)(?: (?P<sign>[<>=!]=|[<>]) (?P<right>\w+))?")

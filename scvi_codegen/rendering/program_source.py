@@ -25,21 +25,6 @@ from scvi_codegen.rendering.kernels.unrolled_equations import unrolled_equations
 from scvi_codegen.rendering.source import Interface, Source, included
 from scvi_codegen.rendering.target import DOUBLE, SINGLE, Target
 
-__all__ = [
-    "EMBEDDED",
-    "Embedded",
-    "EventSearch",
-    "ExampleArrays",
-    "ExampleRun",
-    "render",
-    "render_derivatives",
-    "render_embedded",
-    "render_events",
-    "render_example",
-    "with_fmu",
-]
-
-
 Embedded: TypeAlias = Literal["double", "single"]
 """Precision of C source for a microcontroller."""
 

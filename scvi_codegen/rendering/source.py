@@ -19,9 +19,6 @@ from scvi_codegen.rendering.names import with_own_names
 from scvi_codegen.rendering.preprocessing import preprocessed
 from scvi_codegen.version import __version__
 
-__all__ = ["COMPONENTS", "ArrayLayout", "Interface", "Source", "check_interface", "included"]
-
-
 TEXTS = ("header", "code", "declarations")
 PREFIX = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 SUPPORT = re.compile(r"support/(?:\w+/)?\w+\.h", re.ASCII)

@@ -14,8 +14,6 @@ from scvi_codegen.ir.numbers import Number
 from scvi_codegen.rendering.convergence import TOLERANCE
 from scvi_codegen.tables.precision import mp, settled
 
-__all__ = ["DOUBLE", "SINGLE", "Target"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Target:

@@ -23,8 +23,6 @@ from scvi_codegen.reproduce.oscillators import (
 from scvi_codegen.reproduce.paper_tables import costs, iterations, outlines, properties, tableaux
 from scvi_codegen.reproduce.theorems import collocation, kronecker, order, rates
 
-__all__ = ["EXPERIMENTS"]
-
 ORDER = """
     section-2.1 theorem-2.1 table-1 table-2 table-3 table-4 figure-1
     figure-2 table-5 figure-3 figure-4 figure-5 figure-6 figure-7 figure-8

@@ -16,8 +16,6 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     experiment,
 )
 
-__all__ = ["CLAIMS", "EVIDENCE", "Claim"]
-
 
 @dataclass(frozen=True, slots=True)
 class Claim:

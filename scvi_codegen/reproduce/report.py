@@ -26,8 +26,6 @@ from scvi_codegen.reproduce.laboratory.experiment import Result, TableBlock, Ver
 from scvi_codegen.reproduce.writing import draw
 from scvi_codegen.version import __version__
 
-__all__ = ["color_variables", "contrast", "inline_svg", "label", "report_html", "tally"]
-
 
 def label(name: str) -> str:
     """Return the name of an experiment as in the paper: ``figure-4`` as Figure 4, ``tables-6-7`` as Tables 6-7."""

@@ -23,8 +23,6 @@ from scvi_codegen.errors import MethodWarning, StateError, closest
 from scvi_codegen.reproduce.laboratory.experiment import Experiment, Result
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 
-__all__ = ["CATALOGUE", "Failure", "Outcome", "catalogue", "run_experiments", "with_needs"]
-
 CATALOGUE = "scvi_codegen.reproduce.catalogue"
 PATIENCE = 2.0
 """Seconds to wait for a process to end."""

@@ -20,8 +20,6 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     TableBlock,
 )
 
-__all__ = ["csv_text", "draw", "statement", "write_result"]
-
 WIDTH = 100
 
 

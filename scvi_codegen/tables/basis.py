@@ -20,19 +20,6 @@ from scvi_codegen.tables.nodes import point_count, to_number
 from scvi_codegen.tables.precision import DIGITS, Matrix, Number, Vector, mp, settled
 from scvi_codegen.tables.quadrature import gauss_legendre, legendre_value
 
-__all__ = [
-    "cardinal_derivatives",
-    "cardinal_integrals",
-    "cardinal_values",
-    "continuation",
-    "differentiation_matrix",
-    "extrapolation",
-    "identity_matrix",
-    "matrix_product",
-    "next_step",
-    "transpose",
-]
-
 GUESS_DEGREE = 8
 """Maximum degree of the predictor for the next step: row sums of the extrapolation grow 20-fold per degree."""
 

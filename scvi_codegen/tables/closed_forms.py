@@ -20,8 +20,6 @@ from scvi_codegen.tables.quadrature import (
 )
 from scvi_codegen.tables.tableau import Tableau, explicit_euler, partner_matrix, tableau_by_name
 
-__all__ = ["exact_points", "exact_rule", "exact_tableau"]
-
 
 def reflected(values: Expressions) -> Expressions:
     """Return exact points mirrored at 0, ascending again."""

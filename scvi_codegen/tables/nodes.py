@@ -18,32 +18,6 @@ from scvi_codegen.tables.precision import DIGITS, Number, Vector, mp
 from scvi_codegen.validation.argument_types import WHOLE, checks_arguments
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = [
-    "NODE_FAMILIES",
-    "Expressions",
-    "Nodes",
-    "ascending_points",
-    "chebyshev_gauss",
-    "chebyshev_gauss_points",
-    "chebyshev_lobatto",
-    "chebyshev_lobatto_points",
-    "equispaced",
-    "family_named",
-    "is_antisymmetric",
-    "legendre_gauss",
-    "legendre_gauss_points",
-    "legendre_lobatto",
-    "legendre_lobatto_points",
-    "nodes_by_name",
-    "point_count",
-    "radau_left",
-    "radau_left_points",
-    "radau_right",
-    "radau_right_points",
-    "to_number",
-    "to_unit",
-]
-
 GUARD = 20
 MOST_POINTS = 128
 """Maximum number of points of a rule or a curve: about a second of 60-digit arithmetic."""

@@ -14,8 +14,6 @@ from typing import Any, TypeAlias
 from mpmath import MPContext
 from mpmath.libmp import dps_to_prec, prec_to_dps
 
-__all__ = ["DIGITS", "Matrix", "Number", "Vector", "mp", "settled"]
-
 DIGITS = 60
 
 

@@ -31,20 +31,6 @@ from scvi_codegen.tables.nodes import (
 from scvi_codegen.tables.precision import DIGITS, Matrix, Number, Vector, mp
 from scvi_codegen.validation.argument_types import TEXT, WHOLE, checks_arguments
 
-__all__ = [
-    "QUADRATURE_FAMILIES",
-    "Quadrature",
-    "clenshaw_curtis",
-    "fejer",
-    "gauss_legendre",
-    "gauss_lobatto",
-    "gauss_radau",
-    "hermite",
-    "is_built_in",
-    "quadrature_by_name",
-    "split_name",
-]
-
 GUARD = 20
 COMPUTED_TOLERANCE = mp.mpf("1e-12")
 

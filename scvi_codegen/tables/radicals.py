@@ -10,8 +10,6 @@ import sympy
 
 from scvi_codegen.tables.precision import DIGITS, Number, Vector, mp
 
-__all__ = ["radical_basis", "recognised"]
-
 LARGEST_BASIS = 8
 LARGEST_COEFFICIENT = 10**5
 SLACK = 6

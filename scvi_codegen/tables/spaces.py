@@ -23,8 +23,6 @@ from scvi_codegen.tables.quadrature import Quadrature, gauss_legendre
 from scvi_codegen.validation.argument_types import NUMBERS, check_kind
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["CurveSpace", "Polynomials", "Splines", "Trigonometric", "space_by_name"]
-
 MOST_POINTS = 64
 BETTER = 4
 """Number of additional points of the reference rule by which the accuracy of a rule is judged."""

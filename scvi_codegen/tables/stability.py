@@ -12,8 +12,6 @@ from typing import TypeAlias
 from scvi_codegen.tables.basis import matrix_product
 from scvi_codegen.tables.precision import DIGITS, Matrix, Number, mp
 
-__all__ = ["determinant_polynomial", "has_roots_right", "is_nonnegative", "modulus_gap", "reduced"]
-
 ZERO_TOLERANCE = mp.mpf("1e-30")
 
 Polynomial: TypeAlias = list[Number]

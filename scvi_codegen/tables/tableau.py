@@ -31,21 +31,6 @@ from scvi_codegen.tables.quadrature import gauss_legendre, gauss_lobatto, gauss_
 from scvi_codegen.tables.stability import determinant_polynomial, has_roots_right, is_nonnegative, modulus_gap, reduced
 from scvi_codegen.validation.argument_types import WHOLE, checks_arguments
 
-__all__ = [
-    "TABLEAU_FAMILIES",
-    "Tableau",
-    "chebyshev_gauss",
-    "chebyshev_lobatto",
-    "collocation_tableau",
-    "explicit_euler",
-    "gauss",
-    "lobatto_iiia",
-    "lobatto_iiib",
-    "radau_ia",
-    "radau_iia",
-    "tableau_by_name",
-]
-
 CONDITION_TOLERANCE = mp.mpf("1e-45")
 SMALL_DENOMINATOR, ROUNDINGS = 1000, 2
 """Largest denominator of a rational that replaces a float, and the largest deviation in roundings."""

@@ -19,28 +19,6 @@ import numpy as np
 from scvi_codegen.errors import ArgumentError, ScviCodegenError
 from scvi_codegen.validation.keywords import keyword_hint
 
-__all__ = [
-    "CANVAS",
-    "FORMULA",
-    "FORMULAS",
-    "FUNCTION",
-    "MAPPED",
-    "MAPPING",
-    "NAMES",
-    "NUMBERS",
-    "PATH",
-    "REAL",
-    "SWITCH",
-    "TEXT",
-    "TEXTS",
-    "WHOLE",
-    "ArgumentType",
-    "check_kind",
-    "checks_arguments",
-    "of",
-    "several",
-]
-
 Called = TypeVar("Called", bound=Callable[..., Any])
 MAX_SHOWN_LENGTH = 60
 MOST_ARGUMENTS = 2**31

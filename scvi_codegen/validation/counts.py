@@ -7,8 +7,6 @@ from typing import Any
 
 from scvi_codegen.errors import ScviCodegenError, StateError
 
-__all__ = ["LARGEST_COUNT", "check_tolerance", "checked_count"]
-
 LARGEST_COUNT = 2**53 - 1
 """Largest integer below which binary64 represents every integer."""
 

@@ -8,8 +8,6 @@ from typing import Final
 from scvi_codegen.errors import closest
 from scvi_codegen.validation.synonyms import likely_names, synonym_hint
 
-__all__ = ["keyword_hint"]
-
 EXPLANATIONS: Final = {
     "inputs": "pass them to .integrate(..., inputs={'u': (t, values)}) or .integrate_ensemble, and values that change "
     "during a run to run.set_inputs(u=...)",

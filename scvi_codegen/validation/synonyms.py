@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from typing import Final
 
-__all__ = ["SYNONYMS", "likely_names", "synonym_hint"]
-
 SYNONYMS: Final = {
     "h step": "dt delta_t timestep time_step stepsize step_size max_step first_step",
     "steps": "n N nsteps n_steps num_steps nt",

@@ -20,17 +20,6 @@ from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.native.announcements import announced
 from scvi_codegen.representation import summary
 
-__all__ = [
-    "Certificate",
-    "Check",
-    "Finding",
-    "Outcome",
-    "ViolationError",
-    "checked",
-    "information",
-    "issued",
-]
-
 
 class Outcome(StrEnum):
     """Result of a check."""

@@ -17,8 +17,6 @@ from scvi_codegen.tables.precision import Number, mp
 from scvi_codegen.verification.certificate import Check, Finding, ViolationError, checked
 from scvi_codegen.verification.system_under_test import State, SystemUnderTest
 
-__all__ = ["convergence_checks"]
-
 TARGET_ERROR = mp.mpf(10) ** -17
 """Error at which the order is measured: below the round-off of doubles, so that errors of that size show."""
 FLOOR = mp.mpf(10) ** -38

@@ -23,8 +23,6 @@ from scvi_codegen.verification.certificate import Check, Finding, checked
 from scvi_codegen.verification.system_under_test import State, SystemUnderTest
 from scvi_codegen.verification.variable_steps import VariableSteps
 
-__all__ = ["derivative_checks", "time_transformation_derivative_checks"]
-
 Array = NDArray[np.float64]
 
 BOUND = 1e-10

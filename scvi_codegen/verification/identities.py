@@ -39,8 +39,6 @@ from scvi_codegen.tables.quadrature import (
 from scvi_codegen.verification.certificate import Check, Finding, checked
 from scvi_codegen.verification.system_under_test import SystemUnderTest
 
-__all__ = ["identity_checks"]
-
 EQUAL, ROUNDED = 1e-30, 1e-13
 """Bounds: for equations in 60 digits; for equations whose tables are rounded to 53 bits."""
 OTHER_FORM = "position form is phase-space form for constant mass"

@@ -30,8 +30,6 @@ from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, ViolationError, checked
 from scvi_codegen.verification.system_under_test import EPSILON, State, SystemUnderTest
 
-__all__ = ["roundoff_checks"]
-
 Array = NDArray[np.float64]
 
 ROUNDINGS = 16.0

@@ -28,9 +28,6 @@ from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, ViolationError, checked
 from scvi_codegen.verification.system_under_test import EPSILON, MAX_UNKNOWNS, WEIGHTS, State, SystemUnderTest
 
-__all__ = ["predictor_checks", "step_checks"]
-
-
 Array = NDArray[np.float64]
 
 ROUNDINGS = 16.0

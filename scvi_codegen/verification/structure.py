@@ -17,8 +17,6 @@ from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, checked, information
 from scvi_codegen.verification.system_under_test import EPSILON, Jacobian, State, SystemUnderTest
 
-__all__ = ["ROUNDINGS", "largest_step", "momentum_error", "structure_checks"]
-
 Array = NDArray[np.float64]
 
 ROUNDINGS = 16.0

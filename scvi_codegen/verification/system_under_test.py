@@ -21,9 +21,6 @@ from scvi_codegen.native.announcements import tell
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.stepper import Stepper
 
-__all__ = ["EPSILON", "WEIGHTS", "Jacobian", "State", "SystemUnderTest", "linearised"]
-
-
 Array = NDArray[np.float64]
 Map = Callable[[Array], Array]
 

@@ -21,8 +21,6 @@ from scvi_codegen.verification.certificate import Check, Finding, checked
 from scvi_codegen.verification.structure import ROUNDINGS, momentum_error
 from scvi_codegen.verification.system_under_test import EPSILON, State, SystemUnderTest
 
-__all__ = ["VariableSteps", "at_fixed_energy", "variable_step_checks"]
-
 Array = NDArray[np.float64]
 
 STEP_DIVISOR = 8

@@ -25,9 +25,6 @@ from scvi_codegen.benchmark.cases.unforced import (
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.models.problems import problem
 
-__all__ = ["ADAPTIVE_CASES", "adaptive_case"]
-
-
 ECCENTRICITIES = (0.0, 0.2, 0.5, 0.9, 0.99, 0.999)
 KEPLER_SPAN = 2000.0
 MERCURY = {"axis": 0.387098, "eccentricity": 0.205630, "mass": 1.66e-7, "inclination": math.radians(7.0)}

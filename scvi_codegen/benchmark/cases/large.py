@@ -11,9 +11,6 @@ import numpy as np
 from scvi_codegen.benchmark.cases.unforced import Array
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 
-__all__ = ["Lattice", "atoms", "bodies", "breather", "cloth", "field", "ring", "waves"]
-
-
 SEED = 20261121
 SPACING = 0.98 * 2 ** (2 / 3)
 """Lattice constant of an argon crystal in diameters of its atoms, slightly compressed."""

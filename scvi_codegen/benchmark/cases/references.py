@@ -27,21 +27,6 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.native import building
 
-__all__ = [
-    "Extended",
-    "Reference",
-    "field_of",
-    "final_states",
-    "gauss_tables",
-    "reference",
-    "remembered",
-    "rms",
-    "rms_error",
-    "states_after",
-    "two_doubles",
-]
-
-
 Extended = NDArray[np.longdouble]
 Field = Callable[[Extended, Extended], Extended]
 """Function that returns x' for x, (.., d), at times t, (..)."""

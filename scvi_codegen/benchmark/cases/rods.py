@@ -36,16 +36,6 @@ from scvi_codegen.benchmark.report import Contender
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import as_method
 
-__all__ = [
-    "CONSTRAINED_CASES",
-    "FORCED_CASES",
-    "angles_of",
-    "constrained_contenders",
-    "rod_accelerations",
-    "rods_in_angles",
-]
-
-
 UNITS = {"m": 1.0, "l": 1.0, "g": 1.0}
 
 

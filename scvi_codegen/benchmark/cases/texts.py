@@ -8,9 +8,6 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-__all__ = ["SystemText", "bodies", "chain", "cloth", "kepler", "lennard_jones", "links", "post_newtonian"]
-
-
 AXES = "xyz"
 
 

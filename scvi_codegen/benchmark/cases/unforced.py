@@ -20,22 +20,6 @@ from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.problems import problem
 
-__all__ = [
-    "CASES",
-    "STATES",
-    "Bodies",
-    "Case",
-    "Formulation",
-    "case",
-    "gravitation",
-    "hand_solved",
-    "kepler_case",
-    "rotated",
-    "scaled",
-    "second_order",
-]
-
-
 Array = NDArray[np.float64]
 Vector = Sequence[Any]
 Rates = Callable[[Vector, Mapping[str, Any], Any], list[Any]]

@@ -14,9 +14,6 @@ from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.methods import as_method
 
-__all__: list[str] = []
-
-
 STEP_SIZES = {"ring": 0.1, "field": 0.03}
 """Step sizes."""
 

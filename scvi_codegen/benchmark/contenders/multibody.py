@@ -25,8 +25,6 @@ from scvi_codegen.benchmark.cases.unforced import Array
 from scvi_codegen.benchmark.report import OURS
 from scvi_codegen.errors import StepFailedError
 
-__all__ = ["CONTENDERS", "pendulum"]
-
 STEPS = (16, 32, 64, 128, 256, 512, 1024)
 """Numbers of steps of this package, in one second."""
 TOLERANCES = (1e-5, 1e-7, 1e-9, 1e-11, 1e-13)

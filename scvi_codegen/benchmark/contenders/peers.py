@@ -27,8 +27,6 @@ from scvi_codegen.benchmark.contenders.taylor import heyoka_contenders
 from scvi_codegen.benchmark.contenders.tracing import rates_text
 from scvi_codegen.benchmark.report import Contender
 
-__all__ = ["PEERS", "Peer", "missing_module", "peer_contenders"]
-
 TOLERANCES = (3e-14, 1e-13, 1e-12, 1e-11, 1e-9, 1e-7)
 IAS15_EPSILONS = (1e-9, 1e-6, 1e-4)
 MOST_STEPS = 10**9

@@ -26,8 +26,6 @@ from scvi_codegen.benchmark.cases.unforced import STATES, Array, Case, Formulati
 from scvi_codegen.benchmark.report import Contender
 from scvi_codegen.mechanics.derived_expressions import forms_of
 
-__all__ = ["heyoka_contenders", "heyoka_ensembles", "heyoka_states"]
-
 TOLERANCES = (0.0, 1e-15, 1e-14, 1e-13, 1e-12, 1e-11, 1e-10, 1e-8)
 """Tolerances; 0 is heyoka's default, 2^-52."""
 

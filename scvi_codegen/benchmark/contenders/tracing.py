@@ -7,8 +7,6 @@ from typing import Any
 
 from scvi_codegen.benchmark.cases.unforced import Rates
 
-__all__ = ["rates_text"]
-
 
 class _Lines:
     """Assignments with common subexpressions shared; also replaces the module of functions."""

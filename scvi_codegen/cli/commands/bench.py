@@ -9,8 +9,6 @@ import click
 from scvi_codegen.benchmark import PEERS, Plan, benchmark
 from scvi_codegen.cli.command_group import INTERRUPTED, CommandFailure, check_writable, note, reporting, tell
 
-__all__ = ["bench"]
-
 
 @click.command()
 @click.argument("sections", nargs=-1, metavar="[SECTION ...]")

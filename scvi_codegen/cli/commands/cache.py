@@ -9,8 +9,6 @@ import click
 from scvi_codegen.cli.command_group import reporting, tell
 from scvi_codegen.files.cache import cache_folder, cache_info, clear_cache
 
-__all__ = ["cache"]
-
 
 @click.command()
 @click.argument("action", type=click.Choice(["info", "clear", "path"]), default="info")

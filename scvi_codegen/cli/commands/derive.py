@@ -14,8 +14,6 @@ from scvi_codegen.derivation.arrays import derive_sums
 from scvi_codegen.derivation.equations import StepEquations
 from scvi_codegen.derivation.equations import derive as derive_equations
 
-__all__ = ["derive"]
-
 
 @click.command()
 @model_arguments

@@ -9,8 +9,6 @@ import click
 from scvi_codegen.cli.command_group import FAILURE, CommandFailure, reporting, tell
 from scvi_codegen.cli.diagnostics import FAILED, CheckResult, run_checks
 
-__all__ = ["doctor"]
-
 STATUS_WIDTH, NAME_WIDTH = 5, 17
 
 

@@ -11,8 +11,6 @@ from scvi_codegen.cli.json_documents import recorded_numbers
 from scvi_codegen.cli.recording import check_format, describe_progress
 from scvi_codegen.results.recording import load_run
 
-__all__ = ["export"]
-
 
 @click.command()
 @click.argument("folder", type=click.Path())

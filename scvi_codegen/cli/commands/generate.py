@@ -19,8 +19,6 @@ from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.native.cross import TARGETS
 from scvi_codegen.rendering.program_source import Embedded
 
-__all__ = ["generate"]
-
 
 @click.command()
 @model_arguments

@@ -15,8 +15,6 @@ from scvi_codegen.tables.nodes import Expressions
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.tableau import tableau_by_name
 
-__all__ = ["methods"]
-
 EXAMPLES: dict[str, dict[str, int | list[float]]] = {
     "svi": {"degree": 4},
     "scvi": {"degree": 4},

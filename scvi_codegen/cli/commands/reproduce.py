@@ -28,8 +28,6 @@ from scvi_codegen.reproduce.report import report_html, tally
 from scvi_codegen.reproduce.runner import CATALOGUE, Failure, catalogue, run_experiments, with_needs
 from scvi_codegen.reproduce.writing import write_result
 
-__all__ = ["reproduce"]
-
 EVERYTHING = "all"
 SHOWN_NAMES = 40
 """Largest number of characters of the names next to the progress bar."""

@@ -31,9 +31,6 @@ from scvi_codegen.pictures.canvas import check_plot_path
 from scvi_codegen.pictures.overview import plot_trajectory
 from scvi_codegen.runtime.run.global_error import GlobalError
 
-__all__ = ["run"]
-
-
 ABOUT = """\
 Integrate MODEL; report conserved quantities and the final state.
 

@@ -15,8 +15,6 @@ from scvi_codegen.models.model_files.document import document_of
 from scvi_codegen.models.model_files.model_file import dump_model
 from scvi_codegen.models.problems import PROBLEMS, problem
 
-__all__ = ["systems"]
-
 
 @click.command()
 @click.argument("name", required=False, shell_complete=complete_model)

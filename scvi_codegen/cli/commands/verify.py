@@ -25,8 +25,6 @@ from scvi_codegen.models.packages.package import CERTIFICATE_FILE, MODEL_FILE, l
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.verification import Certificate
 
-__all__ = ["verify"]
-
 
 @click.command()
 @model_arguments

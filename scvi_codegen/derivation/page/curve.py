@@ -28,9 +28,6 @@ from scvi_codegen.tables.precision import Vector
 from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.tableau import Tableau
 
-__all__ = ["curve_section", "kronecker_form", "tables_section"]
-
-
 WIDTH, MARGIN, ROW, RADIUS = 640, 30, 74, 5
 TALLEST = 30
 """Height of the stem of the largest weight."""

@@ -26,8 +26,6 @@ from scvi_codegen.rendering.outline import functions_of
 from scvi_codegen.rendering.program_source import render
 from scvi_codegen.version import __version__
 
-__all__ = ["derivation_html"]
-
 
 def derivation_html(
     system: MechanicalSystem, method: Method, *, solver: str = "auto", start: Start | None = None

@@ -9,8 +9,6 @@ import sympy
 
 from scvi_codegen.display.page.blocks import Code, Content, Formula, Paragraph
 
-__all__ = ["MOST_FORMULAS", "formulas", "lines", "operations"]
-
 MOST_FORMULAS = 12
 """Largest number of equations of one kind that are shown."""
 MOST_OPERATIONS = 400

@@ -21,9 +21,6 @@ from scvi_codegen.ir.program import Program
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import StageSystem
 
-__all__ = ["Start", "entry_numbers", "jacobian_pattern", "jacobian_section"]
-
-
 SIDE = 320
 """Width of the picture in pixels."""
 LARGEST_DRAWN = 400

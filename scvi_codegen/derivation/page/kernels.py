@@ -26,9 +26,6 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.rendering.outline import Function, reached
 
-__all__ = ["functions_section", "kernels_of", "kernels_section", "operations_section"]
-
-
 COUNTS = re.compile(r" Operations: .*$")
 
 

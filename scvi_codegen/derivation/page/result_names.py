@@ -10,8 +10,6 @@ from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Gather, Scatter, StageGroup
 
-__all__ = ["argument_symbol", "meaning", "point_index", "result_symbol", "scalar_name"]
-
 ARGUMENTS = {"v": "q_dot", "a": "q_ddot", "j": "q_d3", "s": "q_d4"}
 """Time derivatives of the curve as they are typeset."""
 PLACES = {"start": "k", "end": "k+1"}

@@ -24,16 +24,6 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageGroup, StageSystem
 
-__all__ = [
-    "component_equations",
-    "component_equations_section",
-    "idel_section",
-    "motion_section",
-    "stage_group_contents",
-    "stage_section",
-    "system_section",
-]
-
 
 def system_section(system: MechanicalSystem) -> Section:
     """Return the section on the Lagrangian or the Hamiltonian, coordinates and parameters."""

@@ -23,9 +23,6 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Block, Row, Scatter, StageGroup, StageSystem, Table
 from scvi_codegen.tables.precision import Number
 
-__all__ = ["column_of", "end_formulas", "gather_formulas", "gathered", "row_formulas"]
-
-
 CARDINAL = {"l": "l", "dl": "l_dot"}
 """Tables of functions at points tau_n."""
 LINES = ("b", "bA", "beta", "gamma")

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 import sympy
 from sympy.printing.pretty.pretty_symbology import greek_unicode
 
-__all__ = ["ACCENTS", "TOKEN", "Name", "TableName", "latex_name", "parsed", "table_name"]
-
 ACCENTS = {"dot": "˙", "ddot": "¨", "hat": "^", "tilde": "~", "bar": "¯"}
 LATEX_ACCENT = re.compile(r"\\(dot|ddot|hat|tilde|bar)\{?(\w+?)\}?(?=[_^]|$)")
 RAISED = ("Q", "V", "P")

@@ -17,8 +17,6 @@ from sympy.printing.precedence import PRECEDENCE, precedence_traditional
 
 from scvi_codegen.display.mathml.names import ACCENTS, TOKEN, Name, parsed, table_name
 
-__all__ = ["ONE_LINE", "Printer", "length"]
-
 DIGITS = 6
 """Significant digits of floating-point numbers."""
 SHORT = 24

@@ -8,20 +8,6 @@ from typing import TypeAlias
 
 import sympy
 
-__all__ = [
-    "Block",
-    "Cell",
-    "Code",
-    "Content",
-    "Drawing",
-    "Formula",
-    "Listing",
-    "Paragraph",
-    "Section",
-    "SideBySide",
-    "TableBlock",
-]
-
 Cell: TypeAlias = float | int | str | sympy.Basic | None
 
 

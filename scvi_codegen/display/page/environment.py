@@ -19,9 +19,6 @@ from scvi_codegen.display.page import blocks
 from scvi_codegen.display.page.blocks import Cell, TableBlock
 from scvi_codegen.files.templates import template_folder
 
-__all__ = ["SPACE", "cell", "page_template", "prose", "style_sheet"]
-
-
 FORMAT = ".3g"
 LONGEST_LINE = 32
 """Largest number of characters of a cell that is not broken into lines."""

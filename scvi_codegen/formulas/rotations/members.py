@@ -32,8 +32,6 @@ from sympy import Add, Expr, Matrix, Symbol
 
 from scvi_codegen.formulas.symbols import DOT, symbol
 
-__all__ = ["AXES", "Direction", "Homogeneous", "Rotation", "Spin", "momenta_of"]
-
 AXES = (1, 2, 3)
 
 

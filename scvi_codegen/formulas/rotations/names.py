@@ -14,8 +14,6 @@ from scvi_codegen.formulas.grammar import Parser, parsed
 from scvi_codegen.formulas.rotations.members import AXES, Direction, Homogeneous, Rotation, Spin, momenta_of
 from scvi_codegen.formulas.symbols import DOT, check_name, symbol
 
-__all__ = ["Forces", "Reduced", "RotationNames"]
-
 ROTATING = ("rotate_1", "rotate_2", "rotate_3", "unrotate_1", "unrotate_2", "unrotate_3")
 """Functions of formulas: components of R (a, b, c), from body to space, and of its inverse."""
 

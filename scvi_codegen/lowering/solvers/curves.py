@@ -53,8 +53,6 @@ from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.tableau import Tableau
 
-__all__ = ["position_iteration", "printed_iteration", "shooting_iteration"]
-
 LARGEST_DIMENSION = 8
 """Largest number of coordinates of shooting; beyond, the kernels take longer to compile than they save."""
 

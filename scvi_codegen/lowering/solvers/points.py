@@ -64,8 +64,6 @@ from scvi_codegen.methods.stage_structure import Accelerations, Velocities
 from scvi_codegen.tables.basis import matrix_product, transpose
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
-__all__ = ["coupled_iteration", "hamiltonian_iteration", "over", "separable_iteration", "weighted_tables"]
-
 
 def separable_iteration(problem: StepProblem, *, velocities: bool = False) -> FixedPointIteration | None:
     """Return the fixed-point iteration of a separable system; ``None`` for others, and with too many points.

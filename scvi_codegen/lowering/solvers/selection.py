@@ -26,9 +26,6 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.tables.precision import mp
 
-__all__ = ["FIXED_POINTS", "check_solver", "iteration_of", "splitting_of"]
-
-
 FIXED_POINTS: tuple[Solver, ...] = (
     separable_iteration,
     hamiltonian_iteration,

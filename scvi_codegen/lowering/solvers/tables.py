@@ -35,20 +35,6 @@ from scvi_codegen.methods.stage_system import Shape
 from scvi_codegen.tables.basis import continuation, extrapolation, legendre_functional, matrix_product, transpose
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
-__all__ = [
-    "MOST_LANES",
-    "Solver",
-    "StepProblem",
-    "VelocityTables",
-    "lane_count",
-    "pad_matrix",
-    "pad_vector",
-    "predictor_tables_of",
-    "resolved_degree",
-    "tableau_tables",
-    "velocity_tables",
-]
-
 
 @dataclass(frozen=True, slots=True)
 class StepProblem:

@@ -17,8 +17,6 @@ from scvi_codegen.formulas.symbols import DOT, number, symbol
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 
-__all__ = ["unrolled_fields"]
-
 Elements = Mapping[str, int]
 Tables = Mapping[str, NDArray[np.int64]]
 

@@ -31,8 +31,6 @@ from scvi_codegen.mechanics.term_groups import MAX_GROUPS, SimilarTerms, TermGro
 from scvi_codegen.representation import summary
 from scvi_codegen.validation.argument_types import MAPPING, checks_arguments
 
-__all__ = ["RolledSums", "roll_sums", "unroll_sums"]
-
 
 @dataclass(frozen=True, slots=True)
 class RolledSums:

@@ -21,8 +21,6 @@ from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.arrays.terms import force_of
 from scvi_codegen.tables.precision import mp
 
-__all__ = ["momentum_maps"]
-
 SAMPLES = 4
 """Number of random points at which an identity is tested in 60 digits."""
 RELATIVE_TOLERANCE = 1e-40

@@ -47,8 +47,6 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.validation.argument_types import FORMULA, MAPPING, NAMES, TEXT, TEXTS, checks_arguments, of
 
-__all__ = ["ARRAYS", "SYSTEM_OR_ARRAYS", "ArrayHamiltonian", "ArrayLagrangian", "ArraySystem"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArraySystem:

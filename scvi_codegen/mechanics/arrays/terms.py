@@ -28,24 +28,6 @@ from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.symbols import DOT, symbol
 from scvi_codegen.indices import Access, Array, Size
 
-__all__ = [
-    "check_constraint",
-    "check_form",
-    "constraint_gradient",
-    "constraint_second_rate",
-    "constraint_text",
-    "entries_of",
-    "force_of",
-    "friction",
-    "friction_of",
-    "masses_of",
-    "momenta_of",
-    "substituted",
-    "table_of",
-    "terms_at_rest",
-    "velocity_symbols",
-]
-
 Term = TypeVar("Term", ArrayTerm, ArrayForce)
 
 

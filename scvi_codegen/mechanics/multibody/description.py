@@ -18,8 +18,6 @@ from scvi_codegen.mechanics.multibody.velocity_constraints import independent_of
 if TYPE_CHECKING:
     from sympy.physics.mechanics import ReferenceFrame
 
-__all__ = ["Multibody"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Multibody:

@@ -11,8 +11,6 @@ from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.tables.precision import mp
 
-__all__ = ["are_zero"]
-
 NEGLIGIBLE = mp.mpf(10) ** -40
 ATTEMPTS, POINTS = 24, 2
 SEED = 20250101

@@ -29,8 +29,6 @@ from scvi_codegen.mechanics.multibody.variables import Variables
 if TYPE_CHECKING:
     from sympy.physics.mechanics import Particle, ReferenceFrame, RigidBody
 
-__all__ = ["gyroscopic_forces", "kinetic_energy", "load_forces", "motions_of"]
-
 
 @dataclass(frozen=True, slots=True)
 class BodyMotion:

@@ -16,8 +16,6 @@ from sympy.integrals.manualintegrate import manualintegrate
 
 from scvi_codegen.mechanics.multibody.identities import are_zero
 
-__all__ = ["potential_of"]
-
 
 def potential_of(forces: Sequence[Expr], coordinates: Sequence[Symbol]) -> Expr | None:
     """Return V(q), or ``None`` if there is none, or none was found.

@@ -17,8 +17,6 @@ from scvi_codegen.mechanics.multibody.variables import Variables
 if TYPE_CHECKING:
     from sympy.physics.mechanics import LagrangesMethod, System
 
-__all__ = ["forces_of_lagranges_method", "of_kanes_method", "of_system"]
-
 
 def forces_of_lagranges_method(method: LagrangesMethod) -> dict[Expr, Expr]:
     """Return the generalised forces of its ``forcelist`` by coordinate; its bodies are part of its Lagrangian.

@@ -14,8 +14,6 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.canonical import evaluated
 from scvi_codegen.formulas.derivatives import gradient
 
-__all__ = ["Variables", "solved_for_speeds"]
-
 
 class Variables:
     """Plain symbols for q(t), dq/dt and generalised speeds u(t); other functions of time get symbols when first read.

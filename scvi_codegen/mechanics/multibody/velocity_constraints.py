@@ -16,8 +16,6 @@ from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.mechanics.regularity import row_rank
 from scvi_codegen.tables.precision import mp
 
-__all__ = ["independent_of"]
-
 ATTEMPTS = 24
 SEED = 20250101
 

@@ -24,8 +24,6 @@ from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.regularity import coupled_blocks
 
-__all__ = ["hamiltonian_of_rotations"]
-
 LARGEST_BLOCK = 4
 """Largest block of coupled velocities whose constant mass matrix is inverted symbolically."""
 

@@ -20,23 +20,6 @@ from scvi_codegen.mechanics.symmetry.bodies import AXES, Body, bodies
 from scvi_codegen.mechanics.symmetry.invariants import Column, Monomial, Polynomial
 from scvi_codegen.mechanics.system import MechanicalSystem
 
-__all__ = [
-    "Terms",
-    "bodies_of",
-    "boost_columns",
-    "combined",
-    "gauge_columns",
-    "independent",
-    "is_shift",
-    "monomial_columns",
-    "planes_of",
-    "polynomial_in",
-    "rigid_columns",
-    "rotation_columns",
-    "total_angular_momentum",
-    "turn",
-]
-
 Terms: TypeAlias = Mapping[Monomial, Expr]
 """Polynomial whose coefficients depend on parameters."""
 

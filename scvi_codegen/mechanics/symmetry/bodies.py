@@ -6,8 +6,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-__all__ = ["AXES", "Body", "bodies"]
-
 AXES = "xyz"
 AXIS_FIRST = re.compile(r"^([xyz])_?(\w+)$")
 

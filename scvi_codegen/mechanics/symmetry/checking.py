@@ -22,8 +22,6 @@ from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.validation.argument_types import FORMULAS, TEXT, checks_arguments
 
-__all__ = ["check_symmetry"]
-
 MAX_SHOWN_LENGTH = 300
 DECIDED_AT = 3
 """Number of points at which the change of L is tested."""

@@ -18,8 +18,6 @@ from scvi_codegen.mechanics.symmetry.sampling import Sample
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import mp
 
-__all__ = ["integrated", "is_total_derivative"]
-
 NEGLIGIBLE = mp.mpf(10) ** -40
 
 

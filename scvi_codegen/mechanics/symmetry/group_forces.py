@@ -14,8 +14,6 @@ from scvi_codegen.mechanics.symmetry.bodies import Body
 from scvi_codegen.mechanics.term_groups import TermGroup
 from scvi_codegen.tables.precision import Number, mp
 
-__all__ = ["LARGEST", "array_forces", "array_value", "exact_forces", "terms_among_few_bodies"]
-
 LARGEST = 10**300
 """Bound below which numbers can be converted to binary64."""
 FEW = 12

@@ -29,8 +29,6 @@ from scvi_codegen.mechanics.symmetry.sampling import Rates, Sample, drawn_parame
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import mp
 
-__all__ = ["Column", "Monomial", "Polynomial", "confirmed", "conserved"]
-
 Array = NDArray[np.float64]
 
 NULL = 1e-9

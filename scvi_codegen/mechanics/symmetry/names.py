@@ -18,8 +18,6 @@ from scvi_codegen.mechanics.symmetry.ansatz import (
 from scvi_codegen.mechanics.symmetry.bodies import AXES
 from scvi_codegen.mechanics.system import MechanicalSystem
 
-__all__ = ["name_of"]
-
 NAMED_TERMS = 4
 
 

@@ -28,8 +28,6 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.term_groups import TermGroup
 from scvi_codegen.tables.precision import Number, mp
 
-__all__ = ["Rates", "Sample", "drawn_parameters", "rates_of"]
-
 Array = NDArray[np.float64]
 
 SEED = 20250101

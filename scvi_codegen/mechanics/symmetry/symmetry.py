@@ -54,8 +54,6 @@ from scvi_codegen.mechanics.term_groups import rolled
 from scvi_codegen.representation import summary
 from scvi_codegen.validation.argument_types import checks_arguments, several
 
-__all__ = ["SYMMETRIES", "Symmetry", "all_symmetries", "symmetries"]
-
 MAX_SEARCHED_COORDINATES = 12
 MOST_SHOWN = 12
 """Maximum number of components of a direction shown in a notebook."""

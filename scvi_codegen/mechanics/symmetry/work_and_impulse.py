@@ -23,8 +23,6 @@ from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import symmetries
 from scvi_codegen.mechanics.system import MechanicalSystem
 
-__all__ = ["WorkRate", "work_rates"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkRate:

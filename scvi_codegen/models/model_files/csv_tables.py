@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import ModelFileError
 
-__all__ = ["CsvTable", "parse_table"]
-
 NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)", re.ASCII | re.IGNORECASE)
 """Pattern of numbers in ASCII digits; Python also accepts 1_0 and digits of other scripts."""
 MAX_SHOWN_LENGTH = 60

@@ -16,8 +16,6 @@ from scvi_codegen.models.model import Model
 if TYPE_CHECKING:
     from scvi_codegen.models.model_files.input_tables import InputTable
 
-__all__ = ["document_of", "motion_of", "with_files"]
-
 SHORT_VECTOR = 4
 TEXT_WIDTH = 100
 LONG_ARRAY = 1000

@@ -40,8 +40,6 @@ from scvi_codegen.validation.counts import checked_count
 if TYPE_CHECKING:
     from scvi_codegen.runtime.core.stepper import Stepper
 
-__all__ = ["EnsembleStates", "load_ensemble"]
-
 Array = NDArray[np.float64]
 Check = Callable[[Sequence[str]], None]
 

@@ -24,8 +24,6 @@ from scvi_codegen.models.model_files.input_tables import InputTable
 from scvi_codegen.models.time_span import real
 from scvi_codegen.native.arguments import real_array
 
-__all__ = ["read_input"]
-
 TIME, VALUE = "t", "value"
 KEYS = ("file", "t", "values", "kind")
 

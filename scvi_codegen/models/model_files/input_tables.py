@@ -12,8 +12,6 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.rendering.program_source import ExampleInput
 from scvi_codegen.runtime.inputs.segments import POWERS, first_inner_time, input_of, parameters_at
 
-__all__ = ["InputTable", "checked_tables", "tables_of_example"]
-
 
 class InputTable(NamedTuple):
     """Function of time as :meth:`Stepper.integrate` accepts it: n ascending times, n values, kind of interpolation."""

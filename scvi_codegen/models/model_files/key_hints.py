@@ -8,8 +8,6 @@ from typing import Final
 from scvi_codegen.errors import closest
 from scvi_codegen.validation.synonyms import likely_names, synonym_hint
 
-__all__ = ["EVENTS", "key_hint"]
-
 KEYS: Final = {
     "run": "step span steps tolerance save_every controller",
     "initial": "q q_dot p t",

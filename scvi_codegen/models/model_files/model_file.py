@@ -106,8 +106,6 @@ from scvi_codegen.validation.argument_types import PATH, checks_arguments, of
 if TYPE_CHECKING:
     from scvi_codegen.models.model_files.input_tables import InputTable
 
-__all__ = ["catalogue_model", "dump_model", "load_model", "model_texts", "parse_model", "save_model"]
-
 SYSTEM_KEYS = ("name", "coordinates", *TURNING, "momenta", *FORMULAS, "inputs", "catalogue", "time_transformation")
 RUN_KEYS = ("step", "tolerance", "error", "controller", "span", "steps", "save_every")
 KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}

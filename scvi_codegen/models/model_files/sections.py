@@ -13,22 +13,6 @@ from scvi_codegen.models.time_span import real
 from scvi_codegen.validation.argument_types import FORMULA
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = [
-    "Document",
-    "Section",
-    "check_keys",
-    "check_one",
-    "chosen_method",
-    "formula_of",
-    "in_section",
-    "merged_sections",
-    "names_of",
-    "read_method",
-    "read_run",
-    "required",
-    "text_of",
-]
-
 Built = TypeVar("Built")
 Section = Mapping[str, Any]
 Document = Mapping[str, Section]

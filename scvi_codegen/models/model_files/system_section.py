@@ -24,18 +24,6 @@ from scvi_codegen.models.model_files.sections import (
 from scvi_codegen.models.problems import Problem, problem
 from scvi_codegen.models.time_span import real
 
-__all__ = [
-    "FORMULAS",
-    "TORQUES",
-    "TURNING",
-    "check_complete",
-    "check_used",
-    "has_arrays",
-    "is_number",
-    "read_catalogue",
-    "read_system",
-]
-
 FORMULAS = ("lagrangian", "hamiltonian", "dissipation", "damping", "constraints")
 TURNING = ("rotations", "directions", "spins")
 """Keys of [system] that declare coordinates of another kind."""

@@ -62,8 +62,6 @@ from scvi_codegen.models.time_span import check_length, real
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["INDICES", "is_filled", "read_array", "read_values"]
-
 Numbers: TypeAlias = NDArray[np.float64]
 Key: TypeAlias = tuple[str, str]
 

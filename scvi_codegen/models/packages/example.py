@@ -19,8 +19,6 @@ from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.interface import read_arrays, read_state, table_limits
 from scvi_codegen.tables.precision import mp
 
-__all__ = ["array_example_of", "example_of"]
-
 OUTPUTS = 20
 COMPARED = 1e-9
 """Tolerance of adaptive steps shown next to an example with a fixed step size."""

@@ -38,8 +38,6 @@ from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.validation.argument_types import PATH, SWITCH, TEXT, TEXTS, checks_arguments
 from scvi_codegen.version import __version__
 
-__all__ = ["generate_fmu"]
-
 DESCRIPTION = "modelDescription.xml"
 EPOCH = (1980, 1, 1, 0, 0, 0)
 """Time stamp of every file in the archive, so that equal models produce equal bytes."""

@@ -11,8 +11,6 @@ from scvi_codegen.rendering.program_source import ExampleRun
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.version import __version__
 
-__all__ = ["build_description", "model_description"]
-
 ENERGY, HELD = "energy", "input, held from one communication point to the next"
 LOGGED = {"logStatusError": "why a call failed", "logStatusDiscard": "why a step was not taken"}
 """Categories of log messages."""

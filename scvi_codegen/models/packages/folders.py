@@ -13,8 +13,6 @@ from typing import IO, Any
 from scvi_codegen.errors import PackageError
 from scvi_codegen.files.atomic import write_atomically
 
-__all__ = ["CERTIFICATE_FILE", "FORMAT", "INTERFACE_FILE", "record_text", "write_folder"]
-
 INTERFACE_FILE, CERTIFICATE_FILE = "interface.json", "certificate.json"
 FORMAT = 1
 FILE_NAME = re.compile(r"(support/(\w+/)?)?[\w.]+")

@@ -13,8 +13,6 @@ from scvi_codegen.errors import PackageError
 from scvi_codegen.models.packages.folders import FORMAT, INTERFACE_FILE
 from scvi_codegen.rendering.source import PREFIX, Source, included
 
-__all__ = ["damaged", "prefix_of", "read_record", "source_in"]
-
 OTHER_NAMES = frozenset({"main", "scvi_codegen", "numpy", "cffi", "platformdirs"})
 """Folder names that would collide with ``main.c`` or shadow imports of the package."""
 

@@ -8,8 +8,6 @@ from scvi_codegen.files.templates import template_folder
 from scvi_codegen.rendering.program_source import Embedded
 from scvi_codegen.rendering.source import Interface
 
-__all__ = ["package_template", "readme_text"]
-
 CLOCK = """
 Time is transformed: steps `h` are of tau, dt = g dtau and `t` is integrated along. The parameter
 `${energy}` is the energy of the initial state; `main.c` shows how it is set.

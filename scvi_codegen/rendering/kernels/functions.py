@@ -19,8 +19,6 @@ from scvi_codegen.rendering.kernels.simd import Lanes
 from scvi_codegen.rendering.layout import table, wrapped, wrapped_comment, wrapped_prototype
 from scvi_codegen.rendering.target import DOUBLE, Target
 
-__all__ = ["kernel_text", "lane_kernel_text", "lane_mass_text"]
-
 UNFORMATTED = "  /* clang-format off */\n{}\n  /* clang-format on */"
 """Wrapper for statements of several lines, whose layout differs from that of clang-format."""
 

@@ -23,20 +23,6 @@ from scvi_codegen.ir.kernel import LoopedKernel
 from scvi_codegen.ir.program import Layout
 from scvi_codegen.rendering.layout import wrapped, wrapped_comment
 
-__all__ = [
-    "DIRECTION",
-    "MOST_THREADS",
-    "Lines",
-    "Nest",
-    "Sharing",
-    "count_text",
-    "product_text",
-    "sharing_of",
-    "sharing_text",
-    "size_text",
-    "sizes_text",
-]
-
 
 def product_text(array: Array) -> str:
     """Return the number of entries of an array, in C."""

@@ -29,8 +29,6 @@ from scvi_codegen.rendering.kernels.printer import inverse_roots, scalar_functio
 from scvi_codegen.rendering.kernels.simd import LIBRARY, POINTS, IterationSource, iteration_source
 from scvi_codegen.rendering.target import DOUBLE
 
-__all__ = ["loop_context"]
-
 EXPLICIT_VECTORS, CONSTRAINED_VECTORS, ITERATION_VECTORS = 4, 7, 4
 """Number of vectors in ``work``.
 

@@ -10,19 +10,6 @@ from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
 from scvi_codegen.ir.numbers import Number
 from scvi_codegen.rendering.target import DOUBLE, Target
 
-__all__ = [
-    "ARRAYS",
-    "INVERSE_ROOT",
-    "constants",
-    "inverse_roots",
-    "lane_functions",
-    "print_expression",
-    "print_lane_statements",
-    "print_number",
-    "print_statements",
-    "scalar_functions",
-]
-
 Sources: TypeAlias = tuple[str, ...]
 """Loads that differ between lanes: ``("u", "t")`` for points, ``("u", "parameters")`` for trajectories."""
 

@@ -23,18 +23,6 @@ from scvi_codegen.rendering.kernels.printer import INVERSE_ROOT, Sources, lane_f
 from scvi_codegen.rendering.layout import table
 from scvi_codegen.rendering.target import DOUBLE
 
-__all__ = [
-    "LIBRARY",
-    "POINTS",
-    "TRAJECTORIES",
-    "Fallback",
-    "IterationSource",
-    "Lanes",
-    "iteration_source",
-    "predictor_text",
-]
-
-
 Fallback: TypeAlias = Literal["own", "external", "provided", "none"]
 """Fallback of a source: its own, that of another library (``external``), one for others (``provided``), or none."""
 

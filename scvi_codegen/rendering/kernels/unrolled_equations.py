@@ -18,8 +18,6 @@ from scvi_codegen.rendering.kernels.printer import print_number
 from scvi_codegen.rendering.layout import wrapped
 from scvi_codegen.rendering.target import Target
 
-__all__ = ["UnrolledEquations", "UnrolledGroup", "unrolled_equations"]
-
 MOST_TERMS = 16
 """Largest number of terms of the Jacobian; beyond it loops over tables are shorter."""
 

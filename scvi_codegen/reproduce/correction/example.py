@@ -15,19 +15,6 @@ from scvi_codegen.derivation.equations import StepEquations, derive
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI
 
-__all__ = [
-    "ByHand",
-    "MiddleValue",
-    "by_hand",
-    "compiled",
-    "eliminated",
-    "largest_difference",
-    "middle_value",
-    "missing_terms",
-    "multipliers_agree",
-    "two_points_agree",
-]
-
 QUADRATURE = "gauss-legendre:2"
 h, q_k, p_k, Q_1, Q_2, v_0, lambda_1, lambda_2 = sympy.symbols("h q_k p_k Q_1 Q_2 v_0 lambda_1 lambda_2", real=True)
 tau = sympy.Symbol("tau", real=True)

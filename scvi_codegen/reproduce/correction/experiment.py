@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["ROWS", "measured"]
-
 ROWS = ((2, 2), (3, 2), (4, 3), (5, 4), (6, 5), (7, 6), (9, 7))
 """Numbers of points and of Gauss points."""
 NOISE = 1e-11

@@ -14,8 +14,6 @@ from scvi_codegen.reproduce.correction.example import (
 )
 from scvi_codegen.reproduce.laboratory.experiment import Block, Formula, Listing, Paragraph
 
-__all__ = ["body"]
-
 q_0, q_1, Q, p_0, p_1, J_0, J_1, X, tau = sympy.symbols("q_0 q_1 Q p_0 p_1 J_0 J_1 X tau", real=True)
 G, L_d, xi, inner = sympy.Function("G"), sympy.Function("L_d"), sympy.Function("xi"), sympy.Function("Q")
 BIG_O = sympy.Function("O")

@@ -42,8 +42,6 @@ from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["periods", "segments", "two_points_fail_at"]
-
 Array = NDArray[np.float64]
 
 ECCENTRICITY = 0.5

@@ -46,22 +46,6 @@ from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = [
-    "ECCENTRICITY",
-    "FORMS",
-    "PRESERVED",
-    "PRINTED",
-    "STEP",
-    "TWO_FORMS",
-    "VARIATIONAL",
-    "Orbit",
-    "orbit_of",
-    "shooting",
-    "structure_check",
-    "structure_table",
-]
-
-
 Array = NDArray[np.float64]
 
 ECCENTRICITY, STEP = 0.5, 0.3

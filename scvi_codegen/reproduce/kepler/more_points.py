@@ -39,8 +39,6 @@ from scvi_codegen.reproduce.laboratory.geometric import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["bases"]
-
 Array = NDArray[np.float64]
 
 LONG_STEP = 5.0

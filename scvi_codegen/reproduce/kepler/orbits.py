@@ -29,23 +29,6 @@ from scvi_codegen.runtime.core.stepper import Stepper
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = [
-    "STATE",
-    "SYSTEM",
-    "Structure",
-    "angular_momentum",
-    "draw_ellipse",
-    "draw_states",
-    "ellipse",
-    "exact_flow",
-    "off_ellipse",
-    "perihelion",
-    "perihelion_turn",
-    "revolutions",
-    "structure_of",
-]
-
-
 Array = NDArray[np.float64]
 Pair = tuple[float, float]
 

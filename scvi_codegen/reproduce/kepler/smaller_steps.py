@@ -42,9 +42,6 @@ from scvi_codegen.tables.precision import DIGITS, Number, mp
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["CIRCLE", "ELLIPSE", "LABELS", "ROUNDOFF", "SCHEMES", "one_step", "orders", "shares_won", "superiority"]
-
-
 Array = NDArray[np.float64]
 
 SCHEMES = ("SVI", "SC")

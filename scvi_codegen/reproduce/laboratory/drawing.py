@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["COLORS", "STYLE", "draw_error", "draw_orbit", "draw_powers", "largest_in_bins", "panels", "thinned"]
-
 Array = NDArray[np.float64]
 
 STYLE = TRAJECTORY_STYLE | {"font.size": 9, "axes.titlesize": 10, "legend.fontsize": 8}

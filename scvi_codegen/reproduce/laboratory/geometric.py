@@ -8,18 +8,6 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "AGREEMENT_FACTOR",
-    "STRAIGHT",
-    "WINDOW",
-    "Line",
-    "factors",
-    "fitted_line",
-    "is_straight",
-    "typical",
-    "within",
-]
-
 Array = NDArray[np.float64]
 Line: TypeAlias = tuple[float, float]
 """Constants (C, K)."""

@@ -25,21 +25,6 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
-__all__ = [
-    "BY_DEGREE",
-    "BY_POINTS",
-    "READINGS",
-    "ROUNDOFF",
-    "SCHEMES",
-    "SECTION_3",
-    "SECTION_4",
-    "Reading",
-    "stepper_of",
-    "steps_in",
-    "trajectory",
-]
-
-
 SCHEMES = ("SVI", "SC")
 
 

@@ -46,8 +46,6 @@ from scvi_codegen.reproduce.oscillators.oscillator import OSCILLATOR, POSITION, 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["convergence"]
-
 Array = NDArray[np.float64]
 
 TITLE = "Harmonic oscillator: error over one step h = 20 with more and more points"

@@ -15,20 +15,6 @@ from scvi_codegen.reproduce.laboratory.experiment import Cell, TableBlock, serie
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
-__all__ = [
-    "NO_DRIFT",
-    "area_change",
-    "area_factor",
-    "curves_table",
-    "drift",
-    "drifts",
-    "energy_error",
-    "energy_table",
-    "largest",
-    "offset_from_curve",
-    "svi_with_points",
-]
-
 Array = NDArray[np.float64]
 
 NO_DRIFT = 1e-12

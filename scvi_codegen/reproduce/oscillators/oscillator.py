@@ -37,8 +37,6 @@ from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["OSCILLATOR", "POSITION", "VELOCITY"]
-
 Array = NDArray[np.float64]
 
 OSCILLATOR = harmonic_oscillator()

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["BEYOND", "DEGREES", "POINTS", "Variant", "fitted_power", "refinement"]
-
 Array = NDArray[np.float64]
 
 LEGEND = (2, 4, 6)

@@ -41,9 +41,6 @@ from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = []
-
-
 Array = NDArray[np.float64]
 
 

@@ -32,26 +32,6 @@ from scvi_codegen.tables.basis import cardinal_derivatives, cardinal_values, dif
 from scvi_codegen.tables.nodes import chebyshev_lobatto
 from scvi_codegen.tables.quadrature import gauss_legendre
 
-__all__ = [
-    "ECCENTRICITY",
-    "SPAN",
-    "Count",
-    "Counts",
-    "NotSolvedError",
-    "Setting",
-    "agreement",
-    "attraction",
-    "compiled_count",
-    "compiled_counts",
-    "galerkin",
-    "newton_counts",
-    "picard_counts",
-    "picard_step",
-    "printed_counts",
-    "spectral_collocation",
-]
-
-
 Array = NDArray[np.float64]
 Force: TypeAlias = Callable[[Array], Array]
 """Function that returns accelerations (points, m) at positions (points, m); masses are 1."""

@@ -33,31 +33,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "EXACT",
-    "FEW",
-    "FULL",
-    "GALERKIN",
-    "METHODS",
-    "PLATEAU",
-    "PRINTED",
-    "QUANTITIES",
-    "SHOWN",
-    "START",
-    "TITLES",
-    "Panel",
-    "Series",
-    "cell",
-    "draw_panels",
-    "errors",
-    "exact_steps",
-    "fitted_order",
-    "quadrature_error",
-    "quick_stepper",
-    "rate",
-]
-
-
 Array = NDArray[np.float64]
 
 STARTS: Mapping[str, tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]] = {

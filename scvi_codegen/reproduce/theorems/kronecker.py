@@ -26,8 +26,6 @@ from scvi_codegen.reproduce.laboratory.experiment import (
 )
 from scvi_codegen.tables.precision import mp
 
-__all__ = ["lemma_differences", "residual"]
-
 TITLE = "Spectral collocation with Kronecker products, (18) and (21)"
 FORMS = {"position": "18", "phase-space": "21"}
 SHOWN_DEGREE, DEGREES = 2, (1, 2, 3)

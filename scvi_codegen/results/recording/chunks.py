@@ -16,8 +16,6 @@ from scvi_codegen.files.atomic import sync_folder, write_atomically
 from scvi_codegen.files.export import COLUMNS, Piece
 from scvi_codegen.files.numpy_files import loaded
 
-__all__ = ["Chunk", "chunk_path", "chunk_paths", "no_states", "read_chunk", "unfinished", "write_chunk"]
-
 NAME = re.compile(r"states-(\d{6,})\.npz")
 UNFINISHED = re.compile(r"\.(states-\d{6,}\.npz|manifest\.json)\..+")
 """Names of temporary files that a killed process leaves."""

@@ -26,8 +26,6 @@ from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.validation.counts import checked_count
 from scvi_codegen.version import __version__
 
-__all__ = ["MANIFEST", "Build", "Manifest", "read_manifest", "write_manifest"]
-
 MANIFEST = "manifest.json"
 FORMAT, FORMAT_TO_A_TIME = 1, 2
 """Format numbers of fixed-step runs, and of adaptive runs, which were added later."""

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from scvi_codegen.runtime.core.stepper import Stepper
     from scvi_codegen.runtime.run.run import Run
 
-__all__ = ["LazyArray", "RecordedRun", "load_run"]
-
 Array = NDArray[np.float64]
 PIECES_IN_MEMORY = 2
 

@@ -32,8 +32,6 @@ from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation.argument_types import FUNCTION, PATH, REAL, TEXT, checks_arguments, of
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["record_run", "resume_run"]
-
 LOCK = ".lock"
 CHECKPOINT_SECONDS = 10.0
 SHORTEST_CHUNK_SECONDS, LONGEST_CHUNK_SECONDS = 0.01, 0.1

@@ -24,8 +24,6 @@ from scvi_codegen.runtime.arrays.interface import Numbers, RunArrays
 from scvi_codegen.runtime.arrays.maps import momentum_of
 from scvi_codegen.runtime.arrays.memory import COMPUTED, REAL_FIELDS, RUN_FIELDS, STATE, aligned, constraint_memory
 
-__all__ = ["ArrayBinding", "ArrayMemory"]
-
 FAILURES_BY_SOLVER = {
     "fixed-point": FAILURES
     | {

@@ -26,8 +26,6 @@ from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import Array, Parameters
 from scvi_codegen.runtime.events.event import Event
 
-__all__ = ["BoundStepper"]
-
 
 class AnySizes(Protocol):
     """Interface required of a stepper of any size (:class:`ArrayStepper`)."""

@@ -26,8 +26,6 @@ from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 if TYPE_CHECKING:
     from scvi_codegen.formulas.arrays import ArrayTerm
 
-__all__ = ["ArraySearch"]
-
 Sample: TypeAlias = tuple[float, float]
 """Fraction of a step, and the function value there."""
 LAST_BIT = 2.0**-52

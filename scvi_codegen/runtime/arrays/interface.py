@@ -15,18 +15,6 @@ from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.rendering.source import ArrayLayout, Interface
 from scvi_codegen.runtime.core.named_arrays import NamedState
 
-__all__ = [
-    "Numbers",
-    "RunArrays",
-    "field_values",
-    "first_state",
-    "flat",
-    "number_values",
-    "read_arrays",
-    "read_state",
-    "table_limits",
-]
-
 Numbers = NDArray[np.float64]
 IndexTable = NDArray[np.int32]
 

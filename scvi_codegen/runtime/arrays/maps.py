@@ -7,8 +7,6 @@ import numpy as np
 from scvi_codegen.indices import ArrayMap
 from scvi_codegen.runtime.arrays.interface import Numbers
 
-__all__ = ["momentum_of"]
-
 
 def momentum_of(q: Numbers, p: Numbers, of: ArrayMap, *, absolute: bool = False) -> float:
     """Return the value of a momentum map from the positions and momenta of its array; ``absolute``: sum of terms."""

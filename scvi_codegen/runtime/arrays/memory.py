@@ -11,8 +11,6 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.runtime.arrays.interface import Numbers
 
-__all__ = ["COMPUTED", "REAL_FIELDS", "RUN_FIELDS", "STATE", "aligned", "constraint_memory"]
-
 STEP_CONTROL_FIELDS = (
     "grid_level",
     "change",

@@ -17,8 +17,6 @@ from scvi_codegen.runtime.arrays.interface import RunArrays, read_arrays
 from scvi_codegen.runtime.arrays.memory import COMPUTED, RUN_FIELDS, STATE
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["read_saved", "saved_bytes"]
-
 RANGES = {
     **dict.fromkeys(("step", "rejected", "avoiding", "steps_from_rest", "steps_to_compare"), (0, 2**53)),
     "guess": (0, 2),

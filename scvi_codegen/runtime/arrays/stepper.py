@@ -25,8 +25,6 @@ from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation.argument_types import MAPPING, checks_arguments
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["ArrayStepper"]
-
 MOST_COORDINATES = 2000
 """Largest number of coordinates that are compiled with known sizes for what requires it."""
 

@@ -34,8 +34,6 @@ from scvi_codegen.runtime.run.run_loop import record
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["ChaosIndicatorsEnsemble"]
-
 CHECKED_STRIDE: Final = 64
 """Stride of the trajectories whose step error is estimated."""
 

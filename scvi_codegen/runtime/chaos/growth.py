@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from scvi_codegen.runtime.core.validation import Array
 
-__all__ = ["SERIES", "Growth", "ill_conditioned", "r_factors"]
-
 SERIES = ("log_norms", "max_log_norms", "log_r_diagonal", "rates", "mean_rates")
 """Names of the accumulated series, defined in :class:`~scvi_codegen.runtime.chaos.indicators.ChaosIndicators`."""
 

@@ -18,8 +18,6 @@ from scvi_codegen.runtime.chaos.growth import SERIES
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["ChaosIndicators"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ChaosIndicators:

@@ -17,8 +17,6 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.chaos.growth import Growth, ill_conditioned, r_factors
 from scvi_codegen.runtime.core.validation import Array
 
-__all__ = ["TRAJECTORIES_TOGETHER", "propagate_in_lanes"]
-
 TRAJECTORIES_TOGETHER = 256
 """Number of trajectories integrated together, so that the output of a block of steps fits into the cache."""
 FIRST, MOST = 8, 32

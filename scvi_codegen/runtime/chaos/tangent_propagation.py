@@ -26,8 +26,6 @@ from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["InitialTangents", "ahead", "along"]
-
 FIRST, MOST = 8, 1024
 """Number of steps of the first and of the largest chunk."""
 SEED = 1892

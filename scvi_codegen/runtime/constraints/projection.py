@@ -22,8 +22,6 @@ from scvi_codegen.runtime.core.validation import (
     missing_input,
 )
 
-__all__ = ["check_reachable", "consistent", "constraint_values", "multipliers", "projected"]
-
 MOST_SHOWN, MOST_DENSE = 4, 64
 """Largest numbers of positions and constraints in a message, and of those whose rank is checked at run-time sizes."""
 

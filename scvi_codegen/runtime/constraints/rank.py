@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from scvi_codegen.runtime.core.validation import Array
 
-__all__ = ["Jacobian", "dependence", "rank_deficiency"]
-
 DEPENDENT = 1e-9
 """Smallest singular value of G, with rows of length 1, below which rows count as linearly dependent."""
 NAMED_SHARE = 1e-6

@@ -17,9 +17,6 @@ from scvi_codegen.runtime.core.named_arrays import named, shapes_of
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.events.event import Event, EventLike, as_events
 
-__all__ = ["CompiledMethod", "Variants"]
-
-
 MOST_EVENT_SETS = 16
 """Number of event sets whose compiled integrators are cached, so that repeated calls do not parse formulas again."""
 

@@ -27,8 +27,6 @@ from scvi_codegen.runtime.core.validation import (
 )
 from scvi_codegen.runtime.sensitivity.step_derivatives import LinearisedMethod
 
-__all__ = ["Integrator"]
-
 REPORTED = 1e-3
 """Largest relative difference between a velocity and the velocity recomputed from its momentum."""
 

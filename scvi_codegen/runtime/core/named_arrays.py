@@ -15,8 +15,6 @@ from scvi_codegen.errors import StateError, closest
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.rendering.source import Interface
 
-__all__ = ["EntryNames", "NamedState", "entries_by_name", "flat_state", "named", "shapes_of", "state_by_name"]
-
 Array = NDArray[np.float64]
 Shapes = Sequence[tuple[str, tuple[int, ...]]]
 

@@ -50,9 +50,6 @@ from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation.argument_types import FUNCTION, MAPPING, ArgumentType, checks_arguments
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["STEPPER", "Stepper", "of_known_sizes"]
-
-
 STEPPER = ArgumentType("a compiled stepper", lambda value: isinstance(value, Stepper) or hasattr(value, "bind"))
 """Type check of steppers, also of those for arrays of any size."""
 

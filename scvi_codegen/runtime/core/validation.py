@@ -15,23 +15,6 @@ from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.core.named_arrays import entries_by_name, flat_state
 
-__all__ = [
-    "BINARY64",
-    "Array",
-    "Parameters",
-    "TakesInputs",
-    "check_inputs_given",
-    "check_left_to_inputs",
-    "checked_parameters",
-    "checked_states",
-    "checked_vector",
-    "columns_of_inputs",
-    "inputs_not_given",
-    "missing_input",
-    "no_input",
-    "parameter_index",
-]
-
 Array = NDArray[np.float64]
 BINARY64, FEW = np.dtype(np.float64), 64
 Parameters = Mapping[str, Any] | Sequence[float] | Array | None

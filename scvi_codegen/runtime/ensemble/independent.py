@@ -43,8 +43,6 @@ from scvi_codegen.runtime.trajectory.joining import joined
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["AdaptiveEnsemble"]
-
 
 class LaneStates(Protocol):
     """Saved states of one trajectory."""

@@ -15,8 +15,6 @@ from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.named_arrays import entries_by_name, flat_state
 from scvi_codegen.runtime.core.validation import Array, check_inputs_given, parameter_index
 
-__all__ = ["EnsembleParameters", "checked_ensemble", "momenta_of_each", "parameters_of_each", "start_of_ensemble"]
-
 EnsembleParameters = Mapping[str, ArrayLike] | Sequence[Any] | Array | None
 
 

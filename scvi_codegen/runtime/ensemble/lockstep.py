@@ -46,13 +46,6 @@ from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = [
-    "Change",
-    "Ensemble",
-    "LaneBlock",
-    "StepChunk",
-]
-
 FIRST_CHUNK_STEPS = 64
 """Steps of the first chunk of a block, before its speed is known."""
 CHUNK_SECONDS = 0.02

@@ -29,8 +29,6 @@ from scvi_codegen.validation.argument_types import MAPPING, PATH, checks_argumen
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["INTERRUPTED", "OK", "EnsembleTrajectory", "Span"]
-
 OK, INTERRUPTED = "ok", "interrupted"
 
 Span: TypeAlias = tuple[slice, slice, Callable[[slice], Array]]

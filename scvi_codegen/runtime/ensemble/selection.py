@@ -23,8 +23,6 @@ from scvi_codegen.runtime.ensemble.initial_states import (
 from scvi_codegen.runtime.ensemble.lockstep import Ensemble
 from scvi_codegen.runtime.inputs.segments import Input, checked_inputs, final_time, first_inner_time, parameters_at
 
-__all__ = ["ensemble_work"]
-
 
 def ensemble_work(
     stepper: Integrator,

@@ -9,8 +9,6 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["MOST_JOBS", "PROGRESS_SECONDS", "StopCheck", "run_jobs", "workers_of"]
-
 PROGRESS_SECONDS = 0.1
 MOST_JOBS = 4096
 """Largest number of jobs of a pool; waiting for a million futures would be slow."""

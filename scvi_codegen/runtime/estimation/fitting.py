@@ -26,8 +26,6 @@ from scvi_codegen.runtime.inputs.segments import checked_inputs
 from scvi_codegen.validation.argument_types import MAPPING, NAMES, SWITCH, checks_arguments
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["Fit", "fit"]
-
 SAME = 1e-10
 """Sensitivity relative to the largest below which an unknown counts as undetermined."""
 REFINEMENT_ITERATIONS = 4

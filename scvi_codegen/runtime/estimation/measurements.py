@@ -22,8 +22,6 @@ from scvi_codegen.runtime.run.times import steps_within
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
 from scvi_codegen.runtime.trajectory.dense_output import checked_times
 
-__all__ = ["Measurements", "distinct", "state_names"]
-
 
 @dataclass(frozen=True, eq=False)
 class Measurements:

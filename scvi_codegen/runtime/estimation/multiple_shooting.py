@@ -20,8 +20,6 @@ from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.estimation.measurements import Measurements
 from scvi_codegen.runtime.inputs.segments import parameters_at
 
-__all__ = ["LOOSE", "TIGHT", "Chain", "Limits", "chained", "joined"]
-
 LOOSE, TIGHT = 0.1, 1e-9
 """Jumps, relative to the size of states, that weigh as much as a measurement residual: initially, and finally."""
 MOST = 100

@@ -19,8 +19,6 @@ from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
 if TYPE_CHECKING:
     from scvi_codegen.runtime.arrays.events import ArraySearch
 
-__all__ = ["CrossingSearch", "crossings_of", "search_of"]
-
 INITIAL_CAPACITY = 256
 """Initial number of crossings that one call can return; doubled when exceeded."""
 

@@ -16,8 +16,6 @@ from scvi_codegen.validation.counts import checked_count
 if TYPE_CHECKING:
     from sympy import Expr
 
-__all__ = ["ACCUMULATED", "Crossings", "Event", "EventLike", "as_events"]
-
 Array = NDArray[np.float64]
 DIRECTIONS = (-1, 0, 1)
 ACCUMULATED = (

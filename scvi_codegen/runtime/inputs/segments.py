@@ -29,23 +29,6 @@ if TYPE_CHECKING:
     from scvi_codegen.runtime.core.integrator import Integrator
     from scvi_codegen.runtime.run.run import Run
 
-__all__ = [
-    "Input",
-    "Segment",
-    "advance_to",
-    "checked_inputs",
-    "final_time",
-    "first_inner_time",
-    "input_of",
-    "parameters_at",
-    "parameters_of",
-    "planned_segments",
-    "prepared_segments",
-    "record_pieces",
-    "time_after_steps",
-    "with_final_state",
-]
-
 POWERS = 4
 ALL = slice(None)
 NEGLIGIBLE_STEP = 1e-9

@@ -15,8 +15,6 @@ from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
-__all__ = ["PeriodicOrbit"]
-
 SYMPLECTIC = 1e-9
 """Symplecticity defect of a monodromy matrix, relative to its squared norm, above which it is not due to rounding."""
 SAME = 1e-6

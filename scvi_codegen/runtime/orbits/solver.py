@@ -34,8 +34,6 @@ from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
 from scvi_codegen.validation.argument_types import NAMES, SWITCH, checks_arguments
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["periodic_orbit"]
-
 MOST_ITERATIONS, MOST_HALVINGS = 50, 12
 EASY, GROWTH = 10.0, 4.0
 """Growth of tangent vectors in a period up to which one segment is enough, and that in each of more segments."""

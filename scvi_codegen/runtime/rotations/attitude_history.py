@@ -18,8 +18,6 @@ from scvi_codegen.runtime.rotations.attitudes import (
 )
 from scvi_codegen.runtime.rotations.states import Member, members_of
 
-__all__ = ["AttitudeHistory"]
-
 Array = NDArray[np.float64]
 
 

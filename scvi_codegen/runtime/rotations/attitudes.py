@@ -16,17 +16,6 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import real_array
 
-__all__ = [
-    "angular_velocity",
-    "body_momentum",
-    "euler_angles",
-    "matrices",
-    "momenta_of_body",
-    "quaternions",
-    "unit_quaternions",
-    "velocities_of_body",
-]
-
 Array = NDArray[np.float64]
 
 ACCEPTED = (

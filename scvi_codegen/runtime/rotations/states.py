@@ -19,8 +19,6 @@ from scvi_codegen.runtime.rotations.attitudes import (
     velocities_of_body,
 )
 
-__all__ = ["Member", "homogeneous_state", "members_of", "state_of"]
-
 Array = NDArray[np.float64]
 
 

@@ -19,16 +19,6 @@ from scvi_codegen.runtime.run.step_plan import StepPlan
 if TYPE_CHECKING:
     from scvi_codegen.runtime.core.integrator import Integrator
 
-__all__ = [
-    "TOLERABLE_ERROR",
-    "warn_of_energies",
-    "warn_of_energy_error",
-    "warn_of_energy_errors",
-    "warn_of_large_steps",
-    "warnings_wanted",
-    "without_accuracy_warnings",
-]
-
 TOLERABLE_ERROR: Final = 1e-3
 """Largest relative error of a step, and largest relative change of the energy of a run, without a warning."""
 

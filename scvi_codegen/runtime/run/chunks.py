@@ -6,8 +6,6 @@ import math
 import time
 from collections.abc import Callable
 
-__all__ = ["CALL_SECONDS", "drive"]
-
 CALL_SECONDS = 0.1
 """Target duration of a C call in seconds; bounds the delay of Ctrl-C and of ``progress``."""
 

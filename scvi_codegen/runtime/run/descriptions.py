@@ -9,8 +9,6 @@ from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.run.step_plan import StepPlan
 
-__all__ = ["describe_run", "describe_states", "describe_step_size", "short_title"]
-
 
 class DescribedRun(Protocol):
     """Interface required of a run."""

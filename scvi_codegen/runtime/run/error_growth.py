@@ -21,8 +21,6 @@ from scvi_codegen.runtime.run.accuracy import warnings_wanted
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.step_plan import StepPlan
 
-__all__ = ["MOST_STEPS", "GrowthCheck"]
-
 Array = NDArray[np.float64]
 
 MOST_STEPS, MOST_NUMBERS = 2048, 2**18

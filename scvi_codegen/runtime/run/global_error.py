@@ -24,8 +24,6 @@ from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, wa
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.runtime.run.accuracy import warnings_wanted, without_accuracy_warnings
 
-__all__ = ["Confirmed", "ConfirmedEnsemble", "GlobalError", "checked_error", "confirmed_run", "warn_of_unconfirmed"]
-
 Array = NDArray[np.float64]
 Result = TypeVar("Result")
 

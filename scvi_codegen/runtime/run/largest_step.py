@@ -21,8 +21,6 @@ from scvi_codegen.runtime.core.validation import Parameters, check_inputs_given
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.run.run import Run
 
-__all__ = ["ROUND_OFF", "accuracy_message", "largest_step"]
-
 ROUND_OFF = 2.0**-53
 """Relative error meant by a tolerance of 0."""
 PILOT_STEPS = 256

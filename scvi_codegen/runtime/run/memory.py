@@ -27,9 +27,6 @@ from scvi_codegen.runtime.run.one_thread import OneThread, alone, in_use
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.validation.counts import LARGEST_COUNT, checked_count
 
-__all__ = ["Memory", "fill"]
-
-
 STEPS_PER_CALL, MOST_UNTIMED = 10**5, 2**10
 """Largest number of steps per call into C, between checks for Ctrl-C, and of coordinates of which it is not timed."""
 GRID_FIELDS, MOST_GRID_LEVEL = ("grid_level", "change", "change_before", "direction", "failed", "avoiding"), 2**16

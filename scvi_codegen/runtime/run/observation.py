@@ -27,8 +27,6 @@ from scvi_codegen.runtime.trajectory.time_transformation import part_of_step
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["Observation", "observed_until"]
-
 Array = NDArray[np.float64]
 CHUNK_NUMBERS = 2**18
 """Largest number of positions in a chunk."""

@@ -10,8 +10,6 @@ from typing import Any, TypeVar, cast
 
 from scvi_codegen.errors import StateError
 
-__all__ = ["OneThread", "alone", "in_use"]
-
 Called = TypeVar("Called", bound=Callable[..., Any])
 
 

@@ -21,8 +21,6 @@ from scvi_codegen.runtime.run.run_loop import record
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
-__all__ = ["Run"]
-
 MOST_KEPT = 2**16
 """Largest number of doubles of workspace of a run that is kept for later calls."""
 

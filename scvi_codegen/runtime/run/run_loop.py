@@ -22,8 +22,6 @@ from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["first_step_size", "record", "trajectory_of"]
-
 NATIVE_DOUBLE, INT32 = Struct("d"), np.dtype(np.int32)
 FIRST_STEPS = 256
 """Number of saved states of the first C call, before the speed of the steps is known."""

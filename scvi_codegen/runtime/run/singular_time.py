@@ -14,8 +14,6 @@ from scvi_codegen.errors import StepFailedError
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
-__all__ = ["ProgressWatch", "check_energy_surface"]
-
 MOST_STEPS: Final = 1e9
 """Number of remaining steps at the present rate above which slow progress counts."""
 SLOW: Final = 1e-6

@@ -8,8 +8,6 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.validation.counts import check_tolerance
 
-__all__ = ["StepPlan"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepPlan:

@@ -11,8 +11,6 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.runtime.core.validation import Array
 
-__all__ = ["WHOLE", "steps_to", "steps_within", "times_after"]
-
 SPLITTER = 2.0**27 + 1.0
 """Factor that splits a double into two halves of 26 bits (Dekker 1971)."""
 WHOLE = 1e-9

@@ -24,8 +24,6 @@ from scvi_codegen.runtime.sensitivity.hessians import checked_function, second_o
 from scvi_codegen.runtime.sensitivity.step_derivatives import LinearisedMethod
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 
-__all__ = ["DerivativesWithInputs", "GradientWithInputs"]
-
 COEFFICIENTS = 4
 """Number of coefficients of a piece of an input; its fifth parameter is the reference time, which is held fixed."""
 

@@ -24,23 +24,6 @@ from scvi_codegen.runtime.sensitivity.transformed_derivatives import time_of
 from scvi_codegen.runtime.trajectory.recomputation import check_recomputed, steps_between
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 
-__all__ = [
-    "Gradient",
-    "backward",
-    "checked_cotangents",
-    "finite",
-    "forward",
-    "gradient_of",
-    "pieces",
-    "propagate",
-    "seeds_of",
-    "sensitivity",
-    "starts_of",
-    "tangent_vectors",
-    "tangents_from_directions",
-    "vector_jacobian_product",
-]
-
 MOST_STEPS = 1024
 """Largest number of steps of a segment processed at once."""
 SAME_STEP_SIZE = 1e-9

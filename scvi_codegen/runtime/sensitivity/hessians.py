@@ -20,8 +20,6 @@ from scvi_codegen.runtime.sensitivity.gradients import (
 from scvi_codegen.runtime.sensitivity.step_derivatives import LinearisedMethod
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 
-__all__ = ["checked_function", "hessian_product", "second_order_adjoints"]
-
 
 def hessian_product(
     states: SavedStates, cotangents: ArrayLike, directions: ArrayLike, curvatures: ArrayLike | None

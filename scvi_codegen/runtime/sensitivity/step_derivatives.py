@@ -20,8 +20,6 @@ from scvi_codegen.representation import summary
 from scvi_codegen.runtime.core.compiled_method import CompiledMethod
 from scvi_codegen.runtime.core.validation import Array, Parameters, check_inputs_given, checked_vector
 
-__all__ = ["LinearisedMethod", "Sensitivity", "Starts"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sensitivity:

@@ -17,8 +17,6 @@ from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
 from scvi_codegen.validation.argument_types import SWITCH, checks_arguments
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["TrajectoryDerivatives"]
-
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class TrajectoryDerivatives(SavedStates):

@@ -18,8 +18,6 @@ from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 
-__all__ = ["PhysicalTime", "TransformedTime", "time_of"]
-
 T = -2
 """Index of t among the variables (q, p, parameters, t, h)."""
 

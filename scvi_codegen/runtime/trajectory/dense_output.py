@@ -27,18 +27,6 @@ from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 from scvi_codegen.runtime.trajectory.time_transformation import states_in_transformed_time
 
-__all__ = [
-    "STEP_END_TOLERANCE",
-    "checked_times",
-    "grid_tolerance",
-    "states_and_steps_at",
-    "states_at",
-    "step_sizes_at",
-    "times_of_run",
-    "whole_steps",
-    "within",
-]
-
 Array = NDArray[np.float64]
 ROUNDINGS = 4.0
 STEP_END_TOLERANCE = 1e-6

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from scvi_codegen.runtime.events.event import Crossings
 from scvi_codegen.runtime.trajectory.saved_states import Array
 
-__all__ = ["Number", "concatenated", "joined", "joined_crossings", "relative_changes"]
-
 Number = TypeVar("Number", bound=np.generic)
 Result = TypeVar("Result")
 

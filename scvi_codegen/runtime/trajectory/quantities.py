@@ -11,8 +11,6 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
 
-__all__ = ["quantities"]
-
 
 def quantities(stepper: Integrator, parameters: Array, t: Array, q: Array, p: Array) -> dict[str, Array]:
     """Return the velocity (n, m), energy (n,) and, if there are any, momentum_map (n, c) of n states."""

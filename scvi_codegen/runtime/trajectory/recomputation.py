@@ -15,8 +15,6 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.runtime.trajectory.dense_output import STEP_END_TOLERANCE, whole_steps
 from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
 
-__all__ = ["check_recomputed", "recomputed_steps", "steps_between"]
-
 Found = TypeVar("Found")
 
 SAME_STATE = 1e-6

@@ -14,8 +14,6 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.run.step_plan import StepPlan
 
-__all__ = ["SavedStates", "checked_row", "checked_rows"]
-
 Array = NDArray[np.float64]
 
 

@@ -13,8 +13,6 @@ from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 
-__all__ = ["part_of_step", "states_in_transformed_time"]
-
 
 def part_of_step(
     stepper: Integrator,

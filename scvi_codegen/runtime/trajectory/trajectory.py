@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from scvi_codegen.pictures.animation import Film
     from scvi_codegen.pictures.plots import Plots
 
-__all__ = ["Trajectory"]
-
 MOST_DRAWN, MOST_CURVES = 400, 6
 """Largest numbers of states and of coordinates in the plot of a notebook."""
 

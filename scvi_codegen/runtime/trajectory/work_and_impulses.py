@@ -7,8 +7,6 @@ import numpy as np
 from scvi_codegen.runtime.trajectory.recomputation import recomputed_steps
 from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
 
-__all__ = ["work_and_impulses_until"]
-
 
 def work_and_impulses_until(states: SavedStates) -> Array:
     """Return (n, 1 + k) work of the forces from the first state to each, and their impulses on the momentum maps.

@@ -19,8 +19,6 @@ from scvi_codegen.runtime.arrays.interface import RunArrays, check_accesses
 from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 from scvi_codegen.runtime.run.run import Run
 
-__all__ = ["SmallStepper", "small_start"]
-
 Numbers = NDArray[np.float64]
 
 CUT_SIZES = ((5, 6), (4, 4), (3, 3), (3, 2), (2, 2), (2, 1), (6, 6), (8, 8), (12, 12), (16, 16))

@@ -22,8 +22,6 @@ from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.verification.certificate import Check, Finding, checked, information
 
-__all__ = ["WholeStart", "whole_checks"]
-
 Numbers = NDArray[np.float64]
 
 EPSILON = 2.0**-52
