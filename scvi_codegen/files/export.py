@@ -21,7 +21,16 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.files.atomic import replaced
-from scvi_codegen.files.labelled_arrays import CHUNK_BYTES, Labelled, imported, missing, write_hdf5, write_zarr
+from scvi_codegen.files.labelled_arrays import (
+    AXES,
+    CHUNK_BYTES,
+    Labelled,
+    NamedQuantity,
+    imported,
+    missing,
+    write_hdf5,
+    write_zarr,
+)
 
 if TYPE_CHECKING:
     import pandas
@@ -45,7 +54,9 @@ class States:
         h: step size.
         about: metadata texts by name: title, system, method, version, ...
         maps: names of the momentum maps.
-        quantities: derived quantities of t (n,), q and p (n, m): velocity (n, m), energy (n,), momentum_map (n, c).
+        attitudes: quantities of rotations, directions and spins.
+        quantities: derived quantities of t (n,), q and p (n, m): velocity (n, m), energy (n,), momentum_map (n, c), and
+            the attitudes by name.
         units: of t, q, p and these, as far as known.
     """
 
@@ -56,6 +67,7 @@ class States:
     h: float
     about: Mapping[str, str]
     maps: tuple[str, ...] = ()
+    attitudes: tuple[NamedQuantity, ...] = ()
     quantities: Callable[[Array, Array, Array], Mapping[str, Array]] | None = None
     units: Mapping[str, str] = field(default_factory=dict)
 
@@ -80,6 +92,10 @@ class States:
         if self.quantities is not None and self.maps:
             dimensions |= {"symmetry": ("symmetry",), "momentum_map": ("t", "symmetry")}
             whole["symmetry"] = np.array(self.maps)
+        attitudes = self.attitudes if self.quantities is not None else ()
+        if attitudes:
+            dimensions |= {axis: (axis,) for axis in AXES} | {each.name: ("t", *each.dimensions) for each in attitudes}
+            whole |= AXES
         return Labelled(
             dimensions=dimensions,
             pieces=self._labelled_pieces,
@@ -87,6 +103,7 @@ class States:
             count=self.count,
             units={name: unit for name, unit in self.units.items() if name in dimensions},
             attributes=self.attributes,
+            long_names={each.name: each.long_name for each in attitudes},
         )
 
     def _labelled_pieces(self) -> Iterator[dict[str, NDArray[Any]]]:
@@ -157,10 +174,11 @@ def to_dataframe(states: States) -> pandas.DataFrame:
 
 
 def _names(states: States) -> list[str]:
-    """Return column names: t, coordinates x, momenta p_x, iterations; velocities x_dot and energy, if known."""
+    """Return column names: t, coordinates x, momenta p_x, iterations; velocities, energy and attitudes, if known."""
     names = ["t", *states.coordinates, *(f"p_{name}" for name in states.coordinates), "iterations"]
     if states.quantities is not None:
         names += [*(f"{name}_dot" for name in states.coordinates), "energy"]
+        names += [name for each in states.attitudes for name in each.columns]
     return names
 
 
@@ -169,6 +187,8 @@ def _columns(states: States) -> Iterator[Iterator[NDArray[Any]]]:
     for t, q, p, iterations in states.pieces():
         derived = {} if states.quantities is None else states.quantities(t, q, p)
         more = (*derived["velocity"].T, derived["energy"]) if derived else ()
+        if derived:
+            more += tuple(column for each in states.attitudes for column in derived[each.name].reshape(len(t), -1).T)
         yield iter((t, *q.T, *p.T, iterations, *more))
 
 

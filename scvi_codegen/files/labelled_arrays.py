@@ -11,7 +11,7 @@ import importlib
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -37,6 +37,8 @@ LONG_NAMES = {
     "energy": "energy p.v - L",
     "momentum_map": "conserved quantity of a symmetry",
     "coordinate": "name of the coordinate",
+    "space_axis": "axis of the space frame",
+    "body_axis": "axis of the body frame",
     "symmetry": "name of the momentum map",
     "parameter": "name of the parameter",
     "parameters": "value of the parameter",
@@ -45,6 +47,27 @@ LONG_NAMES = {
 }
 MEASURED = ("t", "q", "p", "velocity", "energy", "momentum_map")
 """Arrays that may have units."""
+
+
+AXES: dict[str, NDArray[np.int_]] = {name: np.arange(1, 4) for name in ("space_axis", "body_axis")}
+"""Dimensions of the quantities, with their coordinates."""
+
+
+@dataclass(frozen=True, slots=True)
+class NamedQuantity:
+    """Rotation matrix, angular velocity, angular momentum, direction or spin.
+
+    Attributes:
+        name: as in formulas, ``R``, ``omega``, ``p_R``, ``n``, ``n_dot``, ``s``.
+        dimensions: names of its axes.
+        columns: names of its entries in tables, ``R_11``, ``omega_1``, ``n_1_dot``.
+        long_name: description.
+    """
+
+    name: str
+    dimensions: tuple[str, ...]
+    columns: tuple[str, ...]
+    long_name: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,6 +81,7 @@ class Labelled:
         count: the length of t.
         units: of arrays, by name.
         attributes: global attributes, numbers and texts.
+        long_names: of arrays that are not in ``LONG_NAMES``, by name.
     """
 
     dimensions: Mapping[str, tuple[str, ...]]
@@ -66,6 +90,7 @@ class Labelled:
     count: int
     units: Mapping[str, str]
     attributes: Mapping[str, Any]
+    long_names: Mapping[str, str] = field(default_factory=dict)
 
     def sizes(self) -> dict[str, int]:
         """Return the length of each dimension."""
@@ -77,7 +102,7 @@ class Labelled:
     def about(self, name: str) -> dict[str, str]:
         """Return the attributes of an array."""
         units = {"units": self.units[name]} if name in self.units else {}
-        return {"long_name": LONG_NAMES[name], **units}
+        return {"long_name": self.long_names.get(name) or LONG_NAMES[name], **units}
 
     def size(self) -> int:
         """Return the bytes of the arrays along t."""

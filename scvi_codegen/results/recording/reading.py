@@ -18,6 +18,7 @@ from scvi_codegen.files.labelled_arrays import checked_units
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states, read_chunk
 from scvi_codegen.results.recording.manifest import read_manifest
+from scvi_codegen.runtime.rotations.quantities import named_quantities
 from scvi_codegen.runtime.run.run_loop import first_step_size
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.quantities import quantities
@@ -209,6 +210,7 @@ class RecordedRun:
             h=self.h,
             about=manifest.about(),
             maps=manifest.interface.map_names,
+            attitudes=named_quantities(manifest.interface),
             quantities=lambda t, q, p: quantities(self.stepper, np.array(manifest.parameters), t, q, p),
             units=checked_units(units),
         )

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import StateError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.export import LABELLED, check_format, write_whole
-from scvi_codegen.files.labelled_arrays import Labelled, checked_units, to_dataset
+from scvi_codegen.files.labelled_arrays import AXES, Labelled, checked_units, to_dataset
 from scvi_codegen.representation import one_line
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
+from scvi_codegen.runtime.rotations.quantities import named_quantities
 from scvi_codegen.runtime.run.descriptions import short_title
 from scvi_codegen.runtime.run.global_error import ConfirmedEnsemble, GlobalError
 from scvi_codegen.runtime.run.step_plan import StepPlan
@@ -196,6 +197,12 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
         if interface.map_names:
             dimensions |= {"symmetry": ("symmetry",), "momentum_map": (*each, "symmetry")}
             whole["symmetry"] = np.array(interface.map_names)
+        attitudes = named_quantities(interface)
+        if attitudes:
+            dimensions |= {axis: (axis,) for axis in AXES} | {
+                item.name: (*each, *item.dimensions) for item in attitudes
+            }
+            whole |= AXES
         states = {"t": self.t, "q": self.q, "p": self.p}
         if self.times is not None:
             dimensions["time"], states["time"] = each, self.times
@@ -206,6 +213,7 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
             count=len(self.t),
             units={name: unit for name, unit in units.items() if name in dimensions},
             attributes={**interface.about(), "h": self.h},
+            long_names={item.name: item.long_name for item in attitudes},
         )
 
     def _quantities(self) -> dict[str, Array]:

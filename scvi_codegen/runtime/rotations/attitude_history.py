@@ -6,23 +6,28 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.runtime.rotations.attitudes import (
     angular_velocity,
     body_momentum,
     euler_angles,
+    in_space,
     matrices,
-    unit_quaternions,
+    unit_vectors,
 )
+from scvi_codegen.runtime.rotations.quantities import spins
 from scvi_codegen.runtime.rotations.states import Member, members_of
 
 Array = NDArray[np.float64]
 
 
 class AttitudeHistory:
-    """Rotations, directions and spins at the states (q, p) of a trajectory; names may be omitted if there is one."""
+    """Rotations, directions and spins at the states (q, p) of a trajectory; names may be omitted if there is one.
+
+    ``t``, a time or times within a single trajectory, selects dense output as of :meth:`Trajectory.at` instead.
+    """
 
     __slots__ = ()
 
@@ -33,56 +38,68 @@ class AttitudeHistory:
         stepper: Any
         parameters: Array
         each: Any
+        at: Any
+        pieces: Any
+        velocity: Any
 
-    def rotation(self, name: str | None = None) -> Array:
+    def rotation(self, name: str | None = None, *, t: ArrayLike | None = None) -> Array:
         """Return (n, 3, 3) rotation matrices, from components in the body frame to components in space."""
-        return matrices(self.q[..., self._member("rotation", name).columns])
+        return matrices(self._states(t)[0][..., self._member("rotation", name).columns])
 
-    def quaternion(self, name: str | None = None) -> Array:
+    def quaternion(self, name: str | None = None, *, t: ArrayLike | None = None) -> Array:
         """Return (n, 4) unit quaternions (w, x, y, z), continuous in time: q and -q are the same rotation."""
-        return unit_quaternions(self.q[..., self._member("rotation", name).columns])
+        return unit_vectors(self._states(t)[0][..., self._member("rotation", name).columns])
 
-    def euler(self, axes: str, name: str | None = None) -> Array:
+    def euler(self, axes: str, name: str | None = None, *, t: ArrayLike | None = None) -> Array:
         """Return (n, 3) Euler angles in radians, with axes as of ``scipy.spatial.transform.Rotation``: ``"zxz"``."""
-        return euler_angles(self.q[..., self._member("rotation", name).columns], axes)
+        return euler_angles(self._states(t)[0][..., self._member("rotation", name).columns], axes)
 
-    def angular_velocity(self, name: str | None = None, *, space: bool = False) -> Array:
+    def angular_velocity(self, name: str | None = None, *, space: bool = False, t: ArrayLike | None = None) -> Array:
         """Return (n, 3) angular velocities in the body frame, or in the space frame."""
-        member = self._member("rotation", name)
-        body = angular_velocity(self.q[..., member.columns], self._velocities()[..., member.columns])
-        return self._in_space(member, body) if space else body
+        member, (q, p) = self._member("rotation", name), self._states(t)
+        body = angular_velocity(q[..., member.columns], self._velocities(q, p, t)[..., member.columns])
+        return in_space(q[..., member.columns], body) if space else body
 
-    def body_momentum(self, name: str | None = None) -> Array:
+    def body_momentum(self, name: str | None = None, *, t: ArrayLike | None = None) -> Array:
         """Return (n, 3) angular momenta of a rotation in the body frame, dl/domega."""
-        columns = self._member("rotation", name).columns
-        return body_momentum(self.q[..., columns], self.p[..., columns])
+        columns, (q, p) = self._member("rotation", name).columns, self._states(t)
+        return body_momentum(q[..., columns], p[..., columns])
 
-    def angular_momentum(self, name: str | None = None) -> Array:
+    def angular_momentum(self, name: str | None = None, *, t: ArrayLike | None = None) -> Array:
         """Return (n, 3) angular momenta of a rotation in the space frame, without that of the motion of its centre."""
-        return self._in_space(self._member("rotation", name), self.body_momentum(name))
+        columns, (q, p) = self._member("rotation", name).columns, self._states(t)
+        return in_space(q[..., columns], body_momentum(q[..., columns], p[..., columns]))
 
-    def direction(self, name: str | None = None) -> Array:
+    def direction(self, name: str | None = None, *, t: ArrayLike | None = None) -> Array:
         """Return (n, 3) unit vectors."""
-        return unit_quaternions(self.q[..., self._member("direction", name).columns])
+        return unit_vectors(self._states(t)[0][..., self._member("direction", name).columns])
 
-    def spin(self, name: str | None = None) -> Array:
+    def spin(self, name: str | None = None, *, t: ArrayLike | None = None) -> Array:
         """Return (n, 3) spins."""
-        columns = self._member("spin", name).columns
-        a, b = np.moveaxis(self.q[..., columns] + 1j * self.p[..., columns], -1, 0)
-        transverse = np.conj(a) * b / 2
-        return np.stack([transverse.real, transverse.imag, (np.abs(a) ** 2 - np.abs(b) ** 2) / 4], axis=-1)
+        columns, (q, p) = self._member("spin", name).columns, self._states(t)
+        return spins(q[..., columns], p[..., columns])
 
-    def _velocities(self) -> Array:
+    def _states(self, t: ArrayLike | None) -> tuple[Array, Array]:
+        """Return the saved states, or those at times t."""
+        if t is None:
+            return self.q, self.p
+        if not hasattr(self, "at"):
+            raise StateError("ensembles have no dense output: omit t")
+        q, p = self.at(t)
+        return q, p
+
+    def _velocities(self, q: Array, p: Array, t: ArrayLike | None) -> Array:
         """Return velocities of the shape of q; NaN after the end of a trajectory of an ensemble."""
-        if self.q.ndim == 2:
-            return np.asarray(self.stepper.velocity(self.q, self.p, self.t, self.parameters))
-        velocities = np.full_like(self.q, np.nan)
-        for k, (t, q, p, *_) in enumerate(self.each()):
-            velocities[: len(t), k] = self.stepper.velocity(q, p, t, self.parameters[k])
+        if self.q.ndim == 2 and t is None:
+            return np.asarray(self.velocity)
+        if t is not None:
+            if self.pieces:
+                raise StateError("angular velocities between the states of a run with inputs are not available: omit t")
+            return np.asarray(self.stepper.velocity(q, p, t, self.parameters))
+        velocities = np.full_like(q, np.nan)
+        for k, (times, own, momenta, *_) in enumerate(self.each()):
+            velocities[: len(times), k] = self.stepper.velocity(own, momenta, times, self.parameters[k])
         return velocities
-
-    def _in_space(self, member: Member, vectors: Array) -> Array:
-        return np.asarray(np.einsum("...ij,...j->...i", matrices(self.q[..., member.columns]), vectors))
 
     def _member(self, kind: str, name: str | None) -> Member:
         interface = self.stepper.interface

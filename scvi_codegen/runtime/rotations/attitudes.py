@@ -101,14 +101,14 @@ def _of_matrices(matrix: Array, name: str) -> Array:
     return np.asarray(row / np.linalg.norm(row, axis=-1, keepdims=True))
 
 
-def unit_quaternions(q: Array) -> Array:
-    """Return (.., 4) quaternions of length 1 along a run, whose sign is continuous as that of q is."""
+def unit_vectors(q: Array) -> Array:
+    """Return vectors or quaternions of length 1 along a run, whose sign is continuous as that of q is."""
     return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
 
 
 def matrices(q: Array) -> Array:
     """Return (.., 3, 3) rotation matrices of quaternions of any length."""
-    w, x, y, z = np.moveaxis(unit_quaternions(q), -1, 0)
+    w, x, y, z = np.moveaxis(unit_vectors(q), -1, 0)
     rows = [
         [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
@@ -117,11 +117,16 @@ def matrices(q: Array) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def in_space(q: Array, vectors: Array) -> Array:
+    """Return (.., 3) components in space of vectors in the body frame."""
+    return np.asarray(np.einsum("...ij,...j->...i", matrices(q), vectors))
+
+
 def euler_angles(q: Array, axes: str) -> Array:
     """Return (.., 3) Euler angles in radians."""
     from scipy.spatial.transform import Rotation  # imported on use: the core does without SciPy
 
-    flat = np.roll(unit_quaternions(q).reshape(-1, 4), -1, axis=-1)
+    flat = np.roll(unit_vectors(q).reshape(-1, 4), -1, axis=-1)
     try:
         angles = Rotation.from_quat(flat).as_euler(axes)
     except ValueError as error:

@@ -94,9 +94,9 @@ def state_of(
     if p is None and velocity is None and not ordinary and all(member.kind == "spin" for member in members):
         p = {}
     if isinstance(velocity, Mapping):
-        velocity = _joined(_moving(ordinary, members, velocity, own, "velocity"))
+        state, velocity = np.broadcast_arrays(state, _joined(_moving(ordinary, members, velocity, own, "velocity")))
     if isinstance(p, Mapping):
-        p = _joined(_moving(ordinary, members, p, own, "p"))
+        state, p = np.broadcast_arrays(state, _joined(_moving(ordinary, members, p, own, "p")))
     return state, p, velocity
 
 

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import StateError
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.rotations.quantities import values_by_name
 
 
 def quantities(stepper: Integrator, parameters: Array, t: Array, q: Array, p: Array) -> dict[str, Array]:
-    """Return the velocity (n, m), energy (n,) and, if there are any, momentum_map (n, c) of n states."""
+    """Return velocity (n, m), energy (n,), momentum_map (n, c) and attitudes (if there are any) of n states."""
     rows_of_states = np.flatnonzero(np.isfinite(q).all(axis=1) & np.isfinite(p).all(axis=1))
 
     def energies(rows: NDArray[np.intp]) -> Array:
@@ -36,7 +37,7 @@ def quantities(stepper: Integrator, parameters: Array, t: Array, q: Array, p: Ar
     if names := stepper.momentum_map_names:
         result["momentum_map"] = np.full((len(t), len(names)), np.nan)
         _fill(result["momentum_map"], rows_of_states, maps)
-    return result
+    return result | values_by_name(stepper.interface, q, p, result["velocity"])
 
 
 def _fill(into: Array, rows: NDArray[np.intp], compute: Callable[[NDArray[np.intp]], Array]) -> None:

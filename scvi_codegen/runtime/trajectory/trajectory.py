@@ -22,6 +22,7 @@ from scvi_codegen.runtime.core.validation import columns_of_inputs
 from scvi_codegen.runtime.events.detection import crossings_of
 from scvi_codegen.runtime.events.event import Crossings, Event, EventLike, as_events
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
+from scvi_codegen.runtime.rotations.quantities import named_quantities
 from scvi_codegen.runtime.run.accuracy import TOLERABLE_ERROR
 from scvi_codegen.runtime.run.descriptions import describe_states, describe_step_size
 from scvi_codegen.runtime.run.global_error import Confirmed, GlobalError
@@ -251,6 +252,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
             h=self.h,
             about=interface.about(),
             maps=interface.map_names,
+            attitudes=named_quantities(interface),
             quantities=derived,
             units=checked_units(units),
         )

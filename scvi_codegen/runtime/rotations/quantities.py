@@ -1,0 +1,69 @@
+"""Named quantities of rotations, directions and spins, for tables and files."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.files.labelled_arrays import LONG_NAMES, NamedQuantity
+from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.rotations.attitudes import angular_velocity, body_momentum, matrices, unit_vectors
+from scvi_codegen.runtime.rotations.states import Member, members_of
+
+Array = NDArray[np.float64]
+
+SPACE, BODY = (("space_axis",), ("body_axis",))
+
+
+def named_quantities(interface: Interface) -> tuple[NamedQuantity, ...]:
+    """Return the quantities of :func:`values_by_name`, in order."""
+    return tuple(each for member in members_of(interface.dimension, interface.rotations) for each in _names(member))
+
+
+def values_by_name(interface: Interface, q: Array, p: Array, velocity: Array) -> dict[str, Array]:
+    """Return (.., 3) vectors and (.., 3, 3) matrices by name, of (.., m) states."""
+    result: dict[str, Array] = {}
+    for member in members_of(interface.dimension, interface.rotations):
+        own, momenta, rates = (each[..., member.columns] for each in (q, p, velocity))
+        values: tuple[Array, ...]
+        if member.kind == "rotation":
+            values = matrices(own), angular_velocity(own, rates), body_momentum(own, momenta)
+        elif member.kind == "direction":
+            n = unit_vectors(own)
+            moving = rates - n * (n * rates).sum(axis=-1, keepdims=True)
+            values = n, moving / np.linalg.norm(own, axis=-1, keepdims=True)
+        else:
+            values = (spins(own, momenta),)
+        result |= zip((each.name for each in _names(member)), values, strict=True)
+    return result
+
+
+def spins(q: Array, p: Array) -> Array:
+    """Return (.., 3) spins of (.., 2) canonical pairs (:class:`scvi_codegen.formulas.rotations.members.Spin`)."""
+    a, b = np.moveaxis(q + 1j * p, -1, 0)
+    transverse = np.conj(a) * b / 2
+    return np.stack([transverse.real, transverse.imag, (np.abs(a) ** 2 - np.abs(b) ** 2) / 4], axis=-1)
+
+
+def _names(member: Member) -> tuple[NamedQuantity, ...]:
+    """Return the quantities of a member; names that files use otherwise have a trailing underscore."""
+    name = member.name if member.name not in LONG_NAMES else f"{member.name}_"
+    if member.kind == "spin":
+        return (NamedQuantity(name, SPACE, _columns(name), f"spin {name}"),)
+    if member.kind == "direction":
+        rates = tuple(f"{each}_dot" for each in _columns(name))
+        return (
+            NamedQuantity(name, SPACE, _columns(name), f"unit vector {name}"),
+            NamedQuantity(f"{name}_dot", SPACE, rates, f"velocity of the unit vector {name}"),
+        )
+    entries = tuple(f"{name}_{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3))
+    omega, momentum = (f"omega_{name}", member.rate) if member.momentum else (member.rate, f"p_{name}")
+    return (
+        NamedQuantity(name, SPACE + BODY, entries, f"rotation matrix {name} from body to space"),
+        NamedQuantity(omega, BODY, _columns(omega), f"angular velocity of {name} in the body frame"),
+        NamedQuantity(momentum, BODY, _columns(momentum), f"angular momentum of {name} in the body frame"),
+    )
+
+
+def _columns(name: str) -> tuple[str, ...]:
+    return tuple(f"{name}_{axis}" for axis in (1, 2, 3))
