@@ -7,7 +7,7 @@
       -> Stepper   step, integrate (:mod:`scvi_codegen.runtime.core.stepper`)
 
 Each stage is a pure function of frozen data; only ``build`` touches the disk. Sources and compiled libraries are
-cached in the user's cache folder (:mod:`scvi_codegen.files.source_cache`). If everything is in the cache, including the
+cached in the user's cache folder (:mod:`scvi_codegen.files.cache`). If everything is in the cache, including the
 key of a system defined by text (:mod:`scvi_codegen.mechanics.deferred`), neither SymPy nor the pipeline is imported.
 """
 
@@ -21,8 +21,7 @@ from typing import TYPE_CHECKING, Any, cast, overload
 from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.files.source_cache import cached_source
-from scvi_codegen.formulas.subexpressions import key_of
+from scvi_codegen.files.cache import cached_source, key_of
 from scvi_codegen.indices import SIZES_REQUIRED
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import as_method
@@ -32,7 +31,7 @@ from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.events.event import EventLike, as_events
-from scvi_codegen.validation.argument_types import MAPPING, TEXT, TEXTS, ArgumentType, check_kind, checks_arguments
+from scvi_codegen.validation import MAPPING, TEXT, TEXTS, ArgumentType, check_kind, checks_arguments
 
 if TYPE_CHECKING:
     from sympy import Expr

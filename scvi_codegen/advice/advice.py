@@ -30,7 +30,7 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.representation import summary
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
-from scvi_codegen.validation.argument_types import SWITCH, TEXT, checks_arguments
+from scvi_codegen.validation import SWITCH, TEXT, checks_arguments
 
 DEGREES = (2, 4, 6, 8, 10, 12)
 """Degrees, or numbers of stages, among which ``advise`` chooses."""

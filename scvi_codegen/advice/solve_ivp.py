@@ -27,7 +27,7 @@ from scvi_codegen.runtime.run.global_error import checked_error
 from scvi_codegen.runtime.run.largest_step import accuracy_message, largest_step
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-from scvi_codegen.validation.argument_types import SWITCH, checks_arguments, of
+from scvi_codegen.validation import SWITCH, checks_arguments, of
 
 Array = NDArray[np.float64]
 Solution: TypeAlias = Callable[[ArrayLike], Array]

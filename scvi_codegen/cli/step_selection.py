@@ -15,7 +15,7 @@ from scvi_codegen.errors import AccuracyWarning, StateError
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.run.global_error import GlobalError
-from scvi_codegen.validation.counts import check_tolerance
+from scvi_codegen.validation import check_tolerance
 
 ROUND_OFF = 2.0**-52
 """Unit in the last place of 1 in double precision; smaller tolerances mean "as accurate as doubles allow"."""

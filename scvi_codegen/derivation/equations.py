@@ -26,7 +26,7 @@ from scvi_codegen.derivation.matrix_form import MatrixForm, matrix_form
 from scvi_codegen.derivation.notation import LARGEST_SHOWN, Equation, TableEntry, entries, html, latex, text_lines
 from scvi_codegen.display.cards import card, listed, plain
 from scvi_codegen.errors import MethodError
-from scvi_codegen.formulas.derivatives import jacobian
+from scvi_codegen.formulas.expressions import jacobian
 from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, symmetries
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
@@ -37,7 +37,7 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import Block, Row, StageGroup, StageSystem, Table
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.tables.precision import Number
-from scvi_codegen.validation.argument_types import SWITCH, checks_arguments
+from scvi_codegen.validation import SWITCH, checks_arguments
 
 MOST_SHOWN = 12
 """Largest number of equations that a notebook shows."""

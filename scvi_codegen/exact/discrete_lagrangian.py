@@ -22,8 +22,7 @@ from scvi_codegen.exact.solution import ExactMotion
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.representation import summary
 from scvi_codegen.tables.precision import Number, Vector, mp
-from scvi_codegen.validation.argument_types import MAPPING, NUMBERS, ArgumentType, checks_arguments, of
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import MAPPING, NUMBERS, ArgumentType, checked_count, checks_arguments, of
 
 MOST_DIGITS = 50
 POINTS = (10, 15, 22, 32)

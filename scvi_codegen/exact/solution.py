@@ -19,8 +19,7 @@ import sympy
 from scvi_codegen.errors import StateError
 from scvi_codegen.exact.newton import Array as Numbers
 from scvi_codegen.exact.newton import Floats, NotConvergedError, Solve, newton, solver
-from scvi_codegen.formulas.derivatives import jacobian
-from scvi_codegen.formulas.tape import Tape
+from scvi_codegen.formulas.expressions import Tape, jacobian
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Number, mp
 

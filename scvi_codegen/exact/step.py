@@ -21,7 +21,7 @@ import numpy as np
 from scvi_codegen.errors import StateError
 from scvi_codegen.exact.newton import NotConvergedError, Solve, newton
 from scvi_codegen.exact.solution import Numbers, exact_motion, numbers
-from scvi_codegen.formulas.tape import Tape
+from scvi_codegen.formulas.expressions import Tape
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise, paper_equations
 from scvi_codegen.methods.method import Method

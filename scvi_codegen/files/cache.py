@@ -1,4 +1,4 @@
-"""The user's cache folder: compiled integrators, generated texts, reference solutions.
+"""The user's cache folder: compiled integrators, generated sources, reference solutions.
 
 Every entry can be regenerated, and is if it is missing or its checksum does not match. Checksums detect accidents;
 against other users, the folder and its entries are used only if no one but this user and root may write to them. If
@@ -6,24 +6,48 @@ the entries exceed ``$SCVI_CODEGEN_CACHE_SIZE`` (1G by default; 0: no limit), th
 Counting thousands of entries takes as long as compiling one: a process counts them at its first write, and again when
 it has written a certain share of what was free. Concurrent processes are safe: entries are created and removed by
 renaming.
+
+The name of a generated source is a digest of everything that it depends on: the parts of a key that the caller passes,
+and the generator itself, represented by sizes and times of all files. An entry that cannot be read or written, or does
+not match its checksum, is no error: the source is generated again.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import re
 import stat
+import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import platformdirs
 
 from scvi_codegen.errors import BuildError, CacheWarning, warn
-from scvi_codegen.files.atomic import remove
+from scvi_codegen.files.atomic import remove, write_atomically
+
+if TYPE_CHECKING:
+    import sympy
+
+PACKAGE = Path(__file__).parents[1]
+
+
+def template_folder() -> Path:
+    """Return the templates: inside the installed package, or next to it in a checkout."""
+    for folder in (PACKAGE / "templates", PACKAGE.parent / "templates"):
+        if (folder / "stepper.c.jinja").is_file():
+            return folder
+    raise FileNotFoundError("the C templates are missing: reinstall scvi-codegen")
+
 
 CACHE_VARIABLE = "SCVI_CODEGEN_CACHE"
 SIZE_VARIABLE = "SCVI_CODEGEN_CACHE_SIZE"
@@ -232,3 +256,133 @@ def _readable(size: float) -> str:
             return f"{size:.4g} {unit}"
         size /= 1024
     return f"{size:.4g} TiB"
+
+
+def cached_source(key: Sequence[str], make: Callable[[], str]) -> str:
+    """Return the result of ``make`` for this key, from the cache if it was made before."""
+    if trusted_folder() is None:
+        return make()
+    found = stored_text(key)
+    if found is None:
+        found = make()
+        store_text(key, found)
+    return found
+
+
+def stored_text(key: Sequence[str]) -> str | None:
+    """Return the text stored under this key; ``None`` if there is none, or others may write to the folder."""
+    return None if exposed(cache_folder()) else _read(_path(key))
+
+
+def store_text(key: Sequence[str], text: str) -> None:
+    """Store a text under this key, unless others may write to the folder."""
+    if not exposed(folder := cache_folder()):
+        _write(_path(key), text)
+        make_room(folder, _path(key))
+
+
+def _path(key: Sequence[str]) -> Path:
+    return cache_folder() / "texts" / f"{_digest(chr(0).join([*key, _generator()]))[:32]}.json"
+
+
+@cache
+def _generator() -> str:
+    """Return the version of this package, to the file, and of SymPy, which orders terms."""
+    sympy = find_spec("sympy")  # does not import it
+    release = Path(sympy.origin).with_name("release.py").read_text(encoding="utf-8") if sympy and sympy.origin else ""
+    return "\n".join([*sorted([*_files(PACKAGE, ".py"), *_files(template_folder(), "")]), f"sympy {release}"])
+
+
+def _files(folder: str | os.PathLike[str], suffix: str) -> Iterator[str]:
+    """Yield path, size and time of each file below a folder whose name has this suffix."""
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.is_dir():
+                yield from _files(entry, suffix)
+            elif entry.name.endswith(suffix):
+                yield f"{entry.path} {(stat := entry.stat()).st_size} {stat.st_mtime_ns}"
+
+
+def _read(path: Path) -> str | None:
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        text = record["text"]
+        if record["sha256"] != _digest(text) or exposed(path):
+            return None
+        touch(path)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+    return str(text)
+
+
+def _write(path: Path, text: str) -> None:
+    record = json.dumps({"sha256": _digest(text), "text": text})
+    with suppress(OSError):
+        make_folder(path.parent.parent)
+        make_folder(path.parent)
+        write_atomically(path, lambda file: file.write(record.encode()))
+        path.chmod(path.stat().st_mode & ~0o022)
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def identity(expression: sympy.Basic) -> str:
+    """Return text that identifies an expression uniquely.
+
+    Each line is a subexpression that refers to its arguments by line numbers. Arguments are in SymPy's order, the same
+    in all processes; ``sympy.srepr`` sorts them again, which takes longer than to differentiate a sum of thousands.
+
+    >>> from sympy.abc import x
+    >>> print(identity((x + 1)**2))
+    Integer(1)
+    Symbol('x')
+    Add(0, 1)
+    Integer(2)
+    Pow(2, 3)
+    """
+    from sympy import srepr
+
+    numbers: dict[sympy.Basic, int] = {}
+    lines: list[str] = []
+
+    def number_of(part: sympy.Basic) -> int:
+        if part not in numbers:
+            inner = ", ".join([str(number_of(argument)) for argument in part.args])
+            lines.append(f"{type(part).__name__}({inner})" if part.args else srepr(part))
+            numbers[part] = len(lines) - 1
+        return numbers[part]
+
+    number_of(expression)
+    return "\n".join(lines)
+
+
+def key_of(value: Any) -> str:
+    """Return text that differs for different values: a dataclass by its type and all of its fields.
+
+    Cache keys are made from it, so that a new field cannot be forgotten. Fields excluded from comparisons are
+    included.
+
+    Raises:
+        TypeError: for a value that is no dataclass, expression, number, text, ``None``, sequence or mapping.
+
+    >>> key_of((1, 1.0, "1", None))
+    "(1, 1.0, '1', None)"
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        named = ", ".join(f"{field.name}={key_of(getattr(value, field.name))}" for field in fields(value))
+        return f"{type(value).__module__}.{type(value).__qualname__}({named})"
+    if "sympy" in sys.modules and isinstance(value, sys.modules["sympy"].Basic):
+        return repr(identity(value))
+    if hasattr(value, "_mpf_"):
+        return f"mpf{value._mpf_}"
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{key_of(name)}: {key_of(each)}' for name, each in value.items())}}}"
+    if isinstance(value, tuple | list):
+        return f"({', '.join(map(key_of, value))})"
+    if isinstance(value, float):
+        return repr(float(value))
+    if value is None or isinstance(value, bool | int | str):
+        return repr(value)
+    raise TypeError(f"a cache key cannot be made from a {type(value).__name__}: {value!r}")

@@ -21,7 +21,7 @@ from typing import ClassVar, NamedTuple, NoReturn
 from sympy import Add, Expr, Mul, Pow, Rational, S, Symbol
 
 from scvi_codegen.errors import ExpressionError, SystemDefinitionError, closest
-from scvi_codegen.formulas.canonical import (
+from scvi_codegen.formulas.expressions import (
     MAX_BITS,
     MAX_DIGITS,
     NODES,

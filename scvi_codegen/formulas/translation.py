@@ -10,7 +10,7 @@ from sympy import Expr, Symbol
 from sympy.core.function import AppliedUndef
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.canonical import evaluated
+from scvi_codegen.formulas.expressions import evaluated
 from scvi_codegen.formulas.symbols import DOT, TIME, identifier, symbol
 
 

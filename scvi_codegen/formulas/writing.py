@@ -5,7 +5,7 @@ from __future__ import annotations
 from sympy import Expr, Integer, Pow, S
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.canonical import unsupported_part
+from scvi_codegen.formulas.expressions import unsupported_part
 from scvi_codegen.formulas.vocabulary import NAME_OF
 
 

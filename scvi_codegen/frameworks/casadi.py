@@ -9,7 +9,7 @@ from scvi_codegen.frameworks.flow import Flow, imported
 from scvi_codegen.native import building
 from scvi_codegen.rendering.flow import casadi_name, with_casadi_flow
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.validation.argument_types import SWITCH, checks_arguments, of
+from scvi_codegen.validation import SWITCH, checks_arguments, of
 
 ARGUMENTS = ("q", "p", "parameters", "t", "h")
 

@@ -32,8 +32,7 @@ from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageGroup, StageSystem, Table
-from scvi_codegen.validation.argument_types import SWITCH, TEXTS, checks_arguments
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import SWITCH, TEXTS, checked_count, checks_arguments
 
 
 @dataclass(frozen=True)

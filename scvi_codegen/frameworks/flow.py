@@ -24,8 +24,7 @@ from scvi_codegen.rendering.source import Source
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import check_inputs_given, parameter_index
-from scvi_codegen.validation.argument_types import checks_arguments
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count, checks_arguments
 
 
 @dataclass(frozen=True, eq=False)

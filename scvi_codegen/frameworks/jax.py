@@ -12,7 +12,7 @@ from scvi_codegen.native import building
 from scvi_codegen.rendering.flow import XLA_PARTS, XLA_SECOND_ORDER, with_xla_flow
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.validation.argument_types import checks_arguments, of
+from scvi_codegen.validation import checks_arguments, of
 
 _registered: set[str] = set()
 

@@ -21,8 +21,7 @@ from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.validation.argument_types import MAPPING, TEXT, checks_arguments
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import MAPPING, TEXT, checked_count, checks_arguments
 
 
 @checks_arguments(

@@ -14,7 +14,7 @@ from scvi_codegen.errors import StateError, SystemDefinitionError
 from scvi_codegen.frameworks.flow import imported
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.native.arguments import checked_number, real_array
-from scvi_codegen.validation.argument_types import checks_arguments, of
+from scvi_codegen.validation import checks_arguments, of
 
 AXES = "xyz"
 NEWTON = ("basic", "compensated")

@@ -8,7 +8,7 @@ from typing import Any
 from scvi_codegen.errors import StateError
 from scvi_codegen.frameworks.flow import ArrayFlow, Arrays, FlowOfRows, imported
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.validation.argument_types import checks_arguments, of
+from scvi_codegen.validation import checks_arguments, of
 
 
 @checks_arguments(StateError, stepper=of("a compiled stepper", Stepper))

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 import sympy
 from sympy import Expr
 
-from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.formulas.expressions import gradient
 from scvi_codegen.ir.iteration import AdaptivePredictor, Control, FixedPointIteration, StoredValues
 from scvi_codegen.ir.numbers import Number, NumberTable
 from scvi_codegen.ir.program import Program

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 from sympy import Add, Expr, Mul, S, Symbol
 
-from scvi_codegen.formulas.derivatives import gradient, jacobian
+from scvi_codegen.formulas.expressions import gradient, jacobian
 from scvi_codegen.ir.derivatives import Derivatives, InputDerivatives, PointDerivatives, TimeDerivatives
 from scvi_codegen.ir.iteration import FixedPointIteration
 from scvi_codegen.ir.kernel import Kernel

@@ -10,7 +10,7 @@ from sympy import Add, Expr, Symbol
 
 from scvi_codegen.formulas.array_statements import ArrayForce
 from scvi_codegen.formulas.arrays import ArrayTerm
-from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.formulas.expressions import gradient
 from scvi_codegen.indices import Access, Array
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.equations import ConstrainedSteps

@@ -32,8 +32,7 @@ from scvi_codegen.lowering.solvers.tables import resolved_degree, velocity_table
 from scvi_codegen.lowering.stage_groups import bandwidth, bandwidth_ordering, has_action, layout_of, lowered_stage_group
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
-from scvi_codegen.mechanics.symmetry.work_and_impulse import work_rates
+from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, work_rates
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.constraints import END_VELOCITY
 from scvi_codegen.methods.discretise import discretise, is_conformally_symplectic, is_symplectic

@@ -15,15 +15,14 @@ import numpy as np
 import sympy
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.formulas.derivatives import jacobian
-from scvi_codegen.formulas.tape import evaluate
+from scvi_codegen.formulas.expressions import evaluate, jacobian
 from scvi_codegen.ir.equations import DerivativeBlock, GatherLoop, LoweredStageGroup, ScatterLoop
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import lower_matrix, lower_vector
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, curve_rates, multipliers
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.symmetry.work_and_impulse import work_rates
+from scvi_codegen.mechanics.symmetry.symmetry import work_rates
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Gather, StageGroup, StageSystem
 from scvi_codegen.tables.precision import mp

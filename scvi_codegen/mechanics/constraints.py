@@ -19,8 +19,7 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.derivatives import gradient, jacobian
-from scvi_codegen.formulas.tape import Tape
+from scvi_codegen.formulas.expressions import Tape, gradient, jacobian
 from scvi_codegen.mechanics.regularity import row_rank, sample_points
 
 if TYPE_CHECKING:

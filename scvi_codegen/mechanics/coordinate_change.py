@@ -9,11 +9,11 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError, closest
-from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.formulas.expressions import gradient
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import DOT, check_names, symbol
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.validation.argument_types import MAPPING, NAMES, checks_arguments, of
+from scvi_codegen.validation import MAPPING, NAMES, checks_arguments, of
 
 
 @checks_arguments(system=of("a LagrangianSystem", LagrangianSystem), old=MAPPING, coordinates=NAMES)

@@ -13,8 +13,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Self
 
-from scvi_codegen.files.source_cache import store_text, stored_text
-from scvi_codegen.formulas.subexpressions import key_of
+from scvi_codegen.files.cache import key_of, store_text, stored_text
 
 
 class Deferred:

@@ -10,11 +10,9 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
-from scvi_codegen.formulas.canonical import unsupported_part
-from scvi_codegen.formulas.derivatives import hessian
+from scvi_codegen.formulas.expressions import Tape, hessian, unsupported_part
 from scvi_codegen.formulas.inputs import PARTS
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
-from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.mechanics.constraints import check_constraints
 from scvi_codegen.mechanics.forces import check_damping
 from scvi_codegen.mechanics.regularity import null_direction, singular_part

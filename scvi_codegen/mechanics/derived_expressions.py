@@ -2,7 +2,7 @@
 
 L denotes the function of :class:`~scvi_codegen.mechanics.system.MechanicalSystem`. For a Hamiltonian it is p . v - H
 with p as auxiliary variables; the expressions below then depend on p, which solves ``constitutive`` = v - H_p = 0.
-Everything is differentiated term by term with :mod:`scvi_codegen.formulas.derivatives`; nothing is simplified and no
+Everything is differentiated term by term with :mod:`scvi_codegen.formulas.expressions`; nothing is simplified and no
 mass matrix is inverted. Accelerations and multipliers are separate symbols, so a kernel is a function of plain numbers.
 
 Each expression is derived on first use, once per system: :func:`forms_of` returns the same :class:`Forms` for equal
@@ -18,7 +18,7 @@ from functools import cached_property, lru_cache
 import sympy
 from sympy import Expr, Symbol
 
-from scvi_codegen.formulas.derivatives import gradient, jacobian
+from scvi_codegen.formulas.expressions import gradient, jacobian
 from scvi_codegen.mechanics.system import MechanicalSystem
 
 Entries = dict[tuple[int, int], Expr]

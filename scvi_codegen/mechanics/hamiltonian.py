@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.mechanics.system import MechanicalSystem, zero
 from scvi_codegen.representation import summary
-from scvi_codegen.validation.argument_types import (
+from scvi_codegen.validation import (
     FORMULA,
     FORMULAS,
     MAPPED,

@@ -13,12 +13,10 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.canonical import unsupported_part
-from scvi_codegen.formulas.derivatives import gradient, hessian
+from scvi_codegen.formulas.expressions import evaluate, gradient, hessian, unsupported_part
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.inputs import input_formulas
 from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.mechanics.constraints import constraints_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -26,7 +24,7 @@ from scvi_codegen.mechanics.reading import default_momenta
 from scvi_codegen.mechanics.regularity import coupled_blocks, sample_points
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import mp
-from scvi_codegen.validation.argument_types import NAMES, TEXTS, checks_arguments, of
+from scvi_codegen.validation import NAMES, TEXTS, checks_arguments, of
 
 LARGEST_INVERSE = 3
 """Largest number of coupled momenta (velocities) whose quadratic form is inverted symbolically."""

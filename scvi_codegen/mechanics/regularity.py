@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sympy import Expr, Matrix, Symbol
 
-from scvi_codegen.formulas.derivatives import hessian
-from scvi_codegen.formulas.tape import Tape
+from scvi_codegen.formulas.expressions import Tape, hessian
 from scvi_codegen.tables.precision import Number, mp
 
 Entries = Mapping[tuple[int, int], Expr]

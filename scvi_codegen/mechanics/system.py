@@ -28,7 +28,7 @@ from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.symbols import DOT, number, symbol
 from scvi_codegen.indices import Array
 from scvi_codegen.mechanics.deferred import Deferred
-from scvi_codegen.validation.argument_types import of
+from scvi_codegen.validation import of
 
 if TYPE_CHECKING:
     from sympy import Expr, Symbol
@@ -238,4 +238,4 @@ def _free(name: str, taken: set[str]) -> str:
 
 
 SYSTEM = of("a LagrangianSystem or a HamiltonianSystem", MechanicalSystem)
-"""Type check of mechanical systems, for :func:`~scvi_codegen.validation.argument_types.takes`."""
+"""Type check of mechanical systems, for :func:`~scvi_codegen.validation.takes`."""

@@ -15,7 +15,7 @@ from typing import TypeVar
 
 from sympy import Add, Expr, S, Symbol, factor_terms
 
-from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.formulas.expressions import gradient
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.system import MechanicalSystem
 

@@ -34,7 +34,7 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError, closest
-from scvi_codegen.formulas.derivatives import gradient, hessian
+from scvi_codegen.formulas.expressions import gradient, hessian
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.inputs import input_formulas
 from scvi_codegen.formulas.symbols import symbol
@@ -45,7 +45,7 @@ from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import positive_parameters
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem, TimeTransformation
-from scvi_codegen.validation.argument_types import checks_arguments
+from scvi_codegen.validation import checks_arguments
 
 CONTROLLERS = ("symplectic", "reversible")
 """Uses of a time-rescaling function: transform the time of a system, or control the step sizes of its runs."""

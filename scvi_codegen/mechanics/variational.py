@@ -13,14 +13,13 @@ import sympy
 from sympy import Expr
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.derivatives import jacobian
+from scvi_codegen.formulas.expressions import jacobian
 from scvi_codegen.formulas.symbols import DOT, symbol
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
-from scvi_codegen.validation.argument_types import checks_arguments
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count, checks_arguments
 
 
 @checks_arguments(system=SYSTEM)

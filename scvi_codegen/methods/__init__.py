@@ -25,7 +25,7 @@ from scvi_codegen.methods.runge_kutta import (
     RungeKutta,
 )
 from scvi_codegen.methods.shooting import SCVI
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count
 
 __all__ = [
     "METHODS",

@@ -18,11 +18,7 @@ from scvi_codegen.methods.stage_system import (
     StageSystem,
     Table,
 )
-from scvi_codegen.tables.basis import (
-    differentiation_matrix,
-    matrix_product,
-    next_step,
-)
+from scvi_codegen.tables.basis import differentiation_matrix, matrix_product, next_step
 from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
 from scvi_codegen.tables.tableau import Tableau

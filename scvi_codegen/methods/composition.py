@@ -20,7 +20,7 @@ from scvi_codegen.representation import summary
 from scvi_codegen.tables.basis import extrapolation, identity_matrix
 from scvi_codegen.tables.precision import Vector, mp
 from scvi_codegen.tables.tableau import lobatto_iiia
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count
 
 if TYPE_CHECKING:
     from scvi_codegen.display.number_tables import Part

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import sympy
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.formulas.expressions import gradient
 from scvi_codegen.mechanics.constraints import nonholonomic_expressions
 from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem

@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING
 
 from scvi_codegen.display.cards import card, plain
 from scvi_codegen.errors import MethodError
-from scvi_codegen.formulas.subexpressions import key_of
+from scvi_codegen.files.cache import key_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Vector
 from scvi_codegen.tables.tableau import MAX_STAGES
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count
 
 if TYPE_CHECKING:
     from scvi_codegen.display.number_tables import Part

@@ -26,7 +26,7 @@ from scvi_codegen.representation import summary
 from scvi_codegen.tables import tableau as tableaux
 from scvi_codegen.tables.basis import identity_matrix, next_step
 from scvi_codegen.tables.tableau import Tableau
-from scvi_codegen.validation.argument_types import NUMBERS, check_kind, checks_arguments, of
+from scvi_codegen.validation import NUMBERS, check_kind, checks_arguments, of
 
 if TYPE_CHECKING:
     from scvi_codegen.display.number_tables import Part

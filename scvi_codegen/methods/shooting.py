@@ -29,7 +29,7 @@ from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import Vector
 from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.tableau import Tableau, collocation_tableau, tableau_by_name
-from scvi_codegen.validation.argument_types import NUMBERS, check_kind
+from scvi_codegen.validation import NUMBERS, check_kind
 
 if TYPE_CHECKING:
     from scvi_codegen.display.number_tables import Part

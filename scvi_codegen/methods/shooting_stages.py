@@ -32,11 +32,7 @@ from scvi_codegen.methods.stage_system import (
     stationary_nodal,
     unit_sum,
 )
-from scvi_codegen.tables.basis import (
-    cardinal_derivatives,
-    cardinal_values,
-    matrix_product,
-)
+from scvi_codegen.tables.basis import cardinal_derivatives, cardinal_values, matrix_product
 from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 from scvi_codegen.tables.quadrature import Quadrature

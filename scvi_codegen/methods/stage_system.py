@@ -28,7 +28,7 @@ from itertools import count
 
 import sympy
 
-from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.formulas.expressions import gradient
 from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
 
 DYADIC_BITS = 52

@@ -21,7 +21,7 @@ from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.models.problems import Problem
 from scvi_codegen.models.time_span import TimeSpan, check_length, check_one_of, real
 from scvi_codegen.representation import summary
-from scvi_codegen.validation.argument_types import check_kind
+from scvi_codegen.validation import check_kind
 
 if TYPE_CHECKING:
     from scvi_codegen.models.model_files.input_tables import InputTable

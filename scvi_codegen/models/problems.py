@@ -26,7 +26,7 @@ from scvi_codegen.models.systems import (
     spherical_pendulum,
 )
 from scvi_codegen.representation import summary
-from scvi_codegen.validation.argument_types import TEXT, checks_arguments
+from scvi_codegen.validation import TEXT, checks_arguments
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

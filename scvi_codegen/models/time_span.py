@@ -9,7 +9,7 @@ from numbers import Real
 from typing import Any
 
 from scvi_codegen.errors import MethodWarning, ModelFileError, warn
-from scvi_codegen.validation.counts import LARGEST_COUNT, check_tolerance, checked_count
+from scvi_codegen.validation import LARGEST_COUNT, check_tolerance, checked_count
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -17,7 +17,7 @@ from scvi_codegen.pictures.canvas import check_plot_path, color, plain, style
 from scvi_codegen.pictures.shapes import MovingPoints, shape_of
 from scvi_codegen.pictures.trajectory_interface import MOTION, Array, DrawnMotion
 from scvi_codegen.representation import summary
-from scvi_codegen.validation.argument_types import FUNCTION, PATH, REAL, checks_arguments
+from scvi_codegen.validation import FUNCTION, PATH, REAL, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation

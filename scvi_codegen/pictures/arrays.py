@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.pictures.canvas import color, panel, plain
-from scvi_codegen.validation.argument_types import CANVAS, PATH, TEXT, ArgumentType, checks_arguments
+from scvi_codegen.validation import CANVAS, PATH, TEXT, ArgumentType, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,7 +11,7 @@ import numpy as np
 from scvi_codegen.errors import StateError
 from scvi_codegen.pictures.canvas import color, panel
 from scvi_codegen.pictures.trajectory_interface import HISTORIES, MOTION, Array, DrawnMotion, EnergyHistory, several
-from scvi_codegen.validation.argument_types import CANVAS, PATH, checks_arguments
+from scvi_codegen.validation import CANVAS, PATH, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

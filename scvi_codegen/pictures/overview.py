@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
-from scvi_codegen.mechanics.symmetry.bodies import bodies
+from scvi_codegen.mechanics.symmetry.sampling import bodies
 from scvi_codegen.pictures.canvas import COLORS, check_plot_path, new_figure, plain, save, style
 from scvi_codegen.pictures.conserved import draw_energy_error
 from scvi_codegen.pictures.paths import draw_paths, path_panels
 from scvi_codegen.pictures.trajectory_interface import MOTION, DrawnMotion
-from scvi_codegen.validation.argument_types import PATH, checks_arguments
+from scvi_codegen.validation import PATH, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

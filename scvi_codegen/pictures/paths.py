@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scvi_codegen.mechanics.symmetry.bodies import AXES, Body, bodies
+from scvi_codegen.mechanics.symmetry.sampling import AXES, Body, bodies
 from scvi_codegen.pictures.canvas import color, panel, plain
 from scvi_codegen.pictures.trajectory_interface import MOTION, MOTIONS, Array, DrawnMotion, Motions, column, several
-from scvi_codegen.validation.argument_types import CANVAS, NAMES, PATH, checks_arguments
+from scvi_codegen.validation import CANVAS, NAMES, PATH, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

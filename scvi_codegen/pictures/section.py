@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from scvi_codegen.errors import StateError
 from scvi_codegen.pictures.canvas import color, panel, plain
 from scvi_codegen.pictures.trajectory_interface import MOTIONS, Array, DrawnMotion, Motions, column, several
-from scvi_codegen.validation.argument_types import CANVAS, NAMES, PATH, checks_arguments
+from scvi_codegen.validation import CANVAS, NAMES, PATH, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

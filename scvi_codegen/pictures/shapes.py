@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.mechanics.symmetry.bodies import bodies
+from scvi_codegen.mechanics.symmetry.sampling import bodies
 from scvi_codegen.pictures.trajectory_interface import Array, DrawnMotion
 
 NUMBERED = re.compile(r"(.*?)_?(\d+)")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.validation.argument_types import ArgumentType
+from scvi_codegen.validation import ArgumentType
 
 if TYPE_CHECKING:
     from scvi_codegen.rendering.source import Interface

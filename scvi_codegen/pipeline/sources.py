@@ -53,7 +53,7 @@ from scvi_codegen.rendering.program_source import (
 )
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.events.event import EventLike, as_events
-from scvi_codegen.validation.argument_types import SWITCH, TEXT, checks_arguments
+from scvi_codegen.validation import SWITCH, TEXT, checks_arguments
 
 
 class Sources:

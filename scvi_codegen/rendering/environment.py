@@ -9,7 +9,7 @@ from typing import TypeAlias
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, pass_context
 from jinja2.runtime import Context
 
-from scvi_codegen.files.templates import template_folder
+from scvi_codegen.files.cache import template_folder
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import Number
 from scvi_codegen.rendering.kernels.functions import kernel_text, lane_kernel_text, lane_mass_text

@@ -24,7 +24,7 @@ from sympy import Expr, Symbol
 from sympy.core.function import AppliedUndef
 
 from scvi_codegen.errors import EventError, SystemDefinitionError, closest
-from scvi_codegen.formulas.canonical import evaluated, unsupported_part
+from scvi_codegen.formulas.expressions import evaluated, unsupported_part
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.inputs import input_formulas
 from scvi_codegen.formulas.rotations.names import RotationNames

@@ -19,7 +19,7 @@ from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters
 from scvi_codegen.runtime.ensemble.lockstep import Ensemble
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 from scvi_codegen.runtime.ensemble.selection import ensemble_work
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count
 
 if TYPE_CHECKING:
     from scvi_codegen.native.options import SolverOptions

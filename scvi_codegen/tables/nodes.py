@@ -15,8 +15,7 @@ from typing import Any, TypeAlias, TypeVar
 from scvi_codegen.errors import MethodError, closest
 from scvi_codegen.representation import summary
 from scvi_codegen.tables.precision import DIGITS, Number, Vector, mp
-from scvi_codegen.validation.argument_types import WHOLE, checks_arguments
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import WHOLE, checked_count, checks_arguments
 
 GUARD = 20
 MOST_POINTS = 128

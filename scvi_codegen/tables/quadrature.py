@@ -29,7 +29,7 @@ from scvi_codegen.tables.nodes import (
     to_unit,
 )
 from scvi_codegen.tables.precision import DIGITS, Matrix, Number, Vector, mp
-from scvi_codegen.validation.argument_types import TEXT, WHOLE, checks_arguments
+from scvi_codegen.validation import TEXT, WHOLE, checks_arguments
 
 GUARD = 20
 COMPUTED_TOLERANCE = mp.mpf("1e-12")

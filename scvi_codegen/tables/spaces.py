@@ -20,8 +20,7 @@ from scvi_codegen.tables.basis import cardinal_integrals, cardinal_values, diffe
 from scvi_codegen.tables.nodes import to_number
 from scvi_codegen.tables.precision import DIGITS, Matrix, Number, Vector, mp
 from scvi_codegen.tables.quadrature import Quadrature, gauss_legendre
-from scvi_codegen.validation.argument_types import NUMBERS, check_kind
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import NUMBERS, check_kind, checked_count
 
 MOST_POINTS = 64
 BETTER = 4

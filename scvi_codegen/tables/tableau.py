@@ -29,7 +29,7 @@ from scvi_codegen.tables.nodes import (
 from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
 from scvi_codegen.tables.quadrature import gauss_legendre, gauss_lobatto, gauss_radau, split_name
 from scvi_codegen.tables.stability import determinant_polynomial, has_roots_right, is_nonnegative, modulus_gap, reduced
-from scvi_codegen.validation.argument_types import WHOLE, checks_arguments
+from scvi_codegen.validation import WHOLE, checks_arguments
 
 CONDITION_TOLERANCE = mp.mpf("1e-45")
 SMALL_DENOMINATOR, ROUNDINGS = 1000, 2

@@ -31,7 +31,7 @@ from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import checked_vector
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
-from scvi_codegen.validation.argument_types import MAPPING, TEXT, TEXTS, checks_arguments, of
+from scvi_codegen.validation import MAPPING, TEXT, TEXTS, checks_arguments, of
 from scvi_codegen.verification.certificate import Certificate, Check, Outcome, issued
 from scvi_codegen.verification.convergence import convergence_checks
 from scvi_codegen.verification.derivatives import derivative_checks, time_transformation_derivative_checks

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.exact.solution import ExactMotion, exact_motion, numbers
-from scvi_codegen.formulas.tape import Tape
+from scvi_codegen.formulas.expressions import Tape
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.time_transformation import time_rescaling_function
 from scvi_codegen.runtime.core.stepper import Stepper

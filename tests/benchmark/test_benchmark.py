@@ -26,7 +26,7 @@ from scvi_codegen.benchmark.methods import drift_rows, fitted_rate
 from scvi_codegen.benchmark.report import FLOOR, Contender, Point, ResultTable, common_error, frontier, time_at
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, SystemDefinitionError
-from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.formulas.expressions import gradient
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SVI, Composition, StoermerVerlet
 from scvi_codegen.native import building

@@ -11,7 +11,7 @@ from samples import driven_duffing, linkage, pumped_cart_pole, pushed_pendulum
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.exact.discrete_lagrangian import exact_discrete_lagrangian, exact_map
-from scvi_codegen.formulas.tape import evaluate
+from scvi_codegen.formulas.expressions import evaluate
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.models.problems import problem
 from scvi_codegen.tables.precision import mp

@@ -35,7 +35,7 @@ from iterations import ITERATIONS
 from paces import STEP_SIZE_FAULTS
 from sabotage import changed_property, changed_result, of_entries
 
-from scvi_codegen.formulas import derivatives
+from scvi_codegen.formulas import expressions
 from scvi_codegen.ir import arithmetic, numbers
 from scvi_codegen.lowering import stage_groups
 from scvi_codegen.lowering.solvers import curves, points
@@ -389,7 +389,7 @@ MUTATIONS = (
         "_along",
         without_rates_of("theta1", "theta2"),
     ),
-    function("the power rule halved", case("kepler/svi-3"), derivatives, "_partial", power_rule_halved),
+    function("the power rule halved", case("kepler/svi-3"), expressions, "_partial", power_rule_halved),
     function(
         "the derivative of the cosine positive",
         case("pendulum/verlet"),

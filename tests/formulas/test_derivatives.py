@@ -9,7 +9,7 @@ import sympy
 from counting import at_most
 from sympy import Rational, Symbol, atan2, cos, exp, log, sin, sqrt
 
-from scvi_codegen.formulas.derivatives import gradient, hessian, jacobian
+from scvi_codegen.formulas.expressions import gradient, hessian, jacobian
 
 X, Y, Z = sympy.symbols("x y z", real=True)
 M = Symbol("m", real=True)

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from sympy import Integer, Rational, S, Symbol, pi
 
 from scvi_codegen.errors import ExpressionError, SystemDefinitionError
-from scvi_codegen.formulas.canonical import evaluated, unsupported_part
+from scvi_codegen.formulas.expressions import evaluate, evaluated, unsupported_part
 from scvi_codegen.formulas.grammar import MAX_CHARACTERS, parse_expression
-from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.formulas.vocabulary import FUNCTIONS
 from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.tables.precision import mp

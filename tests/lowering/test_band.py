@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from samples import QUICK_FLAGS
 
-from scvi_codegen.files.templates import template_folder
+from scvi_codegen.files.cache import template_folder
 from scvi_codegen.native.building import load
 from scvi_codegen.rendering.source import Source
 

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from samples import lowered
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.derivatives import gradient, jacobian
+from scvi_codegen.formulas.expressions import gradient, jacobian
 from scvi_codegen.ir.arithmetic import DEEPEST_EXPRESSION, lower_kernel
 from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
 from scvi_codegen.methods import SCVI, SVI, Gauss, RadauIIA, SpectralCollocation

@@ -10,8 +10,8 @@ import sympy
 import scvi_codegen as sc
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.exact.solution import ExactMotion, numbers
+from scvi_codegen.formulas.expressions import evaluate
 from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.mechanics.regularity import sample_points
 from scvi_codegen.tables.precision import mp
 

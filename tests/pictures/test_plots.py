@@ -13,7 +13,7 @@ from matplotlib import pyplot
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import PlotError, StateError
-from scvi_codegen.mechanics.symmetry.bodies import bodies
+from scvi_codegen.mechanics.symmetry.sampling import bodies
 from scvi_codegen.methods import SVI, StoermerVerlet
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.problems import problem

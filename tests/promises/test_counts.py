@@ -10,7 +10,7 @@ from scvi_codegen import methods
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.tables.quadrature import gauss_legendre
-from scvi_codegen.validation.counts import LARGEST_COUNT, checked_count
+from scvi_codegen.validation import LARGEST_COUNT, checked_count
 
 
 @pytest.mark.parametrize("value", [3, np.int64(3), np.uint8(3), sympy.Integer(3)])

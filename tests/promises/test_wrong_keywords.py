@@ -9,8 +9,7 @@ from samples import QUICK_FLAGS
 import scvi_codegen as sc
 from scvi_codegen.errors import ArgumentError, StateError
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.validation.keywords import EXPLANATIONS, keyword_hint
-from scvi_codegen.validation.synonyms import SYNONYMS
+from scvi_codegen.validation import EXPLANATIONS, SYNONYMS, keyword_hint
 
 PUSHED = sc.LagrangianSystem.from_text(
     name="pushed pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)", forces={"q": "u"}, inputs=["u"]

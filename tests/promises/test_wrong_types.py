@@ -12,7 +12,7 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.errors import ScviCodegenError
-from scvi_codegen.validation.argument_types import TEXT, checks_arguments
+from scvi_codegen.validation import TEXT, checks_arguments
 
 WRONG = (object(), b"bytes", 1j)
 """No argument of any public function may be one of these."""

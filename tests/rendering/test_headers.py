@@ -16,7 +16,7 @@ import pytest
 from programs import needs
 
 from scvi_codegen import SVI, SpectralCollocation, compile_stepper, problem
-from scvi_codegen.files.templates import template_folder
+from scvi_codegen.files.cache import template_folder
 from scvi_codegen.rendering.flow import with_casadi_flow, with_flow_of_rows
 from scvi_codegen.rendering.preprocessing import preprocessed
 from scvi_codegen.rendering.source import Source

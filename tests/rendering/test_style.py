@@ -9,7 +9,7 @@ import pytest
 from style import check_style
 
 from scvi_codegen import SVI, LagrangianSystem, compile_stepper, generate_source, problem
-from scvi_codegen.files.templates import template_folder
+from scvi_codegen.files.cache import template_folder
 from scvi_codegen.rendering.source import Source
 
 FOLDER = Path(__file__).parents[2] / "generated"

@@ -18,8 +18,8 @@ import sympy
 
 import scvi_codegen as sc
 from scvi_codegen import compiler
-from scvi_codegen.files import source_cache
-from scvi_codegen.formulas.subexpressions import key_of
+from scvi_codegen.files import cache
+from scvi_codegen.files.cache import key_of
 from scvi_codegen.mechanics.deferred import _text_of
 from scvi_codegen.methods import as_method
 from scvi_codegen.models.problems import problem
@@ -267,24 +267,24 @@ def test_cache_key_contains_every_generator_file(tmp_path, monkeypatch):
     for path in files:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("one")
-    monkeypatch.setattr(source_cache, "PACKAGE", package)
-    monkeypatch.setattr(source_cache, "template_folder", lambda: templates)
-    found = [source_cache._generator.__wrapped__()]
+    monkeypatch.setattr(cache, "PACKAGE", package)
+    monkeypatch.setattr(cache, "template_folder", lambda: templates)
+    found = [cache._generator.__wrapped__()]
     for k, path in enumerate(files):
         path.write_text("two")  # as long as before
         os.utime(path, ns=(k, 10**9 + k))
-        found.append(source_cache._generator.__wrapped__())
+        found.append(cache._generator.__wrapped__())
     release = tmp_path / "sympy" / "release.py"
     release.parent.mkdir()
     release.write_text('__version__ = "0.0"')
-    monkeypatch.setattr(source_cache, "find_spec", lambda name: SimpleNamespace(origin=str(release)))
-    found.append(source_cache._generator.__wrapped__())
+    monkeypatch.setattr(cache, "find_spec", lambda name: SimpleNamespace(origin=str(release)))
+    found.append(cache._generator.__wrapped__())
     assert len(set(found)) == len(found)
 
 
 def test_different_generator_regenerates_the_source(made, monkeypatch):
     sc.compile_stepper(spring(), sc.SVI(2))
-    monkeypatch.setattr(source_cache, "_generator", lambda: "the next version")
+    monkeypatch.setattr(cache, "_generator", lambda: "the next version")
     sc.compile_stepper(spring(), sc.SVI(2))
     assert len(made) == 2
 

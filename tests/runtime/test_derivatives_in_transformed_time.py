@@ -23,7 +23,7 @@ from scvi_codegen import (
 )
 from scvi_codegen.exact.solution import exact_motion
 from scvi_codegen.exact.step import compiled_equations
-from scvi_codegen.formulas.tape import Tape
+from scvi_codegen.formulas.expressions import Tape
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
 from scvi_codegen.tables.precision import mp

@@ -24,7 +24,7 @@ from scvi_codegen.derivation.equations import derive
 from scvi_codegen.errors import StateError
 from scvi_codegen.exact.solution import exact_motion
 from scvi_codegen.exact.step import derived_step
-from scvi_codegen.formulas.tape import evaluate
+from scvi_codegen.formulas.expressions import evaluate
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import Gauss, SpectralCollocation
 from scvi_codegen.models.model import Model

@@ -16,7 +16,7 @@ from sympy import Symbol
 from scvi_codegen.derivation.equations import StepEquations
 from scvi_codegen.derivation.page.elision import formulas
 from scvi_codegen.display.page.blocks import Content, Drawing, Formula, Paragraph, Section
-from scvi_codegen.formulas.derivatives import jacobian
+from scvi_codegen.formulas.expressions import jacobian
 from scvi_codegen.ir.program import Program
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import StageSystem

@@ -17,7 +17,7 @@ from sympy.printing.pretty.pretty_symbology import greek_unicode
 from scvi_codegen.display.mathml import mathml, mathml_terms
 from scvi_codegen.display.page import blocks
 from scvi_codegen.display.page.blocks import Cell, TableBlock
-from scvi_codegen.files.templates import template_folder
+from scvi_codegen.files.cache import template_folder
 
 FORMAT = ".3g"
 LONGEST_LINE = 32

@@ -9,7 +9,7 @@ from typing import Any
 from sympy import Add, Expr, Matrix, S, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError, closest
-from scvi_codegen.formulas.derivatives import gradient, hessian
+from scvi_codegen.formulas.expressions import gradient, hessian
 from scvi_codegen.formulas.grammar import Parser, parsed
 from scvi_codegen.formulas.rotations.members import AXES, Direction, Homogeneous, Rotation, Spin, momenta_of
 from scvi_codegen.formulas.symbols import DOT, check_name, symbol

@@ -42,7 +42,7 @@ from typing import Any
 import sympy
 from sympy import Expr
 
-from scvi_codegen.formulas.derivatives import jacobian
+from scvi_codegen.formulas.expressions import jacobian
 from scvi_codegen.ir.iteration import FixedPointIteration, IterationName, IterationTable, StoredValues
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.lowering.kernels import damping_kernel, integrand_kernel, system_kernel

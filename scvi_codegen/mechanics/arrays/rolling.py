@@ -29,7 +29,7 @@ from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.mechanics.term_groups import MAX_GROUPS, SimilarTerms, TermGroup, similar_terms
 from scvi_codegen.representation import summary
-from scvi_codegen.validation.argument_types import MAPPING, checks_arguments
+from scvi_codegen.validation import MAPPING, checks_arguments
 
 
 @dataclass(frozen=True, slots=True)

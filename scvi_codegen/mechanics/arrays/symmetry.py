@@ -14,8 +14,8 @@ from typing import TypeAlias
 from sympy import Add, Expr, S, Symbol
 
 from scvi_codegen.formulas.array_statements import ArrayForce
+from scvi_codegen.formulas.expressions import Tape
 from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.indices import Access, Array, ArrayMap, Place, Size
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.arrays.terms import force_of

@@ -18,14 +18,14 @@ from typing import Any, ClassVar
 from sympy import Expr, S, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.files.cache import key_of
 from scvi_codegen.formulas.array_latex import latex_sum
 from scvi_codegen.formulas.array_statements import ArrayForce, parse_constraint, parse_force
 from scvi_codegen.formulas.array_sympy import array_text
 from scvi_codegen.formulas.arrays import ArrayTerm, parse_array, parse_coordinate, parse_sums
-from scvi_codegen.formulas.canonical import unsupported_part
+from scvi_codegen.formulas.expressions import unsupported_part
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
-from scvi_codegen.formulas.subexpressions import key_of
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
 from scvi_codegen.indices import SIZES_REQUIRED, Access, Array, Loop
 from scvi_codegen.mechanics.arrays.terms import (
@@ -45,7 +45,7 @@ from scvi_codegen.mechanics.definition_checks import warn_of_negative, warn_of_u
 from scvi_codegen.mechanics.forces import check_damping, damping_rate
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.representation import LONGEST, clipped
-from scvi_codegen.validation.argument_types import FORMULA, MAPPING, NAMES, TEXT, TEXTS, checks_arguments, of
+from scvi_codegen.validation import FORMULA, MAPPING, NAMES, TEXT, TEXTS, checks_arguments, of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -427,7 +427,7 @@ class ArrayHamiltonian(ArraySystem):
 
 
 ARRAYS = of("a system with arrays whose sizes are known at run time, as coordinates=['q[N]']", ArraySystem)
-"""Type check of systems of arrays, for :func:`~scvi_codegen.validation.argument_types.checks_arguments`."""
+"""Type check of systems of arrays, for :func:`~scvi_codegen.validation.checks_arguments`."""
 
 SYSTEM_OR_ARRAYS = of("a LagrangianSystem or a HamiltonianSystem", MechanicalSystem, ArraySystem)
 """Type check of systems, also of those with arrays of run-time sizes."""

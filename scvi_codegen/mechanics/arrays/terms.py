@@ -23,8 +23,7 @@ from sympy import Add, Expr, S, Symbol
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.array_statements import ArrayForce
 from scvi_codegen.formulas.arrays import ArrayTerm, parse_array, parse_coordinate
-from scvi_codegen.formulas.canonical import unsupported_part
-from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.formulas.expressions import gradient, unsupported_part
 from scvi_codegen.formulas.symbols import DOT, symbol
 from scvi_codegen.indices import Access, Array, Size
 

@@ -7,8 +7,7 @@ from collections.abc import Iterable
 
 from sympy import Expr
 
-from scvi_codegen.formulas.canonical import unsupported_part
-from scvi_codegen.formulas.tape import Tape
+from scvi_codegen.formulas.expressions import Tape, unsupported_part
 from scvi_codegen.tables.precision import mp
 
 NEGLIGIBLE = mp.mpf(10) ** -40

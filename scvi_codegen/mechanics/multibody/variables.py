@@ -11,8 +11,7 @@ from sympy.core.function import AppliedUndef
 from sympy.matrices.exceptions import NonInvertibleMatrixError
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.canonical import evaluated
-from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.formulas.expressions import evaluated, gradient
 
 
 class Variables:

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.canonical import unsupported_part
-from scvi_codegen.formulas.derivatives import jacobian
-from scvi_codegen.formulas.tape import Tape
+from scvi_codegen.formulas.expressions import Tape, jacobian, unsupported_part
 from scvi_codegen.mechanics.regularity import row_rank
 from scvi_codegen.tables.precision import mp
 

@@ -17,7 +17,7 @@ from functools import lru_cache
 import sympy
 from sympy import Expr, Matrix, S, Symbol
 
-from scvi_codegen.formulas.derivatives import gradient, hessian
+from scvi_codegen.formulas.expressions import gradient, hessian
 from scvi_codegen.formulas.rotations.names import RotationNames
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem

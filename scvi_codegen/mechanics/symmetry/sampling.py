@@ -2,7 +2,8 @@
 
 Time derivatives of functions of (q, p, t) follow from these without solving for accelerations: along every trajectory
 dq/dt = v and dp/dt = L_q with p = L_v for a Lagrangian, dq/dt = H_p and dp/dt = -H_q for a Hamiltonian. With random
-v (or p), an analytic function that is zero at all points is identically zero.
+v (or p), an analytic function that is zero at all points is identically zero. Coordinates are grouped by their names
+into Cartesian positions of bodies; the forces of term groups are computed for all bodies at once.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import functools
 import math
 import random
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,14 +21,135 @@ import sympy
 from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
-from scvi_codegen.formulas.subexpressions import parts
-from scvi_codegen.formulas.tape import Tape, evaluate
+from scvi_codegen.formulas.expressions import Tape, evaluate, parts
 from scvi_codegen.mechanics.constraints import constraint_multipliers, with_constraint_forces
 from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.symmetry.group_forces import LARGEST, array_forces, array_value, exact_forces
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.term_groups import TermGroup
 from scvi_codegen.tables.precision import Number, mp
+
+AXES = "xyz"
+AXIS_FIRST = re.compile(r"^([xyz])_?(\w+)$")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Body:
+    """Coordinates that are the Cartesian position of one body.
+
+    Attributes:
+        name: ``"jupiter"`` for jupiter_x, jupiter_y, jupiter_z, ``"1"`` for x1, y1, z1; empty for plain x, y, z.
+        columns: their indices among all coordinates, x first; two or three.
+    """
+
+    name: str
+    columns: tuple[int, ...]
+
+
+def bodies(coordinates: Sequence[str]) -> tuple[Body, ...]:
+    """Group names such as jupiter_x, jupiter_y, or x1, y1, x2, y2, or x_sun, y_sun, or x, y, into bodies.
+
+    Returns:
+        The bodies, all in the plane or all in space, or none if a coordinate belongs to no body.
+
+    >>> [body.name for body in bodies(["sun_x", "sun_y", "moon_x", "moon_y"])]
+    ['sun', 'moon']
+    >>> [body.name for body in bodies(["x1", "y1", "x2", "y2"])]
+    ['1', '2']
+    >>> bodies(["theta", "x", "y"])
+    ()
+    """
+    return _grouped(coordinates) or _grouped([AXIS_FIRST.sub(r"\2_\1", name) for name in coordinates])
+
+
+def _grouped(coordinates: Sequence[str]) -> tuple[Body, ...]:
+    """Group names that end in the axis."""
+    groups: dict[str, dict[str, int]] = {}
+    for index, name in enumerate(coordinates):
+        stem, axis = (name[:-2], name[-1]) if name[-2:-1] == "_" else ("", name)
+        groups.setdefault(stem, {})[axis] = index
+    shapes = {"".join(sorted(group)) for group in groups.values()}
+    if shapes not in ({"xy"}, {"xyz"}) or sum(map(len, groups.values())) != len(coordinates):
+        return ()
+    shape = shapes.pop()
+    return tuple(Body(name=stem, columns=tuple(group[axis] for axis in shape)) for stem, group in groups.items())
+
+
+LARGEST = 10**300
+"""Bound below which numbers can be converted to binary64."""
+FEW = 12
+"""Number of bodies per term group that :func:`terms_among_few_bodies` selects."""
+
+
+def terms_among_few_bodies(term_groups: Sequence[TermGroup], bodies: Sequence[Body]) -> tuple[TermGroup, ...]:
+    """Return the terms among the first few bodies: what the system conserves, so does this system of few bodies."""
+    body_of = {index: number for number, body in enumerate(bodies) for index in body.columns}
+    chosen = dict[int, None]()
+    for term_group in term_groups:
+        met = dict.fromkeys(body_of.get(index, -1 - index) for row in term_group.places for index in row)
+        chosen |= dict.fromkeys(list(met)[:FEW])
+    return tuple(
+        term_group.where([all(body_of.get(index, -1 - index) in chosen for index in row) for row in term_group.places])
+        for term_group in term_groups
+    )
+
+
+def array_forces(
+    term_groups: Sequence[TermGroup], coordinates: Sequence[Symbol], known: Mapping[Any, Any], count: int
+) -> Sequence[Any]:
+    """Return the force on each coordinate at ``count`` points; ``known`` has coordinates, parameters and time there."""
+    if not term_groups:
+        return [0.0] * len(coordinates)
+    q, force = np.array([known[each] for each in coordinates]), np.zeros((len(coordinates), count))
+    for term_group in term_groups:
+        indices, values = np.array(term_group.places, dtype=int).reshape(-1, len(term_group.slots)), dict(known)
+        values |= {slot: q[indices[:, k]] for k, slot in enumerate(term_group.slots)}
+        for symbol, column in zip(term_group.constants, term_group.values, strict=True):
+            values[symbol] = np.array([known[x] if x in known else np.full(count, float(x)) for x in column])
+        for k, derivative in enumerate(term_group.partials):
+            np.add.at(force, indices[:, k], array_value(derivative, values) + np.zeros((len(indices), count)))
+    return list(force)
+
+
+def exact_forces(
+    term_groups: Sequence[TermGroup], coordinates: Sequence[Symbol], known: Mapping[Any, Number]
+) -> list[Number]:
+    """Return the force on each coordinate at one point, in 60 digits."""
+    force: list[Number] = [mp.zero] * len(coordinates)
+    for term_group in term_groups:
+        shared_symbols = [symbol for symbol in known if symbol not in coordinates]
+        tape = Tape(term_group.partials, (*term_group.slots, *term_group.constants, *shared_symbols))
+        shared, numbers = [known[symbol] for symbol in shared_symbols], dict[Expr, Number]()
+        for row, *constants in zip(term_group.places, *term_group.values, strict=True):
+            for x in constants:
+                numbers.setdefault(x, known[x] if x in known else evaluate(x, {}))
+            derivatives = tape(
+                [*(known[coordinates[index]] for index in row), *(numbers[x] for x in constants), *shared]
+            )
+            for index, force_term in zip(row, derivatives, strict=True):
+                force[index] += force_term
+    return force
+
+
+def array_value(expression: Any, known: dict[Any, Any]) -> Any:
+    """Return the values of an expression, NaN where undefined; ``known`` has its symbols and caches subexpressions."""
+    if expression not in known:
+        known[expression] = _array_node(expression, known)
+    return known[expression]
+
+
+def _array_node(expression: Any, known: dict[Any, Any]) -> Any:
+    if not expression.args:
+        return float(expression) if not expression.is_Rational or abs(expression) < LARGEST else np.nan
+    arguments = [array_value(argument, known) for argument in expression.args]
+    if expression.is_Add:
+        return functools.reduce(np.add, arguments)
+    if expression.is_Mul:
+        return functools.reduce(np.multiply, arguments)
+    if expression.is_Pow:
+        return np.power(arguments[0], float(arguments[1]) if expression.exp.is_Number else arguments[1])
+    name = type(expression).__name__
+    return getattr(np, f"arc{name[1:]}" if name.startswith("a") else name)(*arguments)
+
 
 Array = NDArray[np.float64]
 

@@ -35,7 +35,7 @@ from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.csv_tables import parse_table
 from scvi_codegen.models.time_span import real
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count
 
 if TYPE_CHECKING:
     from scvi_codegen.runtime.core.stepper import Stepper

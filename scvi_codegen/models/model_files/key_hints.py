@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from scvi_codegen.errors import closest
-from scvi_codegen.validation.synonyms import likely_names, synonym_hint
+from scvi_codegen.validation import likely_names, synonym_hint
 
 KEYS: Final = {
     "run": "step span steps tolerance save_every controller",

@@ -101,7 +101,7 @@ from scvi_codegen.models.model_files.system_section import (
 )
 from scvi_codegen.models.model_files.values import read_values
 from scvi_codegen.models.problems import Problem
-from scvi_codegen.validation.argument_types import PATH, checks_arguments, of
+from scvi_codegen.validation import PATH, checks_arguments, of
 
 if TYPE_CHECKING:
     from scvi_codegen.models.model_files.input_tables import InputTable

@@ -10,8 +10,7 @@ from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification, s
 from scvi_codegen.models.model import DEFAULT_METHOD
 from scvi_codegen.models.model_files.key_hints import key_hint
 from scvi_codegen.models.time_span import real
-from scvi_codegen.validation.argument_types import FORMULA
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import FORMULA, checked_count
 
 Built = TypeVar("Built")
 Section = Mapping[str, Any]

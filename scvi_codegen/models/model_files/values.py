@@ -60,7 +60,7 @@ from scvi_codegen.models.model_files.sections import Document, Section, check_ke
 from scvi_codegen.models.model_files.system_section import is_number
 from scvi_codegen.models.time_span import check_length, real
 from scvi_codegen.native.arguments import real_array
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count
 
 Numbers: TypeAlias = NDArray[np.float64]
 Key: TypeAlias = tuple[str, str]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.errors import MethodError, ModelFileError, StateError
-from scvi_codegen.formulas.tape import evaluate
+from scvi_codegen.formulas.expressions import evaluate
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem

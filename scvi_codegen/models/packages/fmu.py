@@ -35,7 +35,7 @@ from scvi_codegen.native.cross import TARGETS, library_for
 from scvi_codegen.pipeline.sources import generate_source
 from scvi_codegen.rendering.program_source import ExampleRun, with_fmu
 from scvi_codegen.rendering.source import Interface, Source
-from scvi_codegen.validation.argument_types import PATH, SWITCH, TEXT, TEXTS, checks_arguments
+from scvi_codegen.validation import PATH, SWITCH, TEXT, TEXTS, checks_arguments
 from scvi_codegen.version import __version__
 
 DESCRIPTION = "modelDescription.xml"

@@ -28,7 +28,7 @@ from scvi_codegen.models.packages.generated_folders import damaged, prefix_of, r
 from scvi_codegen.rendering.source import Interface, Source, check_interface
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.validation.argument_types import PATH, SWITCH, TEXT, ArgumentType, checks_arguments
+from scvi_codegen.validation import PATH, SWITCH, TEXT, ArgumentType, checks_arguments
 
 if TYPE_CHECKING:
     from scvi_codegen.models.model import Model

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from string import Template
 
-from scvi_codegen.files.templates import template_folder
+from scvi_codegen.files.cache import template_folder
 from scvi_codegen.rendering.program_source import Embedded
 from scvi_codegen.rendering.source import Interface
 

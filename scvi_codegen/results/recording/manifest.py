@@ -23,7 +23,7 @@ from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.step_plan import StepPlan
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count
 from scvi_codegen.version import __version__
 
 MANIFEST = "manifest.json"

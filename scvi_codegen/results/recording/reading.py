@@ -24,7 +24,7 @@ from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.quantities import quantities
 from scvi_codegen.runtime.trajectory.saved_states import checked_row
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-from scvi_codegen.validation.argument_types import MAPPING, PATH, checks_arguments
+from scvi_codegen.validation import MAPPING, PATH, checks_arguments
 
 if TYPE_CHECKING:
     from scvi_codegen.runtime.core.stepper import Stepper

@@ -29,8 +29,7 @@ from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.run_loop import record
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-from scvi_codegen.validation.argument_types import FUNCTION, PATH, REAL, TEXT, checks_arguments, of
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import FUNCTION, PATH, REAL, TEXT, checked_count, checks_arguments, of
 
 LOCK = ".lock"
 CHECKPOINT_SECONDS = 10.0

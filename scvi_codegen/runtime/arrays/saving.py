@@ -15,7 +15,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.interface import RunArrays, read_arrays
 from scvi_codegen.runtime.arrays.memory import COMPUTED, RUN_FIELDS, STATE
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count
 
 RANGES = {
     **dict.fromkeys(("step", "rejected", "avoiding", "steps_from_rest", "steps_to_compare"), (0, 2**53)),

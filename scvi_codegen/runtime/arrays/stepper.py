@@ -22,8 +22,7 @@ from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.stepper import RunSettings, Stepper
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-from scvi_codegen.validation.argument_types import MAPPING, checks_arguments
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import MAPPING, checked_count, checks_arguments
 
 MOST_COORDINATES = 2000
 """Largest number of coordinates that are compiled with known sizes for what requires it."""

@@ -32,7 +32,7 @@ from scvi_codegen.runtime.run.accuracy import warn_of_large_steps
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.run_loop import record
 from scvi_codegen.runtime.run.times import times_after
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count
 
 CHECKED_STRIDE: Final = 64
 """Stride of the trajectories whose step error is estimated."""

@@ -16,7 +16,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.representation import summary
 from scvi_codegen.runtime.chaos.growth import SERIES
 from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

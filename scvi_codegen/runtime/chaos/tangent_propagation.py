@@ -24,7 +24,7 @@ from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.sensitivity.gradients import pieces, propagate, starts_of
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count
 
 FIRST, MOST = 8, 1024
 """Number of steps of the first and of the largest chunk."""

@@ -47,8 +47,7 @@ from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.run.times import steps_to, times_after
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-from scvi_codegen.validation.argument_types import FUNCTION, MAPPING, ArgumentType, checks_arguments
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import FUNCTION, MAPPING, ArgumentType, checked_count, checks_arguments
 
 STEPPER = ArgumentType("a compiled stepper", lambda value: isinstance(value, Stepper) or hasattr(value, "bind"))
 """Type check of steppers, also of those for arrays of any size."""

@@ -41,7 +41,7 @@ from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.joining import joined
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count
 
 
 class LaneStates(Protocol):

@@ -44,7 +44,7 @@ from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.run_loop import record
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count
 
 FIRST_CHUNK_STEPS = 64
 """Steps of the first chunk of a block, before its speed is known."""

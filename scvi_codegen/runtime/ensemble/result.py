@@ -25,7 +25,7 @@ from scvi_codegen.runtime.run.global_error import ConfirmedEnsemble, GlobalError
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.joining import relative_changes
 from scvi_codegen.runtime.trajectory.quantities import quantities
-from scvi_codegen.validation.argument_types import MAPPING, PATH, checks_arguments
+from scvi_codegen.validation import MAPPING, PATH, checks_arguments
 
 if TYPE_CHECKING:
     import xarray

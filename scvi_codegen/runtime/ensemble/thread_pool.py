@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count
 
 PROGRESS_SECONDS = 0.1
 MOST_JOBS = 4096

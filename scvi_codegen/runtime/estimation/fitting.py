@@ -23,8 +23,7 @@ from scvi_codegen.runtime.core.validation import Array, checked_vector
 from scvi_codegen.runtime.estimation.measurements import Measurements, distinct, state_names
 from scvi_codegen.runtime.estimation.multiple_shooting import LOOSE, TIGHT, Chain, Limits, chained, joined
 from scvi_codegen.runtime.inputs.segments import checked_inputs
-from scvi_codegen.validation.argument_types import MAPPING, NAMES, SWITCH, checks_arguments
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import MAPPING, NAMES, SWITCH, checked_count, checks_arguments
 
 SAME = 1e-10
 """Sensitivity relative to the largest below which an unknown counts as undetermined."""

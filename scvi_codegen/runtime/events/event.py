@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import EventError
 from scvi_codegen.representation import summary
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count
 
 if TYPE_CHECKING:
     from sympy import Expr

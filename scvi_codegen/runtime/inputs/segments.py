@@ -23,7 +23,7 @@ from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.dense_output import checked_times
 from scvi_codegen.runtime.trajectory.joining import joined
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count
 
 if TYPE_CHECKING:
     from scvi_codegen.runtime.core.integrator import Integrator

@@ -31,8 +31,7 @@ from scvi_codegen.runtime.estimation.measurements import state_names
 from scvi_codegen.runtime.orbits.periodic_orbit import PeriodicOrbit
 from scvi_codegen.runtime.run.times import steps_within, times_after
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
-from scvi_codegen.validation.argument_types import NAMES, SWITCH, checks_arguments
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import NAMES, SWITCH, checked_count, checks_arguments
 
 MOST_ITERATIONS, MOST_HALVINGS = 50, 12
 EASY, GROWTH = 10.0, 4.0

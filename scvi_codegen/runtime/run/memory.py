@@ -25,7 +25,7 @@ from scvi_codegen.runtime.core.validation import (
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.one_thread import OneThread, alone, in_use
 from scvi_codegen.runtime.run.step_plan import StepPlan
-from scvi_codegen.validation.counts import LARGEST_COUNT, checked_count
+from scvi_codegen.validation import LARGEST_COUNT, checked_count
 
 STEPS_PER_CALL, MOST_UNTIMED = 10**5, 2**10
 """Largest number of steps per call into C, between checks for Ctrl-C, and of coordinates of which it is not timed."""

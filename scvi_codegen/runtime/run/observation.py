@@ -25,7 +25,7 @@ from scvi_codegen.runtime.run.times import WHOLE
 from scvi_codegen.runtime.trajectory.dense_output import states_and_steps_at, step_sizes_at, times_of_run
 from scvi_codegen.runtime.trajectory.time_transformation import part_of_step
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count
 
 Array = NDArray[np.float64]
 CHUNK_NUMBERS = 2**18

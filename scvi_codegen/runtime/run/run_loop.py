@@ -20,7 +20,7 @@ from scvi_codegen.runtime.run.singular_time import ProgressWatch, check_energy_s
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import checked_count
 
 NATIVE_DOUBLE, INT32 = Struct("d"), np.dtype(np.int32)
 FIRST_STEPS = 256

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
-from scvi_codegen.validation.counts import check_tolerance
+from scvi_codegen.validation import check_tolerance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

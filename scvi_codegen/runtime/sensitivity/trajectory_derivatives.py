@@ -14,8 +14,7 @@ from scvi_codegen.runtime.sensitivity.gradients import Gradient, sensitivity, ta
 from scvi_codegen.runtime.sensitivity.hessians import hessian_product
 from scvi_codegen.runtime.sensitivity.step_derivatives import Sensitivity
 from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
-from scvi_codegen.validation.argument_types import SWITCH, checks_arguments
-from scvi_codegen.validation.counts import checked_count
+from scvi_codegen.validation import SWITCH, checked_count, checks_arguments
 
 
 @dataclass(slots=True, kw_only=True, eq=False)

@@ -32,7 +32,7 @@ from scvi_codegen.runtime.trajectory.joining import Number, concatenated, joined
 from scvi_codegen.runtime.trajectory.quantities import quantities
 from scvi_codegen.runtime.trajectory.saved_states import Array, checked_row, checked_rows
 from scvi_codegen.runtime.trajectory.work_and_impulses import work_and_impulses_until
-from scvi_codegen.validation.argument_types import MAPPING, PATH, checks_arguments
+from scvi_codegen.validation import MAPPING, PATH, checks_arguments
 
 if TYPE_CHECKING:
     import pandas

@@ -24,7 +24,7 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.runtime.arrays.interface import read_arrays
 from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.validation.argument_types import check_kind, of
+from scvi_codegen.validation import check_kind, of
 from scvi_codegen.verification.arrays.small import SmallStepper, small_start
 from scvi_codegen.verification.arrays.whole import WholeStart, whole_checks
 from scvi_codegen.verification.certificate import Certificate, Finding, checked, issued

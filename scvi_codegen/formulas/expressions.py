@@ -1,0 +1,352 @@
+"""SymPy expressions: canonical form, check against the grammar, derivatives, and evaluation in 60 digits.
+
+Derivatives are computed by forward accumulation, in which each node carries only its own non-zero partial derivatives.
+The Lagrangian of a lattice has a thousand terms and hundreds of variables, but each term depends on two or three.
+Nothing is simplified; entries that SymPy's constructors evaluate to 0 are omitted. Every distinct node is
+differentiated once, with respect to all variables, which is much faster than ``Expr.diff``, term by term.
+
+Values are computed by straight-line programs that evaluate each subexpression once.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+import sympy
+from sympy import Add, Expr, Function, Mul, Pow, Rational, S, Symbol, log
+from sympy.core.function import AppliedUndef
+
+from scvi_codegen.formulas.vocabulary import CONSTANTS, FUNCTIONS, LARGEST, NAME_OF, shortened
+from scvi_codegen.tables.precision import Number, mp
+
+
+def parts(*expressions: sympy.Basic) -> dict[sympy.Basic, None]:
+    """Return all distinct subexpressions, beginning with the expressions themselves."""
+    result = dict.fromkeys(expressions)
+    waiting = list(expressions)
+    while waiting:
+        new = [argument for argument in waiting.pop().args if argument not in result]
+        result.update(dict.fromkeys(new))
+        waiting += new
+    return result
+
+
+CONSTANT_VALUES = {sympy.S.Pi: mp.mpf(mp.pi), sympy.S.Exp1: mp.mpf(mp.e)}
+
+
+class Tape:
+    """Straight-line program of several expressions in the same symbols.
+
+    Args:
+        expressions: of the grammar of :mod:`~scvi_codegen.formulas.grammar`.
+        symbols: all that occur in them.
+    """
+
+    def __init__(self, expressions: Sequence[sympy.Expr], symbols: Sequence[sympy.Symbol]) -> None:
+        self.symbols = tuple(symbols)
+        self._start: list[Number] = [mp.zero] * len(symbols)
+        self._places: dict[sympy.Expr, int] = {symbol: register for register, symbol in enumerate(symbols)}
+        self._steps: list[tuple[int, Callable[..., Number], tuple[int, ...]]] = []
+        self._results = [self._place(expression) for expression in expressions]
+
+    def __call__(self, numbers: Sequence[Number]) -> list[Number]:
+        """Return the values at a point.
+
+        Raises:
+            ArithmeticError: if a value is not real or not within the range of a C double.
+        """
+        values = [*numbers, *self._start[len(numbers) :]]
+        try:
+            for register, operation, operands in self._steps:
+                values[register] = operation(*[values[operand] for operand in operands])
+        except (ValueError, TypeError, AttributeError) as error:
+            raise ArithmeticError(f"no real value: {error}") from error
+        results = [values[register] for register in self._results]
+        if not all(isinstance(value, mp.mpf) and abs(value) <= LARGEST for value in results):
+            raise ArithmeticError("a value is not a finite real number: the state is outside the domain of the formula")
+        return results
+
+    def _place(self, expression: sympy.Expr) -> int:
+        """Return the index of an expression's value, appending the operations that compute it."""
+        if expression in self._places:
+            return self._places[expression]
+        if expression.args:
+            operands = tuple(self._place(argument) for argument in expression.args)
+            operation, operands = _operation(expression, operands)
+            self._steps.append((len(self._start), operation, operands))
+            self._start.append(mp.zero)
+        else:
+            self._start.append(_constant(expression))
+        self._places[expression] = len(self._start) - 1
+        return self._places[expression]
+
+
+def _operation(expression: sympy.Expr, operands: tuple[int, ...]) -> tuple[Callable[..., Number], tuple[int, ...]]:
+    if expression.is_Add:
+        return (operator.add if len(operands) == 2 else _sum), operands
+    if expression.is_Mul:
+        return (operator.mul if len(operands) == 2 else _product), operands
+    if not expression.is_Pow:
+        return getattr(mp, NAME_OF[expression.func]), operands
+    exponent = expression.exp
+    if exponent.is_Integer:
+        power = int(exponent)
+        return (lambda x: x**power), operands[:1]
+    return mp.power, operands
+
+
+def _sum(*terms: Number) -> Number:
+    return mp.fsum(terms)
+
+
+def _product(*factors: Number) -> Number:
+    return mp.fprod(factors)
+
+
+def _constant(expression: Any) -> Number:
+    if expression.is_Rational:
+        return mp.mpf(int(expression.p)) / int(expression.q)
+    return CONSTANT_VALUES[expression]
+
+
+def evaluate(expression: sympy.Expr, values: Mapping[sympy.Symbol, Number]) -> Number:
+    """Return the value of an expression at one point, in 60 digits.
+
+    Args:
+        expression: of the grammar.
+        values: a number for each of its symbols.
+
+    Raises:
+        ArithmeticError: if the value, or that of a subexpression, is not real or exceeds the range of a C double.
+    """
+    try:
+        return Tape(list(parts(expression)), list(values))(list(map(mp.mpf, values.values())))[0]
+    except ArithmeticError as error:
+        raise ArithmeticError(f"'{shortened(expression)}' is not a finite real number") from error
+
+
+MAX_EXPONENT = 64
+MAX_EXPONENT_DENOMINATOR = 10_000
+MAX_BITS = 2048
+MAX_DIGITS = 616
+"""Maximum number of decimal digits of an integer of ``MAX_BITS`` bits."""
+MAX_PASSES = 8
+
+
+def bits(number: Expr) -> int:
+    """Return the size of a rational, the bits of its numerator or denominator; 0 for other expressions."""
+    return max(int(number.p).bit_length(), int(number.q).bit_length()) if number.is_Rational else 0
+
+
+def beyond_double(number: Expr) -> bool:
+    """Return whether a rational overflows as a C double, or underflows to 0."""
+    p, q = abs(int(number.p)), int(number.q)
+    return p > int(LARGEST) * q or (p > 0 and p << 1075 <= q)
+
+
+NODES = frozenset([Add, Mul, Pow, *NAME_OF])
+
+
+_SMOOTHER = {
+    "Abs": "the absolute value is not differentiable, and neither is sqrt(x**2)",
+    "sign": "the sign is not differentiable",
+    "Piecewise": "piecewise functions are not differentiable where pieces meet",
+    "Heaviside": "step functions are not differentiable",
+    "ImaginaryUnit": "a Lagrangian must be real",
+}
+
+
+def unsupported_part(expression: Expr) -> str | None:
+    """Return why an expression is outside the grammar, or ``None``; shared by parser, printer and systems.
+
+    Rejected are other functions, floating-point numbers, non-finite or non-real constants, numbers of more than
+    ``MAX_BITS`` bits and constant exponents beyond ``MAX_EXPONENT``.
+    """
+    pending, seen = [expression], set()
+    while pending:
+        node = pending.pop()
+        if node in seen:
+            continue
+        seen.add(node)
+        problem = _node_problem(node)
+        if problem:
+            return problem
+        pending.extend(node.args)
+    return _constant_problem(expression)
+
+
+def _node_problem(node: Any) -> str | None:
+    if not node.args:
+        if node.is_Symbol or node in (S.Pi, S.Exp1):
+            return None
+        if node.is_Rational and bits(node) > MAX_BITS:
+            return f"a constant exceeds {MAX_BITS} bits, more than any C double can represent"
+        if node.is_Rational:
+            return f"the constant {shortened(node)} exceeds the range of a C double" if beyond_double(node) else None
+        if node in (S.NaN, S.ComplexInfinity, S.Infinity, S.NegativeInfinity):
+            return f"a part of the formula is not finite ({node})"
+    elif node.func in NODES:
+        return exponent_problem(node.exp) if node.is_Pow else None
+    kind = type(node).__name__
+    reason = f": {_SMOOTHER[kind]}" if kind in _SMOOTHER else ""
+    known = ", ".join([*FUNCTIONS, *CONSTANTS])
+    return f"{kind} ('{shortened(node)}') is not supported{reason}. Use + - * / ** and {known}"
+
+
+def exponent_problem(exponent: Expr) -> str | None:
+    """Return why the rational part of an exponent is too large: SymPy extracts 2**10**9 from 2**(x + 10**9)."""
+    constant = exponent.as_coeff_Add(rational=True)[0]
+    if abs(constant) <= MAX_EXPONENT and constant.q <= MAX_EXPONENT_DENOMINATOR:
+        return None
+    return (
+        f"the constant {shortened(constant)} in an exponent is not supported: it must lie between "
+        f"-{MAX_EXPONENT} and {MAX_EXPONENT}, with a denominator of at most {MAX_EXPONENT_DENOMINATOR}"
+    )
+
+
+def _constant_problem(expression: Expr) -> str | None:
+    """Return why a maximal subexpression without symbols is not a finite real number, or ``None``."""
+    pending = [expression]
+    while pending:
+        node = pending.pop()
+        if not node.is_number:
+            pending.extend(argument for argument in node.args if argument.args)
+        elif node.args:
+            try:
+                evaluate(node, {})
+            except ArithmeticError:
+                return f"the constant '{shortened(node)}' is not a finite real number"
+    return None
+
+
+def evaluated(expression: Expr, replacements: Mapping[Expr, Expr] | None = None) -> Expr:
+    """Replace parts, make floating-point numbers rational and re-evaluate all constructors until nothing changes.
+
+    SymPy leaves some nodes as no constructor would build them (``evaluate=False``, but also ``-((1/2)**x - 1)``); the
+    result equals the parsed text of the expression. A float becomes the rational of its shortest decimal form.
+    """
+    rules = dict(replacements or {})
+    for _ in range(MAX_PASSES):
+        result = _rebuilt(expression, rules)
+        if result == expression:
+            break
+        expression, rules = result, {}
+    return expression
+
+
+def _rebuilt(expression: Expr, known: dict[Expr, Expr]) -> Expr:
+    if expression not in known:
+        known[expression] = _rebuilt_node(expression, known)
+    return known[expression]
+
+
+def _rebuilt_node(expression: Expr, known: dict[Expr, Expr]) -> Expr:
+    if expression.is_Float:
+        value = float(expression)
+        return Rational(repr(value) if expression == value else str(expression))
+    if not expression.args or isinstance(expression, (sympy.Derivative, AppliedUndef)):
+        return expression
+    return expression.func(*(_rebuilt(argument, known) for argument in expression.args))
+
+
+_Gradient = dict[int, Expr]
+
+
+def gradient(expression: Expr, variables: Sequence[Symbol]) -> dict[int, Expr]:
+    """Return the non-zero first derivatives of ``expression``, by index into ``variables``, ascending.
+
+    >>> from sympy.abc import x, y, z
+    >>> gradient(x**2 * z + z, [x, y, z])
+    {0: 2*x*z, 2: x**2 + 1}
+    """
+    return dict(sorted(_accumulation(tuple(variables)).of(expression).items()))
+
+
+def jacobian(
+    expressions: Sequence[Expr] | Mapping[int, Expr], variables: Sequence[Symbol]
+) -> dict[tuple[int, int], Expr]:
+    """Return the non-zero first derivatives of several expressions, by (row, column), ascending.
+
+    Args:
+        expressions: the rows, as a sequence or by index (what ``gradient`` returns).
+        variables: the columns.
+
+    >>> from sympy.abc import x, y
+    >>> jacobian([x * y, y**2], [x, y])
+    {(0, 0): y, (0, 1): x, (1, 1): 2*y}
+    """
+    rows = expressions if isinstance(expressions, Mapping) else dict(enumerate(expressions))
+    accumulation = _accumulation(tuple(variables))
+    entries = {(row, column): entry for row in rows for column, entry in accumulation.of(rows[row]).items()}
+    return dict(sorted(entries.items()))
+
+
+def hessian(expression: Expr, variables: Sequence[Symbol]) -> dict[tuple[int, int], Expr]:
+    """Return the non-zero second derivatives by (row, column), ascending; both triangles, which share their entries.
+
+    >>> from sympy.abc import x, y
+    >>> hessian(x**2 * y, [x, y])
+    {(0, 0): 2*y, (0, 1): 2*x, (1, 0): 2*x}
+    """
+    entries = jacobian(gradient(expression, variables), variables)
+    upper = {(row, column): entry for (row, column), entry in entries.items() if row <= column}
+    lower = {(column, row): entry for (row, column), entry in upper.items()}
+    return dict(sorted((upper | lower).items()))
+
+
+@lru_cache(maxsize=4)
+def _accumulation(variables: tuple[Symbol, ...]) -> _Accumulation:
+    """Return the shared cache for these variables, since the derivatives of a system are requested repeatedly."""
+    return _Accumulation(variables)
+
+
+class _Accumulation:
+    """Cache of the non-zero partial derivatives of every visited node, by index of the variable."""
+
+    def __init__(self, variables: Sequence[Symbol]) -> None:
+        self.known: dict[Expr, _Gradient] = {variable: {index: S.One} for index, variable in enumerate(variables)}
+
+    def of(self, node: Expr) -> _Gradient:
+        if not node.args:
+            return self.known.get(node, {})
+        derivative = self.known.get(node)
+        if derivative is None:
+            derivative = self.known[node] = self.derived(node)
+        return derivative
+
+    def derived(self, node: Expr) -> _Gradient:
+        inner = [self.of(argument) for argument in node.args]
+        return _combined(
+            [
+                (factor, derivatives)
+                for position, derivatives in enumerate(inner)
+                if derivatives and (factor := _partial(node, position)) is not S.Zero
+            ]
+        )
+
+
+def _combined(pairs: Sequence[tuple[Expr, _Gradient]]) -> _Gradient:
+    """Return the sum of factor times gradient: the chain rule."""
+    parts: dict[int, list[Expr]] = {}
+    for factor, derivatives in pairs:
+        for index, derivative in derivatives.items():
+            parts.setdefault(index, []).append(derivative if factor is S.One else Mul(factor, derivative))
+    total = {index: Add(*terms) for index, terms in parts.items()}
+    return {index: entry for index, entry in total.items() if entry is not S.Zero}
+
+
+def _partial(node: Expr, position: int) -> Expr:
+    """Return the derivative of a node with respect to its argument in ``position``."""
+    if isinstance(node, Add):
+        return S.One
+    if isinstance(node, Mul):
+        return Mul(*node.args[:position], *node.args[position + 1 :])
+    if isinstance(node, Pow):
+        base, exponent = node.args
+        return Mul(exponent, Pow(base, exponent - 1)) if position == 0 else Mul(node, log(base))
+    if isinstance(node, Function):
+        return node.fdiff(position + 1)
+    raise TypeError(f"cannot differentiate a {type(node).__name__}")

@@ -1,0 +1,243 @@
+"""Validation of the arguments of public functions, with errors that name the argument and suggest keywords.
+
+Types of arguments are checked when the function is called; numbers and arrays, which may be anything convertible, when
+they are converted (:func:`checked_count`, :mod:`scvi_codegen.native.arguments`).
+"""
+
+from __future__ import annotations
+
+import functools
+import numbers
+import operator
+import os
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from inspect import Parameter, signature
+from typing import Any, Final, TypeVar, cast
+
+import numpy as np
+
+from scvi_codegen.errors import ArgumentError, ScviCodegenError, StateError, closest
+
+SYNONYMS: Final = {
+    "h step": "dt delta_t timestep time_step stepsize step_size max_step first_step",
+    "steps": "n N nsteps n_steps num_steps nt",
+    "t": "t0 time start_time t_start start",
+    "t_end span": "T tf t_final t_max tmax tend t_span t_bound duration length time",
+    "tolerance": "tol rtol atol eps epsilon accuracy error",
+    "save_every": "every stride output_every skip",
+    "t_eval": "times saveat t_out",
+    "q y0": "x q0 x0 position positions state coords",
+    "p": "p0 momentum momenta",
+    "velocity q_dot": "v v0 qdot dq velocities",
+    "parameters": "params param args constants",
+    "options": "solver_options",
+    "degree": "n s stages order degrees",
+    "quadrature": "points k",
+    "method": "solver integrator scheme name type kind",
+    "coordinates": "q variables coords x positions",
+    "momenta": "p",
+    "lagrangian": "L l",
+    "hamiltonian": "H h",
+    "forces": "force",
+    "constraints": "constraint",
+    "inputs": "input control controls u",
+    "initial": "init start state y0 initial_conditions",
+    "run": "integrate integration simulation settings solve",
+    "system": "model problem",
+}
+"""Synonyms in other programs, by the names used here for arguments and keys."""
+
+
+def likely_names(word: str) -> Iterator[str]:
+    """Yield the names used here for a word, the likeliest first."""
+    for here, elsewhere in SYNONYMS.items():
+        if {word, word.lower()} & {*here.split(), *elsewhere.split()}:
+            yield from here.split()
+
+
+def synonym_hint(word: str, known: Collection[str]) -> str:
+    """Return ``"; did you mean 'h'?"`` if a known word has the same meaning, else an empty string."""
+    return next((f"; did you mean '{meant}'?" for meant in likely_names(word) if meant in known), "")
+
+
+EXPLANATIONS: Final = {
+    "inputs": "pass them to .integrate(..., inputs={'u': (t, values)}) or .integrate_ensemble, and values that change "
+    "during a run to run.set_inputs(u=...)",
+    "t_eval": "save all states, and interpolate the run: run.at(times)",
+    "events": "pass them to .integrate(..., events=...) or compile_stepper(..., events=...)",
+    "threads": "threads share the steps of arrays whose sizes are known at run time only, coordinates=['q[N]']; others "
+    "are too short to be shared",
+    "observe": "it reduces states of arrays whose sizes are known at run time only, coordinates=['q[N]']; here save "
+    "fewer states by save_every",
+    "tables": "with sizes, tables are passed when compiling: compile_stepper(system, method, sizes=..., tables=...)",
+    "save_every": "pass it to run.record(n, save_every=...) or .integrate",
+    "steps": "pass the number to run.advance(n) or run.record(n)",
+    "h": "pass it to a stepper: compile_stepper(...).integrate(q, p, h=..., steps=...)",
+    "parameters": "pass their values to the run, .integrate(..., parameters={...}), and their names to the system",
+    "velocity": "use momenta, p = stepper.momentum(q, velocity)",
+    "t_end": "for adaptive steps use .integrate(..., t_end=...); for a fixed number of steps give h = (t_end "
+    "- t) / steps",
+    "degree": "include it in the method, 'svi:8' or SVI(8)",
+    "solver": "pass it when compiling: compile_stepper(system, method, solver=...)",
+    "method": "pass it when compiling: compile_stepper(system, method)",
+}
+"""Explanations by keyword, for functions that do not have it."""
+
+
+def keyword_hint(name: str, known: Collection[str]) -> str:
+    """Return ``"; did you mean 'h'?"``, or ``": "`` and an explanation, or the list of keywords.
+
+    Args:
+        name: a keyword that the function does not have.
+        known: keywords that it has.
+    """
+    if here := synonym_hint(name, known):
+        return here
+    for word in (name, *likely_names(name)):
+        if word in EXPLANATIONS and word not in known:
+            return f": {EXPLANATIONS[word]}"
+    hint = closest(name, known)
+    return f": it takes {', '.join(known)}" if hint == "." else hint
+
+
+LARGEST_COUNT = 2**53 - 1
+"""Largest integer below which binary64 represents every integer."""
+
+
+def check_tolerance(value: float, error: type[ScviCodegenError] = StateError) -> None:
+    """Raise an error unless the tolerance of adaptive steps is positive and below 1."""
+    if not 0.0 < value < 1.0:
+        raise error(
+            "the tolerance must be positive and below 1 (relative error of each step), not "
+            f"{value:g}: leave it out for errors at round-off level"
+        )
+
+
+def checked_count(
+    value: Any, name: str, *, least: int, most: int = LARGEST_COUNT, error: type[ScviCodegenError] = StateError
+) -> int:
+    """Return the value as an int from ``least`` to ``most``, or raise an error that names it; booleans are rejected."""
+    try:
+        count = operator.index(value)
+    except TypeError:
+        count = None
+    if count is None or isinstance(value, bool):
+        raise error(f"{name} must be a whole number, not {value!r}")
+    if count < least:
+        raise error(f"{name} must be at least {least}, not {count}")
+    if count > most:
+        raise error(f"{name} must be at most {most}, not {count}")
+    return count
+
+
+Called = TypeVar("Called", bound=Callable[..., Any])
+MAX_SHOWN_LENGTH = 60
+MOST_ARGUMENTS = 2**31
+"""Position of arguments that only ``**named`` accepts."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArgumentType:
+    """Type check of an argument: its description after "must be", and a predicate."""
+
+    words: str
+    accepts: Callable[[Any], bool]
+
+
+def of(words: str, *types: type) -> ArgumentType:
+    """Return the check for an instance of one of the types; a type with ``REQUIRES_SIZES`` must be named itself."""
+
+    def accepts(value: Any) -> bool:
+        full = not hasattr(type(value), "REQUIRES_SIZES") or any(each in type(value).__mro__ for each in types)
+        return full and isinstance(value, types)
+
+    return ArgumentType(words, accepts)
+
+
+def several(words: str, *types: type) -> ArgumentType:
+    """Return the check for a list, a tuple or another sequence of such instances, except text."""
+    return ArgumentType(words, lambda value: _is_sequence(value) and all(isinstance(entry, types) for entry in value))
+
+
+def _is_sequence(value: Any) -> bool:
+    return isinstance(value, Sequence) and not isinstance(value, str | bytes)
+
+
+TEXT = of("text", str)
+FORMULA = ArgumentType(
+    "a formula as text, or a number",
+    lambda value: isinstance(value, str | numbers.Real) and not isinstance(value, bool),
+)
+TEXTS = several("a list of texts", str)
+NAMES = several("a list of names, as ['x', 'y']", str)
+SWITCH = of("True or False", bool, np.bool_)
+WHOLE = ArgumentType("a whole number", lambda value: hasattr(value, "__index__") and not isinstance(value, bool))
+REAL = of("a number", numbers.Real)
+PATH = of("a path", str, os.PathLike)
+MAPPING = ArgumentType(
+    "a mapping from names, as {'k': 2.0}",
+    lambda value: isinstance(value, Mapping) and all(isinstance(name, str) for name in value),
+)
+NUMBERS = ArgumentType("a list of numbers", lambda value: _is_sequence(value) or isinstance(value, np.ndarray))
+MAPPED = of("a mapping, as {x: 2.0}", Mapping)
+FORMULAS = ArgumentType("a list of formulas", lambda value: _is_sequence(value) or hasattr(value, "shape"))
+FUNCTION = ArgumentType("a function", callable)
+CANVAS = ArgumentType("Matplotlib axes", lambda value: hasattr(value, "plot") and hasattr(value, "figure"))
+
+
+def check_kind(kind: ArgumentType, value: Any, name: str, error: type[ScviCodegenError] = ArgumentError) -> None:
+    """Raise an error that names the argument if the value fails the check."""
+    if not kind.accepts(value):
+        shown = repr(value)
+        shown = shown if len(shown) <= MAX_SHOWN_LENGTH else f"{shown[:MAX_SHOWN_LENGTH]} .."
+        raise error(f"{name} must be {kind.words}, not {shown}")
+
+
+def checks_arguments(
+    error: type[ScviCodegenError] = ArgumentError, /, **kinds: ArgumentType
+) -> Callable[[Called], Called]:
+    """Check arguments by name at each call; an argument whose default is ``None`` may be ``None``.
+
+    >>> @checks_arguments(name=TEXT)
+    ... def greet(name):
+    ...     return f"hello {name}"
+    >>> greet(3)
+    Traceback (most recent call last):
+    scvi_codegen.errors.ArgumentError: name must be text, not 3
+
+    A keyword that the function does not have raises an error with a suggestion. A type that lacks features explains it
+    by its attribute ``REQUIRES_SIZES``.
+    """
+
+    def decorate(function: Called) -> Called:
+        parameters = signature(function).parameters
+        names = tuple(parameters)
+        known = dict.fromkeys(name for name in names if name not in ("self", "cls"))
+        open_ended = any(each.kind is Parameter.VAR_KEYWORD for each in parameters.values())
+        optional = {name for name in names if parameters[name].default is None}
+        positions = [
+            (names.index(name) if name in names else MOST_ARGUMENTS, name, kind) for name, kind in kinds.items()
+        ]
+
+        @functools.wraps(function)
+        def checked(*arguments: Any, **keywords: Any) -> Any:
+            if not (open_ended or keywords.keys() <= known.keys()):
+                name = next(name for name in keywords if name not in known)
+                raise ArgumentError(f"{function.__qualname__}() takes no {name!r}{keyword_hint(name, known)}")
+            for position, name, kind in positions:
+                if position < len(arguments) or name in keywords:
+                    value = arguments[position] if position < len(arguments) else keywords[name]
+                    if not (value is None and name in optional):
+                        reason = getattr(type(value), "REQUIRES_SIZES", "")
+                        if reason and not kind.accepts(value):
+                            raise error(f"{function.__qualname__}() is not available for {value!r:.60}: {reason}")
+                        check_kind(kind, value, name, error)
+            return function(*arguments, **keywords)
+
+        for of_a_cache in ("cache_clear", "cache_info"):
+            if hasattr(function, of_a_cache):
+                setattr(checked, of_a_cache, getattr(function, of_a_cache))
+        return cast(Called, checked)
+
+    return decorate

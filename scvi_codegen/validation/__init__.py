@@ -1,1 +1,0 @@
-"""Validation of arguments: types, integers and keywords, with errors that name the argument."""
