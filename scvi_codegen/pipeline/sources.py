@@ -247,7 +247,7 @@ def generate_source(
     source = render_embedded(program, embedded, control) if embedded else render(program, control)
     interface = describe(program, system, method, g=g)
     complete = with_events(source, interface, functions) if functions else source
-    return (complete.amalgamated() if amalgamate else complete), interface
+    return (complete.single_file() if amalgamate else complete), interface
 
 
 def _check_embedded(embedded: Embedded | None, solver: str, functions: Sequence[str]) -> None:

@@ -6,48 +6,57 @@ Not a C parser: it relies on the layout of the templates, where a declaration at
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
+
+from scvi_codegen.rendering.layout import CONTINUATION, WIDTH
 
 IGNORED = re.compile(r'/\*(?:[^*]|\*(?!/))*\*/|"(?:\\.|[^"\\])*"|^#(?:.*\\\n)*.*$', re.MULTILINE)
 MACRO = re.compile(r"^#define (?P<name>\w+)(?:\((?P<parameters>[^)]*)\))?(?P<body>(?:.*\\\n)*.*)$", re.MULTILINE)
 ATTRIBUTE = re.compile(r"__attribute__\(\((?:[^()]|\([^()]*\))*\)\)")
 FUNCTION = re.compile(r"[\w\s*]*?(\w+)\s*\(")
 DECLARED = re.compile(r"(\w+)\s*(?:\[[^=]*\])?\s*;?\s*$")
-SYSTEM_INCLUDE = re.compile(r"^#include <.*>$", re.MULTILINE)
-LEADING = re.compile(r"(?:/\*(?:[^*]|\*(?!/))*\*/\n|#include .*\n|\n)*")
-EXPORTED = re.compile(r"\b(?:NAME|FMI)\((\w+)\)")
+EXPORTED = re.compile(r"\b(NAME|STATUS)\((\w+)\)")
+PREFIXING = re.compile(r"^#define (NAME|STATUS)\(word\) (\w+)##word.*\n", re.MULTILINE)
+TOKEN = re.compile(r'/\*(?:[^*]|\*(?!/))*\*/|"(?:\\.|[^"\\])*"|#include .*|\bFMI\(\w+\)|\b[A-Za-z_]\w*')
+BREAK = re.compile(r'(?:[^" ]|"(?:\\.|[^"\\])*")+ ')
 
 
-def with_own_names(code: str, prefix: str) -> str:
-    """Return a source that prefixes its names at file scope, and leaves no macro defined.
+def with_own_names(code: str, prefix: str, header: str) -> str:
+    """Return a source whose macros and names at file scope begin with the prefix of the integrator.
 
     Args:
         code: of one file, without include guards.
-        prefix: of every exported C name.
+        prefix: of its own names; exported ones may have another, of the integrator that it belongs to.
+        header: included by the code; its names are retained.
     """
-    macros = dict.fromkeys(match["name"] for match in MACRO.finditer(code))
-    exported = set(EXPORTED.findall(code))
-    names = [name for name in dict.fromkeys(_names(code)) if name not in macros]
-    code = _with_leading_includes(code)
-    leading = LEADING.match(code)
-    start = leading.end() if leading else 0
-    renamed = "".join(f"#define {name} {prefix}_{'local_' * (name in exported)}{name}\n" for name in names)
-    undefined = "".join(f"#undef {name}\n" for name in (*macros, *names))
-    return (
-        f"{code[:start]}/* Names at file scope get the prefix of the integrator. */\n{renamed}\n{code[start:]}\n"
-        f"/* Other integrators may follow in the same translation unit. */\n{undefined}"
-    )
+    prefixes = dict(PREFIXING.findall(code))
+    code = EXPORTED.sub(lambda found: prefixes[found[1]] + found[2], PREFIXING.sub("", code))
+    taken = set(TOKEN.findall(header + code))
+    names = {}
+    for name in (*(match["name"] for match in MACRO.finditer(code)), *_names(code)):
+        if not name.lower().startswith(f"{prefix.lower()}_"):
+            own, local = (prefix.upper(), "LOCAL") if name.isupper() else (prefix, "local")
+            names[name] = f"{own}_{name}" if f"{own}_{name}" not in taken else f"{own}_{local}_{name}"
+    renamed = TOKEN.sub(lambda found: names.get(found[0], found[0]), code)
+    return "\n".join(_broken(renamed.split("\n")))
 
 
-def _with_leading_includes(code: str) -> str:
-    """Return the source with unconditional includes of system headers before everything else."""
-    depth, lines, moved = 0, list[str](), list[str]()
-    for line in code.split("\n"):
-        depth += line.startswith("#if") - line.startswith("#endif")
-        (moved if depth == 0 and SYSTEM_INCLUDE.fullmatch(line) else lines).append(line)
-    first = next(i for i, line in enumerate(lines) if line.startswith("#include"))
-    includes = [lines[first], *([""] if moved else []), *sorted(set(moved))]
-    return re.sub(r"\n{3,}", "\n\n", "\n".join([*lines[:first], *includes, *lines[first + 1 :]]))
+def _broken(lines: Sequence[str]) -> Iterator[str]:
+    """Yield lines, those that are too long broken between words of code or of its comment."""
+    for before, line in pairwise(["", *lines]):
+        indent = " " * (len(line) - len(line.lstrip()) + CONTINUATION)
+        end = " \\" if line.startswith("#") or before.endswith("\\") else ""
+        while len(line) > WIDTH:
+            words = BREAK.finditer(line.removesuffix(" */"))
+            ends = [match.end() for match in words if len(indent) < match.end() < WIDTH]
+            if not ends:
+                break
+            first, line = line[: ends[-1] - 1], line[ends[-1] :]
+            commented = first.rfind("/*") > first.rfind("*/")
+            yield first + ("" if commented else end)
+            line = f"{indent}{' * ' if commented else ''}{line}"
+        yield line
 
 
 def _names(code: str) -> Iterator[str]:
@@ -89,7 +98,8 @@ def _declarations(text: str) -> Iterator[str]:
 
 
 def _made(parameters: Iterable[str], made: Iterable[str], head: str) -> Iterator[str]:
-    """Yield the names of functions that a macro defines."""
+    """Yield the names of functions that a macro defines, and those parts of them that the macro contains."""
     arguments = dict(zip(parameters, re.split(r"[(),]", head)[1:], strict=False))
     for name in made:
+        yield from [part for part in name.split("##") if part not in arguments]
         yield "".join(arguments.get(part, part).strip() for part in name.split("##"))

@@ -157,7 +157,7 @@ def render_embedded(program: Program, precision: Embedded, control: Control | No
     target.check((*program.layout.defaults, *chain(*map(constants, _scalar_kernels(program, control)))))
     bound = f"{program.prefix.upper()}_MAX_ITERATIONS"
     bounded = {"embedded": True, "longest": MAX_ITERATIONS, "max_iterations": bound, "most_iterations": bound}
-    return _render(program.prefix, _context(program, target, control) | bounded).amalgamated()
+    return _render(program.prefix, _context(program, target, control) | bounded).single_file()
 
 
 def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") -> Source:

@@ -72,14 +72,18 @@ class Source:
         return (self, self.beside) if self.beside else (self,)
 
     def amalgamated(self) -> Source:
-        """Return the source as one file: support headers inserted, without alternatives that it does not use.
+        """Return the source as one file: support headers inserted, without alternatives that it does not use."""
+        code, _ = preprocessed(self.code, dict(self.support).__getitem__)
+        beside = self.beside.amalgamated() if self.beside else None
+        return replace(self, code=code, support=(), beside=beside)
+
+    def single_file(self) -> Source:
+        """Return the source as one file whose names have the integrator's prefix.
 
         Files of several integrators can be included in one translation unit.
         """
-        code, _ = preprocessed(self.code, dict(self.support).__getitem__)
-        code = with_own_names(code, self.prefix)
-        beside = self.beside.amalgamated() if self.beside else None
-        return replace(self, code=code, support=(), beside=beside)
+        code = with_own_names(self.amalgamated().code, self.prefix, self.header)
+        return replace(self, code=code, support=(), beside=self.beside.single_file() if self.beside else None)
 
     def to_record(self) -> dict[str, Any]:
         """Return plain data, contents line by line, for :meth:`from_record`."""
@@ -141,8 +145,8 @@ def check_interface(source: Source, interface: Interface) -> None:
     for name, size in sizes.items():
         _compare(name, size, re.search(rf"^#define {source.prefix.upper()}_{name} (\d+)$", source.header, re.MULTILINE))
     for name, size in {"MAPS": len(interface.map_names), "CONSTRAINTS": len(interface.constraints)}.items():
-        _compare(name, size, re.search(rf"^  {name} = (\d+),", source.code, re.MULTILINE))
-    sums = re.search(r"^  SUMS = (\d+),", source.code, re.MULTILINE)
+        _compare(name, size, re.search(rf"^  (?:\w+_)?{name} = (\d+),", source.code, re.MULTILINE))
+    sums = re.search(r"^  (?:\w+_)?SUMS = (\d+),", source.code, re.MULTILINE)
     if interface.exchange_names and sums:
         _compare("SUMS", len(interface.exchange_names), sums)
     lengths: dict[str, tuple[object, object]] = {"prefix": (interface.prefix, source.prefix)}

@@ -43,7 +43,7 @@ def output_of(program: str, folder: Path, *flags: str) -> str:
 
 def written(source: Source, folder: Path) -> str:
     """Return the source as one file with its header, and its prefix."""
-    alone = source.amalgamated()
+    alone = source.single_file()
     (folder / f"{alone.prefix}.h").write_text(alone.header)
     (folder / f"{alone.prefix}.c").write_text(alone.code)
     return alone.prefix
@@ -114,7 +114,7 @@ def test_intervals_are_split_only_where_a_root_is_uncertain(tmp_path):
     assert extra is not None
     written(stepper.source, tmp_path)
     prefix = written(extra, tmp_path)
-    degree = f"#define EVENT_DEGREE {prefix}_EVENT_DEGREE"  # names at file scope have the prefix
+    degree = f"#define EVENT_DEGREE {prefix.upper()}_EVENT_DEGREE"  # names at file scope have the prefix
     program = f'#include <stdio.h>\n#include "{prefix}.c"\n{degree}\n{DOUBT.format(prefix=prefix)}'
     flags = ("-Wno-unused-function", f"{stepper.source.prefix}.c")
     found = [float(place) for place in output_of(program, tmp_path, *flags).split()]

@@ -58,7 +58,7 @@ int main(void)
 
 
 def written(source: Source, folder: Path) -> None:
-    for name, text in source.amalgamated().files.items():
+    for name, text in source.single_file().files.items():
         (folder / name).write_text(text)
 
 

@@ -145,7 +145,7 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
         time_transformation=model.time_transformation,
     )
     if single_file:
-        source = source.amalgamated()
+        source = source.single_file()
     texts = source.files
     texts |= render_example(interface, example_of(model, controlled=ADVANCE_TO in source.header), embedded or "double")
     described = model_texts(model)
@@ -170,7 +170,7 @@ def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, si
     source, interface = generate_array_source(model.array_system, model.method, solver=model.solver, prefix=prefix)
     example, arrays = array_example_of(model, interface)
     lines = {f"{name}.txt": "".join(f"{x!r}\n" for x in each.reshape(-1).tolist()) for name, each in arrays.items()}
-    source = source.amalgamated() if single_file else source
+    source = source.single_file() if single_file else source
     texts = {**source.files, **render_example(interface, example), **lines}
     if described := model_texts(model):
         texts |= {**described, "__init__.py": package_template("__init__.py")}
