@@ -30,7 +30,7 @@ _HOMES = {
     "frameworks.rebound": ("GravitatingBodies", "from_rebound", "to_rebound"),
     "files.cache": ("CacheInfo", "cache_info", "clear_cache"),
     "compiler": ("compile_stepper",),
-    "pipeline.sources": ("generate_source",),
+    "pipeline": ("generate_source",),
     "runtime.ensemble.result": ("EnsembleTrajectory",),
     "exact.discrete_lagrangian": ("ExactStep", "exact_discrete_lagrangian", "exact_map"),
     "runtime.chaos.indicators": ("ChaosIndicators",),

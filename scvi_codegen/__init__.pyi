@@ -92,7 +92,7 @@ from scvi_codegen.pictures.overview import plot_trajectory as plot_trajectory
 from scvi_codegen.pictures.paths import plot_motion as plot_motion
 from scvi_codegen.pictures.paths import plot_phase as plot_phase
 from scvi_codegen.pictures.section import plot_section as plot_section
-from scvi_codegen.pipeline.sources import generate_source as generate_source
+from scvi_codegen.pipeline import generate_source as generate_source
 from scvi_codegen.results.recording import RecordedRun as RecordedRun
 from scvi_codegen.results.recording import load_run as load_run
 from scvi_codegen.results.recording import record_run as record_run

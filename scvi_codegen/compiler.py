@@ -1,14 +1,14 @@
 """Compilation: from a mechanical system and a method to a stepper.
 
     MechanicalSystem, Method
-      -> Sources   header, source and interface, derived once (:mod:`scvi_codegen.pipeline.sources`) and cached
+      -> Sources   header, source and interface, derived once (:mod:`scvi_codegen.pipeline`) and cached
       -> build     library, compiled once (:mod:`scvi_codegen.native.building`); Newton's iteration is
                    added when a fixed point first fails (:mod:`scvi_codegen.rendering.kernels.simd`)
       -> Stepper   step, integrate (:mod:`scvi_codegen.runtime.core.stepper`)
 
 Each stage is a pure function of frozen data; only ``build`` touches the disk. Sources and compiled libraries are
 cached in the user's cache folder (:mod:`scvi_codegen.files.cache`). If everything is in the cache, including the
-key of a system defined by text (:mod:`scvi_codegen.mechanics.deferred`), neither SymPy nor the pipeline is imported.
+key of a system defined by text (:mod:`scvi_codegen.mechanics.system`), neither SymPy nor the pipeline is imported.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from scvi_codegen.mechanics.arrays.system import ArraySystem
     from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
-    from scvi_codegen.pipeline.sources import ArraySources, Sources
+    from scvi_codegen.pipeline import ArraySources, Sources
     from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 
 SYSTEM_OR_ARRAYS = ArgumentType(
@@ -173,7 +173,7 @@ class CachedSources:
     @cached_property
     def derived(self) -> Sources | ArraySources:
         """The sources that are not in the cache."""
-        from scvi_codegen.pipeline.sources import sources_of
+        from scvi_codegen.pipeline import sources_of
 
         return sources_of(self.system, self.method, self.solver, self.prefix, self.symmetries, self.g)
 

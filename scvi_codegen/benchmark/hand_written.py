@@ -19,7 +19,7 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.native import building
-from scvi_codegen.pipeline.sources import generate_source
+from scvi_codegen.pipeline import generate_source
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings

@@ -7,9 +7,8 @@ from collections.abc import Iterator, Sequence
 from sympy import Expr, latex
 
 from scvi_codegen.formulas.array_latex import latex_entry, latex_sums
-from scvi_codegen.ir.equations import ConstrainedSteps
-from scvi_codegen.ir.iteration import FixedPointIteration, Splitting
-from scvi_codegen.ir.numbers import Number
+from scvi_codegen.ir.equations import ConstrainedSteps, FixedPointIteration, Splitting
+from scvi_codegen.ir.kernel import Number
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.mechanics.arrays.symmetry import momentum_maps

@@ -1,4 +1,4 @@
-r"""Names of coordinates, velocities, momenta and parameters: validation, and conversion to canonical symbols.
+r"""Names of coordinates, velocities, momenta, parameters and inputs: validation, conversion to canonical symbols.
 
 Every symbol is ``Symbol(name, real=True)`` with a plain identifier as name: coordinate ``q`` has the velocity
 ``q_dot``, time is ``t``. Names chosen by the user are converted as follows.
@@ -6,6 +6,14 @@ Every symbol is ``Symbol(name, real=True)`` with a plain identifier as name: coo
 * ``\theta_1``, ``\theta_{1}`` and ``θ_1`` become ``theta_1``; spaces become underscores.
 * Rejected, with the name: invalid identifiers after this conversion, keywords of C, functions and constants of the
   grammar, ``t`` for anything but time, ``q_dot`` for anything but the velocity of ``q``, two symbols of equal names.
+
+**Inputs** are functions of time passed to runs as data, such as a motor force or a measured ground motion. Between two
+breakpoints an input u is a cubic of the time since the first of them,
+
+    u(t) = u_0 + u_1 s + u_2 s^2 + u_3 s^3,        s = t - u_t,
+
+with five parameters of the system. A run updates them at the breakpoints, which are ends of steps: other data need no
+recompilation, every method and solver supports them, and no step contains a breakpoint, so orders are preserved.
 """
 
 from __future__ import annotations
@@ -13,13 +21,13 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.errors import SystemDefinitionError
 
 if TYPE_CHECKING:
-    from sympy import Symbol
+    from sympy import Basic, Expr, Symbol
 
 C_KEYWORDS = frozenset(
     """
@@ -115,3 +123,47 @@ def check_names(coordinates: Sequence[str], parameters: Sequence[str], momenta: 
             hint = " (a coordinate is used as a parameter: take it out of the parameters)" if shadowed else ""
             raise SystemDefinitionError(f"'{name}' is the name of both {roles[name]} and {role}: rename one{hint}")
         roles[name] = role
+
+
+PARTS = ("0", "1", "2", "3", "t")
+"""Suffixes of the five parameters of an input: coefficients by power, and the breakpoint."""
+
+
+def input_parameters(inputs: Sequence[str]) -> dict[str, float]:
+    """Return the parameters of all inputs, with default value 0."""
+    for name in inputs:
+        check_name(name)
+    return {f"{name}_{part}": 0.0 for name in inputs for part in PARTS}
+
+
+def with_inputs(parameters: Mapping[str, float], inputs: Sequence[str]) -> dict[str, float]:
+    """Return the default values of parameters, including those of inputs.
+
+    Raises:
+        SystemDefinitionError: if a parameter has the name of an input's parameter.
+    """
+    parts = input_parameters(inputs)
+    for name in parameters:
+        if name in parts:
+            raise SystemDefinitionError(
+                f"'{name}' is the name of both a parameter and a component of the input '{name[:-2]}': rename one"
+            )
+    return {**parameters, **parts}
+
+
+def input_formulas(inputs: Sequence[str], time: Symbol) -> Mapping[Symbol, Expr]:
+    """Return the cubic polynomial of each input, by its symbol."""
+    formulas: dict[Symbol, Expr] = {}
+    for name in inputs:
+        c0, c1, c2, c3, start = (symbol(f"{name}_{part}") for part in PARTS)
+        s = time - start
+        formulas[symbol(name)] = c0 + s * (c1 + s * (c2 + s * c3))
+    return formulas
+
+
+def inputs_by_name(formula: Expr, inputs: Sequence[str]) -> Expr:
+    """Return a formula with each input's polynomial replaced by its symbol (coefficient 0; others set to 0)."""
+    from sympy import Integer
+
+    rules: dict[Basic, Basic] = {symbol(part): Integer(0) for part in input_parameters(inputs)}
+    return formula.xreplace(rules | {symbol(f"{name}_0"): symbol(name) for name in inputs})

@@ -21,12 +21,11 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.errors import ArgumentError, MethodError
 from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.formulas.inputs import PARTS, input_parameters
-from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.formulas.symbols import PARTS, input_parameters, symbol
 from scvi_codegen.formulas.vocabulary import CONSTANTS, FUNCTIONS
 from scvi_codegen.frameworks.flow import imported
-from scvi_codegen.mechanics.constraints import constraint_rates, holonomic_expressions
 from scvi_codegen.mechanics.derived_expressions import forms_of
+from scvi_codegen.mechanics.forces import constraint_rates, holonomic_expressions
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretise

@@ -23,8 +23,7 @@ from fractions import Fraction
 import sympy
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
-from scvi_codegen.ir.numbers import exact_number
+from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation, exact_number
 
 FUNCTIONS = {
     sympy.sin: "sin",

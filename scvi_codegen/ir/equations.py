@@ -1,4 +1,4 @@
-"""Stage equations of a step: stage groups in loops, constraints, and the data of RATTLE.
+"""Stage equations and iterations of a step as data: stage groups in loops, constraints, RATTLE, adaptive step sizes.
 
 A stage group consists of points with the same kernel, and loops that gather its arguments and scatter its results.
 Unknowns and rows are located at *sites*: the m coordinates, then the components of blocks of another size
@@ -7,10 +7,12 @@ Unknowns and rows are located at *sites*: the m coordinates, then the components
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from enum import Enum, auto
+from typing import Literal, TypeAlias
 
-from scvi_codegen.ir.kernel import Kernel, LoopedKernel
-from scvi_codegen.ir.numbers import Number, NumberTable
+from scvi_codegen.ir.kernel import Kernel, LoopedKernel, Number, NumberTable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -157,3 +159,215 @@ class ConstrainedSteps:
     conditions: tuple[LoopedKernel, ...]
     curvatures: tuple[LoopedKernel, ...]
     parts: tuple[Number, ...]
+
+
+IterationName: TypeAlias = Literal["separable", "Hamiltonian", "coupled", "collocation", "shooting"]
+
+
+class StoredValues(Enum):
+    """Values at the points of a step that are stored for the predictor and the error estimate of the curve."""
+
+    FORCES = auto()
+    VELOCITIES = auto()
+    ACCELERATIONS = auto()
+
+
+@dataclass(frozen=True, slots=True)
+class IterationTable:
+    """A table by its name in C: one number per point, or rows of them; double-double if necessary."""
+
+    name: str
+    numbers: tuple[Number, ...] | NumberTable
+    in_two_parts: bool = False
+
+    @property
+    def is_matrix(self) -> bool:
+        """True if it has rows."""
+        return isinstance(self.numbers[0], tuple)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PredictorTables:
+    """(lanes, lanes) predictor tables for values at the points: ``last_alone``, or ``last`` and ``before``.
+
+    Attributes:
+        abscissae: of the stored values on a step, without padding.
+        degree, highest, next: (lanes,) weights of the leading Legendre coefficient of the curve through them, and of
+            the next lower one; zeros if there is none.
+    """
+
+    abscissae: tuple[Number, ...]
+    degree: int
+    highest: tuple[Number, ...]
+    next: tuple[Number, ...]
+    last_alone: NumberTable
+    last: NumberTable
+    before: NumberTable
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FixedPointIteration:
+    """Fixed-point iteration whose kernels are evaluated at points on SIMD lanes: data, from which C is rendered.
+
+    Attributes:
+        name: of the equations: separable, Hamiltonian, coupled, collocation or shooting.
+        points: real points; lanes beyond repeat the last one and have weight 0.
+        lanes: a power of two, the number of points or more.
+        own_tables: padded to ``lanes``, in the order in which they are printed, without those of the predictor.
+        guess: predictor of the stored values.
+        kernels: evaluated on SIMD lanes.
+        forces: names of the kernels whose first values are the forces L_q, if these enter nowhere else.
+        kept: values at the points of a step.
+        stored: number of doubles kept from step to step per coordinate.
+        parts: support headers of its C, in order, after those of the meaning of a lane.
+        macros: names and values of macros that these require.
+        mass_entries: (i, j), i >= j, of the derivatives of the kernel that computes the mass, if any.
+        constant_mass: kernel of the masses if they are constant and diagonal.
+        damping: kernel of the rate of a uniform damping, a function of the parameters, if there is one.
+        predictor_matrix: table between the stored values and the predicted ones; empty if they are the same.
+        derivatives_part: support header of tangent and adjoint vectors by fixed-point iteration; ``""`` without one.
+        serves_many: whether lanes may be trajectories.
+        final_iterations: number of iterations after the one that converges.
+        in_groups: whether its C supports several vectors for the points of a step, besides one.
+    """
+
+    name: IterationName
+    points: int
+    lanes: int
+    own_tables: tuple[IterationTable, ...]
+    guess: PredictorTables
+    kernels: tuple[Kernel, ...]
+    forces: tuple[str, ...] = ()
+    kept: StoredValues
+    stored: int
+    parts: tuple[str, ...]
+    macros: tuple[tuple[str, int], ...] = ()
+    mass_entries: tuple[tuple[int, int], ...] = ()
+    constant_mass: Kernel | None = None
+    damping: Kernel | None = None
+    predictor_matrix: NumberTable = ()
+    derivatives_part: str = ""
+    serves_many: bool = False
+    final_iterations: int = 0
+    in_groups: bool = True
+
+    @property
+    def tables(self) -> Iterator[IterationTable]:
+        """All tables, in the order in which they are printed: those of the predictor last."""
+        yield from self.own_tables
+        for name in ("last_alone", "last", "before"):
+            yield IterationTable(name.upper(), getattr(self.guess, name))
+
+    @property
+    def derivatives_tables(self) -> tuple[IterationTable, ...]:
+        """Tables of tangent and adjoint vectors: positions from forces, or from velocities and momenta from forces."""
+        if self.name == "separable":
+            return (IterationTable("PRODUCT_BACK", transposed(self.numbers("PRODUCT"), self.points)),)
+        changes = {}
+        for name in ("POSITION", "MOMENTUM"):
+            (weights,) = self.numbers(f"{name}_WEIGHT")
+            rows = self.numbers(name)
+            changes[name] = tuple(tuple(x * w for x, w in zip(row, weights, strict=True)) for row in rows)
+        return (
+            *(IterationTable(f"CHANGE_{name}", table) for name, table in changes.items()),
+            *(IterationTable(f"CHANGE_{name}_BACK", transposed(table, self.points)) for name, table in changes.items()),
+        )
+
+    def numbers(self, name: str) -> NumberTable:
+        """Return the numbers of a table, those of a vector as the only row."""
+        table = next(each for each in self.own_tables if each.name == name)
+        return table.numbers if table.is_matrix else (table.numbers,)
+
+    def with_forces(self, forces: tuple[LoopedKernel, ...]) -> FixedPointIteration | None:
+        """Return the iteration with further forces L_q of positions; ``None`` if these also enter otherwise."""
+        added = (each.with_sums(forces) if each.name in self.forces else each for each in self.kernels)
+        return replace(self, kernels=tuple(added)) if self.forces else None
+
+    @property
+    def error_power(self) -> int:
+        """Exponent of h in the squared leading displacement over that of the curvature (all but a mean velocity)."""
+        return 2 * self.guess.degree + (0 if self.kept is StoredValues.VELOCITIES else 2)
+
+    @property
+    def diagonal(self) -> bool:
+        """True if the mass matrix is diagonal."""
+        return all(i == j for i, j in self.mass_entries)
+
+    @property
+    def facts(self) -> Mapping[str, int]:
+        """Macros that its support headers require, DIAGONAL_MASS among them if the mass matrix is diagonal."""
+        return {**dict(self.macros), **({"DIAGONAL_MASS": 1} if self.mass_entries and self.diagonal else {})}
+
+
+def transposed(table: NumberTable, points: int) -> NumberTable:
+    """Return the transpose of a padded table; lanes beyond the points remain 0."""
+    padding = (0,) * (len(table) - points)
+    columns = tuple(zip(*table[:points], strict=True))[:points]
+    return (*((*column, *padding) for column in columns), *((0,) * len(table) for _ in padding))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Splitting:
+    """An explicit step: kick 0, drift 0, kick 1, drift 1, .., without those of weight 0.
+
+    Attributes:
+        kicks: (n,) p += h kicks[n] L_q.
+        drifts: (n,) q += h drifts[n] v.
+        abscissae: (n,) c_n of the kicks.
+        force: L_q at (q, t).
+        drift: the constant diagonal of M (no arguments), v = M^-1 p, or v = H_p at p.
+        by_masses: True for M^-1 p.
+    """
+
+    kicks: tuple[Number, ...]
+    drifts: tuple[Number, ...]
+    abscissae: tuple[Number, ...]
+    force: Kernel
+    drift: Kernel
+    by_masses: bool
+
+    @property
+    def kernels(self) -> tuple[Kernel, ...]:
+        """Kernels of kicks and drifts."""
+        return (self.force, self.drift)
+
+    @property
+    def acts(self) -> bool:
+        """True if it has a discrete Lagrangian in closed form: a single drift, whose velocity is (q1 - q0) / h."""
+        return self.by_masses and sum(x != 0 for x in self.drifts) == 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Control:
+    """Adaptive steps with sizes h = 2^(k / levels), by fixed-point iteration or Newton's method; or a step density.
+
+    Attributes:
+        mantissas: 2^(k / levels) for the levels of an octave.
+        predictor: predictor of the fixed-point iteration, ``None`` without one.
+        stage_growth: factor of the error estimate per level for Newton's method; 0 if there is no estimate.
+        density: 1/g and -d(log g)/dt at (q, v), or (q, p) of a Hamiltonian, of a time transformation g; instead of the
+            predictor.
+    """
+
+    mantissas: tuple[float, ...] = ()
+    predictor: AdaptivePredictor | None = None
+    stage_growth: float = 0.0
+    density: Kernel | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AdaptivePredictor:
+    """Predictor tables of the fixed-point iteration for varying step sizes, and the growth of the error estimate.
+
+    Attributes:
+        reach: largest change of level between successive steps.
+        alone: by the change into the next step, -reach .. reach: from the last step to the next.
+        last, before: by the changes into the last step and into the next: from these two steps.
+        growth: factor of the error estimate per level.
+    """
+
+    reach: int
+    alone: tuple[NumberTable, ...]
+    last: tuple[tuple[NumberTable, ...], ...]
+    before: tuple[tuple[NumberTable, ...], ...]
+    growth: float

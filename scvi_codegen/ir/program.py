@@ -12,10 +12,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from scvi_codegen.indices import Array, ArrayDeclarations
-from scvi_codegen.ir.equations import ConstrainedSteps, Constraints, LoweredStageGroup, Rattle
-from scvi_codegen.ir.iteration import FixedPointIteration, Splitting
-from scvi_codegen.ir.kernel import Kernel, LoopedKernel
-from scvi_codegen.ir.numbers import Number, NumberTable
+from scvi_codegen.ir.equations import (
+    ConstrainedSteps,
+    Constraints,
+    FixedPointIteration,
+    LoweredStageGroup,
+    Rattle,
+    Splitting,
+)
+from scvi_codegen.ir.kernel import Kernel, LoopedKernel, Number, NumberTable
 
 LEAST_REUSED_UNKNOWNS = 32
 """Number of unknowns from which on factors of the Newton matrix are reused in later steps.

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from scvi_codegen.errors import MethodError, ScviCodegenError
-from scvi_codegen.ir.equations import ConstrainedSteps
-from scvi_codegen.ir.iteration import FixedPointIteration, Splitting
+from scvi_codegen.ir.equations import ConstrainedSteps, FixedPointIteration, Splitting
 from scvi_codegen.ir.program import LoopedTerms
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem

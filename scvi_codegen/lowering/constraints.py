@@ -34,8 +34,7 @@ from sympy import Symbol
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.equations import ConstrainedSteps, Constraints, Rattle
-from scvi_codegen.ir.kernel import LoopedKernel
-from scvi_codegen.ir.numbers import lower_matrix, lower_vector
+from scvi_codegen.ir.kernel import LoopedKernel, lower_matrix, lower_vector
 from scvi_codegen.lowering.kernels import looped_kernel, system_kernel
 from scvi_codegen.lowering.solvers.tables import velocity_tables
 from scvi_codegen.mechanics.arrays.system import ArraySystem
@@ -45,14 +44,14 @@ from scvi_codegen.mechanics.arrays.terms import (
     constraint_text,
     entries_of,
 )
-from scvi_codegen.mechanics.constraints import (
+from scvi_codegen.mechanics.derived_expressions import forms_of
+from scvi_codegen.mechanics.forces import (
     constraint_jacobian,
     constraint_rates,
     holonomic_expressions,
     nonholonomic_expressions,
     time_derivatives,
 )
-from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_structure import Velocities

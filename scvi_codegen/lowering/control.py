@@ -20,8 +20,8 @@ import sympy
 from sympy import Expr
 
 from scvi_codegen.formulas.expressions import gradient
-from scvi_codegen.ir.iteration import AdaptivePredictor, Control, FixedPointIteration, StoredValues
-from scvi_codegen.ir.numbers import Number, NumberTable
+from scvi_codegen.ir.equations import AdaptivePredictor, Control, FixedPointIteration, StoredValues
+from scvi_codegen.ir.kernel import Number, NumberTable
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.tables import DEGREE_OF_ONE, DEGREE_OF_TWO, INTERPOLATED

@@ -12,7 +12,7 @@ from sympy import Add, Expr, Mul, S, Symbol
 
 from scvi_codegen.formulas.expressions import gradient, jacobian
 from scvi_codegen.ir.derivatives import Derivatives, InputDerivatives, PointDerivatives, TimeDerivatives
-from scvi_codegen.ir.iteration import FixedPointIteration
+from scvi_codegen.ir.equations import FixedPointIteration
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.kernels import system_kernel

@@ -14,8 +14,7 @@ from scvi_codegen.formulas.expressions import gradient
 from scvi_codegen.indices import Access, Array
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.equations import ConstrainedSteps
-from scvi_codegen.ir.kernel import Constant, Load, LoopedKernel
-from scvi_codegen.ir.numbers import exact_number
+from scvi_codegen.ir.kernel import Constant, Load, LoopedKernel, exact_number
 from scvi_codegen.ir.program import LoopedTerms, Program
 from scvi_codegen.lowering.kernels import looped_kernel
 from scvi_codegen.mechanics.arrays.system import ArraySystem

@@ -11,8 +11,7 @@ from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.indices import Array
 from scvi_codegen.ir.equations import LoweredStageGroup
-from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.numbers import lower_matrix, lower_vector
+from scvi_codegen.ir.kernel import Kernel, lower_matrix, lower_vector
 from scvi_codegen.ir.program import (
     FEW_UNKNOWNS,
     Integrals,

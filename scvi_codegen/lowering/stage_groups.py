@@ -17,8 +17,7 @@ import sympy
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.expressions import evaluate, jacobian
 from scvi_codegen.ir.equations import DerivativeBlock, GatherLoop, LoweredStageGroup, ScatterLoop
-from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.numbers import lower_matrix, lower_vector
+from scvi_codegen.ir.kernel import Kernel, lower_matrix, lower_vector
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, curve_rates, multipliers
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem

@@ -6,16 +6,15 @@ import random
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from functools import reduce
 
+import numpy as np
 import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
-from scvi_codegen.formulas.expressions import Tape, hessian, unsupported_part
-from scvi_codegen.formulas.inputs import PARTS
-from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
-from scvi_codegen.mechanics.constraints import check_constraints
-from scvi_codegen.mechanics.forces import check_damping
-from scvi_codegen.mechanics.regularity import null_direction, singular_part
+from scvi_codegen.formulas.expressions import Tape, hessian, jacobian, unsupported_part
+from scvi_codegen.formulas.symbols import DOT, PARTS, TIME, check_names, number, symbol
+from scvi_codegen.mechanics.derived_expressions import null_direction, row_rank, sample_points, singular_part
+from scvi_codegen.mechanics.forces import check_damping, constraint_jacobian
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Number, mp
 
@@ -160,7 +159,7 @@ def check_lagrangian(system: MechanicalSystem) -> None:
     _check_velocities(system)
     _check_mass_matrix(system)
     if system.constraints:
-        check_constraints(system)
+        _check_constraints(system)
 
 
 def _check_velocities(system: MechanicalSystem) -> None:
@@ -219,3 +218,51 @@ def _degenerate_message(system: MechanicalSystem, velocities: Sequence[Symbol], 
         f"{REQUIRED} Add the missing term, such as m*{velocities[0]}**2/2{hint if multiplies else ''}; if {names[0]} "
         "is a known function of time, make it an input or write the function out"
     )
+
+
+def _check_constraints(system: MechanicalSystem) -> None:
+    """Raise :class:`SystemDefinitionError` for constraints that are dependent or nonlinear in velocities."""
+    names = list(map(system.text_of, system.constraints))
+    for name, g in zip(names, system.constraints, strict=True):
+        if g.free_symbols.isdisjoint((*system.coordinates, *system.velocities)):
+            raise SystemDefinitionError(
+                f"the constraint '{name}' contains no coordinate: constraints are g(q, t) = 0, or A(q, t) "
+                "v + b(q, t) = 0. Remove it, or write the condition in terms of the coordinates"
+            )
+    for k, i in jacobian(list(constraint_jacobian(system).values()), system.velocities):
+        name = names[list(constraint_jacobian(system))[k][0]]
+        raise SystemDefinitionError(
+            f"the constraint '{name}' is not linear in the velocity {system.velocities[i]}: "
+            "constraints must have the form g(q, t) = 0, or A(q, t) v + b(q, t) = 0"
+        )
+    if len(names) >= system.dimension:
+        raise SystemDefinitionError(
+            f"{len(names)} constraints on {system.dimension} coordinates of '{system.name}' leave no degree of "
+            "freedom: the constraints alone determine the motion (a fully driven or overconstrained mechanism), and "
+            "there is nothing to integrate. Fewer independent constraints than coordinates are required. Leave out "
+            "redundant constraints; of a driven joint, replace the prescribed motion by a force or torque (an input "
+            "can carry it)"
+        )
+    if dependent := _dependent(system):
+        raise SystemDefinitionError(
+            f"the constraint '{names[dependent]}' is redundant: it depends on the constraints before it. Remove it"
+        )
+
+
+def _dependent(system: MechanicalSystem) -> int:
+    """Return the index of the first constraint dependent on earlier ones at every sampled point, or 0."""
+    derivatives, count = constraint_jacobian(system), len(system.constraints)
+    tape, first = None, 0
+    for point in sample_points(system.coordinates, (system.time,), system.constants):
+        tape = tape or Tape(list(derivatives.values()), list(point))
+        try:
+            values = tape(list(point.values()))
+        except ArithmeticError:
+            continue
+        matrix = np.zeros((count, system.dimension))
+        for (i, j), value in zip(derivatives, values, strict=True):
+            matrix[i, j] = float(value)
+        if row_rank(matrix) == count:
+            return 0
+        first = max(first, next(k for k in range(count) if row_rank(matrix[: k + 1]) <= k))
+    return first

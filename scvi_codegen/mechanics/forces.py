@@ -1,6 +1,7 @@
-"""Forces and damping: generalised forces per coordinate or by Rayleigh's function, and damping of all momenta.
+"""Forces, damping and constraints of a system.
 
-With forces f the equations of motion follow from the principle of Lagrange and d'Alembert,
+**Forces** are given by coordinate or by Rayleigh's function. The equations of motion with generalised forces f follow
+from the principle of Lagrange and d'Alembert,
 
     delta int L dt + int f . delta q dt = 0,      that is      d/dt L_v = L_q + f.
 
@@ -25,19 +26,31 @@ unchanged, and the map contracts areas and momentum maps of L by e^(-gamma h), b
 
 Sources: P. Caldirola, Nuovo Cimento 18 (1941); E. Kanai, Prog. Theor. Phys. 3 (1948); R. McLachlan, M. Perlmutter,
 Conformal Hamiltonian systems, J. Geom. Phys. 39 (2001); J. E. Marsden, M. West, Acta Numerica 10 (2001), section 1.3.
+
+**Constraints** are holonomic, g(q, t) = 0 (rods, joints, loops), or nonholonomic, A v + b = 0 (rolling, skates).
+They enter the equations of motion with Lagrange multipliers lambda; constraint forces do no virtual work,
+
+    d/dt L_v = L_q + f + G^T lambda,        g = 0 with G = g_q,        or A(q, t) v + b(q, t) = 0 with G = A
+
+(holonomic; nonholonomic by the principle of Lagrange and d'Alembert). Both imply a velocity constraint G v = ..; for
+holonomic constraints it is the hidden constraint g_q v + g_t = 0. The index is not reduced: methods impose g itself at
+the points of a step (:mod:`scvi_codegen.methods.constraints`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError, closest
-from scvi_codegen.formulas.expressions import gradient
+from scvi_codegen.formulas.expressions import gradient, jacobian
 from scvi_codegen.formulas.symbols import name_of_key
+
+if TYPE_CHECKING:
+    from scvi_codegen.mechanics.system import MechanicalSystem
 
 
 def forces_by_coordinate(
@@ -90,3 +103,69 @@ def check_damping(name: str, damping: Expr, parameters: Sequence[Symbol]) -> Non
             "momenta, a number or a formula of parameters. Write damping that varies, or differs "
             "between momenta, as forces"
         )
+
+
+def constraints_of(constraints: Iterable[Any] | None, read: Callable[[Any], Expr]) -> tuple[Expr, ...]:
+    """Return g of each formula; an equation, ``left = right`` or SymPy's ``Eq``, becomes left - right."""
+    expressions = []
+    for formula in constraints or ():
+        equation = [formula.lhs, formula.rhs] if isinstance(formula, sympy.Eq) else [formula]
+        sides = formula.split("=") if isinstance(formula, str) else equation
+        if len(sides) > 2:
+            raise SystemDefinitionError(
+                f"the constraint '{formula}' has more than one '=': write one equation per constraint"
+            )
+        expressions.append(read(sides[0]) - read(sides[1]) if len(sides) == 2 else read(formula))
+    return tuple(expressions)
+
+
+def constraint_multipliers(system: MechanicalSystem) -> tuple[Symbol, ...]:
+    """Return the symbols of the Lagrange multipliers lambda, one per constraint."""
+    return tuple(sympy.Symbol(f"lambda_{k}", real=True) for k in range(1, len(system.constraints) + 1))
+
+
+def holonomic(system: MechanicalSystem, g: Expr) -> bool:
+    """Return whether the constraint ``g`` contains no velocities."""
+    return not g.free_symbols & set(system.velocities)
+
+
+def holonomic_expressions(system: MechanicalSystem) -> tuple[Expr, ...]:
+    """Return g of each holonomic constraint, and 0 for each nonholonomic one."""
+    return tuple(g if holonomic(system, g) else sympy.S.Zero for g in system.constraints)
+
+
+def nonholonomic_expressions(system: MechanicalSystem) -> tuple[Expr, ...]:
+    """Return A v + b of each nonholonomic constraint, and 0 for each holonomic one."""
+    return tuple(sympy.S.Zero if holonomic(system, g) else g for g in system.constraints)
+
+
+def constraint_rates(system: MechanicalSystem) -> tuple[Expr, ...]:
+    """Return the velocity form of each constraint: g_q v + g_t, or A v + b."""
+    return tuple(
+        map(sympy.Add, time_derivatives(system, holonomic_expressions(system)), nonholonomic_expressions(system))
+    )
+
+
+def constraint_jacobian(system: MechanicalSystem) -> dict[tuple[int, int], Expr]:
+    """Return the non-zero entries of the constraint Jacobian G by (constraint, coordinate)."""
+    return jacobian(constraint_rates(system), system.velocities)
+
+
+def time_derivatives(system: MechanicalSystem, functions: Sequence[Expr]) -> tuple[Expr, ...]:
+    """Return d/dt of functions of (q, t) along a trajectory, as expressions in (q, v, t); v is held constant."""
+    rates = dict(zip(system.coordinates, system.velocities, strict=True)) | {system.time: sympy.S.One}
+    variables = tuple(rates)
+    results = []
+    for function in functions:
+        derivatives = gradient(function, variables)
+        results.append(sympy.Add(*(derivative * rates[variables[j]] for j, derivative in derivatives.items())))
+    return tuple(results)
+
+
+def with_constraint_forces(system: MechanicalSystem, forces: Sequence[Expr]) -> tuple[Expr, ...]:
+    """Return the forces plus the constraint forces G^T lambda, m expressions."""
+    terms: list[list[Expr]] = [[force] for force in forces]
+    factors = constraint_multipliers(system)
+    for (k, i), derivative in constraint_jacobian(system).items():
+        terms[i].append(derivative * factors[k])
+    return tuple(sympy.Add(*row) for row in terms)

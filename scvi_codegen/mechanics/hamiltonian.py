@@ -120,7 +120,7 @@ class HamiltonianSystem(MechanicalSystem):
                 (:mod:`scvi_codegen.mechanics.forces`).
             constraints: must be empty; :func:`lagrangian_of` accepts constraints.
             inputs: names of functions of time whose values are passed to each run
-                (:mod:`scvi_codegen.formulas.inputs`).
+                (:mod:`scvi_codegen.formulas.symbols`).
             tables: declarations of index tables.
 
         >>> HamiltonianSystem.from_text(
@@ -225,7 +225,7 @@ class HamiltonianSystem(MechanicalSystem):
 
 @lru_cache(maxsize=64)
 def _is_regular(system: HamiltonianSystem) -> bool:
-    from scvi_codegen.mechanics.regularity import singular_part
+    from scvi_codegen.mechanics.derived_expressions import singular_part
 
     others = (*system.coordinates, system.time)
     return singular_part(system.hamiltonian, system.momenta, others, system.constants) is None

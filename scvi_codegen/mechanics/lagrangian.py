@@ -130,9 +130,9 @@ class LagrangianSystem(MechanicalSystem):
             damping: damping rate of all momenta, a number or a formula of parameters
                 (:mod:`scvi_codegen.mechanics.forces`).
             constraints: formulas in coordinates and time that are 0, or equations ``"x**2 + y**2 = l**2"``;
-                formulas linear in velocities are nonholonomic (:mod:`scvi_codegen.mechanics.constraints`).
+                formulas linear in velocities are nonholonomic (:mod:`scvi_codegen.mechanics.forces`).
             inputs: names of functions of time whose values are passed to each run
-                (:mod:`scvi_codegen.formulas.inputs`).
+                (:mod:`scvi_codegen.formulas.symbols`).
             tables: declarations of index tables with their columns, ``["bonds[B, 2]", "pins[P]"]``.
 
         >>> oscillator = LagrangianSystem.from_text(

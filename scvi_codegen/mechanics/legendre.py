@@ -15,13 +15,12 @@ from sympy import Expr, Symbol
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.expressions import evaluate, gradient, hessian, unsupported_part
 from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.formulas.inputs import input_formulas
-from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.mechanics.constraints import constraints_of
+from scvi_codegen.formulas.symbols import input_formulas, symbol
+from scvi_codegen.mechanics.derived_expressions import coupled_blocks, sample_points
+from scvi_codegen.mechanics.forces import constraints_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.reading import default_momenta
-from scvi_codegen.mechanics.regularity import coupled_blocks, sample_points
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.validation import NAMES, TEXTS, checks_arguments, of

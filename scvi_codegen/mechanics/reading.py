@@ -9,16 +9,23 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.rotations.names import Reduced, RotationNames
-from scvi_codegen.formulas.symbols import DOT, TIME, check_names, name_of_key, number, symbol
+from scvi_codegen.formulas.symbols import (
+    DOT,
+    TIME,
+    check_names,
+    input_formulas,
+    name_of_key,
+    number,
+    symbol,
+    with_inputs,
+)
 from scvi_codegen.formulas.translation import Translation, sympy_expression
 from scvi_codegen.mechanics.arrays.elements import unrolled_fields
 from scvi_codegen.mechanics.arrays.system import ArraySystem
-from scvi_codegen.mechanics.constraints import constraints_of
-from scvi_codegen.mechanics.deferred import are_arrays
 from scvi_codegen.mechanics.definition_checks import warn_of_mistakes
-from scvi_codegen.mechanics.forces import damping_rate, dissipative_forces, forces_by_coordinate
+from scvi_codegen.mechanics.forces import constraints_of, damping_rate, dissipative_forces, forces_by_coordinate
+from scvi_codegen.mechanics.system import are_arrays
 
 Read = Callable[[Any], Expr]
 

@@ -14,26 +14,113 @@ and ``auxiliaries``, and ``formula``, the user's function; it validates itself o
 use nothing else, and expressions derived from them only through
 :func:`~scvi_codegen.mechanics.derived_expressions.forms_of`. Matrix-free solvers also use an equivalent Lagrangian, if
 one is known (:func:`~scvi_codegen.mechanics.legendre.equivalent_lagrangian`).
+
+Formulas of systems defined by text are read only when they are first needed.
+An integrator that was compiled before needs no formulas, hence no SymPy: the cache contains the key of its system under
+all arguments of ``from_text``, its class and the versions of this package and of SymPy. The entry is written by
+:meth:`Deferred.store_key`, and only for text that was read without error or warning.
 """
 
 from __future__ import annotations
 
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Self
 
 from scvi_codegen.display.cards import Html, card, listed, plain
 from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.files.cache import key_of, store_text, stored_text
 from scvi_codegen.formulas.symbols import DOT, number, symbol
 from scvi_codegen.indices import Array
-from scvi_codegen.mechanics.deferred import Deferred
 from scvi_codegen.validation import of
 
 if TYPE_CHECKING:
     from sympy import Expr, Symbol
 
     from scvi_codegen.formulas.rotations.members import Homogeneous
+
+
+class Deferred:
+    """Base of frozen dataclasses with slots: fields without a value are read from text when they are first accessed.
+
+    ``_text`` contains the arguments of ``from_text`` as JSON, and ``_key`` the key found in the cache; both are unset
+    for objects made in another way.
+    """
+
+    __slots__ = ("_key", "_text")
+    _key: str
+    _text: str
+
+    @classmethod
+    @abstractmethod
+    def _read(cls, arguments: Mapping[str, Any]) -> tuple[Any, bool]:
+        """Return the system of these arguments, and whether warnings were issued."""
+
+    @classmethod
+    def _of_text(cls, arguments: Mapping[str, Any]) -> Self:
+        """Return the system of these arguments of ``from_text``, unread if its key is in the cache."""
+        text = _text_of(cls, arguments)
+        key = None if text is None else stored_text(("system", text))
+        if key is not None:
+            system = object.__new__(cls)
+            object.__setattr__(system, "_key", key)
+        else:
+            system, warned = cls._read(arguments)
+            text = None if warned else text
+        if text is not None:
+            object.__setattr__(system, "_text", text)
+        return system
+
+    def key(self) -> tuple[str, ...]:
+        """Return the key of this system in caches, made from its type and all of its fields."""
+        return (getattr(self, "_key", None) or key_of(self),)
+
+    def store_key(self) -> None:
+        """Store the key of a system that was read from text, so that later processes need not read the text."""
+        if hasattr(self, "_text") and not hasattr(self, "_key"):
+            (key,) = self.key()
+            store_text(("system", self._text), key)
+            object.__setattr__(self, "_key", key)
+
+    def _argument(self, name: str) -> Any:
+        """Return an argument of ``from_text`` of a system whose key is in the cache."""
+        return json.loads(self._text)[1][name]
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Read the text if ``name`` is a field; called only for attributes without a value."""
+            names = [field.name for field in fields(self)]
+            if name not in names or not hasattr(self, "_text"):
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
+            system, _ = self._read(json.loads(self._text)[1])
+            for each in names:
+                object.__setattr__(self, each, getattr(system, each))
+            return getattr(self, name)
+
+
+def _text_of(cls: type, arguments: Mapping[str, Any]) -> str | None:
+    """Return the class and the arguments as JSON, which differs for different systems; ``None`` if that is impossible.
+
+    Arrays and derived classes are not deferred.
+    """
+    if cls.__module__.partition(".")[0] != __name__.partition(".")[0] or are_arrays(
+        arguments["coordinates"], arguments["parameters"] or (), arguments["tables"]
+    ):
+        return None
+    plain = {name: dict(value) if isinstance(value, Mapping) else value for name, value in arguments.items()}
+    try:
+        return json.dumps([f"{cls.__module__}.{cls.__qualname__}", plain])
+    except (TypeError, ValueError):
+        return None
+
+
+def are_arrays(*declarations: Any) -> bool:
+    """Return whether one of the coordinates, parameters or tables is an array."""
+    return any("[" in str(each) for group in declarations for each in group)
+
 
 MAX_OPERATIONS = 200
 """Maximum number of operations of a formula shown in a notebook."""
@@ -79,9 +166,9 @@ class MechanicalSystem(Deferred, ABC):
             (q, v, t) for a Lagrangian and (q, p, t) for a Hamiltonian, or empty (:mod:`scvi_codegen.mechanics.forces`).
         damping: damping rate gamma of all momenta, a formula of parameters, 0 without damping
             (:mod:`scvi_codegen.mechanics.forces`).
-        inputs: names of inputs, each represented by five of the parameters (:mod:`scvi_codegen.formulas.inputs`).
+        inputs: names of inputs, each represented by five of the parameters (:mod:`scvi_codegen.formulas.symbols`).
         constraints: expressions in (q, t), or linear in v, that are 0 along trajectories of a Lagrangian
-            (:mod:`scvi_codegen.mechanics.constraints`).
+            (:mod:`scvi_codegen.mechanics.forces`).
         arrays: declarations of the arrays of known sizes whose entries are coordinates and parameters.
         definition: the text with arrays or rotations that the system was read from, for model files; else empty.
         rotations: rotations, directions and spins, whose coordinates follow the ordinary ones
@@ -185,7 +272,7 @@ class MechanicalSystem(Deferred, ABC):
 
     def text_of(self, formula: Expr) -> str:
         """Return a formula of the system as text, with its inputs by their names."""
-        from scvi_codegen.formulas.inputs import inputs_by_name
+        from scvi_codegen.formulas.symbols import inputs_by_name
         from scvi_codegen.formulas.writing import format_expression
 
         return format_expression(inputs_by_name(formula, self.inputs))

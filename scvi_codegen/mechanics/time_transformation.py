@@ -36,11 +36,10 @@ from sympy import Expr, Symbol
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.expressions import gradient, hessian
 from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.formulas.inputs import input_formulas
-from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.formulas.symbols import input_formulas, symbol
 from scvi_codegen.formulas.writing import format_expression
-from scvi_codegen.mechanics.constraints import nonholonomic_expressions
 from scvi_codegen.mechanics.derived_expressions import forms_of
+from scvi_codegen.mechanics.forces import nonholonomic_expressions
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import positive_parameters

@@ -33,14 +33,14 @@ from dataclasses import replace
 import sympy
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics.constraints import (
+from scvi_codegen.mechanics.derived_expressions import forms_of
+from scvi_codegen.mechanics.forces import (
     constraint_multipliers,
     constraint_rates,
     holonomic_expressions,
     nonholonomic_expressions,
     with_constraint_forces,
 )
-from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_structure import Velocities
 from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table

@@ -19,8 +19,8 @@ import sympy
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.expressions import gradient
-from scvi_codegen.mechanics.constraints import nonholonomic_expressions
 from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, forms_of
+from scvi_codegen.mechanics.forces import nonholonomic_expressions
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.rotations.hamiltonian import hamiltonian_of_rotations

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scvi_codegen.errors import ModelFileError
-from scvi_codegen.formulas.inputs import input_parameters
+from scvi_codegen.formulas.symbols import input_parameters
 from scvi_codegen.lowering.arrays import check_solver, one_coordinate
 from scvi_codegen.mechanics.arrays.rolling import unroll_sums
 from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem

@@ -10,8 +10,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, pass_context
 from jinja2.runtime import Context
 
 from scvi_codegen.files.cache import template_folder
-from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.numbers import Number
+from scvi_codegen.ir.kernel import Kernel, Number
 from scvi_codegen.rendering.kernels.functions import kernel_text, lane_kernel_text, lane_mass_text
 from scvi_codegen.rendering.kernels.printer import print_number
 from scvi_codegen.rendering.layout import table, wrapped, wrapped_comment, wrapped_comment_lines, wrapped_prototypes

@@ -26,12 +26,10 @@ from sympy.core.function import AppliedUndef
 from scvi_codegen.errors import EventError, SystemDefinitionError, closest
 from scvi_codegen.formulas.expressions import evaluated, unsupported_part
 from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.formulas.inputs import input_formulas
 from scvi_codegen.formulas.rotations.names import RotationNames
-from scvi_codegen.formulas.symbols import DOT, TIME, identifier, symbol
+from scvi_codegen.formulas.symbols import DOT, TIME, identifier, input_formulas, symbol
 from scvi_codegen.ir.arithmetic import lower_kernel
-from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.numbers import lower_matrix, lower_vector
+from scvi_codegen.ir.kernel import Kernel, lower_matrix, lower_vector
 from scvi_codegen.rendering.program_source import EventSearch, render_events
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.tables.nodes import chebyshev_lobatto, to_unit

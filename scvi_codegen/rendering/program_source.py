@@ -13,7 +13,7 @@ from itertools import chain
 from typing import Literal, NamedTuple, TypeAlias, cast, get_args
 
 from scvi_codegen.ir.derivatives import Derivatives
-from scvi_codegen.ir.iteration import Control, FixedPointIteration, StoredValues
+from scvi_codegen.ir.equations import Control, FixedPointIteration, StoredValues
 from scvi_codegen.ir.kernel import Kernel, is_divided
 from scvi_codegen.ir.program import Program
 from scvi_codegen.rendering.convergence import INPUT_PRECISION, LARGEST_VIOLATION, MAX_ITERATIONS, ROUNDING_UNITS

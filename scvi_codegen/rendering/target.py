@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.ir.numbers import Number
+from scvi_codegen.ir.kernel import Number
 from scvi_codegen.rendering.convergence import TOLERANCE
 from scvi_codegen.tables.precision import mp, settled
 

@@ -35,9 +35,9 @@ from scvi_codegen.derivation.page.jacobian import entry_numbers, jacobian_patter
 from scvi_codegen.derivation.page.kernels import ITERATIONS, kernels_of
 from scvi_codegen.display.page.blocks import Formula, Paragraph
 from scvi_codegen.display.page.environment import SPACE
-from scvi_codegen.ir.iteration import IterationName
+from scvi_codegen.ir.equations import IterationName
 from scvi_codegen.methods.discretise import paper_equations, with_auxiliaries
-from scvi_codegen.pipeline.program import program_of
+from scvi_codegen.pipeline import program_of
 from scvi_codegen.rendering.outline import functions_of, reached
 from scvi_codegen.rendering.program_source import render
 

@@ -25,7 +25,7 @@ import scvi_codegen as sc
 from scvi_codegen.derivation import derivation_html
 from scvi_codegen.derivation.equations import derive
 from scvi_codegen.methods.discretise import discretise, paper_equations
-from scvi_codegen.pipeline.program import program_of
+from scvi_codegen.pipeline import program_of
 
 T, H, TIME = mp.mpf("1e-40"), 0.125, 0.375
 Q, P = (0.625, -0.4375), (0.3125, 0.875)

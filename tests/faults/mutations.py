@@ -36,7 +36,7 @@ from paces import STEP_SIZE_FAULTS
 from sabotage import changed_property, changed_result, of_entries
 
 from scvi_codegen.formulas import expressions
-from scvi_codegen.ir import arithmetic, numbers
+from scvi_codegen.ir import arithmetic, kernel
 from scvi_codegen.lowering import stage_groups
 from scvi_codegen.lowering.solvers import curves, points
 from scvi_codegen.mechanics import derived_expressions as mechanics
@@ -90,11 +90,11 @@ MUTATIONS = (
         "numbers printed with 8 digits", case("pendulum/svi"), c_printer, "print_number", lambda _: eight_digits_text
     ),
     function("minus signs lost", case("double/svi"), c_printer, "_print", without_negation),
-    function("tables rounded to 8 digits", case("double/svi"), numbers, "lower_matrix", of_entries(eight_digits)),
+    function("tables rounded to 8 digits", case("double/svi"), kernel, "lower_matrix", of_entries(eight_digits)),
     function(
         "weights rounded to 8 digits",
         case("cart/svi"),
-        numbers,
+        kernel,
         "lower_vector",
         changed_result(lambda found: tuple(map(eight_digits, found))),
     ),

@@ -17,10 +17,12 @@ from typing import Any
 import pytest
 from samples import QUICK_FLAGS
 
-from scvi_codegen import compiler
+from scvi_codegen import (
+    compiler,
+    pipeline,  # imported before any fault: a later import would keep a faulty function
+)
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import Method
-from scvi_codegen.pipeline import sources  # imported before any fault: a later import would keep a faulty function
 from scvi_codegen.rendering import program_source
 from scvi_codegen.verification import Certificate, verify
 
@@ -82,7 +84,7 @@ class Sabotage:
             return rendered
 
         for render in ("render", "render_ensemble", "render_derivatives"):
-            assert getattr(sources, render) is getattr(program_source, render), "an earlier fault is still in force"
+            assert getattr(pipeline, render) is getattr(program_source, render), "an earlier fault is still in force"
             self.replace(program_source, render, make)
 
 

@@ -13,11 +13,11 @@ import pytest
 from click.testing import CliRunner
 
 import scvi_codegen as sc
+from scvi_codegen import pipeline
 from scvi_codegen.cli import main
 from scvi_codegen.errors import BuildError, CacheWarning
 from scvi_codegen.files import cache
 from scvi_codegen.native import building
-from scvi_codegen.pipeline import sources
 from scvi_codegen.rendering.source import Source
 
 FAST = ("-O0",)
@@ -203,8 +203,8 @@ class TestTrust:
         changed = record["text"].replace("return", "return  ", 1)
         path.write_text(json.dumps(record | {"text": changed}))
         made = []
-        derive = sources.program_of
-        monkeypatch.setattr(sources, "program_of", lambda *args, **more: made.append(1) or derive(*args, **more))
+        derive = pipeline.program_of
+        monkeypatch.setattr(pipeline, "program_of", lambda *args, **more: made.append(1) or derive(*args, **more))
         assert spring().source == first.source
         assert made == [1]
 

@@ -37,7 +37,7 @@ from scvi_codegen.models.model_files.ensemble_file import load_ensemble
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.models.problems import problem
-from scvi_codegen.pipeline.sources import generate_source
+from scvi_codegen.pipeline import generate_source
 from scvi_codegen.tables.nodes import nodes_by_name
 from scvi_codegen.tables.quadrature import quadrature_by_name
 from scvi_codegen.tables.spaces import space_by_name

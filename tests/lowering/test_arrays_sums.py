@@ -13,8 +13,7 @@ from scvi_codegen.ir.kernel import Kernel, LoopedKernel
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SVI
 from scvi_codegen.models.systems import fput_chain
-from scvi_codegen.pipeline.interface import describe
-from scvi_codegen.pipeline.program import program_of
+from scvi_codegen.pipeline import describe, program_of
 from scvi_codegen.rendering.program_source import render, render_ensemble
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.stepper import Stepper

@@ -12,7 +12,7 @@ import scvi_codegen as sc
 from scvi_codegen.mechanics import term_groups as module
 from scvi_codegen.mechanics.symmetry.symmetry import symmetries
 from scvi_codegen.methods import as_method
-from scvi_codegen.pipeline.program import program_of
+from scvi_codegen.pipeline import program_of
 
 FLAGS = {"flags": QUICK_FLAGS}
 

@@ -8,11 +8,10 @@ import pytest
 import sympy
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.ir.numbers import exact_number, lower_matrix, lower_vector
+from scvi_codegen.ir.kernel import exact_number, lower_matrix, lower_vector
 from scvi_codegen.methods import SCVI, SVI, RadauIIA, SpectralCollocation
 from scvi_codegen.models.systems import double_pendulum, kepler
-from scvi_codegen.pipeline.program import program_of
-from scvi_codegen.pipeline.sources import generate_source
+from scvi_codegen.pipeline import generate_source, program_of
 from scvi_codegen.rendering.target import DOUBLE, SINGLE
 from scvi_codegen.tables.basis import cardinal_derivatives, cardinal_integrals, next_step
 from scvi_codegen.tables.nodes import chebyshev_lobatto, legendre_gauss

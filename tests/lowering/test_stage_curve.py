@@ -8,7 +8,7 @@ from numpy.polynomial import Legendre
 from numpy.polynomial.legendre import leggauss
 
 import scvi_codegen as sc
-from scvi_codegen.pipeline.program import program_of
+from scvi_codegen.pipeline import program_of
 
 FREE = sc.LagrangianSystem.from_text(name="quartic", coordinates=["x"], lagrangian="x_dot**2/2 - x**4")
 HELD = sc.LagrangianSystem.from_text(

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.ir.iteration import StoredValues
+from scvi_codegen.ir.equations import StoredValues
 from scvi_codegen.lowering.control import predictor_of
-from scvi_codegen.pipeline.program import program_of
+from scvi_codegen.pipeline import program_of
 from scvi_codegen.rendering.target import DOUBLE
 from scvi_codegen.tables.basis import legendre_functional
 from scvi_codegen.tables.precision import mp

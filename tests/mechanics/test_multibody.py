@@ -21,7 +21,7 @@ from sympy.physics.mechanics import (
 )
 
 from scvi_codegen import SVI, LagrangianSystem, SystemDefinitionError, compile_stepper
-from scvi_codegen.mechanics.constraints import holonomic
+from scvi_codegen.mechanics.forces import holonomic
 from scvi_codegen.mechanics.multibody.potential import potential_of
 
 T = dynamicsymbols._t

@@ -38,7 +38,7 @@ from scvi_codegen.methods import (
 )
 from scvi_codegen.models.problems import PROBLEMS, problem
 from scvi_codegen.models.systems import point_vortices
-from scvi_codegen.pipeline.sources import generate_source
+from scvi_codegen.pipeline import generate_source
 from scvi_codegen.tables.tableau import Tableau
 
 ROUNDOFF = 3e-14

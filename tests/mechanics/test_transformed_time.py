@@ -12,7 +12,7 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.exact.solution import ExactMotion, numbers
 from scvi_codegen.formulas.expressions import evaluate
 from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.mechanics.regularity import sample_points
+from scvi_codegen.mechanics.derived_expressions import sample_points
 from scvi_codegen.tables.precision import mp
 
 KEPLER = sc.LagrangianSystem.from_text(

@@ -92,7 +92,7 @@ def test_documented_method_is_the_midpoint_rule(extended: Path) -> None:
 import scvi_codegen, numpy as np
 from scvi_codegen.methods import Gauss, method_from_specification
 from scvi_codegen.models.problems import problem
-from scvi_codegen.pipeline.program import program_of
+from scvi_codegen.pipeline import program_of
 assert scvi_codegen.__file__.startswith(sys.path[0])
 system, method = problem("kepler").system, method_from_specification({"method": "midpoint"})
 own, gauss = (program_of(system, each, prefix="p") for each in (method, Gauss(1)))
@@ -106,7 +106,7 @@ def test_documented_solver_agrees_with_newton(extended: Path) -> None:
     script = """
 import numpy as np
 from scvi_codegen import SCVI, compile_stepper
-from scvi_codegen.pipeline.program import program_of
+from scvi_codegen.pipeline import program_of
 from scvi_codegen.models.problems import problem
 given = problem("kepler")
 method = SCVI(4, abscissae="gauss")

@@ -37,7 +37,7 @@ from scvi_codegen.methods import (
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import fput_chain
 from scvi_codegen.native.building import TUNED_FLAGS, _mathematics
-from scvi_codegen.pipeline.sources import generate_source
+from scvi_codegen.pipeline import generate_source
 from scvi_codegen.rendering.source import Interface, Source
 
 pytestmark = pytest.mark.long

@@ -10,7 +10,7 @@ from style import check_style
 from scvi_codegen import SCVI, SVI, Gauss, hamiltonian_of, problem, reparametrise
 from scvi_codegen.lowering.derivatives import derivatives_of
 from scvi_codegen.methods.discretise import discretise
-from scvi_codegen.pipeline.program import program_of
+from scvi_codegen.pipeline import program_of
 from scvi_codegen.rendering.program_source import render_derivatives
 
 STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]

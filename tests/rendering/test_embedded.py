@@ -22,7 +22,7 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.packages.package import generate_package, load_package
 from scvi_codegen.models.problems import problem
-from scvi_codegen.pipeline.sources import generate_source
+from scvi_codegen.pipeline import generate_source
 from scvi_codegen.rendering.program_source import EMBEDDED, Embedded
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.rendering.target import SINGLE

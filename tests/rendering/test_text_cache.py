@@ -17,14 +17,13 @@ import pytest
 import sympy
 
 import scvi_codegen as sc
-from scvi_codegen import compiler
+from scvi_codegen import compiler, pipeline
 from scvi_codegen.files import cache
 from scvi_codegen.files.cache import key_of
-from scvi_codegen.mechanics.deferred import _text_of
+from scvi_codegen.mechanics.system import _text_of
 from scvi_codegen.methods import as_method
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native import building, fingerprint
-from scvi_codegen.pipeline import sources
 
 
 @pytest.fixture
@@ -32,13 +31,13 @@ def made(tmp_path, monkeypatch) -> list[str]:
     """The methods derived from here on, with an empty cache."""
     monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path))
     names: list[str] = []
-    derive = sources.program_of
+    derive = pipeline.program_of
 
     def counted(system, method, **options):
         names.append(method.name)
         return derive(system, method, **options)
 
-    monkeypatch.setattr(sources, "program_of", counted)
+    monkeypatch.setattr(pipeline, "program_of", counted)
     return names
 
 
@@ -56,8 +55,8 @@ def test_cached_derivations_are_not_repeated(made):
 
 def test_ensemble_source_is_generated_on_demand_and_cached(made, tmp_path, monkeypatch):
     written: list[str] = []
-    render = sources.render_ensemble
-    monkeypatch.setattr(sources, "render_ensemble", lambda program: written.append(program.prefix) or render(program))
+    render = pipeline.render_ensemble
+    monkeypatch.setattr(pipeline, "render_ensemble", lambda program: written.append(program.prefix) or render(program))
     stepper = sc.compile_stepper(spring(), sc.SVI(2))
     stepper.integrate([1.0], [0.0], h=0.1, steps=3)
     assert (len(written), len(list((tmp_path / "texts").iterdir()))) == (0, 2)

@@ -13,7 +13,7 @@ from samples import QUICK_FLAGS
 
 from scvi_codegen import SVI, compile_stepper, generate_source
 from scvi_codegen.native.compilers import find_compiler
-from scvi_codegen.pipeline.sources import generate_array_source
+from scvi_codegen.pipeline import generate_array_source
 from scvi_codegen.rendering.source import Source
 
 STRICT = "-std=c99 -O1 -Wall -Wextra -pedantic -Wshadow -Wconversion -Wno-psabi -Werror".split()  # noqa: SIM905

@@ -20,7 +20,7 @@ from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.methods import as_method
 from scvi_codegen.native.compilers import find_compiler
-from scvi_codegen.pipeline.sources import generate_array_source
+from scvi_codegen.pipeline import generate_array_source
 from scvi_codegen.rendering.kernels.loop_nests import Sharing, sharing_of
 
 RNG = np.random.default_rng(5)

@@ -32,7 +32,7 @@ from scvi_codegen.methods import (
 )
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.problems import problem
-from scvi_codegen.pipeline.sources import generate_source
+from scvi_codegen.pipeline import generate_source
 from scvi_codegen.runtime.core import compiled_method
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.events.event import Event

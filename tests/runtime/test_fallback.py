@@ -16,7 +16,7 @@ from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native import building
 from scvi_codegen.native.building import PORTABLE_FLAGS
-from scvi_codegen.pipeline.sources import generate_source
+from scvi_codegen.pipeline import generate_source
 from scvi_codegen.results.recording import record_run, resume_run
 from scvi_codegen.runtime.core.stepper import Stepper
 

@@ -26,7 +26,7 @@ from scvi_codegen.mechanics.time_transformation import reparametrise
 from scvi_codegen.methods import as_method
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.compilers import find_compiler
-from scvi_codegen.pipeline.sources import ArraySources, Sources, generate_source
+from scvi_codegen.pipeline import ArraySources, Sources, generate_source
 from scvi_codegen.rendering.source import Source
 
 __all__ = ["CELLS", "FLAGS", "RECORDED", "TIMED", "Program", "build", "output", "program", "recorded"]

@@ -11,7 +11,7 @@ import numpy as np
 from oracle import Mechanics, numbers, oracle_step
 
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.ir.iteration import FixedPointIteration
+from scvi_codegen.ir.equations import FixedPointIteration
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.lowering.solvers.selection import iteration_of

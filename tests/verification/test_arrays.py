@@ -15,11 +15,10 @@ from either_system import either_system
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen import compiler
+from scvi_codegen import compiler, pipeline
 from scvi_codegen.cli import main
-from scvi_codegen.ir.iteration import Control
+from scvi_codegen.ir.equations import Control
 from scvi_codegen.ir.program import Program
-from scvi_codegen.pipeline import sources
 from scvi_codegen.rendering.program_source import render
 from scvi_codegen.rendering.source import Source
 
@@ -133,7 +132,7 @@ QUICK = ("a ring that closes one place off",)
 def test_planted_faults_find_their_source_lines(name: str, method: str) -> None:
     """Rewritten source would otherwise disable its planted faults, noticed only by the full tier."""
     system = either_system(name=name, **SYSTEMS[name][0])
-    code = sources.generate_array_source(system, method)[0].amalgamated().code
+    code = pipeline.generate_array_source(system, method)[0].amalgamated().code
     here = {what: fault[2] for what, fault in FAULTS.items() if fault[:2] == (name, method)}
     assert [what for what, pattern in here.items() if not re.search(pattern, code)] == []
 
@@ -153,7 +152,7 @@ def test_planted_faults_are_detected(fault: str, monkeypatch: pytest.MonkeyPatch
         edits += made
         return replace(source, code=code)
 
-    monkeypatch.setattr(sources, "render", rendered)
+    monkeypatch.setattr(pipeline, "render", rendered)
     monkeypatch.setattr(compiler, "cached_source", lambda key, derive: derive())
     found = certificate(name, method)
     assert edits > 0

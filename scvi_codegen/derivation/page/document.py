@@ -21,7 +21,7 @@ from scvi_codegen.display.page.environment import page_template, style_sheet
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import check_regular, paper_equations
 from scvi_codegen.methods.method import Method
-from scvi_codegen.pipeline.program import c_identifier, program_of
+from scvi_codegen.pipeline import c_identifier, program_of
 from scvi_codegen.rendering.outline import functions_of
 from scvi_codegen.rendering.program_source import render
 from scvi_codegen.version import __version__

@@ -5,8 +5,8 @@ from __future__ import annotations
 from sympy import Symbol
 
 from scvi_codegen.lowering.stage_groups import argument_name
-from scvi_codegen.mechanics.constraints import constraint_rates, holonomic_expressions, nonholonomic_expressions
 from scvi_codegen.mechanics.derived_expressions import forms_of
+from scvi_codegen.mechanics.forces import constraint_rates, holonomic_expressions, nonholonomic_expressions
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Gather, Scatter, StageGroup
 

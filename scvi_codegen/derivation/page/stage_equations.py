@@ -18,8 +18,8 @@ from scvi_codegen.derivation.page.result_names import meaning
 from scvi_codegen.derivation.page.sums import end_formulas, gather_formulas, row_formulas
 from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section, TableBlock
 from scvi_codegen.formulas.expressions import gradient
-from scvi_codegen.mechanics.constraints import with_constraint_forces
 from scvi_codegen.mechanics.derived_expressions import forms_of
+from scvi_codegen.mechanics.forces import with_constraint_forces
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageGroup, StageSystem

@@ -27,7 +27,7 @@ from __future__ import annotations
 from sympy import S
 
 from scvi_codegen.formulas.expressions import gradient
-from scvi_codegen.ir.iteration import FixedPointIteration, IterationName, IterationTable, StoredValues
+from scvi_codegen.ir.equations import FixedPointIteration, IterationName, IterationTable, StoredValues
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.tables import (

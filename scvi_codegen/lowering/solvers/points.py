@@ -43,7 +43,7 @@ import sympy
 from sympy import Expr
 
 from scvi_codegen.formulas.expressions import jacobian
-from scvi_codegen.ir.iteration import FixedPointIteration, IterationName, IterationTable, StoredValues
+from scvi_codegen.ir.equations import FixedPointIteration, IterationName, IterationTable, StoredValues
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.lowering.kernels import damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.lowering.solvers.tables import (

@@ -12,8 +12,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.ir.iteration import FixedPointIteration, Splitting
-from scvi_codegen.ir.numbers import lower_vector
+from scvi_codegen.ir.equations import FixedPointIteration, Splitting
+from scvi_codegen.ir.kernel import lower_vector
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.curves import position_iteration, printed_iteration, shooting_iteration
 from scvi_codegen.lowering.solvers.points import coupled_iteration, hamiltonian_iteration, separable_iteration

@@ -1,6 +1,6 @@
 """Common interface and tables of the fixed-point solvers.
 
-A solver is a function from a problem to a :class:`~scvi_codegen.ir.iteration.FixedPointIteration`, or ``None``, and a
+A solver is a function from a problem to a :class:`~scvi_codegen.ir.equations.FixedPointIteration`, or ``None``, and a
 line in ``FIXED_POINTS`` (:mod:`scvi_codegen.lowering.solvers.selection`). The iteration is plain data, with the tables
 and the support headers from which :mod:`scvi_codegen.rendering.kernels.simd` renders C. Solvers share only the problem.
 They may rely on the following:
@@ -25,8 +25,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from scvi_codegen.ir.iteration import FixedPointIteration, PredictorTables
-from scvi_codegen.ir.numbers import Number, NumberTable, lower_matrix, lower_vector
+from scvi_codegen.ir.equations import FixedPointIteration, PredictorTables
+from scvi_codegen.ir.kernel import Number, NumberTable, lower_matrix, lower_vector
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem

@@ -19,8 +19,7 @@ from sympy import Add, Expr, Symbol
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.array_statements import ArrayForce
 from scvi_codegen.formulas.arrays import ArrayTerm, term_of
-from scvi_codegen.formulas.inputs import input_formulas, with_inputs
-from scvi_codegen.formulas.symbols import DOT, symbol
+from scvi_codegen.formulas.symbols import DOT, input_formulas, symbol, with_inputs
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
 from scvi_codegen.mechanics.arrays.elements import unrolled_fields
 from scvi_codegen.mechanics.arrays.system import ARRAYS, ArrayHamiltonian, ArrayLagrangian, ArraySystem

@@ -25,8 +25,7 @@ from scvi_codegen.formulas.array_sympy import array_text
 from scvi_codegen.formulas.arrays import ArrayTerm, parse_array, parse_coordinate, parse_sums
 from scvi_codegen.formulas.expressions import unsupported_part
 from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.formulas.inputs import input_formulas, with_inputs
-from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
+from scvi_codegen.formulas.symbols import DOT, TIME, check_names, input_formulas, number, symbol, with_inputs
 from scvi_codegen.indices import SIZES_REQUIRED, Access, Array, Loop
 from scvi_codegen.mechanics.arrays.terms import (
     check_constraint,
@@ -179,7 +178,7 @@ class ArraySystem:
             dissipation: Rayleigh's function, a sum of sums over velocities, whose forces -dD/dq_dot are added.
             damping: damping rate of all momenta, a number or a formula of parameters.
             inputs: names of functions of time whose values are passed to each run
-                (:mod:`scvi_codegen.formulas.inputs`).
+                (:mod:`scvi_codegen.formulas.symbols`).
             constraints: formulas in coordinates and time that are 0, or equations, followed by the loops over which
                 they hold, ``"(q[i+1] - q[i])**2 = 1 for i in 0..N-2"``.
 

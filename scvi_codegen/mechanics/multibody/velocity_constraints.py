@@ -11,7 +11,7 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.expressions import Tape, jacobian, unsupported_part
-from scvi_codegen.mechanics.regularity import row_rank
+from scvi_codegen.mechanics.derived_expressions import row_rank
 from scvi_codegen.tables.precision import mp
 
 ATTEMPTS = 24

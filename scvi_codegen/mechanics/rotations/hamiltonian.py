@@ -20,9 +20,9 @@ from sympy import Expr, Matrix, S, Symbol
 from scvi_codegen.formulas.expressions import gradient, hessian
 from scvi_codegen.formulas.rotations.names import RotationNames
 from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.mechanics.derived_expressions import coupled_blocks
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.regularity import coupled_blocks
 
 LARGEST_BLOCK = 4
 """Largest block of coupled velocities whose constant mass matrix is inverted symbolically."""

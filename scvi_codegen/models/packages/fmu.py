@@ -23,7 +23,7 @@ from typing import IO
 
 from scvi_codegen.errors import ModelFileError, PackageError
 from scvi_codegen.files.atomic import write_atomically
-from scvi_codegen.formulas.inputs import PARTS
+from scvi_codegen.formulas.symbols import PARTS
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.model_file import model_texts
 from scvi_codegen.models.packages.example import example_of
@@ -32,7 +32,7 @@ from scvi_codegen.models.packages.generated_folders import prefix_of
 from scvi_codegen.models.packages.package import MODEL
 from scvi_codegen.native.building import PORTABLE_FLAGS, load
 from scvi_codegen.native.cross import TARGETS, library_for
-from scvi_codegen.pipeline.sources import generate_source
+from scvi_codegen.pipeline import generate_source
 from scvi_codegen.rendering.program_source import ExampleRun, with_fmu
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.validation import PATH, SWITCH, TEXT, TEXTS, checks_arguments

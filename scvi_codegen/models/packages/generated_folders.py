@@ -63,7 +63,7 @@ def _read(file: Path) -> str:
 
 def prefix_of(folder: Path) -> str:
     """Return the name of the folder, validated as a prefix of C names and as a Python module."""
-    from scvi_codegen.pipeline.program import (
+    from scvi_codegen.pipeline import (
         LONGEST_PREFIX,
         c_identifier,  # imported here: it imports SymPy
     )

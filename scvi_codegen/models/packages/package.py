@@ -116,7 +116,7 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
 def _stepper_of_arrays(folder: Path) -> Stepper:
     """Return the stepper of a folder with arrays whose sizes are known at run time; its model has their layout."""
     from scvi_codegen.models.model_files.model_file import load_model
-    from scvi_codegen.pipeline.sources import generate_array_source
+    from scvi_codegen.pipeline import generate_array_source
     from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 
     model, prefix = load_model(folder / MODEL_FILE), prefix_of(folder)
@@ -131,7 +131,7 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
     from scvi_codegen.models.model_files.model_file import model_texts
     from scvi_codegen.models.packages.example import example_of
     from scvi_codegen.models.packages.readme import package_template, readme_text
-    from scvi_codegen.pipeline.sources import generate_source
+    from scvi_codegen.pipeline import generate_source
     from scvi_codegen.rendering.program_source import render_example
 
     model = model.with_known_sizes()
@@ -163,7 +163,7 @@ def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, si
     from scvi_codegen.models.model_files.model_file import model_texts
     from scvi_codegen.models.packages.example import array_example_of
     from scvi_codegen.models.packages.readme import package_template
-    from scvi_codegen.pipeline.sources import generate_array_source
+    from scvi_codegen.pipeline import generate_array_source
     from scvi_codegen.rendering.program_source import render_example
 
     assert model.array_system is not None  # by the caller

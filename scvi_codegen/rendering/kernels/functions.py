@@ -10,7 +10,7 @@ from functools import partial
 from typing import TypeAlias
 
 from scvi_codegen.indices import Access, Place
-from scvi_codegen.ir.iteration import FixedPointIteration
+from scvi_codegen.ir.equations import FixedPointIteration
 from scvi_codegen.ir.kernel import Constant, Kernel, Load, LoopedKernel, Part, parts
 from scvi_codegen.ir.program import Layout
 from scvi_codegen.rendering.kernels.loop_nests import Nest

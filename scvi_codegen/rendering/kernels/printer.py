@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from typing import TypeAlias
 
-from scvi_codegen.ir.iteration import FixedPointIteration
-from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation, Part, kept_length, parts
-from scvi_codegen.ir.numbers import Number
+from scvi_codegen.ir.equations import FixedPointIteration
+from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Number, Operation, Part, kept_length, parts
 from scvi_codegen.rendering.target import DOUBLE, Target
 
 Sources: TypeAlias = tuple[str, ...]

@@ -16,9 +16,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from scvi_codegen.ir.iteration import AdaptivePredictor, FixedPointIteration, StoredValues
-from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.numbers import Number, NumberTable
+from scvi_codegen.ir.equations import AdaptivePredictor, FixedPointIteration, StoredValues
+from scvi_codegen.ir.kernel import Kernel, Number, NumberTable
 from scvi_codegen.rendering.kernels.printer import INVERSE_ROOT, Sources, lane_functions, print_number
 from scvi_codegen.rendering.layout import table
 from scvi_codegen.rendering.target import DOUBLE

@@ -12,7 +12,7 @@ from itertools import accumulate
 from typing import TypeAlias
 
 from scvi_codegen.ir.equations import LoweredStageGroup
-from scvi_codegen.ir.numbers import Number
+from scvi_codegen.ir.kernel import Number
 from scvi_codegen.ir.program import FEW_UNKNOWNS, Program
 from scvi_codegen.rendering.kernels.printer import print_number
 from scvi_codegen.rendering.layout import wrapped

@@ -10,7 +10,7 @@ from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.shooting import SCVI
 from scvi_codegen.models.systems import planar_pendulum
-from scvi_codegen.pipeline.sources import generate_source
+from scvi_codegen.pipeline import generate_source
 from scvi_codegen.rendering.outline import Function, functions_of, outline
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,

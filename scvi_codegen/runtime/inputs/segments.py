@@ -1,6 +1,6 @@
 """Runs with inputs: integrate from breakpoint to breakpoint of piecewise cubic functions of time.
 
-Steps end at breakpoints; compensated sums continue across them. See :mod:`scvi_codegen.formulas.inputs`.
+Steps end at breakpoints; compensated sums continue across them. See :mod:`scvi_codegen.formulas.symbols`.
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ CasADi; :func:`scvi_codegen.frameworks.casadi_step.casadi_step` exports the stag
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 
@@ -25,23 +26,24 @@ from sympy import Expr
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.indices import SIZES_REQUIRED
-from scvi_codegen.ir.iteration import Control
+from scvi_codegen.ir.equations import Control
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.arrays import check_solver as check_solver_of_arrays
 from scvi_codegen.lowering.control import control_of, density_of
 from scvi_codegen.lowering.derivatives import derivatives_of
+from scvi_codegen.lowering.loops import with_sums
 from scvi_codegen.lowering.program import lower
+from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
-from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES, Symmetry
+from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
+from scvi_codegen.mechanics.term_groups import rolled
 from scvi_codegen.mechanics.variational import with_tangent_vectors
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretise, discretised_form
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.announcements import announced
-from scvi_codegen.pipeline.interface import describe, describe_arrays
-from scvi_codegen.pipeline.program import c_identifier, program_of
 from scvi_codegen.rendering.events import with_events
 from scvi_codegen.rendering.program_source import (
     EMBEDDED,
@@ -50,10 +52,138 @@ from scvi_codegen.rendering.program_source import (
     render_derivatives,
     render_embedded,
     render_ensemble,
+    workspace_size,
 )
-from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.rendering.source import ArrayLayout, Interface, Source
 from scvi_codegen.runtime.events.event import EventLike, as_events
 from scvi_codegen.validation import SWITCH, TEXT, checks_arguments
+
+LONGEST_PREFIX = 64
+C_HEADERS = frozenset(
+    """
+    assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg stdbool stddef
+    stdint stdio stdlib string tgmath time wchar wctype unistd
+    """.split()  # noqa: SIM905  (a paragraph of words reads better than thirty quoted ones)
+)
+
+
+def program_of(
+    system: MechanicalSystem,
+    method: Method,
+    *,
+    solver: str = "auto",
+    prefix: str | None = None,
+    symmetries: Sequence[Symmetry] = (),
+    lanes: bool = True,
+    fallback: bool = True,
+) -> Program:
+    """Return the lowered program of an integrator; other arguments as of :func:`compile_stepper`.
+
+    ``lanes`` and ``fallback`` are those of :func:`~scvi_codegen.lowering.program.lower`.
+    """
+    name = c_identifier(prefix or f"{system.name}_{method.name}")
+    tracked = all_symmetries(system, symmetries)
+    program_part = partial(
+        lower, method=method, prefix=name, solver=solver, symmetries=tracked, lanes=lanes, fallback=fallback
+    )
+    parts = rolled(system)
+    looped = with_sums(program_part(parts.rest), parts) if parts else None
+    return looped or program_part(system)
+
+
+def c_identifier(name: str) -> str:
+    """Return a name of lower-case letters, digits and underscores that begins with a letter, of limited length.
+
+    Single letters (``X_OK`` is a POSIX macro) and names of C headers get a suffix.
+    """
+    cleaned = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")[:LONGEST_PREFIX].strip("_")
+    if not cleaned[:1].isalpha():
+        return f"integrator_{cleaned}".rstrip("_")
+    return f"{cleaned}_integrator" if len(cleaned) == 1 or cleaned in C_HEADERS else cleaned
+
+
+def describe(
+    program: Program,
+    system: MechanicalSystem,
+    method: Method,
+    *,
+    uses_fallback_library: bool = False,
+    g: str | Expr | None = None,
+) -> Interface:
+    """Return the interface of a program; ``uses_fallback_library``: a separate library has Newton's iteration."""
+    return Interface(
+        prefix=program.prefix,
+        title=program.title,
+        notes=program.notes,
+        system=system.name,
+        method=method.name,
+        coordinates=program.layout.names,
+        parameters=program.layout.parameters,
+        defaults=program.layout.defaults,
+        unknowns=program.equations.unknowns,
+        workspace=workspace_size(program),
+        has_action=program.action or (uses_fallback_library and program.equations.acts),
+        map_names=tuple(each.name for each in program.quantities.momentum_maps),
+        map_formulas=tuple(each.formula for each in program.quantities.momentum_maps),
+        map_exact=tuple(each.exact for each in program.quantities.momentum_maps),
+        has_fallback=uses_fallback_library or (program.newton and program.fixed_point is not None),
+        momentum_names=tuple(momentum.name for momentum in system.momentum_symbols),
+        time_transformation="" if g is None else str(g),
+        exchange_names=program.quantities.work_and_impulses,
+        constraints=program.constraints.formulas if program.constraints else (),
+        inputs=system.inputs,
+        conserves_energy=not system.changes_energy and not system.inputs,
+        arrays=_arrays_of(system),
+        rotations=tuple(each.declaration for each in system.rotations),
+        energy_parameter=system.clock.energy.name if system.clock else "",
+        solver=_solver_of(program),
+    )
+
+
+def _arrays_of(system: MechanicalSystem) -> tuple[str, ...]:
+    """Return the declarations of the arrays whose entries are all of the coordinates, or parameters."""
+    names = [each.name for each in (*system.coordinates, *system.parameters)]
+    known = [array for array in system.arrays if set(array.elements) <= set(names)]
+    listed = [name for array in known for name in array.elements]
+    whole = listed[: system.dimension] == names[: system.dimension]
+    return tuple(str(array) for array in known if array.axes or whole) if whole else ()
+
+
+def _solver_of(program: Program) -> str:
+    """Return the name of the solver that is tried first."""
+    if program.splitting:
+        return "explicit"
+    return "rattle" if program.rattle else "fixed-point" if program.fixed_point else "newton"
+
+
+def describe_arrays(system: ArraySystem, method: Method, *, prefix: str, solver: str) -> Interface:
+    """Return the interface of an integrator of arrays whose sizes are known at run time."""
+    layout = ArrayLayout(
+        sizes=system.sizes,
+        coordinates=system.coordinates,
+        momenta=system.momenta,
+        fields=system.fields,
+        tables=system.tables,
+        field_defaults=system.field_defaults,
+        maps=momentum_maps(system),
+        accesses=system.accesses,
+        depends_on_time=system.depends_on_time,
+        constraints=tuple(term.loops for term in system.constraints),
+        continued=not (method.fractions or system.constraints),
+    )
+    return Interface(
+        prefix=prefix,
+        title=f"{system.name}: {method.title}",
+        system=system.name,
+        method=method.name,
+        coordinates=tuple(array.name for array in system.coordinates),
+        parameters=tuple(parameter.name for parameter in system.parameters),
+        defaults=system.defaults,
+        inputs=system.inputs,
+        conserves_energy=not (system.momenta or system.changes_energy or system.inputs),
+        solver="rattle" if system.constraints else solver,
+        layout=layout,
+    )
 
 
 class Sources:
@@ -239,7 +369,7 @@ def generate_source(
     """
     method = as_method(method, system)
     system = discretised_form(system, method)
-    functions = tuple(event.function for event in as_events(events))
+    functions = tuple(event.function for event in as_events(events)) if events else ()
     _check_embedded(embedded, solver, functions)
     program = program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None)
     g = time_transformation

@@ -1,1 +1,0 @@
-"""Derivation of C sources: from a mechanical system and a method to the texts that are compiled."""
