@@ -107,7 +107,7 @@ class ChaosIndicatorsEnsemble:
 
     def _lanes(self) -> Binding | None:
         """Return the compiled ensemble library with tangent vectors, or ``None``."""
-        if self.stepper.interface.constraints:
+        if self.stepper.interface.constraints or self.stepper.interface.rotations:
             return None
         source = self.stepper._variational_source(self.values.shape[-1])
         return None if source is None else Binding(building.load(source, flags=self.stepper.flags), source.prefix)
@@ -142,7 +142,7 @@ class ChaosIndicatorsEnsemble:
         for j in range(len(self.q)):
             with suppress(StepFailedError):
                 return int(self._first(j).shape[1])
-        return self.changes.count or 2 * self.stepper.dimension
+        return self.changes.count or self.changes.size
 
     def _first(self, j: int) -> Array:
         """Return the (2m, k) initial tangent vectors of trajectory j."""

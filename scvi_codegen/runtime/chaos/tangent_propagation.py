@@ -21,6 +21,7 @@ from scvi_codegen.runtime.chaos.growth import Growth, ill_conditioned, r_factors
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.rotations.reduction import Reduction
 from scvi_codegen.runtime.sensitivity.gradients import pieces, propagate, starts_of
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
@@ -41,22 +42,31 @@ StepSegment = tuple[Starts, NDArray[np.intp]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InitialTangents:
-    """Initial tangent vectors, (2m, k) of length 1: the first of a random frame, or given directions.
+    """Initial tangent vectors, (size, k) of length 1: the first of a random frame, or given directions.
 
-    With constraints the frame spans the admissible directions, the range of the derivative of a step.
+    Vectors have 2m entries, with rotations those of the reduced space, without gauge directions
+    (:mod:`scvi_codegen.runtime.rotations.reduction`). With constraints the frame spans the admissible directions, the
+    range of the derivative of a step.
+
+    Attributes:
+        directions: (2m, k) directions of (q, p), or ``None``.
+        reduction: maps to the reduced space, ``None`` without rotations.
     """
 
     stepper: Integrator
     count: int | None
     directions: Array | None
+    reduction: Reduction | None
 
     @classmethod
     def checked(cls, stepper: Integrator, count: int | None, directions: ArrayLike | None) -> InitialTangents:
         """Construct from user arguments; raise :class:`StateError` for invalid numbers or directions."""
         size = 2 * stepper.dimension
+        reduction = Reduction(stepper.interface) if stepper.interface.rotations else None
         if directions is None:
-            wanted = None if count is None else checked_count(count, "count", least=1, most=size)
-            return cls(stepper, wanted, None)
+            most = reduction.size if reduction else size
+            wanted = None if count is None else checked_count(count, "count", least=1, most=most)
+            return cls(stepper, wanted, None, reduction)
         array = real_array(directions, "directions")
         columns = array[:, np.newaxis] if array.ndim == 1 else array
         if columns.ndim != 2 or len(columns) != size or not 0 < columns.shape[1] <= size:
@@ -66,15 +76,34 @@ class InitialTangents:
         lengths = np.linalg.norm(columns, axis=0)
         if not np.isfinite(lengths).all() or not lengths.all():
             raise StateError("directions must be finite and not 0")
-        return cls(stepper, None, columns / lengths)
+        return cls(stepper, None, columns / lengths, reduction)
+
+    @property
+    def size(self) -> int:
+        """Number of entries of a tangent vector."""
+        return self.reduction.size if self.reduction else 2 * self.stepper.dimension
+
+    def entering(self, vectors: Array, q: Array, p: Array) -> Array:
+        """Return (2m, k) changes of (q, p) of tangent vectors at a state."""
+        return vectors if self.reduction is None else np.asarray(self.reduction.inward(q, p) @ vectors)
+
+    def leaving(self, changes: Array, q: Array, p: Array) -> Array:
+        """Return the (.., size, k) tangent vectors of (.., 2m, k) changes of (q, p) at (.., m) states."""
+        return changes if self.reduction is None else np.asarray(self.reduction.outward(q, p) @ changes)
 
     def at(self, q: Array, p: Array, h: float, t: float, parameters: Array, options: SolverOptions | None) -> Array:
         """Return the tangent vectors at (q, p) for a first step of h."""
-        directions = self.directions
+        directions = None if self.directions is None else self.leaving(self.directions, q, p)
+        if self.reduction is not None and directions is not None:
+            lengths = np.linalg.norm(directions, axis=0)
+            if (lengths < FORBIDDEN).any():
+                raise StateError("directions must change the rotations, not only the lengths of quaternions")
+            directions = directions / lengths
         if not self.stepper.interface.constraints:
-            return _frame(self.stepper.dimension)[:, : self.count] if directions is None else directions
+            return _frame(self.size // 2)[:, : self.count] if directions is None else directions
         before = self.stepper.step(q, p, -h, t, parameters, options=options)
         ends = self.stepper.jacobian(*before, h, t - h, parameters, options=options)
+        ends = self.leaving(ends, q, p) @ self.entering(np.eye(self.size), *before)
         allowed, sizes, _ = np.linalg.svd(ends)
         frame = allowed[:, sizes > FORBIDDEN * sizes[0]]
         if directions is not None:
@@ -105,9 +134,7 @@ def along(states: SavedStates, tangents: InitialTangents) -> ChaosIndicators:
 
     states.stepper._check_physical_time("the growth of tangent vectors")
     first = states.q[0], states.p[0], float(states.step_sizes[0]), float(states.t[0])
-    propagation = _TangentPropagation(
-        tangents.at(*first, states.parameters, states.options), states.stepper._input_size, states.t
-    )
+    propagation = _TangentPropagation(tangents, tangents.at(*first, states.parameters, states.options), states.t)
     propagation.follow((starts_of(states, first, last) for first, last in pieces(states)), propagate_chunk)
     return ChaosIndicators.of(states.t, propagation.growth.values)
 
@@ -150,7 +177,7 @@ def ahead(
     propagation = None
     try:
         propagation = _TangentPropagation(
-            tangents.at(q, p, h, float(t[0]), parameters, options), stepper._input_size, t[::save_every]
+            tangents, tangents.at(q, p, h, float(t[0]), parameters, options), t[::save_every]
         )
         propagation.follow(step_segments(), propagate_chunk)
     except StepFailedError as failure:
@@ -162,14 +189,14 @@ class _TangentPropagation:
     """Propagation of tangent vectors.
 
     Args:
-        tangents: (2m, k) initial vectors of length 1.
-        input_size: number of variables of a step.
+        space: stepper and space of the vectors.
+        tangents: (size, k) initial vectors of length 1.
         t: (n,) times of saved values.
     """
 
-    def __init__(self, tangents: Array, input_size: int, t: Array) -> None:
+    def __init__(self, space: InitialTangents, tangents: Array, t: Array) -> None:
         self._frame, self._triangle = np.linalg.qr(tangents)
-        self._input_size, self._size = input_size, FIRST
+        self._space, self._size = space, FIRST
         with np.errstate(divide="ignore"):  # linearly dependent directions span zero volume: log 0 = -inf
             self.growth = Growth(t, np.log(np.abs(np.diag(self._triangle))))
 
@@ -182,10 +209,13 @@ class _TangentPropagation:
             while done < steps:
                 end = min(done + self._size, steps)
                 part, saved = starts.part(done, end), numbers[done : end + 1]
-                vectors = np.zeros((end - done + 1, self._frame.shape[1], self._input_size))
-                vectors[0, :, : len(self._frame)] = self._frame.T
+                stepper = self._space.stepper
+                vectors = np.zeros((end - done + 1, self._frame.shape[1], stepper._input_size))
+                columns = slice(2 * stepper.dimension)
+                vectors[0, :, columns] = self._space.entering(self._frame, part.q[0], part.p[0]).T
                 propagate_chunk(part, saved, vectors)
-                done += self._take(part, saved[1:], vectors[1:, :, : len(self._frame)].transpose(0, 2, 1))
+                images = self._space.leaving(vectors[1:, :, columns].transpose(0, 2, 1), part.q[1:], part.p[1:])
+                done += self._take(part, saved[1:], images)
 
     def _take(self, part: Starts, numbers: NDArray[np.intp], images: Array) -> int:
         """Accumulate as many (2m, k) images as are well conditioned, at least one; return their number."""

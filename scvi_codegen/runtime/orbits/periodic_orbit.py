@@ -30,7 +30,8 @@ class PeriodicOrbit:
         t: initial time.
         period: the period.
         steps: number of steps per period, each of size ``period / steps``.
-        monodromy: (2m, 2m) derivative of the end with respect to the start.
+        monodromy: (2m, 2m) derivative of the end with respect to the start; of systems with rotations in canonical
+            coordinates of the reduced space, with 6 rows for a rotation, 4 for a direction and 2 for a spin.
         residual: largest entry of the end minus the start.
         iterations: number of Newton iterations.
         parameters: (k,) in the order of ``stepper.parameters``.

@@ -29,6 +29,8 @@ from scvi_codegen.runtime.core.validation import (
 )
 from scvi_codegen.runtime.estimation.measurements import state_names
 from scvi_codegen.runtime.orbits.periodic_orbit import PeriodicOrbit
+from scvi_codegen.runtime.rotations.reduction import Reduction
+from scvi_codegen.runtime.rotations.states import homogeneous_state
 from scvi_codegen.runtime.run.times import steps_within, times_after
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
 from scvi_codegen.validation import NAMES, SWITCH, checked_count, checks_arguments
@@ -76,7 +78,8 @@ def periodic_orbit(
 
     Args:
         stepper: the compiled stepper.
-        q, p, velocity: (m,) initial guess of a state on the orbit, with one of p and velocity.
+        q, p, velocity: (m,) initial guess of a state on the orbit, with one of p and velocity. Rotations must close as
+            rotations, not as quaternions.
         period: initial guess of the period, positive.
         steps: number of steps per period.
         h: instead of ``steps``, the largest step size for the initial period; its sign is ignored.
@@ -99,6 +102,7 @@ def periodic_orbit(
         StepFailedError: if a step from the initial guess fails.
     """
     stepper = of_known_sizes(stepper, q, parameters)
+    q, p, velocity = homogeneous_state(stepper.interface, q, p, velocity)
     search = _OrbitSearch.checked(
         stepper,
         period=period,
@@ -122,10 +126,12 @@ class _OrbitSearch:
     """Equations of a periodic orbit as a function of z = (q, p, period).
 
     Attributes:
+        reduction: maps between (q, p) and the tangent space without gauge directions of rotations.
         fixed_indices: indices of the fixed entries of z, -1 that of the period.
     """
 
     stepper: Stepper
+    reduction: Reduction
     period: float
     steps: int
     fixed_indices: tuple[int, ...]
@@ -170,6 +176,7 @@ class _OrbitSearch:
                 raise StateError(f"fixed names '{name}', which is no coordinate or momentum{closest(name, names)}")
         return cls(
             stepper=stepper,
+            reduction=Reduction(interface),
             period=period,
             steps=checked_count(steps, "steps", least=1) if h is None else int(steps_within(period, checked_step(h))),
             fixed_indices=(*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else [])),
@@ -185,14 +192,14 @@ class _OrbitSearch:
         z, equations, iterations = self._iterated(*self._by_segments(guess))
         m, motion = self.stepper.dimension, equations.motion
         size = float(np.abs([z[:-1], guess[:-1]]).max())
-        allowed = CLOSED * max(1.0, float(np.linalg.norm(motion.monodromy, 2)))
+        allowed = CLOSED * max(1.0, float(np.linalg.norm(equations.monodromy, 2)))
         if not equations.error <= allowed * size:
             raise OrbitError(
                 f"no periodic orbit was found near the guess: after {iterations} iterations the closing error is "
                 f"{equations.error:.1e}. Give a better initial guess, or more steps"
             )
         self._check_energy(equations, allowed * size)
-        if np.linalg.norm(motion.by_period) * z[-1] <= EQUILIBRIUM_MOTION * size:
+        if np.linalg.norm(self._leaving(motion) @ motion.by_period) * z[-1] <= EQUILIBRIUM_MOTION * size:
             raise OrbitError("the iteration converged to an equilibrium: give a better initial guess")
         if motion.by_time.any():
             self._check_repeats(z, equations, allowed * size)
@@ -202,7 +209,7 @@ class _OrbitSearch:
             t=self.t,
             period=float(z[-1]),
             steps=self.steps,
-            monodromy=motion.monodromy,
+            monodromy=equations.monodromy,
             residual=equations.error,
             iterations=iterations,
             parameters=self.parameters,
@@ -220,7 +227,9 @@ class _OrbitSearch:
         half, start = self.steps // 2, guess[:-1]
         forward = self._segment(start, 0, half, guess[-1])
         backward = self._segment(start, 0, self.steps - half, -guess[-1])
-        monodromy = np.linalg.solve(backward.monodromy.T, forward.monodromy.T).T
+        inward = self.reduction.inward(*np.split(start, 2))
+        forth, back = (self._leaving(each) @ each.monodromy @ inward for each in (forward, backward))
+        monodromy = np.linalg.solve(back.T, forth.T).T
         growth = float(np.abs(np.linalg.eigvals(monodromy)).max())
         if growth <= EASY:
             return guess, self._closing(guess), 0
@@ -282,7 +291,7 @@ class _OrbitSearch:
         if np.linalg.norm(change) <= SETTLED * np.linalg.norm(z):
             return None
         for shortened in 0.5 ** np.arange(MOST_HALVINGS):
-            trial = z - shortened * change
+            trial = self._normalised(z - shortened * change)
             if trial[-1] <= 0.0:
                 continue
             with suppress(StepFailedError):
@@ -299,18 +308,22 @@ class _OrbitSearch:
         count = len(starts)
         bounds = self._bounds(count)
         segments = [self._segment(*each, z[-1]) for each in zip(starts, bounds[:-1], bounds[1:], strict=True)]
-        rows = np.zeros((count, size, count * size + 1))
-        defects = np.array([segment.states[-1] for segment in segments]) - np.roll(starts, -1, axis=0)
-        defects[-1] -= np.append(self.gain, np.zeros(size // 2))
+        left = self._independent_equations(starts, segments)
+        rows = np.zeros((count, self.reduction.size, count * size + 1))
+        defects = np.zeros(rows.shape[:2])
         for k, segment in enumerate(segments):
             after = (k + 1) % count
-            rows[k, :, k * size : (k + 1) * size] = segment.monodromy
-            rows[k, :, after * size : (after + 1) * size] -= np.eye(size)
-            rows[k, :, -1] = segment.by_period
+            leaving, outward = self._leaving(segment), self.reduction.outward(*np.split(starts[after], 2))
+            end = segment.states[-1].copy()
+            end[: size // 2] -= self.gain * (after == 0)
+            defects[k] = outward @ (self.reduction.aligned(end, starts[after]) - starts[after])
+            rows[k, :, k * size : (k + 1) * size] = leaving @ segment.monodromy
+            rows[k, :, after * size : (after + 1) * size] -= outward
+            rows[k, :, -1] = leaving @ segment.by_period
         error = float(np.abs(defects).max())
-        left = self._independent_equations(starts, segments)
+        monodromy = leaving @ segments[-1].monodromy @ self.reduction.inward(*np.split(starts[-1], 2))
         rows[-1], defects[-1] = left @ rows[-1], left @ defects[-1]
-        partials, wanted = rows.reshape(count * size, -1), defects.ravel()
+        partials, wanted = rows.reshape(defects.size, -1), defects.ravel()
         if self.energy is not None:
             first = starts[0]
             energy = self.stepper.energy(first[: size // 2], first[size // 2 :], self.t, self.parameters)
@@ -318,7 +331,16 @@ class _OrbitSearch:
             row = np.zeros(len(z))
             row[:size] = self._integral_gradients(first, self.t)[0]
             partials = np.vstack([partials, row])
-        return _ClosingEquations(segments, error, wanted, partials)
+        return _ClosingEquations(segments, monodromy, error, wanted, partials)
+
+    def _leaving(self, segment: _Segment) -> Array:
+        """Return the matrix from changes of (q, p) at the end of a segment to the reduced tangent space."""
+        return self.reduction.outward(*np.split(segment.states[-1], 2))
+
+    def _normalised(self, z: Array) -> Array:
+        """Return the unknowns with the gauge normalised in each state."""
+        states = z[:-1].reshape(-1, 2, self.stepper.dimension)
+        return np.append([self.reduction.normalised(*state) for state in states], z[-1])
 
     def _segment(self, start: Array, first: int, last: int, period: float) -> _Segment:
         """Integrate from the start of step ``first`` to the start of step ``last``."""
@@ -342,21 +364,26 @@ class _OrbitSearch:
         )
 
     def _independent_equations(self, starts: Array, segments: Sequence[_Segment]) -> Array:
-        """Return the (2m, 2m) projection onto the equations of return not implied by conserved quantities.
+        """Return the (size, size) projection onto the equations of return not implied by conserved quantities.
 
         Energy and momentum maps count as conserved if the Jacobian of every segment maps their gradients accordingly.
         """
         conserved_masks = []
         for start, segment in zip(starts, segments, strict=True):
-            begin = self._integral_gradients(start, segment.start_time)
-            end = self._integral_gradients(segment.states[-1], segment.end_time)
-            sizes = np.linalg.norm(end, axis=1) * np.linalg.norm(segment.monodromy, 2)
-            conserved_masks.append(np.linalg.norm(end @ segment.monodromy - begin, axis=1) <= CONSERVED * sizes)
-        conserved = self._integral_gradients(starts[0], self.t)[np.all(conserved_masks, axis=0)]
+            begin = self._reduced_gradients(start, segment.start_time)
+            end = self._reduced_gradients(segment.states[-1], segment.end_time)
+            monodromy = self._leaving(segment) @ segment.monodromy @ self.reduction.inward(*np.split(start, 2))
+            sizes = np.linalg.norm(end, axis=1) * np.linalg.norm(monodromy, 2)
+            conserved_masks.append(np.linalg.norm(end @ monodromy - begin, axis=1) <= CONSERVED * sizes)
+        conserved = self._reduced_gradients(starts[0], self.t)[np.all(conserved_masks, axis=0)]
         directions, strengths, _ = np.linalg.svd(conserved.T, full_matrices=False)
         directions = directions[:, strengths > CONSERVED * strengths.max(initial=0.0)]
-        projection: Array = np.eye(starts.shape[1]) - directions @ directions.T
+        projection: Array = np.eye(self.reduction.size) - directions @ directions.T
         return projection
+
+    def _reduced_gradients(self, state: Array, t: float) -> Array:
+        """Return (r, size) gradients in the reduced tangent space."""
+        return np.asarray(self._integral_gradients(state, t) @ self.reduction.inward(*np.split(state, 2)))
 
     def _integral_gradients(self, state: Array, t: float) -> Array:
         """Return (r, 2m) gradients of the energy and the momentum maps by finite differences, for directions only."""
@@ -398,12 +425,14 @@ class _ClosingEquations:
 
     Attributes:
         segments: in their order.
+        monodromy: derivative of the end of the last segment by its start, without gauge directions.
         error: largest entry of the ends minus the starts that follow.
         defects: (r,) residuals.
         partials: (r, 2m segments + 1) Jacobian of the residuals with respect to the starts of segments and the period.
     """
 
     segments: Sequence[_Segment]
+    monodromy: Array
     error: float
     defects: Array
     partials: Array

@@ -154,19 +154,18 @@ def momenta_of_body(q: Array, momentum: Array) -> Array:
     return np.asarray(2 * _rotated(q, momentum) / (q * q).sum(axis=-1, keepdims=True))
 
 
+def rates_matrices(q: Array) -> Array:
+    """Return the (.., 4, 3) matrices E(q) with q_dot = E(q) omega/2; E^T E = |q|^2, E^T q = 0."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    rows = [[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
 def _transposed(q: Array, p: Array) -> Array:
     """Return E(q)^T p."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    a, b, c, d = np.moveaxis(p, -1, 0)
-    return np.stack(
-        [-x * a + w * b + z * c - y * d, -y * a - z * b + w * c + x * d, -z * a + y * b - x * c + w * d], axis=-1
-    )
+    return np.asarray(np.einsum("...ij,...i->...j", rates_matrices(q), p))
 
 
 def _rotated(q: Array, r: Array) -> Array:
     """Return E(q) r."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    a, b, c = np.moveaxis(r, -1, 0)
-    return np.stack(
-        [-x * a - y * b - z * c, w * a - z * b + y * c, z * a + w * b - x * c, -y * a + x * b + w * c], axis=-1
-    )
+    return np.asarray(np.einsum("...ij,...j->...i", rates_matrices(q), r))
