@@ -8,12 +8,12 @@
     comparison          timing of all of them in turn, in one process, for one case, or an ensemble of 64 trajectories
     report              time at equal error, by interpolation; tables and JSON of results; plots: their pictures
     adaptive            adaptive step size
-    methods             energy over ten million steps; SVI and explicit composition methods; Tables 6 and 7 of the paper
+    energies            energy drift over ten million steps, and of array systems over a hundred thousand
     hand_written        generated C and hand-written C; cost of a control step, and of the bare C function
     first_step          time from text to the first step, also for larger systems and SymPy's bodies and loads
     constrained_bodies  energies and lengths at equal time; MuJoCo
-    lattices            array systems at equal error; hand-written C (lattices.c), SciPy, REBOUND; scaling with size
-    array_systems       energies over a hundred thousand steps; several threads; a thousand bodies and REBOUND
+    lattices            SVI and compositions at equal error; hand-written C (lattices.c), SciPy, REBOUND, OpenMM
+    array_systems       scaling with size; several threads
     machine             description and limits of the machine; the same source with several compilers
     settings            settings of a benchmark; processor times of functions and outputs of fresh processes
 
@@ -31,18 +31,18 @@ from pathlib import Path
 from typing import Any
 
 from scvi_codegen.benchmark.adaptive import run_adaptive
-from scvi_codegen.benchmark.array_systems import run_energies, run_thousand_bodies, run_threads
+from scvi_codegen.benchmark.array_systems import run_growth, run_threads
 from scvi_codegen.benchmark.cases.adaptive import ADAPTIVE_CASES
 from scvi_codegen.benchmark.cases.rods import CONSTRAINED_CASES, FORCED_CASES
 from scvi_codegen.benchmark.cases.unforced import CASES
 from scvi_codegen.benchmark.comparison import ENSEMBLES, run_case, run_constrained, run_ensemble, run_forced
 from scvi_codegen.benchmark.constrained_bodies import run_constrained_bodies
 from scvi_codegen.benchmark.contenders.peers import PEERS
+from scvi_codegen.benchmark.energies import run_drift, run_energies
 from scvi_codegen.benchmark.first_step import run_cold_start, run_compile_times, run_mechanisms
 from scvi_codegen.benchmark.hand_written import run_control_loop, run_hand_written
-from scvi_codegen.benchmark.lattices import run_growth, run_lattices
+from scvi_codegen.benchmark.lattices import run_compositions, run_lattices
 from scvi_codegen.benchmark.machine import machine, run_compilers
-from scvi_codegen.benchmark.methods import run_compositions, run_drift, run_paper_tables
 from scvi_codegen.benchmark.report import LEGEND, CaseResult, ResultTable, header_lines
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.errors import ScviCodegenError, StateError, closest
@@ -60,7 +60,6 @@ SECTIONS: Mapping[str, Callable[[Plan, ReportActivity], CaseResult | ResultTable
     **{f"constrained:{name}": partial(run_constrained, name) for name in CONSTRAINED_CASES},
     **{f"adaptive:{name}": partial(run_adaptive, name) for name in ADAPTIVE_CASES},
     "drift": run_drift,
-    "tables": run_paper_tables,
     "compositions": run_compositions,
     "hand-written": run_hand_written,
     "cold-start": run_cold_start,
@@ -72,7 +71,6 @@ SECTIONS: Mapping[str, Callable[[Plan, ReportActivity], CaseResult | ResultTable
     "growth": run_growth,
     "threads": run_threads,
     "energies": run_energies,
-    "thousand-bodies": run_thousand_bodies,
     "c-compilers": run_compilers,
 }
 """Sections of the benchmark: name on the command line -> function that measures it."""

@@ -1,7 +1,7 @@
 """Constrained bodies in this package and in MuJoCo: the same masses, lengths and initial states.
 
     chain      5 masses of 1/5 on rods of 1/5, released from 0.6 (the first) to 0.3 from the vertical; MuJoCo uses
-               joint angles, which satisfy the constraints identically, and this package is also run in angles
+               joint angles, which satisfy the constraints identically
     four-bar   masses at the two joints of rods of 1, 2 and 1.5 between points that are 2 apart; MuJoCo closes the loop
                by its equality ``connect``
 
@@ -22,13 +22,11 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.benchmark.cases.rods import rods_in_angles
 from scvi_codegen.benchmark.cases.unforced import Array
 from scvi_codegen.benchmark.report import FLOOR, OURS, Point, ResultTable, error_at
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.runtime.core.stepper import Stepper
 
 GRAVITY = 9.81
 PARTS = 10
@@ -127,23 +125,6 @@ def our_motion(linkage: Linkage, method: str) -> Callable[[float, int], Contende
     )
     stepper = compile_stepper(system, method)
     q, p = stepper.project(np.ravel(linkage.start))
-    return _by(stepper, q, p, lambda x: _length_error(linkage, x.reshape(n, 2)))
-
-
-def motion_in_angles(linkage: Linkage, method: str) -> Callable[[float, int], ContenderRun]:
-    """Return a run of an open chain of equal masses and rods in the angles of these, without constraints."""
-    n = len(linkage.masses)
-    values = {"m": linkage.masses[0], "l": linkage.length(*linkage.rods[0]), "g": GRAVITY}
-    stepper = compile_stepper(rods_in_angles(n, parameters=values), method)
-    along = [linkage.point(j) - linkage.point(i) for i, j in linkage.rods]
-    q = np.array([np.arctan2(x, -y) for x, y in along])
-    return _by(stepper, q, np.zeros(n), lambda x: 0.0)
-
-
-def _by(
-    stepper: Stepper, q: Array, p: Array, length_error: Callable[[Array], float]
-) -> Callable[[float, int], ContenderRun]:
-    """Return a run of a stepper, for a step size and a number of steps."""
 
     def move(h: float, steps: int) -> ContenderRun:
         run, seconds, energies, worst = stepper.start(q, p, h=h), 0.0, [float(stepper.energy(q, p))], 0.0
@@ -152,7 +133,7 @@ def _by(
             run.advance(steps // PARTS)
             seconds += time.process_time() - began
             energies.append(float(stepper.energy(run.q, run.p)))
-            worst = max(worst, length_error(run.q))
+            worst = max(worst, _length_error(linkage, run.q.reshape(n, 2)))
         return ContenderRun(seconds, float(np.ptp(energies)), worst)
 
     return move
@@ -269,11 +250,11 @@ def run_constrained_bodies(plan: Plan, report_activity: ReportActivity) -> Resul
         for method in METHODS[: 1 if plan.quick else None]:
             report_activity(f"held: {name} by {method}")
             constrained += list(_rows(linkage, f"{OURS} {method}", our_motion(linkage, method), OUR_STEPS, plan))
-        angles = [] if linkage.closed else list(_angles(linkage, plan))
         theirs = [row for label, move in _others(linkage) for row in _rows(linkage, label, move, STEPS, plan)]
-        curves = {"energy": _points(constrained), "angles": _points(angles)}
-        result = [row | _beside(row, curves) for row in theirs] or [{"by": "MuJoCo", "why_not": "pip install mujoco"}]
-        rows += [{"bodies": name} | row for row in (*constrained, *angles, *result)]
+        result = [row | _beside(row, _points(constrained)) for row in theirs] or [
+            {"by": "MuJoCo", "why_not": "pip install mujoco"}
+        ]
+        rows += [{"bodies": name} | row for row in (*constrained, *result)]
     return ResultTable(
         name="constrained-bodies",
         title="constrained bodies: errors of energy and rod lengths over ten seconds",
@@ -286,21 +267,15 @@ def run_constrained_bodies(plan: Plan, report_activity: ReportActivity) -> Resul
             "stretch": ".0e",
             "ours_then": ".1e",
             "ratio": ".2g",
-            "in_angles_then": ".1e",
             "why_not": "",
         },
         rows=tuple(rows),
         remarks=(
             "second: processor microseconds per second of simulated time; energy: its largest change, in units of",
             "all weights times 1; stretch: of a rod, as a part of its length; ours then: that energy by constraints of",
-            "this project at equal time, between its settings; ratio: theirs over ours; in angles: ours in those.",
+            "this project at equal time, between its settings; ratio: theirs over ours.",
         ),
     )
-
-
-def _angles(linkage: Linkage, plan: Plan) -> Iterator[dict[str, Any]]:
-    for method in METHODS[-1:]:
-        yield from _rows(linkage, f"{OURS} {method}, angles", motion_in_angles(linkage, method), OUR_STEPS, plan)
 
 
 def _others(linkage: Linkage) -> Iterator[tuple[str, Move]]:
@@ -341,10 +316,9 @@ def _points(rows: Sequence[dict[str, Any]]) -> list[Point]:
     return [Point(seconds=row["second_us"], error=row["energy"]) for row in rows if "why_not" not in row]
 
 
-def _beside(row: dict[str, Any], curves: dict[str, list[Point]]) -> dict[str, Any]:
-    """Return the errors of this package in the time of a row."""
+def _beside(row: dict[str, Any], points: list[Point]) -> dict[str, Any]:
+    """Return the energy error of this package in the time of a row."""
     if "why_not" in row:
         return {}
-    ours, angles = (error_at(curves[name], row["second_us"]) for name in ("energy", "angles"))
-    ratio = None if ours is None else row["energy"] / max(ours, FLOOR)
-    return {"ours_then": ours, "ratio": ratio, "in_angles_then": angles}
+    ours = error_at(points, row["second_us"])
+    return {"ours_then": ours, "ratio": None if ours is None else row["energy"] / max(ours, FLOOR)}

@@ -1,6 +1,4 @@
-"""Benchmark of the time from text to the first step of the Kepler problem, without and with cache, in new processes.
-
-Benchmark of the time from text to the first step, for two to some thousand coordinates, in fresh processes.
+"""Benchmark of the time from text to the first step, for two to some thousand coordinates, in fresh processes.
 
 Benchmark from SymPy's description of n links on a cart to a trajectory: this package, SymPy's lambdify and PyDy.
 """
@@ -11,7 +9,6 @@ import json
 import statistics
 import subprocess
 import tempfile
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
@@ -32,62 +29,6 @@ from scvi_codegen.benchmark.cases.texts import (
 from scvi_codegen.benchmark.report import OURS, Point, ResultTable, time_at
 from scvi_codegen.benchmark.settings import Plan, ReportActivity, output_of_process
 
-FIRST_STEP_OF_KEPLER = """
-import json, sys, time
-began = time.perf_counter()
-import scvi_codegen as sc
-symbolic = "sympy" in sys.modules
-sc.LagrangianSystem, sc.compile_stepper, sc.SVI
-imported = time.perf_counter()
-kepler = sc.LagrangianSystem.from_text(
-    name="Kepler problem",
-    coordinates=["q1", "q2"],
-    lagrangian="(q1_dot**2 + q2_dot**2)/2 + mu/sqrt(q1**2 + q2**2)",
-    parameters={"mu": 1.0},
-)
-sc.compile_stepper(kepler, sc.SVI(8)).step([0.5, 0.0], [0.0, 3.0**0.5], 0.1)
-done = time.perf_counter()
-print(json.dumps([imported - began, done - imported, symbolic, "sympy" in sys.modules]))
-"""
-
-
-def run_cold_start(plan: Plan, report_activity: ReportActivity) -> ResultTable:
-    """Measure medians, without and with cache in turn."""
-    result: dict[str, list[dict[str, Any]]] = {"cold": [], "cached": []}
-    for number in range(plan.rounds):
-        report_activity(f"cold start: round {number + 1}")
-        with tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder:
-            for kind, rows in result.items():
-                rows.append(_cold_start(folder) | {"cache": kind})
-    formats = {"cache": "", "import_ms": ".0f", "first_step_ms": ".0f", "process_ms": ".0f"}
-    return ResultTable(
-        name="cold-start",
-        title="from the text of Kepler's Lagrangian to the first step, in a fresh process",
-        columns=formats | {"sympy_by_import": "", "sympy_by_step": ""},
-        rows=tuple(_medians(rows) for rows in result.values()),
-        remarks=(
-            "import: of scvi_codegen and the names used; first step: from the text on; process: the whole.",
-            "sympy: whether SymPy was imported by 'import scvi_codegen', and by the step.",
-        ),
-    )
-
-
-def _cold_start(folder: str) -> dict[str, Any]:
-    began = time.perf_counter()
-    output = output_of_process(["-c", FIRST_STEP_OF_KEPLER], cache=folder, longest=LONGEST)
-    whole = time.perf_counter() - began
-    imported, stepped, by_import, by_step = json.loads(output)
-    times = {"import_ms": 1e3 * imported, "first_step_ms": 1e3 * stepped, "process_ms": 1e3 * whole}
-    return times | {"sympy_by_import": str(by_import), "sympy_by_step": str(by_step)}
-
-
-def _medians(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    return {
-        key: statistics.median(row[key] for row in rows) if isinstance(value, float) else value
-        for key, value in rows[0].items()
-    }
-
-
 COMPILED: Mapping[str, tuple[Callable[[], SystemText], str]] = {
     "Kepler": (kepler, "SVI(8)"),
     "double pendulum": (partial(links, 2), "SVI(8)"),
@@ -107,64 +48,89 @@ COMPILED: Mapping[str, tuple[Callable[[], SystemText], str]] = {
 QUICK = ("Kepler", "double pendulum")
 LONGEST = 1800
 
-FIRST_STEP_IN_PARTS = """
+FIRST_STEP = """
 import json, os, sys, time
 began = time.perf_counter()
 import scvi_codegen as sc
-from scvi_codegen.mechanics.symmetry.symmetry import symmetries
-
+by_import = "sympy" in sys.modules
+sc.LagrangianSystem, sc.compile_stepper, sc.SVI
 given, start, method = json.load(sys.stdin)
 marks = [time.perf_counter()]
 system = sc.LagrangianSystem.from_text(**given)
-marks.append(time.perf_counter())
-symmetries(system)
 marks.append(time.perf_counter())
 stepper = sc.compile_stepper(system, getattr(sc, method[0])(*method[1]))
 stepper.step(start, [0.0] * len(start), 1e-3)
 done = time.perf_counter()
 used = os.times()
-python, compiler = used.user + used.system, used.children_user + used.children_system
-lines = stepper.source.code.count("\\n")
-print(json.dumps([lines, done - began, marks[1] - marks[0], marks[2] - marks[1], python, compiler]))
+seconds = [marks[0] - began, marks[1] - marks[0], done - marks[0]]
+cpu = [used.user + used.system, used.children_user + used.children_system]
+by_step = "sympy" in sys.modules
+print(json.dumps([stepper.source.code.count("\\n"), *seconds, *cpu, str(by_import), str(by_step)]))
 """
 MEASURED = {
     "lines_of_C": "d",
-    "first_step_s": ".2f",
-    "read_s": ".2f",
-    "symmetries_s": ".2f",
+    "import_s": ".3f",
+    "read_s": ".3f",
+    "first_step_s": ".3f",
     "python_cpu_s": ".2f",
     "compiler_cpu_s": ".2f",
+    "sympy_by_import": "",
+    "sympy_by_step": "",
 }
 """Numbers that this prints, with their formats."""
+
+
+def run_cold_start(plan: Plan, report_activity: ReportActivity) -> ResultTable:
+    """Measure the medians for Kepler's problem, without and with cache in turn."""
+    result: dict[str, list[dict[str, Any]]] = {"empty": [], "filled": []}
+    for number in range(plan.rounds):
+        report_activity(f"cold start: round {number + 1}")
+        with tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder:
+            for kind, rows in result.items():
+                rows.append({"cache": kind} | _first_step("Kepler", folder))
+    return _first_steps("cold-start", [_medians(rows) for rows in result.values()])
 
 
 def run_compile_times(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure one run per system, each with an empty cache."""
     rows = []
-    for name, (write, method) in COMPILED.items():
-        if plan.quick and name not in QUICK:
-            continue
-        report_activity(f"compile: {name}")
-        rows.append({"system": name, "method": method} | _first_step(write(), method))
+    for name in COMPILED:
+        if not plan.quick or name in QUICK:
+            report_activity(f"compile: {name}")
+            rows.append({"cache": "empty"} | _first_step(name))
+    return _first_steps("compile", rows)
+
+
+def _first_steps(section: str, rows: list[dict[str, Any]]) -> ResultTable:
     return ResultTable(
-        name="compile",
-        title="from the text of a Lagrangian to the first step, in a fresh process with an empty cache",
-        columns={"system": "", "method": "", "coordinates": "d", **MEASURED},
+        name=section,
+        title="from the text of a Lagrangian to the first step, in a fresh process",
+        columns={"system": "", "method": "", "cache": "", "coordinates": "d", **MEASURED},
         rows=tuple(rows),
         remarks=(
-            "first step: wall time from the import on, including parsing and checking the text and the search for",
-            "symmetries; cpu: processor seconds of Python and of the C compiler, less sensitive to other processes.",
+            "import: wall time of scvi_codegen and the names used; first step: from the text on, including reading it;",
+            "cpu: processor seconds of Python and of the C compiler, less sensitive to other processes; sympy: whether",
+            "it was imported by 'import scvi_codegen', and by the step.",
         ),
     )
 
 
-def _first_step(written: SystemText, method: str) -> dict[str, Any]:
-    keywords = asdict(written)
+def _first_step(system: str, cache: str = "") -> dict[str, Any]:
+    write, method = COMPILED[system]
+    keywords = asdict(write())
     start = keywords.pop("start")
     name, _, arguments = method.rstrip(")").partition("(")
     text = json.dumps([keywords, start, [name, [int(argument) for argument in arguments.split(",") if argument]]])
-    numbers = json.loads(output_of_process(["-c", FIRST_STEP_IN_PARTS], text=text, longest=LONGEST))
-    return {"coordinates": len(start)} | dict(zip(MEASURED, numbers, strict=True))
+    numbers = json.loads(output_of_process(["-c", FIRST_STEP], text=text, cache=cache, longest=LONGEST))
+    given = {"system": system, "method": method, "coordinates": len(start)}
+    return given | dict(zip(MEASURED, numbers, strict=True))
+
+
+def _medians(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    return {
+        key: statistics.median(row[key] for row in rows) if isinstance(value, float) else value
+        for key, value in rows[0].items()
+    }
 
 
 CONTENDERS = (OURS, "lambdify", "PyDy")

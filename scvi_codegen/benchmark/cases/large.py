@@ -10,6 +10,7 @@ import numpy as np
 
 from scvi_codegen.benchmark.cases.unforced import Array
 from scvi_codegen.mechanics.arrays.system import ArraySystem
+from scvi_codegen.mechanics.system import MechanicalSystem
 
 SEED = 20261121
 SPACING = 0.98 * 2 ** (2 / 3)
@@ -17,20 +18,21 @@ SPACING = 0.98 * 2 ** (2 / 3)
 
 
 class Lattice(NamedTuple):
-    """Problem: system and initial state, duration, largest step size to try, accelerations by NumPy.
+    """Problem: system and initial state, duration, largest step size to try.
 
-    ``by_hand``: (is a field, length of an axis, strength) for the hand-written C; ``tables``: index tables of bonds.
+    ``accelerations``: by NumPy, for SciPy's DOP853; ``by_hand``: (is a field, length of an axis, strength) for the
+    hand-written C; ``tables``: index tables of bonds.
     """
 
     name: str
-    system: ArraySystem
+    system: ArraySystem | MechanicalSystem
     q: Array
     v: Array
     span: float
     longest: float
-    accelerations: Callable[[Array], Array]
-    by_hand: tuple[int, int, float] | None
-    parameters: Mapping[str, float]
+    accelerations: Callable[[Array], Array] | None = None
+    by_hand: tuple[int, int, float] | None = None
+    parameters: Mapping[str, float] = MappingProxyType({})
     tables: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -58,7 +60,6 @@ def ring(count: int, span: float) -> Lattice:
         longest=0.4,
         accelerations=accelerations,
         by_hand=(0, count, beta),
-        parameters={},
     )
 
 
@@ -88,7 +89,6 @@ def field(side: int, span: float) -> Lattice:
         longest=0.06,
         accelerations=accelerations,
         by_hand=(1, side, 1 / dx**2),
-        parameters={},
     )
 
 
@@ -116,7 +116,6 @@ def bodies(count: int, span: float) -> Lattice:
         span=span,
         longest=0.25,
         accelerations=accelerations,
-        by_hand=None,
         parameters={"m": 1 / count},
     )
 
@@ -146,18 +145,11 @@ def atoms(cells: int, span: float) -> Lattice:
         span=span,
         longest=0.05,
         accelerations=accelerations,
-        by_hand=None,
-        parameters={},
     )
 
 
 def waves(count: int, span: float) -> Lattice:
     """Return a Klein-Gordon ring with on-site q^4 potential, with long waves."""
-
-    def accelerations(q: Array) -> Array:
-        result: Array = np.roll(q, -1) - 2.0 * q + np.roll(q, 1) - q - q**3
-        return result
-
     phase = 2.0 * np.pi * np.arange(count) / count
     return Lattice(
         name="waves",
@@ -170,9 +162,6 @@ def waves(count: int, span: float) -> Lattice:
         v=np.cos(3.0 * phase),
         span=span,
         longest=0.4,
-        accelerations=accelerations,
-        by_hand=None,
-        parameters={},
     )
 
 
@@ -180,10 +169,6 @@ def breather(count: int, span: float) -> Lattice:
     """Return the breather of the sine-Gordon equation, 4 atan(k sin(w t) / (w cosh(k x))), k^2 = 1 - w^2, on a ring."""
     dx, frequency = 0.1, 0.8
     derivative = np.sqrt(1.0 - frequency**2)
-
-    def accelerations(u: Array) -> Array:
-        result: Array = (np.roll(u, -1) - 2.0 * u + np.roll(u, 1)) / dx**2 - np.sin(u)
-        return result
 
     x = dx * (np.arange(count) - count // 2)
     return Lattice(
@@ -198,9 +183,6 @@ def breather(count: int, span: float) -> Lattice:
         v=4.0 * derivative / np.cosh(derivative * x),
         span=span,
         longest=0.06,
-        accelerations=accelerations,
-        by_hand=None,
-        parameters={},
     )
 
 
@@ -211,14 +193,6 @@ def cloth(side: int, span: float) -> Lattice:
     bonds = np.concatenate([down.reshape(-1, 2), along.reshape(-1, 2)])
     x, y = (each.T for each in np.meshgrid(np.arange(side), np.arange(side)))
     q = np.stack([1.05 * x, 1.02 * y, 0.1 * np.sin(x) * np.cos(y)], axis=-1).reshape(-1, 3)
-
-    def accelerations(r: Array) -> Array:
-        d = r[bonds[:, 0]] - r[bonds[:, 1]]
-        length, result = np.sqrt(np.sum(d**2, axis=-1, keepdims=True)), np.zeros_like(r)
-        np.add.at(result, bonds[:, 0], -100.0 * (1.0 - 1.0 / length) * d)
-        np.add.at(result, bonds[:, 1], 100.0 * (1.0 - 1.0 / length) * d)
-        return result
-
     return Lattice(
         name="cloth",
         system=ArraySystem.from_text(
@@ -233,8 +207,5 @@ def cloth(side: int, span: float) -> Lattice:
         v=np.zeros_like(q),
         span=span,
         longest=0.04,
-        accelerations=accelerations,
-        by_hand=None,
-        parameters={},
         tables={"bonds": bonds},
     )

@@ -40,8 +40,7 @@ def bench(
       ensemble:planar-pendulum, :kepler:0.2, :outer-solar-system            64 trajectories at once
       adaptive:kepler:0.9, ..   adaptive and fixed step size, time transformation; heyoka and IAS15
       drift                     energy over ten million steps
-      tables                    Tables 6 and 7 of the paper
-      compositions              explicit composition methods
+      compositions              explicit composition methods, at equal error
       hand-written              hand-written C
       cold-start, compile       time from text to the first step; for larger systems
       mechanisms                SymPy mechanisms; lambdify and PyDy
@@ -50,7 +49,6 @@ def bench(
       lattices, growth          array systems (lattices, fields, bodies); scaling with size
       threads                   steps with several threads
       energies                  energy of array systems over 100,000 steps
-      thousand-bodies           a thousand bodies; REBOUND
       c-compilers               compilers and processors
 
     Install the peers with 'scvi-codegen[bench]'. Each section is printed, and written to the JSON file, when it is
