@@ -15,12 +15,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, cast, overload
 
 from numpy.typing import ArrayLike
 
-from scvi_codegen.errors import MethodError
+from scvi_codegen.errors import MethodError, SizesRequiredError
 from scvi_codegen.files.cache import cached_source, key_of
 from scvi_codegen.indices import SIZES_REQUIRED
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -133,16 +134,25 @@ def compile_stepper(
     if known_sizes := not hasattr(system, "REQUIRES_SIZES"):
         method = as_method(method, system)
     else:
-        _check_sizes_not_needed(system, symmetries=symmetries, events=events, time_transformation=time_transformation)
+        _check_sizes_not_needed(system, symmetries=symmetries, events=events)
         method = as_method(method)
     sources = CachedSources(system, method, solver, prefix, symmetries, time_transformation)
-    source, interface = sources.integrator()
     variants = Variants(make=sources.variant)
     if not known_sizes:
+        source, interface, reason = sources.of_any_size()
         from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 
-        of_sizes = partial(compile_stepper, cast(Any, system), method, solver=solver, flags=flags, prefix=prefix)
-        return ArrayStepper(source, interface, variants=variants, flags=flags, of_sizes=of_sizes)
+        of_sizes = partial(
+            compile_stepper,
+            cast(Any, system),
+            method,
+            solver=solver,
+            flags=flags,
+            prefix=prefix,
+            time_transformation=time_transformation,
+        )
+        return ArrayStepper(source, interface, variants=variants, flags=flags, of_sizes=of_sizes, reason=reason)
+    source, interface = sources.integrator()
     cast(MechanicalSystem, system).store_key()
     return Stepper(source, interface, variants=variants, flags=flags, events=as_events(events))
 
@@ -185,9 +195,22 @@ class CachedSources:
             return json.dumps([source.to_record(), interface.to_record()])
 
         source, interface = json.loads(cached_source((*self.key, "integrator"), derive))
-        if hasattr(self.system, "REQUIRES_SIZES"):  # JSON cannot represent arrays
-            return Source.from_record(source), self.derived.interface
         return Source.from_record(source), Interface.from_record(interface)
+
+    def of_any_size(self) -> tuple[Source | None, Interface, str]:
+        """Return the C source for arrays of any size, or ``None``; the interface; the reason why there is none."""
+
+        def derive() -> str:
+            try:
+                return json.dumps([self.derived.integrator()[0].to_record(), ""])
+            except SizesRequiredError as error:
+                return json.dumps([None, str(error)])
+
+        record, reason = json.loads(cached_source((*self.key, "integrator"), derive))
+        interface = self.derived.interface
+        if record:
+            return Source.from_record(record), interface, ""
+        return None, replace(interface, layout=replace(interface.layout, maps=())), reason
 
     def variant(self, name: str) -> Source | None:
         """Return the source of a variant (:class:`Variants`)."""

@@ -68,6 +68,10 @@ class MethodError(ScviCodegenError, ValueError):
     """An invalid combination of degree, nodes and quadrature, or a feature that the method does not have."""
 
 
+class SizesRequiredError(SystemDefinitionError, MethodError):
+    """A system or a method that has no integrator for arrays of any size: the sizes must be known."""
+
+
 class OrbitError(ScviCodegenError, ArithmeticError):
     """Failure to find a periodic orbit near an initial guess."""
 

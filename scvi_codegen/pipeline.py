@@ -24,7 +24,7 @@ from functools import cached_property, partial
 
 from sympy import Expr
 
-from scvi_codegen.errors import MethodError
+from scvi_codegen.errors import MethodError, SizesRequiredError
 from scvi_codegen.indices import SIZES_REQUIRED
 from scvi_codegen.ir.equations import Control
 from scvi_codegen.ir.program import Program
@@ -288,21 +288,29 @@ class ArraySources:
     ArraySystem, Method -> lower -> Program (kernels of terms, tables of one coordinate) -> render -> Source.
     """
 
-    def __init__(self, system: ArraySystem, method: Method, solver: str, prefix: str | None) -> None:
+    def __init__(
+        self, system: ArraySystem, method: Method, solver: str, prefix: str | None, g: str | Expr | None = None
+    ) -> None:
         self.solver = "fixed-point" if solver == "auto" else solver
         check_solver_of_arrays(self.solver)
-        system.check_run_time_sizes()
-        self.system, self.method = system, method
+        self.system, self.method, self.g = system, method, g
         self.prefix = c_identifier(prefix or f"{system.name}_{method.name}")
 
     @cached_property
     def program(self) -> Program:
-        """Lowered program with fixed step size."""
+        """Lowered program with fixed step size.
+
+        Raises:
+            SizesRequiredError: if there is none for arrays of any size.
+        """
+        self.system.check_run_time_sizes()
         with announced(f"deriving the equations of {self.system.name} by {self.method.name}"):
             try:
+                if self.g is not None:
+                    raise SizesRequiredError("time_transformation is not available for arrays of any size")
                 return lower(self.system, self.method, prefix=self.prefix, solver=self.solver)
-            except MethodError as error:
-                raise MethodError(f"{error}. This concerns '{self.system.name}': {SIZES_REQUIRED}") from error
+            except SizesRequiredError as error:
+                raise SizesRequiredError(f"{error}. This concerns '{self.system.name}': {SIZES_REQUIRED}") from error
 
     @property
     def interface(self) -> Interface:
@@ -329,7 +337,7 @@ def sources_of(
 ) -> Sources | ArraySources:
     """Return the sources of an integrator; arguments as of :func:`~scvi_codegen.compile_stepper`."""
     if isinstance(system, ArraySystem):
-        return ArraySources(system, method, solver, prefix)
+        return ArraySources(system, method, solver, prefix, g)
     return Sources(system, method, solver, prefix, symmetries, g)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 from sympy import Expr, latex
 
@@ -15,20 +16,42 @@ from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.arrays.terms import constraint_text, force_of
 from scvi_codegen.methods.method import Method
+from scvi_codegen.representation import LONGEST, clipped
 
 DIGITS = 17
 
 
-def derive_sums(system: ArraySystem, method: Method, *, as_latex: bool = False) -> str:
-    """Return the compiled kernels, with the loops around them, and the equations of a step, as text or LaTeX.
+@dataclass(frozen=True, slots=True)
+class ArrayStepEquations:
+    """Compiled kernels of a system of arrays, with the loops around them, and the equations of a step.
 
-    Raises:
-        MethodError: for a method without fixed-point iteration.
+    Attributes:
+        system, method: the system and the method.
     """
-    program = lower(system, method, prefix="derived")
-    if as_latex:
-        return "\n".join(_latex(system))
-    return "\n".join([*_text(system), "", *_step(program, method)])
+
+    system: ArraySystem
+    method: Method
+
+    def __repr__(self) -> str:
+        return clipped(f"<equations of {self.system.name} by {self.method.name}>", LONGEST)
+
+    @property
+    def program(self) -> Program:
+        """Lowered program.
+
+        Raises:
+            MethodError: for a method without fixed-point iteration, and a system that requires known sizes.
+        """
+        self.system.check_run_time_sizes()
+        return lower(self.system, self.method, prefix="derived")
+
+    def to_text(self) -> str:
+        """Return plain text."""
+        return "\n".join([*_text(self.system), "", *_step(self.program, self.method)])
+
+    def to_latex(self) -> str:
+        """Return L or H and the derivatives of its terms, one line each."""
+        return "\n".join(_latex(self.system))
 
 
 def _text(system: ArraySystem) -> Iterator[str]:

@@ -19,6 +19,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, overload
 
 import sympy
 
@@ -28,8 +29,9 @@ from scvi_codegen.display.cards import card, listed, plain
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.expressions import jacobian
 from scvi_codegen.formulas.writing import format_expression
+from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, symmetries
-from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.collocation import SpectralCollocation
 from scvi_codegen.methods.discretise import discretised_form, paper_equations
@@ -38,6 +40,9 @@ from scvi_codegen.methods.stage_system import Block, Row, StageGroup, StageSyste
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.tables.precision import Number
 from scvi_codegen.validation import SWITCH, checks_arguments
+
+if TYPE_CHECKING:
+    from scvi_codegen.derivation.arrays import ArrayStepEquations
 
 MOST_SHOWN = 12
 """Largest number of equations that a notebook shows."""
@@ -162,9 +167,15 @@ class StepEquations:
         return card(f"{self.system.name}: {self.method.title}", facts, *shown, *more)
 
 
-@checks_arguments(system=SYSTEM, radicals=SWITCH)
-def derive(system: MechanicalSystem, method: Method | str, *, radicals: bool = False) -> StepEquations:
-    """Return the closed form of one step in the notation of the paper.
+@overload
+def derive(system: ArraySystem, method: Method | str, *, radicals: bool = False) -> ArrayStepEquations: ...
+@overload
+def derive(system: MechanicalSystem, method: Method | str, *, radicals: bool = False) -> StepEquations: ...
+@checks_arguments(system=SYSTEM_OR_ARRAYS, radicals=SWITCH)
+def derive(
+    system: MechanicalSystem | ArraySystem, method: Method | str, *, radicals: bool = False
+) -> StepEquations | ArrayStepEquations:
+    """Return the closed form of one step in the notation of the paper; of arrays of any size its kernels and loops.
 
     Args:
         system: the Lagrangian.
@@ -172,6 +183,10 @@ def derive(system: MechanicalSystem, method: Method | str, *, radicals: bool = F
             (22).
         radicals: replace table entries by radicals if they have a short form.
     """
+    if isinstance(system, ArraySystem):
+        from scvi_codegen.derivation.arrays import ArrayStepEquations
+
+        return ArrayStepEquations(system, as_method(method))
     method = as_method(method, system)
     system = discretised_form(system, method)
     stages = paper_equations(system, method)

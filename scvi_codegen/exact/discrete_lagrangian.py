@@ -19,6 +19,8 @@ from scvi_codegen.errors import StateError, closest
 from scvi_codegen.exact.curve import Curve, Grid
 from scvi_codegen.exact.newton import Array, NotConvergedError, largest
 from scvi_codegen.exact.solution import ExactMotion
+from scvi_codegen.mechanics.arrays.rolling import unrolled_at
+from scvi_codegen.mechanics.arrays.system import ArrayLagrangian
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.representation import summary
 from scvi_codegen.tables.precision import Number, Vector, mp
@@ -32,7 +34,7 @@ MAX_STRAIGHT_PIECES = 2
 """Maximum number of pieces for which the straight line is the initial guess; more have not helped."""
 
 Values = Mapping[str, Any] | Sequence[Any] | None
-LAGRANGIAN = of("a LagrangianSystem", LagrangianSystem)
+LAGRANGIAN_OR_ARRAYS = of("a LagrangianSystem", LagrangianSystem, ArrayLagrangian)
 VALUES = ArgumentType("values by name or a list of all", lambda value: MAPPING.accepts(value) or NUMBERS.accepts(value))
 
 
@@ -61,7 +63,7 @@ class ExactStep:
     __repr__ = summary("action", "error")
 
 
-@checks_arguments(system=LAGRANGIAN, parameters=VALUES)
+@checks_arguments(system=LAGRANGIAN_OR_ARRAYS, parameters=VALUES)
 def exact_discrete_lagrangian(
     system: LagrangianSystem,
     q0: Sequence[Any],
@@ -80,8 +82,8 @@ def exact_discrete_lagrangian(
 
     Args:
         system: any regular Lagrangian without forces and constraints.
-        q0, q1: m positions each. Floats are used with their exact binary values; strings such as ``"0.1"``, integers,
-            fractions, mpmath and SymPy numbers are converted to 60 digits.
+        q0, q1: m positions each, or arrays by name. Floats are used with their exact binary values; strings such as
+            ``"0.1"``, integers, fractions, mpmath and SymPy numbers are converted to 60 digits.
         h: step size, negative for a step backward in time.
         t: initial time.
         parameters: by name (others keep their defaults) or all in order; coefficients for inputs.
@@ -92,6 +94,7 @@ def exact_discrete_lagrangian(
         StateError: for invalid numbers, wrong shapes or names, inputs without values, and systems with forces or
             constraints; if no solution is found; if q1 is conjugate to q0, where the solution is not unique.
     """
+    system, parameters = unrolled_at(system, q0, parameters)
     if system.forces:
         raise StateError(
             f"forces act on '{system.name}', so its momenta are not derivatives of an action: use exact_map"
@@ -117,7 +120,7 @@ def exact_discrete_lagrangian(
     return problem.answer(solve, f"no trajectory from q0 = {_shown(start)} to q1 = {_shown(end)} was found: {hint}")
 
 
-@checks_arguments(system=LAGRANGIAN, parameters=VALUES)
+@checks_arguments(system=LAGRANGIAN_OR_ARRAYS, parameters=VALUES)
 def exact_map(
     system: LagrangianSystem,
     q0: Sequence[Any],
@@ -132,13 +135,14 @@ def exact_map(
 
     Args:
         system: any regular Lagrangian without constraints; forces are supported.
-        q0, p0: m positions and m momenta.
+        q0, p0: m positions and m momenta, or arrays by name.
         h, t, parameters, digits: as in :func:`exact_discrete_lagrangian`.
 
     Raises:
         StateError: for invalid numbers, wrong shapes or names, inputs without values, and systems with constraints; if
             the trajectory does not exist up to t + h, or is not smooth enough for 16 pieces.
     """
+    system, parameters = unrolled_at(system, q0, parameters)
     problem = _Problem(system, h, t, parameters, digits)
     start, momenta = problem.vector(q0, "q0"), problem.vector(p0, "p0")
     origin = f"the trajectory from q0 = {_shown(start)}, p0 = {_shown(momenta)}"
@@ -159,6 +163,7 @@ class _Problem:
     def __init__(self, system: LagrangianSystem, h: Any, t: Any, parameters: Values, digits: int) -> None:
         checked_count(digits, "digits", least=1, most=MOST_DIGITS)
         self.names = [coordinate.name for coordinate in system.coordinates]
+        self.arrays = [array.name for array in system.arrays] or self.names
         self.digits, self.t, self.h = digits, _number(t, "the time t"), _number(h, "the step h")
         if self.h == 0:
             raise StateError("the step size h is 0: it must be positive or negative")
@@ -169,8 +174,11 @@ class _Problem:
             )
         self.motion = ExactMotion(system, list(_parameter_values(system, parameters).values()))
 
-    def vector(self, values: Sequence[Any], name: str) -> Array:
+    def vector(self, values: Any, name: str) -> Array:
         """Return (m,) numbers."""
+        if isinstance(values, Mapping):
+            arrays = [values[name] for name in self.arrays if name in values]
+            values = [entry for array in arrays for entry in np.asarray(array, dtype=object).flat]
         entries = [values] if isinstance(values, str) or not hasattr(values, "__len__") else list(values)
         if len(entries) != len(self.names):
             raise StateError(f"{name} must be {len(self.names)} numbers ({', '.join(self.names[:6])}), not {values!r}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from scvi_codegen.errors import MethodError, ScviCodegenError
+from scvi_codegen.errors import MethodError, ScviCodegenError, SizesRequiredError
 from scvi_codegen.ir.equations import ConstrainedSteps, FixedPointIteration, Splitting
 from scvi_codegen.ir.program import LoopedTerms
 from scvi_codegen.mechanics.arrays.system import ArraySystem
@@ -36,7 +36,11 @@ def check_solver_of_arrays(
     chosen: Splitting | ConstrainedSteps | FixedPointIteration | None,
     loops: LoopedTerms,
 ) -> None:
-    """Raise :class:`MethodError` for a method and a solver that are not available for an array system."""
+    """Raise :class:`MethodError` for a method and a solver that are not available for an array system.
+
+    Raises:
+        SizesRequiredError: if they are available for known sizes.
+    """
     if isinstance(chosen, Splitting) and system.velocities:
         raise MethodError(
             f"{method.name} does not support velocity-dependent forces of array systems: use an SVI or a "
@@ -44,13 +48,13 @@ def check_solver_of_arrays(
         )
     iterated = isinstance(chosen, FixedPointIteration) and chosen.name in ("separable", "Hamiltonian")
     if solver == "newton" and (not loops.products or system.momenta or system.velocities or not iterated):
-        raise MethodError(
+        raise SizesRequiredError(
             "Newton's method for array systems requires a Lagrangian with a potential that is not linear, forces of "
             "positions and time, no constraints, and an implicit method: leave out solver='newton'"
         )
     if not (iterated or isinstance(chosen, Splitting | ConstrainedSteps)):
         explicit = "" if system.momenta else ", Stoermer-Verlet or a composition"
-        raise MethodError(
+        raise SizesRequiredError(
             f"{method.name} is not supported for array systems: use an SVI, a Runge-Kutta method of at "
             f"most 32 points{explicit}"
         )

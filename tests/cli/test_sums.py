@@ -116,7 +116,7 @@ def test_options_of_array_systems(ring: str) -> None:
         (("run", "-o", "ring.txt"), "a trajectory is written as .npz, .csv"),
         (("run", "--size", "N=1.5"), "must be an integer, not 1.5"),
         (("run", "--parameter", "x=1"), "has no parameter 'x'"),
-        (("run", "--method", "scvi:4"), "not supported for array systems"),
+        (("generate", "-o", "folder", "--method", "scvi:4"), "not supported for array systems"),
         (("run", "--solver", "explicit"), "unknown solver 'explicit' of an array system"),
         (("generate", "-o", "folder", "--method", "stoermer-verlet", *NEWTON), "leave out solver='newton'"),
     ],

@@ -10,7 +10,7 @@ import pytest
 from printed_formulas import mp, tree_of_latex, value
 
 import scvi_codegen as sc
-from scvi_codegen.derivation.arrays import derive_sums
+from scvi_codegen.derivation.equations import derive
 
 COUNT, H, T, K = 5, 0.125, 0.375, 0.6875
 MASSES = [1.25, 0.75, 1.5, 2.0, 0.875]
@@ -72,7 +72,7 @@ def at(text: str, i: int) -> Any:
 
 @pytest.mark.parametrize("system", [RING, ROTORS], ids=lambda system: system.name)
 def test_gradients_of_terms_sum_to_forces(system):
-    text = derive_sums(system, sc.SVI(2) if system is RING else sc.Gauss(2))
+    text = derive(system, sc.SVI(2) if system is RING else sc.Gauss(2)).to_text()
     added: dict[str, Any] = {"q": numbers([0] * COUNT), "p": numbers([0] * COUNT)}
     partials = re.findall(r"^    by (\w)\[i([+-]\d+)?\]: (.*)$", text, re.MULTILINE)
     assert len(partials) == text.count("    by ")
@@ -86,7 +86,7 @@ def test_gradients_of_terms_sum_to_forces(system):
         rates, kicks = rotor_rates(numbers(Q), numbers(P))
         assert np.max(np.abs(-added["p"] - rates)) < mp.mpf("1e-50")
         assert np.max(np.abs(added["q"] - kicks)) < mp.mpf("1e-50")
-    latex = [line for line in derive_sums(system, sc.SVI(2), as_latex=True).splitlines() if r"\quad" in line]
+    latex = [line for line in derive(system, sc.SVI(2)).to_latex().splitlines() if r"\quad" in line]
     assert len(latex) == len(partials)
     for line, (letter, shift, formula) in zip(latex, partials, strict=True):
         assert rf"\partial {letter}_{{i{shift}}}" in line
@@ -110,7 +110,7 @@ def stepped(system: Any, method: Any) -> tuple[Any, Any]:
 @pytest.mark.parametrize("method", [sc.StoermerVerlet(), sc.Composition(8)], ids=lambda method: method.name)
 def test_kicks_and_drifts_are_the_step(method):
     q, p = numbers(Q), numbers(P)
-    lines = derive_sums(RING, method).partition("the force on it):\n")[2].splitlines()
+    lines = derive(RING, method).to_text().partition("the force on it):\n")[2].splitlines()
     for line in lines:
         kick = re.fullmatch(r"  p \+= h\*\((.*)\)\*F at t \+ h\*\((.*)\)", line)
         drift = re.fullmatch(r"  q \+= h\*\((.*)\)\*p/m", line)
@@ -125,7 +125,7 @@ def test_kicks_and_drifts_are_the_step(method):
 @pytest.mark.parametrize(("system", "method"), [(RING, sc.SVI(2)), (RING, sc.Gauss(3)), (ROTORS, sc.Gauss(2))])
 def test_points_and_ends_are_the_step(system, method):
     """Lines as they stand, again and again until they converge."""
-    lines = derive_sums(system, method).partition("of all):\n")[2].splitlines()
+    lines = derive(system, method).to_text().partition("of all):\n")[2].splitlines()
     known = scope(q=numbers(Q), p=numbers(P), m=numbers(MASSES), h=mp.mpf(H))
     known |= {f"{letter}_{n}": numbers([0] * COUNT) for letter in "FV" for n in range(3)}
     for _ in range(40):

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from samples import QUICK_FLAGS
 from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
-from scvi_codegen.errors import StateError, SystemDefinitionError
+from scvi_codegen.errors import StateError
 
 LAGRANGIAN = (
     "M*x_dot**2/2 + sum(i in {N}, m[i]*q_dot[i]**2/2) - k*x**2/2"
@@ -113,17 +114,19 @@ def test_invalid_states_are_rejected(known, q, message):
 
 
 @pytest.mark.parametrize(
-    ("extra", "message"),
+    ("extra", "method", "message"),
     [
-        ({"lagrangian": "sum(i in N, q_dot[i]**2/2 + q[i]**2*q_dot[i]**2)"}, "velocities as m"),
-        ({"constraints": ["q_dot[i] = q[i] for i in 0..0"]}, "must be holonomic"),
+        ({"lagrangian": "sum(i in N, q_dot[i]**2/2 + q[i]**2*q_dot[i]**2)"}, "svi:2", "velocities as m"),
+        ({"constraints": ["q_dot[i] = q[i]*q_dot[i+1] for i in 0..0"]}, sc.SVI(1, "gauss-lobatto:2"), "holonomic"),
+        ({}, "scvi:2", "not supported for array systems"),
     ],
 )
-def test_known_sizes_lift_restrictions(extra, message):
+def test_steps_that_require_known_sizes_are_compiled_with_those_of_the_call(extra, method, message):
     given = {"lagrangian": "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)", **extra}
     system = sc.LagrangianSystem.from_text(name="chain", coordinates=["q[N]"], **given)
-    with pytest.raises(SystemDefinitionError, match=rf"(?s){message}.*sizes=\{{'N': 8\}}"):
-        sc.compile_stepper(system, "svi:2")
-    if "constraints" not in extra:
-        run = sc.compile_stepper(system, "svi:2", sizes={"N": 2}).integrate([0.1, 0.2], velocity=[0, 0], h=0.1, steps=3)
-        assert np.isfinite(run.q).all()
+    any_size, start = sc.compile_stepper(system, method, flags=QUICK_FLAGS), {"q": np.array([0.1, 0.2])}
+    run = any_size.integrate(start, velocity={"q": [0.02, 0.2]}, h=0.1, steps=3)
+    known = sc.compile_stepper(system, method, sizes={"N": 2}, flags=QUICK_FLAGS)
+    assert (run.q["q"] == known.integrate(start, velocity=[0.02, 0.2], h=0.1, steps=3).q).all()
+    with pytest.raises(sc.MethodError, match=rf"(?s)2001 coordinates are too many.*{message}.*sizes=\{{'N': 8\}}"):
+        any_size.integrate(np.zeros(2001), h=0.1, steps=1)

@@ -10,7 +10,6 @@ import click
 from scvi_codegen.cli.command_group import check_writable, emit, reporting
 from scvi_codegen.cli.model_options import ModelOptions, model_arguments, read_model, with_known_sizes
 from scvi_codegen.derivation import Start, derivation_html
-from scvi_codegen.derivation.arrays import derive_sums
 from scvi_codegen.derivation.equations import StepEquations
 from scvi_codegen.derivation.equations import derive as derive_equations
 
@@ -46,10 +45,6 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
     about = {"system": model.system.name, "method": model.method.name}
     if html is not None or radicals:
         model = with_known_sizes(model, "--html" if html is not None else "--radicals")
-    if model.array_system is not None:
-        text = derive_sums(model.array_system, model.method, as_latex=latex)
-        emit(text, output, **about, text=text)
-        return
     if html is not None:
         h = model.first_step(model.stepper()) if model.h is None else model.step
         start = Start(q=model.q, velocity=model.velocity, p=model.p, h=h, t=model.t)
@@ -57,7 +52,8 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
         return
     equations = derive_equations(model.system, model.method, radicals=radicals)
     text = equations.to_latex() if latex else equations.to_text()
-    emit(text, output, **about, **_formulas(equations), text=text)
+    formulas = _formulas(equations) if isinstance(equations, StepEquations) else {}
+    emit(text, output, **about, **formulas, text=text)
 
 
 def _formulas(of: StepEquations) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -183,6 +184,25 @@ class _Rolled:
         """Yield the arrays of constants with their values."""
         for slot, column in zip(self.group.constants, self.group.values, strict=True):
             yield self.accesses[slot].array, np.array([float(defaults.get(each, each)) for each in column])
+
+
+def unrolled_at(
+    system: ArraySystem | MechanicalSystem, q: Mapping[str, Any] | Any, parameters: Any = None
+) -> tuple[Any, Any]:
+    """Return the system with the sizes and the array parameters of a call, and the other parameters."""
+    if not isinstance(system, ArraySystem):
+        return system, parameters
+    state = q if isinstance(q, Mapping) else {system.coordinates[0].name: q}
+    arrays = {name: value for name, value in dict(parameters or {}).items() if np.ndim(value)}
+    others = {name: value for name, value in dict(parameters or {}).items() if name not in arrays}
+    declared = [(array, each[array.name]) for each in (state, arrays) for array in system.arrays if array.name in each]
+    sizes = {
+        axis.name: length
+        for array, values in declared
+        for axis, length in zip(array.axes, np.shape(values), strict=False)
+        if axis.name
+    }
+    return unroll_sums(system, sizes, parameters=arrays), others
 
 
 @checks_arguments(SystemDefinitionError, system=ARRAYS, sizes=MAPPING, tables=MAPPING, parameters=MAPPING)

@@ -15,7 +15,7 @@ from sympy import Add, Expr, S, Symbol
 
 from scvi_codegen.formulas.array_statements import ArrayForce
 from scvi_codegen.formulas.expressions import Tape
-from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.formulas.symbols import DOT, symbol
 from scvi_codegen.indices import Access, Array, ArrayMap, Place, Size
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.arrays.terms import force_of
@@ -31,6 +31,11 @@ MAX_ROTATED_COMPONENTS = 3
 
 def momentum_maps(system: ArraySystem) -> tuple[ArrayMap, ...]:
     """Return all momentum maps of these kinds that a system has."""
+    moving = {array.name + DOT for array in system.coordinates}
+    if any(access.array.name in moving for term in system.constraints for _, access in term.slots):
+        return ()  # nonholonomic
+    if system.coupled_terms and system.damping != 0:
+        return ()
     return tuple(each for array in system.coordinates for each in _maps(system, array))
 
 
@@ -38,6 +43,8 @@ def _forces(system: ArraySystem) -> Iterator[ArrayForce]:
     """Yield what one element of each sum adds to the rates of momenta (-H_p: to those of positions)."""
     yield from system.all_forces
     yield from (force_of(term, system.coordinates) for term in system.constraints)  # G^T lambda, for any lambda
+    moving = [*system.coordinates, *(_velocity(array) for array in system.coordinates)]
+    yield from (force_of(term, moving) for term in system.coupled_terms)
 
 
 def _maps(system: ArraySystem, array: Array) -> Iterator[ArrayMap]:
@@ -92,7 +99,11 @@ def _phase(system: ArraySystem, force: ArrayForce, array: Array) -> tuple[list[E
 
 
 def _conjugate(system: ArraySystem, array: Array) -> tuple[Array, ...]:
-    return system.momenta and (system.momenta[system.coordinates.index(array)],)
+    return (system.momenta[system.coordinates.index(array)],) if system.momenta else (_velocity(array),)
+
+
+def _velocity(array: Array) -> Array:
+    return Array(array.name + DOT, array.axes)
 
 
 Entry: TypeAlias = tuple[Array, Place | None]

@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 
 from sympy import Expr, S, Symbol
 
-from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.errors import SizesRequiredError, SystemDefinitionError
 from scvi_codegen.files.cache import key_of
 from scvi_codegen.formulas.array_latex import latex_sum
 from scvi_codegen.formulas.array_statements import ArrayForce, parse_constraint, parse_force
@@ -29,11 +29,11 @@ from scvi_codegen.formulas.symbols import DOT, TIME, check_names, input_formulas
 from scvi_codegen.indices import SIZES_REQUIRED, Access, Array, Loop
 from scvi_codegen.mechanics.arrays.terms import (
     check_constraint,
-    check_form,
     constraint_text,
     force_of,
     friction,
     friction_of,
+    has_constant_mass,
     masses_of,
     momenta_of,
     substituted,
@@ -114,22 +114,23 @@ class ArraySystem:
         check_damping(self.name, self.damping, self.parameters)
 
     def check_run_time_sizes(self) -> None:
-        """Raise :class:`SystemDefinitionError` for a system that cannot be compiled for sizes known at run time."""
+        """Raise :class:`SizesRequiredError` for a system that cannot be compiled for sizes known at run time."""
         try:
-            for term in self.terms:
-                check_form(term, self._velocities, self.time)
+            for term in self.coupled_terms:
+                raise SizesRequiredError(
+                    f"'{term}' contains velocities in another form: arrays of any size have velocities as m*v**2/2 "
+                    "only, with a constant mass m"
+                )
             inputs = "|".join(f"{name}_[0123t]" for name in self.inputs)
             for term in self.constraints:
                 check_constraint(term, self.coordinates, self.fields, inputs)
             if self.damping != 0 and self.momenta:
-                raise SystemDefinitionError("damping of a Hamiltonian requires known sizes: write it as forces")
+                raise SizesRequiredError("damping of a Hamiltonian requires known sizes: write it as forces")
             for array in self.coordinates:
                 if len(array.axes) > 1 and any(not axis.name for axis in array.axes[:-1]):
-                    raise SystemDefinitionError(
-                        f"of the axes of {array} only the last may be a number: name the others"
-                    )
-        except SystemDefinitionError as error:
-            raise SystemDefinitionError(f"{error}. This concerns '{self.name}': {SIZES_REQUIRED}") from error
+                    raise SizesRequiredError(f"of the axes of {array} only the last may be a number: name the others")
+        except SizesRequiredError as error:
+            raise SizesRequiredError(f"{error}. This concerns '{self.name}': {SIZES_REQUIRED}") from error
 
     @classmethod
     @checks_arguments(
@@ -312,19 +313,30 @@ class ArraySystem:
         return f"the {self.function} depends on time" if self.depends_on_time else ""
 
     @property
+    def coupled_terms(self) -> tuple[ArrayTerm, ...]:
+        """Terms that contain velocities other than as m v**2/2 with a constant m."""
+        coordinates = () if self.momenta else self.coordinates
+        return tuple(term for term in self.terms if not has_constant_mass(term, coordinates, self.time))
+
+    @property
+    def _plain_terms(self) -> tuple[ArrayTerm, ...]:
+        coupled = self.coupled_terms
+        return tuple(term for term in self.terms if term not in coupled)
+
+    @property
     def masses(self) -> tuple[ArrayForce, ...]:
-        """Masses (second derivatives of L with respect to velocities); empty for a Hamiltonian."""
-        return tuple(chain(*(masses_of(term, self._velocities) for term in self.terms)))
+        """Constant masses (second derivatives of L with respect to velocities); empty for a Hamiltonian."""
+        return tuple(chain(*(masses_of(term, self._velocities) for term in self._plain_terms)))
 
     @property
     def potentials(self) -> tuple[ArrayTerm, ...]:
         """Terms of -V or -H that depend on coordinates or momenta, at zero velocity."""
-        return terms_at_rest(self.terms, self._velocities, self.state, negative=bool(self.momenta), moving=True)
+        return terms_at_rest(self._plain_terms, self._velocities, self.state, negative=bool(self.momenta), moving=True)
 
     @property
     def energy_offsets(self) -> tuple[ArrayTerm, ...]:
         """Terms of -V or -H without coordinates and momenta, which change the energy but not the trajectory."""
-        return terms_at_rest(self.terms, self._velocities, self.state, negative=bool(self.momenta), moving=False)
+        return terms_at_rest(self._plain_terms, self._velocities, self.state, negative=bool(self.momenta), moving=False)
 
     @property
     def applied_forces(self) -> tuple[ArrayForce, ...]:

@@ -15,12 +15,13 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import sympy
 from sympy import Add, Expr, S, Symbol
 
-from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.errors import SizesRequiredError, SystemDefinitionError
 from scvi_codegen.formulas.array_statements import ArrayForce
 from scvi_codegen.formulas.arrays import ArrayTerm, parse_array, parse_coordinate
 from scvi_codegen.formulas.expressions import gradient, unsupported_part
@@ -82,9 +83,10 @@ def velocity_symbols(term: ArrayTerm, velocities: Mapping[str, Array]) -> tuple[
     return tuple(slot for slot, access in term.slots if access.array.name in velocities)
 
 
-def check_form(term: ArrayTerm, velocities: Mapping[str, Array], time: Symbol) -> None:
-    """Raise :class:`SystemDefinitionError` unless velocities occur as m v**2/2 with a constant m."""
-    coordinates = set(velocities.values())
+@lru_cache(maxsize=256)
+def has_constant_mass(term: ArrayTerm, coordinates: tuple[Array, ...], time: Symbol) -> bool:
+    """Return whether velocities occur as m v**2/2 with a constant m."""
+    velocities = {array.name + DOT: array for array in coordinates}
     varies = {slot for slot, access in term.slots if access.array.name in velocities or access.array in coordinates}
     slots = velocity_symbols(term, velocities)
     derivatives = gradient(term.formula, slots)
@@ -92,10 +94,8 @@ def check_form(term: ArrayTerm, velocities: Mapping[str, Array], time: Symbol) -
         derivative = derivatives.get(k, S.Zero)
         mass = derivative.diff(v)
         if mass.free_symbols & (varies | {time}) or sympy.expand(derivative - mass * v) != 0:
-            raise SystemDefinitionError(
-                f"in '{term}' the derivative with respect to {v} is {derivative}: the Lagrangian of an "
-                "array system may contain velocities as m*v**2/2 only, with a constant mass m"
-            )
+            return False
+    return True
 
 
 def terms_at_rest(
@@ -147,7 +147,7 @@ def check_constraint(term: ArrayTerm, coordinates: Sequence[Array], fields: Sequ
         raise SystemDefinitionError(f"in the constraint '{shown}': {problem}")
     if moving := {access.array for _, access in term.slots} - {*coordinates, *fields}:
         name = min(array.name for array in moving)
-        raise SystemDefinitionError(
+        raise SizesRequiredError(
             f"the constraint '{shown}' contains the velocity {name}: constraints of array systems "
             "must be holonomic (coordinates and time only)"
         )

@@ -36,6 +36,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import overload
 
 import sympy
 from sympy import Expr, Symbol
@@ -44,6 +45,9 @@ from scvi_codegen.display.cards import Html, card
 from scvi_codegen.display.mathml import mathml
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.expressions import gradient
+from scvi_codegen.indices import ArrayMap
+from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
+from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.symmetry.ansatz import (
@@ -61,7 +65,7 @@ from scvi_codegen.mechanics.symmetry.ansatz import (
 )
 from scvi_codegen.mechanics.symmetry.invariants import Monomial, Polynomial, confirmed, conserved
 from scvi_codegen.mechanics.symmetry.sampling import Rates, rates_of, terms_among_few_bodies
-from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.term_groups import rolled
 from scvi_codegen.representation import summary
 from scvi_codegen.validation import checks_arguments, several
@@ -146,17 +150,24 @@ SYMMETRIES = several("a list of symmetries", Symmetry)
 """Type check of lists of symmetries, for :func:`~scvi_codegen.validation.checks_arguments`."""
 
 
-@checks_arguments(system=SYSTEM)
+@overload
+def symmetries(system: ArraySystem) -> tuple[ArrayMap, ...]: ...
+@overload
+def symmetries(system: MechanicalSystem) -> tuple[Symmetry, ...]: ...
+@checks_arguments(system=SYSTEM_OR_ARRAYS)
 @lru_cache(maxsize=64)
-def symmetries(system: MechanicalSystem) -> tuple[Symmetry, ...]:
+def symmetries(system: MechanicalSystem | ArraySystem) -> tuple[Symmetry, ...] | tuple[ArrayMap, ...]:
     """Return the affine symmetries of a system, a basis with short momentum maps: translations, rotations, boosts, ..
 
-    They are affine in q and t for a Lagrangian, in (q, p) and t for a Hamiltonian.
+    They are affine in q and t for a Lagrangian, in (q, p) and t for a Hamiltonian. Those of arrays of any size are the
+    translations and rotations of whole arrays.
 
     >>> from scvi_codegen.models.systems import kepler
     >>> print(*symmetries(kepler()))
     angular momentum = q1*p_q2 - q2*p_q1
     """
+    if isinstance(system, ArraySystem):
+        return momentum_maps(system)
     return _distinct([_symmetry(system, terms) for terms in _found(system)])
 
 

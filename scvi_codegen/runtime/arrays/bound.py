@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,7 +30,7 @@ from scvi_codegen.runtime.events.event import Event
 class AnySizes(Protocol):
     """Interface required of a stepper of any size (:class:`ArrayStepper`)."""
 
-    source: Source
+    source: Source | None
     interface: Interface
     flags: tuple[str, ...]
     _variants: Variants
@@ -67,7 +67,7 @@ class BoundStepper(Stepper):
     ) -> None:
         self.origin, self.problem, self.threads = origin, arrays, threads
         super().__init__(
-            source or origin.source,
+            cast(Source, source or origin.source),
             _bound_interface(origin.interface, arrays),
             variants=origin._variants,
             flags=origin.flags,

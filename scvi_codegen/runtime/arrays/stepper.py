@@ -35,6 +35,7 @@ class UnavailableError(MethodError, AttributeError):
 class ArrayStepper:
     """Compiled integrator of arrays of any size: a :class:`Stepper` is bound to the arrays of each call.
 
+    A system or method without an integrator for arrays of any size has no source: each call uses :meth:`with_sizes`.
     Every method of :class:`Stepper` whose first argument is q is also a method of this class. Its states are arrays of
     the declared shapes, one or several by name, which determine the sizes, or vectors for :meth:`with_sizes`;
     additional arguments are ``tables`` and ``threads`` (per step). Without p and velocity the initial velocity is 0.
@@ -42,9 +43,10 @@ class ArrayStepper:
     Args:
         variants: source with adaptive steps, ``"controlled"``.
         of_sizes: compiles the stepper of known sizes and tables.
+        reason: reason why there is no source for arrays of any size.
 
     Attributes:
-        source: the C source.
+        source: the C source; ``None`` if it is compiled with the sizes of each call.
         interface: names and shapes.
         flags: flags of the C compiler.
     """
@@ -53,14 +55,16 @@ class ArrayStepper:
 
     def __init__(
         self,
-        source: Source,
+        source: Source | None,
         interface: Interface,
         *,
         variants: Variants | None = None,
         flags: tuple[str, ...] = building.TUNED_FLAGS,
         of_sizes: Callable[..., Any] | None = None,
+        reason: str = "",
     ) -> None:
         self.source, self.interface, self.flags, self._of_sizes = source, interface, flags, of_sizes
+        self._reason = reason
         self._variants = Variants() if variants is None else variants
         self._known: dict[Any, Stepper] = {}
 
@@ -98,7 +102,7 @@ class ArrayStepper:
 
     def prepare(self, *, adaptive: bool = True) -> None:
         """Compile now what the first run would compile; with ``adaptive`` also the variant that ``t_end=`` needs."""
-        variants = (self.source, self._variants["controlled"] if adaptive else None)
+        variants = (self.source, self._variants["controlled"] if adaptive and self.source else None)
         for source in filter(None, variants):
             building.load(source, flags=self.flags)
 
@@ -123,7 +127,7 @@ class ArrayStepper:
         if count > MOST_COORDINATES:
             raise MethodError(
                 f"{count} coordinates are too many to compile with known sizes, which this requires: at most "
-                f"{MOST_COORDINATES}"
+                f"{MOST_COORDINATES}{'. ' * bool(self._reason)}{self._reason}"
             )
         if self._of_sizes is None:
             raise MethodError(f"{self!r} lacks its system: call compile_stepper(system, method, sizes={values})")
@@ -139,7 +143,7 @@ class ArrayStepper:
         parameters: Mapping[str, ArrayLike] | None = None,
         tables: Mapping[str, ArrayLike] | None = None,
         threads: int | None = None,
-    ) -> tuple[BoundStepper, Any]:
+    ) -> tuple[Stepper, Any]:
         """Return the stepper bound to the sizes and tables of these arrays, and the states as vectors.
 
         Raises:
@@ -149,6 +153,10 @@ class ArrayStepper:
         if count > 1 and self.interface.layout.constraints:
             raise MethodError("systems with constraints use one thread: omit threads")
         arrays = read_arrays(self.interface, q, parameters, tables)
+        if self.source is None:
+            if count > 1:
+                raise MethodError(f"omit threads: this system is compiled with the sizes of each call. {self._reason}")
+            return self.with_sizes(arrays.sizes, tables=arrays.places), flat(arrays.state)
         return BoundStepper(self, arrays, threads=count), flat(arrays.state)
 
     def _moving(self, q: Any, p: Any, velocity: Any) -> dict[str, Any]:
@@ -241,5 +249,5 @@ class ArrayStepper:
         return bound.from_checkpoint(run.state, parameters=run.parameters, **settings)
 
 
-def _rebuild(source: Source, interface: Interface, variants: Variants, flags: tuple[str, ...]) -> ArrayStepper:
+def _rebuild(source: Source | None, interface: Interface, variants: Variants, flags: tuple[str, ...]) -> ArrayStepper:
     return ArrayStepper(source, interface, variants=variants, flags=flags)

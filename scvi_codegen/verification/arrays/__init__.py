@@ -15,7 +15,7 @@ from typing import Any, cast
 import numpy as np
 
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.errors import StateError
 from scvi_codegen.lowering.arrays import one_coordinate
 from scvi_codegen.mechanics.arrays.rolling import unroll_sums
 from scvi_codegen.mechanics.arrays.system import ArraySystem
@@ -55,28 +55,25 @@ def verify_arrays(
 ) -> Certificate:
     """Return the certificate of arrays of run-time sizes; arguments as of :func:`~scvi_codegen.verify`.
 
-    Properties are measured on a few indices of the arrays first, then at full size.
+    Properties are measured on a few indices of the arrays first, then at full size; adaptive steps, constraints, and
+    systems without an integrator for arrays of any size with known sizes only.
     """
-    if tolerance is not None:
-        raise MethodError(
-            f"tolerance is not available for arrays of '{system.name}', whose sizes are known at run time only: verify "
-            "unroll_sums(system, sizes)"
-        )
     if q is None or h is None:
         raise StateError(f"verify requires q and h for arrays of '{system.name}': their shapes determine the sizes")
     if stepper is not None:
         check_kind(of("an ArrayStepper", ArrayStepper), stepper, "stepper", StateError)
+    from scvi_codegen.verification import verify  # imported here: it imports this module
+
     began = time.perf_counter()
     chosen = as_method(method, one_coordinate(system))
-    if system.constraints:
-        raise MethodError(
-            "certificates are not available for arrays of run-time sizes with constraints: verify "
-            "unroll_sums(system, sizes) by SVI(1, 'gauss-lobatto:2')"
-        )
     stepper = stepper or compile_stepper(system, chosen, flags=tuple(flags))
     assert isinstance(stepper, ArrayStepper)
     run = stepper.start(q, p, h=h, t=t, **arrays_of_run)
     arrays = read_arrays(stepper.interface, q, arrays_of_run["parameters"], arrays_of_run["tables"])
+    if stepper.source is None or tolerance is not None or system.constraints:
+        numbers = dict(zip(stepper.interface.parameters, arrays.numbers, strict=True))
+        known = unroll_sums(system, arrays.sizes, tables=arrays.places, parameters={**numbers, **arrays.fields})
+        return verify(known, chosen, run.q, run.p, h=run.h, t=run.t, tolerance=tolerance, flags=flags)
     start = WholeStart(system, chosen, stepper, arrays, run.stepper.arrays(run.p), run.h, run.t)
     tested = _subject(start)
     checks = (
