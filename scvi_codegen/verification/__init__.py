@@ -108,7 +108,8 @@ def verify(
     if isinstance(system, ArraySystem):
         from scvi_codegen.verification.arrays import verify_arrays  # imported here: it imports modules of this package
 
-        return verify_arrays(system, method, q, p, h=h, t=t, stepper=stepper, tolerance=tolerance, flags=flags, **more)
+        more |= {"stepper": stepper, "tolerance": tolerance, "flags": flags, "of_known_sizes": verify}
+        return verify_arrays(system, method, q, p, h=h, t=t, **more)
     for name, value in more.items():
         if value is not None:
             raise StateError(

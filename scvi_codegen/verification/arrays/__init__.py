@@ -8,7 +8,7 @@ compared with NumPy, and conserved quantities are measured along a run.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, cast
 
@@ -51,9 +51,10 @@ def verify_arrays(
     stepper: Stepper | ArrayStepper | None,
     tolerance: float | None,
     flags: Sequence[str],
+    of_known_sizes: Callable[..., Certificate],
     **arrays_of_run: Any,
 ) -> Certificate:
-    """Return the certificate of arrays of run-time sizes; arguments as of :func:`~scvi_codegen.verify`.
+    """Return the certificate of arrays of run-time sizes; arguments as of ``of_known_sizes``, which is ``verify``.
 
     Properties are measured on a few indices of the arrays first, then at full size; adaptive steps, constraints, and
     systems without an integrator for arrays of any size with known sizes only.
@@ -62,8 +63,6 @@ def verify_arrays(
         raise StateError(f"verify requires q and h for arrays of '{system.name}': their shapes determine the sizes")
     if stepper is not None:
         check_kind(of("an ArrayStepper", ArrayStepper), stepper, "stepper", StateError)
-    from scvi_codegen.verification import verify  # imported here: it imports this module
-
     began = time.perf_counter()
     chosen = as_method(method, one_coordinate(system))
     stepper = stepper or compile_stepper(system, chosen, flags=tuple(flags))
@@ -73,7 +72,7 @@ def verify_arrays(
     if stepper.source is None or tolerance is not None or system.constraints:
         numbers = dict(zip(stepper.interface.parameters, arrays.numbers, strict=True))
         known = unroll_sums(system, arrays.sizes, tables=arrays.places, parameters={**numbers, **arrays.fields})
-        return verify(known, chosen, run.q, run.p, h=run.h, t=run.t, tolerance=tolerance, flags=flags)
+        return of_known_sizes(known, chosen, run.q, run.p, h=run.h, t=run.t, tolerance=tolerance, flags=flags)
     start = WholeStart(system, chosen, stepper, arrays, run.stepper.arrays(run.p), run.h, run.t)
     tested = _subject(start)
     checks = (
