@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.kernel import Number
 from scvi_codegen.rendering.convergence import TOLERANCE
-from scvi_codegen.tables.precision import mp, settled
+from scvi_codegen.tables.precision import mp, nearest_float, settled
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,11 +40,8 @@ class Target:
 
     def rounded(self, value: Number) -> float:
         """Return the number of the target nearest to ``value``; 0 below its smallest, as for low words of tables."""
-        digits = mp.convert(value)  # all 60 of them: it is rounded once
-        if abs(digits) < self.smallest:
-            return 0.0
-        with mp.workprec(self.halvings + 1):
-            return float(+digits)
+        nearest = nearest_float(value, self.halvings + 1)
+        return 0.0 if abs(nearest) <= self.smallest and abs(mp.convert(value)) < self.smallest else nearest
 
     def rest(self, value: Number) -> Number:
         """Return the rounding error: the low word of a double-double number."""

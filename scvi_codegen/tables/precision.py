@@ -2,7 +2,7 @@
 
 Nodes, weights and cardinal functions are computed once, at generation time, and rounded once, when they are printed;
 50 digits are guaranteed, ten are reserve. The context is independent of a user's ``mpmath.mp.dps``. Its precision is
-thread-local: a thread that rounds to the 53 bits of a double does not affect tables computed by others.
+thread-local: functions of mpmath that raise it meanwhile do not affect tables computed by other threads.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Any, TypeAlias
 
 from mpmath import MPContext
-from mpmath.libmp import dps_to_prec, prec_to_dps
+from mpmath.libmp import dps_to_prec, mpf_pos, prec_to_dps, round_nearest, to_float
 
 DIGITS = 60
 
@@ -55,6 +55,11 @@ Number: TypeAlias = Any
 
 Vector: TypeAlias = tuple[Number, ...]
 Matrix: TypeAlias = tuple[Vector, ...]
+
+
+def nearest_float(value: Number, bits: int) -> float:
+    """Return a number of any type rounded once to ``bits`` bits, without a change of the working precision."""
+    return float(to_float(mpf_pos(mp.convert(value)._mpf_, bits, round_nearest)))
 
 
 def settled(value: Number) -> Number:
