@@ -13,15 +13,13 @@ from typing import Any
 import programs
 import pytest
 from browsing import chromium
-from samples import Sample, compile_quickly, sample_named, stepper_for
+from samples import UNOPTIMISED, Sample, compile_quickly, sample_named, stepper_for
 from tiers import DEFAULT, long_ones_first, mark_the_rest_full
 
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import FLAGS_VARIABLE
 from scvi_codegen.runtime.core.stepper import Stepper
-
-UNOPTIMISED = "-O0"
 
 sys.addaudithook(programs.audit)
 signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background of a shell
@@ -30,7 +28,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests
 def pytest_configure(config: pytest.Config) -> None:
     """Lower the optimisation of compilers in most tests: the results of the C code do not depend on it."""
     if config.option.markexpr == DEFAULT:
-        os.environ.setdefault(FLAGS_VARIABLE, UNOPTIMISED)
+        os.environ.setdefault(FLAGS_VARIABLE, " ".join(UNOPTIMISED))
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -84,7 +82,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 def as_users_compile() -> Iterator[None]:
     """Compile with the default flags, for tests of bits, round-off, long runs and documentation."""
     with pytest.MonkeyPatch.context() as patch:
-        if os.environ.get(FLAGS_VARIABLE) == UNOPTIMISED:  # and not those of `test_builds.py`
+        if os.environ.get(FLAGS_VARIABLE) == " ".join(UNOPTIMISED):  # and not those of `test_builds.py`
             patch.delenv(FLAGS_VARIABLE)
         yield
 

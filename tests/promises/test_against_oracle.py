@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import oracle
 import pytest
+import samples
 from samples import QUICK_FLAGS
+from tiers import family, first_of_each
 
 from scvi_codegen.methods import (
     SCVI,
@@ -89,7 +91,7 @@ TOLERANCE = 2e-14
 """Of the state: a step rounds its answer once (1e-16), and its kernels and Newton's last update some tens of times."""
 
 
-UNOPTIMISED = ("-O0", *QUICK_FLAGS[1:])
+UNOPTIMISED = (*samples.UNOPTIMISED, *QUICK_FLAGS[1:])
 """What most families and solvers are tried with here; the full tier has every method with those of users."""
 
 
@@ -104,7 +106,7 @@ def check(sample, compiled, name, method, *, h=H, t=T, **how):
     assert relative(compiled(name, method, **how).step(q, p, h, t), case.oracle(method, q, p, h, t)) < TOLERANCE
 
 
-@pytest.mark.covering(2)
+@pytest.mark.covering
 @pytest.mark.parametrize("name", SYSTEMS)
 @pytest.mark.parametrize("method", FEW, ids=lambda method: method.name)
 def test_every_kind_of_lagrangian_agrees_with_the_oracle(sample, compiled, name, method):
@@ -135,7 +137,7 @@ def test_both_solvers_agree_with_the_oracle(sample, compiled, name, method, solv
     check(sample, compiled, name, method, solver=solver, flags=UNOPTIMISED)
 
 
-@pytest.mark.parametrize("method", MANY, ids=lambda method: method.name)
+@pytest.mark.parametrize("method", first_of_each(MANY, family), ids=lambda method: method.name)
 def test_every_family_of_methods_agrees_with_the_oracle(sample, compiled, method):
     """The Lagrangian is coupled, has masses depending on angle and time, and velocity-dependent terms."""
     check(sample, compiled, "pumped-cart-pole", method, flags=UNOPTIMISED)
@@ -148,6 +150,7 @@ def test_every_method_on_every_system_agrees_with_the_oracle(sample, compiled, n
     check(sample, compiled, name, method)
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("method", [SVI(2, "gauss-legendre:3"), SCVI(3), RadauIIA(2)], ids=lambda method: method.name)
 @pytest.mark.parametrize(("h", "t"), [(-0.11, 0.37), (0.02, -5.5), (-0.2, 100.0)])
 def test_backward_steps_and_large_times_agree_with_the_oracle(sample, compiled, method, h, t):

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from samples import UNOPTIMISED
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
@@ -56,7 +57,9 @@ ENERGY_ERRORS = {
 }
 
 
-@pytest.fixture(autouse=True, params=["-O0", pytest.param("", marks=pytest.mark.full)], ids=["quickly", "as users"])
+@pytest.fixture(
+    autouse=True, params=[" ".join(UNOPTIMISED), pytest.param("", marks=pytest.mark.full)], ids=["quickly", "as users"]
+)
 def compiled_with(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Compile with little optimisation, which does not change the output of an example."""
     monkeypatch.setenv(FLAGS_VARIABLE, request.param)

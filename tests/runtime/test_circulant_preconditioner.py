@@ -89,6 +89,7 @@ def test_boundaries_and_amplitudes_need_few_products(name, shape, most):
     assert products_of(stepper_of(name), smooth(shape), 1.0, steps=3, parameters={"k": 1e4}) <= 3 * most
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("name", LATTICES)
 @pytest.mark.parametrize("k", [1e2, 1e5])
 def test_preconditioned_steps_equal_those_of_the_unrolled_system(name, k):

@@ -293,6 +293,7 @@ MASSES = {
 }
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("method", [sc.StoermerVerlet(), sc.SVI(2, "gauss-lobatto:2")])
 @pytest.mark.parametrize(
     ("name", "solver"),
@@ -368,7 +369,9 @@ def test_solve_ivp_accepts_the_tolerance_of_steps(kepler):
     assert not sc.solve_ivp(kepler, (0.0, 2.0), [1.0, 0.0, 0.0, 0.0], rtol=1e-12).success
 
 
-@pytest.mark.parametrize("method", ["svi:5", "svi:8", "gauss:4"])
+@pytest.mark.parametrize(
+    "method", ["svi:5", *(pytest.param(name, marks=pytest.mark.full) for name in ("svi:8", "gauss:4"))]
+)
 def test_initial_step_size_is_found_for_zero_velocity(method):
     """A cart at rest, pushed: rounding hides what short steps make of its velocity, and they fail."""
     crane = sc.LagrangianSystem.from_text(

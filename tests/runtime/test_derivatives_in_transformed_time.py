@@ -84,14 +84,13 @@ class Digits:
         found = made(q, p, mp.findroot(late, (0.5 * h, 0.7 * h), tol=mp.mpf(10) ** -70))
         return [*found.q, *found.p, given[-2] + t_end - T0]
 
-    def partials(self, values, steps, t_end=None):
-        """(5, given) by differences; the energy, last of the parameters, is what is added to that of the state."""
+    def partials(self, values, directions, steps, t_end=None):
+        """(5, n) along n directions; the energy, last of the parameters, is what is added to that of the state."""
         columns = []
-        for k in range(len(values)):
+        for direction in directions.T:
             ends = []
-            for sign in (1, -1):
-                moved = [mp.mpf(x) for x in values]
-                moved[k] += sign * WIDTH
+            for by in (WIDTH, -WIDTH):
+                moved = [mp.mpf(x) + by * mp.mpf(d) for x, d in zip(values, direction, strict=True)]
                 ends.append(np.array(self.end(moved, steps, t_end), dtype=object))
             columns.append(((ends[0] - ends[1]) / (2 * WIDTH)).astype(float))
         return np.array(columns).T
@@ -112,12 +111,18 @@ def values_of(form):
     return [*Q, *P, *stepper(form).defaults[:-1], 0.0, T0, H]
 
 
+def directions_of(form):
+    """Return three random directions of length 1, which weight all initial data."""
+    found = np.random.default_rng(4).normal(size=(len(values_of(form)), 3))
+    return found / np.linalg.norm(found, axis=0)
+
+
 @pytest.mark.parametrize("form", FORMS)
 def test_derivatives_of_a_step_by_all_arguments(form):
     """At the energy of its state; and at one that is given, where it is symplectic."""
-    made, exact = stepper(form), Digits(form).partials(values_of(form), 1)
-    found = columns_of(made.sensitivity(Q, P, H, T0))
-    assert np.abs(found - exact).max() < EXACT * np.abs(exact).max()
+    made, directions = stepper(form), directions_of(form)
+    found, exact = columns_of(made.sensitivity(Q, P, H, T0)), Digits(form).partials(values_of(form), directions, 1)
+    assert np.abs(found @ directions - exact).max() < EXACT * np.abs(found).max()
     assert_allclose(made.jacobian(Q, P, H, T0), found[:4, :4], rtol=0, atol=1e-15)
     assert_allclose(made.jvp(Q, P, H, T0, tangents=np.eye(4)).T, found[:4, :4], rtol=0, atol=1e-15)
     assert_allclose(made.vjp(Q, P, H, T0, cotangents=np.eye(4)), found[:4, :4], rtol=0, atol=1e-14)
@@ -132,14 +137,15 @@ def test_derivatives_of_a_step_by_all_arguments(form):
     "form", [form if form == "L" else pytest.param(form, marks=pytest.mark.full) for form in FORMS]
 )
 def test_derivatives_of_runs_by_steps_and_to_an_end_time(form):
-    made, values = stepper(form), values_of(form)
+    made, values, directions = stepper(form), values_of(form), directions_of(form)
     run = made.integrate(Q, P, h=H, steps=3, t=T0)
-    exact = Digits(form).partials(values, 3)
-    assert np.abs(columns_of(run.sensitivity())[-1] - exact).max() < 3 * EXACT * np.abs(exact).max()
+    exact, found = Digits(form).partials(values, directions, 3), columns_of(run.sensitivity())[-1]
+    assert np.abs(found @ directions - exact).max() < 3 * EXACT * np.abs(found).max()
     t_end = float(run.t[2] + 0.6 * (run.t[3] - run.t[2]))
     ended = made.integrate(Q, P, h=H, t_end=t_end, t=T0)
-    exact = Digits(form).partials(values, 2, t_end)[:, :-1]
-    assert np.abs(columns_of(ended.sensitivity())[-1] - exact).max() < 3 * EXACT * np.abs(exact).max()
+    exact = Digits(form).partials(values, np.vstack([directions[:-1], np.zeros(3)]), 2, t_end)
+    found = columns_of(ended.sensitivity())[-1]
+    assert np.abs(found @ directions[:-1] - exact).max() < 3 * EXACT * np.abs(found).max()
     assert ended.sensitivity().h is None
 
 

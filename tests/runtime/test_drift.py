@@ -20,6 +20,7 @@ def start(eccentricity: float) -> tuple[np.ndarray, np.ndarray]:
     return np.array([1 - eccentricity, 0.0]), np.array([0.0, speed])
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("flags", [TUNED_FLAGS, PORTABLE_FLAGS], ids=["tuned", "portable"])
 @pytest.mark.parametrize(("eccentricity", "h"), [(0.2, 0.35), (0.5, 0.1)])
 def test_energy_does_not_drift(eccentricity, h, flags):

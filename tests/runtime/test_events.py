@@ -441,6 +441,7 @@ def thrown(request):
     return compiled_plainly(BALL, SVI(2)), compiled_plainly(DISC, SVI(2)), ("y", "x", "y")
 
 
+@pytest.mark.covering
 @pytest.mark.filterwarnings("ignore::scvi_codegen.AccuracyWarning")
 @pytest.mark.parametrize(("floor", "error"), [(0.0, 1e-12), (1000.0, 2e-5)])
 @pytest.mark.parametrize("h", [0.1, -0.02])

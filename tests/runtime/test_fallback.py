@@ -27,7 +27,7 @@ LONG = 0.2
 
 each_method = pytest.mark.parametrize(
     "method",
-    [SVI(4), Gauss(3), *(pytest.param(method, marks=pytest.mark.full) for method in (SCVI(2), SpectralCollocation(2)))],
+    [SVI(4), *(pytest.param(each, marks=pytest.mark.full) for each in (Gauss(3), SCVI(2), SpectralCollocation(2)))],
     ids=lambda method: method.name,
 )
 

@@ -270,6 +270,7 @@ def check_bounds(name, error):
 
 
 class TestEstimatesBoundTheTrueError:
+    @pytest.mark.covering
     @pytest.mark.parametrize("error", [1e-5, 1e-9])
     @pytest.mark.parametrize("name", QUICK)
     def test_estimates_bound_errors_of_selected_systems(self, name, error):

@@ -43,7 +43,12 @@ def numbers_of(gradient):
     return np.concatenate([gradient.q, gradient.p, gradient.parameters, [gradient.t, gradient.h]])
 
 
-@pytest.mark.parametrize("name", CASES)
+QUICK = ("whirl", "tangle", "rubbed, several vectors of points")
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in CASES]
+)
 def test_iterated_derivatives_equal_those_by_factorisation(name):
     """Forward and back, by all that is given; more directions than factors take at a time; runs kept now and then."""
     system, method, h = CASES[name]

@@ -24,6 +24,8 @@ QUICK = {
     "pendulums": ("svi:2", "newton"),
     "ellipses": ("svi:2", "newton"),
 }
+REDUNDANT = ("planar-pendulum", "damped", "pendulums")
+"""Systems with the iteration of another one of them, for the full tier."""
 METHODS = (
     *(sc.SVI(degree) for degree in (2, 3, 4, 5, 6, 8, 12)),
     *(sc.SVI(*sizes) for sizes in ((3, "gauss-legendre:5"), (3, "gauss-lobatto:3"), (4, "gauss-lobatto:4"))),
@@ -47,7 +49,9 @@ def check(name, method, solver, steps):
     return found
 
 
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.full] if name in REDUNDANT else []) for name in QUICK]
+)
 def test_step_errors_are_bounded_by_their_estimates(name):
     found = check(name, *QUICK[name], trials(name, 150))
     assert (found.errors > 1e-12).sum() > 10  # enough of them have an error to compare
@@ -122,6 +126,7 @@ SPURIOUS = {
 }
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize(("name", "flags"), [(name, flags) for name in SPURIOUS for flags in (("-O1",), ("-O2",))])
 def test_spurious_solution_is_rejected_or_its_error_reported(name, flags):
     """Their curves are smooth: the energy of the first grows from -0.44 to 591."""
@@ -164,6 +169,7 @@ def test_comparison_with_half_steps_does_not_change_a_run():
         assert whole.step_error < 1e-6
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("steps", [{"h": 0.1, "steps": 12}, {"t_end": 0.5, "tolerance": 1e-6}], ids=["h", "t_end"])
 @pytest.mark.parametrize("solver", ["fixed-point", "newton"])
 def test_comparison_with_half_steps_does_not_change_an_array_run(solver, steps):

@@ -431,6 +431,7 @@ def test_undefined_energy_is_an_error(compiled):
 # The discrete Lagrangian.
 
 
+@pytest.mark.covering
 @each_action
 @pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole"])
 def test_step_is_the_plus_transform_after_the_inverse_of_the_minus_transform(sample, compiled, name, method):
@@ -564,6 +565,7 @@ def test_a_stepper_shows_system_and_method(kepler):
     assert kepler.dimension == 2
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("name", ["double-pendulum", "relativistic-particle", "planar-pendulum", "harmonic-oscillator"])
 @pytest.mark.parametrize("method", [SVI(8), SVI(4, "gauss-legendre:6"), SCVI(4)], ids=lambda method: method.name)
 def test_fixed_point_iteration_starts_from_rest(name, method):

@@ -237,6 +237,8 @@ def sample_named(name: str) -> Sample:
     return Sample(name, OWN_SYSTEMS[name]() if name in OWN_SYSTEMS else problem(name).system)
 
 
+UNOPTIMISED = ("-O0", "-Dalways_inline=unused")
+"""For most tests. Inlining takes a third of the time of gcc where it does not optimise."""
 QUICK_FLAGS = ("-O1", *(flag for flag in TUNED_FLAGS if flag != "-O3"))
 """What users get, but for the optimisation of which most of the compilation time is made."""
 
