@@ -9,8 +9,15 @@
 
 #define NAME(word) kepler_scvi_2_##word /* prefix of every exported name */
 #define STATUS(word) KEPLER_SCVI_2_##word
-#define MOMENTUM_MAPS
 #define TOLERANCE 2.220446049250313e-16 /* default */
+
+/* Choices of this integrator among the alternatives of the support headers. */
+#define MOMENTUM_MAPS /* first integrals from symmetries */
+#ifndef __GNUC__ /* no vector extensions */
+#define NEWTON_ALONE
+#endif
+#define SPURIOUS_TESTED /* solutions of Newton's method */
+#define DISCRETE_LAGRANGIAN
 
 enum {
   M = 2, /* coordinates */
@@ -312,10 +319,9 @@ static const double STAGE_CURVATURE[5] = {0.0, 1.0, 0.0, 0.0, 0.0};
 static const double STAGE_OTHER_CURVATURE[5] = {0.0, 0.0, 1.0, 0.0, 0.0};
 
 #include "support/step_size/stage_error.h"
-#define SPURIOUS_TESTED
 #include "support/newton/newton_from_line.h"
 
-#ifdef __GNUC__
+#ifndef NEWTON_ALONE
 #define POINTS 2
 #define LANES 2
 #define HOT static inline __attribute__((always_inline))
@@ -393,7 +399,6 @@ static inline void action_lanes(const lanes *u, lanes t, const double *parameter
 #include "support/iteration/mass_matrix.h"
 #include "support/iteration/curve.h"
 #include "support/iteration/shooting_iteration.h"
-#include "support/iteration/fallback.h"
 #include "support/iteration/iteration_solver.h"
 
 /* Error estimate of a curve, and its exponent in the relative error of the end of the step. */
@@ -406,10 +411,6 @@ static inline void action_lanes(const lanes *u, lanes t, const double *parameter
 static const lanes HIGHEST[GROUPS] = {-1.0, 1.0};
 static const lanes NEXT[GROUPS] = {1.0, 0.0};
 
-#include "support/step_size/curve_error.h"
-#include "support/step_size/largest_error.h"
-#include "support/step_size/sizes.h"
-#include "support/step_size/observed_error.h"
 #else
 static const double EXTRAPOLATION[5][5] = {
     {1.0, 0.0, 0.0, 0.0, 0.0},
@@ -418,13 +419,8 @@ static const double EXTRAPOLATION[5][5] = {
     {0.0, 0.0, 0.0, 1.0, 0.0},
     {0.0, 0.0, 0.0, 0.0, 1.0}};
 
-#define NEWTON_ALONE
 #include "support/newton/newton_solver.h"
-#include "support/step_size/largest_error.h"
-
 #define ERROR_POWER STAGE_POWER
-#include "support/step_size/sizes.h"
-#include "support/step_size/observed_error.h"
 #endif
 
 #include "support/run/run.h"
@@ -453,5 +449,4 @@ static void sums_along(const step_data *step, const double *z, double *sum)
   add_quadrature_sums(step, z, sum);
 }
 
-#define DISCRETE_LAGRANGIAN
 #include "support/mechanics/discrete_legendre.h"

@@ -8,8 +8,15 @@
 
 #define NAME(word) kepler_svi_4_##word /* prefix of every exported name */
 #define STATUS(word) KEPLER_SVI_4_##word
-#define MOMENTUM_MAPS
 #define TOLERANCE 2.220446049250313e-16 /* default */
+
+/* Choices of this integrator among the alternatives of the support headers. */
+#define MOMENTUM_MAPS /* first integrals from symmetries */
+#ifndef __GNUC__ /* no vector extensions */
+#define NEWTON_ALONE
+#endif
+#define SPURIOUS_TESTED /* solutions of Newton's method */
+#define DISCRETE_LAGRANGIAN
 
 enum {
   M = 2, /* coordinates */
@@ -187,10 +194,9 @@ static const double STAGE_CURVATURE[4] = {-1.0, 0.0, 0.0, 1.0};
 static const double STAGE_OTHER_CURVATURE[4] = {-1.0, 0.0, 1.0, 0.0};
 
 #include "support/step_size/stage_error.h"
-#define SPURIOUS_TESTED
 #include "support/newton/newton_from_line.h"
 
-#ifdef __GNUC__
+#ifndef NEWTON_ALONE
 #define POINTS 4
 #define HOT static inline __attribute__((always_inline))
 #define FINAL_ITERATIONS 1
@@ -261,7 +267,6 @@ static void mass(const double *u, double t, const double *parameters, double *va
 #include "support/core/progress.h"
 #include "support/iteration/one_trajectory.h"
 #include "support/iteration/separable_iteration.h"
-#include "support/iteration/fallback.h"
 #include "support/iteration/iteration_solver.h"
 
 /* Error estimate of a curve, and its exponent in the relative error of the end of the step. */
@@ -274,10 +279,6 @@ static void mass(const double *u, double t, const double *parameters, double *va
 static const lanes HIGHEST[GROUPS] = {-0.37102700340194733, 0.939772470377753, -0.939772470377753, 0.37102700340194733};
 static const lanes NEXT[GROUPS] = {0.5325080420189116, -0.5325080420189116, -0.5325080420189116, 0.5325080420189116};
 
-#include "support/step_size/curve_error.h"
-#include "support/step_size/largest_error.h"
-#include "support/step_size/sizes.h"
-#include "support/step_size/observed_error.h"
 #else
 static const double EXTRAPOLATION[4][4] = {
     {-0.3043475322896335, -1.956342611081263, -7.352359801851611, -14.971892910590412},
@@ -285,13 +286,8 @@ static const double EXTRAPOLATION[4][4] = {
     {-1.929896390297009, -9.46401244076669, -29.80681363156252, -55.9889724574008},
     {2.191699902136537, 6.173927437193185, 15.914967984193565, 27.864733549197386}};
 
-#define NEWTON_ALONE
 #include "support/newton/newton_solver.h"
-#include "support/step_size/largest_error.h"
-
 #define ERROR_POWER STAGE_POWER
-#include "support/step_size/sizes.h"
-#include "support/step_size/observed_error.h"
 #endif
 
 #include "support/run/run.h"
@@ -320,5 +316,4 @@ static void sums_along(const step_data *step, const double *z, double *sum)
   add_quadrature_sums(step, z, sum);
 }
 
-#define DISCRETE_LAGRANGIAN
 #include "support/mechanics/discrete_legendre.h"

@@ -8,8 +8,12 @@
 
 #define NAME(word) pendulum_stoermer_verlet_##word /* prefix of every exported name */
 #define STATUS(word) PENDULUM_STOERMER_VERLET_##word
-#define NO_FALLBACK
 #define TOLERANCE 2.220446049250313e-16 /* default */
+
+/* Choices of this integrator among the alternatives of the support headers. */
+#define NO_ERROR_ESTIMATE
+#define CONSTANT_MASSES /* drifts are by constant masses */
+#define EXPLICIT_STEPS /* their discrete Lagrangian is summed along the steps */
 
 enum {
   M = 1, /* coordinates */
@@ -71,10 +75,7 @@ static void mass(const double *u, double t, const double *parameters, double *va
   value[0] = parameters[0] * (parameters[1] * parameters[1]);
 }
 
-#define BY_MASSES
 #include "support/iteration/splitting.h"
 
-#define NO_ERROR_ESTIMATE
 #include "support/run/run.h"
-#define EXPLICIT_STEPS
 #include "support/mechanics/discrete_legendre.h"

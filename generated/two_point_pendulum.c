@@ -11,6 +11,14 @@
 #define STATUS(word) TWO_POINT_PENDULUM_##word
 #define TOLERANCE 2.220446049250313e-16 /* default */
 
+/* Choices of this integrator among the alternatives of the support headers. */
+#ifndef __GNUC__ /* no vector extensions */
+#define NEWTON_ALONE
+#endif
+#define UNROLLED_EQUATIONS /* stage equations without loops */
+#define SPURIOUS_TESTED /* solutions of Newton's method */
+#define DISCRETE_LAGRANGIAN
+
 enum {
   M = 1, /* coordinates */
   SITES = 1, /* coordinates, then the components of other unknowns */
@@ -87,7 +95,6 @@ static void lagrangian(const double *u, double t, const double *parameters, doub
 #include "support/newton/band.h"
 #include "support/mechanics/legendre.h"
 #include "support/mechanics/energies.h"
-#define UNROLLED_EQUATIONS
 #include "support/newton/stages.h"
 
 /* Quadrature points, 2: u = (q, v) at each. */
@@ -133,10 +140,9 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 }
 
 #include "support/newton/newton.h"
-#define SPURIOUS_TESTED
 #include "support/newton/newton_from_line.h"
 
-#ifdef __GNUC__
+#ifndef NEWTON_ALONE
 #define POINTS 2
 #define HOT static inline __attribute__((always_inline))
 #define FINAL_ITERATIONS 1
@@ -188,7 +194,6 @@ static void mass(const double *u, double t, const double *parameters, double *va
 #include "support/core/progress.h"
 #include "support/iteration/one_trajectory.h"
 #include "support/iteration/separable_iteration.h"
-#include "support/iteration/fallback.h"
 #include "support/iteration/iteration_solver.h"
 
 /* Error estimate of a curve, and its exponent in the relative error of the end of the step. */
@@ -201,14 +206,9 @@ static void mass(const double *u, double t, const double *parameters, double *va
 static const lanes HIGHEST[GROUPS] = {0.5, 0.5};
 static const lanes NEXT[GROUPS] = {0.0, 0.0};
 
-#include "support/step_size/curve_error.h"
-#include "support/step_size/largest_error.h"
-#include "support/step_size/sizes.h"
-#include "support/step_size/observed_error.h"
 #else
 static const double EXTRAPOLATION[1][1] = {{1.0}};
 
-#define NEWTON_ALONE
 #include "support/newton/newton_solver.h"
 #define NO_ERROR_ESTIMATE
 #endif
@@ -237,5 +237,4 @@ static void sums_along(const step_data *step, const double *z, double *sum)
   add_quadrature_sums(step, z, sum);
 }
 
-#define DISCRETE_LAGRANGIAN
 #include "support/mechanics/discrete_legendre.h"

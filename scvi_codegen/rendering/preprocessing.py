@@ -1,6 +1,6 @@
 """Partial preprocessing of generated C: includes of support headers, and conditions on macros that the source defines.
 
-The result is one text without include guards and without alternatives that the source does not use. Conditions on the
+The result is one text without include guards, macros and alternatives that the source does not use. Conditions on the
 compiler, the processor or options of compilation (names that begin with ``_`` or ``SCVI_``) remain.
 """
 
@@ -18,8 +18,9 @@ COMPARED = re.compile(r"(?P<left>\w+)(?: (?P<sign>[<>=!]=|[<>]) (?P<right>\w+))?
 OWN = re.compile(r'"(?:\.\./\w+/)?\w+\.h"')
 """Headers of the same or of a sibling folder; others, as of XLA, are those of libraries."""
 SUPPORT = re.compile('"support/')
-GUARD = re.compile(r"#define (?P<macro>SUPPORT_\w+_H)")
+SWITCH = re.compile(r"#define (?P<macro>\w+)(?: /\*.*\*/)?")
 COMMENT = re.compile(r" *(?://.*|/\*.*)$")
+COMMENTS = re.compile(r"/\*.*?\*/", re.DOTALL)
 SIGNS: dict[str, Callable[[int, int], bool]] = {
     "<": operator.lt,
     ">": operator.gt,
@@ -188,6 +189,7 @@ def preprocessed(text: str, read: Callable[[str], str]) -> tuple[str, dict[str, 
     """
     work = _Preprocessor(read)
     lines = list(work.lines(text, ""))
-    tested = {word for line in lines if line.startswith("#if") for word in re.findall(r"\w+", line)}
-    kept = [line for line in lines if not ((guard := GUARD.match(line)) and guard["macro"] not in tested)]
+    rest = COMMENTS.sub("", "\n".join(line for line in lines if not SWITCH.fullmatch(line)))
+    used = set(re.findall(r"\w+", rest))
+    kept = [line for line in lines if not ((switch := SWITCH.fullmatch(line)) and switch["macro"] not in used)]
     return re.sub(r"\n{3,}", "\n\n", "\n".join(kept).rstrip() + "\n"), work.files

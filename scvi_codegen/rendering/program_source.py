@@ -198,7 +198,7 @@ def render_ensemble(program: Program) -> Source | None:
         "cut": is_divided(fixed_point.kernels),
         "needs_velocities": fixed_point.kept is StoredValues.VELOCITIES,
         "hot": "static",
-        "fixed_point": iteration_source(fixed_point, TRAJECTORIES, fallback="none"),
+        "fixed_point": iteration_source(fixed_point, TRAJECTORIES),
     }
     return _render(prefix, context, "ensemble")
 
@@ -279,7 +279,7 @@ def _context(
         "unrolled_equations": unrolled_equations(program, target),
         "fallback": fallback,
         **_control_context(program, control),
-        **_lane_context(program, fallback, lanes),
+        **_lane_context(program, lanes),
     }
 
 
@@ -291,14 +291,14 @@ def _scalar_kernels(
     return (*own, *splitting, *((control.density,) if control and control.density else ()))
 
 
-def _lane_context(program: Program, fallback: Fallback, beside: Sequence[Kernel]) -> dict[str, object]:
+def _lane_context(program: Program, beside: Sequence[Kernel]) -> dict[str, object]:
     """Return the template's context for the fixed-point iteration; ``beside``: kernels of its derivative."""
     fixed_point = program.fixed_point
     if fixed_point is None:
         return {"fixed_point": None}
     hot = "static inline __attribute__((always_inline))" if _size(fixed_point) <= LARGEST_INLINED else "static"
     kernels = (*fixed_point.kernels, *beside)
-    text = iteration_source(fixed_point, POINTS, fallback=fallback, kernels=kernels, changes=bool(beside))
+    text = iteration_source(fixed_point, POINTS, kernels=kernels, changes=bool(beside))
     return {"fixed_point": text, "hot": hot}
 
 

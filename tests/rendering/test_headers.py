@@ -50,7 +50,7 @@ GENERATED = (
 )
 """Headers with types that the generated part uses."""
 CHOSEN = (
-    r"iteration/\w*(?:_iteration|trajectory|trajectories|_solver|fallback|splitting)|newton/newton_solver"
+    r"iteration/\w*(?:_iteration|trajectory|trajectories|_solver|splitting)|newton/newton_solver"
     r"|newton/library_fallback|arrays/array_hamiltonian_iteration|arrays/newton_gmres"
     r"|derivatives/(?:separable|coupled)_derivatives|step_size/(?:trials|density)"
 )

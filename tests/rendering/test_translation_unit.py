@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 from pathlib import Path
 
@@ -94,3 +95,11 @@ def test_no_name_or_macro_of_an_integrator_remains(tmp_path):
     ).stdout  # fmt: skip
     left = {line.split()[1].split("(")[0] for line in set(listed.splitlines()) - set(empty.splitlines())}
     assert {name for name in left if not name.startswith(("ONE_", "TWO_"))} == set()
+
+
+def test_single_file_defines_no_macro_that_it_does_not_use():
+    code = generate_source(catalogue("kepler")(), "svi:4", prefix="one")[0].single_file().code
+    plain = re.sub(r"/\*.*?\*/", "", code, flags=re.DOTALL)
+    assert "#undef" not in plain
+    for name in re.findall(r"^#define (\w+)$", plain, re.MULTILINE):
+        assert len(re.findall(rf"\b{name}\b", plain)) > 1, name

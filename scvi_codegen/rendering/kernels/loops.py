@@ -89,7 +89,7 @@ def _work(program: Program) -> int:
 
 def _iteration_text(program: Program) -> IterationSource | None:
     fixed_point, kernels = program.fixed_point, [each.kernel for each in program.loops.applied]
-    return iteration_source(fixed_point, POINTS, fallback="none", kernels=kernels) if fixed_point else None
+    return iteration_source(fixed_point, POINTS, kernels=kernels) if fixed_point else None
 
 
 def _vector_functions(program: Program) -> list[str]:

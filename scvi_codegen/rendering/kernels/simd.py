@@ -39,12 +39,11 @@ class Lanes:
     Attributes:
         sources: loads of a kernel that differ between lanes.
         meaning: its support header, before the tables.
-        before, memory: further headers, after the tables.
+        memory: further headers, after the tables.
     """
 
     sources: Sources
     meaning: str
-    before: tuple[str, ...]
     memory: tuple[str, ...]
 
     @property
@@ -57,8 +56,8 @@ class Lanes:
         return "lanes" if source in self.sources else "double"
 
 
-POINTS = Lanes(("u", "t"), "points", (), ("core/progress", "iteration/one_trajectory"))
-TRAJECTORIES = Lanes(("u", "parameters"), "trajectories", ("core/batched_step",), ("iteration/many_trajectories",))
+POINTS = Lanes(("u", "t"), "points", ("core/progress", "iteration/one_trajectory"))
+TRAJECTORIES = Lanes(("u", "parameters"), "trajectories", ("iteration/many_trajectories",))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,7 +107,6 @@ def iteration_source(
     fixed_point: FixedPointIteration,
     meaning: Lanes,
     *,
-    fallback: Fallback,
     kernels: Sequence[Kernel] | None = None,
     changes: bool = False,
 ) -> IterationSource:
@@ -117,7 +115,6 @@ def iteration_source(
     Args:
         fixed_point: the iteration.
         meaning: of a lane.
-        fallback: solver that is tried if it fails.
         kernels: those applied to vectors, if they are not the iteration's own.
         changes: whether it also propagates tangent and adjoint vectors.
     """
@@ -126,8 +123,7 @@ def iteration_source(
     damping = None if meaning.are_points else fixed_point.damping
     applied = (*kernels, *((mass,) if mass and not meaning.are_points else ()), *((damping,) if damping else ()))
     functions = set().union(*(lane_functions(kernel, meaning.sources) for kernel in applied))
-    tried = "newton/library_fallback" if fallback == "external" else "iteration/fallback"
-    solver = (tried, "iteration/iteration_solver") if meaning.are_points else ()
+    solver = ("iteration/iteration_solver",) if meaning.are_points else ()
     parts = (f"iteration/{name}" for name in fixed_point.parts)
     return IterationSource(
         lanes=fixed_point.lanes,
@@ -142,7 +138,7 @@ def iteration_source(
         kernels=kernels,
         mass=mass,
         damping=damping,
-        support=(*meaning.before, "iteration/convergence", *meaning.memory, *parts, *solver),
+        support=("iteration/convergence", *meaning.memory, *parts, *solver),
         error_defines=_kept(fixed_point),
         highest=_table("HIGHEST", fixed_point.guess.highest),
         next=_table("NEXT", fixed_point.guess.next),

@@ -1,7 +1,6 @@
 #ifndef SUPPORT_MANY_TRAJECTORIES_H
 #define SUPPORT_MANY_TRAJECTORIES_H
 
-#include "../core/batched_step.h"
 #include "../core/trajectories.h"
 #include "convergence.h"
 

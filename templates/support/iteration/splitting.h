@@ -4,8 +4,8 @@
 #include "../core/status_codes.h"
 #include "../core/step.h"
 
-/* Explicit splitting method: drifts by constant masses (BY_MASSES) or by velocities v(p, t), and kicks. */
-#ifdef BY_MASSES
+/* Explicit splitting method: drifts by constant masses (CONSTANT_MASSES) or by velocities v(p, t), and kicks. */
+#ifdef CONSTANT_MASSES
 /* Drift of splitting methods with constant masses: dq += h part M^-1 p. Requires: step.h, the kernel mass. */
 typedef struct {
   real inverse_mass[M];

@@ -4,7 +4,7 @@
 #include "trial.h"
 
 /* Trials of an adaptive step until its error estimate is admissible, and comparison with two half steps. Requires:
- * step_size_levels.h, sizes.h; the type trial with at.t, at.t_low, t_end, limits, change, error, guess, last
+ * step_size_levels.h; the type trial with at.t, at.t_low, t_end, limits, change, error, guess, last
  * and apart; try_step, which sets error, guess and last; compare_trial, which compares a trial with its half steps,
  * in momenta too if requested; changes_little, 1 if the momenta change by a small part of the largest one;
  * SHORT_STEPS_FAIL, 1 if rounding alone may make a step fail; DOUBTS, 1 if momenta may be compared; HOT. */
