@@ -21,8 +21,7 @@ from scvi_codegen.version import __version__ as __version__
 
 _HOMES = {
     "advice.advice": ("Advice", "advise"),
-    "frameworks.casadi": ("casadi_flow",),
-    "frameworks.casadi_step": ("casadi_step",),
+    "frameworks.casadi": ("casadi_flow", "casadi_step"),
     "frameworks.control_task": ("ControlledMotion",),
     "frameworks.optimal_control": ("optimal_control",),
     "frameworks.jax": ("JaxFlow", "jax_flow"),
@@ -95,10 +94,9 @@ _HOMES = {
     "models.packages.package": ("generate_package", "load_package"),
     "pictures.animation": ("Film", "animate"),
     "pictures.conserved": ("plot_energy", "plot_momentum_maps"),
-    "pictures.overview": ("plot_trajectory",),
+    "pictures.overview": ("plot_section", "plot_trajectory"),
     "pictures.paths": ("plot_motion", "plot_phase"),
     "pictures.arrays": ("plot_arrays",),
-    "pictures.section": ("plot_section",),
     "models.problems": ("PROBLEMS", "problem"),
     "tables.quadrature": (
         "Quadrature",

@@ -36,7 +36,7 @@ from scvi_codegen.files.cache import CacheInfo as CacheInfo
 from scvi_codegen.files.cache import cache_info as cache_info
 from scvi_codegen.files.cache import clear_cache as clear_cache
 from scvi_codegen.frameworks.casadi import casadi_flow as casadi_flow
-from scvi_codegen.frameworks.casadi_step import casadi_step as casadi_step
+from scvi_codegen.frameworks.casadi import casadi_step as casadi_step
 from scvi_codegen.frameworks.control_task import ControlledMotion as ControlledMotion
 from scvi_codegen.frameworks.jax import JaxFlow as JaxFlow
 from scvi_codegen.frameworks.jax import jax_flow as jax_flow
@@ -88,10 +88,10 @@ from scvi_codegen.pictures.animation import animate as animate
 from scvi_codegen.pictures.arrays import plot_arrays as plot_arrays
 from scvi_codegen.pictures.conserved import plot_energy as plot_energy
 from scvi_codegen.pictures.conserved import plot_momentum_maps as plot_momentum_maps
+from scvi_codegen.pictures.overview import plot_section as plot_section
 from scvi_codegen.pictures.overview import plot_trajectory as plot_trajectory
 from scvi_codegen.pictures.paths import plot_motion as plot_motion
 from scvi_codegen.pictures.paths import plot_phase as plot_phase
-from scvi_codegen.pictures.section import plot_section as plot_section
 from scvi_codegen.pipeline import generate_source as generate_source
 from scvi_codegen.results.recording import RecordedRun as RecordedRun
 from scvi_codegen.results.recording import load_run as load_run

@@ -13,7 +13,7 @@
 Two other consumers read a ``StageSystem``: :func:`scvi_codegen.derivation.equations.derive` prints the equations in the
 paper's notation, and :func:`scvi_codegen.exact.step.derived_step` solves them in 60-digit arithmetic.
 :mod:`scvi_codegen.frameworks` extends the C source of one step and its derivatives to many steps for JAX, PyTorch and
-CasADi; :func:`scvi_codegen.frameworks.casadi_step.casadi_step` exports the stage equations as CasADi expressions.
+CasADi; :func:`scvi_codegen.frameworks.casadi.casadi_step` exports the stage equations as CasADi expressions.
 """
 
 from __future__ import annotations

@@ -19,8 +19,7 @@ from pathlib import Path
 from scvi_codegen.errors import BuildError
 from scvi_codegen.files.cache import CACHE_VARIABLE, cache_folder, cache_info, exposed, remedy_of
 from scvi_codegen.native.building import FLAGS_VARIABLE, TUNED_FLAGS
-from scvi_codegen.native.compilers import compiler_title, find_compiler, from_wheel
-from scvi_codegen.native.processes import running
+from scvi_codegen.native.compilers import compiler_title, find_compiler, from_wheel, running
 
 OK, MISSING, FAILED = "ok", "lacks", "fails"
 PACKAGE = "scvi-codegen"

@@ -10,10 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.cli.conservation import momentum_report
-from scvi_codegen.cli.formatting import counted, duration
-from scvi_codegen.cli.memory import check_memory
-from scvi_codegen.cli.progress import interruptions, progress_bar
+from scvi_codegen.cli.reports import counted, duration, momentum_report
+from scvi_codegen.cli.supervision import check_memory, interruptions, progress_bar
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.ensemble_file import EnsembleStates
 from scvi_codegen.native.options import FAILURES, SolverOptions

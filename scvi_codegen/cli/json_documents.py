@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.advice.tolerance_check import Known
-from scvi_codegen.cli.conservation import Balance
 from scvi_codegen.cli.ensembles import EnsembleOutcome
 from scvi_codegen.cli.recording import RecordedOutcome
+from scvi_codegen.cli.reports import Balance
 from scvi_codegen.cli.running import RunOutcome
 from scvi_codegen.errors import StateError
 from scvi_codegen.models.model import Model

@@ -14,9 +14,9 @@ from typing import Any
 import click
 import numpy as np
 
-from scvi_codegen.cli.formatting import counted, duration
-from scvi_codegen.cli.progress import interruptions, progress_bar
+from scvi_codegen.cli.reports import counted, duration
 from scvi_codegen.cli.running import conserved, final_state
+from scvi_codegen.cli.supervision import interruptions, progress_bar
 from scvi_codegen.errors import ModelFileError, StepFailedError
 from scvi_codegen.files import export
 from scvi_codegen.models.model import Model

@@ -10,10 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from scvi_codegen.advice.tolerance_check import SECOND_RUN, Known, known_digits
-from scvi_codegen.cli.conservation import Balance, energy_report, momentum_report
-from scvi_codegen.cli.formatting import counted, duration, in_known_digits
-from scvi_codegen.cli.memory import check_memory, check_run_memory
-from scvi_codegen.cli.progress import BAR_LENGTH, interruptions, progress_bar
+from scvi_codegen.cli.reports import Balance, counted, duration, energy_report, in_known_digits, momentum_report
+from scvi_codegen.cli.supervision import BAR_LENGTH, check_memory, check_run_memory, interruptions, progress_bar
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.models.model import Model

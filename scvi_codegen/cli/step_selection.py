@@ -10,7 +10,7 @@ import click
 
 from scvi_codegen.advice.advice import Advice, Evidence, advise
 from scvi_codegen.cli.command_group import tell
-from scvi_codegen.cli.formatting import duration
+from scvi_codegen.cli.reports import duration
 from scvi_codegen.errors import AccuracyWarning, StateError
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from sympy import Expr, latex
 
-from scvi_codegen.formulas.array_latex import latex_entry, latex_sums
+from scvi_codegen.formulas.array_notation import latex_entry, latex_sums
 from scvi_codegen.ir.equations import ConstrainedSteps, FixedPointIteration, Splitting
 from scvi_codegen.ir.kernel import Number
 from scvi_codegen.ir.program import Program

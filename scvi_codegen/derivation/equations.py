@@ -28,7 +28,7 @@ from scvi_codegen.derivation.notation import LARGEST_SHOWN, Equation, TableEntry
 from scvi_codegen.display.cards import card, listed, plain
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.expressions import jacobian
-from scvi_codegen.formulas.writing import format_expression
+from scvi_codegen.formulas.translation import format_expression
 from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, symmetries
 from scvi_codegen.mechanics.system import MechanicalSystem

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scvi_codegen.errors import MethodError, StateError, closest
-from scvi_codegen.frameworks.casadi_step import EndConditions, casadi_step, straight
+from scvi_codegen.frameworks.casadi import EndConditions, casadi_step, straight
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method

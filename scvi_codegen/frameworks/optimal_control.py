@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.errors import ControlError, MethodError, StateError
-from scvi_codegen.frameworks.casadi_step import own_parameters
+from scvi_codegen.frameworks.casadi import own_parameters
 from scvi_codegen.frameworks.control_task import Conditions, ControlledMotion, Task, check_known, interval
 from scvi_codegen.frameworks.flow import imported
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem

@@ -273,7 +273,7 @@ class MechanicalSystem(Deferred, ABC):
     def text_of(self, formula: Expr) -> str:
         """Return a formula of the system as text, with its inputs by their names."""
         from scvi_codegen.formulas.symbols import inputs_by_name
-        from scvi_codegen.formulas.writing import format_expression
+        from scvi_codegen.formulas.translation import format_expression
 
         return format_expression(inputs_by_name(formula, self.inputs))
 

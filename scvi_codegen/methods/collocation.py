@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.arguments import resolve_nodes
-from scvi_codegen.methods.method import Method, Specification, degree_count
+from scvi_codegen.methods.method import Method, Specification, degree_count, resolve_nodes
 from scvi_codegen.methods.runge_kutta import RungeKutta, check_form
 from scvi_codegen.representation import summary
 from scvi_codegen.tables import tableau as tableaux

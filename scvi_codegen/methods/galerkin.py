@@ -18,12 +18,15 @@ from typing import TYPE_CHECKING
 
 from scvi_codegen.errors import MethodError, MethodWarning, warn
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.arguments import (
+from scvi_codegen.methods.method import (
+    Exactness,
+    Method,
+    Specification,
+    degree_count,
     resolve_nodes,
     resolve_quadrature,
     resolve_space,
 )
-from scvi_codegen.methods.method import Exactness, Method, Specification, degree_count
 from scvi_codegen.representation import summary
 from scvi_codegen.tables.basis import next_step
 from scvi_codegen.tables.nodes import Nodes

@@ -21,9 +21,15 @@ from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.arguments import resolve_nodes, resolve_quadrature
 from scvi_codegen.methods.galerkin import SVI
-from scvi_codegen.methods.method import Exactness, Method, Specification, degree_count
+from scvi_codegen.methods.method import (
+    Exactness,
+    Method,
+    Specification,
+    degree_count,
+    resolve_nodes,
+    resolve_quadrature,
+)
 from scvi_codegen.representation import summary
 from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import Vector

@@ -3,7 +3,7 @@
 An integrator is compiled once into a shared library, and its declarations once into cffi's description of them (ABI
 mode: no compiled binding, so no headers of Python, at a cost of .2 microseconds per call). Both are stored in the
 user's cache folder under a name that is a digest of everything that determines them
-(:mod:`scvi_codegen.native.fingerprint`). They are built in a temporary folder inside the cache and renamed into place,
+(:mod:`scvi_codegen.native.compilers`). They are built in a temporary folder inside the cache and renamed into place,
 so processes may race without locks; an entry that does not match its recorded checksum is built again. If the cache
 cannot be written, or others can write it, a temporary folder is used (:mod:`scvi_codegen.files.cache`).
 """
@@ -40,9 +40,15 @@ from scvi_codegen.files.cache import (
     trusted_folder,
 )
 from scvi_codegen.native.announcements import announced
-from scvi_codegen.native.compilers import another_compiler, find_compiler, from_wheel, words_of
-from scvi_codegen.native.fingerprint import FLAGS_VARIABLE, fingerprint
-from scvi_codegen.native.processes import running
+from scvi_codegen.native.compilers import (
+    FLAGS_VARIABLE,
+    another_compiler,
+    find_compiler,
+    fingerprint,
+    from_wheel,
+    running,
+    words_of,
+)
 from scvi_codegen.rendering.source import Source
 
 __all__ = [

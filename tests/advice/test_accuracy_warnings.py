@@ -13,7 +13,7 @@ from click.testing import CliRunner, Result
 import scvi_codegen as sc
 from scvi_codegen.advice.tolerance_check import known_digits, missed_tolerance
 from scvi_codegen.cli import main
-from scvi_codegen.cli.formatting import in_known_digits
+from scvi_codegen.cli.reports import in_known_digits
 
 PUSHED = sc.LagrangianSystem.from_text(
     name="pushed",

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 from scvi_codegen import load_model, problem
 from scvi_codegen.cli import main
-from scvi_codegen.cli.conservation import MAX_BALANCE_COORDINATES, MAX_BALANCE_STEPS, energy_balance
+from scvi_codegen.cli.reports import MAX_BALANCE_COORDINATES, MAX_BALANCE_STEPS, energy_balance
 
 MODEL = """
 [system]

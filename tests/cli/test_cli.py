@@ -24,8 +24,8 @@ from click.shell_completion import ShellComplete
 from click.testing import CliRunner, Result
 
 from scvi_codegen.cli import ABOUT, main
-from scvi_codegen.cli.conservation import energy_report
 from scvi_codegen.cli.model_options import ModelOptions, read_model
+from scvi_codegen.cli.reports import energy_report
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.models.model import Model
@@ -408,7 +408,7 @@ class TestRun:
         assert len(arrays("a.npz")["t"]) == 1
 
     def test_states_beyond_memory_are_saved_as_advised(self, monkeypatch):
-        monkeypatch.setattr("scvi_codegen.cli.memory.usable_memory", lambda: 20_000.0)
+        monkeypatch.setattr("scvi_codegen.cli.supervision.usable_memory", lambda: 20_000.0)
         save_every = re.search(r"--save-every (\d+)", error_of("run", "kepler", "--steps", "1000"))[1]
         assert 1 < int(save_every) < 10
         assert "1000 steps" in output_of("run", "kepler", "--steps", "1000", "--save-every", save_every)

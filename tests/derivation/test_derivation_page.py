@@ -30,10 +30,9 @@ from scvi_codegen.cli import main
 from scvi_codegen.derivation import Start, derivation_html
 from scvi_codegen.derivation.equations import derive
 from scvi_codegen.derivation.notation import table_entries
-from scvi_codegen.derivation.page.elision import MOST_LINES, formulas, operations
 from scvi_codegen.derivation.page.jacobian import entry_numbers, jacobian_pattern
 from scvi_codegen.derivation.page.kernels import ITERATIONS, kernels_of
-from scvi_codegen.display.page.blocks import Formula, Paragraph
+from scvi_codegen.display.page.blocks import MOST_LINES, Formula, Paragraph, formulas, operations
 from scvi_codegen.display.page.environment import SPACE
 from scvi_codegen.ir.equations import IterationName
 from scvi_codegen.methods.discretise import paper_equations, with_auxiliaries

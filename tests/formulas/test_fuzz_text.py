@@ -28,7 +28,7 @@ from scvi_codegen.errors import (
 )
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import IDENTIFIER
-from scvi_codegen.formulas.writing import format_expression
+from scvi_codegen.formulas.translation import format_expression
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import ARGUMENTS, METHODS, SCVI, SVI, Gauss, method_from_specification

@@ -15,7 +15,7 @@ import pytest
 from programs import needs
 
 from scvi_codegen.errors import BuildError, ScviCodegenError
-from scvi_codegen.native import building, compilers, fingerprint
+from scvi_codegen.native import building, compilers
 from scvi_codegen.rendering.source import TEXTS, Source
 
 FAST = ("-O0",)
@@ -130,7 +130,7 @@ def more_flags(tmp_path, monkeypatch):
 
 
 def other_cffi(tmp_path, monkeypatch):
-    monkeypatch.setattr(fingerprint._cffi_backend, "__version__", "0.0")
+    monkeypatch.setattr(compilers._cffi_backend, "__version__", "0.0")
 
 
 @pytest.mark.parametrize(
@@ -177,7 +177,7 @@ def test_processor_specific_code_is_not_shared_between_processors(where, tmp_pat
     monkeypatch.setenv(building.FLAGS_VARIABLE, native if where == "environment" else "")
     monkeypatch.setenv("CC", f"{compiler_reporting(tmp_path, '1.0')} {native if where == 'compiler' else '-pipe'}")
     for processor in ("one", "another"):
-        monkeypatch.setattr(fingerprint, "_processor", lambda processor=processor: processor)
+        monkeypatch.setattr(compilers, "_processor", lambda processor=processor: processor)
         names.append(building.fingerprint(source(), flags=(*FAST, native) if where == "flags" else FAST))
     assert (names[0] == names[1]) == (where == "not at all")
 
@@ -188,7 +188,7 @@ def test_processor_specific_code_is_not_shared_between_processors(where, tmp_pat
 def test_processors_are_distinguished_by_tuning_features(line, monkeypatch):
     def processor(text: str) -> str:
         monkeypatch.setattr(Path, "read_text", lambda self: text)
-        return fingerprint._processor.__wrapped__()
+        return compilers._processor.__wrapped__()
 
     common = "processor\t: 0\nmodel name\t: some\nflags\t\t: fpu avx\nFeatures\t: asimd\nCPU part\t: 0xd0c\n"
     key = line.split(":")[0]

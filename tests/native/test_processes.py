@@ -17,7 +17,7 @@ import pytest
 from scvi_codegen.errors import BuildError
 from scvi_codegen.native import announcements, building
 from scvi_codegen.native.building import PORTABLE_FLAGS
-from scvi_codegen.native.processes import _alone, running
+from scvi_codegen.native.compilers import _alone, running
 from scvi_codegen.rendering.source import Source
 
 SLOW_COMPILER = """#!/bin/sh

@@ -9,8 +9,15 @@ import sympy
 from sympy import Symbol
 from sympy.core.function import AppliedUndef
 
-from scvi_codegen.derivation.page.result_names import argument_symbol, point_index, result_symbol
-from scvi_codegen.derivation.page.sums import column_of, end_formulas, gather_formulas, row_formulas
+from scvi_codegen.derivation.page.sums import (
+    argument_symbol,
+    column_of,
+    end_formulas,
+    gather_formulas,
+    point_index,
+    result_symbol,
+    row_formulas,
+)
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import StageSystem
 

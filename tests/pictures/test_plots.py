@@ -19,9 +19,8 @@ from scvi_codegen.models.model import Model
 from scvi_codegen.models.problems import problem
 from scvi_codegen.pictures.canvas import check_plot_path
 from scvi_codegen.pictures.conserved import largest_in_bins, plot_energy, plot_momentum_maps
-from scvi_codegen.pictures.overview import plot_trajectory
+from scvi_codegen.pictures.overview import plot_section, plot_trajectory
 from scvi_codegen.pictures.paths import plot_motion, plot_phase
-from scvi_codegen.pictures.section import plot_section
 from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 

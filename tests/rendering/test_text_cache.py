@@ -23,7 +23,7 @@ from scvi_codegen.files.cache import key_of
 from scvi_codegen.mechanics.system import _text_of
 from scvi_codegen.methods import as_method
 from scvi_codegen.models.problems import problem
-from scvi_codegen.native import building, fingerprint
+from scvi_codegen.native import building, compilers
 
 
 @pytest.fixture
@@ -403,8 +403,8 @@ def test_library_name_depends_on_compiler_flags_and_commands(monkeypatch):
         changed = source if value is None else f"{value}2" if isinstance(value, str) else (*value, ("support/a.h", ""))
         object.__setattr__(other, field.name, changed)
         found.append(building.fingerprint(other, flags=("-O1", "-g")))
-    monkeypatch.setattr(fingerprint, "compiler_version", lambda command: "another")
+    monkeypatch.setattr(compilers, "compiler_version", lambda command: "another")
     found.append(building.fingerprint(source, flags=("-O1", "-g")))
-    monkeypatch.setattr(fingerprint, "_commands", lambda: "another")
+    monkeypatch.setattr(compilers, "_commands", lambda: "another")
     found.append(building.fingerprint(source, flags=("-O1", "-g")))
     assert len(set(found)) == len(found) == 11

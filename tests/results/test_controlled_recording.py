@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 from recorded_runs import STATE, StopsAfter, assert_same, digests, recorded
 
-from scvi_codegen.cli import main, memory
+from scvi_codegen.cli import main, supervision
 from scvi_codegen.errors import RecordingError, StateError
 from scvi_codegen.methods import SVI
 from scvi_codegen.models.model import Model
@@ -147,7 +147,7 @@ def test_the_command_line_runs_records_and_resumes_it(kepler):
 
 def test_run_beyond_the_memory_ends_with_advice(monkeypatch):
     Path("k.toml").write_text(MODEL)
-    monkeypatch.setattr(memory, "usable_memory", lambda: 8000.0)
+    monkeypatch.setattr(supervision, "usable_memory", lambda: 8000.0)
     done = invoke("k.toml")
     assert done.exit_code != 0
     assert "save fewer (--save-every" in done.output

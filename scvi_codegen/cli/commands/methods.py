@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from scvi_codegen.cli.command_group import reporting, tell
-from scvi_codegen.cli.formatting import table
+from scvi_codegen.cli.reports import table
 from scvi_codegen.methods import ARGUMENTS, METHODS, method_from_specification, size_of
 from scvi_codegen.tables.closed_forms import exact_tableau
 from scvi_codegen.tables.nodes import Expressions

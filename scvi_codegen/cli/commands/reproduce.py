@@ -20,7 +20,7 @@ from scvi_codegen.cli.command_group import (
     reporting,
     tell,
 )
-from scvi_codegen.cli.formatting import counted
+from scvi_codegen.cli.reports import counted
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.pictures.canvas import check_plot_path
 from scvi_codegen.reproduce.laboratory.experiment import Experiment, Result

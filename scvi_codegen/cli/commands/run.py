@@ -10,7 +10,6 @@ import click
 
 from scvi_codegen.advice.tolerance_check import missed_tolerance
 from scvi_codegen.cli.command_group import FAILURE, INTERRUPTED, CommandFailure, check_writable, reporting, tell
-from scvi_codegen.cli.conservation import energy_balance
 from scvi_codegen.cli.ensembles import ensemble_summary, integrate_states
 from scvi_codegen.cli.json_documents import ensemble_numbers, failure_text, recorded_numbers, run_numbers
 from scvi_codegen.cli.model_options import (
@@ -21,6 +20,7 @@ from scvi_codegen.cli.model_options import (
     with_known_sizes,
 )
 from scvi_codegen.cli.recording import RecordedOutcome, Recording, check_format, check_resumed, is_run_folder
+from scvi_codegen.cli.reports import energy_balance
 from scvi_codegen.cli.running import RunOutcome, integrate_model, known_at_end, summary
 from scvi_codegen.cli.step_selection import model_with_adaptive_steps, model_with_advised_step, model_with_global_error
 from scvi_codegen.models.model import Model

@@ -8,8 +8,8 @@ from typing import Any
 import click
 
 from scvi_codegen.cli.command_group import reporting, tell
-from scvi_codegen.cli.formatting import table
 from scvi_codegen.cli.model_options import complete_model
+from scvi_codegen.cli.reports import table
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.document import document_of
 from scvi_codegen.models.model_files.model_file import dump_model

@@ -14,8 +14,7 @@ import sympy
 from sympy import Symbol
 
 from scvi_codegen.derivation.equations import StepEquations
-from scvi_codegen.derivation.page.elision import formulas
-from scvi_codegen.display.page.blocks import Content, Drawing, Formula, Paragraph, Section
+from scvi_codegen.display.page.blocks import Content, Drawing, Formula, Paragraph, Section, formulas
 from scvi_codegen.formulas.expressions import jacobian
 from scvi_codegen.ir.program import Program
 from scvi_codegen.mechanics.system import MechanicalSystem

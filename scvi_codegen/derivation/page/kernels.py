@@ -13,10 +13,20 @@ import sympy
 from sympy import Function as Applied
 from sympy import Symbol
 
-from scvi_codegen.derivation.page.elision import MOST_FORMULAS, formulas, lines, operations
 from scvi_codegen.derivation.page.stage_equations import stage_group_contents
 from scvi_codegen.derivation.page.sums import end_formulas, row_formulas
-from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section, SideBySide, TableBlock
+from scvi_codegen.display.page.blocks import (
+    MOST_FORMULAS,
+    Content,
+    Formula,
+    Paragraph,
+    Section,
+    SideBySide,
+    TableBlock,
+    formulas,
+    lines,
+    operations,
+)
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
 from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, multipliers

@@ -13,10 +13,8 @@ from sympy import Symbol
 
 from scvi_codegen.derivation.equations import StepEquations, derive
 from scvi_codegen.derivation.notation import Equation
-from scvi_codegen.derivation.page.elision import formulas, operations
-from scvi_codegen.derivation.page.result_names import meaning
-from scvi_codegen.derivation.page.sums import end_formulas, gather_formulas, row_formulas
-from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section, TableBlock
+from scvi_codegen.derivation.page.sums import end_formulas, gather_formulas, meaning, row_formulas
+from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section, TableBlock, formulas, operations
 from scvi_codegen.formulas.expressions import gradient
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.forces import with_constraint_forces

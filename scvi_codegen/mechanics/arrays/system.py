@@ -19,9 +19,8 @@ from sympy import Expr, S, Symbol
 
 from scvi_codegen.errors import SizesRequiredError, SystemDefinitionError
 from scvi_codegen.files.cache import key_of
-from scvi_codegen.formulas.array_latex import latex_sum
+from scvi_codegen.formulas.array_notation import array_text, latex_sum
 from scvi_codegen.formulas.array_statements import ArrayForce, parse_constraint, parse_force
-from scvi_codegen.formulas.array_sympy import array_text
 from scvi_codegen.formulas.arrays import ArrayTerm, parse_array, parse_coordinate, parse_sums
 from scvi_codegen.formulas.expressions import unsupported_part
 from scvi_codegen.formulas.grammar import parse_expression

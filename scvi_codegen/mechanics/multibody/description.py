@@ -12,8 +12,7 @@ from sympy import Expr, Symbol
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.mechanics.multibody.kinetics import gyroscopic_forces, kinetic_energy, load_forces, motions_of
 from scvi_codegen.mechanics.multibody.potential import potential_of
-from scvi_codegen.mechanics.multibody.variables import Variables, solved_for_speeds
-from scvi_codegen.mechanics.multibody.velocity_constraints import independent_of
+from scvi_codegen.mechanics.multibody.variables import Variables, independent_of, solved_for_speeds
 
 if TYPE_CHECKING:
     from sympy.physics.mechanics import ReferenceFrame

@@ -23,7 +23,7 @@ from sympy import Expr, Matrix
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.expressions import jacobian
-from scvi_codegen.mechanics.multibody.identities import are_zero
+from scvi_codegen.mechanics.multibody.potential import are_zero
 from scvi_codegen.mechanics.multibody.variables import Variables
 
 if TYPE_CHECKING:

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import ModelFileError, closest
 from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_files.csv_tables import parse_table
+from scvi_codegen.models.model_files.input_tables import parse_table
 from scvi_codegen.models.time_span import real
 from scvi_codegen.validation import checked_count
 

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.files.numpy_files import loaded
-from scvi_codegen.models.model_files.csv_tables import CsvTable, parse_table
-from scvi_codegen.models.model_files.input_tables import InputTable
+from scvi_codegen.models.model_files.input_tables import CsvTable, InputTable, parse_table
 from scvi_codegen.models.time_span import real
 from scvi_codegen.native.arguments import real_array
 

@@ -55,7 +55,7 @@ from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.indices import Array
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.models.model_files.csv_tables import parse_table
+from scvi_codegen.models.model_files.input_tables import parse_table
 from scvi_codegen.models.model_files.sections import Document, Section, check_keys, check_one, in_section, required
 from scvi_codegen.models.model_files.system_section import is_number
 from scvi_codegen.models.time_span import check_length, real

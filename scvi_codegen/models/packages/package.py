@@ -23,8 +23,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from scvi_codegen.errors import PackageError
-from scvi_codegen.models.packages.folders import CERTIFICATE_FILE, INTERFACE_FILE, record_text, write_folder
-from scvi_codegen.models.packages.generated_folders import damaged, prefix_of, read_record, source_in
+from scvi_codegen.models.packages.folders import (
+    CERTIFICATE_FILE,
+    INTERFACE_FILE,
+    damaged,
+    prefix_of,
+    read_record,
+    record_text,
+    source_in,
+    write_folder,
+)
 from scvi_codegen.rendering.source import Interface, Source, check_interface
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.stepper import Stepper

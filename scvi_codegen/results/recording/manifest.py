@@ -13,9 +13,7 @@ import numpy as np
 from scvi_codegen.errors import RecordingError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.native.arguments import checked_number
-from scvi_codegen.native.compilers import compiler_title
-from scvi_codegen.native.fingerprint import fingerprint
-from scvi_codegen.native.flags import check_flags
+from scvi_codegen.native.compilers import check_flags, compiler_title, fingerprint
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source, check_interface
 from scvi_codegen.runtime.core.compiled_method import Variants

@@ -20,7 +20,7 @@ from scvi_codegen.files.atomic import sync_folder
 from scvi_codegen.files.export import Piece, chunk_rows
 from scvi_codegen.indices import SIZES_REQUIRED
 from scvi_codegen.native.arguments import checked_number
-from scvi_codegen.native.flags import check_flags
+from scvi_codegen.native.compilers import check_flags
 from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states, read_chunk, unfinished, write_chunk
 from scvi_codegen.results.recording.manifest import MANIFEST, Build, Manifest, read_manifest, write_manifest
 from scvi_codegen.results.recording.reading import RecordedRun, load_run

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     import xarray
 
     from scvi_codegen.pictures.animation import Film
-    from scvi_codegen.pictures.plots import Plots
+    from scvi_codegen.pictures.overview import Plots
 
 MOST_DRAWN, MOST_CURVES = 400, 6
 """Largest numbers of states and of coordinates in the plot of a notebook."""
@@ -358,7 +358,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
 
         There are ``motion``, ``phase``, ``energy``, ``momentum_maps`` and ``section``; each returns Matplotlib axes.
         """
-        from scvi_codegen.pictures.plots import Plots
+        from scvi_codegen.pictures.overview import Plots
 
         return Plots(self)
 

@@ -1,13 +1,24 @@
-"""Check of the memory that a run needs, before it starts: the system kills larger processes without a message."""
+"""Supervision of a run: check of the memory that it needs, progress bar, and handling of SIGINT and SIGTERM.
+
+The memory is checked before the run starts: the system kills larger processes without a message.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
-from collections.abc import Sequence
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import FrameType
 
+import click
+
+from scvi_codegen.cli.command_group import is_quiet
 from scvi_codegen.errors import StateError
 from scvi_codegen.models.model import Model
 
@@ -65,3 +76,40 @@ def usable_memory() -> float:
     with suppress(OSError, ValueError):
         result.append(float(CGROUP_LIMIT.read_text()))
     return min(result)
+
+
+BAR_LENGTH = 1000
+"""Length of the progress bar of a run whose number of steps is not known in advance."""
+
+
+@contextlib.contextmanager
+def interruptions() -> Iterator[list[int]]:
+    """Record the first SIGINT or SIGTERM in a list instead of ending the process; a second one acts as usual."""
+    caught: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield caught  # only the main thread may handle signals
+        return
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = {int(number): signal.getsignal(number) for number in signals}
+
+    def note(number: int, frame: FrameType | None) -> None:
+        caught.append(number)
+        signal.signal(number, before[number])
+
+    try:
+        for number in signals:
+            signal.signal(number, note)
+        yield caught
+    finally:
+        for number in signals:
+            signal.signal(number, before[number])
+
+
+@contextlib.contextmanager
+def progress_bar(steps: int) -> Iterator[Callable[[int], None]]:
+    """Show a bar on stderr if that is a terminal; the function it yields takes the number of completed steps."""
+    if not sys.stderr.isatty() or steps == 0 or is_quiet():
+        yield lambda done: None
+        return
+    with click.progressbar(length=steps, label="integrating", file=sys.stderr) as bar:
+        yield lambda done: bar.update(done - bar.pos)
