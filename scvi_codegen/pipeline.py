@@ -4,7 +4,7 @@
       -> discretise  StageSystem   points, kernel and tables: the equations of one step
                                    (:mod:`scvi_codegen.methods.discretise`)
       -> iteration   Iteration     fixed-point iteration, if the system admits one; splitting_of: explicit splitting
-                                   (:mod:`scvi_codegen.lowering.solvers.selection`)
+                                   (:mod:`scvi_codegen.lowering.program`)
       -> symmetries  Symmetry      conserved quantities (:mod:`scvi_codegen.mechanics.symmetry.symmetry`)
       -> lower       Program       kernels, tables, loops: intermediate form (:mod:`scvi_codegen.lowering.program`)
       -> render      Source        header, source: from ``templates/`` (:mod:`scvi_codegen.rendering.program_source`);

@@ -35,8 +35,8 @@ from sympy import Symbol
 from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.equations import ConstrainedSteps, Constraints, Rattle
 from scvi_codegen.ir.kernel import LoopedKernel, lower_matrix, lower_vector
-from scvi_codegen.lowering.kernels import looped_kernel, system_kernel
 from scvi_codegen.lowering.solvers.tables import velocity_tables
+from scvi_codegen.lowering.stage_groups import looped_kernel, system_kernel
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.arrays.terms import (
     constraint_gradient,
@@ -63,7 +63,7 @@ from scvi_codegen.tables.precision import Vector, mp
 def rattle_of(system: MechanicalSystem, stages: StageSystem) -> Rattle | None:
     """Return the tables of such steps; ``None`` if they are not applicable."""
     forms, tables = forms_of(system), velocity_tables(stages.shape)
-    if not system.constraints or any(nonholonomic_expressions(system)) or not forms.separable or tables is None:
+    if any(nonholonomic_expressions(system)) or not forms.separable or tables is None:
         return None
     partials = list(constraint_jacobian(system))
     at: dict[int, list[int]] = {}
@@ -131,10 +131,8 @@ def _kernels(system: ArraySystem) -> Iterator[tuple[LoopedKernel, LoopedKernel]]
         )
 
 
-def lowered_constraints(system: MechanicalSystem) -> Constraints | None:
-    """Return the kernels of the constraints of a system, ``None`` if it has none."""
-    if not system.constraints:
-        return None
+def lowered_constraints(system: MechanicalSystem) -> Constraints:
+    """Return the kernels of the constraints of a system."""
     partials, rates = constraint_jacobian(system), constraint_rates(system)
     return Constraints(
         formulas=tuple(map(system.text_of, system.constraints)),

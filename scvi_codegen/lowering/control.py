@@ -23,8 +23,8 @@ from scvi_codegen.formulas.expressions import gradient
 from scvi_codegen.ir.equations import AdaptivePredictor, Control, FixedPointIteration, StoredValues
 from scvi_codegen.ir.kernel import Number, NumberTable
 from scvi_codegen.ir.program import Program
-from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.tables import DEGREE_OF_ONE, DEGREE_OF_TWO, INTERPOLATED
+from scvi_codegen.lowering.stage_groups import system_kernel
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.time_transformation import time_rescaling_function

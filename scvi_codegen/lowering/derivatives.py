@@ -15,7 +15,7 @@ from scvi_codegen.ir.derivatives import Derivatives, InputDerivatives, PointDeri
 from scvi_codegen.ir.equations import FixedPointIteration
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
-from scvi_codegen.lowering.kernels import system_kernel
+from scvi_codegen.lowering.stage_groups import system_kernel
 from scvi_codegen.mechanics.derived_expressions import Entries, forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian

@@ -16,7 +16,7 @@ from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.equations import ConstrainedSteps
 from scvi_codegen.ir.kernel import Constant, Load, LoopedKernel, exact_number
 from scvi_codegen.ir.program import LoopedTerms, Program
-from scvi_codegen.lowering.kernels import looped_kernel
+from scvi_codegen.lowering.stage_groups import looped_kernel
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.arrays.terms import entries_of, force_of
 from scvi_codegen.mechanics.system import MechanicalSystem

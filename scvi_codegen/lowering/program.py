@@ -1,4 +1,9 @@
-"""Lowering of a symbolic system and a method to a program: kernels, tables and loops (:mod:`scvi_codegen.ir`)."""
+"""Lowering of a symbolic system and a method to a program: kernels, tables and loops (:mod:`scvi_codegen.ir`).
+
+Fixed-point solvers (``FIXED_POINTS``) iterate on kernels at points that are the lanes of one vector, without a Newton
+matrix: on positions, on velocities, or on momenta and velocities (:mod:`~scvi_codegen.lowering.solvers.points`); on
+accelerations, or on accelerations and multipliers (:mod:`~scvi_codegen.lowering.solvers.curves`).
+"""
 
 from __future__ import annotations
 
@@ -10,7 +15,7 @@ import sympy
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.indices import Array
-from scvi_codegen.ir.equations import LoweredStageGroup
+from scvi_codegen.ir.equations import FixedPointIteration, LoweredStageGroup, Splitting
 from scvi_codegen.ir.kernel import Kernel, lower_matrix, lower_vector
 from scvi_codegen.ir.program import (
     FEW_UNKNOWNS,
@@ -24,22 +29,100 @@ from scvi_codegen.ir.program import (
 )
 from scvi_codegen.lowering.arrays import check_solver_of_arrays, one_coordinate
 from scvi_codegen.lowering.constraints import constrained_steps, lowered_constraints, rattle_of
-from scvi_codegen.lowering.kernels import comment_text, damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.lowering.loops import looped_terms
-from scvi_codegen.lowering.solvers.selection import check_solver, iteration_of, splitting_of
-from scvi_codegen.lowering.solvers.tables import resolved_degree, velocity_tables
-from scvi_codegen.lowering.stage_groups import bandwidth, bandwidth_ordering, has_action, layout_of, lowered_stage_group
+from scvi_codegen.lowering.solvers.curves import position_iteration, printed_iteration, shooting_iteration
+from scvi_codegen.lowering.solvers.points import coupled_iteration, hamiltonian_iteration, separable_iteration
+from scvi_codegen.lowering.solvers.tables import Solver, StepProblem, resolved_degree, velocity_tables
+from scvi_codegen.lowering.stage_groups import (
+    bandwidth,
+    bandwidth_ordering,
+    comment_text,
+    damping_kernel,
+    has_action,
+    integrand_kernel,
+    layout_of,
+    lowered_stage_group,
+    system_kernel,
+)
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.derived_expressions import forms_of
+from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, work_rates
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.constraints import END_VELOCITY
 from scvi_codegen.methods.discretise import discretise, is_conformally_symplectic, is_symplectic
+from scvi_codegen.methods.leapfrog_stages import kicks_and_drifts
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_structure import Accelerations, PrintedCurve, ShotCurve, Velocities
 from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.tables.basis import cardinal_values, legendre_functional
 from scvi_codegen.tables.precision import Matrix, Vector, mp
+
+FIXED_POINTS: tuple[Solver, ...] = (
+    separable_iteration,
+    hamiltonian_iteration,
+    coupled_iteration,
+    position_iteration,
+    printed_iteration,
+    shooting_iteration,
+)
+"""Fixed-point solvers, the fastest first; the first that is applicable is used."""
+
+
+def iteration_of(
+    system: MechanicalSystem, stages: StageSystem, *, velocities: bool = False
+) -> FixedPointIteration | None:
+    """Return the fixed-point iteration of the stage equations of a system, or ``None`` if there is none.
+
+    With ``velocities`` it has a table of those at the points, on which forces depend.
+    """
+    if system.constraints:
+        return None
+    problem = StepProblem(system, stages.shape)
+    if velocities:
+        return separable_iteration(problem, velocities=True)
+    return next((fixed_point for solver in FIXED_POINTS if (fixed_point := solver(problem)) is not None), None)
+
+
+def check_solver(
+    solver: str, method: Method, names: Sequence[str], *, found: FixedPointIteration | Splitting | None
+) -> None:
+    """Raise :class:`MethodError` for an unknown solver, or one that this method and system do not have."""
+    if solver not in names:
+        raise MethodError(f"unknown solver {solver!r}: use one of {', '.join(names)}")
+    if solver == "explicit" and found is None:
+        raise MethodError(f"{method.name} is not explicit for this system: use solver='auto'")
+    if solver == "fixed-point" and found is None:
+        raise MethodError(
+            f"{method.name} has no fixed-point iteration for this system: use solver='auto' or 'newton', "
+            "or at most 32 points (an SVI: at least as many as its degree; a variational SCVI: at most 8 coordinates)"
+        )
+
+
+def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
+    """Return the sequence of kicks and drifts, or ``None`` if the method is implicit."""
+    if not method.fractions or system.constraints:
+        return None
+    twin = equivalent_lagrangian(system)
+    by_masses = twin is not None and forms_of(twin).separable
+    if not by_masses and not forms_of(system).split:
+        return None
+    moved = twin if twin is not None and by_masses else system
+    forms = forms_of(moved)
+    kicks, drifts = kicks_and_drifts(method)
+    if by_masses:
+        drift = system_kernel(moved, "mass", forms.mass.values(), of=(), purpose="The constant masses.")
+    else:
+        drift = system_kernel(moved, "drift_velocity", forms.legendre, of=moved.auxiliaries, purpose="H_p at u = p.")
+    return Splitting(
+        kicks=lower_vector(kicks),
+        drifts=lower_vector(drifts),
+        abscissae=lower_vector(tuple(mp.fsum(drifts[:n]) for n in range(len(kicks)))),
+        force=system_kernel(moved, "force", forms.force, of=moved.coordinates, purpose="L_q at u = q."),
+        drift=drift,
+        by_masses=by_masses,
+    )
+
 
 SOLVERS = ("auto", "explicit", "fixed-point", "newton")
 
@@ -100,8 +183,8 @@ def lower(
         polynomial_curves=polynomial,
         equations=_equations(system, method, stages, newton=newton, curve=newton and polynomial and splitting is None),
         quantities=_quantities(system, method, stages, symmetries),
-        constraints=lowered_constraints(system),
-        rattle=rattle_of(system, stages) if solver == "auto" else None,
+        constraints=lowered_constraints(system) if system.constraints else None,
+        rattle=rattle_of(system, stages) if system.constraints and solver == "auto" else None,
         damping=damping_kernel(system),
     )
 

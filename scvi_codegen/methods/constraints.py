@@ -56,13 +56,11 @@ SAME = mp.mpf(10) ** -40
 
 
 def with_constraints(system: MechanicalSystem, stages: StageSystem, name: str) -> StageSystem:
-    """Return the stage equations with the constraints of the system; unchanged if there are none.
+    """Return the stage equations with the constraints of the system.
 
     Raises:
         MethodError: unless the method, of this name, is an SVI of degree s with s + 1 points, both ends among them.
     """
-    if not system.constraints:
-        return stages
     _check_points(system, stages, name)
     group, count = stages.stage_groups[0], len(system.constraints)
     nothing, points = (mp.zero, mp.zero), len(group.abscissae)

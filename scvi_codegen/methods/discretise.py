@@ -69,7 +69,9 @@ def paper_equations(system: MechanicalSystem, method: Method) -> StageSystem:
 
 def _completed(system: MechanicalSystem, stages: StageSystem, name: str) -> StageSystem:
     """Add auxiliary variables, constraints and damping to the equations."""
-    return replace(with_constraints(system, with_auxiliaries(system, stages), name), damping=system.damping)
+    completed = with_auxiliaries(system, stages)
+    completed = with_constraints(system, completed, name) if system.constraints else completed
+    return replace(completed, damping=system.damping)
 
 
 def _check_damping(system: MechanicalSystem, method: Method, stages: StageSystem) -> None:

@@ -1,7 +1,7 @@
 """Shapes of stage equations: the structure that a solver without a Newton matrix must know.
 
 A method states the shape of its stage system (:attr:`~scvi_codegen.methods.stage_system.StageSystem.shape`); a solver
-states which shapes it supports (:mod:`scvi_codegen.lowering.solvers.selection`). A shape consists of numbers of the
+states which shapes it supports (:mod:`scvi_codegen.lowering.program`). A shape consists of numbers of the
 method, in 60 digits, independent of the system. Stage equations without a shape are solved by Newton's iteration.
 """
 

@@ -18,10 +18,10 @@ from scvi_codegen.ir.kernel import Kernel, is_divided
 from scvi_codegen.ir.program import Program
 from scvi_codegen.rendering.convergence import INPUT_PRECISION, LARGEST_VIOLATION, MAX_ITERATIONS, ROUNDING_UNITS
 from scvi_codegen.rendering.environment import support_text, template_environment
+from scvi_codegen.rendering.kernels.functions import unrolled_equations
 from scvi_codegen.rendering.kernels.loops import loop_context
 from scvi_codegen.rendering.kernels.printer import constants, inverse_roots
 from scvi_codegen.rendering.kernels.simd import POINTS, TRAJECTORIES, Fallback, iteration_source, predictor_text
-from scvi_codegen.rendering.kernels.unrolled_equations import unrolled_equations
 from scvi_codegen.rendering.source import Interface, Source, included
 from scvi_codegen.rendering.target import DOUBLE, SINGLE, Target
 

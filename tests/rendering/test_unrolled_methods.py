@@ -12,7 +12,7 @@ from scvi_codegen import SCVI, SVI, Gauss, StoermerVerlet, compile_stepper, gene
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.models.systems import planar_pendulum
 from scvi_codegen.native.building import PORTABLE_FLAGS
-from scvi_codegen.rendering.kernels import unrolled_equations
+from scvi_codegen.rendering.kernels import functions
 from scvi_codegen.runtime.core.stepper import Stepper
 
 pytestmark = pytest.mark.usefixtures("as_users_compile")
@@ -36,8 +36,8 @@ CASES = {
 def both(case, monkeypatch, flags):
     """The stepper written out, and that with tables."""
     steppers = []
-    for most in (unrolled_equations.MOST_TERMS, -1):
-        monkeypatch.setattr(unrolled_equations, "MOST_TERMS", most)
+    for most in (functions.MOST_TERMS, -1):
+        monkeypatch.setattr(functions, "MOST_TERMS", most)
         source, interface = generate_source(*CASES[case], solver="newton", prefix="p")
         assert ("#define UNROLLED_EQUATIONS" in source.code) == (most >= 0)
         steppers.append(Stepper(source, interface, **flags))

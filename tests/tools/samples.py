@@ -13,8 +13,7 @@ from oracle import Mechanics, numbers, oracle_step
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.ir.equations import FixedPointIteration
 from scvi_codegen.ir.program import Program
-from scvi_codegen.lowering.program import lower
-from scvi_codegen.lowering.solvers.selection import iteration_of
+from scvi_codegen.lowering.program import iteration_of, lower
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem

@@ -29,7 +29,6 @@ from sympy import S
 from scvi_codegen.formulas.expressions import gradient
 from scvi_codegen.ir.equations import FixedPointIteration, IterationName, IterationTable, StoredValues
 from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.tables import (
     MOST_LANES,
     StepProblem,
@@ -38,6 +37,7 @@ from scvi_codegen.lowering.solvers.tables import (
     pad_vector,
     predictor_tables_of,
 )
+from scvi_codegen.lowering.stage_groups import system_kernel
 from scvi_codegen.mechanics.derived_expressions import accelerations, forms_of, multipliers
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem

@@ -45,7 +45,6 @@ from sympy import Expr
 from scvi_codegen.formulas.expressions import jacobian
 from scvi_codegen.ir.equations import FixedPointIteration, IterationName, IterationTable, StoredValues
 from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.lowering.kernels import damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.lowering.solvers.tables import (
     MOST_LANES,
     StepProblem,
@@ -58,6 +57,7 @@ from scvi_codegen.lowering.solvers.tables import (
     tableau_tables,
     velocity_tables,
 )
+from scvi_codegen.lowering.stage_groups import damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.stage_structure import Accelerations, Velocities

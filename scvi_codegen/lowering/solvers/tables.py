@@ -1,7 +1,7 @@
 """Common interface and tables of the fixed-point solvers.
 
 A solver is a function from a problem to a :class:`~scvi_codegen.ir.equations.FixedPointIteration`, or ``None``, and a
-line in ``FIXED_POINTS`` (:mod:`scvi_codegen.lowering.solvers.selection`). The iteration is plain data, with the tables
+line in ``FIXED_POINTS`` (:mod:`scvi_codegen.lowering.program`). The iteration is plain data, with the tables
 and the support headers from which :mod:`scvi_codegen.rendering.kernels.simd` renders C. Solvers share only the problem.
 They may rely on the following:
 
