@@ -190,6 +190,14 @@ def _check_mass_matrix(system: MechanicalSystem) -> None:
     values = " with the default parameters" if used else ""
     direction = null_direction(block, velocities)
     motion = f": a motion with ({direction}) has no kinetic energy" if direction else ""
+    names_of_velocities = {velocity.name for velocity in velocities}
+    for each in system.rotations:
+        if not zero and names_of_velocities & {name + DOT for name in each.coordinates}:
+            raise SystemDefinitionError(
+                f"the inertia of the rotation '{each.name}' of '{system.name}' is singular{values}: turning about some "
+                "axis has no kinetic energy. Give all three moments of inertia positive values, or declare the axis of "
+                "a thin rod as a unit vector instead: directions=['n']"
+            )
     remedy = f"{zero} = 0 is the default: give it a positive value" if zero else REDUNDANT
     raise SystemDefinitionError(
         f"{subject} in {names} is singular at every sampled point{values}{motion}. {REQUIRED} {remedy}"

@@ -139,6 +139,8 @@ class HamiltonianSystem(MechanicalSystem):
         name=TEXT,
         coordinates=FORMULAS,
         momenta=FORMULAS,
+        rotations=MAPPING,
+        spins=NAMES,
         parameters=MAPPED,
         forces=MAPPED,
         inputs=FORMULAS,
@@ -148,8 +150,10 @@ class HamiltonianSystem(MechanicalSystem):
         *,
         name: str,
         hamiltonian: Expr,
-        coordinates: Sequence[Expr],
-        momenta: Sequence[Expr],
+        coordinates: Sequence[Expr] = (),
+        momenta: Sequence[Expr] = (),
+        rotations: Mapping[str, str] | None = None,
+        spins: Sequence[str] = (),
         time: Symbol | None = None,
         parameters: Mapping[Symbol | str, float] | None = None,
         forces: Mapping[Expr | str, Expr] | None = None,
@@ -165,6 +169,7 @@ class HamiltonianSystem(MechanicalSystem):
             name: name of the system.
             hamiltonian: H.
             coordinates, momenta: symbols or functions of time, parallel to each other.
+            rotations, spins: as of :meth:`from_text`; the names in formulas are symbols, ``Symbol("s_1")``.
             time: the symbol for time; by default the argument of the coordinates, or the symbol called ``t``.
             parameters: default value by symbol or by name.
             forces: expression by coordinate, in coordinates, momenta and time.
@@ -180,6 +185,8 @@ class HamiltonianSystem(MechanicalSystem):
             name=name,
             coordinates=coordinates,
             momenta=momenta,
+            rotations=rotations,
+            spins=spins,
             time=time,
             parameters=parameters,
             forces=forces,

@@ -157,7 +157,7 @@ class LagrangianSystem(MechanicalSystem):
         SystemDefinitionError,
         name=TEXT,
         coordinates=FORMULAS,
-        rotations=MAPPING,
+        rotations=MAPPED,
         directions=NAMES,
         velocities=FORMULAS,
         parameters=MAPPED,
@@ -172,7 +172,7 @@ class LagrangianSystem(MechanicalSystem):
         name: str,
         lagrangian: Expr,
         coordinates: Sequence[Expr | str] = (),
-        rotations: Mapping[str, str] | None = None,
+        rotations: Mapping[Any, Any] | None = None,
         directions: Sequence[str] = (),
         velocities: Sequence[Expr] | None = None,
         time: Symbol | None = None,
@@ -196,7 +196,9 @@ class LagrangianSystem(MechanicalSystem):
             lagrangian: L.
             coordinates: symbols, or functions of time such as ``dynamicsymbols`` returns.
             rotations, directions, torques, torques_space: as of :meth:`from_text`; the names in formulas are symbols,
-                ``Symbol("R_33")``, ``Symbol("omega_1")``.
+                ``Symbol("R_33")``, ``Symbol("omega_1")``. A frame ``B.orient_quaternion(N, ..)`` is declared by
+                ``{B: N}``: its rotation is called as the frame, and its angular velocity ``omega``, or ``omega_B`` if
+                there are several frames.
             velocities: parallel to ``coordinates``; by default ``Derivative(q(t), t)`` for a function of time, the
                 symbol called ``q_dot`` for a symbol ``q``.
             time: the symbol for time; by default the argument of the coordinates, or the symbol called ``t``.

@@ -21,6 +21,7 @@ from scvi_codegen.mechanics.forces import constraints_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.reading import default_momenta
+from scvi_codegen.mechanics.rotations.hamiltonian import hamiltonian_of_rotations
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.validation import NAMES, TEXTS, checks_arguments, of
@@ -134,6 +135,8 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
     Raises:
         SystemDefinitionError: if SymPy finds no closed-form solution of p = dL/dv.
 
+    The Hamiltonian of rotations with constant inertia has no energy of the length of the quaternion, and keeps them.
+
     >>> oscillator = LagrangianSystem.from_text(
     ...     name="oscillator", coordinates=["x"], lagrangian="m*x_dot**2/2 - k*x**2/2", parameters={"m": 1, "k": 2})
     >>> hamiltonian_of(oscillator).hamiltonian
@@ -144,6 +147,8 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
             f"'{system.name}' has constraints, which are supported for Lagrangians only: keep the "
             "Lagrangian, or convert it without constraints"
         )
+    if system.rotations and momenta is None and system.clock is None and (singular := hamiltonian_of_rotations(system)):
+        return singular
     names = default_momenta([q.name for q in system.coordinates]) if momenta is None else tuple(momenta)
     if len(names) != system.dimension:
         raise SystemDefinitionError(
@@ -164,6 +169,7 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
         forces=tuple(f.xreplace(velocities) for f in system.forces),
         damping=system.damping,
         inputs=system.inputs,
+        rotations=system.rotations,
     )
 
 
@@ -192,6 +198,12 @@ def lagrangian_of(system: HamiltonianSystem, *, constraints: Sequence[str] = ())
 
 @lru_cache(maxsize=64)
 def _lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
+    if system.rotations:
+        named = ", ".join(f"'{each.name}'" for each in system.rotations)
+        raise SystemDefinitionError(
+            f"'{system.name}' has rotations or spins ({named}), and its Hamiltonian is singular in their momenta: "
+            "write the Lagrangian with rotations=.., or use the Hamiltonian"
+        )
     if not system.is_regular:
         raise SystemDefinitionError(
             f"'{system.name}' has no Lagrangian: d2H/dp2 is singular, so velocities do not determine "

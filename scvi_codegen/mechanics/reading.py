@@ -25,6 +25,7 @@ from scvi_codegen.mechanics.arrays.elements import unrolled_fields
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.definition_checks import warn_of_mistakes
 from scvi_codegen.mechanics.forces import constraints_of, damping_rate, dissipative_forces, forces_by_coordinate
+from scvi_codegen.mechanics.rotations.frames import rotations_of_frames
 from scvi_codegen.mechanics.system import are_arrays
 
 Read = Callable[[Any], Expr]
@@ -129,19 +130,25 @@ def system_from_sympy(
 
     Other arguments are those of ``cls.from_sympy``; ``turning`` are those of ``TURNING`` and ``TORQUES``.
     """
+    turning["rotations"], of_frames = rotations_of_frames(turning.get("rotations"))
     names = RotationNames.declared(*(turning.get(each) for each in TURNING), momentum=momenta is not None)
     if function == "Lagrangian" and are_arrays(each for each in coordinates if isinstance(each, str)):
         others = (velocities, forces, dissipation, damping, constraints, inputs, *turning.values())
         return _arrays_from_sympy(cls, formula, others, name, list(coordinates), parameters, tables)
-    formula = sympy_expression(formula, function)
-    applied = {q: _components(f, f"force on {q}") for q, f in (forces or {}).items()}
+
+    def expression_of(value: Any, what: str) -> Expr:
+        return sympy_expression(value, what).xreplace(of_frames)
+
+    formula = expression_of(formula, function)
+    applied = {q: _components(f, f"force on {q}", expression_of) for q, f in (forces or {}).items()}
     torques, torques_space = (
-        {name: _components(f, f"torque on {name}") for name, f in (turning.get(each) or {}).items()} for each in TORQUES
+        {str(key): _components(f, f"torque on {key}", expression_of) for key, f in (turning.get(each) or {}).items()}
+        for each in TORQUES
     )
-    friction = None if dissipation is None else sympy_expression(dissipation, "dissipation")
+    friction = None if dissipation is None else expression_of(dissipation, "dissipation")
     acted = [f for each in (applied, torques, torques_space) for f in each.values()]
     rate = damping_rate(damping, lambda each: sympy_expression(each, "damping"))
-    conditions = constraints_of(constraints, lambda g: sympy_expression(g, "constraint"))
+    conditions = constraints_of(constraints, lambda g: expression_of(g, "constraint"))
     input_names = tuple(name_of_key(each) for each in inputs)
     constants = with_inputs(_named_parameters(parameters), input_names)
     translation = Translation(
@@ -161,6 +168,7 @@ def system_from_sympy(
 
     by_symbol = {translation.rules.get(q, q): f for q, f in applied.items()}
     variables = (*translation.coordinates, *map(symbol, names.coordinates))
+    conjugate = (*translation.momenta, *map(symbol, default_momenta(names.coordinates)))
     if names.members:
         by_name, ordinary = (
             {name_of_key(q): f for q, f in by_symbol.items()},
@@ -174,7 +182,7 @@ def system_from_sympy(
     system = cls(
         name=name,
         coordinates=variables,
-        **({} if momenta is None else {"momenta": translation.momenta}),
+        **({} if momenta is None else {"momenta": conjugate}),
         time=symbol(TIME),
         parameters=translation.parameters,
         defaults=tuple(number(parameter, value) for parameter, value in constants.items()),
@@ -201,13 +209,9 @@ def _arrays_from_sympy(
     return _of_arrays(cls, arrays)
 
 
-def _components(force: Any, what: str) -> Any:
+def _components(force: Any, what: str, read: Callable[[Any, str], Expr]) -> Any:
     """Return a force as an expression, or its components as a tuple."""
-    return (
-        tuple(sympy_expression(f, what) for f in force)
-        if isinstance(force, tuple | list)
-        else sympy_expression(force, what)
-    )
+    return tuple(read(f, what) for f in force) if isinstance(force, tuple | list) else read(force, what)
 
 
 def _flat(forces: Iterable[Any]) -> list[Expr]:

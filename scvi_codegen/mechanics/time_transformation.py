@@ -36,6 +36,7 @@ from sympy import Expr, Symbol
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.expressions import gradient, hessian
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.rotations.names import RotationNames
 from scvi_codegen.formulas.symbols import input_formulas, symbol
 from scvi_codegen.formulas.translation import format_expression
 from scvi_codegen.mechanics.derived_expressions import forms_of
@@ -186,12 +187,15 @@ def time_rescaling_function(system: MechanicalSystem, g: str | Expr, *, in_time:
     driven = input_formulas(system.inputs, system.time) if in_time else {}
     time = (system.time, *driven) if in_time else ()
     known = {symbol.name: symbol for symbol in (*system.coordinates, *system.auxiliaries, *system.parameters, *time)}
+    names = RotationNames(system.rotations)
+    readable = known | names.symbols
     if isinstance(g, Expr):
-        formula = g.xreplace({free: known[free.name] for free in g.free_symbols if free.name in known})
+        formula = g.xreplace({free: readable[free.name] for free in g.free_symbols if free.name in readable})
     elif isinstance(g, str):
-        formula = _read(g, known)
+        formula = _read(g, readable)
     else:
         raise SystemDefinitionError(f"time_transformation must be a name, text or a SymPy expression, not {g!r}")
+    formula = names.in_coordinates(formula)
     unknown = sorted(free.name for free in formula.free_symbols - set(known.values()))
     if unknown:
         kinds = "coordinates, momenta and parameters" if system.auxiliaries else "coordinates and parameters"

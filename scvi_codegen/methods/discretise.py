@@ -25,6 +25,7 @@ from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.rotations.hamiltonian import hamiltonian_of_rotations
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.mechanics.time_transformation import reparametrise
 from scvi_codegen.methods.constraints import with_constraints
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_structure import Velocities
@@ -46,7 +47,12 @@ def discretised_form(system: MechanicalSystem, method: Method) -> MechanicalSyst
     """
     if not isinstance(system, LagrangianSystem) or not system.rotations or not method.symplectic:
         return system
-    return system if method.needs_regular else hamiltonian_of_rotations(system) or system
+    if (
+        method.needs_regular
+        or (form := hamiltonian_of_rotations(system.clock.plain if system.clock else system)) is None
+    ):
+        return system
+    return reparametrise(form, system.clock.rate) if system.clock else form
 
 
 def discretise(system: MechanicalSystem, method: Method) -> StageSystem:
