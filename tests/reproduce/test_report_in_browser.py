@@ -49,8 +49,8 @@ class TestInABrowser:
 
     def test_single_panel_fits_a_phone_and_wider_pictures_scroll(self, view):
         figures = """[...document.querySelectorAll('figure .scroll')].map(e => {
-            const width = e.querySelector('svg').style.getPropertyValue('--width');
-            return [parseFloat(width) * 4 / 3, e.scrollWidth, e.clientWidth, getComputedStyle(e).backgroundImage];
+            const width = e.querySelector('img').style.getPropertyValue('--width');
+            return [parseFloat(width) * 96, e.scrollWidth, e.clientWidth, getComputedStyle(e).backgroundImage];
         })"""
         found = view.evaluate(figures)
         assert found
@@ -83,5 +83,6 @@ def test_dark_mode_has_a_dark_background(browser, page):
     view = browser.new_page(color_scheme="dark")
     view.set_content(page)
     assert view.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(22, 24, 28)"
-    assert view.evaluate("getComputedStyle(document.querySelector('svg text')).fill") == "rgb(227, 228, 230)"
+    shown = "getComputedStyle(document.querySelector('figure .scroll')).getPropertyValue('--behind')"
+    assert view.evaluate(shown) == "#ffffff"
     view.close()
