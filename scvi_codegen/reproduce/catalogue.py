@@ -7,20 +7,18 @@ from scvi_codegen.reproduce.kepler import (
     figures_13_to_20,
     figures_23_to_30,
     many_points,
-    more_points,
     overview,
     phase_plane,
-    smaller_steps,
 )
 from scvi_codegen.reproduce.laboratory.experiment import REGISTERED, Experiment
 from scvi_codegen.reproduce.oscillators import (
-    long_step,
     oscillator,
-    oscillator_orders,
     pendulum_and_duffing,
     two_point_pendulum,
 )
 from scvi_codegen.reproduce.paper_tables import costs, iterations, outlines, properties, tableaux
+from scvi_codegen.reproduce.refinement import kepler as kepler_refinement
+from scvi_codegen.reproduce.refinement import oscillator as oscillator_refinement
 from scvi_codegen.reproduce.theorems import collocation, kronecker, order, rates
 
 ORDER = """
@@ -33,8 +31,16 @@ ORDER = """
     correction claims
 """
 MODULES = (
-    *(overview, oscillator, long_step, oscillator_orders, pendulum_and_duffing, figures_13_to_20, figures_23_to_30),
-    *(more_points, smaller_steps, many_points, phase_plane, correction, tableaux, properties, outlines, costs),
+    *(
+        overview,
+        oscillator,
+        oscillator_refinement,
+        kepler_refinement,
+        pendulum_and_duffing,
+        figures_13_to_20,
+        figures_23_to_30,
+    ),
+    *(many_points, phase_plane, correction, tableaux, properties, outlines, costs),
     *(iterations, two_point_pendulum, collocation, kronecker, order, rates, claims),
 )
 """Modules whose import registers the experiments."""

@@ -21,9 +21,11 @@ from scvi_codegen.reproduce.kepler import figures_13_to_20 as kepler
 from scvi_codegen.reproduce.kepler import figures_23_to_30 as kepler_shooting
 from scvi_codegen.reproduce.kepler.many_points import PRINTED, SPAN, STEP, VARIATIONAL, orbit_of, shooting
 from scvi_codegen.reproduce.kepler.orbits import STATE, SYSTEM, exact_flow, off_ellipse, perihelion, revolutions
-from scvi_codegen.reproduce.kepler.smaller_steps import one_step, orders
 from scvi_codegen.reproduce.laboratory.experiment import Verdict
 from scvi_codegen.reproduce.laboratory.running import stepper_of
+from scvi_codegen.reproduce.refinement import kepler as refinement
+from scvi_codegen.reproduce.refinement.over_steps import fitted_power
+from scvi_codegen.reproduce.refinement.study import step_errors
 from scvi_codegen.reproduce.writing import draw, statement
 
 NAMES = (*(f"figure-{n}" for n in (*range(13, 21), *range(23, 31))), "correction")
@@ -74,36 +76,36 @@ ORDERS = {
     ("SC", 4): (6, 5, 6, 6),
     ("SC", 6): (8, 7, 8, 8),
 }
-"""(scheme, degree) -> powers of h of q1, q2, momentum, energy from the perihelion of an ellipse."""
+"""(scheme, N as the degree) -> powers of h of q1, q2, momentum, energy from the perihelion of an ellipse."""
 CIRCLE_ORDERS = {
-    ("SVI", 1): (4, 3, None, 6),
-    ("SVI", 3): (8, 7, None, 14),
-    ("SVI", 5): (12, 11, None, 22),
-    ("SC", 1): (2, 3, 2, 2),
-    ("SC", 3): (4, 5, 4, 4),
-    ("SC", 5): (6, 7, 6, 6),
+    ("SVI", 2): (4, 3, None, 6),
+    ("SVI", 4): (8, 7, None, 14),
+    ("SVI", 6): (12, 11, None, 22),
+    ("SC", 2): (2, 3, 2, 2),
+    ("SC", 4): (4, 5, 4, 4),
+    ("SC", 6): (6, 7, 6, 6),
 }
 """On the circle with 2, 4, 6 points: 2, 4, 6, 8, 12 are the lines that the paper draws for q1."""
 
 
 @pytest.mark.parametrize(
-    ("scheme", "degree", "e", "expected"),
-    [(*key, 0.5, value) for key, value in ORDERS.items()]
-    + [(*key, 0.0, value) for key, value in CIRCLE_ORDERS.items()],
+    ("scheme", "n", "setting", "expected"),
+    [(*key, refinement.ELLIPSE, value) for key, value in ORDERS.items()]
+    + [(*key, refinement.CIRCLE, value) for key, value in CIRCLE_ORDERS.items()],
 )
-def test_convergence_orders_of_the_local_error(scheme, degree, e, expected):
-    found = orders(scheme, degree, e)
-    assert [derivative is None for derivative in found] == [power is None for power in expected]
-    pairs = [(derivative, power) for derivative, power in zip(found, expected, strict=True) if power]
-    assert all(abs(derivative - power) < 0.1 for derivative, power in pairs)
+def test_convergence_orders_of_the_local_error(scheme, n, setting, expected):
+    found = [fitted_power(setting, scheme, n, what) for what in refinement.QUANTITIES]
+    assert [law is None for law in found] == [power is None for power in expected]
+    pairs = [(law.power, power) for law, power in zip(found, expected, strict=True) if power]
+    assert all(abs(measured - power) < 0.1 for measured, power in pairs)
 
 
 @pytest.mark.parametrize(("scheme", "constant", "base"), [("SVI", 1e10, 0.03), ("SC", 1e7, 0.1)])
 def test_errors_on_the_circle_follow_the_lines_of_figure_16(scheme, constant, base):
     for points in (10, 14):
-        errors = one_step(scheme, points - 1, 0.0, 5.0)
-        assert 1 / 10 < errors.q1 / (constant * base**points) < 1
-        assert 1 / 20 < errors.q2 / (constant * base**points) < 1
+        errors = step_errors(refinement.OVER_N.settings[0], scheme, points, 5.0)
+        assert 1 / 10 < errors["q1"] / (constant * base**points) < 1
+        assert 1 / 20 < errors["q2"] / (constant * base**points) < 1
 
 
 @pytest.mark.full
@@ -114,13 +116,14 @@ def test_lines_of_the_circle_are_not_those_of_ellipses(name):
     assert {check.verdict for check in result.checks} == {Verdict.PARTLY}
     fitted = {row[:3]: row[4] for row in result.tables[0].rows}
     quantity = {"figure-16": "q1", "figure-17": "energy"}[name]
-    assert fitted[0.0, "SC", quantity] == pytest.approx(0.097, abs=0.002)
-    assert fitted[0.2, "SC", quantity] > 0.4
-    assert fitted[0.5, "SC", quantity] > 0.7
+    assert fitted["e = 0", "SC", quantity] == pytest.approx(0.097, abs=0.002)
+    assert fitted["e = 0.2", "SC", quantity] > 0.4
+    assert fitted["e = 0.5", "SC", quantity] > 0.7
 
 
 def test_a_step_is_the_same_in_both_arithmetics():
-    assert one_step("SVI", 2, 0.5, 0.02).q1 / one_step("SVI", 2, 0.5, 0.01).q1 == pytest.approx(2**6, rel=0.02)
+    larger, smaller = (step_errors(refinement.ELLIPSE, "SVI", 2, h)["q1"] for h in (0.02, 0.01))
+    assert larger / smaller == pytest.approx(2**6, rel=0.02)
 
 
 # Figs. 23-26.

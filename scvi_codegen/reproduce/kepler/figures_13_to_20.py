@@ -1,6 +1,6 @@
 """Section 3.3.4: SVI and SC on Kepler's problem.
 
-This module has Figs. 13-15, long runs; 16 and 17 are in :mod:`.more_points`, 18-20 in :mod:`.smaller_steps`.
+This module has Figs. 13-15, long runs; 16-20 are in :mod:`scvi_codegen.reproduce.refinement.kepler`.
 """
 
 from __future__ import annotations

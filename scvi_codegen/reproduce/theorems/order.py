@@ -9,6 +9,7 @@ from functools import partial
 import sympy
 
 from scvi_codegen.methods import SCVI, SVI, SpectralCollocation
+from scvi_codegen.reproduce.laboratory.drawing import Panel, Series, draw_panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
     Formula,
@@ -31,10 +32,7 @@ from scvi_codegen.reproduce.theorems.convergence import (
     SHOWN,
     START,
     TITLES,
-    Panel,
-    Series,
     cell,
-    draw_panels,
     errors,
     fitted_order,
 )

@@ -8,6 +8,7 @@ from functools import partial
 from typing import TypeAlias
 
 from scvi_codegen.methods import SpectralCollocation
+from scvi_codegen.reproduce.laboratory.drawing import Panel, Series, draw_panels
 from scvi_codegen.reproduce.laboratory.experiment import Comparison, Picture, Result, TableBlock, experiment, holds
 from scvi_codegen.reproduce.theorems.convergence import (
     EXACT,
@@ -21,10 +22,7 @@ from scvi_codegen.reproduce.theorems.convergence import (
     SHOWN,
     START,
     TITLES,
-    Panel,
-    Series,
     cell,
-    draw_panels,
     errors,
     quadrature_error,
     rate,
