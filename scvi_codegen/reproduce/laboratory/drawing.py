@@ -92,8 +92,8 @@ class Series:
         marker, line: styles of Matplotlib.
     """
 
-    x: Sequence[float]
-    y: Sequence[float]
+    x: ArrayLike
+    y: ArrayLike
     scheme: str
     label: str = ""
     end: str = ""
