@@ -15,6 +15,9 @@ from scvi_codegen.validation import (
     MAPPED,
     MAPPING,
     NAMES,
+    NUMBERS,
+    PATH,
+    SWITCH,
     TEXT,
     TEXTS,
     ArgumentType,
@@ -22,6 +25,8 @@ from scvi_codegen.validation import (
 )
 
 if TYPE_CHECKING:
+    from os import PathLike
+
     from sympy import Expr, Symbol
     from sympy.physics.mechanics import KanesMethod, LagrangesMethod, System
 
@@ -29,6 +34,9 @@ if TYPE_CHECKING:
 
 LAGRANGES_METHOD = ArgumentType("a LagrangesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "lam_vec"))
 KANES_METHOD = ArgumentType("a KanesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "kindiffdict"))
+JOINTS = ArgumentType(
+    "a list of names of joints, or True for all", lambda value: value in (True, False) or NAMES.accepts(value)
+)
 BODIES = ArgumentType("a System of sympy.physics.mechanics", lambda value: hasattr(value, "actuators"))
 
 
@@ -37,7 +45,8 @@ class LagrangianSystem(MechanicalSystem):
     """Lagrangian L(q, q_dot, t; parameters) in m coordinates, validated on construction.
 
     Build one with ``from_text``, ``from_sympy``, or from SymPy's mechanics with ``from_lagranges_method``,
-    ``from_kanes_method`` and ``from_system``. Equality is structural.
+    ``from_kanes_method`` and ``from_system``, or from a robot's file with ``from_urdf`` and ``from_mjcf``. Equality is
+    structural.
 
     Attributes:
         name, coordinates, time, parameters, defaults: see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
@@ -332,6 +341,71 @@ class LagrangianSystem(MechanicalSystem):
         from scvi_codegen.mechanics.multibody.readers import of_system
 
         return cls.from_sympy(name=name, parameters=parameters, inputs=inputs, **of_system(system).formulas())
+
+    @classmethod
+    @checks_arguments(SystemDefinitionError, path=PATH, floating=SWITCH, gravity=NUMBERS, actuated=JOINTS)
+    def from_urdf(
+        cls,
+        path: str | PathLike[str],
+        *,
+        floating: bool = False,
+        gravity: Sequence[float] = (0.0, 0.0, -9.81),
+        actuated: Sequence[str] | bool = False,
+        name: str | None = None,
+    ) -> LagrangianSystem:
+        """Create the system from a URDF file, in joint coordinates: kinetic energy, gravity and damping of joints.
+
+        Revolute, continuous and prismatic joints are coordinates with the name of the joint. A floating base has the
+        position ``x_BASE``, ``y_BASE``, ``z_BASE`` of its frame, the rotation ``R_BASE`` and the angular velocity
+        ``omega_BASE`` in its frame, where ``BASE`` is the name of its link. Links of fixed joints are merged. Joints
+        with ``mimic`` follow theirs. Meshes, collisions, limits and dry friction are not read; angles ``rpy`` that
+        differ from a multiple of pi/2 by less than 5e-6 are this multiple, since files print them with few digits.
+
+        Args:
+            path: the file.
+            floating: whether the base moves freely; otherwise it is fixed to the world.
+            gravity: acceleration of gravity in the world frame, in the units of the file (m/s^2).
+            actuated: names of the joints on which an input ``tau_JOINT``, a torque or force, acts; ``True`` for all.
+            name: name of the system; by default that of the robot.
+
+        Raises:
+            SystemDefinitionError: naming file and element, if something is malformed or not read.
+        """
+        from scvi_codegen.mechanics.multibody.trees.urdf import links_of_urdf
+
+        robot, links = links_of_urdf(path, floating=floating)
+        return cls._of_tree(name or robot, links, gravity, actuated)
+
+    @classmethod
+    @checks_arguments(SystemDefinitionError, path=PATH, actuated=JOINTS)
+    def from_mjcf(
+        cls, path: str | PathLike[str], *, actuated: Sequence[str] | bool = False, name: str | None = None
+    ) -> LagrangianSystem:
+        """Create the system from an MJCF file of MuJoCo: kinetic energy, gravity, springs and damping of joints.
+
+        Hinges and slides are coordinates with the name of the joint. A ball joint is a rotation ``R_JOINT`` relative to
+        the parent with the angular velocity ``omega_JOINT`` in the frame of the body; a free joint has the position
+        ``x_JOINT``, ``y_JOINT``, ``z_JOINT`` as well. A joint without a name has that of its body. Inertias of bodies
+        follow from their ``inertial`` or geoms. Contacts, limits, actuators, sensors and dry friction are not read.
+
+        Args:
+            path, actuated: see :meth:`from_urdf`.
+            name: name of the system; by default that of the model.
+
+        Raises:
+            SystemDefinitionError: naming file and element, if something is malformed, or changes the mechanics and is
+                not read: equality constraints, tendons with stiffness, inertias of meshes.
+        """
+        from scvi_codegen.mechanics.multibody.trees.mjcf import links_of_mjcf
+
+        model, links, gravity = links_of_mjcf(path)
+        return cls._of_tree(name or model, links, gravity, actuated)
+
+    @classmethod
+    def _of_tree(cls, name: str, links: Any, gravity: Any, actuated: Sequence[str] | bool) -> LagrangianSystem:
+        from scvi_codegen.mechanics.multibody.trees.energies import arguments_of
+
+        return cls.from_sympy(name=name, **arguments_of(links, gravity, actuated))
 
     @classmethod
     def _read(cls, arguments: Mapping[str, Any]) -> tuple[Any, bool]:

@@ -1,0 +1,1 @@
+"""Trees of rigid bodies: kinematics, and the readers of URDF and MJCF."""

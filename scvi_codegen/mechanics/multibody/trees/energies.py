@@ -1,0 +1,234 @@
+"""Lagrangian of a tree of rigid bodies in joint coordinates.
+
+The frame of link i has the rotation A_i into the frame of its parent p, and its origin lies at r_i there. Angular
+velocity and velocity of the origin, in the frame of the link, follow from the parent's,
+
+    w_i = A_i^T w_p + a q_dot (hinge),    v_i = A_i^T (v_p + w_p x r_i) + a q_dot (slide),
+
+the kinetic energy is the sum of m |v_i + w_i x c_i|^2/2 + w_i . I_i w_i/2, and the first moments of the subtrees are
+S_i = m_i c_i + sum over children (m_subtree r_k + A_k S_k). A free base with position x, rotation R and angular
+velocity omega adds, with the total mass M, the first moment S of the tree in its frame and S_dot = dS/dq q_dot,
+
+    T = M |x_dot|^2/2 + R^T x_dot . (S_dot + omega x S) + T(x_dot = 0),    V = -g . (M x + R S).
+
+R. Featherstone, Rigid Body Dynamics Algorithms, Springer 2008, chapters 3 and 4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from itertools import chain
+from typing import Any
+
+from sympy import Add, Expr, Matrix, Rational, S, cos, sin, zeros
+
+from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.formulas.rotations.members import Rotation
+from scvi_codegen.formulas.symbols import DOT, symbol
+from scvi_codegen.mechanics.multibody.trees.tree import (
+    SINGLE,
+    Inertia,
+    Joint,
+    Link,
+    Vector,
+    aligned,
+    identifier,
+    named,
+    without_fixed,
+)
+
+
+def arguments_of(links: Sequence[Link], gravity: Vector, actuated: Collection[str] | bool) -> dict[str, Any]:
+    """Return arguments of :meth:`LagrangianSystem.from_sympy` for a tree: coordinates, rotations, lagrangian, forces.
+
+    Args:
+        links: with parents before their children.
+        gravity: acceleration of gravity in the world frame.
+        actuated: names of the joints on which an input ``tau_NAME`` acts, or ``True`` for all hinges and slides.
+
+    Raises:
+        SystemDefinitionError: if nothing moves, or a joint does not exist.
+    """
+    return _Tree(aligned(named(without_fixed(links))), gravity).arguments(actuated)
+
+
+class _Tree:
+    """Formulas of the links of a tree, from the root to the leaves and back."""
+
+    def __init__(self, links: Sequence[Link], gravity: Vector) -> None:
+        self.links = links
+        self.gravity = _vector(gravity)
+        self.joints = {link.joint.name: link.joint for link in links}
+        self.outward = [self.rotation_to_parent(link.joint) for link in links]
+        self.moments, self.masses = self.first_moments()
+
+    def coordinate(self, joint: Joint) -> tuple[Expr, Expr]:
+        """Return q and q_dot of a hinge or slide."""
+        if joint.follows is not None:
+            other, factor, offset = joint.follows
+            if other not in self.joints:
+                known = closest(other, [*self.joints])
+                raise SystemDefinitionError(f"joint '{joint.name}' follows '{other}', which is no moving joint{known}")
+            q, v = self.coordinate(self.joints[other])
+            return _number(factor) * q + _number(offset), _number(factor) * v
+        return symbol(joint.name), symbol(joint.name + DOT)
+
+    def displacement(self, joint: Joint) -> Expr:
+        return self.coordinate(joint)[0] - _number(joint.zero)
+
+    def rotation_to_parent(self, joint: Joint) -> Matrix:
+        """Return A, from the frame of the link to that of its parent."""
+        constant = _matrix(joint.pose.rotation)
+        if joint.kind == "hinge":
+            q = self.displacement(joint)
+            return constant * Matrix([[cos(q), -sin(q), 0], [sin(q), cos(q), 0], [0, 0, 1]])
+        if joint.kind == "ball":
+            return constant * Matrix(3, 3, rotation_of(joint).entries)
+        return Matrix(3, 3, rotation_of(joint).entries) if joint.kind == "free" else constant
+
+    def origin(self, joint: Joint) -> Matrix:
+        """Return the origin of the link in the frame of its parent."""
+        at = _vector(joint.pose.position)
+        return at + _matrix(joint.pose.rotation)[:, 2] * self.displacement(joint) if joint.kind == "slide" else at
+
+    def first_moments(self) -> tuple[list[Matrix], list[Expr]]:
+        """Return the first moment and the mass of each subtree, in the frame of its root."""
+        moments = [_number(each.inertia.mass) * _vector(each.inertia.center) for each in self.links]
+        masses = [_number(each.inertia.mass) for each in self.links]
+        for i in reversed(range(len(self.links))):
+            parent, joint = self.links[i].parent, self.links[i].joint
+            if parent >= 0:
+                moments[parent] += masses[i] * self.origin(joint) + self.outward[i] * moments[i]
+                masses[parent] += masses[i]
+        return moments, masses
+
+    def kinetic_energy(self) -> Expr:
+        """Return T; bases that are free contribute as in the docstring of the module."""
+        terms: list[Expr] = []
+        turning: list[Matrix] = []
+        moving: list[Matrix] = []
+        along = Matrix([0, 0, 1])
+        for i, link in enumerate(self.links):
+            joint, back = link.joint, self.outward[i].T
+            outer = turning[link.parent] if link.parent >= 0 else zeros(3, 1)
+            speed = moving[link.parent] if link.parent >= 0 else zeros(3, 1)
+            w = back * outer
+            v = back * (speed + outer.cross(self.origin(joint)))
+            if joint.kind in SINGLE:
+                rate = self.coordinate(joint)[1]
+                if joint.kind == "hinge":
+                    w += along * rate
+                else:
+                    v += along * rate
+            else:
+                w += Matrix(rotation_of(joint).rates)
+                if joint.kind == "free":
+                    terms.append(self.free_base(i))
+            turning.append(w)
+            moving.append(v)
+            terms.append(_energy(link.inertia, w, v))
+            terms.append(self.quadratic(joint, joint.armature))
+        return Add(*terms)
+
+    def quadratic(self, joint: Joint, factor: float) -> Expr:
+        """Return factor/2 times the sum of the squared rates of a joint."""
+        if joint.kind in SINGLE:
+            rates: list[Expr] = [self.coordinate(joint)[1]]
+        else:
+            rates = [*rotation_of(joint).rates]
+            rates += [symbol(name + DOT) for name in position_of(joint)] if joint.kind == "free" else []
+        return _number(factor) * Add(*(rate**2 for rate in rates)) / 2
+
+    def free_base(self, i: int) -> Expr:
+        """Return the kinetic energy of the velocity of a free base."""
+        joint = self.links[i].joint
+        velocity = Matrix([symbol(name + DOT) for name in position_of(joint)])
+        moment = self.moments[i]
+        rate = Matrix(rotation_of(joint).rates).cross(moment)
+        for name in self.single_coordinates():
+            rate += moment.diff(symbol(name)) * symbol(name + DOT)
+        for each in self.links:
+            if each.joint.kind == "ball":
+                rate += _rate_of_matrix(moment, rotation_of(each.joint))
+        turned = Matrix(3, 3, rotation_of(joint).entries) * rate
+        return self.masses[i] * velocity.dot(velocity) / 2 + velocity.dot(turned)
+
+    def potential_energy(self) -> Expr:
+        """Return V of gravity and springs."""
+        terms: list[Expr] = []
+        for i, link in enumerate(self.links):
+            joint = link.joint
+            if link.parent < 0:
+                position = self.origin(joint)
+                if joint.kind == "free":
+                    position = Matrix([symbol(name) for name in position_of(joint)])
+                place = self.masses[i] * position + self.outward[i] * self.moments[i]
+                terms.append(-self.gravity.dot(place))
+            if joint.stiffness:
+                terms.append(_number(joint.stiffness) * (self.coordinate(joint)[0] - _number(joint.rest)) ** 2 / 2)
+        return Add(*terms)
+
+    def dissipation(self) -> Expr:
+        """Return Rayleigh's function of the damping of joints."""
+        return Add(*(self.quadratic(joint, joint.damping) for joint in self.joints.values()))
+
+    def single_coordinates(self) -> list[str]:
+        """Return the names of the coordinates of hinges and slides."""
+        return [each.name for each in self.joints.values() if each.kind in SINGLE and not each.follows]
+
+    def arguments(self, actuated: Collection[str] | bool) -> dict[str, Any]:
+        """Return the arguments of :meth:`LagrangianSystem.from_sympy`."""
+        singles = self.single_coordinates()
+        driven = (singles if actuated else []) if isinstance(actuated, bool) else [*map(identifier, actuated)]
+        for name in driven:
+            if name not in singles:
+                raise SystemDefinitionError(f"there is no hinge or slide '{name}' to act on{closest(name, singles)}")
+        free = [joint for joint in self.joints.values() if joint.kind == "free"]
+        turning = [rotation_of(each) for each in self.joints.values() if each.kind in ("ball", "free")]
+        dissipation = self.dissipation()
+        return {
+            "coordinates": [symbol(name) for name in (*chain.from_iterable(map(position_of, free)), *singles)],
+            "rotations": {each.name: each.rate for each in turning},
+            "lagrangian": self.kinetic_energy() - self.potential_energy(),
+            "dissipation": None if dissipation == 0 else dissipation,
+            "forces": {name: symbol(f"tau_{name}") for name in driven},
+            "inputs": [f"tau_{name}" for name in driven],
+        }
+
+
+def rotation_of(joint: Joint) -> Rotation:
+    """Return the rotation of a ball joint or free body: ``R_NAME`` with the angular velocity ``omega_NAME``."""
+    return Rotation(f"R_{joint.name}", f"omega_{joint.name}")
+
+
+def position_of(joint: Joint) -> tuple[str, ...]:
+    """Return the names of the position of a free body: ``x_NAME``, ``y_NAME``, ``z_NAME``."""
+    return tuple(f"{axis}_{joint.name}" for axis in "xyz")
+
+
+def _energy(inertia: Inertia, w: Matrix, v: Matrix) -> Expr:
+    velocity = v + w.cross(_vector(inertia.center))
+    return (_number(inertia.mass) * velocity.dot(velocity) + (w.T * _matrix(inertia.matrix) * w)[0]) / 2
+
+
+def _rate_of_matrix(formula: Matrix, rotation: Rotation) -> Matrix:
+    """Return the time derivative of a formula by the entries of a rotation, R_dot = R hat(omega)."""
+    one, two, three = rotation.rates
+    hat = Matrix([[0, -three, two], [three, 0, -one], [-two, one, 0]])
+    rates = Matrix(3, 3, rotation.entries) * hat
+    rate = zeros(3, 1)
+    for entry, derivative in zip(rotation.entries, rates, strict=True):
+        rate += formula.diff(entry) * derivative
+    return rate
+
+
+def _number(value: float) -> Expr:
+    return S(int(value)) if value == int(value) else Rational(repr(float(value)))
+
+
+def _vector(values: Vector) -> Matrix:
+    return Matrix([_number(float(each)) for each in values])
+
+
+def _matrix(values: Vector) -> Matrix:
+    return Matrix([[_number(float(each)) for each in row] for row in values])

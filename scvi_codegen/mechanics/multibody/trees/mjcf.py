@@ -1,0 +1,288 @@
+"""Reader of MJCF, the model format of MuJoCo: bodies, joints, inertias of bodies and geoms, gravity.
+
+Contacts, meshes, limits of joints, actuators and sensors are not read. Attributes and defaults are those of
+https://mujoco.readthedocs.io/en/stable/XMLreference.html.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.mechanics.multibody.trees.document import Element, root_of
+from scvi_codegen.mechanics.multibody.trees.shapes import SHAPES, volume_and_inertia
+from scvi_codegen.mechanics.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about
+
+REFUSED = ("attach", "replicate", "composite", "flexcomp", "plugin")
+"""Elements inside bodies that are not read, and without which the model would be another one."""
+WEIGHTLESS = ("plane", "hfield")
+ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
+MOST_INCLUDED = 20
+AXES = dict(zip("xyz", np.eye(3), strict=True))
+
+
+def links_of_mjcf(path: str | PathLike[str]) -> tuple[str, list[Link], Vector]:
+    """Return the name of the model, its links with parents first, and the acceleration of gravity.
+
+    Raises:
+        SystemDefinitionError: naming file and element, if something is malformed or changes the mechanics and is not
+            read.
+    """
+    model = _Model(root_of(path, "mujoco"))
+    for body in model.inside("worldbody"):
+        model.read(body, -1, Pose(), "main")
+    return model.root.node.get("model", Path(path).stem), model.scaled(), model.gravity
+
+
+class _Model:
+    """Settings, default classes and links of a document."""
+
+    def __init__(self, root: Element) -> None:
+        self.root = root
+        self.sections = [*_sections(root, 0)]
+        self.settings: dict[str, str] = {}
+        options: dict[str, str] = {}
+        self.classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
+        for section in self.sections:
+            if section.node.tag == "compiler":
+                self.settings |= section.node.attrib
+            elif section.node.tag == "option":
+                options |= section.node.attrib
+            elif section.node.tag == "default":
+                self.read_defaults(section, {})
+            elif section.node.tag in ("equality", "deformable") and len(section.node):
+                section.refuse(f"contains <{section.node[0].tag}>, which is not read: remove it or write a constraint")
+            elif section.node.tag == "tendon":
+                for tendon in section.children("spatial", "fixed"):
+                    if tendon.has("stiffness"):
+                        tendon.refuse("has a stiffness, which is not read")
+        option = Element(root.file, root.node, options)
+        self.gravity = option.vector("gravity", (0, 0, -9.81))
+        if any(option.number(each, 0) != 0 for each in ("density", "viscosity")):
+            warnings.warn(f"{root.file}: forces of the medium (density, viscosity) are not read", stacklevel=5)
+        self.turn = 1.0 if self.settings.get("angle", "degree") == "radian" else np.pi / 180
+        self.links: list[Link] = []
+
+    def read_defaults(self, element: Element, inherited: Mapping[str, Mapping[str, str]]) -> None:
+        """Store the attributes of a default class, which inherits those of the class around it."""
+        attributes = {tag: dict(values) for tag, values in inherited.items()}
+        for node in element.node:
+            if node.tag != "default":
+                attributes[node.tag] = attributes.get(node.tag, {}) | node.attrib
+        self.classes[element.node.get("class", "main")] = attributes
+        for child in element.children("default"):
+            self.read_defaults(child, attributes)
+
+    def inside(self, tag: str) -> Iterator[Element]:
+        """Yield the sections with a tag."""
+        yield from (section for section in self.sections if section.node.tag == tag)
+
+    def with_defaults(self, element: Element, inherited: str) -> Element:
+        """Return an element with the defaults of its class, or of the class of the bodies around it."""
+        name = element.node.get("class", inherited)
+        if name not in self.classes:
+            element.refuse(f"is of the class '{name}', which does not exist")
+        return Element(element.file, element.node, self.classes[name].get(element.node.tag, {}))
+
+    def read(self, body: Element, link: int, at: Pose, inherited: str) -> None:
+        """Read what a body, a frame or the world contains, fixed to a link at a pose."""
+        for child in body.children(*REFUSED):
+            child.refuse("is not read: write its bodies out")
+        inherited = body.node.get("childclass", inherited)
+        for frame in body.children("frame"):
+            self.read(frame, link, at @ self.pose(frame), inherited)
+        for inner in body.children("body"):
+            if inner.number("gravcomp", 0) != 0:
+                inner.refuse("has a gravity compensation, which is not read: remove gravcomp")
+            pose = at @ self.pose(inner)
+            self.read(inner, self.add(inner, link, pose, inner.node.get("childclass", inherited)), Pose(), inherited)
+
+    def add(self, body: Element, parent: int, pose: Pose, inherited: str) -> int:
+        """Add a link for each joint of a body and one that carries its inertia; return the position of the last."""
+        name = body.node.get("name", f"body{len(self.links)}")
+        anchor = np.zeros(3)
+        for count, (element, frame) in enumerate(self.contents(body, "joint", "freejoint")):
+            joint = self.with_defaults(element, inherited)
+            at = frame.position + frame.rotation @ joint.vector("pos", (0, 0, 0))
+            place = pose @ Pose(at - anchor)
+            label = element.node.get("name", name if count == 0 else f"{name}_{count + 1}")
+            self.links.append(Link(label, parent, self.joint(joint, label, place, frame, parent), Inertia()))
+            parent, pose, anchor = len(self.links) - 1, Pose(), at
+        carried = Joint(name=name, kind="fixed", pose=pose @ Pose(-anchor))
+        self.links.append(Link(name, parent, carried, self.inertia(body, inherited)))
+        return len(self.links) - 1
+
+    def contents(self, body: Element, *tags: str) -> Iterator[tuple[Element, Pose]]:
+        """Yield the children of a body with one of the tags, also in frames, with the pose of their frame."""
+        for child in body.children("frame", *tags):
+            if child.node.tag == "frame":
+                for element, inner in self.contents(child, *tags):
+                    yield element, self.pose(child) @ inner
+            else:
+                yield child, Pose()
+
+    def joint(self, joint: Element, name: str, pose: Pose, frame: Pose, parent: int) -> Joint:
+        """Return a joint whose link has a pose in its parent."""
+        kind = "free" if joint.node.tag == "freejoint" else joint.text("type", "hinge")
+        if kind not in ("hinge", "slide", "ball", "free"):
+            joint.refuse(f"is of type '{kind}', which does not exist")
+        if kind == "free" and parent >= 0:
+            joint.refuse("is free, but its body is inside another body")
+        turn = self.turn if kind == "hinge" else 1.0
+        stiffness, rest, zero = (joint.number(each, 0) for each in ("stiffness", "springref", "ref"))
+        if kind in ("ball", "free") and stiffness != 0:
+            joint.refuse("has a stiffness, which is read for hinges and slides only")
+        if kind != "free" and joint.number("frictionloss", 0) != 0:
+            warnings.warn(f"dry friction of joint '{name}' is not read: it is no smooth force", stacklevel=8)
+        bare = joint.node.tag == "freejoint"
+        return Joint(
+            name=name,
+            kind=kind,
+            pose=pose,
+            axis=frame.rotation @ joint.unit("axis", (0, 0, 1)) if kind in SINGLE else np.zeros(3),
+            damping=0.0 if bare else joint.number("damping", 0),
+            stiffness=stiffness,
+            rest=rest * turn,
+            armature=0.0 if bare else joint.number("armature", 0),
+            zero=zero * turn if kind in SINGLE else 0.0,
+        )
+
+    def inertia(self, body: Element, inherited: str) -> Inertia:
+        """Return the inertia of a body, by its inertial or, as ``inertiafromgeom`` says, by its geoms."""
+        rule = self.settings.get("inertiafromgeom", "auto")
+        inertial = body.child("inertial")
+        if rule == "false" or (rule == "auto" and inertial is not None):
+            return Inertia() if inertial is None else self.inertial(inertial)
+        total = Inertia()
+        for element, frame in self.contents(body, "geom"):
+            total += self.geom(self.with_defaults(element, inherited)).seen_from(frame)
+        return total
+
+    def inertial(self, inertial: Element) -> Inertia:
+        if inertial.has("fullinertia"):
+            xx, yy, zz, xy, xz, yz = inertial.vector("fullinertia", sizes=(6,))
+            matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        else:
+            matrix = np.diag(inertial.vector("diaginertia", (0, 0, 0)))
+        return Inertia(inertial.number("mass"), matrix=matrix).seen_from(self.pose(inertial))
+
+    def geom(self, geom: Element) -> Inertia:
+        """Return the inertia of a geom."""
+        shape = geom.text("type", "mesh" if geom.has("mesh") and not geom.has("type") else "sphere")
+        if shape in WEIGHTLESS or (geom.has("mass") and geom.number("mass") == 0):
+            return Inertia()
+        if shape not in SHAPES or geom.has("shellinertia"):
+            geom.refuse(f"is a {shape} whose inertia is not computed: give its body an <inertial>")
+        count = SHAPES[shape][0]
+        pose = self.pose(geom)
+        if geom.has("fromto"):
+            ends = geom.vector("fromto", sizes=(6,))
+            line = (ends[3:] - ends[:3]) / 2
+            half = float(np.linalg.norm(line))
+            if half == 0 or shape == "sphere":
+                geom.refuse("has fromto, which needs two different points and a shape with an axis")
+            pose = Pose((ends[:3] + ends[3:]) / 2, _shortest_turn(line / half))
+            radius = geom.vector("size", sizes=(1, 2, 3))[0]
+            size = np.array([radius] * (count - 1) + [half])
+        else:
+            size = geom.vector("size", sizes=range(count, 4))[:count]
+        volume, moments = volume_and_inertia(shape, size)
+        mass = geom.number("mass") if geom.has("mass") else geom.number("density", 1000) * volume
+        return Inertia(mass, matrix=mass * np.diag(moments)).seen_from(pose)
+
+    def pose(self, element: Element) -> Pose:
+        """Return position and orientation of an element."""
+        return Pose(element.vector("pos", (0, 0, 0)), self.orientation(element))
+
+    def orientation(self, element: Element) -> Vector:
+        """Return the rotation matrix of the one attribute of orientation that an element has."""
+        present = [each for each in ORIENTATIONS if each in element.node.attrib]
+        if len(present) > 1:
+            element.refuse(f"has {' and '.join(present)}: one orientation is needed")
+        kind = present[0] if present else ""
+        if kind == "quat":
+            return _of_quaternion(element, element.vector("quat", sizes=(4,)))
+        if kind == "axisangle":
+            *axis, angle = element.vector("axisangle", sizes=(4,))
+            length = float(np.linalg.norm(axis))
+            if length == 0:
+                element.refuse("has an axis of length 0")
+            return about(np.array(axis) / length, angle * self.turn)
+        if kind == "euler":
+            rotation = np.eye(3)
+            for letter, angle in zip(self.settings.get("eulerseq", "xyz"), element.vector("euler"), strict=True):
+                turned = about(AXES[letter.lower()], angle * self.turn)
+                rotation = rotation @ turned if letter.islower() else turned @ rotation
+            return rotation
+        if kind == "xyaxes":
+            axes = element.vector("xyaxes", sizes=(6,))
+            x = axes[:3] / np.linalg.norm(axes[:3])
+            y = axes[3:] - (axes[3:] @ x) * x
+            y /= np.linalg.norm(y)
+            return np.column_stack([x, y, np.cross(x, y)])
+        return _shortest_turn(element.unit("zaxis")) if kind else np.eye(3)
+
+    def scaled(self) -> list[Link]:
+        """Return the links, with inertias scaled to ``settotalmass``."""
+        total = float(self.settings.get("settotalmass", "-1"))
+        masses = sum(link.inertia.mass for link in self.links)
+        if total <= 0 or masses == 0:
+            return self.links
+        by = total / masses
+        return [
+            Link(
+                each.name,
+                each.parent,
+                each.joint,
+                Inertia(each.inertia.mass * by, each.inertia.center, each.inertia.matrix * by),
+            )
+            for each in self.links
+        ]
+
+
+def _sections(root: Element, depth: int) -> Iterator[Element]:
+    """Yield the sections of a document and of those that it includes."""
+    for node in root.node:
+        section = Element(root.file, node)
+        if node.tag != "include":
+            yield section
+        elif depth == MOST_INCLUDED:
+            section.refuse(f"is nested deeper than {MOST_INCLUDED} files")
+        else:
+            file = Path(root.file).parent / section.text("file")
+            yield from _sections(_included(file), depth + 1)
+
+
+def _included(file: Path) -> Element:
+    try:
+        return root_of(file, "mujocoinclude")
+    except SystemDefinitionError as error:
+        if "begins with <mujoco>" not in str(error):
+            raise
+        return root_of(file, "mujoco")
+
+
+def _of_quaternion(element: Element, q: Vector) -> Vector:
+    length = float(np.linalg.norm(q))
+    if length == 0:
+        element.refuse("has a quaternion of length 0")
+    return about(*_axis_and_angle(q / length))
+
+
+def _axis_and_angle(q: Vector) -> tuple[Vector, float]:
+    sine = float(np.linalg.norm(q[1:]))
+    return (q[1:] / sine if sine else np.array([0.0, 0.0, 1.0])), 2 * float(np.arctan2(sine, q[0]))
+
+
+def _shortest_turn(axis: Vector) -> Vector:
+    """Return the shortest rotation that turns the z axis into a unit vector."""
+    across = np.cross([0.0, 0.0, 1.0], axis)
+    length = float(np.linalg.norm(across))
+    if length < 1e-12:
+        return np.diag([1.0, np.sign(axis[2]), np.sign(axis[2])])
+    return about(across / length, float(np.arctan2(length, axis[2])))
