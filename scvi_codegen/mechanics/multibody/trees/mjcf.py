@@ -33,13 +33,13 @@ def links_of_mjcf(path: str | PathLike[str]) -> tuple[str, list[Link], Vector]:
         SystemDefinitionError: naming file and element, if something is malformed or changes the mechanics and is not
             read.
     """
-    model = _Model(root_of(path, "mujoco"))
+    model = _MujocoModel(root_of(path, "mujoco"))
     for body in model.inside("worldbody"):
         model.read(body, -1, Pose(), "main")
     return model.root.node.get("model", Path(path).stem), model.scaled(), model.gravity
 
 
-class _Model:
+class _MujocoModel:
     """Settings, default classes and links of a document."""
 
     def __init__(self, root: Element) -> None:
