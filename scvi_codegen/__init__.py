@@ -36,7 +36,6 @@ _HOMES = {
     "runtime.events.event": ("Crossings", "Event"),
     "runtime.estimation.fitting": ("Fit", "fit"),
     "runtime.sensitivity.gradients": ("Gradient",),
-    "runtime.arrays.stepper": ("ArrayStepper",),
     "runtime.sensitivity.step_derivatives": ("Sensitivity",),
     "mechanics.hamiltonian": ("HamiltonianSystem",),
     "mechanics.legendre": ("hamiltonian_of", "lagrangian_of"),

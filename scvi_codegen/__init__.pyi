@@ -97,7 +97,6 @@ from scvi_codegen.results.recording import RecordedRun as RecordedRun
 from scvi_codegen.results.recording import load_run as load_run
 from scvi_codegen.results.recording import record_run as record_run
 from scvi_codegen.results.recording import resume_run as resume_run
-from scvi_codegen.runtime.arrays.stepper import ArrayStepper as ArrayStepper
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators as ChaosIndicators
 from scvi_codegen.runtime.core.stepper import Stepper as Stepper
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory as EnsembleTrajectory

@@ -17,7 +17,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, cast, overload
+from typing import TYPE_CHECKING, cast
 
 from numpy.typing import ArrayLike
 
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from scvi_codegen.mechanics.arrays.system import ArraySystem
     from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
     from scvi_codegen.pipeline import ArraySources, Sources
-    from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 
 SYSTEM_OR_ARRAYS = ArgumentType(
     "a LagrangianSystem or a HamiltonianSystem", lambda value: isinstance(value, MechanicalSystem)
@@ -48,29 +47,6 @@ SYSTEM_OR_ARRAYS = ArgumentType(
 """Type check of systems, also of those with arrays of run-time sizes."""
 
 
-@overload
-def compile_stepper(
-    system: ArraySystem,
-    method: Method | str,
-    *,
-    solver: str = "auto",
-    flags: tuple[str, ...] = TUNED_FLAGS,
-    prefix: str | None = None,
-) -> ArrayStepper: ...
-@overload
-def compile_stepper(
-    system: MechanicalSystem,
-    method: Method | str,
-    *,
-    solver: str = "auto",
-    flags: tuple[str, ...] = TUNED_FLAGS,
-    prefix: str | None = None,
-    symmetries: Sequence[Symmetry] = (),
-    events: EventLike | Sequence[EventLike] | None = None,
-    time_transformation: str | Expr | None = None,
-    sizes: Mapping[str, int] | None = None,
-    tables: Mapping[str, ArrayLike] | None = None,
-) -> Stepper: ...
 @checks_arguments(
     system=SYSTEM_OR_ARRAYS,
     solver=TEXT,
@@ -91,7 +67,7 @@ def compile_stepper(
     time_transformation: str | Expr | None = None,
     sizes: Mapping[str, int] | None = None,
     tables: Mapping[str, ArrayLike] | None = None,
-) -> Stepper | ArrayStepper:
+) -> Stepper:
     """Derive, generate, compile and load the integrator of ``system`` by ``method``.
 
     Args:
@@ -140,18 +116,16 @@ def compile_stepper(
     variants = Variants(make=sources.variant)
     if not known_sizes:
         source, interface, reason = sources.of_any_size()
-        from scvi_codegen.runtime.arrays.stepper import ArrayStepper
-
         of_sizes = partial(
             compile_stepper,
-            cast(Any, system),
+            system,
             method,
             solver=solver,
             flags=flags,
             prefix=prefix,
             time_transformation=time_transformation,
         )
-        return ArrayStepper(source, interface, variants=variants, flags=flags, of_sizes=of_sizes, reason=reason)
+        return Stepper(source, interface, variants=variants, flags=flags, of_sizes=of_sizes, reason=reason)
     source, interface = sources.integrator()
     cast(MechanicalSystem, system).store_key()
     return Stepper(source, interface, variants=variants, flags=flags, events=as_events(events))

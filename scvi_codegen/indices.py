@@ -23,6 +23,8 @@ SIZES_REQUIRED = (
     "compile_stepper(system, method, sizes={'N': 8}), or use unroll_sums(system, {'N': 8})"
 )
 """Reason why arrays of run-time sizes lack a feature, with the remedy."""
+MOST_THREADS = 64
+"""Largest number of threads that share a step: the largest number of blocks of coordinates."""
 
 
 @dataclass(frozen=True, slots=True)

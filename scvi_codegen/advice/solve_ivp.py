@@ -141,7 +141,7 @@ def solve_ivp(
         checked_error(error, {"h": h, "tolerance": tolerance, "rtol": rtol, **others})
     request = _StepRequest(h, rtol, tolerance, error)
     stepper, uncompiled = _stepper(system, method, (time_transformation, controller), request)
-    p = stepper._initial_momenta(q, p0, velocity, start, parameters)
+    p: Any = stepper._initial_momenta(q, p0, velocity, start, parameters)
     along: dict[str, Any] = {"t": start, "parameters": parameters, "options": options}
     plan = _plan(stepper, uncompiled, request, (q, p, end - start), along)
     settings = {**_steps(stepper, start, end, plan), **along, "events": events}

@@ -279,7 +279,7 @@ class Model(TimeSpan):
         """Return the inputs, and the scalar parameters as a function of time."""
         from scvi_codegen.runtime.inputs.segments import checked_inputs, parameters_at
 
-        stepper = of.stepper if hasattr(of, "stepper") else of
+        stepper: Any = getattr(of, "stepper", of)
         inputs = checked_inputs(stepper.interface, self.all_inputs())
         return inputs, partial(parameters_at, stepper.parameters, stepper._parameters(self.parameters), inputs)
 

@@ -55,7 +55,7 @@ def plot_arrays(
     of the final state.
 
     Args:
-        trajectory: result of :meth:`ArrayStepper.integrate`.
+        trajectory: result of :meth:`Stepper.integrate`.
         path, ax: as of :func:`~scvi_codegen.pictures.paths.plot_motion`.
         array: name of the array; by default the first.
 

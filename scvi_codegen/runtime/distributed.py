@@ -24,6 +24,7 @@ from scvi_codegen.validation import checked_count
 if TYPE_CHECKING:
     from scvi_codegen.native.options import SolverOptions
     from scvi_codegen.runtime.core.stepper import Stepper
+    from scvi_codegen.runtime.core.validation import States
 
 __all__ = ["integrate_ensemble"]
 
@@ -39,10 +40,10 @@ WORKER_SECONDS = 60
 
 def integrate_ensemble(
     stepper: Stepper,
-    q: ArrayLike,
-    p: ArrayLike | None = None,
+    q: States,
+    p: States | None = None,
     *,
-    velocity: ArrayLike | None = None,
+    velocity: States | None = None,
     h: float | None = None,
     steps: int | None = None,
     t_end: ArrayLike | None = None,

@@ -27,11 +27,10 @@ from scvi_codegen.methods.discretise import discretised_form
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.building import TUNED_FLAGS
-from scvi_codegen.runtime.arrays.stepper import ArrayStepper
-from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import STEPPER, Stepper
 from scvi_codegen.runtime.core.validation import checked_vector
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
-from scvi_codegen.validation import MAPPING, TEXT, TEXTS, checks_arguments, of
+from scvi_codegen.validation import MAPPING, TEXT, TEXTS, checks_arguments
 from scvi_codegen.verification.certificate import Certificate, Check, Outcome, issued
 from scvi_codegen.verification.convergence import convergence_checks
 from scvi_codegen.verification.derivatives import derivative_checks, time_transformation_derivative_checks
@@ -54,7 +53,7 @@ LONGEST, HALVINGS, PART = 1.0, 40, 0.1
 
 @checks_arguments(
     system=SYSTEM_OR_ARRAYS,
-    stepper=of("a stepper", Stepper, ArrayStepper),
+    stepper=STEPPER,
     solver=TEXT,
     flags=TEXTS,
     parameters=MAPPING,
@@ -69,7 +68,7 @@ def verify(
     *,
     h: float | None = None,
     t: float = 0.0,
-    stepper: Stepper | ArrayStepper | None = None,
+    stepper: Stepper | None = None,
     tolerance: float | None = None,
     solver: str = "auto",
     flags: Sequence[str] = TUNED_FLAGS,
@@ -92,7 +91,7 @@ def verify(
         tolerance: also measure runs with adaptive step size and this relative local error; 0: round-off.
         solver, flags: as for ``compile_stepper``.
         velocity, parameters, tables: only for arrays of run-time sizes, which also need q and h, as of
-            :meth:`ArrayStepper.integrate`: properties are measured on a few indices of the arrays first, then at full
+            :meth:`Stepper.integrate`: properties are measured on a few indices of the arrays first, then at full
             size; the state of the certificate is that of the few indices.
 
     Returns:
@@ -115,7 +114,8 @@ def verify(
             raise StateError(
                 f"{name} is for arrays of run-time sizes: give p, and parameters as defaults of the system"
             )
-    assert not isinstance(stepper, ArrayStepper)
+    if stepper is not None and stepper.any_size:
+        raise StateError(f"{stepper!r} is for arrays of run-time sizes, but the sizes of '{system.name}' are known")
     t, h = checked_number(t, "the time t"), None if h is None else checked_step(h)
     began, method = time.perf_counter(), as_method(method, system)
     system = discretised_form(system, method)

@@ -83,7 +83,7 @@ def stepper() -> sc.Stepper:
 
 
 @cache
-def arrays() -> sc.ArrayStepper:
+def arrays() -> sc.Stepper:
     found = sc.LagrangianSystem.from_text(
         name="net",
         coordinates=["q[N]"],

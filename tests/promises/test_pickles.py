@@ -94,7 +94,7 @@ RUNS: dict[str, dict[str, Any]] = {
 
 
 def test_every_argument_of_a_run_is_in_the_table() -> None:
-    assert set(inspect.signature(Stepper.start).parameters) - {"self", "q", "p"} == set(RUNS)
+    assert set(inspect.signature(Stepper.start).parameters) - {"self", "q", "p", "tables", "threads"} == set(RUNS)
 
 
 @pytest.mark.parametrize("argument", RUNS)

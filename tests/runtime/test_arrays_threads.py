@@ -123,7 +123,7 @@ def system_of(case: Case) -> sc.LagrangianSystem:
 
 
 @cache
-def stepper_of(name: str, method: str, solver: str = "fixed-point") -> sc.ArrayStepper:
+def stepper_of(name: str, method: str, solver: str = "fixed-point") -> sc.Stepper:
     return sc.compile_stepper(system_of(CASES[name]), method, solver=solver)
 
 
@@ -224,7 +224,7 @@ def test_run_continues_with_other_threads() -> None:
     parts = stepper.from_checkpoint(parts.checkpoint(), threads=2)
     parts.advance(3)
     assert bits(parts) == bits(whole)
-    assert parts.stepper.threads == 2
+    assert parts.stepper.problem.threads == 2
 
 
 def test_interrupt_ends_a_run_between_steps() -> None:

@@ -24,7 +24,7 @@ def stepper() -> sc.Stepper:
 
 
 @pytest.fixture(scope="module")
-def arrays() -> sc.ArrayStepper:
+def arrays() -> sc.Stepper:
     system = sc.LagrangianSystem.from_text(
         name="pendulums", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2 + cos(q[i]))"
     )
@@ -88,7 +88,7 @@ def test_recorded_scalar_run_belongs_to_one_thread(stepper: sc.Stepper) -> None:
         enter()
 
 
-def test_advancing_array_run_belongs_to_one_thread(arrays: sc.ArrayStepper) -> None:
+def test_advancing_array_run_belongs_to_one_thread(arrays: sc.Stepper) -> None:
     run = arrays.start([1.0, 0.5], h=0.1)
     with Holder(run, lambda wait: run.advance(1, progress=lambda _: wait())):
         check_refused(run)
@@ -111,7 +111,7 @@ def test_owner_thread_may_reenter_a_run(stepper: sc.Stepper) -> None:
 
 
 @pytest.mark.parametrize("kind", ["scalar", "arrays"])
-def test_steps_of_racing_threads_are_all_counted(kind: str, stepper: sc.Stepper, arrays: sc.ArrayStepper) -> None:
+def test_steps_of_racing_threads_are_all_counted(kind: str, stepper: sc.Stepper, arrays: sc.Stepper) -> None:
     """A thread either makes its steps or is refused."""
     run: Any = stepper.start([1.0], [0.0], h=0.1) if kind == "scalar" else arrays.start([1.0, 0.5], h=0.1)
     made, size = [], 2000

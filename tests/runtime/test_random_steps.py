@@ -182,7 +182,7 @@ def test_comparison_with_half_steps_does_not_change_an_array_run(solver, steps):
         return dataclasses.replace(source, support=headers)
 
     controlled = comparing(few._variants["controlled"])
-    all_of_them = sc.ArrayStepper(comparing(few.source), few.interface, variants=Variants({"controlled": controlled}))
+    all_of_them = sc.Stepper(comparing(few.source), few.interface, variants=Variants({"controlled": controlled}))
     start = np.random.default_rng(1).normal(size=1100)
     wanted = few.integrate(start, **steps)
     assert wanted.steps > 5

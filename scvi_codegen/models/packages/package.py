@@ -20,7 +20,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from scvi_codegen.errors import PackageError
 from scvi_codegen.models.packages.folders import (
@@ -125,13 +125,12 @@ def _stepper_of_arrays(folder: Path) -> Stepper:
     """Return the stepper of a folder with arrays whose sizes are known at run time; its model has their layout."""
     from scvi_codegen.models.model_files.model_file import load_model
     from scvi_codegen.pipeline import generate_array_source
-    from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 
     model, prefix = load_model(folder / MODEL_FILE), prefix_of(folder)
     if model.array_system is None:
         raise damaged(folder, KeyError("interface"))
     _, interface = generate_array_source(model.array_system, model.method, solver=model.solver, prefix=prefix)
-    return cast(Stepper, ArrayStepper(source_in(folder, prefix), interface))
+    return Stepper(source_in(folder, prefix), interface)
 
 
 def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:

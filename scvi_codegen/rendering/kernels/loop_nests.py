@@ -53,10 +53,6 @@ def sizes_text(layout: Layout, text: str) -> Iterator[str]:
             yield f"const long long size_{name} = given->size[{k}];"
 
 
-MOST_THREADS = 64
-"""Largest number of threads that share a step: the largest number of blocks of coordinates."""
-
-
 class Sharing(Enum):
     """Kinds of tasks (``window`` of templates/support/arrays/arrays.h)."""
 

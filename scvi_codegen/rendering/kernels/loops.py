@@ -8,14 +8,13 @@ from itertools import accumulate
 from math import prod
 from typing import Any
 
-from scvi_codegen.indices import Array
+from scvi_codegen.indices import MOST_THREADS, Array
 from scvi_codegen.ir.equations import ConstrainedSteps
 from scvi_codegen.ir.kernel import Kernel, LoopedKernel, is_divided
 from scvi_codegen.ir.program import Program
 from scvi_codegen.rendering.kernels.functions import kernel_text
 from scvi_codegen.rendering.kernels.loop_nests import (
     DIRECTION,
-    MOST_THREADS,
     Nest,
     Sharing,
     count_text,

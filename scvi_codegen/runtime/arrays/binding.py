@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
+from scvi_codegen.indices import ArrayMap
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.building import Library
 from scvi_codegen.native.options import FAILURES, NOT_CONVERGED
 from scvi_codegen.rendering.source import Interface
-from scvi_codegen.runtime.arrays.interface import Numbers, RunArrays
-from scvi_codegen.runtime.arrays.maps import momentum_of
+from scvi_codegen.runtime.arrays.interface import Numbers, RunSizes
 from scvi_codegen.runtime.arrays.memory import COMPUTED, REAL_FIELDS, RUN_FIELDS, STATE, aligned, constraint_memory
+from scvi_codegen.validation import LARGEST_COUNT
 
 FAILURES_BY_SOLVER = {
     "fixed-point": FAILURES
@@ -81,7 +82,7 @@ class ArrayMemory:
             vector |= constraint_memory(binding.raw, run, problem, n)
         for name, array in vector.items():
             setattr(run, name, binding.raw.pointer(array))
-        run.threads = binding.threads
+        run.threads = binding.arrays.threads
         self.__dict__.update(numbers=vector, parameters=np.zeros(binding.parameter_count), ready=False)
 
     def __getattr__(self, name: str) -> Any:
@@ -139,9 +140,11 @@ class ArrayMemory:
     def set_state_bytes(self, saved: bytes) -> None:
         """Restore the state of :meth:`state_bytes`."""
         fields = np.frombuffer(saved, count=len(RUN_FIELDS) + 2)
-        for name, value in zip(RUN_FIELDS, fields.tolist(), strict=False):
-            setattr(self.run, name, value if name in REAL_FIELDS else int(value))
-        self.iterations, self.adaptive, first = int(fields[-2]), bool(fields[-1]), fields.nbytes
+        for name, value in zip((*RUN_FIELDS, "iterations", "adaptive"), fields.tolist(), strict=True):
+            if name not in REAL_FIELDS and not (value.is_integer() and abs(value) <= LARGEST_COUNT):
+                raise StateError(f"invalid saved run: {name} is {value:g}, which is no count")
+            setattr(self, name, value if name in REAL_FIELDS else int(value))
+        first = fields.nbytes
         for _, array in self._stored():
             array[:] = np.frombuffer(saved, array.dtype, array.size, first)
             first += array.nbytes
@@ -176,16 +179,15 @@ class ArrayBinding(Binding):
     Args:
         library: the compiled source.
         interface: interface of the source.
-        arrays: sizes and tables.
-        threads: number of threads per step.
+        arrays: sizes, tables and number of threads per step.
     """
 
     reusable = False
 
-    def __init__(self, library: Library, interface: Interface, arrays: RunArrays, threads: int) -> None:
+    def __init__(self, library: Library, interface: Interface, arrays: RunSizes) -> None:
         super().__init__(library, interface.prefix)
         self.raw = Binding(library, interface.prefix)
-        self.interface, self.arrays, self.threads, self._unused = interface, arrays, threads, list[ArrayMemory]()
+        self.interface, self.arrays, self._unused = interface, arrays, list[ArrayMemory]()
         self.count = sum(int(np.prod(array.shape(arrays.sizes))) for array in interface.layout.coordinates)
         ends = np.cumsum([int(np.prod(field.shape(arrays.sizes))) for field in interface.layout.fields], dtype=int)
         first = len(interface.parameters)
@@ -273,31 +275,30 @@ class ArrayBinding(Binding):
             return self._advance(memory, 1, 1, None, options, unused[0], q1, p1, unused[1], report, None)
 
     def _energies(self, count: int, t: Any, q: Any, p: Any, parameters: Any, result: Any, _: Any) -> int:
-        self._vector(result, count)[:] = self.energy_parts(count, t, q, p, parameters)[:, 2]
+        parts = np.empty((count, 3))
+        self._energy_parts(count, t, q, p, parameters, self.raw.pointer(parts))
+        self._vector(result, count)[:] = parts[:, 2]
         return 0
 
-    def energy_parts(self, count: int, t: Any, q: Any, p: Any, parameters: Any) -> Numbers:
-        """Return (n, 3) kinetic, potential and total energies in double-double arithmetic; 0, H, H of a Hamiltonian."""
-        parts, n = np.empty((count, 3)), self.count
+    def _energy_parts(self, count: int, t: Any, q: Any, p: Any, parameters: Any, parts: Any) -> None:
+        """Compute (n, 3) kinetic, potential and total energies in double-double arithmetic; 0, H, H if given by H."""
+        n = self.count
         with self._at(0.0, q, p, parameters) as memory:
-            for k, row in enumerate(parts):
+            for k in range(count):
                 memory.q[:], memory.p[:] = self._vector(q + k * n), self._vector(p + k * n)
-                arrays = (memory.run.q, memory.run.p, memory.run.inverse_mass, self.raw.pointer(row))
+                arrays = (memory.run.q, memory.run.p, memory.run.inverse_mass, parts + 3 * k)
                 self.raw.function("energies")(memory.problem, t[k], *arrays)
-        return parts
-
-    def inverse_masses(self, parameters: Numbers) -> Numbers:
-        """Return 1/m of every coordinate."""
-        zeros = self.raw.pointer(np.zeros(self.count))
-        with self._at(0.0, zeros, zeros, self.raw.pointer(parameters)) as memory:
-            return np.array(memory.numbers["inverse_mass"])
 
     def _velocity(self, t: float, q: Any, p: Any, parameters: Any, result: Any, _: Any) -> int:
+        if self.interface.layout.momenta:
+            raise StateError("velocities are unavailable for a system defined by a Hamiltonian: use the momenta p")
         with self._at(t, q, p, parameters) as memory:
             self._vector(result)[:] = memory.p * memory.numbers["inverse_mass"]
         return 0
 
     def _momentum(self, t: float, q: Any, v: Any, parameters: Any, result: Any, _: Any) -> int:
+        if self.interface.layout.momenta:
+            raise StateError("the system is defined by a Hamiltonian: give momenta p instead of velocity")
         with self._at(t, q, v, parameters) as memory:
             self._vector(result)[:] = memory.p / memory.numbers["inverse_mass"]
         return 0
@@ -359,7 +360,10 @@ class ArrayBinding(Binding):
     @contextmanager
     def _at(self, t: float, q: Any, p: Any, parameters: Any, h: float = 0.0) -> Iterator[ArrayMemory]:
         """Provide memory of a run at a state; it may be used by one thread at a time."""
-        memory = self._unused.pop() if self._unused else ArrayMemory(self)
+        try:
+            memory = self._unused.pop()
+        except IndexError:
+            memory = ArrayMemory(self)
         memory.start(t, h, self._vector(q), self._vector(p))
         memory.set_parameters(self._vector(parameters, self.parameter_count))
         try:
@@ -371,6 +375,18 @@ class ArrayBinding(Binding):
         """Return the numbers at a pointer."""
         size = self.count if count is None else count
         return np.frombuffer(self._ffi.buffer(pointer, 8 * size)) if size else np.empty(0)
+
+
+def momentum_of(q: Numbers, p: Numbers, of: ArrayMap, *, absolute: bool = False) -> float:
+    """Return the value of a momentum map from the positions and momenta of its array; ``absolute``: sum of terms."""
+    if of.phase:
+        return float(np.sum(q**2 + p**2) / 2)
+    if of.component is None:
+        return float(np.sum(p))
+    if of.other is None:
+        return float(np.sum(p[..., of.component]))
+    sign = 1.0 if absolute else -1.0
+    return float(np.sum(q[..., of.component] * p[..., of.other] + sign * q[..., of.other] * p[..., of.component]))
 
 
 def _arrived(memory: ArrayMemory, t_end: float) -> bool:

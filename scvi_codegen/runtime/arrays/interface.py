@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,15 +19,27 @@ Numbers = NDArray[np.float64]
 IndexTable = NDArray[np.int32]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RunArrays:
-    """Data of a run: sizes, positions, fields and tables by name, and scalar parameters in order."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RunSizes:
+    """Sizes and tables of a run by name, and the number of threads per step."""
 
     sizes: dict[str, int]
+    places: dict[str, IndexTable]
+    threads: int = 1
+
+    @property
+    def key(self) -> Hashable:
+        """Key that is equal for equal sizes, tables and threads."""
+        return tuple(self.sizes.values()), tuple(table.tobytes() for table in self.places.values()), self.threads
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RunArrays(RunSizes):
+    """Data of a run: also positions and fields by name, and scalar parameters in order."""
+
     state: dict[str, Numbers]
     numbers: list[float]
     fields: dict[str, Numbers]
-    places: dict[str, IndexTable]
 
 
 def read_arrays(
@@ -57,19 +69,17 @@ def read_arrays(
     return RunArrays(sizes=sizes, state=state, numbers=numbers, fields=fields, places=index_tables)
 
 
-def first_state(interface: Interface, argument: Any) -> tuple[Any, Any]:
-    """Return the first of several states (k, ..) by name, and all of them as (k, m) numbers; ``None`` for one state."""
+def first_state(interface: Interface, argument: Any) -> Any:
+    """Return the first of several states (k, ..), by name or as an array, and one state as it is."""
     if isinstance(argument, NamedState):
-        return (argument, None) if argument.ndim == 1 else (argument[0], np.asarray(argument))
+        return argument if argument.ndim == 1 else argument[0]
     first = interface.layout.coordinates[0]
     values = argument.get(first.name) if isinstance(argument, Mapping) else argument
-    if values is None or np.ndim(values) <= len(first.axes):
-        return argument, None
-    arrays = argument if isinstance(argument, Mapping) else {first.name: argument}
-    every = {name: real_array(each, "q") for name, each in arrays.items()}
-    one = {name: each[0] for name, each in every.items()}
-    rows = [flat(read_state(interface, {n: x[k] for n, x in every.items()}, "positions")) for k in range(len(values))]
-    return one, np.array(rows)
+    if values is None or (array := real_array(values, "positions")).ndim <= len(first.axes) or not len(array):
+        return argument
+    if isinstance(argument, Mapping):
+        return {name: real_array(each, "q")[0] for name, each in argument.items()}
+    return real_array(argument, "q")[0]
 
 
 def read_state(interface: Interface, argument: ArrayLike | Mapping[str, ArrayLike], what: str) -> dict[str, Numbers]:

@@ -24,7 +24,7 @@ from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
 from scvi_codegen.runtime.chaos.tangent_lanes import TRAJECTORIES_TOGETHER, propagate_in_lanes
 from scvi_codegen.runtime.chaos.tangent_propagation import InitialTangents, ahead
 from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.core.validation import Array, States
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, start_of_ensemble
 from scvi_codegen.runtime.ensemble.result import OK
 from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
@@ -44,8 +44,8 @@ class ChaosIndicatorsEnsemble:
     def __init__(
         self,
         stepper: Integrator,
-        q: ArrayLike,
-        p: ArrayLike,
+        q: States,
+        p: States,
         *,
         h: float,
         steps: int,

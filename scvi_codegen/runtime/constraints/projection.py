@@ -16,6 +16,7 @@ from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import (
     Array,
     Parameters,
+    States,
     checked_states,
     checked_vector,
     inputs_not_given,
@@ -26,7 +27,7 @@ MOST_SHOWN, MOST_DENSE = 4, 64
 """Largest numbers of positions and constraints in a message, and of those whose rank is checked at run-time sizes."""
 
 
-def constraint_values(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayLike, parameters: Parameters) -> Array:
+def constraint_values(stepper: Integrator, q: States, p: States, t: ArrayLike, parameters: Parameters) -> Array:
     """Return (2, n, c) values of g and of its rate g_q v + g_t at states."""
     times, positions, momenta = _of_constrained(stepper, q, p, t)
     values = np.empty((2, len(times), len(stepper.constraints)))
@@ -34,7 +35,7 @@ def constraint_values(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayL
     return values
 
 
-def multipliers(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayLike, parameters: Parameters) -> Array:
+def multipliers(stepper: Integrator, q: States, p: States, t: ArrayLike, parameters: Parameters) -> Array:
     """Return (n, c) lambda of d/dt L_v = L_q + f + g_q^T lambda at states, in physical time t."""
     times, positions, momenta = _of_constrained(stepper, q, p, t)
     values = np.empty((len(times), len(stepper.constraints)))
@@ -45,7 +46,7 @@ def multipliers(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayLike, p
 
 
 def projected(
-    stepper: Integrator, q: ArrayLike, p: ArrayLike, t: float, parameters: Parameters
+    stepper: Integrator, q: States, p: States, t: float, parameters: Parameters
 ) -> tuple[Array, Array, Array]:
     """Return the nearest state on the constraints, and (2,) its relative distance in q and in p.
 
@@ -73,7 +74,7 @@ def projected(
 
 
 def consistent(
-    stepper: Integrator, q: ArrayLike, p: ArrayLike, t: float, parameters: Parameters, *, check_rank: bool = True
+    stepper: Integrator, q: States, p: States, t: float, parameters: Parameters, *, check_rank: bool = True
 ) -> tuple[Array, Array]:
     """Return an initial state projected onto the constraints; warn unless rounding explains the distance.
 
@@ -132,7 +133,7 @@ def check_reachable(stepper: Integrator, q: Array, p: Array, t: float, parameter
         )
 
 
-def _of_constrained(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayLike) -> tuple[Array, Array, Array]:
+def _of_constrained(stepper: Integrator, q: States, p: States, t: ArrayLike) -> tuple[Array, Array, Array]:
     if not stepper.constraints:
         raise MethodError(f"'{stepper.interface.system}' has no constraints")
     return checked_states(stepper.interface, q, p, t)

@@ -2,23 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Self
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from typing import Any, Self, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from scvi_codegen.display.cards import card, listed, plain
-from scvi_codegen.errors import MethodError
+from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.native import building
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.representation import LONGEST, clipped
-from scvi_codegen.runtime.core.named_arrays import named, shapes_of
+from scvi_codegen.runtime.arrays.any_size import (
+    check_few_coordinates,
+    forwarding_methods,
+    interface_of_sizes,
+    sizes_of_run,
+    unavailable,
+)
+from scvi_codegen.runtime.arrays.binding import ArrayBinding
+from scvi_codegen.runtime.arrays.interface import RunSizes
+from scvi_codegen.runtime.core.named_arrays import flat_state, named, shapes_of
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.events.event import Event, EventLike, as_events
 
 MOST_EVENT_SETS = 16
 """Number of event sets whose compiled integrators are cached, so that repeated calls do not parse formulas again."""
+
+
+OF_KNOWN_SIZES = ("derivatives", "second_derivatives", "changes")
+"""Beginnings of the names of variants that arrays of run-time sizes take from the stepper compiled with their sizes."""
 
 
 class Variants:
@@ -58,41 +72,158 @@ class CompiledMethod:
         defaults: (k,) default parameter values.
         dimension: degrees of freedom m.
         momentum_map_names: names of the conserved quantities.
-        source: the C source it was compiled from.
+        source: the C source it was compiled from; ``None`` of arrays that are compiled with the sizes of each call.
         fallback: source with Newton's iteration, if the main source contains only the fixed-point iteration.
         events: events that every run records.
+        any_size: whether the sizes of its arrays are those of each call; the stepper is bound to them, or
+            compiled with them if an integrator of any size is impossible.
+        origin, problem: of a bound stepper, the stepper of any size, and the sizes and tables; else ``None``.
     """
 
     def __init__(
         self,
-        source: Source,
+        source: Source | None,
         interface: Interface,
         *,
         variants: Variants | None = None,
         flags: tuple[str, ...] = building.TUNED_FLAGS,
         events: tuple[Event, ...] = (),
+        of_sizes: Callable[..., Any] | None = None,
+        reason: str = "",
+        origin: Self | None = None,
+        problem: RunSizes | None = None,
     ) -> None:
         self.interface, self.flags, self.events = interface, flags, events
+        self.origin, self.problem, self._of_sizes, self._reason = origin, problem, of_sizes, reason
+        self.any_size = problem is None and bool(interface.layout.coordinates)
         self._variants = Variants() if variants is None else variants
         self._with_tangent: Binding | None = None
         self._with_curvature: Binding | None = None
         self._with_control: Self | None = None
         self._event_variants: dict[tuple[Event, ...], Self] = {}
         self._released_runs: list[Any] = []
-        self._plain = source
+        self._known: dict[Hashable, Self] = {}
+        self._bound: tuple[Hashable, Self] | None = None
+        self._plain = cast(Source, source)
         self.shapes = shapes_of(interface)
         self._load()
+        if self.any_size:
+            self.__dict__.update(forwarding_methods(self))
 
     def _load(self) -> None:
-        """Load the library with the events."""
+        """Load the library with the events; of arrays of run-time sizes once these are known."""
         interface, events = self.interface, self.events
+        if interface.layout.coordinates:
+            self.source = self._plain
+            if self.problem is not None and self.origin is not None:
+                library = building.load(self.source, flags=self.flags)
+                self.binding: Binding = ArrayBinding(library, self.origin.interface, self.problem)
+            return
         self.source = _event_variant(self._plain, interface, events) if events else self._plain
         library = building.load(self.source, flags=self.flags)
         self.binding = Binding(library, interface.prefix, interface.workspace, fallback=self._load_fallback)
 
     def _copy(self, source: Source, events: tuple[Event, ...]) -> Self:
         """Return the integrator with another source or other events."""
-        return type(self)(source, self.interface, variants=self._variants, flags=self.flags, events=events)
+        return type(self)(
+            source,
+            self.interface,
+            variants=self._variants,
+            flags=self.flags,
+            events=events,
+            of_sizes=self._of_sizes,
+            reason=self._reason,
+            origin=self.origin,
+            problem=self.problem,
+        )
+
+    def __getattr__(self, name: str) -> Any:
+        if self.__dict__.get("any_size") and name in ("binding", "dimension"):
+            raise unavailable(name, self)
+        raise AttributeError(f"'{type(self).__name__}' has no attribute '{name}'")
+
+    def bind(
+        self,
+        q: Any,
+        parameters: Any = None,
+        tables: Mapping[str, ArrayLike] | None = None,
+        threads: int | None = None,
+    ) -> tuple[Self, Any]:
+        """Return the stepper bound to the sizes and tables of these arrays, and their states as vectors.
+
+        A stepper of known sizes is returned itself, with q as it is; it has no tables and threads per step.
+
+        Raises:
+            StateError: if a name, shape or number is invalid, or an index would leave its array.
+        """
+        if not self.any_size:
+            self._check_not_of_run(tables, threads)
+            return self, q
+        problem = sizes_of_run(self.interface, q, parameters, tables, threads)
+        if self._reason and problem.threads > 1:
+            raise MethodError(f"omit threads: this system is compiled with the sizes of each call. {self._reason}")
+        bound = self.with_sizes(problem.sizes, tables=problem.places) if self._reason else self._bound_to(problem)
+        return bound, flat_state(bound.interface, q, "q")
+
+    def _check_not_of_run(self, tables: object, threads: object) -> None:
+        """Raise :class:`StateError` for arguments of arrays of run-time sizes."""
+        if tables is not None or threads is not None:
+            what = "tables are" if tables is not None else "threads per step are"
+            raise StateError(f"{what} for arrays whose sizes are known at run time only: omit them here")
+
+    def _bound_to(self, problem: RunSizes) -> Self:
+        """Return the stepper bound to these sizes and tables; the last one is kept for later calls."""
+        if self._bound is None or self._bound[0] != problem.key:
+
+            def make(name: str) -> Source | None:
+                known = bound.known if name.startswith(OF_KNOWN_SIZES) else self
+                return known._variants[name]
+
+            bound = type(self)(
+                self._plain,
+                interface_of_sizes(self.interface, problem.sizes),
+                variants=Variants(make=make),
+                flags=self.flags,
+                events=self.events,
+                origin=self,
+                problem=problem,
+            )
+            self._bound = problem.key, bound
+        return self._bound[1]
+
+    @property
+    def known(self) -> Self:
+        """Stepper compiled with known sizes; raises as :meth:`with_sizes`."""
+        if self.problem is None or self.origin is None:
+            return self
+        return self.origin.with_sizes(self.problem.sizes, tables=self.problem.places)
+
+    def with_sizes(
+        self,
+        sizes: Mapping[str, int] | None = None,
+        /,
+        *,
+        tables: Mapping[str, ArrayLike] | None = None,
+        **named: int,
+    ) -> Self:
+        """Return the stepper of arrays of run-time sizes compiled with these sizes, ``with_sizes(N=9)``, once.
+
+        It has every feature.
+
+        Raises:
+            MethodError: if a size is missing, there are more than 2000 coordinates, or the stepper was unpickled or
+                loaded from a folder and hence lacks its system.
+        """
+        values = {**(sizes or {}), **named}
+        if not self.any_size:
+            raise MethodError(f"{self!r} has known sizes: with_sizes is for a stepper of arrays of any size")
+        check_few_coordinates(self.interface, values, self._reason)
+        if self._of_sizes is None:
+            raise MethodError(f"{self!r} lacks its system: call compile_stepper(system, method, sizes={values})")
+        key = (tuple(sorted(values.items())), *((name, np.asarray(x).tobytes()) for name, x in (tables or {}).items()))
+        if key not in self._known:
+            self._known[key] = self._of_sizes(sizes=values, tables=dict(tables) if tables else None)
+        return self._known[key]
 
     def named(self, values: Array) -> Array:
         """Return (.., m) numbers of states that arrays of coordinates index by name; without arrays unchanged."""
@@ -162,13 +293,20 @@ class CompiledMethod:
             events: the formulas that later calls pass as ``events=``, all those of one call together.
         """
         for each in (self,) if events is None else (self, self.with_events(events)):
-            each.binding.set_fallback()
-            if adaptive and each._variants["controlled"] is not None:
-                each._adaptive().binding.set_fallback()
+            each._compile()
+            if adaptive and not each._reason and each._variants["controlled"] is not None:
+                each._adaptive()._compile()
         wanted = {"derivatives": tangent, "second_derivatives": second, "ensemble": ensemble}
         for source in [self._variants[name] for name, is_wanted in wanted.items() if is_wanted]:
             if source is not None:
                 building.load(source, flags=self.flags)
+
+    def _compile(self) -> None:
+        """Compile the library and its fallback."""
+        if not self.any_size:
+            self.binding.set_fallback()
+        elif not self._reason:
+            building.load(self.source, flags=self.flags)
 
     @property
     def tangent(self) -> Binding:
@@ -187,7 +325,7 @@ class CompiledMethod:
     def _linearised(self, source: Source | None, what: str) -> Binding:
         if source is None:
             raise MethodError(f"{what} of the steps are unavailable for '{self.title}'{self._why_not()}")
-        binding = Binding(building.load(source, flags=self.flags), self.interface.prefix)
+        binding = Binding(building.load(source, flags=self.flags), source.prefix)
         return binding.with_workspace(binding.constant("LINEARISED_WORKSPACE"))
 
     def _why_not(self) -> str:
@@ -237,16 +375,18 @@ class CompiledMethod:
     @property
     def impulse_names(self) -> tuple[str, ...]:
         """Names of the momentum maps of L alone that forces change, in the order of :meth:`Trajectory.impulses`."""
-        return self.interface.exchange_names[1:]
+        return self.known.interface.exchange_names[1:]
 
     @property
     def momentum_map_names(self) -> tuple[str, ...]:
         """Names of the conserved quantities of the system: ``"angular momentum"``, ``"boost of x"``."""
-        return self.interface.map_names
+        return self.interface.map_names or tuple(each.name for each in self.interface.layout.maps)
 
     @property
     def dimension(self) -> int:
         """Degrees of freedom m."""
+        if self.any_size:
+            raise unavailable("dimension", self)
         return self.interface.dimension
 
     def with_events(self, events: EventLike | Sequence[EventLike]) -> Self:

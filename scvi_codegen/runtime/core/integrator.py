@@ -5,6 +5,7 @@ All C calls release the GIL and share no state, so one integrator may be used fr
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,17 +13,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import MethodError, StateError
-from scvi_codegen.native.arguments import checked_number, checked_step, real_array
+from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import REASONS, SolverOptions, step_failure
+from scvi_codegen.runtime.arrays.any_size import constraint_shapes
 from scvi_codegen.runtime.core.named_arrays import flat_state, state_by_name
 from scvi_codegen.runtime.core.validation import (
     Array,
     Parameters,
+    States,
     check_inputs_given,
     checked_parameters,
     checked_states,
     checked_vector,
+    is_one_state,
     parameter_index,
 )
 from scvi_codegen.runtime.sensitivity.step_derivatives import LinearisedMethod
@@ -36,8 +40,8 @@ class Integrator(LinearisedMethod):
 
     def step(
         self,
-        q: ArrayLike,
-        p: ArrayLike,
+        q: States,
+        p: States,
         h: float,
         t: float = 0.0,
         parameters: Parameters = None,
@@ -104,7 +108,7 @@ class Integrator(LinearisedMethod):
         name = self.interface.energy_parameter
         return not name or (parameters is not None and (not isinstance(parameters, Mapping) or name in parameters))
 
-    def rates(self, q: ArrayLike, p: ArrayLike, parameters: Parameters = None) -> Array:
+    def rates(self, q: States, p: States, parameters: Parameters = None) -> Array:
         """Return (n,) rates dt/dtau at (n, m) states; 1 if time is not transformed."""
         _, positions, momenta = checked_states(self.interface, q, p, 0.0)
         rates = np.ones(positions.size // self.dimension)
@@ -116,11 +120,11 @@ class Integrator(LinearisedMethod):
             raise StateError("the rate dt/dtau of the time transformation must be positive at every state")
         return rates
 
-    def momentum(self, q: ArrayLike, v: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
+    def momentum(self, q: States, v: States, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
         """Return momenta p = dL/dv at (q, v, t), the Legendre transform: (m,), or (n, m) for (n, m) states."""
         return self._transform("momentum", q, v, t, parameters, "v")
 
-    def velocity(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
+    def velocity(self, q: States, p: States, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
         """Return velocities v with dL/dv(q, v, t) = p, the inverse Legendre transform (Newton's iteration from v = 0).
 
         Returns:
@@ -129,8 +133,8 @@ class Integrator(LinearisedMethod):
         return self.named(self._transform("velocity", q, p, t, parameters, "p"))
 
     def _initial_momenta(
-        self, q: ArrayLike, p: ArrayLike | None, velocity: ArrayLike | None, t: float, parameters: Parameters
-    ) -> ArrayLike:
+        self, q: States, p: States | None, velocity: States | None, t: float, parameters: Parameters
+    ) -> States:
         """Return the momenta of a state specified by p or by velocity.
 
         Raises:
@@ -139,7 +143,7 @@ class Integrator(LinearisedMethod):
         name, values = self.momentum_or_velocity(p, velocity)
         return values if name == "p" else self.initial_momentum(q, values, t, parameters)
 
-    def initial_momentum(self, q: ArrayLike, velocity: ArrayLike, t: float, parameters: Parameters) -> Array:
+    def initial_momentum(self, q: States, velocity: States, t: float, parameters: Parameters) -> Array:
         """Return the (m,) momentum of the initial state of a run.
 
         Raises:
@@ -167,7 +171,7 @@ class Integrator(LinearisedMethod):
             "polar coordinates at the origin)"
         )
 
-    def momentum_or_velocity(self, p: ArrayLike | None, velocity: ArrayLike | None) -> tuple[str, ArrayLike]:
+    def momentum_or_velocity(self, p: States | None, velocity: States | None) -> tuple[str, States]:
         """Return the name and the value of the one of both that is passed.
 
         Raises:
@@ -179,16 +183,20 @@ class Integrator(LinearisedMethod):
             return "velocity", velocity
         raise StateError(f"give either p or velocity with q; got {'neither' if p is None else 'both'}")
 
-    def energy(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Any:
+    def energy(self, q: States, p: States, t: ArrayLike = 0.0, parameters: Parameters = None) -> Any:
         """Return the energy p.v - L: a float for (m,) states, (n,) for (n, m) with one time or (n,) times."""
         times, positions, momenta = checked_states(self.interface, q, p, t)
         result = self._energies_of(times, positions, momenta, self._parameters(parameters))
-        return float(result[0]) if np.ndim(q) == 1 else result
+        return float(result[0]) if is_one_state(self.interface, q) else result
 
     def _energy_parts(self, q: Array, p: Array, t: Array, parameters: Array) -> Array:
         """Return (n, 3) kinetic, potential and total energies of (n, m) states; parts of run-time sizes, else NaN."""
         parts = np.full((len(q), 3), np.nan)
-        parts[:, 2] = self.energy(q, p, t, parameters)
+        if self.binding.has("energy_parts"):
+            arrays = (np.ascontiguousarray(each, dtype=float) for each in (t, q, p, parameters))
+            self.binding.function("energy_parts")(len(t), *map(self.binding.pointer, (*arrays, parts)))
+        else:
+            parts[:, 2] = self.energy(q, p, t, parameters)
         return parts
 
     def _energies_of(self, t: Array, q: Array, p: Array, parameters: Array) -> Array:
@@ -207,7 +215,7 @@ class Integrator(LinearisedMethod):
             result = parameters[parameter_index(self.interface, name)] + result / self.rates(q, p, parameters)
         return result
 
-    def momentum_maps(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
+    def momentum_maps(self, q: States, p: States, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
         """Return the k conserved quantities in the order of ``momentum_map_names``.
 
         Returns:
@@ -217,10 +225,10 @@ class Integrator(LinearisedMethod):
             StateError: if a shape, name or number is invalid.
         """
         values = self._momentum_maps_and_sizes(q, p, t, parameters)[0]
-        return values[0] if np.ndim(q) == 1 else values
+        return values[0] if is_one_state(self.interface, q) else values
 
     def _momentum_maps_and_sizes(
-        self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None
+        self, q: States, p: States, t: ArrayLike = 0.0, parameters: Parameters = None
     ) -> tuple[Array, Array]:
         """Return (n, k) momentum maps and the root sum of squares of their terms, the scale of rounding errors."""
         times, positions, momenta = checked_states(self.interface, q, p, t)
@@ -286,8 +294,8 @@ class Integrator(LinearisedMethod):
 
     def work_and_impulses(
         self,
-        q: ArrayLike,
-        p: ArrayLike,
+        q: States,
+        p: States,
         h: float,
         t: float = 0.0,
         parameters: Parameters = None,
@@ -304,6 +312,8 @@ class Integrator(LinearisedMethod):
             MethodError: if no forces act, or the method has no curve of positions.
             StepFailedError: if Newton's iteration does not converge.
         """
+        if self.known is not self:
+            return self.known.work_and_impulses(q, p, h, t, self._parameters(parameters), options=options)
         if not self.interface.exchange_names:
             raise MethodError(
                 f"work and impulses are unavailable for {self.interface.method} and '{self.interface.system}': they "
@@ -342,6 +352,8 @@ class Integrator(LinearisedMethod):
         parameters: Parameters,
         options: SolverOptions | None,
     ) -> tuple[Array, Array, float]:
+        if self.known is not self:
+            return self.known._discrete_legendre(q0, q1, h, t, self._parameters(parameters), options)
         if not self.interface.has_action:
             raise MethodError(
                 f"{self.interface.method} has no discrete Lagrangian for '{self.interface.system}': this requires SVI, "
@@ -355,9 +367,9 @@ class Integrator(LinearisedMethod):
         return p0, p1, float(action[0])
 
     def _transform(
-        self, name: str, q: ArrayLike, other: ArrayLike, t: ArrayLike, parameters: Parameters, label: str
+        self, name: str, q: States, other: States, t: ArrayLike, parameters: Parameters, label: str
     ) -> Array:
-        if real_array(flat_state(self.interface, q, "q"), "q").ndim == 1:
+        if is_one_state(self.interface, q):
             at, values = checked_number(t, "the time t"), self._parameters(parameters)
             return self._transformed(name, at, self._vector(q, "q"), self._vector(other, label), values)
         times, positions, others = checked_states(self.interface, q, other, t, second=label)
@@ -401,24 +413,29 @@ class Integrator(LinearisedMethod):
         """
         return state_by_name(self.interface, values)
 
-    def _vector(self, value: ArrayLike, name: str) -> Array:
+    def _vector(self, value: States, name: str) -> Array:
         return checked_vector(self.interface, value, name)
 
     def _parameters(self, parameters: Parameters, base: Array | None = None) -> Array:
         """Return the (k,) parameters; those that are not passed by name are those of ``base``, or defaults."""
-        if base is not None and isinstance(parameters, Mapping):
-            parameters = {**self.parameters_by_name(base), **parameters}
-        return checked_parameters(self.interface, parameters)
+        return checked_parameters(self.interface, parameters, base)
 
     def parameters_by_name(self, values: Array) -> dict[str, Any]:
-        """Return (k,) parameters by name."""
-        return dict(zip(self.interface.parameters, values.tolist(), strict=True))
+        """Return (k,) parameters by name; those of arrays of run-time sizes as arrays."""
+        interface = self.interface if self.problem is None or self.origin is None else self.origin.interface
+        result: dict[str, Any] = dict(zip(interface.parameters, values.tolist(), strict=self.problem is None))
+        if self.problem is not None:
+            fields, first = np.asarray(values), len(interface.parameters)
+            for field in interface.layout.fields:
+                shape = field.shape(self.problem.sizes)
+                result[field.name] = fields[first : first + math.prod(shape)].reshape(shape)
+                first += math.prod(shape)
+        return result
 
     def constraint_arrays(self, values: Array) -> Any:
-        """Return numbers of all constraints in the form of :attr:`Run.multipliers`: unchanged."""
-        return values
-
-    def _checkpoint(self, run: Any) -> bytes:
-        """Return a run as bytes."""
-        saved: bytes = run.snapshot
-        return saved
+        """Return numbers of all constraints in the form of :attr:`Run.multipliers`."""
+        if self.problem is None:
+            return values
+        shapes = constraint_shapes(self.interface.layout, self.problem.sizes)
+        ends = np.cumsum([math.prod(shape) for shape in shapes], dtype=int)
+        return tuple(part.reshape(shape) for part, shape in zip(np.split(values, ends), shapes, strict=False))

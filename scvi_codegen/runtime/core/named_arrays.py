@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, KeysView, Mapping, Sequence
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -136,24 +135,6 @@ def shapes_of(interface: Interface) -> Shapes | None:
     return _coordinates(interface) if interface.arrays else None
 
 
-def entries_by_name(interface: Interface, parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """Return parameters with each array replaced by its entries; a number is the value of all entries."""
-    arrays = dict(_declared(interface.arrays))
-    entries = {}
-    for name, value in parameters.items():
-        shape = () if name in interface.parameters else arrays.get(name, ())
-        if not shape:
-            entries[name] = value
-            continue
-        array = real_array(value, f"the parameter {name}")
-        if array.ndim and array.shape[array.ndim - len(shape) :] != shape:
-            raise StateError(f"the parameter {name} must have the shape {shape}, not {array.shape}")
-        by_index = np.moveaxis(array, range(-len(shape), 0), range(len(shape))) if array.ndim else array
-        for index in product(*map(range, shape)):
-            entries["_".join([name, *map(str, index)])] = by_index[index] if array.ndim else array
-    return entries
-
-
 def _joined(arrays: Sequence[tuple[str, tuple[int, ...]]], by_name: Mapping[str, Any], what: str) -> Array:
     names = [name for name, _ in arrays]
     for name in by_name:
@@ -175,13 +156,14 @@ def _joined(arrays: Sequence[tuple[str, tuple[int, ...]]], by_name: Mapping[str,
 def _coordinates(interface: Interface) -> list[tuple[str, tuple[int, ...]]]:
     """Return the name and shape of each array of coordinates; without arrays, each coordinate is one."""
     coordinates, total = [], 0
-    for name, shape in _declared(interface.arrays or interface.coordinates):
+    for name, shape in declared(interface.arrays or interface.coordinates):
         if total < interface.dimension:
             coordinates.append((name, shape))
             total += math.prod(shape)
     return coordinates
 
 
-def _declared(declarations: Sequence[str]) -> Iterator[tuple[str, tuple[int, ...]]]:
+def declared(declarations: Sequence[str]) -> Iterator[tuple[str, tuple[int, ...]]]:
+    """Yield the name and shape of each declaration; a single name has the shape ()."""
     for each in declarations:
         yield each.partition("[")[0], tuple(map(int, re.findall(r"\d+", each.partition("[")[2])))

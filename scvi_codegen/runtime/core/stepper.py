@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, TypedDict
+from typing import Any, TypedDict, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,12 +18,13 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.runtime.arrays.interface import RunSizes
 from scvi_codegen.runtime.chaos.ensemble import ChaosIndicatorsEnsemble
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
 from scvi_codegen.runtime.constraints.projection import consistent, constraint_values, multipliers, projected
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.core.validation import Array, Parameters
+from scvi_codegen.runtime.core.validation import Array, Parameters, States, is_one_state
 from scvi_codegen.runtime.ensemble.independent import AdaptiveEnsemble
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, momenta_of_each
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
@@ -43,14 +44,12 @@ from scvi_codegen.runtime.run.error_growth import GrowthCheck
 from scvi_codegen.runtime.run.global_error import checked_error, confirmed_run, warn_of_unconfirmed
 from scvi_codegen.runtime.run.observation import Observation, observed_until
 from scvi_codegen.runtime.run.run import Run
+from scvi_codegen.runtime.run.saving import read_checkpoint
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.run.times import steps_to, times_after
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-from scvi_codegen.validation import FUNCTION, MAPPING, ArgumentType, checked_count, checks_arguments
-
-STEPPER = ArgumentType("a compiled stepper", lambda value: isinstance(value, Stepper) or hasattr(value, "bind"))
-"""Type check of steppers, also of those for arrays of any size."""
+from scvi_codegen.validation import FUNCTION, MAPPING, checked_count, checks_arguments, of
 
 
 class RunSettings(TypedDict, total=False):
@@ -75,16 +74,19 @@ class Stepper(Integrator):
     """Compiled integrator of one system: :class:`Integrator` with integrations, runs, ensembles and projections."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (_rebuild, (self._plain, self.interface, self._variants, self.flags, self.events))
+        if self.origin is not None:
+            return (_rebuild_bound, (self.origin, self.problem, self._plain, self.events))
+        variants = Variants() if self._reason else self._variants
+        return (_rebuild, (self._plain, self.interface, variants, self.flags, self.events, self._reason))
 
     @checks_arguments(StateError, progress=FUNCTION, observe=FUNCTION, inputs=MAPPING)
     def integrate(
         self,
-        q: ArrayLike,
-        p: ArrayLike | None = None,
+        q: States,
+        p: States | None = None,
         *,
         inputs: Mapping[str, Any] | None = None,
-        velocity: ArrayLike | None = None,
+        velocity: States | None = None,
         h: float | None = None,
         steps: int | None = None,
         t_end: float | None = None,
@@ -99,6 +101,8 @@ class Stepper(Integrator):
         events: EventLike | Sequence[EventLike] | None = None,
         error: float | None = None,
         check_growth: bool | None = None,
+        tables: Mapping[str, ArrayLike] | None = None,
+        threads: int | None = None,
     ) -> Trajectory:
         """Integrate ``steps`` steps of h, or to t_end, and save every ``save_every``-th state and the initial one.
 
@@ -135,6 +139,10 @@ class Stepper(Integrator):
             check_growth: after an adaptive run, repeat up to 2048 of its steps from an initial state perturbed in its
                 last place, unless a coarse run shows that errors grow slowly, and warn if the states differ by more
                 than 1e-7 (relative). ``True``: all steps, without a coarse run; ``False``: no check.
+            tables, threads: of arrays of run-time sizes: (rows, columns) whole numbers by name, (rows,) for a single
+                column; and the number of threads per step, by default one, with bitwise equal results. Threads pay off
+                if a step takes longer than some tens of microseconds; they start again at every saved state. The shapes
+                of the arrays determine the sizes, and without p and velocity the initial velocity is 0.
 
         Returns:
             A :class:`Trajectory` of steps // save_every + 1 states, fewer if an event ended it; with inputs states
@@ -146,6 +154,7 @@ class Stepper(Integrator):
             EventError: if an event function has an unknown symbol or is not finite.
             StepFailedError: if a step fails; its ``trajectory`` contains the states before.
         """
+        self._check_not_of_run(tables, threads)
         stepper = self if events is None else self.with_events(events)
         if t_eval is not None and save_every != 1:
             raise StateError(f"give either t_eval or save_every={save_every}, not both")
@@ -194,27 +203,33 @@ class Stepper(Integrator):
     @checks_arguments(StateError)
     def start(
         self,
-        q: ArrayLike,
-        p: ArrayLike | None = None,
+        q: States,
+        p: States | None = None,
         *,
-        velocity: ArrayLike | None = None,
+        velocity: States | None = None,
         h: float | None = None,
         t: float = 0.0,
         t_end: float | None = None,
         tolerance: float | None = None,
         parameters: Parameters = None,
         options: SolverOptions | None = None,
+        tables: Mapping[str, ArrayLike] | None = None,
+        threads: int | None = None,
     ) -> Run:
-        """Return a run from (q, p), or q and a velocity, at t, with fixed steps h or adaptive steps to t_end."""
+        """Return a run from (q, p), or q and a velocity, at t, with fixed steps h or adaptive steps to t_end.
+
+        Tables and threads are those of :meth:`integrate`.
+        """
+        self._check_not_of_run(tables, threads)
         if self.interface.rotations:
             q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
         return self._started(q, p, velocity, (h, t_end, tolerance), t, parameters, options)
 
     def _started(
         self,
-        q: ArrayLike,
-        p: ArrayLike | None,
-        velocity: ArrayLike | None,
+        q: States,
+        p: States | None,
+        velocity: States | None,
         step_plan: tuple[float | None, float | None, float | None],
         t: float,
         parameters: Parameters,
@@ -258,29 +273,44 @@ class Stepper(Integrator):
         h: float | None = None,
         parameters: Parameters = None,
         options: SolverOptions | None = None,
+        threads: int | None = None,
     ) -> Run:
         """Restore a run saved by :meth:`Run.checkpoint`; it continues bitwise equally if ``t_end`` is passed again.
 
-        ``h`` is required with a time transformation and not allowed otherwise.
+        ``h`` is required with a time transformation and not allowed otherwise. A run of arrays of run-time sizes
+        contains its tables and parameters; ``threads`` is the number of threads per step.
+
+        Raises:
+            StateError: if the bytes are no saved run or belong to another integrator.
         """
+        stepper: Any = self
+        if self._reason:
+            raise StateError(f"restore this run by with_sizes(...).from_checkpoint(saved): {self._reason}")
+        if self.interface.layout.coordinates:
+            stepper, saved, known = read_checkpoint(
+                saved, self.origin or self, threads=threads, adaptive=t_end is not None
+            )
+            parameters = known | dict(cast(Mapping[str, Any], parameters or {}))
+        else:
+            self._check_not_of_run(None, threads)
+        plan: StepPlan | None = None
         if self.interface.time_transformation:
             plan = StepPlan.in_tau(self.interface.time_transformation, h, t_end, tolerance)
-            return Run.restored(self._adaptive(), saved, parameters=parameters, options=options, plan=plan)
-        if h is not None:
+        elif h is not None:
             raise StateError("omit h: the saved run contains its step size")
-        if t_end is None:
-            return Run.restored(self, saved, parameters=parameters, options=options)
-        plan = StepPlan.checked(t_end, tolerance)
-        return Run.restored(self._adaptive(), saved, parameters=parameters, options=options, plan=plan)
+        elif t_end is not None:
+            plan = StepPlan.checked(t_end, tolerance)
+        stepper = stepper if plan is None else stepper._adaptive()
+        return Run.restored(stepper, saved, parameters=parameters, options=options, plan=plan)
 
     @checks_arguments(StateError, progress=FUNCTION, inputs=MAPPING)
     def integrate_ensemble(
         self,
-        q: ArrayLike,
-        p: ArrayLike | None = None,
+        q: States,
+        p: States | None = None,
         *,
         inputs: Mapping[str, Any] | None = None,
-        velocity: ArrayLike | None = None,
+        velocity: States | None = None,
         h: float | None = None,
         steps: int | None = None,
         t_end: ArrayLike | None = None,
@@ -353,12 +383,12 @@ class Stepper(Integrator):
     @checks_arguments(StateError, progress=FUNCTION)
     def chaos_indicators_ensemble(
         self,
-        q: ArrayLike,
-        p: ArrayLike | None = None,
+        q: States,
+        p: States | None = None,
         *,
         h: float,
         steps: int,
-        velocity: ArrayLike | None = None,
+        velocity: States | None = None,
         count: int | None = None,
         directions: ArrayLike | None = None,
         save_every: int | None = None,
@@ -410,10 +440,10 @@ class Stepper(Integrator):
 
     def project(
         self,
-        q: ArrayLike,
-        p: ArrayLike | None = None,
+        q: States,
+        p: States | None = None,
         *,
-        velocity: ArrayLike | None = None,
+        velocity: States | None = None,
         t: float = 0.0,
         parameters: Parameters = None,
     ) -> tuple[Array, Array]:
@@ -438,7 +468,7 @@ class Stepper(Integrator):
         l**2`` the tension of the rod is -2 l lambda. They depend on the state alone and are as accurate as the state.
         """
         values = multipliers(self, q, p, t, parameters)
-        return values[0] if np.ndim(q) == 1 else values
+        return values[0] if is_one_state(self.interface, q) else values
 
     def constraint_values(
         self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None
@@ -448,7 +478,7 @@ class Stepper(Integrator):
         For a velocity constraint only the rate is defined; its g is 0 if it does not restrict positions.
         """
         g, rate = constraint_values(self, q, p, t, parameters)
-        return (g[0], rate[0]) if np.ndim(q) == 1 else (g, rate)
+        return (g[0], rate[0]) if is_one_state(self.interface, q) else (g, rate)
 
 
 def _recorded(
@@ -497,13 +527,20 @@ def _end_of(run: Run, steps: int | None) -> float:
     return run.plan.t_end if run.plan else float(times_after(run.t, run.h, checked_count(steps, "steps", least=0))[0])
 
 
-def of_known_sizes(stepper: Any, q: ArrayLike, parameters: Parameters = None) -> Stepper:
-    """Return a stepper for arrays of any size compiled with the sizes of these positions, and others as they are."""
-    known: Stepper = stepper.bind(q, parameters)[0].known if hasattr(stepper, "bind") else stepper
-    return known
-
-
 def _rebuild(
-    source: Source, interface: Interface, variants: Variants, flags: tuple[str, ...], events: tuple[Event, ...]
+    source: Source,
+    interface: Interface,
+    variants: Variants,
+    flags: tuple[str, ...],
+    events: tuple[Event, ...],
+    reason: str = "",
 ) -> Stepper:
-    return Stepper(source, interface, variants=variants, flags=flags, events=events)
+    return Stepper(source, interface, variants=variants, flags=flags, events=events, reason=reason)
+
+
+def _rebuild_bound(origin: Stepper, problem: RunSizes, source: Source, events: tuple[Event, ...]) -> Stepper:
+    return origin._bound_to(problem)._copy(source, events)
+
+
+STEPPER = of("a compiled stepper", Stepper)
+"""Type check of steppers."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,10 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.rendering.source import Interface
-from scvi_codegen.runtime.core.named_arrays import entries_by_name, flat_state
+from scvi_codegen.runtime.core.named_arrays import declared, flat_state
 
 Array = NDArray[np.float64]
 BINARY64, FEW = np.dtype(np.float64), 64
+States = ArrayLike | Mapping[str, ArrayLike]
+"""Positions, momenta or velocities: numbers in order, or arrays by name."""
 Parameters = Mapping[str, Any] | Sequence[float] | Array | None
 """Parameters, also arrays of known sizes, by name (others have their defaults), or all in order."""
 
@@ -37,7 +39,7 @@ class TakesInputs(Protocol):
         """Name of the energy parameter of transformed time, or ""."""
 
 
-def checked_vector(interface: Interface, value: ArrayLike, name: str) -> Array:
+def checked_vector(interface: Interface, value: States, name: str) -> Array:
     """Return a finite, contiguous (m,) copy; for one coordinate a number suffices."""
     if (
         type(value) is np.ndarray
@@ -60,11 +62,11 @@ def checked_vector(interface: Interface, value: ArrayLike, name: str) -> Array:
 
 
 def checked_states(
-    interface: Interface, q: ArrayLike, p: ArrayLike, t: ArrayLike, *, second: str = "p"
+    interface: Interface, q: States, p: States, t: ArrayLike, *, second: str = "p"
 ) -> tuple[Array, Array, Array]:
     """Return (n,) times and contiguous (n, m) positions and momenta (or what ``second`` names) of one or n states."""
-    q, p = flat_state(interface, q, "q"), flat_state(interface, p, second)
-    positions, momenta = real_array(q, "q"), real_array(p, second)
+    positions = real_array(flat_state(interface, q, "q"), "q")
+    momenta = real_array(flat_state(interface, p, second), second)
     if positions.ndim <= 1:
         positions, momenta = checked_vector(interface, q, "q"), checked_vector(interface, p, second)
     elif positions.ndim != 2 or positions.shape != momenta.shape or positions.shape[1] != interface.dimension:
@@ -81,25 +83,52 @@ def checked_states(
     return times, np.ascontiguousarray(positions), np.ascontiguousarray(momenta)
 
 
-def checked_parameters(interface: Interface, parameters: Parameters) -> Array:
-    """Return the (k,) parameter values in order."""
-    names, values = interface.parameters, np.array(interface.defaults, dtype=float)
+def is_one_state(interface: Interface, q: States) -> bool:
+    """Return whether these are the positions of one state, not of several."""
+    plain = not isinstance(q, Mapping) and np.ndim(q) == 1
+    return plain or np.ndim(flat_state(interface, q, "q")) == 1
+
+
+def checked_parameters(interface: Interface, parameters: Parameters, base: Array | None = None) -> Array:
+    """Return the (k,) parameter values in order; by default those of ``base``, or the defaults."""
+    names, values = interface.parameters, np.array(interface.defaults if base is None else base, dtype=float)
     if parameters is None:
         return values
     if isinstance(parameters, Mapping):
-        for name, value in entries_by_name(interface, parameters).items():
-            values[parameter_index(interface, name)] = checked_number(value, f"the parameter {name}")
+        for name, where, value in parameter_columns(interface, parameters):
+            if isinstance(where, slice) and value.ndim > 1:
+                raise StateError(f"the parameter {name} must have the shape of one state, not {value.shape}")
+            values[where] = value if isinstance(where, slice) else checked_number(value, f"the parameter {name}")
     else:
         array = real_array(parameters, "parameters")
         if array.shape != values.shape:
-            raise StateError(
-                f"parameters must have {len(values)} values ({', '.join(names) or 'none'}), not {array.size}"
-            )
+            known = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
+            raise StateError(f"parameters must have {len(values)} values ({known or 'none'}), not {array.size}")
         values = array
     if not np.isfinite(values).all():
         worst = int(np.flatnonzero(~np.isfinite(values))[0])
         raise StateError(f"the parameter {names[worst]} is {values[worst]}: it must be finite")
     return values
+
+
+def parameter_columns(interface: Interface, parameters: Mapping[str, Any]) -> Iterator[tuple[str, int | slice, Any]]:
+    """Yield the name, the index and the value of each parameter; of an array the slice and its (.., size) entries.
+
+    A number is the value of all entries of an array.
+    """
+    arrays = dict(declared(interface.arrays)) if interface.arrays else {}
+    for name, value in parameters.items():
+        shape = () if name in interface.parameters else arrays.get(name, ())
+        if not shape:
+            yield name, parameter_index(interface, name), value
+            continue
+        array = real_array(value, f"the parameter {name}")
+        if array.ndim and array.shape[max(0, array.ndim - len(shape)) :] != shape:
+            raise StateError(f"the parameter {name} must have the shape {shape}, not {array.shape}")
+        size = math.prod(shape)
+        first = parameter_index(interface, "_".join([name, *("0" for _ in shape)])) if size else 0
+        leading = array.shape[: array.ndim - len(shape)]
+        yield name, slice(first, first + size), array.reshape(*leading, size) if array.ndim else array
 
 
 def inputs_not_given(interface: TakesInputs, parameters: Any) -> tuple[str, ...]:

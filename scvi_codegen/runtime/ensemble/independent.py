@@ -20,7 +20,7 @@ from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.core.validation import Array, columns_of_inputs
+from scvi_codegen.runtime.core.validation import Array, States, columns_of_inputs
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, start_of_ensemble
 from scvi_codegen.runtime.ensemble.result import INTERRUPTED, OK, EnsembleTrajectory, Span
 from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
@@ -76,8 +76,8 @@ class AdaptiveEnsemble:
     def __init__(
         self,
         stepper: Integrator,
-        q: ArrayLike,
-        p: ArrayLike,
+        q: States,
+        p: States,
         *,
         t_end: ArrayLike,
         inputs: Mapping[str, Input] | None = None,

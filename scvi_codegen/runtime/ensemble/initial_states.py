@@ -12,13 +12,13 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.runtime.constraints.projection import consistent
 from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.core.named_arrays import entries_by_name, flat_state
-from scvi_codegen.runtime.core.validation import Array, check_inputs_given, parameter_index
+from scvi_codegen.runtime.core.named_arrays import flat_state
+from scvi_codegen.runtime.core.validation import Array, States, check_inputs_given, parameter_columns
 
 EnsembleParameters = Mapping[str, ArrayLike] | Sequence[Any] | Array | None
 
 
-def checked_ensemble(stepper: Integrator, q: ArrayLike, p: ArrayLike) -> tuple[Array, Array]:
+def checked_ensemble(stepper: Integrator, q: States, p: States) -> tuple[Array, Array]:
     """Return validated (k, m) initial positions and momenta."""
     positions, momenta = _states(stepper, q, "q"), _states(stepper, p, "p")
     if positions.shape != momenta.shape:
@@ -28,12 +28,12 @@ def checked_ensemble(stepper: Integrator, q: ArrayLike, p: ArrayLike) -> tuple[A
 
 def momenta_of_each(
     stepper: Integrator,
-    q: ArrayLike,
-    p: ArrayLike | None,
-    velocity: ArrayLike | None,
+    q: States,
+    p: States | None,
+    velocity: States | None,
     t: float,
     parameters: EnsembleParameters,
-) -> ArrayLike:
+) -> States:
     """Return the momenta of states specified by p or by velocity, each with its own parameters."""
     name, argument = stepper.momentum_or_velocity(p, velocity)
     if name == "p":
@@ -51,7 +51,7 @@ def momenta_of_each(
 
 
 def start_of_ensemble(
-    stepper: Integrator, q: ArrayLike, p: ArrayLike, t: float, parameters: EnsembleParameters
+    stepper: Integrator, q: States, p: States, t: float, parameters: EnsembleParameters
 ) -> tuple[Array, Array, Array]:
     """Return (k, m) positions and momenta, projected onto constraints, and (k, number of parameters) parameters."""
     check_inputs_given(stepper.interface, parameters)
@@ -65,7 +65,7 @@ def start_of_ensemble(
     return positions, momenta, values
 
 
-def _states(stepper: Integrator, value: ArrayLike, name: str) -> Array:
+def _states(stepper: Integrator, value: States, name: str) -> Array:
     """Return a validated (k, m) array of finite numbers."""
     array = real_array(flat_state(stepper.interface, value, name), name)
     if array.ndim == 1:
@@ -83,13 +83,14 @@ def parameters_of_each(stepper: Integrator, argument: EnsembleParameters, count:
     names = stepper.parameters
     values = np.tile(stepper.defaults, (count, 1))
     if isinstance(argument, Mapping):
-        for name, value in entries_by_name(stepper.interface, argument).items():
+        for name, where, value in parameter_columns(stepper.interface, argument):
             column = real_array(value, f"the parameter {name}")
-            if column.shape not in ((), (count,)):
+            each = column.shape[:-1] if isinstance(where, slice) else column.shape
+            if each not in ((), (count,)):
                 raise StateError(
                     f"the parameter {name} must be one number or {count} numbers, not of shape {column.shape}"
                 )
-            values[:, parameter_index(stepper.interface, name)] = column
+            values[:, where] = column
     elif argument is not None:
         array = real_array(argument, "parameters")
         if array.shape not in ((len(names),), (count, len(names))):

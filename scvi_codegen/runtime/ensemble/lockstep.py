@@ -19,7 +19,6 @@ from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native import building
@@ -27,7 +26,7 @@ from scvi_codegen.native.arguments import checked_number, checked_step, empty_ar
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.core.validation import Array, columns_of_inputs, parameter_index
+from scvi_codegen.runtime.core.validation import Array, States, columns_of_inputs, parameter_index
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, start_of_ensemble
 from scvi_codegen.runtime.ensemble.result import INTERRUPTED, OK, EnsembleTrajectory, Span
 from scvi_codegen.runtime.ensemble.thread_pool import MOST_JOBS, PROGRESS_SECONDS, workers_of
@@ -90,8 +89,8 @@ class Ensemble:
     def __init__(
         self,
         stepper: Integrator,
-        q: ArrayLike,
-        p: ArrayLike,
+        q: States,
+        p: States,
         *,
         h: float,
         steps: int | None = None,

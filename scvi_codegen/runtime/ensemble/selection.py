@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.core.validation import Array, check_left_to_inputs
+from scvi_codegen.runtime.core.validation import Array, States, check_left_to_inputs
 from scvi_codegen.runtime.ensemble.independent import AdaptiveEnsemble
 from scvi_codegen.runtime.ensemble.initial_states import (
     EnsembleParameters,
@@ -26,11 +26,11 @@ from scvi_codegen.runtime.inputs.segments import Input, checked_inputs, final_ti
 
 def ensemble_work(
     stepper: Integrator,
-    q: ArrayLike,
-    p: ArrayLike | None,
+    q: States,
+    p: States | None,
     *,
     inputs: Mapping[str, Any] | None = None,
-    velocity: ArrayLike | None = None,
+    velocity: States | None = None,
     h: float | None = None,
     steps: int | None = None,
     t_end: ArrayLike | None = None,
@@ -77,11 +77,11 @@ def _common_steps(h: float | None, steps: int | None, **others: object) -> tuple
 
 def _work_with_inputs(
     stepper: Integrator,
-    q: ArrayLike,
-    p: ArrayLike | None,
+    q: States,
+    p: States | None,
     *,
     inputs: Mapping[str, Any],
-    velocity: ArrayLike | None = None,
+    velocity: States | None = None,
     h: float | None = None,
     steps: int | None = None,
     t_end: ArrayLike | None = None,
@@ -115,13 +115,13 @@ def _work_with_inputs(
 
 def _start_with_inputs(
     stepper: Integrator,
-    q: ArrayLike,
-    p: ArrayLike | None,
-    velocity: ArrayLike | None,
+    q: States,
+    p: States | None,
+    velocity: States | None,
     inputs: Mapping[str, Any],
     interval: tuple[float, float],
     parameters: EnsembleParameters,
-) -> tuple[dict[str, Input], ArrayLike, Array]:
+) -> tuple[dict[str, Input], States, Array]:
     """Return inputs, momenta and (k, number of parameters) initial parameters; ``interval``: (start, final time).
 
     Raises:

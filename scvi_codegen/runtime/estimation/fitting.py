@@ -18,7 +18,7 @@ from scvi_codegen.errors import AccuracyWarning, FitError, StateError, StepFaile
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.pictures.residuals import ResidualPlot
 from scvi_codegen.representation import summary
-from scvi_codegen.runtime.core.stepper import STEPPER, Stepper, of_known_sizes
+from scvi_codegen.runtime.core.stepper import STEPPER, Stepper
 from scvi_codegen.runtime.core.validation import Array, checked_vector
 from scvi_codegen.runtime.estimation.measurements import Measurements, distinct, state_names
 from scvi_codegen.runtime.estimation.multiple_shooting import LOOSE, TIGHT, Chain, Limits, chained, joined
@@ -154,7 +154,7 @@ def fit(
         StateError: if a shape, name or number is invalid.
         StepFailedError: if a step of the initial guess fails.
     """
-    stepper = of_known_sizes(stepper, q, parameters)
+    stepper = stepper.bind(q, parameters)[0].known
     measurements = Measurements.checked(
         stepper, t, measured, observed, deviations, start, h, checked_inputs(stepper.interface, inputs)
     )

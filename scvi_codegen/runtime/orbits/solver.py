@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.errors import MethodError, OrbitError, StateError, StepFailedError, closest
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.core.stepper import STEPPER, Stepper, of_known_sizes
+from scvi_codegen.runtime.core.stepper import STEPPER, Stepper
 from scvi_codegen.runtime.core.validation import (
     Array,
     Parameters,
@@ -101,7 +101,7 @@ def periodic_orbit(
         StateError: if a shape, name or number is invalid, or an input is not set.
         StepFailedError: if a step from the initial guess fails.
     """
-    stepper = of_known_sizes(stepper, q, parameters)
+    stepper = stepper.bind(q, parameters)[0].known
     q, p, velocity = homogeneous_state(stepper.interface, q, p, velocity)
     search = _OrbitSearch.checked(
         stepper,

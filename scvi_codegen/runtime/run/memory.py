@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
@@ -16,6 +16,7 @@ from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import (
     Array,
     Parameters,
+    States,
     checked_vector,
     inputs_not_given,
     missing_input,
@@ -24,13 +25,23 @@ from scvi_codegen.runtime.core.validation import (
 )
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.one_thread import OneThread, alone, in_use
+from scvi_codegen.runtime.run.saving import checkpoint
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.validation import LARGEST_COUNT, checked_count
 
 STEPS_PER_CALL, MOST_UNTIMED = 10**5, 2**10
 """Largest number of steps per call into C, between checks for Ctrl-C, and of coordinates of which it is not timed."""
-GRID_FIELDS, MOST_GRID_LEVEL = ("grid_level", "change", "change_before", "direction", "failed", "avoiding"), 2**16
-"""Fields of adaptive steps that index tables of the step-size grid; a bound beyond all exponents of a double."""
+LARGEST_STEP, MOST_GRID_LEVEL = 2**53, 2**16
+"""Largest number of steps that a double represents; a bound of step-size levels beyond all exponents of a double."""
+RANGES = {
+    **dict.fromkeys(("step", "iterations", "rejected", "steps_from_rest", "steps_to_compare"), (0, LARGEST_STEP)),
+    **dict.fromkeys(("guess", "turn"), (0, 2)),
+    **dict.fromkeys(
+        ("grid_level", "change", "change_before", "direction", "failed"), (-MOST_GRID_LEVEL, MOST_GRID_LEVEL)
+    ),
+    "avoiding": (-MOST_GRID_LEVEL, LARGEST_STEP),
+}
+"""Smallest and largest values of whole numbers in the memory of a run, which C uses as counts and indices."""
 FUNCTIONS = ("start", "set_parameters", "advance", "advance_to", "step_error")
 """Functions of C that take a run; sources of version 0.1 have no error estimate."""
 NO_OUTPUT = LARGEST_COUNT
@@ -67,8 +78,8 @@ class Memory(OneThread):
     def started(
         cls,
         stepper: Integrator,
-        q: ArrayLike,
-        p: ArrayLike,
+        q: States,
+        p: States,
         *,
         h: float | StepPlan,
         t: float = 0.0,
@@ -82,8 +93,8 @@ class Memory(OneThread):
 
     def _start(
         self,
-        q: ArrayLike,
-        p: ArrayLike,
+        q: States,
+        p: States,
         *,
         h: float | StepPlan,
         t: float,
@@ -262,7 +273,7 @@ class Memory(OneThread):
     @alone
     def checkpoint(self) -> bytes:
         """Return a bitwise copy of the run for :meth:`Stepper.from_checkpoint` on the same kind of machine."""
-        return self.stepper._checkpoint(self)
+        return checkpoint(self)
 
     def check_inputs(self) -> None:
         """Raise :class:`StateError` if an input is not set."""
@@ -394,9 +405,8 @@ def _time(memory: Any) -> float:
 
 def _check_memory(memory: Any) -> None:
     """Raise :class:`StateError` if the bytes cannot belong to a run."""
-    numbers = [_time(memory), memory.h, *memory.q, *memory.p, *memory.carry_q, *memory.carry_p]
-    counts = {"step": memory.step, "guess": memory.guess, "iterations": memory.iterations}
-    grid_levels = {name: getattr(memory, name) for name in GRID_FIELDS if hasattr(memory, name)}
-    sound = np.isfinite(numbers).all() and all(0 <= count < 2**53 for count in counts.values())
-    if not sound or memory.guess > 2 or any(abs(grid_level) > MOST_GRID_LEVEL for grid_level in grid_levels.values()):
-        raise StateError(f"invalid saved run: h = {memory.h:g}, {counts | grid_levels}")
+    if not np.isfinite([_time(memory), memory.h, *memory.q, *memory.p, *memory.carry_q, *memory.carry_p]).all():
+        raise StateError(f"invalid saved run: its state is not finite, h = {memory.h:g}")
+    for name, (least, most) in RANGES.items():
+        if not least <= (value := getattr(memory, name, least)) <= most:
+            raise StateError(f"invalid saved run: {name} is {value}, not a whole number from {least} to {most}")

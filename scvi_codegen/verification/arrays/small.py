@@ -1,23 +1,17 @@
-"""Reduction of arrays to a few indices, and the integrator there as one of named coordinates, for certificates."""
+"""Reduction of arrays to a few indices, for certificates."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.indices import Array
-from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.interface import RunArrays, check_accesses
-from scvi_codegen.runtime.arrays.stepper import ArrayStepper
-from scvi_codegen.runtime.run.run import Run
 
 Numbers = NDArray[np.float64]
 
@@ -29,7 +23,7 @@ MAX_COORDINATES = 9
 
 @dataclass(frozen=True, slots=True)
 class SmallStart:
-    """Arrays of small sizes and their momenta, as of :meth:`ArrayStepper.start`."""
+    """Arrays of small sizes and their momenta, as of :meth:`Stepper.start`."""
 
     arrays: RunArrays
     p: dict[str, Numbers]
@@ -126,110 +120,3 @@ def _cut(
 
 def _row_size(interface: Interface, table: str) -> str:
     return next(each.axes[0].name for each in interface.layout.tables if each.name == table)
-
-
-class SmallStepper:
-    """Integrator of arrays at small sizes with the interface of a stepper of named coordinates.
-
-    Args:
-        stepper: stepper of any size.
-        start: sizes, fields and tables.
-        unrolled: unrolled system, whose parameters include the entries of fields.
-    """
-
-    interface = SimpleNamespace(has_action=False, has_fallback=False, map_names=(), map_exact=(), energy_parameter="")
-
-    def __init__(self, stepper: ArrayStepper, start: SmallStart, unrolled: MechanicalSystem) -> None:
-        self.stepper, self.arrays, self.unrolled = stepper, start.arrays, unrolled
-        self.defaults = [float(value) for value in unrolled.defaults]
-
-    def integrate(
-        self,
-        q: Numbers,
-        p: Numbers,
-        *,
-        h: float,
-        steps: int,
-        t: float = 0.0,
-        parameters: Any = None,
-        options: SolverOptions | None = None,
-    ) -> SimpleNamespace:
-        """Return every state, (steps + 1, m), and the iterations of each step.
-
-        Raises as :meth:`ArrayStepper.integrate`.
-        """
-        run = self._run(q, p, h, t, parameters, options)
-        states, counts, times = [self._flat(run)], [0], [run.t]
-        for _ in range(steps):
-            before = run.iterations
-            run.advance(1)
-            states.append(self._flat(run))
-            counts.append(run.iterations - before)
-            times.append(run.t)
-        both = np.array(states)
-        return SimpleNamespace(t=np.array(times), q=both[:, 0], p=both[:, 1], iterations=np.array(counts))
-
-    def step(
-        self,
-        q: Numbers,
-        p: Numbers,
-        h: float,
-        t: float = 0.0,
-        parameters: Any = None,
-        options: SolverOptions | None = None,
-    ) -> tuple[Numbers, Numbers]:
-        """Return the state after one step; raises as :meth:`ArrayStepper.integrate`."""
-        run = self._run(q, p, h, t, parameters, options)
-        run.advance(1)
-        end = self._flat(run)
-        return end[0], end[1]
-
-    def velocity(self, q: Numbers, p: Numbers, t: float = 0.0, parameters: Any = None) -> Numbers:
-        """Return the velocities (m,) of a state; raises StateError for a Hamiltonian."""
-        return np.asarray(self._run(q, p, 1.0, t, parameters, None).velocity)
-
-    def momentum(self, q: Numbers, v: Numbers, t: float = 0.0, parameters: Any = None) -> Numbers:
-        """Return the momenta (m,) of positions and velocities."""
-        return np.asarray(self._run(q, v, 1.0, t, parameters, None).stepper.momentum(q, v, t, self._values(parameters)))
-
-    def energy(self, q: Numbers, p: Numbers, t: float = 0.0, parameters: Any = None) -> float:
-        """Return the energy of a state."""
-        return self._run(q, p, 1.0, t, parameters, None).energy
-
-    def _run(self, q: Numbers, p: Numbers, h: float, t: float, parameters: Any, options: SolverOptions | None) -> Run:
-        values = self._values(parameters)
-        return self.stepper.start(
-            self._arrays(q),
-            self._arrays(p),
-            h=h,
-            t=t,
-            parameters=values,
-            tables=self.arrays.places,
-            options=options,
-        )
-
-    def _values(self, parameters: Any) -> dict[str, Any]:
-        """Return numbers and fields from the parameters of the unrolled system, by name or in order."""
-        names = [parameter.name for parameter in self.unrolled.parameters]
-        values = self.defaults if parameters is None else parameters
-        known = dict(values) if isinstance(values, Mapping) else dict(zip(names, values, strict=True))
-        result: dict[str, Any] = {name: known[name] for name in self.stepper.interface.parameters}
-        for array in self.stepper.interface.layout.fields:
-            shape = array.shape(self.arrays.sizes)
-            entries = ["_".join([array.name, *map(str, index)]) for index in np.ndindex(*shape)]
-            result[array.name] = np.array([known[name] for name in entries]).reshape(shape)
-        return result
-
-    def _arrays(self, flat: Numbers) -> dict[str, Numbers]:
-        result, start = {}, 0
-        for name, values in self.arrays.state.items():
-            result[name] = np.asarray(flat)[start : start + values.size].reshape(values.shape)
-            start += values.size
-        return result
-
-    def _flat(self, run: Run) -> tuple[Numbers, Numbers]:
-        return np.asarray(run.q), np.asarray(run.p)
-
-
-def _joined(arrays: Mapping[str, Numbers]) -> Numbers:
-    return np.concatenate([values.reshape(-1) for values in arrays.values()])

@@ -18,7 +18,7 @@ from scvi_codegen.indices import Access, Loop
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runtime.arrays.interface import RunArrays
-from scvi_codegen.runtime.arrays.stepper import ArrayStepper
+from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.verification.certificate import Check, Finding, checked, information
 
@@ -42,7 +42,7 @@ class WholeStart:
 
     system: ArraySystem
     method: Method
-    stepper: ArrayStepper
+    stepper: Stepper
     arrays: RunArrays
     p: Mapping[str, Numbers]
     h: float

@@ -1,0 +1,140 @@
+"""Steppers of arrays of any size: each call binds one to the sizes and tables of its arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import replace
+from functools import cache, partial, update_wrapper
+from inspect import isfunction, signature
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.indices import MOST_THREADS, SIZES_REQUIRED, Loop
+from scvi_codegen.rendering.source import ArrayLayout, Interface
+from scvi_codegen.runtime.arrays.interface import RunSizes, first_state, read_arrays
+from scvi_codegen.runtime.core.named_arrays import EntryNames
+from scvi_codegen.validation import MAPPING, check_kind, checked_count
+
+MOST_COORDINATES = 2000
+"""Largest number of coordinates that are compiled with known sizes for what requires it."""
+AT_REST = ("start", "integrate", "project")
+"""Methods whose initial velocity is 0 if neither p nor velocity is passed."""
+
+
+class UnavailableError(MethodError, AttributeError):
+    """Error of an attribute that requires known sizes; ``hasattr`` is false."""
+
+
+def unavailable(name: str, stepper: object) -> UnavailableError:
+    """Return the error for an attribute that a stepper of any size lacks."""
+    return UnavailableError(f"{name} is not available for {stepper!r}: {SIZES_REQUIRED}")
+
+
+def forwarding_methods(stepper: Any) -> dict[str, Callable[..., Any]]:
+    """Return the methods of a stepper of any size that take a state: each calls that of a stepper bound to its sizes.
+
+    Each has the further argument ``tables``.
+    """
+    return {
+        name: update_wrapper(partial(_call, stepper, name), getattr(stepper, name))
+        for name in _methods_of_states(cast(Hashable, type(stepper)))
+    }
+
+
+@cache
+def _methods_of_states(cls: Hashable) -> tuple[str, ...]:
+    """Return the names of the methods whose first argument is a position."""
+    methods = ((name, getattr(cls, name)) for name in dir(cls) if not name.startswith("_") and name != "bind")
+    return tuple(
+        name
+        for name, method in methods
+        if isfunction(method) and [*signature(method).parameters, "", ""][1] in ("q", "q0", "q_previous")
+    )
+
+
+def _call(
+    stepper: Any,
+    name: str,
+    q: Any,
+    *arguments: Any,
+    parameters: Any = None,
+    tables: Mapping[str, ArrayLike] | None = None,
+    **others: Any,
+) -> Any:
+    """Call a method of the stepper that is bound to the arrays of the call."""
+    threads = others.pop("threads", None) if name in AT_REST else None
+    bound, state = stepper.bind(q, parameters, tables, threads)
+    if name in AT_REST and not arguments and others.get("p") is None and others.get("velocity") is None:
+        others["p"] = np.zeros(bound.dimension)
+    return getattr(bound, name)(state, *arguments, parameters=parameters, **others)
+
+
+def sizes_of_run(
+    interface: Interface,
+    q: Any,
+    parameters: Mapping[str, ArrayLike] | None,
+    tables: Mapping[str, ArrayLike] | None,
+    threads: int | None,
+) -> RunSizes:
+    """Return the sizes and tables of arrays; of several states the first determines them.
+
+    Raises:
+        StateError: if a name, shape or number is invalid, or an index would leave its array.
+        MethodError: for several threads with constraints.
+    """
+    for name, value in (("parameters", parameters), ("tables", tables)):
+        if value is not None:
+            check_kind(MAPPING, value, name, StateError)
+    count = checked_count(1 if threads is None else threads, "threads", least=1, most=MOST_THREADS)
+    if count > 1 and interface.layout.constraints:
+        raise MethodError("systems with constraints use one thread: omit threads")
+    arrays = read_arrays(interface, first_state(interface, q), parameters, tables)
+    return RunSizes(sizes=arrays.sizes, places=arrays.places, threads=count)
+
+
+def check_few_coordinates(interface: Interface, sizes: Mapping[str, int], reason: str) -> None:
+    """Raise :class:`MethodError` unless all sizes are known and there are few coordinates."""
+    if missing := [name for name in interface.layout.sizes if name not in sizes]:
+        raise MethodError(f"the size {missing[0]} is missing: give with_sizes({missing[0]}=...)")
+    count = sum(int(np.prod(array.shape(sizes))) for array in interface.layout.coordinates)
+    if count > MOST_COORDINATES:
+        raise MethodError(
+            f"{count} coordinates are too many to compile with known sizes, which this requires: at most "
+            f"{MOST_COORDINATES}{'. ' * bool(reason)}{reason}"
+        )
+
+
+def interface_of_sizes(interface: Interface, sizes: Mapping[str, int]) -> Interface:
+    """Return the interface of these sizes, whose names are made when they are read."""
+    layout = interface.layout
+    shapes = [(array.name, array.shape(sizes)) for array in (*layout.coordinates, *layout.fields)]
+    count = len(layout.coordinates)
+    momenta = [(array.name, array.shape(sizes)) for array in layout.momenta]
+    of_fields = zip(shapes[count:], layout.field_defaults, strict=True)
+    names: dict[str, Any] = {
+        "coordinates": EntryNames(shapes[:count]),
+        "parameters": EntryNames([*((name, ()) for name in interface.parameters), *shapes[count:]]),
+        "defaults": np.concatenate([interface.defaults, *(np.full(shape, x).ravel() for (_, shape), x in of_fields)]),
+        "momentum_names": EntryNames(momenta) if momenta else (),
+        "constraints": tuple(
+            f"constraint {number}" + (str(list(map(int, index))) if shape else "")
+            for number, shape in enumerate(constraint_shapes(layout, sizes), 1)
+            for index in np.ndindex(*shape)
+        ),
+    }
+    declared = tuple(f"{name}[{', '.join(map(str, shape))}]" if shape else name for name, shape in shapes)
+    return replace(interface, arrays=declared, map_names=tuple(each.name for each in layout.maps), **names)
+
+
+def constraint_shapes(layout: ArrayLayout, sizes: Mapping[str, int]) -> list[list[int]]:
+    """Return one axis per loop of each constraint; the two loops of a pair share one axis."""
+
+    def shape(loops: tuple[Loop, ...]) -> list[int]:
+        outer = {loop.behind for loop in loops}
+        spans = [(loop, loop.end.at(sizes) - loop.first.at(sizes)) for loop in loops if loop.index not in outer]
+        return [span * (span - 1) // 2 if loop.behind else span for loop, span in spans]
+
+    return [shape(loops) for loops in layout.constraints]

@@ -1,0 +1,107 @@
+"""Checkpoints: the bytes of a run, of arrays of run-time sizes preceded by sizes, tables and parameters."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.errors import ScviCodegenError, StateError
+from scvi_codegen.indices import MOST_THREADS
+from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.arrays.interface import RunSizes, check_accesses, read_tables
+from scvi_codegen.runtime.core.integrator import Integrator
+from scvi_codegen.validation import checked_count
+
+MAGIC, FORMER = b"scvi run 2\n", b"PK"
+"""First bytes of runs of run-time sizes, and of those of version 0.2."""
+DIGEST = 32
+
+
+def checkpoint(run: Any) -> bytes:
+    """Return the bytes of a run; those of run-time sizes also contain what :meth:`Stepper.bind` requires."""
+    stepper: Integrator = run.stepper
+    state: bytes = run.snapshot
+    if stepper.problem is None or stepper.origin is None:
+        return state
+    arrays = [*stepper.problem.places.values(), run.parameters]
+    header = {
+        "integrator": _integrator(stepper.origin.interface),
+        "sizes": stepper.problem.sizes,
+        "unset inputs": run._unset_inputs,
+        "adaptive": run.plan is not None,
+    }
+    body = b"".join([json.dumps(header).encode(), b"\n", *(array.tobytes() for array in arrays), state])
+    return MAGIC + hashlib.sha256(body).digest() + body
+
+
+def read_checkpoint(
+    saved: bytes, origin: Integrator, *, threads: int | None, adaptive: bool
+) -> tuple[Integrator, bytes, dict[str, Any]]:
+    """Return the bound stepper, the state and the parameters by name of a run of run-time sizes.
+
+    Raises:
+        StateError: if the bytes are invalid or damaged or belong to another integrator or another kind of steps.
+    """
+    if not isinstance(saved, bytes):
+        raise StateError(f"a saved run must be bytes, not {type(saved).__name__}")
+    if saved.startswith(FORMER):
+        raise StateError(
+            "invalid saved run: it has the format of version 0.2, which this version does not read. Continue it with "
+            "version 0.2, or start a new run from its state"
+        )
+    body = saved[len(MAGIC) + DIGEST :]
+    if not saved.startswith(MAGIC) or hashlib.sha256(body).digest() != saved[len(MAGIC) : -len(body)]:
+        raise StateError("invalid saved run: the checksum differs. Save the run again")
+    with damage_as_state_error():
+        return _read(body, origin, threads, adaptive=adaptive)
+
+
+def _read(
+    body: bytes, origin: Integrator, threads: int | None, *, adaptive: bool
+) -> tuple[Integrator, bytes, dict[str, Any]]:
+    text, _, rest = body.partition(b"\n")
+    header, layout = json.loads(text), origin.interface.layout
+    if header["integrator"] != _integrator(origin.interface):
+        raise StateError(f"the saved run is one of '{header['integrator']}', not of '{_integrator(origin.interface)}'")
+    if header["adaptive"] != adaptive:
+        raise StateError(
+            "the saved run has fixed steps: omit t_end" if adaptive else "the saved run has adaptive steps: give t_end"
+        )
+    sizes = {name: checked_count(header["sizes"][name], name, least=0) for name in layout.sizes}
+    tables, first = {}, 0
+    for table in layout.tables:
+        tables[table.name] = np.frombuffer(rest, np.int32, math.prod(table.shape(sizes)), first).reshape(
+            table.shape(sizes)
+        )
+        first += tables[table.name].nbytes
+    places = read_tables(origin.interface, tables)
+    check_accesses(layout, sizes, places)
+    count = checked_count(1 if threads is None else threads, "threads", least=1, most=MOST_THREADS)
+    bound = origin._bound_to(RunSizes(sizes=sizes, places=places, threads=count))
+    values = np.frombuffer(rest, count=len(bound.defaults), offset=first)
+    known = bound.parameters_by_name(values)
+    for name in header["unset inputs"]:
+        del known[f"{name}_0"]
+    return bound, rest[first + values.nbytes :], known
+
+
+@contextmanager
+def damage_as_state_error() -> Iterator[None]:
+    """Convert exceptions caused by damaged bytes to :class:`StateError`."""
+    try:
+        yield
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, MemoryError, ScviCodegenError) as error:
+        if isinstance(error, StateError):
+            raise
+        raise StateError(f"invalid saved run: {error!r}") from error
+
+
+def _integrator(interface: Interface) -> str:
+    """Return the identification of saved runs; runs of another solver have another memory layout."""
+    return f"{interface.title}, {interface.solver}"
