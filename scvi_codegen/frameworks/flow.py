@@ -46,9 +46,10 @@ class Flow:
         """Return a flow for arguments of users.
 
         Raises:
-            MethodError: for a stepper without derivatives or without fixed steps.
+            MethodError: for a stepper without derivatives, without fixed steps or of arrays of any size.
             StateError: for invalid numbers of steps.
         """
+        stepper = stepper.known
         stepper._check_fixed_steps("a flow")
         steps = checked_count(steps, "steps", least=1)
         save_every = 0 if save_every is None else checked_count(save_every, "save_every", least=1)

@@ -54,6 +54,10 @@ class Kind:
         """Return a stepper of the system without anything else."""
         return self.compiled(self.system())
 
+    def sized(self) -> Any:
+        """Return the stepper, compiled with its sizes."""
+        return self.stepper().with_sizes(N=2) if self.run_time else self.stepper()
+
     def compiled(self, system: Any, method: Any = "svi:2", **given: Any) -> Any:
         """Return the stepper of a system."""
         return sc.compile_stepper(system, method, flags=QUICK_FLAGS, **given)
@@ -191,15 +195,15 @@ def fits(of: Kind, _: Path) -> Any:
 
 
 def jax(of: Kind, _: Path) -> Any:
-    return sc.jax_flow(of.stepper(), steps=3)
+    return sc.jax_flow(of.sized(), steps=3)
 
 
 def torch(of: Kind, _: Path) -> Any:
-    return sc.torch_flow(of.stepper(), steps=3)
+    return sc.torch_flow(of.sized(), steps=3)
 
 
 def casadi(of: Kind, _: Path) -> Any:
-    return sc.casadi_flow(of.stepper(), steps=3)
+    return sc.casadi_flow(of.sized(), steps=3)
 
 
 def momentum_maps(of: Kind, _: Path) -> Any:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.display.cards import card, listed, plain
 from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.indices import SIZES_REQUIRED
 from scvi_codegen.native import building
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.rendering.source import Interface, Source
@@ -193,7 +194,9 @@ class CompiledMethod:
 
     @property
     def known(self) -> Self:
-        """Stepper compiled with known sizes; raises as :meth:`with_sizes`."""
+        """Stepper compiled with known sizes; raises as :meth:`with_sizes`, and for a stepper of any size."""
+        if self.any_size:
+            raise MethodError(f"{self!r} requires sizes here: pass stepper.with_sizes(..). {SIZES_REQUIRED}")
         if self.problem is None or self.origin is None:
             return self
         return self.origin.with_sizes(self.problem.sizes, tables=self.problem.places)
