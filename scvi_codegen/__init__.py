@@ -94,6 +94,7 @@ _HOMES = {
     "pictures.animation": ("Film", "animate"),
     "pictures.conserved": ("plot_energy", "plot_momentum_maps"),
     "pictures.overview": ("plot_section", "plot_trajectory"),
+    "pictures.attitudes": ("plot_attitude",),
     "pictures.paths": ("plot_motion", "plot_phase"),
     "pictures.arrays": ("plot_arrays",),
     "models.problems": ("PROBLEMS", "problem"),

@@ -138,9 +138,10 @@ class _Scene:
         self._set_limits(dimension)
         nothing: list[list[float]] = [[]] * dimension
         self.trails = [self.axes.plot(*nothing, color=color(k), linewidth=1.0, alpha=0.5)[0] for k in shape.trails]
-        marks: list[Any] = [slice(None)] if shape.joined else list(range(self.drawn_points.shape[1]))
+        alone: list[Any] = [slice(None)] if shape.joined else list(range(self.drawn_points.shape[1]))
+        marks = list(shape.solids) or alone
         names = shape.names or ("",) * len(marks)
-        line = "o-" if shape.joined else "o"
+        line = "-" if shape.solids else "o-" if shape.joined else "o"
         self.marks = [
             (which, self.axes.plot(*nothing, line, color=color(k), markersize=5, linewidth=1.2, label=name)[0])
             for k, (which, name) in enumerate(zip(marks, names, strict=True))

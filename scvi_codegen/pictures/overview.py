@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.mechanics.symmetry.sampling import bodies
+from scvi_codegen.pictures.attitudes import plot_attitude
 from scvi_codegen.pictures.canvas import COLORS, check_plot_path, color, new_figure, panel, plain, save, style
 from scvi_codegen.pictures.conserved import draw_energy_error, plot_energy, plot_momentum_maps
 from scvi_codegen.pictures.paths import draw_paths, path_panels, plot_motion, plot_phase
@@ -136,6 +137,10 @@ class Plots:
     def energy(self, path: Path = None, *, ax: Axes | None = None) -> Axes:
         """Draw the energy error over time, as :func:`scvi_codegen.plot_energy`."""
         return plot_energy(self.trajectory, path, ax=ax)
+
+    def attitude(self, path: Path = None, *, axis: int = 3, ax: Axes | None = None) -> Axes:
+        """Draw the path of a body axis on the sphere, as :func:`scvi_codegen.plot_attitude`."""
+        return plot_attitude(self.trajectory, path, axis=axis, ax=ax)
 
     def momentum_maps(self, path: Path = None, *, ax: Axes | None = None) -> Axes:
         """Draw the errors of momentum maps, as :func:`scvi_codegen.plot_momentum_maps`."""

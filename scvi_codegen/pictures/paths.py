@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scvi_codegen.mechanics.symmetry.sampling import AXES, Body, bodies
+from scvi_codegen.pictures.attitudes import draw_unit_vectors
 from scvi_codegen.pictures.canvas import color, panel, plain
 from scvi_codegen.pictures.trajectory_interface import MOTION, MOTIONS, Array, DrawnMotion, Motions, column, several
 from scvi_codegen.validation import CANVAS, NAMES, PATH, checks_arguments
@@ -72,8 +73,10 @@ def plot_phase(
 
 
 def path_panels(motion: DrawnMotion) -> int:
-    """Return the number of panels of a path: two for motion in space and for three to six coordinates."""
+    """Return the number of panels of a path: two for rotations, motion in space and three to six coordinates."""
     coordinates = motion.stepper.interface.coordinates
+    if motion.stepper.interface.rotations:
+        return 2
     result = bodies(coordinates)
     spatial = result and len(result[0].columns) == 3
     return 2 if spatial or (not result and 3 <= len(coordinates) <= MAX_CURVES) else 1
@@ -82,12 +85,15 @@ def path_panels(motion: DrawnMotion) -> int:
 def draw_paths(panels: Sequence[Axes], motion: DrawnMotion) -> None:
     """Draw the path into the panels.
 
-    One coordinate is drawn in the phase plane, bodies by their orbits, a few coordinates in their first planes, many
-    coordinates as one image over time.
+    One coordinate is drawn in the phase plane, bodies by their orbits, rotations by body axes, a few coordinates in
+    their first planes, many coordinates as one image over time.
     """
     coordinates = motion.stepper.interface.coordinates
     result, m = bodies(coordinates), len(coordinates)
-    if m == 1:
+    if motion.stepper.interface.rotations:
+        for drawn, plane in zip(panels, combinations(range(3), 2), strict=False):
+            draw_unit_vectors(drawn, motion, plane)
+    elif m == 1:
         _draw_phase_plane(panels[0], motion)
     elif result:
         for drawn, plane in zip(panels, combinations(range(3), 2), strict=False):

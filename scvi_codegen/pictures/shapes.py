@@ -11,6 +11,7 @@ import numpy as np
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.mechanics.symmetry.sampling import bodies
+from scvi_codegen.pictures.attitudes import solids
 from scvi_codegen.pictures.trajectory_interface import Array, DrawnMotion
 
 NUMBERED = re.compile(r"(.*?)_?(\d+)")
@@ -28,6 +29,7 @@ class MovingPoints:
     Attributes:
         points: function from q and p (n, m) to (n, k, d) positions of k points in the plane or in space.
         joined: draw a line through the points of a state.
+        solids: slices of points that a line joins each, or none.
         trails: indices of the points whose paths are drawn.
         labels: labels of the d axes.
         names: names of the points, or none.
@@ -37,6 +39,7 @@ class MovingPoints:
     points: Callable[[Array, Array], Array]
     labels: tuple[str, ...]
     joined: bool = False
+    solids: tuple[slice, ...] = ()
     trails: tuple[int, ...] = ()
     names: tuple[str, ...] = ()
     equal: bool = True
@@ -55,6 +58,8 @@ def shape_of(motion: DrawnMotion, positions: Callable[[Array], Array] | None = N
     coordinates, m = motion.stepper.interface.coordinates, motion.q.shape[1]
     if positions is not None:
         return _given(motion, positions)
+    if motion.stepper.interface.rotations:
+        return _solids(motion)
     if result := bodies(coordinates):
         columns = np.array([body.columns for body in result])
         names = tuple(body.name for body in result if body.name)
@@ -87,6 +92,15 @@ def _given(motion: DrawnMotion, positions: Callable[[Array], Array]) -> MovingPo
         labels=tuple("xyz"[: tried[2]]),
         trails=tuple(range(tried[1])),
     )
+
+
+def _solids(motion: DrawnMotion) -> MovingPoints:
+    """Return a box for each rotation, an arrow for each direction and spin, at (x, y, z) if these are coordinates."""
+    coordinates = motion.stepper.interface.coordinates
+    columns = [coordinates.index(name) for name in "xyz" if name in coordinates]
+    centres = motion.q[:, columns] if len(columns) == 3 else np.zeros((len(motion.q), 3))
+    points, parts, trails = solids(motion, centres)
+    return MovingPoints(points=lambda q, p: points, labels=tuple("xyz"), solids=parts, trails=trails)
 
 
 def _pendulum(lengths: Array, sign: float) -> MovingPoints:

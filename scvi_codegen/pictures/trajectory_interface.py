@@ -61,6 +61,9 @@ class DrawnMotion(Protocol):
     def stepper(self) -> Mover: ...  # noqa: D102
     def energy(self) -> Array: ...  # noqa: D102
     def momentum_errors(self) -> Array: ...  # noqa: D102
+    def rotation(self, name: str) -> Array: ...  # noqa: D102
+    def direction(self, name: str) -> Array: ...  # noqa: D102
+    def spin(self, name: str) -> Array: ...  # noqa: D102
 
 
 Motions: TypeAlias = DrawnMotion | Sequence[DrawnMotion]

@@ -1,0 +1,118 @@
+"""Plots of rotations, directions and spins: paths of body axes on the unit sphere, bodies for animations."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.pictures.canvas import check_plot_path, color, new_figure, plain, save, style
+from scvi_codegen.pictures.trajectory_interface import MOTION, Array, DrawnMotion
+from scvi_codegen.validation import CANVAS, PATH, WHOLE, checks_arguments
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+CIRCLE = np.linspace(0.0, 2 * np.pi, 73)
+HALF_SIDES = np.array([0.5, 0.3, 0.12])
+"""Half sides of the box that represents a body, along its axes."""
+BOX = [0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4]
+"""Path along all edges of a box; bits of a corner are the signs of its three coordinates."""
+
+
+def unit_vectors(motion: DrawnMotion, axis: int = 3) -> dict[str, Array]:
+    """Return (n, 3) unit vectors in space by label: a body axis of each rotation, each direction and spin."""
+    result: dict[str, Array] = {}
+    for kind, name, *_ in map(str.split, motion.stepper.interface.rotations):
+        if kind == "rotation":
+            result[f"axis {axis} of {name}"] = motion.rotation(name)[..., axis - 1]
+        else:
+            vectors = motion.direction(name) if kind == "direction" else motion.spin(name)
+            result[name] = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return result
+
+
+@checks_arguments(trajectory=MOTION, path=PATH, axis=WHOLE, ax=CANVAS)
+def plot_attitude(
+    trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None, *, axis: int = 3, ax: Axes | None = None
+) -> Axes:
+    """Draw the path of a body axis of each rotation, and of directions and spins, on the unit sphere.
+
+    Args:
+        trajectory: trajectory to draw.
+        path: file for the picture, .png or .svg; ``None`` to write none.
+        axis: number of the body axis, 1 to 3.
+        ax: three-dimensional axes to draw on; ``None`` for new ones.
+
+    Returns:
+        The axes.
+
+    Raises:
+        StateError: for another suffix, or if the system has no rotation, direction or spin.
+        PlotError: without matplotlib.
+    """
+    if axis not in (1, 2, 3):
+        raise StateError(f"axis must be 1, 2 or 3, not {axis}")
+    if not (vectors := unit_vectors(trajectory, axis)):
+        raise StateError(f"'{trajectory.stepper.interface.system}' has no rotation, direction or spin to draw")
+    if path is not None:
+        check_plot_path(path)
+    with style():
+        drawn = new_figure(path, (4.8, 4.8)).add_subplot(projection="3d") if ax is None else ax
+        for latitude in np.deg2rad(np.arange(-60, 90, 30)):
+            radius, height = np.cos(latitude), np.full(len(CIRCLE), np.sin(latitude))
+            drawn.plot(radius * np.cos(CIRCLE), radius * np.sin(CIRCLE), height, color="0.85", linewidth=0.5)
+        for longitude in np.deg2rad(np.arange(0, 180, 30)):
+            across = np.cos(CIRCLE)
+            drawn.plot(
+                across * np.cos(longitude), across * np.sin(longitude), np.sin(CIRCLE), color="0.85", linewidth=0.5
+            )
+        for number, (label, curve) in enumerate(vectors.items()):
+            drawn.plot(*curve.T, color=color(number), linewidth=0.9, label=plain(label))
+            drawn.plot(*curve[-1:].T, "o", color=color(number), markersize=4)
+        drawn.set(xlabel="x", ylabel="y", zlabel="z", title=plain(trajectory.stepper.interface.system))
+        drawn.set_aspect("equal")
+        drawn.legend(loc="upper right", fontsize=8)
+        if path is not None:
+            save(drawn.get_figure(root=True), path)
+    return drawn
+
+
+def draw_unit_vectors(axes: Axes, motion: DrawnMotion, plane: tuple[int, int]) -> None:
+    """Draw the projections of body axes, directions and spins to a plane of space, in the unit circle."""
+    axes.plot(np.cos(CIRCLE), np.sin(CIRCLE), color="0.7", linewidth=0.6)
+    for number, (label, curve) in enumerate(unit_vectors(motion).items()):
+        axes.plot(*curve[:, plane].T, color=color(number), linewidth=0.8, label=plain(label))
+    axes.set(xlabel="xyz"[plane[0]], ylabel="xyz"[plane[1]], title="body axes")
+    axes.legend(fontsize=8)
+    axes.set_aspect("equal")
+
+
+def solids(motion: DrawnMotion, centres: Array) -> tuple[Array, tuple[slice, ...], tuple[int, ...]]:
+    """Return the points (n, k, 3) of a box for each rotation and of an arrow for each direction and spin.
+
+    Args:
+        motion: trajectory of a system with rotations.
+        centres: (n, 3) positions of their common centre.
+
+    Returns:
+        Points, the slice of those of each solid, which a line joins, and the numbers of points that leave a trail.
+    """
+    corners = np.array([[1 if number >> k & 1 else -1 for k in range(3)] for number in BOX]) * HALF_SIDES
+    parts: list[Array] = []
+    ends, trails = [0], []
+    for (kind, name, *_), vector in zip(
+        map(str.split, motion.stepper.interface.rotations), unit_vectors(motion).values(), strict=True
+    ):
+        tip = vector[:, np.newaxis]
+        if kind == "rotation":
+            box = np.einsum("nij,kj->nki", motion.rotation(name), corners)
+            parts.append(np.concatenate([box, 0.0 * tip, tip], axis=1))
+        else:
+            parts.append(np.concatenate([0.0 * tip, tip], axis=1))
+        ends.append(ends[-1] + parts[-1].shape[1])
+        trails.append(ends[-1] - 1)
+    points = np.concatenate(parts, axis=1) + centres[:, np.newaxis]
+    return points, tuple(map(slice, ends[:-1], ends[1:])), tuple(trails)
