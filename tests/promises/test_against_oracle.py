@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import oracle
 import pytest
-import samples
-from samples import QUICK_FLAGS
 from tiers import family, first_of_each
 
 from scvi_codegen.methods import (
@@ -23,9 +21,9 @@ from scvi_codegen.methods import (
     SpectralCollocation,
     StoermerVerlet,
 )
-from scvi_codegen.native.building import TUNED_FLAGS
+from scvi_codegen.native.building import FLAGS_VARIABLE, TUNED_FLAGS
 
-pytestmark = [pytest.mark.long, pytest.mark.usefixtures("as_users_compile")]
+pytestmark = pytest.mark.long
 
 SEPARABLE = ("planar-pendulum", "kepler")
 COUPLED = ("double-pendulum", "cart-pole")
@@ -91,10 +89,6 @@ TOLERANCE = 2e-14
 """Of the state: a step rounds its answer once (1e-16), and its kernels and Newton's last update some tens of times."""
 
 
-UNOPTIMISED = (*samples.UNOPTIMISED, *QUICK_FLAGS[1:])
-"""What most families and solvers are tried with here; the full tier has every method with those of users."""
-
-
 def relative(found, expected):
     """The largest difference, relative to the size of the state (never less than 1)."""
     return np.abs(np.array(found) - expected).max() / max(1.0, np.abs(expected).max())
@@ -109,7 +103,9 @@ def check(sample, compiled, name, method, *, h=H, t=T, **how):
 @pytest.mark.covering
 @pytest.mark.parametrize("name", SYSTEMS)
 @pytest.mark.parametrize("method", FEW, ids=lambda method: method.name)
-def test_every_kind_of_lagrangian_agrees_with_the_oracle(sample, compiled, name, method):
+def test_every_kind_of_lagrangian_agrees_with_the_oracle(sample, compiled, name, method, monkeypatch):
+    """Compiled as users do."""
+    monkeypatch.delenv(FLAGS_VARIABLE, raising=False)
     check(sample, compiled, name, method, flags=TUNED_FLAGS)
 
 
@@ -134,13 +130,13 @@ SOLVED_BOTH_WAYS = (
 @pytest.mark.parametrize("solver", ["newton", "fixed-point"])
 @pytest.mark.parametrize(("name", "method"), SOLVED_BOTH_WAYS, ids=lambda value: getattr(value, "name", value))
 def test_both_solvers_agree_with_the_oracle(sample, compiled, name, method, solver):
-    check(sample, compiled, name, method, solver=solver, flags=UNOPTIMISED)
+    check(sample, compiled, name, method, solver=solver)
 
 
 @pytest.mark.parametrize("method", first_of_each(MANY, family), ids=lambda method: method.name)
 def test_every_family_of_methods_agrees_with_the_oracle(sample, compiled, method):
     """The Lagrangian is coupled, has masses depending on angle and time, and velocity-dependent terms."""
-    check(sample, compiled, "pumped-cart-pole", method, flags=UNOPTIMISED)
+    check(sample, compiled, "pumped-cart-pole", method)
 
 
 @pytest.mark.full
@@ -154,7 +150,7 @@ def test_every_method_on_every_system_agrees_with_the_oracle(sample, compiled, n
 @pytest.mark.parametrize("method", [SVI(2, "gauss-legendre:3"), SCVI(3), RadauIIA(2)], ids=lambda method: method.name)
 @pytest.mark.parametrize(("h", "t"), [(-0.11, 0.37), (0.02, -5.5), (-0.2, 100.0)])
 def test_backward_steps_and_large_times_agree_with_the_oracle(sample, compiled, method, h, t):
-    check(sample, compiled, "pumped-cart-pole", method, h=h, t=t, flags=UNOPTIMISED)
+    check(sample, compiled, "pumped-cart-pole", method, h=h, t=t)
 
 
 @pytest.mark.parametrize("method", [SVI(2, "gauss-legendre:3"), SCVI(3)], ids=lambda method: method.name)
