@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import replace
-from fractions import Fraction
 from functools import cache, partial
 from typing import Any
 
@@ -12,7 +11,6 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.exact.step import derived_step
 from scvi_codegen.reproduce.catalogue import EXPERIMENTS as ALL
 from scvi_codegen.reproduce.laboratory import geometric
 from scvi_codegen.reproduce.laboratory.experiment import Result, Verdict, judged
@@ -64,14 +62,6 @@ def test_results_are_complete(name, whole):
     assert all(len(row) == len(table.columns) for table in found.tables for row in table.rows)
     assert found.verdict is (Verdict.PARTLY if name in NOT_AS_PRINTED else Verdict.HOLDS)
     assert draw(pickle.loads(pickle.dumps(found.picture)), "png")[1:4] == b"PNG"
-
-
-def test_figure_1_has_the_areas():
-    areas = column("figure-1", "change of the area of the ellipse")
-    assert areas["explicit Euler"] > 1
-    assert areas["Chebyshev collocation"] == pytest.approx(0.053, rel=0.1)
-    assert abs(areas["Stoermer-Verlet"]) < 1e-3
-    assert abs(areas["symplectic Runge-Kutta"]) < 5e-3
 
 
 def test_figure_4_has_the_position_errors():
@@ -183,23 +173,6 @@ def test_figure_21_the_printed_form_is_the_same_map_with_two_points():
         for m in (whole, printed)
     ]
     assert np.abs(np.subtract(*ends)).max() < 1e-15
-
-
-def test_a_derived_step_is_exact():
-    """The midpoint rule for the oscillator: a rational map."""
-    end = derived_step(oscillator.OSCILLATOR, sc.SVI(1, "gauss-legendre:1"))([1], [0.5], 0.25)
-    h, q, p = Fraction(1, 4), Fraction(1), Fraction(1, 2)
-    scale = 1 + h * h / 4
-    expected = (((1 - h * h / 4) * q + h * p) / scale, ((1 - h * h / 4) * p - h * q) / scale)
-    for got, want in zip((*end.q, *end.p), expected, strict=True):
-        assert abs(got - mp.mpf(want.numerator) / want.denominator) < mp.mpf("1e-55")
-
-
-def test_a_derived_step_of_a_coupled_system_is_the_compiled_one():
-    double, method = sc.problem("double-pendulum").system, sc.SCVI(2)
-    end = derived_step(double, method)([1.0, 0.5], [0.2, -0.1], 0.05)
-    q, p = stepper_of(double, method).step([1.0, 0.5], [0.2, -0.1], h=0.05)
-    assert np.abs(np.array([*end.q, *end.p], dtype=float) - [*q, *p]).max() < 1e-14
 
 
 def test_drift_is_distinguished_from_oscillation():
