@@ -35,23 +35,22 @@ from scvi_codegen.models.problems import problem
 QUICK = ("-O1", "-ffp-contract=off")
 ROUND_OFF = 2e-14
 METHODS = (
-    SVI(3),
     SVI(2, "gauss-legendre:4"),
-    SVI(3, "clenshaw-curtis:4"),
-    SCVI(1),
     SCVI(3),
-    SCVI(2, "gauss-lobatto:4"),
     SCVI(3, variational=False),
     SCVI(3, abscissae="radau-iia"),
     SpectralCollocation(3),
     SpectralCollocation(3, form="phase-space"),
-    Gauss(2),
-    Gauss(2, form="position"),
     RadauIA(2),
-    RadauIIA(3),
     LobattoIIIA(3, form="position"),
     StoermerVerlet(),
-    ExplicitEuler(),
+    *(
+        pytest.param(method, marks=pytest.mark.full)
+        for method in (
+            *(SVI(3), SVI(3, "clenshaw-curtis:4"), SCVI(1), SCVI(2, "gauss-lobatto:4"), Gauss(2)),
+            *(Gauss(2, form="position"), RadauIIA(3), ExplicitEuler()),
+        )
+    ),
 )
 
 
