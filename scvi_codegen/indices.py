@@ -14,9 +14,10 @@ derivatives are taken with respect to these symbols.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any
 
 SIZES_REQUIRED = (
     "the sizes of its arrays are known at run time only. Give them when compiling, "
@@ -57,10 +58,15 @@ class Array:
     """Declaration of an array: name and size of each axis; the last axis of an index table is a whole number.
 
     A single coordinate is an array without axes.
+
+    Attributes:
+        name, axes: name of the array, size of each axis.
+        letters: names of the entries along the last axis, ``"wxyz"`` of quaternions; by default their indices.
     """
 
     name: str
     axes: tuple[Size, ...]
+    letters: str = ""
 
     def shape(self, sizes: Mapping[str, int]) -> tuple[int, ...]:
         """Return the numerical shape for the sizes of a run."""
@@ -77,7 +83,10 @@ class Array:
     @property
     def elements(self) -> tuple[str, ...]:
         """Names of the entries of an array of known sizes, ``q_0``, .., the last axis running fastest."""
-        return tuple("_".join([self.name, *map(str, index)]) for index in product(*map(range, self.shape({}))))
+        ranges: list[Iterable[Any]] = [*map(range, self.shape({}))]
+        if self.letters:
+            ranges[-1] = self.letters
+        return tuple("_".join([self.name, *map(str, index)]) for index in product(*ranges))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -160,7 +160,7 @@ def describe_arrays(system: ArraySystem, method: Method, *, prefix: str, solver:
     """Return the interface of an integrator of arrays whose sizes are known at run time."""
     layout = ArrayLayout(
         sizes=system.sizes,
-        coordinates=system.coordinates,
+        coordinates=system.positions,
         momenta=system.momenta,
         fields=system.fields,
         tables=system.tables,
@@ -176,7 +176,7 @@ def describe_arrays(system: ArraySystem, method: Method, *, prefix: str, solver:
         title=f"{system.name}: {method.title}",
         system=system.name,
         method=method.name,
-        coordinates=tuple(array.name for array in system.coordinates),
+        coordinates=tuple(array.name for array in system.positions),
         parameters=tuple(parameter.name for parameter in system.parameters),
         defaults=system.defaults,
         inputs=system.inputs,

@@ -9,7 +9,7 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.rotations.names import Reduced, RotationNames
+from scvi_codegen.formulas.rotations.names import RotationNames
 from scvi_codegen.formulas.symbols import (
     DOT,
     TIME,
@@ -58,15 +58,10 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
     """
     ordinary, parameters, inputs = (arguments[each] for each in ("coordinates", "parameters", "inputs"))
     of_momenta = "momenta" in arguments
-    names = RotationNames.declared(*(arguments.get(each) for each in TURNING), momentum=of_momenta)
-    if are_arrays(ordinary, parameters or (), arguments["tables"]):
-        if names.members:
-            raise SystemDefinitionError(
-                f"'{arguments['name']}' has arrays and rotations, which are not supported together: declare each "
-                "coordinate by its name"
-            )
-        plain = {each: value for each, value in arguments.items() if each not in (*TURNING, *TORQUES)}
-        return _of_arrays(cls, ArraySystem.from_text(**plain)), True
+    turning = [arguments.get(each) for each in TURNING]
+    if are_arrays(ordinary, parameters or (), arguments["tables"], *(each or () for each in turning)):
+        return _of_arrays(cls, ArraySystem.from_text(**arguments)), True
+    names = RotationNames.declared(*turning, momentum=of_momenta)
     coordinates = (*ordinary, *names.coordinates)
     momenta = arguments.get("momenta", ())
     momenta = default_momenta(ordinary) if momenta is None else tuple(momenta)
@@ -96,7 +91,7 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
         name=arguments["name"],
         coordinates=variables,
         **conjugate,
-        **_formulas(names, function, read(arguments[function]), forces, constraints, coordinates, constants),
+        **names.fields(function, read(arguments[function]), forces, constraints, coordinates, constants),
         definition=_definition(arguments) if names.members else {},
         time=symbols[TIME],
         parameters=constants,
@@ -178,7 +173,7 @@ def system_from_sympy(
     else:
         acting = _forces(variables, by_symbol, friction, reader("forces"))
     expression, conditions = reader(function)(formula), constraints_of(conditions, reader("constraints"))
-    parts = names, function.lower(), expression, acting, conditions, [q.name for q in variables]
+    parts = function.lower(), expression, acting, conditions, [q.name for q in variables]
     system = cls(
         name=name,
         coordinates=variables,
@@ -186,7 +181,7 @@ def system_from_sympy(
         time=symbol(TIME),
         parameters=translation.parameters,
         defaults=tuple(number(parameter, value) for parameter, value in constants.items()),
-        **_formulas(*parts, translation.parameters),
+        **names.fields(*parts, translation.parameters),
         damping=reader("damping")(rate),
         inputs=input_names,
     )
@@ -222,37 +217,6 @@ def _flat(forces: Iterable[Any]) -> list[Expr]:
 def _definition(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of a system with rotations that are not empty, for model files."""
     return {key: arguments[key] for key in DEFINING if arguments.get(key)}
-
-
-def _formulas(
-    names: RotationNames,
-    function: str,
-    formula: Expr,
-    forces: Any,
-    constraints: tuple[Expr, ...],
-    variables: Sequence[str],
-    parameters: Sequence[Symbol],
-) -> dict[str, Any]:
-    """Return the fields of a system that are formulas, those of rotations as functions of their coordinates.
-
-    Args:
-        names: rotations, directions and spins.
-        function: ``"lagrangian"`` or ``"hamiltonian"``.
-        formula, constraints: in the names of formulas.
-        forces: on all coordinates; with rotations by name (:meth:`RotationNames.forces_by_name`).
-        variables, parameters: names of all coordinates, symbols of the parameters.
-    """
-    if not names.members:
-        return {function: formula, "forces": forces, "constraints": constraints}
-    fields = {
-        "forces": names.forces(forces, variables),
-        "constraints": tuple(map(names.in_coordinates, constraints)),
-        "rotations": names.members,
-    }
-    if function == "hamiltonian":
-        return {function: names.in_coordinates(formula), "gauge": names.gauge(), **fields}
-    reduced = Reduced(formula, forces, constraints)
-    return {function: names.lagrangian(formula, parameters), "reduced": reduced, **fields}
 
 
 def default_momenta(coordinates: Sequence[str]) -> tuple[str, ...]:

@@ -52,6 +52,7 @@ def discretised_form(system: MechanicalSystem, method: Method) -> MechanicalSyst
         or (form := hamiltonian_of_rotations(system.clock.plain if system.clock else system)) is None
     ):
         return system
+    form = replace(form, arrays=system.arrays) if system.arrays else form
     return reparametrise(form, system.clock.rate) if system.clock else form
 
 

@@ -168,6 +168,35 @@ class RotationNames:
                     add(name, -Matrix([friction.get(i, S.Zero) for i in range(len(rates))]))
         return tuple((name, tuple(force)) for name, force in total.items())
 
+    def fields(
+        self,
+        function: str,
+        formula: Expr,
+        forces: Any,
+        constraints: Sequence[Expr],
+        variables: Sequence[str],
+        parameters: Sequence[Symbol],
+    ) -> dict[str, Any]:
+        """Return the fields of a system that are formulas, as functions of its coordinates.
+
+        Args:
+            function: ``"lagrangian"`` or ``"hamiltonian"``.
+            formula, constraints: in the names of formulas.
+            forces: on all coordinates; with rotations by name (:meth:`forces_by_name`).
+            variables, parameters: names of all coordinates, symbols of the parameters.
+        """
+        if not self.members:
+            return {function: formula, "forces": forces, "constraints": tuple(constraints)}
+        fields = {
+            "forces": self.forces(forces, variables),
+            "constraints": tuple(map(self.in_coordinates, constraints)),
+            "rotations": self.members,
+        }
+        if function == "hamiltonian":
+            return {function: self.in_coordinates(formula), "gauge": self.gauge(), **fields}
+        reduced = Reduced(formula, forces, tuple(constraints))
+        return {function: self.lagrangian(formula, parameters), "reduced": reduced, **fields}
+
     def _rates(self, coordinates: Sequence[str]) -> dict[str, tuple[Symbol, ...]]:
         """Return the symbols of velocities by name of a coordinate, rotation or direction."""
         ordinary = {name: (symbol(name + DOT),) for name in coordinates}

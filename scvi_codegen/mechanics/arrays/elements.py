@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sympy import Add, Expr, Symbol
+from sympy import Add, Expr, Matrix, S, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.array_statements import ArrayForce
 from scvi_codegen.formulas.arrays import ArrayTerm
+from scvi_codegen.formulas.rotations.arrays import torque_symbols
+from scvi_codegen.formulas.rotations.members import AXES, momenta_of
+from scvi_codegen.formulas.rotations.names import Forces, RotationNames
 from scvi_codegen.formulas.symbols import DOT, number, symbol
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
 from scvi_codegen.mechanics.arrays.system import ArraySystem
@@ -44,6 +47,8 @@ def unrolled_fields(
         for array, default in zip(system.fields, system.field_defaults, strict=True)
     }
     names = {array.name: _names(array, sizes) for array in (*system.state, *system.fields)}
+    for turning in system.rotations:
+        names |= turning.names(sizes)
     values = {
         str(name): float(value)
         for array in system.fields
@@ -55,28 +60,57 @@ def unrolled_fields(
             raise SystemDefinitionError(f"'{system.name}' has no parameter '{name}'{closest(name, numbers)}")
         numbers[name] = number(name, value)
     written = _Elements(sizes, columns, names)
-    summands = [term.formula.xreplace(rule) for term in system.terms for _, rule in written.rules(term)]
-    applied = written.forces(system.forces)
-    coordinates, momenta = (
-        tuple(symbol(str(name)) for array in arrays for name in names[array.name].flat)
-        for arrays in (system.coordinates, system.momenta)
-    )
-    together: dict[str, Any] = {
+    constants = tuple(map(symbol, [*numbers, *values]))
+    return {
         "name": system.name,
-        "coordinates": coordinates,
         "time": system.time,
-        "parameters": tuple(map(symbol, [*numbers, *values])),
+        "parameters": constants,
         "defaults": (*numbers.values(), *values.values()),
-        "forces": tuple(Add(*applied.get(q, ())) for q in coordinates) if applied else (),
         "inputs": system.inputs,
         "damping": system.damping,
-        "arrays": tuple(known_array(array, sizes) for array in (*system.coordinates, *system.fields)),
+        "arrays": tuple(known_array(array, sizes) for array in (*system.positions, *system.fields)),
         "definition": {} if system.sizes else system.definition,
+        **_formulas(system, written, constants),
     }
-    if momenta:
-        return together | {"momenta": momenta, "hamiltonian": Add(*summands)}
-    constraints = tuple(term.formula.xreplace(rule) for term in system.constraints for _, rule in written.rules(term))
-    return together | {"lagrangian": Add(*summands), "constraints": constraints}
+
+
+def _formulas(system: ArraySystem, written: _Elements, constants: Sequence[Symbol]) -> dict[str, Any]:
+    """Return the coordinates and momenta, and the fields that are formulas of them."""
+    turning = RotationNames([member for each in system.rotations for _, member in each.entries(written.sizes)])
+    coordinates, momenta = (
+        tuple(symbol(str(name)) for array in arrays for name in written.names[array.name].flat)
+        for arrays in (system.coordinates, system.momenta)
+    )
+    coordinates = (*coordinates, *map(symbol, turning.coordinates))
+    summands, constraints = (
+        [term.formula.xreplace(rule) for term in terms for _, rule in written.rules(term)]
+        for terms in (system.terms, system.constraints)
+    )
+    total = {q: Add(*formulas) for q, formulas in written.forces(system.forces).items()}
+    forces: Any = _forces_by_name(turning, total)
+    if not turning.members:
+        forces = tuple(total.get(q, S.Zero) for q in coordinates) if total else ()
+    fields = turning.fields(
+        system.function.lower(), Add(*summands), forces, constraints, [each.name for each in coordinates], constants
+    )
+    if system.function == "Hamiltonian":
+        fields["momenta"] = (*momenta, *momenta_of(turning.coordinates))
+    return {"coordinates": coordinates, **fields}
+
+
+def _forces_by_name(turning: RotationNames, total: dict[Symbol, Expr]) -> Forces:
+    """Return the forces by name of a coordinate (one), rotation or direction (three components)."""
+    total, by_name = dict(total), list[tuple[str, tuple[Expr, ...]]]()
+    for member in turning.members:
+        body, space = (
+            Matrix([total.pop(each, S.Zero) for each in torque_symbols(member, in_space=in_space)])
+            for in_space in (False, True)
+        )
+        if space != space * 0:
+            body += Matrix(len(AXES), len(AXES), member.entries).T * space
+        if body != body * 0:
+            by_name.append((member.name, tuple(body)))
+    return (*((q.name, (force,)) for q, force in total.items()), *by_name)
 
 
 def known_array(array: Array, sizes: Mapping[str, int]) -> Array:

@@ -231,5 +231,5 @@ def unroll_sums(
     q_0_dot**2/2 + q_1_dot**2/2 - (-q_0 + q_1)**2/2
     """
     assert isinstance(system, ArraySystem)
-    kind = HamiltonianSystem if system.momenta else LagrangianSystem
+    kind = HamiltonianSystem if system.function == "Hamiltonian" else LagrangianSystem
     return kind(**unrolled_fields(system, sizes, tables, parameters))

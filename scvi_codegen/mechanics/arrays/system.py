@@ -24,6 +24,7 @@ from scvi_codegen.formulas.array_statements import ArrayForce, parse_constraint,
 from scvi_codegen.formulas.arrays import ArrayTerm, parse_array, parse_coordinate, parse_sums
 from scvi_codegen.formulas.expressions import unsupported_part
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.rotations.arrays import MemberArray, member_arrays, torque_components
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, input_formulas, number, symbol, with_inputs
 from scvi_codegen.indices import SIZES_REQUIRED, Access, Array, Loop
 from scvi_codegen.mechanics.arrays.terms import (
@@ -65,6 +66,7 @@ class ArraySystem:
         inputs: names of functions of time passed to each run, each represented by five of the parameters.
         constraints: g = 0 at every element of loops (:mod:`scvi_codegen.mechanics.arrays.terms`).
         damping: damping rate of all momenta, see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
+        rotations: rotations, directions and spins, which require known sizes.
         definition: the arguments of :meth:`from_text` other than name and parameters, for model files.
     """
 
@@ -82,6 +84,7 @@ class ArraySystem:
     inputs: tuple[str, ...] = ()
     constraints: tuple[ArrayTerm, ...] = ()
     damping: Expr = S.Zero
+    rotations: tuple[MemberArray, ...] = ()
     definition: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
     REQUIRES_SIZES: ClassVar[str] = SIZES_REQUIRED
 
@@ -115,6 +118,8 @@ class ArraySystem:
     def check_run_time_sizes(self) -> None:
         """Raise :class:`SizesRequiredError` for a system that cannot be compiled for sizes known at run time."""
         try:
+            if self.rotations:
+                raise SystemDefinitionError(f"'{self.name}' has rotations, directions or spins: {SIZES_REQUIRED}")
             for term in self.coupled_terms:
                 raise SizesRequiredError(
                     f"'{term}' contains velocities in another form: arrays of any size have velocities as m*v**2/2 "
@@ -162,6 +167,11 @@ class ArraySystem:
         damping: str | float | None = None,
         inputs: Sequence[str] = (),
         constraints: Sequence[str] = (),
+        rotations: Mapping[str, str] | None = None,
+        directions: Sequence[str] | None = None,
+        spins: Sequence[str] | None = None,
+        torques: Mapping[str, Sequence[str]] | None = None,
+        torques_space: Mapping[str, Sequence[str]] | None = None,
     ) -> ArraySystem:
         """Read L or H from text of the grammar in :mod:`scvi_codegen.formulas.arrays`.
 
@@ -181,6 +191,9 @@ class ArraySystem:
                 (:mod:`scvi_codegen.formulas.symbols`).
             constraints: formulas in coordinates and time that are 0, or equations, followed by the loops over which
                 they hold, ``"(q[i+1] - q[i])**2 = 1 for i in 0..N-2"``.
+            rotations, directions, spins, torques, torques_space: as of :meth:`LagrangianSystem.from_text`, single or in
+                arrays, ``rotations={"R[N]": "omega"}`` with ``R_33[i]``, ``omega_1[i]`` in formulas and torques on
+                ``"R[i]"``.
 
         Raises:
             SystemDefinitionError: for text outside the grammar.
@@ -202,6 +215,11 @@ class ArraySystem:
             "damping": damping,
             "inputs": list(inputs),
             "constraints": list(constraints),
+            "rotations": dict(rotations or {}),
+            "directions": list(directions or ()),
+            "spins": list(spins or ()),
+            "torques": dict(torques or {}),
+            "torques_space": dict(torques_space or {}),
         }
         arrays = tuple(map(parse_coordinate, coordinates))
         conjugate = momenta_of(arrays, momenta, lagrangian, hamiltonian)
@@ -214,12 +232,24 @@ class ArraySystem:
         assert text is not None
         known = {key: symbol(key) for key in (*scalars, *inputs, TIME)}
         driven = input_formulas(inputs, symbol(TIME))
-        everything = (*arrays, *conjugate, *velocities, *fields.values())
-        applied = [parse_force(*pair, arrays, everything, known, index_tables) for pair in (forces or {}).items()]
+        turning = member_arrays(rotations, directions, spins, momentum=hamiltonian is not None)
+        turned = [array for each in turning for array in each.formulas]
+        everything = (*arrays, *conjugate, *velocities, *fields.values(), *turned)
+        targets = [(*pair, arrays) for pair in (forces or {}).items() if isinstance(pair[1], str)]
+        vectors = {target: force for target, force in (forces or {}).items() if not isinstance(force, str)}
+        for by_name, in_space in (({**vectors, **(torques or {})}, False), (torques_space or {}, True)):
+            for target, torque in by_name.items():
+                targets += torque_components(turning, target, torque, in_space=in_space)
+        applied = [
+            parse_force(target, force, on, (*everything, *on), known, index_tables) for target, force, on in targets
+        ]
         if dissipation is not None:
             dissipated = parse_sums(dissipation, everything, known, index_tables)
-            applied.append(friction(dissipated, dict(zip(velocities, arrays, strict=False))))
-        kind = ArrayHamiltonian if conjugate else ArrayLagrangian
+            moving = dict(zip(velocities, arrays, strict=False))
+            for each in turning:
+                moving |= zip(each.rates, each.torques(), strict=False)
+            applied.append(friction(dissipated, moving))
+        kind = ArrayLagrangian if hamiltonian is None else ArrayHamiltonian
         system = kind(
             name=name,
             coordinates=arrays,
@@ -235,6 +265,7 @@ class ArraySystem:
             inputs=tuple(inputs),
             constraints=tuple(parse_constraint(each, everything, known, index_tables) for each in constraints),
             damping=damping_rate(damping, lambda formula: parse_expression(str(formula), known)),
+            rotations=turning,
             definition={key: value for key, value in definition.items() if value not in (None, [], {})},
         )
         system.warn_of_mistakes()
@@ -277,8 +308,13 @@ class ArraySystem:
 
     @property
     def arrays(self) -> tuple[Array, ...]:
-        """Coordinates, momenta, fields, tables."""
-        return (*self.state, *self.fields, *self.tables)
+        """Coordinates, those of rotations, momenta, fields, tables."""
+        return (*self.positions, *self.momenta, *self.fields, *self.tables)
+
+    @property
+    def positions(self) -> tuple[Array, ...]:
+        """Coordinates, and homogeneous coordinates of rotations, directions and spins."""
+        return (*self.coordinates, *(each.array for each in self.rotations))
 
     @property
     def state(self) -> tuple[Array, ...]:
@@ -383,7 +419,7 @@ class ArraySystem:
     @property
     def function(self) -> str:
         """Kind of the defining function: "Hamiltonian" or "Lagrangian"."""
-        return "Hamiltonian" if self.momenta else "Lagrangian"
+        return "Hamiltonian" if isinstance(self, ArrayHamiltonian) else "Lagrangian"
 
     @property
     def _velocities(self) -> dict[str, Array]:
@@ -409,9 +445,9 @@ class ArraySystem:
                 )
 
     def _check_names(self) -> None:
-        names = ([each.name for each in group] for group in (self.coordinates, self.parameters, self.momenta))
-        check_names(*names)
-        known = [array.name for array in self.arrays] + [each.name for each in self.parameters]
+        check_names(*([each.name for each in group] for group in (self.positions, self.parameters, self.momenta)))
+        known = [each.name for each in (*self.arrays, *self.parameters)]
+        known += [array.name for each in self.rotations for array in each.formulas if array.name != each.member.name]
         for name in known:
             if known.count(name) > 1 or name in self.sizes:
                 raise SystemDefinitionError(f"the name '{name}' is used twice: rename one")

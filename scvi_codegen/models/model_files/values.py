@@ -123,10 +123,12 @@ def _by_coordinate(section: Section, system: MechanicalSystem) -> Section:
 
     q = section.get("q")
     members = members_of(system.dimension, [each.declaration for each in system.rotations])
-    if not isinstance(q, dict) or not any(member.name in q for member in members):
+    shapes = [(array.name, array.shape({})) for array in system.arrays if array.axes]
+    turning = {*(member.name for member in members), *(array.name for array in system.arrays if array.letters)}
+    if not isinstance(q, dict) or turning.isdisjoint(q):
         return section
     names = [coordinate.name for coordinate in system.coordinates]
-    state = in_section("[initial]", lambda: state_of(names, members, q, section.get("p"), section.get("q_dot")))
+    state = in_section("[initial]", lambda: state_of(names, members, q, section.get("p"), section.get("q_dot"), shapes))
     vectors = {key: value for key, value in zip(("q", "p", "q_dot"), state, strict=True) if value is not None}
     return {**section, **{key: np.asarray(value, dtype=float).tolist() for key, value in vectors.items()}}
 

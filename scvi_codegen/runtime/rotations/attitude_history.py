@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError, closest
+from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.core.named_arrays import shapes_of
 from scvi_codegen.runtime.rotations.attitudes import (
     angular_velocity,
     body_momentum,
@@ -107,6 +110,10 @@ class AttitudeHistory:
             each for each in members_of(interface.dimension, interface.rotations) if each.kind == kind
         ]
         names = [each.name for each in members]
+        arrays = _columns_of_arrays(interface, names)
+        if name in arrays or (name is None and len(arrays) == 1):
+            array = name or next(iter(arrays))
+            return replace(members[0], name=array, columns=arrays[array])
         if name is None and len(members) == 1:
             return members[0]
         if name not in names:
@@ -114,3 +121,14 @@ class AttitudeHistory:
             hint = closest(str(name), names) if name is not None else "."
             raise StateError(f"{reason}{hint} The system has: {', '.join(names) or f'no {kind}'}")
         return members[names.index(name)]
+
+
+def _columns_of_arrays(interface: Interface, names: Sequence[str]) -> dict[str, NDArray[np.intp]]:
+    """Return the columns (.., k) of the coordinates of every array of members of these names."""
+    columns, first = {}, 0
+    for array, shape in shapes_of(interface) or ():
+        end = first + int(np.prod(shape))
+        if len(shape) > 1 and f"{array}{'_0' * (len(shape) - 1)}" in names:
+            columns[array] = np.arange(first, end).reshape(shape)
+        first = end
+    return columns

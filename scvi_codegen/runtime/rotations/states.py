@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.rendering.source import COMPONENTS, Interface
+from scvi_codegen.runtime.core.named_arrays import Shapes, shapes_of
 from scvi_codegen.runtime.rotations.attitudes import (
     matrices,
     momenta_of_body,
@@ -29,14 +30,14 @@ class Member:
     Attributes:
         kind: ``"rotation"``, ``"direction"`` or ``"spin"``.
         name, rate: its name, and that of its angular velocity or, in a Hamiltonian, momentum.
-        columns: its homogeneous coordinates among all.
+        columns: its homogeneous coordinates among all; of an array of members their indices (.., k).
         momentum: whether ``rate`` names a momentum.
     """
 
     kind: str
     name: str
     rate: str
-    columns: slice
+    columns: Any
     momentum: bool = False
 
     def moving_name(self, what: str) -> str:
@@ -66,11 +67,49 @@ def homogeneous_state(interface: Interface, q: Any, p: Any, velocity: Any) -> tu
     if not isinstance(q, Mapping):
         return q, p, velocity
     members = members_of(interface.dimension, interface.rotations)
-    return state_of(interface.coordinates, members, q, p, velocity)
+    return state_of(interface.coordinates, members, q, p, velocity, shapes_of(interface) or ())
+
+
+def _by_entry(shapes: Shapes, members: Sequence[Member], values: Any) -> Any:
+    """Return a state by name with its arrays replaced by their entries, ``R_0``, ``R_1`` of ``R``."""
+    if not isinstance(values, Mapping):
+        return values
+    own, axes, kinds = {member.name: member for member in members}, dict[str, tuple[int, ...]](), dict[str, str]()
+    for name, shape in shapes:
+        first = "_0" * (len(shape) - 1)
+        member = own.get(name + first)
+        axes[name] = shape if member is None else shape[:-1]
+        if member is not None:
+            rate = member.rate.removesuffix(first)
+            axes[rate], kinds[name], kinds[rate] = shape[:-1], member.kind, "rate"
+    entries = {}
+    for name, value in values.items():
+        base = name.removesuffix("_space")
+        if not axes.get(base):
+            entries[name] = value
+            continue
+        array = (
+            quaternions(value, name)
+            if kinds.get(base) == "rotation" and np.ndim(value) > len(axes[base]) + 1
+            else value
+        )
+        array, last = real_array(array, name), int(base in kinds)
+        outer = array.ndim - last - len(axes[base])
+        if outer < 0 or array.shape[outer : array.ndim - last] != axes[base]:
+            raise StateError(f"'{name}' must have the shape {axes[base]}{' of vectors' * last}, not {array.shape}")
+        for index in np.ndindex(*axes[base]):
+            suffix = "".join(f"_{k}" for k in index) + name.removeprefix(base)
+            entries[base + suffix] = array[(slice(None),) * outer + index]
+    return entries
 
 
 def state_of(
-    coordinates: Sequence[str], members: Sequence[Member], q: Mapping[str, Any], p: Any, velocity: Any
+    coordinates: Sequence[str],
+    members: Sequence[Member],
+    q: Mapping[str, Any],
+    p: Any,
+    velocity: Any,
+    shapes: Shapes = (),
 ) -> tuple[Any, Any, Any]:
     """Return (q, p, velocity) with states by name as (.., m) numbers, and momenta and velocities as they are.
 
@@ -82,10 +121,12 @@ def state_of(
             (that of its momentum in a Hamiltonian), or in the space frame under this name with ``_space``.
         velocity: by name: of ordinary coordinates and directions, and the angular velocity under its own name (body
             frame) or with ``_space``.
+        shapes: names and shapes of arrays of coordinates, ``("R", (3, 4))`` of three rotations.
 
     Raises:
         StateError: naming what is unknown, missing or invalid.
     """
+    q, p, velocity = (_by_entry(shapes, members, each) for each in (q, p, velocity))
     ordinary = coordinates[: members[0].columns.start]
     _check(q, [*ordinary, *(member.name for member in members)], "q")
     parts = [_column(q, name, "q") for name in ordinary]
