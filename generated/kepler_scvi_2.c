@@ -25,6 +25,7 @@ enum {
   B = 5, /* unknowns per site */
   N = 10, /* unknowns */
   MOST_POINTS = 5, /* largest number of points of a stage group, or of blocks */
+  JACOBIAN = 144, /* entries of its factors */
   POINT = 0, /* numbers that describe where a reused Jacobian was evaluated */
   MOST_ITERATIONS = INT_MAX, /* whatever the options are */
   MAX_ITERATIONS = 50, /* default */

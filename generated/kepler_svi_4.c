@@ -24,6 +24,7 @@ enum {
   B = 4, /* unknowns per site */
   N = 8, /* unknowns */
   MOST_POINTS = 4, /* largest number of points of a stage group, or of blocks */
+  JACOBIAN = 100, /* entries of its factors */
   POINT = 0, /* numbers that describe where a reused Jacobian was evaluated */
   MOST_ITERATIONS = INT_MAX, /* whatever the options are */
   MAX_ITERATIONS = 50, /* default */

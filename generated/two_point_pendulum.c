@@ -25,6 +25,7 @@ enum {
   B = 1, /* unknowns per site */
   N = 1, /* unknowns */
   MOST_POINTS = 2, /* largest number of points of a stage group, or of blocks */
+  JACOBIAN = 4, /* entries of its factors */
   POINT = 0, /* numbers that describe where a reused Jacobian was evaluated */
   MOST_ITERATIONS = INT_MAX, /* whatever the options are */
   MAX_ITERATIONS = 50, /* default */

@@ -235,15 +235,20 @@ def render_example(interface: Interface, start: ExampleRun, precision: Embedded 
 
 
 def workspace_size(program: Program) -> int:
-    """Return the doubles of workspace: scratch, memory; unknowns, point, update, pivots, rows, Jacobian of Newton.
+    """Return the doubles of workspace: scratch, memory; unknowns, rows, update, pivots, Jacobian, point of Newton.
 
     Without Newton's method one instead, for the result of a fallback.
     """
     if not program.newton:
         return scratch_size(program) + program.memory + 1
     rows = program.equations.unknowns + program.equations.sites
-    jacobian = program.matrix_size(program.equations.sites, program.equations.blocks + (1 if program.action else 0))
-    return scratch_size(program) + program.memory + program.equations.unknowns + program.point + 3 * rows + jacobian
+    newton = program.equations.unknowns + program.point + 3 * rows + jacobian_size(program)
+    return scratch_size(program) + program.memory + newton
+
+
+def jacobian_size(program: Program) -> int:
+    """Return the doubles of the factors of Newton's method, with p0 as a further unknown for a discrete Lagrangian."""
+    return program.matrix_size(program.equations.sites, program.equations.blocks + (1 if program.action else 0))
 
 
 def scratch_size(program: Program) -> int:
@@ -273,6 +278,7 @@ def _context(
         "inverse_roots": inverse_roots(scalars),
         "workspace": workspace_size(program),
         "scratch": scratch_size(program),
+        "jacobian": jacobian_size(program),
         "most_iterations": "INT_MAX",
         "embedded": False,
         "derivatives": None,

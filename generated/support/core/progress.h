@@ -16,7 +16,7 @@ typedef struct {
 
 static inline progress before_iterations(void)
 {
-  const progress none = {0.0, INFINITY, INFINITY, INFINITY, 0.0, 0, 0};
+  const progress none = {.last = INFINITY, .before = INFINITY, .earlier = INFINITY};
   return none;
 }
 

@@ -75,7 +75,7 @@ static int run_workers(run_memory *run, const job *way, solver_report *report)
 
 solver_options NAME(default_options)(void)
 {
-  const solver_options options = {TOLERANCE, MAX_ITERATIONS, 0};
+  const solver_options options = {.tolerance = TOLERANCE, .max_iterations = MAX_ITERATIONS};
   return options;
 }
 

@@ -18,21 +18,16 @@
 
 /* Factors of the saddle-point matrix [L_vv, G^T; G, 0] of a state, and a right-hand side. */
 typedef struct {
-  real *matrix, *pivot, *x;
+  real matrix[SADDLE], pivot[SITES], x[SITES];
 } saddle;
 
-static saddle saddle_in(real *workspace)
+static saddle *saddle_in(real *workspace)
 {
-  const band shape = band_of(SITES, 1);
-  saddle at;
-  at.matrix = workspace + SCRATCH + MEMORY;
-  at.pivot = at.matrix + band_size(&shape);
-  at.x = at.pivot + SITES;
-  return at;
+  return (saddle *)(workspace + SCRATCH + MEMORY);
 }
 
 /* Factorises the matrix at u = (q, v) and computes g. */
-static int factorise_saddle(real t, const real *u, const real *parameters, const saddle *at, real *g)
+static int factorise_saddle(real t, const real *u, const real *parameters, saddle *at, real *g)
 {
   const band shape = band_of(SITES, 1);
   real p[M], mass[MASS_ENTRIES], derivative[CONSTRAINT_ENTRIES];
@@ -53,7 +48,7 @@ static int factorise_saddle(real t, const real *u, const real *parameters, const
 }
 
 /* Solves L_vv x + G^T y = a (0 if NULL), G x = b. */
-static void solve_saddle(const saddle *at, const real *a, const real *b, real *x, real *y)
+static void solve_saddle(saddle *at, const real *a, const real *b, real *x, real *y)
 {
   const band shape = band_of(SITES, 1);
   for (int i = 0; i < M; i++)
@@ -115,7 +110,7 @@ static real misfit(real t, const real *q, const real *parameters, real *g)
 
 /* Projects q onto g = 0 by Gauss-Newton steps in the metric of the mass matrix at u = (q, v). An update is halved while
  * it does not reduce |g|; the iteration ends when rounding prevents a reduction. */
-static int project_position(real t, real *u, const real *parameters, const saddle *at)
+static int project_position(real t, real *u, const real *parameters, saddle *at)
 {
   real g[CONSTRAINTS], y[CONSTRAINTS], update[M], nearest[M];
   real left = misfit(t, u, parameters, g);
@@ -150,7 +145,7 @@ static int project_position(real t, real *u, const real *parameters, const saddl
 }
 
 /* Projects p onto the cotangent space of the constraints. */
-static int project_momentum(real t, const real *q, real *p, const real *parameters, const saddle *at, real *workspace)
+static int project_momentum(real t, const real *q, real *p, const real *parameters, saddle *at, real *workspace)
 {
   real u[2 * M], g[CONSTRAINTS], rate[CONSTRAINTS], y[CONSTRAINTS], update[M], derivative[CONSTRAINT_ENTRIES];
   for (int k = 0; k < MOMENTUM_PROJECTIONS; k++) {
@@ -172,7 +167,7 @@ static int project_momentum(real t, const real *q, real *p, const real *paramete
 /* Nearest state that satisfies the constraints; on failure q1 and p1 are unchanged. */
 int NAME(project)(real t, const real *q0, const real *p0, const real *parameters, real *q1, real *p1, real *workspace)
 {
-  const saddle at = saddle_in(workspace);
+  saddle *at = saddle_in(workspace);
   real u[2 * M], p[M];
   int status = NAME(velocity)(t, q0, p0, parameters, u + M, workspace);
   memcpy(u, q0, sizeof(real) * M);
@@ -180,7 +175,7 @@ int NAME(project)(real t, const real *q0, const real *p0, const real *parameters
   if (status == OK)
     status = project_position(t, u, parameters, &at);
   if (status == OK)
-    status = project_momentum(t, u, p, parameters, &at, workspace);
+    status = project_momentum(t, u, p, parameters, at, workspace);
   if (status != OK)
     return status;
   memcpy(q1, u, sizeof(real) * M);
@@ -245,19 +240,19 @@ int NAME(apart)(real t, const real *q0, const real *p0, const real *q1, const re
 int NAME(multipliers)(long long count, const real *t, const real *q, const real *p, const real *parameters,
     real *multiplier, real *workspace)
 {
-  const saddle at = saddle_in(workspace);
+  saddle *at = saddle_in(workspace);
   for (long long k = 0; k < count; k++) {
     real u[2 * M], value[M + 2 * CONSTRAINTS], g[CONSTRAINTS], a[M], *y = multiplier + k * CONSTRAINTS;
     int status = NAME(velocity)(t[k], q + k * M, p + k * M, parameters, u + M, workspace);
     memcpy(u, q + k * M, sizeof(real) * M);
     if (status == OK)
-      status = factorise_saddle(t[k], u, parameters, &at, g);
+      status = factorise_saddle(t[k], u, parameters, at, g);
     if (status != OK)
       return status;
     constrained_motion(u, t[k], parameters, value);
     for (int j = 0; j < CONSTRAINTS; j++)
       value[M + CONSTRAINTS + j] = -value[M + CONSTRAINTS + j];
-    solve_saddle(&at, value, value + M + CONSTRAINTS, a, y);
+    solve_saddle(at, value, value + M + CONSTRAINTS, a, y);
     for (int j = 0; j < CONSTRAINTS; j++)
       y[j] = -y[j];
     if (!all_finite(y, CONSTRAINTS))

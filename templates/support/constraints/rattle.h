@@ -22,14 +22,12 @@ typedef struct {
 
 static band multiplier_shape(int count)
 {
-  const int rows = CONSTRAINTS * count, reach = (CONSTRAINT_REACH + 1) * count - 1, full = 3 * reach + 1 >= rows;
-  const band shape = {rows, reach, full ? rows : 3 * reach, full ? 0 : 2 * reach};
-  return shape;
+  return band_within(CONSTRAINTS * count, (CONSTRAINT_REACH + 1) * count - 1);
 }
 
 /* Factorises scale sum over coordinates of row_r response[n][r] column_n / mass, with rows r of each constraint, and
  * columns n; row and column are derivatives at `count` points. Returns 0 if that matrix is singular. */
-static int factorise_multipliers(const newton_data *data, const real *row, const real *column, const real *response,
+static int factorise_multipliers(newton_data *data, const real *row, const real *column, const real *response,
     int count,
     const real *inverse_mass, real scale)
 {
@@ -48,7 +46,7 @@ static int factorise_multipliers(const newton_data *data, const real *row, const
 }
 
 /* Solves matrix x = -right with these factors. */
-static void solve_multipliers(const newton_data *data, const real *right, int count, real *x)
+static void solve_multipliers(newton_data *data, const real *right, int count, real *x)
 {
   const band shape = multiplier_shape(count);
   for (int k = 0; k < CONSTRAINTS; k++)
@@ -167,7 +165,7 @@ static movement move(const step_data *step, rattle_step *now, const real *change
 
 /* Solves g(u) = 0 for lambda and u; evaluates forces and constraints there. Returns SINGULAR, NOT_CONVERGED or
  * NOT_FINITE on failure. */
-static int solve_constraints(const step_data *step, rattle_step *now, const newton_data *data,
+static int solve_constraints(const step_data *step, rattle_step *now, newton_data *data,
     const solver_options *options,
     solver_report *report)
 {
@@ -212,7 +210,7 @@ static int solve_constraints(const step_data *step, rattle_step *now, const newt
 }
 
 /* Initial values: the first point, and a guess of the others, from the unknowns in data->z. */
-static void begin(const step_data *step, const newton_data *data, rattle_step *now)
+static void begin(const step_data *step, newton_data *data, rattle_step *now)
 {
   real g[CONSTRAINTS];
   constrained_mass(NULL, step->t, step->parameters, now->inverse_mass);
@@ -225,7 +223,7 @@ static void begin(const step_data *step, const newton_data *data, rattle_step *n
 }
 
 /* Computes p1 - p0 on the tangent space, and the unknowns z of the step. */
-static int finish_step(const step_data *step, const rattle_step *now, const newton_data *data, real *dp)
+static int finish_step(const step_data *step, const rattle_step *now, newton_data *data, real *dp)
 {
   const real weight = step->h * RATTLE_WEIGHT[DEGREE];
   real f[M * DEGREE], u[2 * M], value[M + 2 * CONSTRAINTS], lambda[CONSTRAINTS], own[1] = {1};
@@ -257,7 +255,7 @@ static int finish_step(const step_data *step, const rattle_step *now, const newt
 }
 
 /* Computes the unknowns z of the step, from their initial guess, and p1 - p0. On failure they are undefined. */
-static int rattle(const step_data *step, const newton_data *data, real *dp, const solver_options *options,
+static int rattle(const step_data *step, newton_data *data, real *dp, const solver_options *options,
     solver_report *report)
 {
   rattle_step now;

@@ -21,7 +21,7 @@ static void end_time(const linearised_step *at, int back)
   memset(u, 0, sizeof(wide) * (size_t)(f->points * f->arguments));
   if (!back)
     arguments_wide(f, step->h, back, at->partials, at->v, at->dz, u);
-  arguments_of(f, step, at->data.z, place);
+  arguments_of(f, step, at->data->z, place);
   for (int n = 0; n < f->points; n++) {
     const real weight = INTEGRAL_WEIGHT[n];
     real rate, derivative[RATE_DERIVATIVES];
@@ -95,17 +95,17 @@ static int linearise_step(linearised_step *at, const solver_options *options, re
   const step_data *step = at->step;
   const long long before = report->iterations;
   real dq[M], dp[2 * M] = {0}, size_p[SITES], size_q[M], *partials = at->partials;
-  int keep = 0, status = newton_from_line(step, &at->data, dp, &keep, options, report);
+  int keep = 0, status = newton_from_line(step, at->data, dp, &keep, options, report);
   if (status != OK)
     return status;
-  gather(END_POSITION, 1, step->h, at->data.z, M, dq, 0, 1);
-  if (is_spurious(step, at->data.z, dq, report->iterations - before))
+  gather(END_POSITION, 1, step->h, at->data->z, M, dq, 0, 1);
+  if (is_spurious(step, at->data->z, dq, report->iterations - before))
     return STATUS(SPURIOUS_SOLUTION);
-  evaluate(step, at->data.z, at->data.rows, size_p, size_q, at->data.factors, &at->shape);
-  if (!factorise(at->data.factors, &at->shape, at->data.pivot))
+  evaluate(step, at->data->z, at->data->rows, size_p, size_q, at->data->factors, &at->shape);
+  if (!factorise(at->data->factors, &at->shape, at->data->pivot))
     return SINGULAR;
   for (int f = 0; f < COUNT_OF_GROUPS; f++)
-    partials = derivatives_of_group(STAGE_GROUPS + f, step, at->data.z, partials);
+    partials = derivatives_of_group(STAGE_GROUPS + f, step, at->data->z, partials);
   for (int i = 0; i < M; i++)
     at->p1[i] = step->p0[i] + (dp[i] + dp[M + i]);
   for (int i = 0; q1 && i < M; i++) {
@@ -118,7 +118,7 @@ static int linearise_step(linearised_step *at, const solver_options *options, re
 /* From v (back: to it) to all rows, or from dz to the last one, that of p1, through all points. */
 static void through_points(const linearised_step *at, int back, wide *v, wide *dz)
 {
-  const step_change by = {at->step->h, at->growth, at->grown};
+  const step_change by = {.h = at->step->h, .growth = at->growth, .grown = at->grown};
   const real *partials = at->partials;
   for (int f = 0; f < COUNT_OF_GROUPS; f++)
     partials = through_group(STAGE_GROUPS + f, &by, back, partials, at->points, v, dz, at->rows);
@@ -129,7 +129,7 @@ static void solve_forward(const linearised_step *at)
 {
   for (int i = 0; i < N; i++)
     at->x[POSITION_IN_MATRIX[i / B] * B + i % B] = at->rows[i / B * (B + 1) + i % B];
-  solve_wide(at->data.factors, &at->shape, at->data.pivot, 0, at->x);
+  solve_wide(at->data->factors, &at->shape, at->data->pivot, 0, at->x);
   memset(at->dz, 0, sizeof(wide) * N);
   for (int i = 0; i < N; i++)
     propagate(0, at->dz + i, -1, at->x + POSITION_IN_MATRIX[i / B] * B + i % B);
@@ -141,7 +141,7 @@ static void solve_back(const linearised_step *at)
   memset(at->x, 0, sizeof(wide) * N);
   for (int i = 0; i < N; i++)
     propagate(1, at->dz + i, -1, at->x + POSITION_IN_MATRIX[i / B] * B + i % B);
-  solve_wide(at->data.factors, &at->shape, at->data.pivot, 1, at->x);
+  solve_wide(at->data->factors, &at->shape, at->data->pivot, 1, at->x);
   for (int i = 0; i < N; i++)
     at->rows[i / B * (B + 1) + i % B] = at->x[POSITION_IN_MATRIX[i / B] * B + i % B];
 }
@@ -149,7 +149,7 @@ static void solve_back(const linearised_step *at)
 /* Derivative of q1 with respect to q0, unknowns and h. */
 static void end_position(const linearised_step *at, int back)
 {
-  const real h = at->step->h, *z = at->data.z;
+  const real h = at->step->h, *z = at->data->z;
   for (int i = 0; i < M; i++)
     for (int b = 0; b < B; b++) {
       propagate(back, at->v + i, h * END_POSITION[b], at->dz + i * B + b);

@@ -13,7 +13,7 @@ enum {
 /* The solved step, its derivatives at the points, and memory for tangent or adjoint vectors. */
 typedef struct {
   const step_data *step;
-  newton_data data;
+  newton_data *data;
   band shape;
   real *partials;
   wide *v, *dz, *rows, *x, *points;

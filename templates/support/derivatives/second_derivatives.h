@@ -119,7 +119,7 @@ static const real *add_group_hessian(const stage_group *f, const linearised_step
   scatter_wide(f, h, at->growth, 1, 0, to->adjoints + first, at->rows);
   multiply_wide(f, 1, derivative, to->adjoints, to->adjoints + first);
   if (f->curvature)
-    arguments_of(f, at->step, at->data.z, to->u);
+    arguments_of(f, at->step, at->data->z, to->u);
   for (int n = 0; f->curvature && n < f->points; n++)
     for (int j = 0; j < WIDTH; j++)
       add_kernel_hessian(f, at->step, to, n, j);
@@ -207,7 +207,7 @@ int NAME(second_order)(long long steps, const real *t, const real *h, const real
   const long long across = (long long)count * STEP_INPUTS;
   memset(report, 0, sizeof *report);
   for (long long k = steps - 1; k >= 0; k--) {
-    const step_data step = {t[k], h[k], q + k * M, p + k * M, carry, carry, parameters, workspace, 1, NULL};
+    const step_data step = {.t = t[k], .h = h[k], .q0 = q + k * M, .p0 = p + k * M, .carry_q = carry, .carry_p = carry, .parameters = parameters, .scratch = workspace, .first = 1};
     linearised_step at = linearised_in(&step, workspace);
     int status;
     report->t = t[k];

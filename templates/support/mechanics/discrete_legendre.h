@@ -47,9 +47,9 @@ SELDOM int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q
   const solver_options standard = NAME(default_options)();
   const real carry_q[M] = {0};
   solver_report unread;
-  const newton_data data = newton_in(workspace + SCRATCH);
+  newton_data *data = newton_in(workspace + SCRATCH);
   real v[M], start_p[M], increment[M];
-  const step_data step = {t, h, q0, start_p, carry_q, carry_q, parameters, workspace, 1, NULL};
+  const step_data step = {.t = t, .h = h, .q0 = q0, .p0 = start_p, .carry_q = carry_q, .carry_p = carry_q, .parameters = parameters, .scratch = workspace, .first = 1};
   int keep = 0, status;
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
@@ -57,8 +57,8 @@ SELDOM int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q
     v[i] = (q1[i] - q0[i]) / h;
   status = NAME(momentum)(t, q0, v, parameters, start_p, workspace);
   if (status == OK) {
-    start_on_line(v, start_p, data.z);
-    status = newton(&step, &data, q1, start_p, increment, &keep, options ? options : &standard, report);
+    start_on_line(v, start_p, data->z);
+    status = newton(&step, data, q1, start_p, increment, &keep, options ? options : &standard, report);
   }
   if (status != OK)
     return status;
@@ -66,7 +66,7 @@ SELDOM int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q
     p0[i] = start_p[i];
     p1[i] = start_p[i] + increment[i];
   }
-  sums_along(&step, data.z, action);
+  sums_along(&step, data->z, action);
   return OK;
 }
 #else
@@ -78,19 +78,19 @@ SELDOM int NAME(work_and_impulses)(real t, real h, const real *q0, const real *p
 {
   const solver_options standard = NAME(default_options)();
   const real carry[M] = {0};
-  const newton_data data = newton_in(workspace + SCRATCH);
-  const step_data step = {t, h, q0, p0, carry, carry, parameters, workspace, 1, NULL};
+  newton_data *data = newton_in(workspace + SCRATCH);
+  const step_data step = {.t = t, .h = h, .q0 = q0, .p0 = p0, .carry_q = carry, .carry_p = carry, .parameters = parameters, .scratch = workspace, .first = 1};
   solver_report unread;
   real dq[M], dp[2 * M] = {0};
   int keep = 0, status;
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
   report->t = t;
-  status = newton_from_line(&step, &data, dp, &keep, options ? options : &standard, report);
+  status = newton_from_line(&step, data, dp, &keep, options ? options : &standard, report);
   if (status != OK)
     return status;
-  sums_along(&step, data.z, given);
-  gather(END_POSITION, 1, h, data.z, M, dq, 0, 1);
+  sums_along(&step, data->z, given);
+  gather(END_POSITION, 1, h, data->z, M, dq, 0, 1);
   if (!all_finite(given, SUMS) || !reaches(&step, dq, dp))
     return NOT_FINITE;
   for (int i = 0; i < M; i++) {

@@ -23,7 +23,7 @@ typedef struct {
 
 static movement no_movement(void)
 {
-  const movement none = {0, 0, 0, 0};
+  const movement none = {0};
   return none;
 }
 
@@ -41,22 +41,17 @@ static void measure(movement *moved, const real *change, const real *size)
   moved->absolute = larger(moved->absolute, largest_change);
 }
 
-/* Memory of Newton's method: unknowns; rows and their update; pivots and factors of the Jacobian. If factors are reused
- * in later steps (POINT > 0), `point` is where they were computed: t, q0 with its compensation, unknowns. */
+/* Workspace of Newton's method. */
 typedef struct {
-  real *z, *point, *rows, *update, *pivot, *factors;
+  real z[N]; /* unknowns */
+  real rows[N + SITES], update[N + SITES]; /* residuals of the equations, and the solution of the linear system */
+  real factors[JACOBIAN], pivot[N + SITES]; /* of the Jacobian */
+  real point[]; /* t, q0 with its compensation and z where the factors were computed, if they are reused (POINT > 0) */
 } newton_data;
 
-static newton_data newton_in(real *workspace)
+static newton_data *newton_in(real *workspace)
 {
-  newton_data data;
-  data.z = workspace;
-  data.point = data.z + N;
-  data.rows = data.point + POINT;
-  data.update = data.rows + N + SITES;
-  data.pivot = data.update + N + SITES;
-  data.factors = data.pivot + N + SITES;
-  return data;
+  return (newton_data *)workspace;
 }
 
 /* Stages of a straight line with velocity v and momentum p0; other unknowns are 0. */
@@ -69,7 +64,7 @@ static void start_on_line(const real *v, const real *p0, real *z)
 }
 
 /* z -= update, the solution with the current factors; p0 likewise, if it is not NULL. Measures the update. */
-static void apply_update(const newton_data *data, const band *shape, real h, real *p0, const real *size_p,
+static void apply_update(newton_data *data, const band *shape, real h, real *p0, const real *size_p,
     const real *size_q, movement *moved)
 {
   const int blocks = shape->rows / SITES;
@@ -118,7 +113,7 @@ static int has_converged(const solver_options *options, const movement *moved, i
 }
 
 /* Replaces the row of p1 - p0 by q0 + h sum_b beta_b z_b = q1, with p0 as a further unknown. */
-static void add_boundary(const step_data *step, const newton_data *data, const real *q1, int with_jacobian,
+static void add_boundary(const step_data *step, newton_data *data, const real *q1, int with_jacobian,
     const band *shape)
 {
   for (int i = 0; i < M; i++) {
@@ -137,7 +132,7 @@ static void add_boundary(const step_data *step, const newton_data *data, const r
 }
 
 /* Factorises the Jacobian and stores where it was evaluated. Returns 0 if it is singular. */
-static int linearise(const step_data *step, const newton_data *data, const band *shape)
+static int linearise(const step_data *step, newton_data *data, const band *shape)
 {
   if (POINT > 0) {
     data->point[0] = step->t;
@@ -151,7 +146,7 @@ static int linearise(const step_data *step, const newton_data *data, const band 
 /* Solves the stage equations from the initial guess in z; on success z and the increment p1 - p0 are consistent, on
  * failure they are undefined. The factors, of an earlier step if *keep, are reused as long as updates are small and
  * decrease fast. With an end position q1, p0 is unknown, too, and solved for in place. */
-static int newton(const step_data *step, const newton_data *data, const real *q1, real *p0, real *increment, int *keep,
+static int newton(const step_data *step, newton_data *data, const real *q1, real *p0, real *increment, int *keep,
     const solver_options *options, solver_report *report)
 {
   const band shape = band_of(SITES, q1 ? B + 1 : B);

@@ -6,7 +6,7 @@
 /* Newton's method without previous steps. Requires: newton.h. */
 
 /* Initial guess: q moves on a straight line with its initial velocity. */
-static int line_from(const step_data *step, const newton_data *data)
+static int line_from(const step_data *step, newton_data *data)
 {
   real v[M];
   const int status = NAME(velocity)(step->t, step->q0, step->p0, step->parameters, v, step->scratch);
@@ -16,7 +16,7 @@ static int line_from(const step_data *step, const newton_data *data)
 }
 
 /* Newton's method from that guess. */
-static int newton_from_line(const step_data *step, const newton_data *data, real *dp, int *keep,
+static int newton_from_line(const step_data *step, newton_data *data, real *dp, int *keep,
     const solver_options *options, solver_report *report)
 {
   const int status = line_from(step, data);

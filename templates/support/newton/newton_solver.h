@@ -17,7 +17,7 @@ static void prepare(const step_data *step, solver_data *data)
 }
 
 /* Recomputes the factors at a stored point, bit for bit; returns 0 if that fails. */
-static int remake_factors(const step_data *step, const real *point, const newton_data *data)
+static int remake_factors(const step_data *step, const real *point, newton_data *data)
 {
   const band shape = band_of(SITES, B);
   real size_p[SITES], size_q[M];
@@ -31,7 +31,7 @@ static int remake_factors(const step_data *step, const real *point, const newton
 }
 
 /* Extrapolates the unknowns of the previous step. */
-static void guess_from(const real *memory, const newton_data *data)
+static void guess_from(const real *memory, newton_data *data)
 {
   gather(EXTRAPOLATION[0], B, 1, memory, M, data->z, 1, B);
   gather(EXTRAPOLATION[SITES > M ? B : 0], B, 1, memory + M * B, SITES - M, data->z + M * B, 1, B);
@@ -44,31 +44,31 @@ static void guess_from(const real *memory, const newton_data *data)
 static int solve(const step_data *step, const solver_data *unused, real *memory, long long *guess, real *dq, real *dp,
     const solver_options *options, solver_report *report, real *workspace)
 {
-  const newton_data data = newton_in(workspace);
+  newton_data *data = newton_in(workspace);
   int status = NOT_CONVERGED, keep = 0;
   (void)unused;
   if (POINT > 0 && *guess == 2)
-    keep = step->first ? remake_factors(step, memory + N, &data) : 1;
+    keep = step->first ? remake_factors(step, memory + N, data) : 1;
 #ifdef RATTLE
   if (*guess)
-    guess_from(memory, &data);
-  if (*guess || line_from(step, &data) == OK)
-    status = rattle(step, &data, dp, options, report);
+    guess_from(memory, data);
+  if (*guess || line_from(step, data) == OK)
+    status = rattle(step, data, dp, options, report);
   keep = 0;
 #endif
   if (status != OK && *guess) {
-    guess_from(memory, &data);
-    status = newton(step, &data, NULL, NULL, dp, &keep, options, report);
+    guess_from(memory, data);
+    status = newton(step, data, NULL, NULL, dp, &keep, options, report);
   }
   if (status != OK)
-    status = newton_from_line(step, &data, dp, &keep, options, report);
+    status = newton_from_line(step, data, dp, &keep, options, report);
   if (status != OK)
     return status;
-  gather(END_POSITION, 1, step->h, data.z, M, dq, 0, 1);
+  gather(END_POSITION, 1, step->h, data->z, M, dq, 0, 1);
   if (!reaches(step, dq, dp))
     return NOT_FINITE;
-  memcpy(memory, data.z, sizeof(real) * N);
-  memcpy(memory + N, data.point, sizeof(real) * POINT);
+  memcpy(memory, data->z, sizeof(real) * N);
+  memcpy(memory + N, data->point, sizeof(real) * POINT);
   *guess = POINT > 0 && keep ? 2 : 1;
   return status;
 }

@@ -90,13 +90,13 @@ static void store_states(const state *now, int count, double *q, double *p)
 void NAME(advance)(block_memory *block, int count, long long steps, long long every, const solver_options *options,
     double *q, double *p, long long row_length)
 {
-  const solver_options standard = {TOLERANCE, MAX_ITERATIONS, 0};
+  const solver_options standard = {.tolerance = TOLERANCE, .max_iterations = MAX_ITERATIONS};
   state now;
   iteration_data data;
-  solver_report report = {block->active, 0};
+  solver_report report = {.active = block->active};
   lanes parameters[P + 1], memory[2][S][M];
   lanes dq[2 * M] = {{0.0}}, dp[2 * M] = {{0.0}}; /* increments, then their low words */
-  step_data step = {block->t, block->h, now.q, now.p, now.carry_q, now.carry_p, parameters};
+  step_data step = {.t = block->t, .h = block->h, .q0 = now.q, .p0 = now.p, .carry_q = now.carry_q, .carry_p = now.carry_p, .parameters = parameters};
   load_state(block, &now);
   memcpy(parameters, block->parameters, sizeof(lanes) * P);
   memcpy(memory, block->memory, sizeof memory);
