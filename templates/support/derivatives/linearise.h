@@ -18,7 +18,8 @@ typedef struct {
 
 static step_data step_of(const propagation *over, long long k, const real *nothing)
 {
-  const step_data step = {.t = over->t[k], .h = over->h[k], .q0 = over->q + k * M, .p0 = over->p + k * M, .carry_q = nothing, .carry_p = nothing, .parameters = over->parameters, .scratch = over->workspace, .first = 1};
+  const step_data step = step_from(over->t[k], over->h[k], over->q + k * M, over->p + k * M, nothing, nothing,
+      over->parameters, over->workspace);
   return step;
 }
 
@@ -155,7 +156,19 @@ int NAME(linearise)(long long steps, const real *t, const real *h, const real *q
     solver_report *report, real *workspace)
 {
   const solver_options standard = NAME(default_options)();
-  propagation over = {.t = t, .h = h, .q = q, .p = p, .parameters = parameters, .options = options ? options : &standard, .back = back, .count = count, .vectors = vectors, .q1 = q1, .p1 = p1, .workspace = workspace, .report = report};
+  propagation over = {.t = t,
+      .h = h,
+      .q = q,
+      .p = p,
+      .parameters = parameters,
+      .options = options ? options : &standard,
+      .back = back,
+      .count = count,
+      .vectors = vectors,
+      .q1 = q1,
+      .p1 = p1,
+      .workspace = workspace,
+      .report = report};
   int status = OK;
   memset(report, 0, sizeof *report);
   for (long long done = 0; status == OK && done < steps; done += STEPS_AT_ONCE) {

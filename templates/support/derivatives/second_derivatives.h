@@ -207,7 +207,7 @@ int NAME(second_order)(long long steps, const real *t, const real *h, const real
   const long long across = (long long)count * STEP_INPUTS;
   memset(report, 0, sizeof *report);
   for (long long k = steps - 1; k >= 0; k--) {
-    const step_data step = {.t = t[k], .h = h[k], .q0 = q + k * M, .p0 = p + k * M, .carry_q = carry, .carry_p = carry, .parameters = parameters, .scratch = workspace, .first = 1};
+    const step_data step = step_from(t[k], h[k], q + k * M, p + k * M, carry, carry, parameters, workspace);
     linearised_step at = linearised_in(&step, workspace);
     int status;
     report->t = t[k];

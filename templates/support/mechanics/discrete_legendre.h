@@ -49,7 +49,7 @@ SELDOM int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q
   solver_report unread;
   newton_data *data = newton_in(workspace + SCRATCH);
   real v[M], start_p[M], increment[M];
-  const step_data step = {.t = t, .h = h, .q0 = q0, .p0 = start_p, .carry_q = carry_q, .carry_p = carry_q, .parameters = parameters, .scratch = workspace, .first = 1};
+  const step_data step = step_from(t, h, q0, start_p, carry_q, carry_q, parameters, workspace);
   int keep = 0, status;
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
@@ -79,7 +79,7 @@ SELDOM int NAME(work_and_impulses)(real t, real h, const real *q0, const real *p
   const solver_options standard = NAME(default_options)();
   const real carry[M] = {0};
   newton_data *data = newton_in(workspace + SCRATCH);
-  const step_data step = {.t = t, .h = h, .q0 = q0, .p0 = p0, .carry_q = carry, .carry_p = carry, .parameters = parameters, .scratch = workspace, .first = 1};
+  const step_data step = step_from(t, h, q0, p0, carry, carry, parameters, workspace);
   solver_report unread;
   real dq[M], dp[2 * M] = {0};
   int keep = 0, status;

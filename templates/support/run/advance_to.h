@@ -21,13 +21,13 @@ int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long step
 {
   solver_options standard = NAME(default_options)();
   solver_report unread;
-  trial now = {.t_end = t_end,
-      .step = {.q0 = now.at.q, .p0 = now.at.p, .carry_q = now.at.carry_q, .carry_p = now.at.carry_p, .parameters = parameters, .scratch = workspace, .first = 1}};
+  trial now = {.t_end = t_end};
   begin_trials(run, &now, tolerance, &standard);
   run->direction = (t_end - run->t) - run->t_low < 0 ? -1 : 1;
   options = options ? options : &standard;
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
+  now.step = step_from(run->t, 0, now.at.q, now.at.p, now.at.carry_q, now.at.carry_p, parameters, workspace);
   load_state(run, &now.at);
   while (report->steps < steps && !has_arrived(now.at.t, now.at.t_low, t_end)) {
     const long long before = report->iterations;

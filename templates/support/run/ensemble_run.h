@@ -96,7 +96,13 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
   solver_report report = {.active = block->active};
   lanes parameters[P + 1], memory[2][S][M];
   lanes dq[2 * M] = {{0.0}}, dp[2 * M] = {{0.0}}; /* increments, then their low words */
-  step_data step = {.t = block->t, .h = block->h, .q0 = now.q, .p0 = now.p, .carry_q = now.carry_q, .carry_p = now.carry_p, .parameters = parameters};
+  step_data step = {.t = block->t,
+      .h = block->h,
+      .q0 = now.q,
+      .p0 = now.p,
+      .carry_q = now.carry_q,
+      .carry_p = now.carry_p,
+      .parameters = parameters};
   load_state(block, &now);
   memcpy(parameters, block->parameters, sizeof(lanes) * P);
   memcpy(memory, block->memory, sizeof memory);
