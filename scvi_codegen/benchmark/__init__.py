@@ -127,7 +127,7 @@ def benchmark(
         names: names of sections, by default all; ``kepler`` means ``kepler:0.2`` and ``kepler:0.5``.
         plan: settings of the measurement.
         json_path: file to write, after each section.
-        plot_path: file of the plot; for adaptive cases a second one, NAME-steps, shows step sizes along an orbit.
+        plot_path: file of the plot.
         resume: keep the sections of ``json_path`` that did not fail, and add others to them.
         report_activity: called with a description of each activity.
         show: called with the text of the report, section by section.
@@ -149,10 +149,6 @@ def benchmark(
         from scvi_codegen.benchmark.plots import plot_curves
 
         plot_curves(report.cases, plot_path)
-        if any(result.name.startswith("adaptive:") for result in report.cases):
-            from scvi_codegen.benchmark.plots import plot_step_sizes
-
-            plot_step_sizes(Path(plot_path).with_stem(f"{Path(plot_path).stem}-steps"))
     return report
 
 

@@ -96,6 +96,7 @@ EVIDENCE: tuple[str, ...] = (
     "theorem-4.2",
     "theorem-4.3",
     "section-4.3",
+    "correction",
 )
 """Experiments whose checks are collected."""
 

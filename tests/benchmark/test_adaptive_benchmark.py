@@ -13,7 +13,6 @@ from scvi_codegen import benchmark as bench
 from scvi_codegen.benchmark import adaptive
 from scvi_codegen.benchmark.cases.adaptive import ADAPTIVE_CASES, adaptive_case
 from scvi_codegen.benchmark.cases.references import field_of, final_states, states_after
-from scvi_codegen.benchmark.plots import plot_step_sizes, step_sizes
 from scvi_codegen.errors import StateError
 from scvi_codegen.native import building
 
@@ -108,15 +107,6 @@ def test_all_modes_run_and_agree():
     for each in tight:
         assert np.abs(each.prepare(3)() - exact.high[3]).max() < 1e-12
     assert all(f"adaptive:{name}" in bench.SECTIONS for name in ADAPTIVE_CASES)
-
-
-def test_plotted_steps_follow_the_motion(tmp_path):
-    for name, (t, lengths) in step_sizes().items():
-        assert len(t) == len(lengths) > 20, name
-        assert lengths.max() > 8.0 * lengths.min()
-    pytest.importorskip("matplotlib")
-    plot_step_sizes(tmp_path / "steps.svg")
-    assert (tmp_path / "steps.svg").stat().st_size > 1000
 
 
 @pytest.mark.full

@@ -94,11 +94,6 @@ def test_the_printed_iterations_are_those_of_the_paper():
     assert sum(count.converged for count in iteration_counts.printed_counts(9).values()) == 24
 
 
-def test_full_newton_needs_four_iterations_a_step():
-    used = iteration_counts.newton_counts(orbits.SYSTEM, SVI(5), *orbits.perihelion(0.2), h=0.5, steps=200)
-    assert (max(used), sum(used)) == (4, 800)
-
-
 def test_iterations_of_the_compiled_solvers():
     fixed, newton = (iteration_counts.compiled_count(0.2, 0.5, 5, "SVI", solver) for solver in iterations.SOLVERS)
     assert fixed.total == pytest.approx(1354, rel=0.05)

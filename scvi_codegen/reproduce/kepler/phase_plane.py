@@ -14,7 +14,6 @@ from scvi_codegen.methods import Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.methods.method import Method
 from scvi_codegen.reproduce.kepler.many_points import (
     ECCENTRICITY,
-    FORMS,
     PRESERVED,
     PRINTED,
     STEP,
@@ -23,8 +22,6 @@ from scvi_codegen.reproduce.kepler.many_points import (
     Orbit,
     orbit_of,
     shooting,
-    structure_check,
-    structure_table,
 )
 from scvi_codegen.reproduce.kepler.orbits import ellipse
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
@@ -74,9 +71,8 @@ def _figure_27(_: Mapping[str, Result]) -> Result:
             _kept_check(orbits, [name for name in orbits if name not in ("SC", PRINTED_NAME)]),
             _kept_check(orbits, [PRINTED_NAME], _with_less_eccentricity()),
             _sc_check(orbits["SC"]),
-            *(structure_check(FOUR_POINTS[0], FOUR_POINTS[1:], form) for form in FORMS),
         ),
-        tables=(_orbits_table(orbits), structure_table(FOUR_POINTS[0], (2, 3, 4))),
+        tables=(_orbits_table(orbits),),
         picture=Picture(draw=partial(_draw_phases, orbits=_phases(orbits)), width=11.0, height=7.6),
     )
 

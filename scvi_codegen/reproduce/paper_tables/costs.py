@@ -8,7 +8,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +18,8 @@ from scvi_codegen.methods import Gauss, SpectralCollocation
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import duffing, planar_pendulum
-from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
-    Picture,
     Result,
     TableBlock,
     Verdict,
@@ -32,10 +29,6 @@ from scvi_codegen.reproduce.laboratory.experiment import (
 )
 from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, SECTION_3, steps_in
 from scvi_codegen.runtime.core.stepper import Stepper
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 ROUNDS = 15
 """Number of timed runs of each scheme, in turn with the others."""
@@ -178,7 +171,6 @@ def _result(setting: Setting, _: Mapping[str, Result]) -> Result:
         ),
         checks=tuple(_checks(setting, result)),
         tables=(_table(setting, result),),
-        picture=Picture(draw=partial(draw_costs, _bars(setting, result)), width=9.0, height=3.8),
     )
 
 
@@ -197,46 +189,20 @@ def _table(setting: Setting, result: Mapping[str, Cost]) -> TableBlock:
         ),
         rows=tuple(
             (
-                one.scheme,
-                one.method,
+                scheme,
+                setting.methods[scheme].name,
                 1e3 * cost.seconds,
-                one.ratio,
-                setting.seconds[one.scheme],
-                one.printed,
+                cost.seconds / result["SRK"].seconds,
+                setting.seconds[scheme],
+                setting.seconds[scheme] / setting.seconds["SRK"],
                 cost.energy,
                 cost.position,
                 1e3 * cost.seconds_a_digit if cost.position < 1.0 else None,
             )
-            for one, cost in zip(_bars(setting, result), result.values(), strict=True)
+            for scheme, cost in result.items()
         ),
         formats={"over SRK": ".2f", "s (paper)": ".2f", "over SRK (paper)": ".2f"}
         | {"energy error": ".1e", "position error": ".1e"},
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class Bars:
-    """Data of a scheme in the picture: times relative to SRK, errors."""
-
-    scheme: str
-    method: str
-    ratio: float
-    printed: float
-    energy: float
-    position: float
-
-
-def _bars(setting: Setting, result: Mapping[str, Cost]) -> tuple[Bars, ...]:
-    return tuple(
-        Bars(
-            scheme=scheme,
-            method=setting.methods[scheme].name,
-            ratio=cost.seconds / result["SRK"].seconds,
-            printed=setting.seconds[scheme] / setting.seconds["SRK"],
-            energy=cost.energy,
-            position=cost.position,
-        )
-        for scheme, cost in result.items()
     )
 
 
@@ -290,25 +256,6 @@ def _of_a_digit(cost: Cost) -> str:
 def _cheaper(ratio: float) -> Verdict:
     """Return the verdict for a ratio of times; in part if the times are equal."""
     return Verdict.PARTLY if abs(ratio - 1.0) <= SAME else holds(ratio < 1.0)
-
-
-def draw_costs(bars: Sequence[Bars], figure: Figure) -> None:
-    """Draw times relative to SRK, measured and printed, and errors."""
-    left, right = panels(figure, 1, 2)
-    colors = [COLORS[one.scheme] for one in bars]
-    _draw_pairs(left, [one.ratio for one in bars], [one.printed for one in bars], colors)
-    left.set(title="time over that of SRK (pale: as printed)")
-    _draw_pairs(right, [one.energy for one in bars], [one.position for one in bars], colors)
-    right.set(title="relative error: largest of energy, of final position (pale)", yscale="log")
-    for axes in (left, right):
-        axes.margins(y=0.12)
-        axes.set_xticks(range(len(bars)), [f"{one.scheme}\n{one.method}" for one in bars], fontsize=7)
-
-
-def _draw_pairs(axes: Axes, dark: Sequence[float], pale: Sequence[float], colors: Sequence[str]) -> None:
-    for heights, shift, alpha in ((dark, -0.2, 1.0), (pale, 0.2, 0.35)):
-        drawn = axes.bar(np.arange(len(heights)) + shift, heights, 0.36, color=colors, alpha=alpha)
-        axes.bar_label(drawn, fmt="{:.2g}", fontsize=7)
 
 
 for setting in SETTINGS.values():

@@ -6,22 +6,16 @@ import math
 import statistics
 from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from scvi_codegen.reproduce.kepler.orbits import SYSTEM, perihelion
-from scvi_codegen.reproduce.laboratory.drawing import panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
-    Picture,
     Result,
     TableBlock,
     Verdict,
     experiment,
     holds,
 )
-from scvi_codegen.reproduce.laboratory.running import BY_DEGREE, BY_POINTS, READINGS, SECTION_3, steps_in
+from scvi_codegen.reproduce.laboratory.running import BY_DEGREE, BY_POINTS, READINGS, SECTION_3
 from scvi_codegen.reproduce.paper_tables.iteration_counts import (
     ECCENTRICITY,
     SPAN,
@@ -29,15 +23,9 @@ from scvi_codegen.reproduce.paper_tables.iteration_counts import (
     Counts,
     agreement,
     compiled_counts,
-    newton_counts,
     picard_counts,
     printed_counts,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
 
 PICARD = "Picard, by points"
 """Iteration on which verdicts are based."""
@@ -47,8 +35,6 @@ AS_PRINTED = 0.9
 """Least share of cells that converge or fail as printed for a table to count as reproduced."""
 LARGE = 2.0
 """Least step size that counts as large."""
-EXAMPLE = (0.5, 5, "SVI")
-"""Setting that is also solved by Newton's method in Python."""
 
 
 def _all_counts(number: int) -> dict[str, Counts]:
@@ -82,10 +68,8 @@ def table(number: int, _: Mapping[str, Result]) -> Result:
             _dashes(number, printed),
             *(_faster(name, result[name]) for name in result if name != "Picard, by degree"),
             *(_stabler(name, result[name]) for name in result if name != "Picard, by degree"),
-            _example(number, printed, result),
         ),
         tables=(_counts_table(printed, result), _tolerances(number, printed)),
-        picture=Picture(draw=partial(draw_counts, {"as printed": printed} | result), width=9.0, height=11.5),
     )
 
 
@@ -190,72 +174,6 @@ def _sound(result: Counts, least: float) -> tuple[int, int]:
     """Return the number of settings with h >= least at which SC, and at which SVI, remains bound."""
     pairs = [(sc.sound, svi.sound) for h, sc, svi in _pairs(result) if h >= least]
     return sum(sc for sc, _ in pairs), sum(svi for _, svi in pairs)
-
-
-def _example(number: int, printed: Counts, result: Mapping[str, Counts]) -> Comparison:
-    h, n, scheme = EXAMPLE
-    ours = "; ".join(f"{_text(counts[EXAMPLE])} by '{name}'" for name, counts in result.items())
-    method, start = BY_POINTS.method(scheme, n), perihelion(ECCENTRICITY[number])
-    full = newton_counts(SYSTEM, method, *start, h=h, steps=steps_in(SPAN, h))
-    return Comparison(
-        claim=f"SVI with N = {n} and h = {h} needs {_text(printed[EXAMPLE])} iterations (largest/all).",
-        measured=f"{ours}; Newton's method in full, N points, each step from the straight line, until |dQ| < 1e-14: "
-        f"{max(full)}/{sum(full)}.",
-        verdict=Verdict.SHOWN,
-    )
-
-
-def _text(count: Count) -> str:
-    return f"{count.largest}/{count.total}" if count.converged else "-"
-
-
-CENTRED: Mapping[str, Any] = {"ha": "center", "va": "center", "fontsize": 7}
-
-
-NOTE = "; in brackets: converged, energy error above 100 %"
-
-
-def draw_counts(tables: Mapping[str, Counts], figure: Figure) -> None:
-    """Draw the tables one below the other: colour is iterations per step, grey is failure."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import LogNorm
-
-    norm, where = LogNorm(3.0, 100.0), panels(figure, len(tables), 1)
-    for axes, (title, result) in zip(where, tables.items(), strict=True):
-        _draw_tiles(axes, result, norm)
-        axes.set_title(
-            f"{title}: largest number of iterations in a step / all"
-            + (NOTE if any(_lost(count) for count in result.values()) else "")
-        )
-    figure.colorbar(ScalarMappable(norm, "YlOrRd"), ax=where, label="iterations a step", shrink=0.6)
-
-
-def _lost(count: Count) -> bool:
-    return count.converged and count.energy >= 1.0
-
-
-def _draw_tiles(axes: Axes, result: Counts, norm: LogNorm) -> None:
-    from matplotlib import colormaps
-
-    steps = list(dict.fromkeys(h for h, _, _ in result))
-    columns = list(dict.fromkeys((n, scheme) for _, n, scheme in result))
-    colors = np.full((len(steps), len(columns), 4), (0.93, 0.93, 0.93, 1.0))
-    for (h, n, scheme), count in result.items():
-        y, x, shade = steps.index(h), columns.index((n, scheme)), 0.0
-        if count.total is not None:
-            shade = norm(count.total / steps_in(SPAN, h))
-            colors[y, x] = colormaps["YlOrRd"](shade)
-        axes.annotate(
-            f"({_text(count)})" if _lost(count) else _text(count),
-            (x, y),
-            color="#fefefe" if shade > 0.65 else "#111111",
-            **CENTRED,
-        )
-    axes.imshow(colors, aspect="auto")
-    axes.set_xticks(range(len(columns)), [f"{scheme}\nN = {n}" for n, scheme in columns], fontsize=7)
-    axes.set_yticks(range(len(steps)), [f"h = {h:g}" for h in steps])
-    axes.tick_params(length=0)
-    axes.grid(False)
 
 
 experiment("table-8", "Number of iterations, Kepler problem, e = 0.2")(partial(table, 8))

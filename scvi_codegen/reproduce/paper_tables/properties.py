@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
-from typing import TYPE_CHECKING
+from functools import lru_cache
 
 from scvi_codegen.methods.collocation import SpectralCollocation
-from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
-    Picture,
     Result,
     TableBlock,
     Verdict,
@@ -27,10 +24,6 @@ from scvi_codegen.tables.tableau import (
     radau_ia,
     radau_iia,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Patch
 
 MOST_STAGES = 9
 FAMILIES: Mapping[str, tuple[Callable[[int], Tableau], int, str]] = {
@@ -102,7 +95,6 @@ def table_4(results: Mapping[str, Result]) -> Result:
         ),
         checks=(*(_mark_check(name, result) for name in MARKS), _collocation_check(result), _stability_check(result)),
         tables=(_property_table(result),),
-        picture=Picture(draw=partial(draw_marks, result), width=9.0, height=5.2),
     )
 
 
@@ -172,24 +164,3 @@ def _listed(stages: Sequence[int]) -> str:
 
 def _joined(names: Sequence[str]) -> str:
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
-
-
-def draw_marks(result: Sequence[Properties], figure: Figure) -> None:
-    """Draw a panel for each property: families down, stages across, a filled square where it holds."""
-    families = list(dict.fromkeys(one.family for one in result))
-    for axes, name in zip(panels(figure, 2, 2), MARKS, strict=True):
-        for one in result:
-            color = COLORS["SRK"] if one.marks[name] else "#eeeeee"
-            axes.add_patch(_square(one.stages, families.index(one.family), color))
-        axes.set(xlim=(0.5, MOST_STAGES + 0.5), ylim=(len(families) - 0.5, -0.5), title=name)
-        axes.set_xticks(range(1, MOST_STAGES + 1))
-        axes.set_yticks(range(len(families)), families)
-        axes.set_xlabel("stages")
-        axes.tick_params(length=0)
-        axes.grid(False)
-
-
-def _square(x: float, y: float, color: str) -> Patch:
-    from matplotlib.patches import Rectangle
-
-    return Rectangle((x - 0.42, y - 0.42), 0.84, 0.84, facecolor=color, edgecolor="none")
