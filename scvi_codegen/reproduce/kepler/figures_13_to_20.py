@@ -15,16 +15,18 @@ from numpy.typing import NDArray
 
 from scvi_codegen.methods import SVI, SpectralCollocation
 from scvi_codegen.reproduce.kepler.orbits import (
-    SYSTEM,
+    Orbit,
     angular_momentum,
     draw_ellipse,
+    draw_invariant,
     draw_states,
     exact_flow,
     off_ellipse,
+    orbit_of,
     perihelion,
-    perihelion_turn,
+    time_series,
 )
-from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels
+from scvi_codegen.reproduce.laboratory.drawing import draw_error, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
     Picture,
@@ -32,9 +34,8 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     TableBlock,
     experiment,
     holds,
-    series_table,
 )
-from scvi_codegen.reproduce.laboratory.running import trajectory
+from scvi_codegen.reproduce.laboratory.running import SECTION_3
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -68,27 +69,23 @@ class Numbers:
     position: float
 
 
-@lru_cache(maxsize=8)
-def _run(scheme: str, degree: int = DEGREE) -> tuple[Array, Array, Array, Array]:
-    """Return (t, q, p, energy) over the whole span."""
+def _orbit(scheme: str, degree: int = DEGREE) -> Orbit:
     method = SVI(degree) if scheme == "SVI" else SpectralCollocation(degree)
-    result = trajectory(SYSTEM, method, *perihelion(ECCENTRICITY), h=STEP, span=SPAN)
-    return result.t, result.q, result.p, result.energy()
+    return orbit_of(method, STEP, SPAN, ECCENTRICITY, SECTION_3)
 
 
 @lru_cache(maxsize=8)
 def numbers(scheme: str, degree: int = DEGREE) -> Numbers:
-    """Return the errors of :func:`_run`."""
-    t, q, p, energy = _run(scheme, degree)
-    momentum = angular_momentum(q, p)
-    exact, _ = exact_flow(*perihelion(ECCENTRICITY), t[-1])
+    """Return the errors of a scheme over the whole span."""
+    orbit = _orbit(scheme, degree)
+    exact, _ = exact_flow(*perihelion(ECCENTRICITY), orbit.end)
     return Numbers(
-        float(np.abs(energy - energy[0]).max()),
-        float(energy[-1] - energy[0]),
-        float(np.abs(momentum - momentum[0]).max()),
-        float(np.abs(off_ellipse(q, ECCENTRICITY)).max()),
-        perihelion_turn(q, p),
-        float(np.hypot(*(q[-1] - exact[0]))),
+        orbit.largest[0],
+        float(orbit.energy[-1]),
+        orbit.largest[1],
+        float(np.abs(off_ellipse(orbit.run.q, ECCENTRICITY)).max()),
+        orbit.turn,
+        float(np.hypot(*(orbit.run.q[-1] - exact[0]))),
     )
 
 
@@ -101,11 +98,6 @@ def _table() -> TableBlock:
             for scheme, degree, n in rows
         ),
     )
-
-
-def _series(column: str, values: Mapping[str, Array]) -> TableBlock:
-    named = {f"{column} {scheme}": series.tolist() for scheme, series in values.items()}
-    return series_table({"t": _run("SVI")[0].tolist(), **named})
 
 
 @experiment("figure-13", "Kepler, e = 0.5: orbits of SVI and SC over 318 revolutions")
@@ -133,7 +125,11 @@ def _figure_13(_: Mapping[str, Result]) -> Result:
             ),
         ),
         tables=(_table(),),
-        picture=Picture(draw=partial(_draw_orbits, runs={s: _run(s)[:2] for s in SCHEMES}), width=12.0, height=4.2),
+        picture=Picture(
+            draw=partial(_draw_orbits, runs={s: (_orbit(s).run.t, _orbit(s).run.q) for s in SCHEMES}),
+            width=12.0,
+            height=4.2,
+        ),
     )
 
 
@@ -150,60 +146,47 @@ def _draw_orbits(figure: Figure, runs: Mapping[str, tuple[Array, Array]]) -> Non
     distance.legend(loc="center right")
 
 
+def _invariant(name: str, values: Mapping[str, Array], check: Comparison) -> Result:
+    columns = {f"{name} {scheme}": series for scheme, series in values.items()}
+    t = _orbit("SVI").run.t
+    return Result(
+        title=f"Kepler two body, {name}",
+        setting=SETTING,
+        checks=(check,),
+        tables=(_table(), time_series(t, columns)),
+        picture=Picture(draw=partial(draw_invariant, t=t, values=values, name=name)),
+    )
+
+
 @experiment("figure-14", "Kepler, e = 0.5: energy of SVI and SC over 318 revolutions")
 def _figure_14(_: Mapping[str, Result]) -> Result:
     svi, sc = numbers("SVI"), numbers("SC")
-    energies = {scheme: _run(scheme)[3] for scheme in SCHEMES}
-    return Result(
-        title="Kepler two body, energy",
-        setting=SETTING,
-        checks=(
-            Comparison(
-                claim="SVI preserves the energy very well, while it drifts with SC.",
-                measured=(
-                    f"Largest error: SVI {svi.energy:.1e}, SC {sc.energy:.1e}; at T = 2000 SC has "
-                    f"{-0.5 + sc.last_energy:.5f} for -0.5, and its error there is "
-                    f"{abs(sc.last_energy) / sc.energy:.0%} of the largest: it grows all the time."
-                ),
-                verdict=holds(svi.energy < 1e-6 < sc.energy and abs(sc.last_energy) > 0.9 * sc.energy),
-                bears_on=("accuracy", "long-time"),
+    return _invariant(
+        "energy",
+        {scheme: _orbit(scheme).run.energy() for scheme in SCHEMES},
+        Comparison(
+            claim="SVI preserves the energy very well, while it drifts with SC.",
+            measured=(
+                f"Largest error: SVI {svi.energy:.1e}, SC {sc.energy:.1e}; at T = 2000 SC has "
+                f"{-0.5 + sc.last_energy:.5f} for -0.5, and its error there is "
+                f"{abs(sc.last_energy) / sc.energy:.0%} of the largest: it grows all the time."
             ),
+            verdict=holds(svi.energy < 1e-6 < sc.energy and abs(sc.last_energy) > 0.9 * sc.energy),
+            bears_on=("accuracy", "long-time"),
         ),
-        tables=(_table(), _series("energy", energies)),
-        picture=Picture(draw=partial(_draw_invariant, t=_run("SVI")[0], values=energies, name="energy")),
     )
 
 
 @experiment("figure-15", "Kepler, e = 0.5: angular momentum of SVI and SC over 318 revolutions")
 def _figure_15(_: Mapping[str, Result]) -> Result:
     svi, sc = numbers("SVI"), numbers("SC")
-    momenta = {scheme: angular_momentum(*_run(scheme)[1:3]) for scheme in SCHEMES}
-    return Result(
-        title="Kepler two body, momentum",
-        setting=SETTING,
-        checks=(
-            Comparison(
-                claim="SVI preserves the momentum very well, while it drifts with SC.",
-                measured=f"Largest error: SVI {svi.momentum:.1e}, which is round-off, SC {sc.momentum:.1e}.",
-                verdict=holds(svi.momentum < ROUNDOFF_OF_A_RUN and sc.momentum > 1e-6),
-                bears_on=("accuracy", "long-time"),
-            ),
+    return _invariant(
+        "momentum",
+        {scheme: angular_momentum(_orbit(scheme).run.q, _orbit(scheme).run.p) for scheme in SCHEMES},
+        Comparison(
+            claim="SVI preserves the momentum very well, while it drifts with SC.",
+            measured=f"Largest error: SVI {svi.momentum:.1e}, which is round-off, SC {sc.momentum:.1e}.",
+            verdict=holds(svi.momentum < ROUNDOFF_OF_A_RUN and sc.momentum > 1e-6),
+            bears_on=("accuracy", "long-time"),
         ),
-        tables=(_table(), _series("momentum", momenta)),
-        picture=Picture(draw=partial(_draw_invariant, t=_run("SVI")[0], values=momenta, name="angular momentum")),
     )
-
-
-def _draw_invariant(figure: Figure, t: Array, values: Mapping[str, Array], name: str) -> None:
-    """Draw an invariant as in the paper, and its error on a logarithmic axis."""
-    left, right = panels(figure, 1, 2)
-    every = 4
-    for scheme in reversed(SCHEMES):
-        series = values[scheme]
-        left.plot(t[::every], series[::every], color=COLORS[scheme], label=scheme, linewidth=0.8)
-        draw_error(right, t, series - series[0], scheme)
-    left.set(title=name, xlabel="t", ylabel=name)
-    right.set(title=f"error of the {name}", xlabel="t", ylabel="|error|, largest in each bin")
-    left.ticklabel_format(useOffset=False)
-    left.legend(loc="lower left")
-    right.legend(loc="center right")

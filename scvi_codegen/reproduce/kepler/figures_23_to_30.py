@@ -15,18 +15,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import StepFailedError
 from scvi_codegen.methods import SCVI, SpectralCollocation
 from scvi_codegen.reproduce.kepler.orbits import (
     SYSTEM,
+    Orbit,
     angular_momentum,
     draw_ellipse,
-    draw_states,
+    draw_invariant,
+    draw_orbits,
+    orbit_of,
     perihelion,
-    perihelion_turn,
     revolutions,
+    time_series,
 )
-from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels
+from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
     Picture,
@@ -34,9 +36,8 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     TableBlock,
     experiment,
     holds,
-    series_table,
 )
-from scvi_codegen.reproduce.laboratory.running import SECTION_4, stepper_of, trajectory
+from scvi_codegen.reproduce.laboratory.running import SECTION_4, stepper_of
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -89,6 +90,7 @@ def _figure_23(_: Mapping[str, Result]) -> Result:
     first, last = parts[0], parts[-1]
     change = max(abs(last.lowest - first.lowest), abs(last.highest - first.highest)) / (first.highest - first.lowest)
     momentum = max(part.momentum for part in parts)
+    runs = {f"steps {a} to {b}": (part.q, "SCVI") for (a, b), part in zip(SEGMENTS, parts, strict=True)}
     return Result(
         title="Orbit of the Kepler problem computed using SCVI with 2 collocation points",
         setting=("Kepler's problem, e = 0.5, from the perihelion, h = pi/20, T = 20000 pi: 400000 steps.", QUADRATURE),
@@ -111,17 +113,8 @@ def _figure_23(_: Mapping[str, Result]) -> Result:
                 formats={"first step": "d", "last step": "d", "lowest energy": ".6f", "highest energy": ".6f"},
             ),
         ),
-        picture=Picture(draw=partial(_draw_segments, runs=[part.q for part in parts]), width=11.0, height=4.0),
+        picture=Picture(draw=partial(draw_orbits, runs=runs, rows=1, e=ECCENTRICITY), width=11.0, height=4.0),
     )
-
-
-def _draw_segments(figure: Figure, runs: list[Array]) -> None:
-    for axes, (first, last), q in zip(panels(figure, 1, 3), SEGMENTS, runs, strict=True):
-        draw_states(axes, q, "SCVI")
-        draw_ellipse(axes, ECCENTRICITY)
-        axes.set(title=f"steps {first} to {last}", xlabel="$q_1$", ylabel="$q_2$", aspect="equal")
-        axes.set(xlim=(-1.6, 1.6), ylim=(-1.6, 1.6))
-        axes.legend(loc="upper right")
 
 
 # Figs. 24-26: SCVI with two points, SC with three.
@@ -137,9 +130,8 @@ FACTOR = 2.5, 3.0
 """Range of factors that counts as "almost three"."""
 
 
-@lru_cache(maxsize=2)
-def _run(scheme: str) -> Trajectory:
-    return trajectory(SYSTEM, COMPARED[scheme], *perihelion(ECCENTRICITY), h=STEP, span=SPAN, options=SECTION_4)
+def _orbit(scheme: str) -> Orbit:
+    return orbit_of(COMPARED[scheme], STEP, SPAN, ECCENTRICITY)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,27 +158,16 @@ class Periods:
 @lru_cache(maxsize=2)
 def periods(scheme: str) -> Periods:
     """Return the periods of ``"SCVI"`` with two points or of ``"SC"`` with three."""
-    run = _run(scheme)
-    durations = revolutions(run.t, run.q, run.p)
-    energy = float(run.energy()[-1])
-    return Periods(
-        float(durations[0]),
-        float(durations[-1]),
-        2 * math.pi / (-2 * energy) ** 1.5,
-        perihelion_turn(run.q, run.p),
-    )
+    orbit = _orbit(scheme)
+    durations = revolutions(orbit.run.t, orbit.run.q, orbit.run.p)
+    energy = float(orbit.run.energy()[-1])
+    return Periods(float(durations[0]), float(durations[-1]), 2 * math.pi / (-2 * energy) ** 1.5, orbit.turn)
 
 
-@lru_cache(maxsize=1)
 def two_points_fail_at() -> tuple[float, float]:
     """Return (time, energy) of the last state of SC with two points; the end of the span if it succeeds."""
-    try:
-        run = trajectory(
-            SYSTEM, SpectralCollocation(1), *perihelion(ECCENTRICITY), h=STEP, span=SPAN, options=SECTION_4
-        )
-    except StepFailedError as failure:
-        run = Trajectory.before(failure)
-    return float(run.t[-1]), float(run.energy()[-1])
+    orbit = orbit_of(SpectralCollocation(1), STEP, SPAN, ECCENTRICITY)
+    return orbit.end, float(orbit.run.energy()[-1])
 
 
 @experiment("figure-24", "Kepler: orbits of SCVI with two points, SC with three")
@@ -236,7 +217,9 @@ def _figure_24(_: Mapping[str, Result]) -> Result:
             ),
         ),
         picture=Picture(
-            draw=partial(_draw_periods, runs={scheme: (_run(scheme).t, _run(scheme).q) for scheme in COMPARED}),
+            draw=partial(
+                _draw_periods, runs={scheme: (_orbit(scheme).run.t, _orbit(scheme).run.q) for scheme in COMPARED}
+            ),
             width=9.0,
             height=7.6,
         ),
@@ -261,8 +244,9 @@ def _draw_periods(figure: Figure, runs: Mapping[str, tuple[Array, Array]]) -> No
 
 @experiment("figure-25", "Kepler: momentum of SCVI with two points, SC with three")
 def _figure_25(_: Mapping[str, Result]) -> Result:
-    momenta = {scheme: angular_momentum(_run(scheme).q, _run(scheme).p) for scheme in COMPARED}
-    error = {scheme: float(np.abs(m - m[0]).max()) for scheme, m in momenta.items()}
+    momenta = {scheme: angular_momentum(_orbit(scheme).run.q, _orbit(scheme).run.p) for scheme in COMPARED}
+    error = {scheme: _orbit(scheme).largest[1] for scheme in COMPARED}
+    t = _orbit("SC").run.t / (2 * math.pi)
     return Result(
         title="Kepler problem, momentum of SCVI with 2 collocation points and of SC with 3",
         setting=SETTING,
@@ -277,28 +261,16 @@ def _figure_25(_: Mapping[str, Result]) -> Result:
                 bears_on=("scvi-structure",),
             ),
         ),
-        tables=(_series({f"momentum {scheme}": m for scheme, m in momenta.items()}),),
-        picture=Picture(draw=partial(_draw_momenta, t=_run("SC").t, momenta=momenta)),
+        tables=(time_series(_orbit("SC").run.t, {f"momentum {scheme}": m for scheme, m in momenta.items()}),),
+        picture=Picture(draw=partial(draw_invariant, t=t, values=momenta, name="momentum", unit="in periods")),
     )
-
-
-def _draw_momenta(figure: Figure, t: Array, momenta: Mapping[str, Array]) -> None:
-    left, right = panels(figure, 1, 2)
-    for scheme, series in momenta.items():
-        left.plot(t / (2 * math.pi), series, color=COLORS[scheme], label=scheme)
-        draw_error(right, t / (2 * math.pi), series - series[0], scheme)
-    left.set(title="angular momentum", xlabel="t, in periods", ylabel="angular momentum")
-    right.set(title="its error", xlabel="t, in periods", ylabel="|error|, largest in each bin")
-    left.legend(loc="lower left")
-    right.legend(loc="center right")
 
 
 @experiment("figure-26", "Kepler: energies of SCVI with two points, SC with three")
 def _figure_26(_: Mapping[str, Result]) -> Result:
     energies = {scheme: _energies(scheme) for scheme in COMPARED}
-    error = {scheme: np.abs(parts["total"] - parts["total"][0]) for scheme, parts in energies.items()}
-    half = len(error["SCVI"]) // 2
-    early, late = float(error["SCVI"][:half].max()), float(error["SCVI"][half:].max())
+    early, late = _orbit("SCVI").halves()
+    columns = {f"{part} {s}": series for s, parts in energies.items() for part, series in parts.items()}
     return Result(
         title="Kepler problem, energy of SCVI with 2 collocation points and of SC with 3",
         setting=SETTING,
@@ -309,17 +281,17 @@ def _figure_26(_: Mapping[str, Result]) -> Result:
                     f"Largest error of SCVI: {early:.2e} in the first half, {late:.2e} in the second. SC ends with "
                     f"{energies['SC']['total'][-1]:.3f} for -0.5."
                 ),
-                verdict=holds(late < 1.1 * early and error["SC"][-1] > 0.1),
+                verdict=holds(late < 1.1 * early and abs(_orbit("SC").energy[-1]) > 0.1),
                 bears_on=("scvi-structure",),
             ),
         ),
-        tables=(_series({f"{part} {s}": series for s, parts in energies.items() for part, series in parts.items()}),),
-        picture=Picture(draw=partial(_draw_energies, t=_run("SC").t, energies=energies), height=4.6),
+        tables=(time_series(_orbit("SC").run.t, columns),),
+        picture=Picture(draw=partial(_draw_energies, t=_orbit("SC").run.t, energies=energies), height=4.6),
     )
 
 
 def _energies(scheme: str) -> dict[str, Array]:
-    run = _run(scheme)
+    run = _orbit(scheme).run
     kinetic = (run.p**2).sum(axis=1) / 2
     return {"total": run.energy(), "kinetic": kinetic, "potential": run.energy() - kinetic}
 
@@ -334,7 +306,3 @@ def _draw_energies(figure: Figure, t: Array, energies: Mapping[str, Mapping[str,
             axes.plot(t / (2 * math.pi), series, STYLES[part], color=COLORS[scheme], linewidth=width, label=part)
         axes.set(title=f"energy of {scheme}", xlabel="t, in periods", ylabel="energy", ylim=(-2.6, 2.6))
         axes.legend(loc="upper left", ncols=3)
-
-
-def _series(columns: Mapping[str, Array]) -> TableBlock:
-    return series_table({"t": _run("SC").t.tolist(), **{key: series.tolist() for key, series in columns.items()}})

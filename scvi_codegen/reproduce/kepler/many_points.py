@@ -10,25 +10,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import StepFailedError
 from scvi_codegen.methods import SCVI
-from scvi_codegen.methods.method import Method
-from scvi_codegen.reproduce.kepler.orbits import (
-    SYSTEM,
-    angular_momentum,
-    draw_ellipse,
-    draw_states,
-    perihelion,
-    perihelion_turn,
-)
+from scvi_codegen.reproduce.kepler.orbits import Orbit, draw_orbits, orbit_of, time_series
 from scvi_codegen.reproduce.laboratory.drawing import draw_error, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
@@ -39,8 +29,6 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     experiment,
     holds,
 )
-from scvi_codegen.reproduce.laboratory.running import SECTION_4, trajectory
-from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,64 +41,11 @@ FORMS = (PRINTED, VARIATIONAL)
 TWO_FORMS = (
     "SCVI is run twice: as printed, (34a)-(34e), and in variational form, with the chain-rule term in (34d), (34e)."
 )
-PRESERVED = 0.05
-"""Largest energy error at which a phase trajectory counts as preserved: a tenth of the semi-major axis."""
 
 
 def shooting(points: int, gauss: int, form: str) -> SCVI:
     """Return SCVI with given numbers of Chebyshev and Gauss points."""
     return SCVI(points - 1, f"gauss-legendre:{gauss}", variational=form == VARIATIONAL)
-
-
-@dataclass(frozen=True, slots=True)
-class Orbit:
-    """Run and its errors over time.
-
-    Attributes:
-        run: states.
-        energy, momentum: errors over time.
-        turn: rotation of the perihelion, in radians per revolution.
-        failed: True if a step had no solution before the end.
-    """
-
-    run: Trajectory
-    energy: Array
-    momentum: Array
-    turn: float
-    failed: bool
-
-    @property
-    def largest(self) -> tuple[float, float]:
-        """Largest errors of energy and momentum."""
-        return float(np.abs(self.energy).max()), float(np.abs(self.momentum).max())
-
-    @property
-    def lost(self) -> float:
-        """First time at which the energy is off by a tenth, or the last time."""
-        off = np.flatnonzero(np.abs(self.energy) > PRESERVED)
-        return float(self.run.t[off[0]]) if len(off) else self.end
-
-    @property
-    def end(self) -> float:
-        """Time of the last state."""
-        return float(self.run.t[-1])
-
-
-@lru_cache(maxsize=16)
-def orbit_of(method: Method, h: float, span: float, e: float = ECCENTRICITY) -> Orbit:
-    """Return the orbit from the perihelion, with the tolerance of section 4."""
-    failed = False
-    try:
-        run = trajectory(SYSTEM, method, *perihelion(e), h=h, span=span, options=SECTION_4, solver=_solver(method))
-    except StepFailedError as failure:
-        run, failed = Trajectory.before(failure), True
-    energy, momentum = run.energy(), angular_momentum(run.q, run.p)
-    turn = perihelion_turn(run.q, run.p) / (run.t[-1] / (2 * math.pi))
-    return Orbit(run, energy - energy[0], momentum - momentum[0], turn, failed)
-
-
-def _solver(method: Method) -> str:
-    return "newton" if isinstance(method, SCVI) else "auto"
 
 
 FORM_COLORS = {PRINTED: "printed", VARIATIONAL: "SCVI"}
@@ -128,10 +63,15 @@ def _orbits() -> dict[tuple[str, int], Orbit]:
     return {(form, g): orbit_of(shooting(NINE, g, form), STEP, SPAN) for form in FORMS for g in GAUSS}
 
 
+def turn(orbit: Orbit) -> float:
+    """Return the rotation of the perihelion in radians per revolution."""
+    return orbit.turn / (orbit.end / (2 * math.pi))
+
+
 def _many_table() -> TableBlock:
     return TableBlock(
         columns=("form", "Gauss points", "energy error", "momentum error", "turn of the perihelion a revolution"),
-        rows=tuple((form, g, *orbit.largest, orbit.turn) for (form, g), orbit in _orbits().items()),
+        rows=tuple((form, g, *orbit.largest, turn(orbit)) for (form, g), orbit in _orbits().items()),
         formats={"Gauss points": "d"},
     )
 
@@ -147,7 +87,7 @@ def _listed(values: list[float]) -> str:
 @experiment("figure-28", "Kepler: orbits of SCVI with nine points")
 def _figure_28(_: Mapping[str, Result]) -> Result:
     orbits = _orbits()
-    turns = {form: [abs(orbits[form, g].turn) for g in GAUSS] for form in FORMS}
+    turns = {form: [abs(turn(orbits[form, g])) for g in GAUSS] for form in FORMS}
     precession = Comparison(
         claim="With 5 Gauss points the orbit precesses and fills an annulus; with 6 and 7 it does not visibly.",
         measured=(
@@ -157,25 +97,14 @@ def _figure_28(_: Mapping[str, Result]) -> Result:
         ),
         verdict=holds(200 * turns[PRINTED][0] > 1.0 and 200 * max(turns[PRINTED][1:]) < 1.0),
     )
+    runs = {f"9 points, {g} Gauss points, {form}": (o.run.q, FORM_COLORS[form]) for (form, g), o in orbits.items()}
     return Result(
         title="Two-body Kepler problem, orbit of SCVI with 9 points and 5, 6, 7 Gauss points",
         setting=SETTING,
         checks=(precession,),
         tables=(_many_table(),),
-        picture=Picture(
-            draw=partial(_draw_many_orbits, orbits={key: orbit.run.q for key, orbit in orbits.items()}),
-            width=11.0,
-            height=7.8,
-        ),
+        picture=Picture(draw=partial(draw_orbits, runs=runs, rows=2, e=ECCENTRICITY), width=11.0, height=7.8),
     )
-
-
-def _draw_many_orbits(figure: Figure, orbits: Mapping[tuple[str, int], Array]) -> None:
-    for axes, ((form, g), q) in zip(panels(figure, 2, 3), orbits.items(), strict=True):
-        draw_states(axes, q, FORM_COLORS[form], form)
-        draw_ellipse(axes, ECCENTRICITY)
-        axes.set(title=f"9 points, {g} Gauss points, {form}", xlabel="$q_1$", ylabel="$q_2$", aspect="equal")
-        axes.set(xlim=(-1.65, 1.65), ylim=(-1.65, 1.65))
 
 
 @experiment("figure-29", "Kepler: momentum of SCVI with nine points")
@@ -218,7 +147,7 @@ def _figure_30(_: Mapping[str, Result]) -> Result:
         title="Two-body Kepler problem, energy error of SCVI with 9 points and 5, 6, 7 Gauss points",
         setting=SETTING,
         checks=(
-            *(_bounded_check(form, [orbits[form, g].energy for g in GAUSS]) for form in FORMS),
+            *(_bounded_check(form, [orbits[form, g] for g in GAUSS]) for form in FORMS),
             Comparison(
                 claim="More quadrature points make the energy more accurate.",
                 measured=(
@@ -234,9 +163,9 @@ def _figure_30(_: Mapping[str, Result]) -> Result:
     )
 
 
-def _bounded_check(form: str, energies: list[Array]) -> Comparison:
+def _bounded_check(form: str, orbits: list[Orbit]) -> Comparison:
     """Return the check that the error is as large in the second half of a run as in the first."""
-    growth = [float(np.abs(e[len(e) // 2 :]).max() / np.abs(e[: len(e) // 2]).max()) for e in energies]
+    growth = [late / early for early, late in (orbit.halves() for orbit in orbits)]
     return Comparison(
         claim=f"The energy error of SCVI remains bounded ({form}).",
         measured=(
@@ -250,14 +179,8 @@ def _bounded_check(form: str, energies: list[Array]) -> Comparison:
 
 def _many_series(name: str) -> TableBlock:
     orbits = _orbits()
-    columns = [getattr(orbit, name).tolist() for orbit in orbits.values()]
-    t = orbits[PRINTED, GAUSS[0]].run.t.tolist()
-    return TableBlock(
-        name="series",
-        columns=("t", *(f"error {form} {g} Gauss points" for form, g in orbits)),
-        rows=tuple(zip(t, *columns, strict=False)),
-        shown=False,
-    )
+    columns = {f"error {form} {g} Gauss points": getattr(orbit, name) for (form, g), orbit in orbits.items()}
+    return time_series(orbits[PRINTED, GAUSS[0]].run.t, columns)
 
 
 def _error_picture(name: str) -> Picture:

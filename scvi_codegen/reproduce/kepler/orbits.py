@@ -3,15 +3,13 @@
 The "analytic solution" in section 2.2 of the paper has the time in place of the eccentric anomaly; here Kepler's
 equation is solved.
 
-Plots of Kepler orbits.
-
-Structure of one step of Kepler's problem: symplectic form, angular momentum, and order.
+Runs with their errors over time, and pictures of orbits and invariants.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -20,14 +18,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StepFailedError
+from scvi_codegen.methods import SCVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import kepler
-from scvi_codegen.reproduce.laboratory.drawing import COLORS
-from scvi_codegen.reproduce.laboratory.running import stepper_of
-from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels, thinned
+from scvi_codegen.reproduce.laboratory.experiment import TableBlock, series_table
+from scvi_codegen.reproduce.laboratory.running import SECTION_4, trajectory
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 Pair = tuple[float, float]
@@ -96,6 +98,71 @@ def revolutions(t: Array, q: Array, p: Array) -> Array:
     return np.diff(t[before] + share * (t[before + 1] - t[before]))
 
 
+PRESERVED = 0.05
+"""Largest energy error at which a phase trajectory counts as preserved: a tenth of the semi-major axis."""
+
+
+@dataclass(frozen=True, slots=True)
+class Orbit:
+    """Run from the perihelion and its errors over time.
+
+    Attributes:
+        run: states.
+        energy, momentum: errors over time.
+        failed: True if a step had no solution before the end.
+    """
+
+    run: Trajectory
+    energy: Array
+    momentum: Array
+    failed: bool
+
+    @property
+    def largest(self) -> tuple[float, float]:
+        """Largest errors of energy and momentum."""
+        return float(np.abs(self.energy).max()), float(np.abs(self.momentum).max())
+
+    @property
+    def turn(self) -> float:
+        """Rotation of the perihelion over the whole run, in radians."""
+        return perihelion_turn(self.run.q, self.run.p)
+
+    @property
+    def lost(self) -> float:
+        """First time at which the energy is off by a tenth, or the last time."""
+        off = np.flatnonzero(np.abs(self.energy) > PRESERVED)
+        return float(self.run.t[off[0]]) if len(off) else self.end
+
+    @property
+    def end(self) -> float:
+        """Time of the last state."""
+        return float(self.run.t[-1])
+
+    def halves(self) -> tuple[float, float]:
+        """Return the largest energy errors of the first and of the second half."""
+        half = len(self.energy) // 2
+        return float(np.abs(self.energy[:half]).max()), float(np.abs(self.energy[half:]).max())
+
+
+@lru_cache(maxsize=32)
+def orbit_of(method: Method, h: float, span: float, e: float = 0.5, options: SolverOptions = SECTION_4) -> Orbit:
+    """Return the orbit from the perihelion, by default with the tolerance of section 4."""
+    failed = False
+    try:
+        solver = "newton" if isinstance(method, SCVI) and method.degree > 1 else "auto"
+        run = trajectory(SYSTEM, method, *perihelion(e), h=h, span=span, options=options, solver=solver)
+    except StepFailedError as failure:
+        run, failed = Trajectory.before(failure), True
+    energy, momentum = run.energy(), angular_momentum(run.q, run.p)
+    return Orbit(run, energy - energy[0], momentum - momentum[0], failed)
+
+
+def time_series(t: Array, columns: Mapping[str, Array]) -> TableBlock:
+    """Return a table of quantities over time; those of runs that ended before are empty from then on."""
+    padded = {name: [*values.tolist(), *[None] * (len(t) - len(values))] for name, values in columns.items()}
+    return series_table({"t": t.tolist()} | padded)
+
+
 def draw_states(axes: Axes, q: Array, scheme: str, label: str | None = None) -> None:
     """Draw positions of a long run as dots, rasterised also in SVG."""
     style: dict[str, Any] = {"color": COLORS[scheme], "markersize": 1.2, "rasterized": True}
@@ -107,74 +174,24 @@ def draw_ellipse(axes: Axes, e: float) -> None:
     axes.plot(*ellipse(e), color="black", linewidth=0.8, label="exact")
 
 
-STATE = np.array([0.3, 0.8]), np.array([-1.1, 0.4])
-"""State (q, p) off the symmetry axes of the orbit (eccentricity 0.17), so that no error vanishes by symmetry."""
-LONG_STEP_SIZE = 0.3
-SPAN = 2.4
-STEPS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
-ABOVE_ROUNDOFF = 1e-13
-POINTS_OF_A_RATE = 3
-DERIVATIVE_WEIGHTS = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
-WIDTH = 2e-3
-"""Width of central differences of order six; round-off and truncation are then both near 1e-13."""
+def draw_orbits(figure: Figure, runs: Mapping[str, tuple[Array, str]], *, rows: int, e: float) -> None:
+    """Draw the states of runs, each (q, scheme) by title, over the exact ellipse."""
+    for axes, (title, (q, scheme)) in zip(panels(figure, rows, len(runs) // rows), runs.items(), strict=True):
+        draw_states(axes, q, scheme)
+        draw_ellipse(axes, e)
+        axes.set(title=title, xlabel="$q_1$", ylabel="$q_2$", aspect="equal", xlim=(-1.65, 1.65), ylim=(-1.65, 1.65))
+        axes.legend(loc="upper right")
 
 
-@dataclass(frozen=True, slots=True)
-class Structure:
-    """Structure of a step.
-
-    Attributes:
-        defect: max |J^T Omega J - Omega|, J the Jacobian of the step; its measurement has noise 1e-13.
-        momentum: change of the angular momentum in the step.
-        order: slope of the error over h, above round-off.
-    """
-
-    defect: float
-    momentum: float
-    order: float
-
-
-@lru_cache(maxsize=64)
-def structure_of(method: Method) -> Structure:
-    """Return the structure of one step from :data:`STATE`; the order is from runs over 2.4."""
-    stepper = stepper_of(SYSTEM, method, "newton")
-    q, p = stepper.step(*STATE, LONG_STEP_SIZE)
-    return Structure(
-        symplecticity_defect(stepper, *STATE, LONG_STEP_SIZE),
-        float(angular_momentum(q, p) - angular_momentum(*STATE)),
-        _order(stepper),
-    )
-
-
-def symplecticity_defect(stepper: Stepper, q: Array, p: Array, h: float) -> float:
-    """Return max |J^T Omega J - Omega| of the step of h from (q, p)."""
-    m = len(q)
-    jacobian = _jacobian(lambda z: np.concatenate(stepper.step(z[:m], z[m:], h)), np.concatenate([q, p]))
-    omega = np.kron([[0, 1], [-1, 0]], np.eye(m))
-    return float(np.abs(jacobian.T @ omega @ jacobian - omega).max())
-
-
-def _jacobian(step: Callable[[Array], Array], state: Array) -> Array:
-    columns = [
-        sum(w / WIDTH * (step(state + k * unit) - step(state - k * unit)) for k, w in DERIVATIVE_WEIGHTS.items())
-        for unit in np.eye(len(state)) * WIDTH
-    ]
-    return np.array(columns).T
-
-
-def _order(stepper: Stepper) -> float:
-    """Return the slope through the smallest errors that are above round-off."""
-    errors = {steps: error for steps in STEPS if (error := _error(stepper, steps)) > ABOVE_ROUNDOFF}
-    smallest: Sequence[int] = sorted(errors)[-POINTS_OF_A_RATE:]
-    derivative, _ = np.polyfit(np.log([SPAN / n for n in smallest]), np.log([errors[n] for n in smallest]), 1)
-    return float(derivative)
-
-
-def _error(stepper: Stepper, steps: int) -> float:
-    """Return the error of the state after :data:`SPAN`; 0, which is ignored, if a step fails."""
-    try:
-        run = stepper.integrate(*STATE, h=SPAN / steps, steps=steps, save_every=steps)
-    except StepFailedError:
-        return 0.0
-    exact = np.concatenate(exact_flow(*STATE, SPAN), axis=1)[0]
-    return float(np.abs(np.concatenate([run.q[-1], run.p[-1]]) - exact).max())
+def draw_invariant(figure: Figure, t: Array, values: Mapping[str, Array], name: str, unit: str = "") -> None:
+    """Draw an invariant by scheme as in the paper, and its error on a logarithmic axis."""
+    left, right = panels(figure, 1, 2)
+    for scheme, series in reversed(values.items()):
+        left.plot(*thinned(t, series, most=3000), color=COLORS[scheme], label=scheme, linewidth=0.8)
+        draw_error(right, t, series - series[0], scheme)
+    time = ", ".join(filter(None, ("t", unit)))
+    left.set(title=name, xlabel=time, ylabel=name)
+    right.set(title=f"error of the {name}", xlabel=time, ylabel="|error|, largest in each bin")
+    left.ticklabel_format(useOffset=False)
+    left.legend(loc="lower left")
+    right.legend(loc="center right")

@@ -14,16 +14,13 @@ from scvi_codegen.methods import Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.methods.method import Method
 from scvi_codegen.reproduce.kepler.many_points import (
     ECCENTRICITY,
-    PRESERVED,
     PRINTED,
     STEP,
     TWO_FORMS,
     VARIATIONAL,
-    Orbit,
-    orbit_of,
     shooting,
 )
-from scvi_codegen.reproduce.kepler.orbits import ellipse
+from scvi_codegen.reproduce.kepler.orbits import PRESERVED, Orbit, ellipse, orbit_of
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
@@ -99,8 +96,7 @@ def _kept_check(orbits: Mapping[str, Orbit], names: list[str], more: str = "") -
 
 
 def _sc_check(orbit: Orbit) -> Comparison:
-    half = len(orbit.energy) // 2
-    early, late = (float(np.abs(part).max()) for part in (orbit.energy[:half], orbit.energy[half:]))
+    early, late = orbit.halves()
     return Comparison(
         claim="SC does not preserve the phase trajectory.",
         measured=(
