@@ -186,7 +186,7 @@ def draw_orbits(figure: Figure, runs: Mapping[str, tuple[Array, str]], *, rows: 
 def draw_invariant(figure: Figure, t: Array, values: Mapping[str, Array], name: str, unit: str = "") -> None:
     """Draw an invariant by scheme as in the paper, and its error on a logarithmic axis."""
     left, right = panels(figure, 1, 2)
-    for scheme, series in reversed(values.items()):
+    for scheme, series in reversed([*values.items()]):
         left.plot(*thinned(t, series, most=3000), color=COLORS[scheme], label=scheme, linewidth=0.8)
         draw_error(right, t, series - series[0], scheme)
     time = ", ".join(filter(None, ("t", unit)))
