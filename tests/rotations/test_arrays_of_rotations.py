@@ -80,14 +80,16 @@ def test_model_file_with_an_array_of_rotations(tmp_path):
     assert again.integrate().q == pytest.approx(np.asarray(model.integrate().q), abs=1e-15)
 
 
-def test_spin_chain_against_scipy():
+@pytest.mark.parametrize("size", ["6", "N"])
+def test_spin_chain_against_scipy(size):
     """ds/dt = s x dH/ds with the field of the neighbours."""
     chain = sc.HamiltonianSystem.from_text(
         name="spin chain",
         coordinates=[],
-        hamiltonian="-sum(i in 6 periodic, s_1[i]*s_1[i+1] + s_2[i]*s_2[i+1] + s_3[i]*s_3[i+1])- b*sum(i in 6, s_3[i])",
+        hamiltonian=f"-sum(i in {size} periodic, s_1[i]*s_1[i+1] + s_2[i]*s_2[i+1] + s_3[i]*s_3[i+1])"
+        f" - b*sum(i in {size}, s_3[i])",
         parameters={"b": 0.3},
-        spins=["s[6]"],
+        spins=[f"s[{size}]"],
     )
     start = np.random.default_rng(0).normal(size=(6, 3))
 

@@ -119,7 +119,7 @@ class ArraySystem:
         """Raise :class:`SizesRequiredError` for a system that cannot be compiled for sizes known at run time."""
         try:
             if self.rotations:
-                raise SystemDefinitionError(f"'{self.name}' has rotations, directions or spins: {SIZES_REQUIRED}")
+                raise SizesRequiredError("rotations, directions and spins are not available for arrays of any size")
             for term in self.coupled_terms:
                 raise SizesRequiredError(
                     f"'{term}' contains velocities in another form: arrays of any size have velocities as m*v**2/2 "

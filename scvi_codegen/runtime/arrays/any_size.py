@@ -13,9 +13,11 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.indices import MOST_THREADS, SIZES_REQUIRED, Loop
+from scvi_codegen.native.arguments import real_array
 from scvi_codegen.rendering.source import ArrayLayout, Interface
 from scvi_codegen.runtime.arrays.interface import RunSizes, first_state, read_arrays
 from scvi_codegen.runtime.core.named_arrays import EntryNames
+from scvi_codegen.runtime.rotations.attitudes import quaternions
 from scvi_codegen.validation import MAPPING, check_kind, checked_count
 
 MOST_COORDINATES = 2000
@@ -68,7 +70,9 @@ def _call(
     threads = others.pop("threads", None) if name in AT_REST else None
     bound, state = stepper.bind(q, parameters, tables, threads)
     if name in AT_REST and not arguments and others.get("p") is None and others.get("velocity") is None:
-        others["p"] = np.zeros(bound.dimension)
+        known_lagrangian = stepper._reason and not stepper.interface.layout.momenta
+        if not any(each.startswith("spin") for each in bound.interface.rotations):  # spins have momenta of their own
+            others["velocity" if known_lagrangian else "p"] = np.zeros(bound.dimension)
     return getattr(bound, name)(state, *arguments, parameters=parameters, **others)
 
 
@@ -91,8 +95,21 @@ def sizes_of_run(
     count = checked_count(1 if threads is None else threads, "threads", least=1, most=MOST_THREADS)
     if count > 1 and interface.layout.constraints:
         raise MethodError("systems with constraints use one thread: omit threads")
-    arrays = read_arrays(interface, first_state(interface, q), parameters, tables)
+    arrays = read_arrays(interface, first_state(interface, _homogeneous(interface, q)), parameters, tables)
     return RunSizes(sizes=arrays.sizes, places=arrays.places, threads=count)
+
+
+def _homogeneous(interface: Interface, q: Any) -> Any:
+    """Return a state by name with homogeneous coordinates of the shape of rotations, directions and spins."""
+    arrays = {each.name: each for each in interface.layout.coordinates if each.letters}
+    if not isinstance(q, Mapping) or arrays.keys().isdisjoint(q):
+        return q
+    shapes = {
+        name: (quaternions(q[name], name) if array.letters == "wxyz" else real_array(q[name], name)).shape[:-1]
+        for name, array in arrays.items()
+        if name in q
+    }
+    return {**q, **{name: np.zeros((*shape, len(arrays[name].letters))) for name, shape in shapes.items()}}
 
 
 def check_few_coordinates(interface: Interface, sizes: Mapping[str, int], reason: str) -> None:
