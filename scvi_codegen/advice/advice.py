@@ -15,20 +15,21 @@ from functools import partial
 from itertools import takewhile
 from typing import Any, NamedTuple
 
-from numpy.typing import ArrayLike
-
 from scvi_codegen.advice.pilot import EXPONENTIAL_POWER, Pilot, run_pilot
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.display.cards import Html, card, grid, plain
 from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.mechanics.arrays.rolling import unrolled_at
+from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, as_method, method_from_specification
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.representation import summary
 from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.core.validation import States
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.validation import SWITCH, TEXT, checks_arguments
 
@@ -107,13 +108,13 @@ class Advice:
         return card(f"Advice: {self.method.title}", facts, pilots)
 
 
-@checks_arguments(system=SYSTEM, degree=SWITCH, solver=TEXT)
+@checks_arguments(system=SYSTEM_OR_ARRAYS, degree=SWITCH, solver=TEXT)
 @without_accuracy_warnings()
 def advise(
-    system: MechanicalSystem,
+    system: MechanicalSystem | ArraySystem,
     method: Method | str,
-    q: ArrayLike,
-    p: ArrayLike,
+    q: States,
+    p: States,
     span: float,
     tolerance: float,
     *,
@@ -133,9 +134,9 @@ def advise(
     that ends before an encounter does not resolve it.
 
     Args:
-        system: mechanical system.
+        system: mechanical system; arrays of run-time sizes have the sizes of q.
         method: method, or its name, as ``"svi:8"``.
-        q, p: (m,) initial positions and momenta.
+        q, p: (m,) initial positions and momenta, or arrays by name.
         span: duration of the run, negative to integrate backward.
         tolerance: wanted error ``|q - q_exact| / |q|`` at the end; the step size aims at half of it.
         parameters: values by name (others keep their defaults), or all in order.
@@ -153,10 +154,12 @@ def advise(
         MethodError: if the degree is to be chosen for a method that has none, or time is transformed.
         BuildError: without a C compiler.
     """
-    method = as_method(method, system)
-    if system.clock is not None:
+    known: MechanicalSystem
+    known, parameters = unrolled_at(system, q, parameters)
+    method = as_method(method, known)
+    if known.clock is not None:
         raise MethodError(
-            f"'{system.name}' is in transformed time: no step size is recommended; use largest_step or try h"
+            f"'{known.name}' is in transformed time: no step size is recommended; use largest_step or try h"
         )
     length, target = checked_number(span, "the span"), checked_number(tolerance, "the tolerance")
     if length == 0.0:
@@ -167,9 +170,9 @@ def advise(
     result: list[tuple[float, Advice]] = []
     failures: list[StateError] = []
     for candidate in _candidates(method) if degree else [method]:
-        for stepper in _steppers(system, candidate, solver):
+        for stepper in _steppers(known, candidate, solver):
             try:
-                result.append(_advised(stepper, candidate, is_symplectic(candidate, system), q, state, length, target))
+                result.append(_advised(stepper, candidate, is_symplectic(candidate, known), q, state, length, target))
             except StateError as failure:
                 failures.append(failure)
                 continue
@@ -185,7 +188,7 @@ def _advised(
     stepper: Stepper,
     method: Method,
     symplectic: bool,
-    q: ArrayLike,
+    q: States,
     state: Mapping[str, Any],
     span: float,
     tolerance: float,

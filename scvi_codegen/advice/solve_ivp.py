@@ -15,6 +15,8 @@ from scvi_codegen.advice.advice import advise
 from scvi_codegen.advice.tolerance_check import missed_tolerance
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
+from scvi_codegen.mechanics.arrays.rolling import unrolled_at
+from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.time_transformation import with_time_transformation
 from scvi_codegen.methods import Method, as_method, default_method
@@ -22,6 +24,7 @@ from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.representation import summary
 from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.core.validation import States
 from scvi_codegen.runtime.events.event import EventLike
 from scvi_codegen.runtime.run.global_error import checked_error
 from scvi_codegen.runtime.run.largest_step import accuracy_message, largest_step
@@ -70,13 +73,13 @@ class OdeResult:
         return self.status >= 0
 
 
-@checks_arguments(system=of("a system or its stepper", MechanicalSystem, Stepper), dense_output=SWITCH)
+@checks_arguments(system=of("a system or its stepper", MechanicalSystem, ArraySystem, Stepper), dense_output=SWITCH)
 def solve_ivp(
-    system: MechanicalSystem | Stepper,
+    system: MechanicalSystem | ArraySystem | Stepper,
     t_span: Sequence[float],
-    y0: ArrayLike,
+    y0: States,
     *,
-    velocity: ArrayLike | None = None,
+    velocity: States | None = None,
     method: Method | str | None = None,
     h: float | None = None,
     tolerance: float | None = None,
@@ -104,8 +107,9 @@ def solve_ivp(
     Args:
         system: mechanical system; or its compiled stepper, which takes the place of ``method``.
         t_span: two times.
-        y0: (2 m,) initial positions, then momenta; (m,) positions alone if ``velocity`` is passed.
-        velocity: (m,) initial velocities, instead of momenta.
+        y0: (2 m,) initial positions, then momenta; (m,) positions alone, also arrays by name, if ``velocity`` is
+            passed. They determine the sizes of arrays that are known at run time only.
+        velocity: (m,) initial velocities, instead of momenta, or arrays by name.
         method: method, or its name, as ``"svi:6"``; by default ``SVI(8)``, with constraints SVI(6) with Lobatto points.
         h: upper bound of a fixed step size, reduced so that whole steps fill the span.
         tolerance: instead of ``h``: error ``|q - q_exact| / |q|`` at the end, for which :func:`advise` chooses ``h``.
@@ -140,7 +144,12 @@ def solve_ivp(
         others = {"time_transformation": time_transformation, "controller": controller}
         checked_error(error, {"h": h, "tolerance": tolerance, "rtol": rtol, **others})
     request = _StepRequest(h, rtol, tolerance, error)
-    stepper, uncompiled = _stepper(system, method, (time_transformation, controller), request)
+    known: MechanicalSystem | Stepper
+    if isinstance(system, Stepper):
+        known = system.bind(q, parameters)[0]
+    else:
+        known, parameters = unrolled_at(system, q, parameters)
+    stepper, uncompiled = _stepper(known, method, (time_transformation, controller), request)
     p: Any = stepper._initial_momenta(q, p0, velocity, start, parameters)
     along: dict[str, Any] = {"t": start, "parameters": parameters, "options": options}
     plan = _plan(stepper, uncompiled, request, (q, p, end - start), along)
@@ -151,7 +160,7 @@ def solve_ivp(
 def _integrated(
     stepper: Stepper,
     plan: _StepChoice,
-    initial: tuple[ArrayLike, ArrayLike],
+    initial: tuple[States, States],
     settings: dict[str, Any],
     requested_times: Array | None,
     dense_output: bool,
@@ -213,7 +222,7 @@ def _plan(
     stepper: Stepper,
     uncompiled: tuple[MechanicalSystem, Method] | None,
     request: _StepRequest,
-    motion: tuple[ArrayLike, ArrayLike, float],
+    motion: tuple[States, States, float],
     along: dict[str, Any],
 ) -> _StepChoice:
     """Return the step-size selection for a request and an initial state (q, p) over a span."""
@@ -329,7 +338,9 @@ def _span(t_span: Sequence[float]) -> tuple[float, float]:
     return start, end
 
 
-def _halves(y0: ArrayLike) -> tuple[ArrayLike, ArrayLike | None]:
+def _halves(y0: States) -> tuple[States, States | None]:
+    if isinstance(y0, Mapping):
+        raise StateError("y0 contains positions by name: give velocity, too, or numbers for positions and momenta")
     try:
         y = np.array(y0, dtype=float)
     except (TypeError, ValueError) as error:

@@ -290,3 +290,25 @@ def test_error_estimate_survives_a_zero_of_one_coefficient() -> None:
         run = stepper.integrate([np.cos(phase)], velocity=[np.sin(phase)], t_end=30.0, tolerance=1e-4)
         worst = max(worst, np.abs(np.diff(run.energy())).max() / run.energy()[0])
     assert worst < 3e-5  # 2e-4 where it is
+
+
+def test_advice_solutions_and_recorded_runs_are_those_of_known_sizes(ring, steppers, tmp_path) -> None:
+    """What compiles the sizes of a call gives the results of the unrolled system."""
+    known = sc.unroll_sums(ring, {"N": N})
+    found, expected = (sc.advise(system, "svi:4", Q, V, 1.0, 1e-5) for system in (ring, known))
+    assert (found.h, found.steps) == (expected.h, expected.steps)
+    y0 = np.concatenate([Q, V])
+    one, other = (sc.solve_ivp(system, (0.0, 1.0), y0, method="svi:4", h=0.1) for system in (ring, known))
+    assert np.array_equal(one.y, other.y)
+    named = sc.solve_ivp(steppers[0], (0.0, 1.0), {"q": Q}, velocity={"q": V}, h=0.1)
+    _, q, p = steppers[1].integrate(Q, V, h=0.1, steps=10)[-1]
+    assert named.y[:, -1] == pytest.approx(np.concatenate([q, p]), abs=1e-13)
+    with pytest.raises(StateError, match="give velocity"):
+        sc.solve_ivp(ring, (0.0, 1.0), {"q": Q})
+    for k, plan in enumerate(({"h": 0.1}, {"t_end": 1.0, "tolerance": 1e-8})):
+        run = steppers[0].start(Q, velocity=V, t=0.5, parameters={"beta": 0.3}, **plan)
+        steps = {"steps": 10} if k == 0 else {}
+        recorded = sc.record_run(run, tmp_path / str(k), **steps)
+        direct = sc.compile_stepper(ring, "svi:6", sizes={"N": N}).start(Q, V, t=0.5, parameters={"beta": 0.3}, **plan)
+        assert np.array_equal(recorded.q, direct.record(**steps).q)
+        assert run.steps == 0

@@ -251,6 +251,8 @@ def advice(of: Kind, _: Path) -> Any:
 
 
 def solve_ivp(of: Kind, _: Path) -> Any:
+    if of.run_time:
+        return sc.solve_ivp(of.system(), (0.0, 1.0), of.q, velocity=of.p)
     start = np.concatenate([[0.3], np.zeros(5)])
     return sc.solve_ivp(of.system(), (0.0, 1.0), start)
 

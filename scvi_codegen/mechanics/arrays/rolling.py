@@ -192,6 +192,8 @@ def unrolled_at(
     """Return the system with the sizes and the array parameters of a call, and the other parameters."""
     if not isinstance(system, ArraySystem):
         return system, parameters
+    if parameters is not None and not isinstance(parameters, Mapping):
+        raise SystemDefinitionError("parameters of arrays of run-time sizes must be given by name")
     state = q if isinstance(q, Mapping) else {system.coordinates[0].name: q}
     arrays = {name: value for name, value in dict(parameters or {}).items() if np.ndim(value)}
     others = {name: value for name, value in dict(parameters or {}).items() if name not in arrays}

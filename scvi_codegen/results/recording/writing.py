@@ -15,10 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.errors import MethodError, RecordingError, RecordingWarning, StateError, StepFailedError, warn
+from scvi_codegen.errors import RecordingError, RecordingWarning, StateError, StepFailedError, warn
 from scvi_codegen.files.atomic import sync_folder
 from scvi_codegen.files.export import Piece, chunk_rows
-from scvi_codegen.indices import SIZES_REQUIRED
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.compilers import check_flags
 from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states, read_chunk, unfinished, write_chunk
@@ -62,7 +61,9 @@ def record_run(
     """Advance a run by ``steps``, or to its target time, and record every ``save_every``-th state in a folder.
 
     Args:
-        run: a run at its start, from ``stepper.start(q, p, h=h)`` or ``start(q, p, t_end=..., tolerance=...)``.
+        run: a run at its start, from ``stepper.start(q, p, h=h)`` or ``start(q, p, t_end=..., tolerance=...)``. Arrays
+            of run-time sizes are recorded by the stepper compiled with their sizes, for at most 2000 coordinates; this
+            run then remains at its start.
         folder: created if missing; it must be empty, or contain a run that ended before its first state.
         steps: number of steps; omitted for adaptive steps, which end at the target time.
         save_every: steps between saved states; the state at the target time is also saved.
@@ -87,8 +88,7 @@ def record_run(
     if run.steps:
         raise StateError(f"record_run requires a run at its start, but this run has {run.steps} steps: start a new one")
     _check_inputs(run)
-    if run.stepper.interface.layout.coordinates:
-        raise MethodError(f"recorded runs are not available for {run!r}: {SIZES_REQUIRED}")
+    run = _of_known_sizes(run)
     check_flags(run.stepper.flags, StateError)
     manifest = Manifest(
         source=run.stepper.source,
@@ -329,6 +329,23 @@ def _extended(manifest: Manifest, run: Run, steps: int | None, t_end: float | No
 def _piece(trajectory: Trajectory, first: int) -> Piece:
     """Return the states of a trajectory from row ``first`` on."""
     return trajectory.t[first:], trajectory.q[first:], trajectory.p[first:], trajectory.iterations[first:]
+
+
+def _of_known_sizes(run: Run) -> Run:
+    """Return the run of the stepper with known sizes from the same state."""
+    stepper, plan = run.stepper, run.plan
+    if stepper.known is stepper:
+        return run
+    known: Any = stepper.known
+    return Run.started(
+        known if plan is None else known._adaptive(),
+        run.q,
+        run.p,
+        h=run.h if plan is None else plan,
+        t=run.t,
+        parameters=run.parameters,
+        options=run.options,
+    )
 
 
 def _checked_checkpoints(seconds: float, steps: int | None) -> tuple[float, int | None]:

@@ -11,13 +11,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
-from numpy.typing import ArrayLike
-
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.core.validation import Parameters, check_inputs_given
+from scvi_codegen.runtime.core.validation import Parameters, States, check_inputs_given
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.run.run import Run
 
@@ -33,8 +31,8 @@ ALLOWED = 10.0
 
 def largest_step(
     stepper: Stepper,
-    q: ArrayLike,
-    p: ArrayLike,
+    q: States,
+    p: States,
     span: float,
     tolerance: float = 0.0,
     *,
