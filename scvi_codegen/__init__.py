@@ -40,8 +40,7 @@ _HOMES = {
     "mechanics.hamiltonian": ("HamiltonianSystem",),
     "mechanics.legendre": ("hamiltonian_of", "lagrangian_of"),
     "mechanics.time_transformation": ("reparametrise",),
-    "mechanics.variational": ("variational_system",),
-    "mechanics.coordinate_change": ("change_coordinates",),
+    "mechanics.derived_systems": ("change_coordinates", "variational_system"),
     "derivation.equations": ("StepEquations", "derive"),
     "errors": (
         "AccuracyWarning",

@@ -49,7 +49,8 @@ from scvi_codegen.frameworks.torch import torch_flow as torch_flow
 from scvi_codegen.mechanics.arrays.rolling import RolledSums as RolledSums
 from scvi_codegen.mechanics.arrays.rolling import roll_sums as roll_sums
 from scvi_codegen.mechanics.arrays.rolling import unroll_sums as unroll_sums
-from scvi_codegen.mechanics.coordinate_change import change_coordinates as change_coordinates
+from scvi_codegen.mechanics.derived_systems import change_coordinates as change_coordinates
+from scvi_codegen.mechanics.derived_systems import variational_system as variational_system
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem as HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem as LagrangianSystem
 from scvi_codegen.mechanics.legendre import hamiltonian_of as hamiltonian_of
@@ -58,7 +59,6 @@ from scvi_codegen.mechanics.symmetry.checking import check_symmetry as check_sym
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry as Symmetry
 from scvi_codegen.mechanics.symmetry.symmetry import symmetries as symmetries
 from scvi_codegen.mechanics.time_transformation import reparametrise as reparametrise
-from scvi_codegen.mechanics.variational import variational_system as variational_system
 from scvi_codegen.methods import SCVI as SCVI
 from scvi_codegen.methods import SVI as SVI
 from scvi_codegen.methods import ChebyshevGauss as ChebyshevGauss

@@ -35,11 +35,11 @@ from scvi_codegen.lowering.loops import with_sums
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
 from scvi_codegen.mechanics.arrays.system import ArraySystem
+from scvi_codegen.mechanics.derived_systems import with_tangent_vectors
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.mechanics.term_groups import rolled
-from scvi_codegen.mechanics.variational import with_tangent_vectors
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretise, discretised_form
 from scvi_codegen.methods.method import Method

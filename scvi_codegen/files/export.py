@@ -2,6 +2,8 @@
 
 Files are written in chunks, which bounds memory, and atomically. h5netcdf, zarr, xarray and pandas are the extra
 ``data``, imported where they are used.
+
+NumPy's files (.npy, .npz) are read without pickle.
 """
 
 from __future__ import annotations
@@ -11,10 +13,11 @@ import json
 import os
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import IO, TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +37,28 @@ from scvi_codegen.files.labelled_arrays import (
 
 if TYPE_CHECKING:
     import pandas
+
+
+@contextmanager
+def loaded(file: Any | IO[bytes]) -> Iterator[Any]:
+    """Return the result of ``numpy.load``, open within the context.
+
+    Raises:
+        OSError: if the file cannot be read.
+        ValueError: for any failure on a damaged file: of zipfile, zlib, the header parser, or memory.
+    """
+    try:
+        content = np.load(file, allow_pickle=False)
+        try:
+            yield content
+        finally:
+            if hasattr(content, "close"):
+                content.close()
+    except (OSError, ValueError):
+        raise
+    except Exception as error:
+        raise ValueError(f"it is not a complete NumPy file: {error!r}") from error
+
 
 Array = NDArray[np.float64]
 Piece: TypeAlias = tuple[Array, Array, Array, NDArray[np.int32]]

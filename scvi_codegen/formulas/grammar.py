@@ -22,6 +22,8 @@ from sympy import Add, Expr, Mul, Pow, Rational, S, Symbol
 
 from scvi_codegen.errors import ExpressionError, SystemDefinitionError, closest
 from scvi_codegen.formulas.expressions import (
+    CONSTANTS,
+    FUNCTIONS,
     MAX_BITS,
     MAX_DIGITS,
     NODES,
@@ -32,7 +34,6 @@ from scvi_codegen.formulas.expressions import (
     unsupported_part,
 )
 from scvi_codegen.formulas.symbols import DOT
-from scvi_codegen.formulas.vocabulary import CONSTANTS, FUNCTIONS
 
 MAX_CHARACTERS = 1_000_000
 """Length limit; parsing time grows with length times bracket depth (fifty atoms in a gas: 212 000 characters)."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.formulas.vocabulary import NAME_OF
+from scvi_codegen.formulas.expressions import NAME_OF
 from scvi_codegen.indices import Access, Loop, Place
 
 

@@ -96,7 +96,7 @@ def check_name(name: object) -> None:
         )
     if name in C_KEYWORDS:
         raise SystemDefinitionError(f"'{name}' is a keyword of C: rename the symbol, for example to '{name}_'")
-    from scvi_codegen.formulas.vocabulary import FUNCTIONS
+    from scvi_codegen.formulas.expressions import FUNCTIONS
 
     if name in FUNCTIONS or name == "pi":
         raise SystemDefinitionError(f"'{name}' is reserved in formulas: rename the symbol, for example to '{name}_'")

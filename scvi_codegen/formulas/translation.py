@@ -14,9 +14,8 @@ from sympy import Expr, Integer, Pow, S, Symbol
 from sympy.core.function import AppliedUndef
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.expressions import evaluated, unsupported_part
+from scvi_codegen.formulas.expressions import NAME_OF, evaluated, unsupported_part
 from scvi_codegen.formulas.symbols import DOT, TIME, identifier, symbol
-from scvi_codegen.formulas.vocabulary import NAME_OF
 
 
 def sympy_expression(value: Any, what: str) -> Expr:

@@ -20,9 +20,9 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import ArgumentError, MethodError, StateError
+from scvi_codegen.formulas.expressions import CONSTANTS, FUNCTIONS
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import PARTS, input_parameters, symbol
-from scvi_codegen.formulas.vocabulary import CONSTANTS, FUNCTIONS
 from scvi_codegen.frameworks.flow import Flow, imported
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.forces import constraint_rates, holonomic_expressions

@@ -12,12 +12,14 @@ from __future__ import annotations
 
 import atexit
 import hashlib
+import importlib.util
 import json
 import os
 import platform
 import re
 import shutil
 import subprocess
+import sys
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -333,3 +335,34 @@ def _finished(command: list[str], folder: Path) -> Iterator[None]:
     if process.returncode:
         shown = "\n".join(errors.splitlines()[:30])
         raise BuildError(f"the C compiler rejected the source\n{' '.join(command)}\n{shown}{another_compiler(command)}")
+
+
+TARGETS = {
+    "aarch64-darwin": "aarch64-macos",
+    "aarch64-linux": "aarch64-linux-gnu.2.17",
+    "aarch64-windows": "aarch64-windows-gnu",
+    "x86_64-darwin": "x86_64-macos",
+    "x86_64-linux": "x86_64-linux-gnu.2.17",
+    "x86_64-windows": "x86_64-windows-gnu",
+}
+"""Compiler's names of the platforms of FMI; for Linux with the oldest C library that both architectures support."""
+
+
+def library_for(platform: str, source: Source, *, flags: tuple[str, ...]) -> bytes:
+    """Return a shared library for a platform of :data:`TARGETS`: equal sources and flags give equal bytes.
+
+    Raises:
+        BuildError: without the extra ``compiler``, or if it rejects the source.
+    """
+    if importlib.util.find_spec("ziglang") is None:
+        raise BuildError(
+            f"compiling for {platform} requires a cross compiler: pip install 'scvi-codegen[compiler]' (ziglang)"
+        )
+    with tempfile.TemporaryDirectory(prefix="scvi-codegen-") as name:
+        folder, made = Path(name), "library"
+        source.write(folder)
+        texts = [f"{each.prefix}.c" for each in source.sources]
+        command = [sys.executable, "-m", "ziglang", "cc", "-target", TARGETS[platform], "-shared", "-fPIC", "-s"]
+        with announced(f"compiling for {platform}, slowest the first time"):
+            run_compiler([*command, "-std=c99", "-I.", *flags, *texts, "-lm", "-o", made], folder)
+        return (folder / made).read_bytes()

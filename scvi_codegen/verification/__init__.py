@@ -32,9 +32,8 @@ from scvi_codegen.runtime.core.validation import checked_vector
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.validation import MAPPING, TEXT, TEXTS, checks_arguments
 from scvi_codegen.verification.certificate import Certificate, Check, Outcome, issued
-from scvi_codegen.verification.convergence import convergence_checks
+from scvi_codegen.verification.convergence import convergence_checks, identity_checks
 from scvi_codegen.verification.derivatives import derivative_checks, time_transformation_derivative_checks
-from scvi_codegen.verification.identities import identity_checks
 from scvi_codegen.verification.roundoff import roundoff_checks
 from scvi_codegen.verification.stepping import predictor_checks, step_checks
 from scvi_codegen.verification.structure import largest_step, structure_checks

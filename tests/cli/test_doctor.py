@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from scvi_codegen.cli import diagnostics, main
+from scvi_codegen.cli import main
+from scvi_codegen.cli.commands import doctor as diagnostics
 
 PROJECT = Path(__file__).parents[2] / "pyproject.toml"
 

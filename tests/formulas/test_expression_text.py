@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 from sympy import Integer, Rational, S, Symbol, pi
 
 from scvi_codegen.errors import ExpressionError, SystemDefinitionError
-from scvi_codegen.formulas.expressions import evaluate, evaluated, unsupported_part
+from scvi_codegen.formulas.expressions import FUNCTIONS, evaluate, evaluated, unsupported_part
 from scvi_codegen.formulas.grammar import MAX_CHARACTERS, parse_expression
 from scvi_codegen.formulas.translation import format_expression
-from scvi_codegen.formulas.vocabulary import FUNCTIONS
 from scvi_codegen.tables.precision import mp
 
 X, Y, Z = sympy.symbols("x y z", real=True)

@@ -8,7 +8,7 @@ from sympy.physics.mechanics import LagrangesMethod, Point, ReferenceFrame, dyna
 
 from scvi_codegen.errors import MethodError, StateError, SystemDefinitionError
 from scvi_codegen.exact.discrete_lagrangian import exact_discrete_lagrangian
-from scvi_codegen.mechanics.coordinate_change import change_coordinates
+from scvi_codegen.mechanics.derived_systems import change_coordinates
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import hamiltonian_of, lagrangian_of

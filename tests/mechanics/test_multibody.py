@@ -22,7 +22,7 @@ from sympy.physics.mechanics import (
 
 from scvi_codegen import SVI, LagrangianSystem, SystemDefinitionError, compile_stepper
 from scvi_codegen.mechanics.forces import holonomic
-from scvi_codegen.mechanics.multibody.potential import potential_of
+from scvi_codegen.mechanics.multibody.kinetics import potential_of
 
 T = dynamicsymbols._t
 Q1, Q2, U1, U2 = dynamicsymbols("q1 q2 u1 u2")

@@ -17,7 +17,7 @@ from scvi_codegen import (
     variational_system,
 )
 from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.variational import with_tangent_vectors
+from scvi_codegen.mechanics.derived_systems import with_tangent_vectors
 
 
 def test_tangent_vectors_satisfy_the_variational_equations():

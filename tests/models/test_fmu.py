@@ -32,8 +32,7 @@ from scvi_codegen import (
 )
 from scvi_codegen.cli import main
 from scvi_codegen.models.packages import fmu as fmu_module
-from scvi_codegen.native.building import PORTABLE_FLAGS
-from scvi_codegen.native.cross import TARGETS
+from scvi_codegen.native.building import PORTABLE_FLAGS, TARGETS
 
 H = 0.1
 STRICT = "-std=c99 -O1 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Wno-psabi -Werror -c".split()  # noqa: SIM905

@@ -16,7 +16,7 @@ from scvi_codegen.cli.model_options import (
 )
 from scvi_codegen.models.packages.fmu import generate_fmu
 from scvi_codegen.models.packages.package import generate_package
-from scvi_codegen.native.cross import TARGETS
+from scvi_codegen.native.building import TARGETS
 from scvi_codegen.rendering.program_source import Embedded
 
 

@@ -1,21 +1,142 @@
-"""Conversion of ``LagrangesMethod``, ``KanesMethod`` and ``System`` of ``sympy.physics.mechanics``."""
+"""Lagrangian systems of ``LagrangesMethod``, ``KanesMethod`` and ``System`` of ``sympy.physics.mechanics``."""
 
 from __future__ import annotations
 
 import copy
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import sympy
-from sympy import Expr
+from sympy import Expr, Symbol
 from sympy.physics.mechanics import KanesMethod, dynamicsymbols
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.mechanics.multibody.description import Multibody
-from scvi_codegen.mechanics.multibody.kinetics import load_forces
-from scvi_codegen.mechanics.multibody.variables import Variables
+from scvi_codegen.mechanics.multibody.kinetics import (
+    gyroscopic_forces,
+    kinetic_energy,
+    load_forces,
+    motions_of,
+    potential_of,
+)
+from scvi_codegen.mechanics.multibody.variables import Variables, independent_of, solved_for_speeds
 
 if TYPE_CHECKING:
-    from sympy.physics.mechanics import LagrangesMethod, System
+    from sympy.physics.mechanics import LagrangesMethod, ReferenceFrame, System
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Multibody:
+    """Multibody system in SymPy's terms: bodies, loads and constraints.
+
+    Attributes:
+        frame: the inertial frame.
+        time: its symbol.
+        coordinates, speeds: q(t), and generalised speeds u(t) or dq/dt.
+        kinematics: linear expressions in dq/dt and u that are 0.
+        auxiliary: auxiliary speeds, which are 0.
+        bodies: particles and rigid bodies.
+        loads: in groups that act together, each of pairs of a point and a force or of a frame and a torque.
+        potential: total potential energy of the bodies.
+        configuration: expressions in q and t that are 0.
+        velocity: expressions in q, dq/dt, u and t that are 0, with or without the rates of ``configuration``.
+    """
+
+    frame: ReferenceFrame
+    time: Symbol
+    coordinates: tuple[Expr, ...]
+    speeds: tuple[Expr, ...]
+    kinematics: tuple[Expr, ...]
+    auxiliary: tuple[Expr, ...]
+    bodies: tuple[Any, ...]
+    loads: tuple[tuple[Any, ...], ...]
+    potential: Expr = sympy.S.Zero
+    configuration: tuple[Expr, ...]
+    velocity: tuple[Expr, ...]
+
+    def formulas(self) -> Mapping[str, Any]:
+        """Return arguments of :meth:`LagrangianSystem.from_sympy`: lagrangian, coordinates, forces and constraints.
+
+        Raises:
+            SystemDefinitionError: if SymPy does not know a velocity, speeds are not a combination of the rates of the
+                coordinates, or masses depend on coordinates.
+        """
+        variables = Variables(self.coordinates, self.time, self.speeds, self.auxiliary)
+        equations = (
+            [row for row in map(variables.read, self.kinematics) if row.has(*variables.u)] if variables.u else []
+        )
+        idle = [u for u in variables.u if not any(row.has(u) for row in equations)]
+        if idle and len(equations) + len(idle) == len(variables.u):
+            return self._with_ignored(list(map(variables.write, idle))).formulas()
+        if len(equations) != len(variables.u):
+            raise SystemDefinitionError(
+                f"there are {len(variables.u)} generalised speeds, but {len(equations)} kinematic "
+                "equations for them: give as many, so that speeds are an invertible combination of "
+                "the rates of the coordinates"
+            )
+        rolling = list(map(variables.write, self._beyond_configuration(variables)))
+        variables.substitute_speeds(solved_for_speeds(equations, variables))
+        energy, forces = self._dynamics(variables)
+        write = variables.write
+        return {
+            "lagrangian": write(energy) - self.potential,
+            "coordinates": list(self.coordinates),
+            "forces": {q: write(f) for q, f in zip(self.coordinates, forces, strict=True) if f != 0},
+            "constraints": [*self.configuration, *(write(variables.read(each)) for each in rolling)],
+        }
+
+    def _beyond_configuration(self, variables: Variables) -> list[Expr]:
+        """Return the velocity constraints, in plain symbols, that kinematics and configuration do not imply."""
+        velocity = list(map(variables.read, self.velocity))
+        known = [*map(variables.read, self.kinematics)]
+        known += [variables.rate(variables.read(g)) for g in self.configuration]
+        chosen = independent_of(known, velocity, (*variables.v, *variables.u)) if velocity else ()
+        return [velocity[k] for k in chosen]
+
+    def _with_ignored(self, speeds: Sequence[Expr]) -> Multibody:
+        """Return the system with a coordinate, its time integral, added for each speed that nothing depends on."""
+        new = tuple(sympy.Function(f"integral_{u.func}")(self.time) for u in speeds)
+        equations = tuple(q.diff(self.time) - u for q, u in zip(new, speeds, strict=True))
+        return replace(self, coordinates=(*self.coordinates, *new), kinematics=(*self.kinematics, *equations))
+
+    def _dynamics(self, variables: Variables) -> tuple[Expr, tuple[Expr, ...]]:
+        """Return T - V, with the potential of conservative loads, and all other forces."""
+        try:
+            motions = motions_of(self.bodies, self.frame, variables)
+            groups = [load_forces(group, self.frame, variables) for group in self.loads]
+        except (ValueError, TypeError) as error:
+            reason = " ".join(str(error).split())
+            raise SystemDefinitionError(
+                f"SymPy cannot determine the velocities of bodies and loads: {reason}"
+            ) from error
+        if any(entry.has(*variables.x) for motion in motions for entry in motion.inertia):
+            raise SystemDefinitionError(
+                "a mass or an inertia depends on a coordinate, which is not supported: make it a parameter"
+            )
+        potential, forces = _split(groups, variables)
+        beyond = gyroscopic_forces(motions, variables)
+        return kinetic_energy(motions) - potential, tuple(map(sympy.Add, forces, beyond))
+
+
+def _split(groups: Sequence[Sequence[Expr]], variables: Variables) -> tuple[Expr, tuple[Expr, ...]]:
+    """Return the potential of the conservative loads, all together or by group, and the other forces."""
+    changing = (*variables.v, variables.time, *variables.other_functions)
+    parts = [[sympy.expand_mul(f).as_independent(*changing, as_Add=True) for f in group] for group in groups]
+    static = [[part[0] for part in group] for group in parts]
+    varying = [[part[1] for part in group] for group in parts]
+    size = len(variables.x)
+    whole = potential_of(_sum(static, size), variables.x)
+    if whole is not None:
+        return whole, _sum(varying, size)
+    potentials = [potential_of(group, variables.x) for group in static]
+    rest = [group for group, potential in zip(static, potentials, strict=True) if potential is None]
+    return sympy.Add(*(potential for potential in potentials if potential is not None)), _sum([*rest, *varying], size)
+
+
+def _sum(rows: Iterable[Sequence[Expr]], size: int) -> tuple[Expr, ...]:
+    """Return the sum of force vectors."""
+    rows = list(rows)
+    return tuple(sympy.Add(*(row[i] for row in rows)) for i in range(size))
 
 
 def forces_of_lagranges_method(method: LagrangesMethod) -> dict[Expr, Expr]:

@@ -80,23 +80,21 @@ from scvi_codegen.methods import fitted
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.document import document_of, motion_of, with_files
 from scvi_codegen.models.model_files.sections import (
-    Document,
-    Section,
-    check_keys,
-    chosen_method,
-    in_section,
-    merged_sections,
-    read_method,
-    read_run,
-)
-from scvi_codegen.models.model_files.system_section import (
     FORMULAS,
     TORQUES,
     TURNING,
+    Document,
+    Section,
     check_complete,
+    check_keys,
     check_used,
+    chosen_method,
     has_arrays,
+    in_section,
+    merged_sections,
     read_catalogue,
+    read_method,
+    read_run,
     read_system,
 )
 from scvi_codegen.models.model_files.values import read_values
@@ -283,6 +281,6 @@ def _check_error_bound(error: Any, run: Section) -> None:
 def _read_inputs(section: Section, folder: str | os.PathLike[str]) -> Mapping[str, InputTable]:
     if not section:
         return {}
-    from scvi_codegen.models.model_files.input_files import read_input  # imported here: it imports the runtime
+    from scvi_codegen.models.model_files.input_tables import read_input  # imported here: it imports the runtime
 
     return {name: read_input(name, entry, folder) for name, entry in section.items()}

@@ -47,7 +47,7 @@ from numpy.typing import NDArray
 from sympy import Expr
 
 from scvi_codegen.errors import ExpressionError, ModelFileError, closest
-from scvi_codegen.files.numpy_files import loaded
+from scvi_codegen.files.export import loaded
 from scvi_codegen.formulas.arrays import parse_array
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.numpy_values import on_arrays
@@ -56,8 +56,15 @@ from scvi_codegen.indices import Array
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.model_files.input_tables import parse_table
-from scvi_codegen.models.model_files.sections import Document, Section, check_keys, check_one, in_section, required
-from scvi_codegen.models.model_files.system_section import is_number
+from scvi_codegen.models.model_files.sections import (
+    Document,
+    Section,
+    check_keys,
+    check_one,
+    in_section,
+    is_number,
+    required,
+)
 from scvi_codegen.models.time_span import check_length, real
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.validation import checked_count

@@ -30,8 +30,7 @@ from scvi_codegen.models.model_files.model_file import model_texts
 from scvi_codegen.models.packages.example import example_of
 from scvi_codegen.models.packages.folders import prefix_of
 from scvi_codegen.models.packages.package import MODEL
-from scvi_codegen.native.building import PORTABLE_FLAGS, load
-from scvi_codegen.native.cross import TARGETS, library_for
+from scvi_codegen.native.building import PORTABLE_FLAGS, TARGETS, library_for, load
 from scvi_codegen.pipeline import generate_source
 from scvi_codegen.rendering.program_source import ExampleRun, with_fmu
 from scvi_codegen.rendering.source import Interface, Source

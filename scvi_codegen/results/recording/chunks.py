@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import RecordingError
 from scvi_codegen.files.atomic import sync_folder, write_atomically
-from scvi_codegen.files.export import COLUMNS, Piece
-from scvi_codegen.files.numpy_files import loaded
+from scvi_codegen.files.export import COLUMNS, Piece, loaded
 
 NAME = re.compile(r"states-(\d{6,})\.npz")
 UNFINISHED = re.compile(r"\.(states-\d{6,}\.npz|manifest\.json)\..+")

@@ -1,6 +1,6 @@
 """Tangent vectors of many trajectories in SIMD lanes: each lane integrates a trajectory and its variational equations.
 
-The variations are additional coordinates (:mod:`scvi_codegen.mechanics.variational`) of an ensemble. After each
+The variations are additional coordinates (:mod:`scvi_codegen.mechanics.derived_systems`) of an ensemble. After each
 block of steps the tangent frame of every lane is replaced by Q of its QR factorisation. A block is repeated with half
 as many steps if its R shows that the tangent vectors became nearly parallel.
 """
