@@ -12,7 +12,7 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -116,26 +116,16 @@ def imported(library: str, extra: str) -> Any:
         ) from error
 
 
-class Arrays(Protocol):
-    """Array operations of a framework that a flow needs."""
-
-    def binary64(self, value: Any, name: str) -> Any:
-        """Return an array in double precision; raise StateError for lower precision."""
-
-    def expanded(self, array: Any, shape: tuple[int, ...]) -> Any:
-        """Return the array broadcast to a shape."""
-
-    def joined(self, parts: Sequence[Any]) -> Any:
-        """Concatenate (.., n) arrays along the last axis."""
-
-
 class ArrayFlow(Flow):
     """States of a trajectory as a differentiable function of a framework."""
 
-    @property
     @abstractmethod
-    def _arrays(self) -> Arrays:
-        """Array operations of the framework."""
+    def _binary64(self, value: Any, name: str) -> Any:
+        """Return an array in double precision; raise StateError for lower precision."""
+
+    @abstractmethod
+    def _joined(self, parts: Sequence[Any], batch: tuple[int, ...]) -> Any:
+        """Return arrays (.., n), broadcast to the leading axes ``batch``, concatenated along the last axis."""
 
     @abstractmethod
     def _along(self, x: Any) -> Any:
@@ -173,10 +163,10 @@ class ArrayFlow(Flow):
 
     def _number(self, value: Any, name: str) -> Any:
         """Return a number as an array (.., 1)."""
-        return self._arrays.binary64(value, name)[..., None]
+        return self._binary64(value, name)[..., None]
 
     def _vector(self, value: Any, length: int, name: str) -> Any:
-        array = self._arrays.binary64(value, name)
+        array = self._binary64(value, name)
         if tuple(array.shape[-1:]) != (length,):
             raise StateError(f"{name} must have shape (.., {length}), not {tuple(array.shape)}")
         return array
@@ -187,7 +177,7 @@ class ArrayFlow(Flow):
             batch = np.broadcast_shapes(*(tuple(part.shape[:-1]) for part in parts))
         except ValueError as error:
             raise StateError(f"the leading axes of q, p, parameters, t and h cannot be broadcast: {error}") from error
-        return self._arrays.joined([self._arrays.expanded(part, (*batch, part.shape[-1])) for part in parts])
+        return self._joined(parts, batch)
 
 
 class FlowOfRows(Flow):

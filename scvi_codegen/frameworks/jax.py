@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Any
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.frameworks.flow import ArrayFlow, Arrays, imported
+from scvi_codegen.frameworks.flow import ArrayFlow, imported
 from scvi_codegen.native import building
 from scvi_codegen.rendering.flow import XLA_PARTS, XLA_SECOND_ORDER, with_xla_flow
 from scvi_codegen.rendering.source import Source
@@ -44,11 +44,6 @@ def jax_flow(stepper: Stepper, *, steps: int, save_every: int | None = None) -> 
 
 class JaxFlow(ArrayFlow):
     """States of a trajectory as a function that JAX differentiates."""
-
-    @property
-    def _arrays(self) -> Arrays:
-        """Array operations of JAX."""
-        return _JaxArrays()
 
     def _along(self, x: Any) -> Any:
         """Return the saved states; see :meth:`ArrayFlow._along`."""
@@ -91,12 +86,8 @@ class JaxFlow(ArrayFlow):
             _registered.add(name)
         return name
 
-
-class _JaxArrays:
-    """Array operations of JAX."""
-
-    def binary64(self, value: Any, name: str) -> Any:
-        """Return an array in double precision; see :meth:`Arrays.binary64`."""
+    def _binary64(self, value: Any, name: str) -> Any:
+        """Return an array in double precision; see :meth:`ArrayFlow._binary64`."""
         import jax
         import jax.numpy as jnp
 
@@ -109,14 +100,8 @@ class _JaxArrays:
             raise StateError(f"{name} is {array.dtype}, but a flow is computed in binary64: give float64")
         return array.astype(jnp.float64)
 
-    def expanded(self, array: Any, shape: tuple[int, ...]) -> Any:
-        """Return the array broadcast to a shape; see :meth:`Arrays.expanded`."""
+    def _joined(self, parts: Sequence[Any], batch: tuple[int, ...]) -> Any:
+        """Return arrays concatenated along the last axis; see :meth:`ArrayFlow._joined`."""
         import jax.numpy as jnp
 
-        return jnp.broadcast_to(array, shape)
-
-    def joined(self, parts: Sequence[Any]) -> Any:
-        """Concatenate along the last axis; see :meth:`Arrays.joined`."""
-        import jax.numpy as jnp
-
-        return jnp.concatenate(parts, axis=-1)
+        return jnp.concatenate([jnp.broadcast_to(part, (*batch, part.shape[-1])) for part in parts], axis=-1)

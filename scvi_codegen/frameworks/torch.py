@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.frameworks.flow import ArrayFlow, Arrays, FlowOfRows, imported
+from scvi_codegen.frameworks.flow import ArrayFlow, FlowOfRows, imported
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.validation import checks_arguments, of
 
@@ -37,23 +37,14 @@ def torch_flow(stepper: Stepper, *, steps: int, save_every: int | None = None) -
 class TorchFlow(FlowOfRows, ArrayFlow):
     """States of a trajectory as a function that PyTorch differentiates."""
 
-    @property
-    def _arrays(self) -> Arrays:
-        """Tensor operations of PyTorch."""
-        return _Tensors()
-
     def _along(self, x: Any) -> Any:
         """Return the saved states; see :meth:`ArrayFlow._along`."""
         from scvi_codegen.frameworks.torch_functions import StatesAlong
 
         return StatesAlong.apply(x, self)
 
-
-class _Tensors:
-    """Tensor operations of PyTorch."""
-
-    def binary64(self, value: Any, name: str) -> Any:
-        """Return a tensor in double precision; see :meth:`Arrays.binary64`."""
+    def _binary64(self, value: Any, name: str) -> Any:
+        """Return a tensor in double precision; see :meth:`ArrayFlow._binary64`."""
         import torch
 
         tensor = torch.as_tensor(value, dtype=None if isinstance(value, torch.Tensor) else torch.float64)
@@ -63,12 +54,8 @@ class _Tensors:
             raise StateError(f"{name} is {tensor.dtype}, but a flow is computed in binary64: give torch.float64")
         return tensor.to(torch.float64)
 
-    def expanded(self, array: Any, shape: tuple[int, ...]) -> Any:
-        """Return the tensor broadcast to a shape; see :meth:`Arrays.expanded`."""
-        return array.expand(shape)
-
-    def joined(self, parts: Sequence[Any]) -> Any:
-        """Concatenate along the last axis; see :meth:`Arrays.joined`."""
+    def _joined(self, parts: Sequence[Any], batch: tuple[int, ...]) -> Any:
+        """Return tensors concatenated along the last axis; see :meth:`ArrayFlow._joined`."""
         import torch
 
-        return torch.cat(list(parts), dim=-1)
+        return torch.cat([part.expand((*batch, part.shape[-1])) for part in parts], dim=-1)
