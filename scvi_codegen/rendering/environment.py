@@ -13,7 +13,7 @@ from scvi_codegen.files.cache import template_folder
 from scvi_codegen.ir.kernel import Kernel, Number
 from scvi_codegen.rendering.kernels.functions import kernel_text, lane_kernel_text, lane_mass_text
 from scvi_codegen.rendering.kernels.printer import print_number
-from scvi_codegen.rendering.layout import table, wrapped, wrapped_comment, wrapped_comment_lines, wrapped_prototypes
+from scvi_codegen.rendering.text import table, wrapped, wrapped_comment, wrapped_comment_lines, wrapped_prototypes
 
 Rows: TypeAlias = Sequence[Sequence[Number]]
 

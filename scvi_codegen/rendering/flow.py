@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from scvi_codegen.rendering.environment import support_text
-from scvi_codegen.rendering.source import Source, included
+from scvi_codegen.rendering.source import Source
+from scvi_codegen.rendering.text import included
 
 XLA_PARTS = ("states", "jvp", "vjp")
 """XLA handlers: states, tangent vectors of states (JVP), gradients with respect to inputs (VJP)."""

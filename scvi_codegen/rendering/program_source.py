@@ -20,10 +20,10 @@ from scvi_codegen.rendering.convergence import INPUT_PRECISION, LARGEST_VIOLATIO
 from scvi_codegen.rendering.environment import support_text, template_environment
 from scvi_codegen.rendering.kernels.functions import unrolled_equations
 from scvi_codegen.rendering.kernels.loops import loop_context
-from scvi_codegen.rendering.kernels.printer import constants, inverse_roots
+from scvi_codegen.rendering.kernels.printer import DOUBLE, SINGLE, Target, constants, inverse_roots
 from scvi_codegen.rendering.kernels.simd import POINTS, TRAJECTORIES, Fallback, iteration_source, predictor_text
-from scvi_codegen.rendering.source import Interface, Source, included
-from scvi_codegen.rendering.target import DOUBLE, SINGLE, Target
+from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.rendering.text import included
 
 Embedded: TypeAlias = Literal["double", "single"]
 """Precision of C source for a microcontroller."""

@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from scvi_codegen.indices import Access, ArrayDeclarations, ArrayMap, Loop
-from scvi_codegen.rendering.names import with_own_names
-from scvi_codegen.rendering.preprocessing import preprocessed
+from scvi_codegen.rendering.text import preprocessed, with_own_names
 from scvi_codegen.version import __version__
 
 TEXTS = ("header", "code", "declarations")
@@ -166,11 +165,6 @@ def _compare(name: str, size: int, found: re.Match[str] | None) -> None:
     wanted = int(found[1]) if found else 0
     if size != wanted:
         raise ValueError(f"{name} is {size} in the interface and {wanted} in the C source: they must be equal")
-
-
-def included(code: str, read: Callable[[str], str]) -> tuple[tuple[str, str], ...]:
-    """Return names and texts of the support headers that a source includes, in order."""
-    return tuple(preprocessed(code, read)[1].items())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,7 +12,7 @@ from scvi_codegen.ir.kernel import exact_number, lower_matrix, lower_vector
 from scvi_codegen.methods import SCVI, SVI, RadauIIA, SpectralCollocation
 from scvi_codegen.models.systems import double_pendulum, kepler
 from scvi_codegen.pipeline import generate_source, program_of
-from scvi_codegen.rendering.target import DOUBLE, SINGLE
+from scvi_codegen.rendering.kernels.printer import DOUBLE, SINGLE
 from scvi_codegen.tables.basis import cardinal_derivatives, cardinal_integrals, next_step
 from scvi_codegen.tables.nodes import chebyshev_lobatto, legendre_gauss
 from scvi_codegen.tables.precision import mp

@@ -9,7 +9,7 @@ import scvi_codegen as sc
 from scvi_codegen.ir.equations import StoredValues
 from scvi_codegen.lowering.control import predictor_of
 from scvi_codegen.pipeline import program_of
-from scvi_codegen.rendering.target import DOUBLE
+from scvi_codegen.rendering.kernels.printer import DOUBLE
 from scvi_codegen.tables.basis import legendre_functional
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.quadrature import gauss_legendre, legendre_value

@@ -29,7 +29,7 @@ wait
 
 COMPILING = """
 from scvi_codegen.native import building
-from scvi_codegen.rendering.source import Source
+from scvi_codegen.rendering.source import (Source)
 building.load(Source(prefix="tiny", header="", code="", declarations=""))
 """
 

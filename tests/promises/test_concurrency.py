@@ -52,7 +52,7 @@ LOADING = """
 import json, sys, time
 from pathlib import Path
 from scvi_codegen.native import building
-from scvi_codegen.rendering.source import Source
+from scvi_codegen.rendering.source import (Source)
 sources = [Source(**fields) for fields in json.loads(Path(sys.argv[1]).read_text())]
 print("ready", flush=True)
 sys.stdin.readline()

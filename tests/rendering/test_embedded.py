@@ -23,9 +23,9 @@ from scvi_codegen.models.model import Model
 from scvi_codegen.models.packages.package import generate_package, load_package
 from scvi_codegen.models.problems import problem
 from scvi_codegen.pipeline import generate_source
+from scvi_codegen.rendering.kernels.printer import SINGLE
 from scvi_codegen.rendering.program_source import EMBEDDED, Embedded
 from scvi_codegen.rendering.source import Interface, Source
-from scvi_codegen.rendering.target import SINGLE
 
 HERE = Path(__file__).parent / "embedded"
 CROSS, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"

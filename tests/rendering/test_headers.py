@@ -18,8 +18,8 @@ from programs import needs
 from scvi_codegen import SVI, SpectralCollocation, compile_stepper, problem
 from scvi_codegen.files.cache import template_folder
 from scvi_codegen.rendering.flow import with_casadi_flow, with_flow_of_rows
-from scvi_codegen.rendering.preprocessing import preprocessed
 from scvi_codegen.rendering.source import Source
+from scvi_codegen.rendering.text import preprocessed
 
 FOLDER = template_folder()
 HEADERS = sorted(str(path.relative_to(FOLDER)) for path in FOLDER.glob("support/*/*.h"))

@@ -15,7 +15,8 @@ from typing import IO, Any
 
 from scvi_codegen.errors import PackageError
 from scvi_codegen.files.atomic import write_atomically
-from scvi_codegen.rendering.source import PREFIX, Source, included
+from scvi_codegen.rendering.source import PREFIX, Source
+from scvi_codegen.rendering.text import included
 
 INTERFACE_FILE, CERTIFICATE_FILE = "interface.json", "certificate.json"
 FORMAT = 1

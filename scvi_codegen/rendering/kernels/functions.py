@@ -20,10 +20,16 @@ from scvi_codegen.ir.equations import FixedPointIteration, LoweredStageGroup
 from scvi_codegen.ir.kernel import Constant, Kernel, Load, LoopedKernel, Number, Part, parts
 from scvi_codegen.ir.program import FEW_UNKNOWNS, Layout, Program
 from scvi_codegen.rendering.kernels.loop_nests import Nest
-from scvi_codegen.rendering.kernels.printer import ARRAYS, print_lane_statements, print_number, print_statements
+from scvi_codegen.rendering.kernels.printer import (
+    ARRAYS,
+    DOUBLE,
+    Target,
+    print_lane_statements,
+    print_number,
+    print_statements,
+)
 from scvi_codegen.rendering.kernels.simd import Lanes
-from scvi_codegen.rendering.layout import table, wrapped, wrapped_comment, wrapped_prototype
-from scvi_codegen.rendering.target import DOUBLE, Target
+from scvi_codegen.rendering.text import table, wrapped, wrapped_comment, wrapped_prototype
 
 MOST_TERMS = 16
 """Largest number of terms of the Jacobian; beyond it loops over tables are shorter."""

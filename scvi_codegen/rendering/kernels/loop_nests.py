@@ -21,7 +21,7 @@ from typing import TypeAlias
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
 from scvi_codegen.ir.kernel import LoopedKernel
 from scvi_codegen.ir.program import Layout
-from scvi_codegen.rendering.layout import wrapped, wrapped_comment
+from scvi_codegen.rendering.text import wrapped, wrapped_comment
 
 
 def product_text(array: Array) -> str:

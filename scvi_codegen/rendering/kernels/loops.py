@@ -24,9 +24,8 @@ from scvi_codegen.rendering.kernels.loop_nests import (
     size_text,
     sizes_text,
 )
-from scvi_codegen.rendering.kernels.printer import inverse_roots, scalar_functions
+from scvi_codegen.rendering.kernels.printer import DOUBLE, inverse_roots, scalar_functions
 from scvi_codegen.rendering.kernels.simd import LIBRARY, POINTS, IterationSource, iteration_source
-from scvi_codegen.rendering.target import DOUBLE
 
 EXPLICIT_VECTORS, CONSTRAINED_VECTORS, ITERATION_VECTORS = 4, 7, 4
 """Number of vectors in ``work``.

@@ -18,9 +18,8 @@ from typing import Literal, TypeAlias
 
 from scvi_codegen.ir.equations import AdaptivePredictor, FixedPointIteration, StoredValues
 from scvi_codegen.ir.kernel import Kernel, Number, NumberTable
-from scvi_codegen.rendering.kernels.printer import INVERSE_ROOT, Sources, lane_functions, print_number
-from scvi_codegen.rendering.layout import table
-from scvi_codegen.rendering.target import DOUBLE
+from scvi_codegen.rendering.kernels.printer import DOUBLE, INVERSE_ROOT, Sources, lane_functions, print_number
+from scvi_codegen.rendering.text import table
 
 Fallback: TypeAlias = Literal["own", "external", "provided", "none"]
 """Fallback of a source: its own, that of another library (``external``), one for others (``provided``), or none."""
