@@ -24,7 +24,7 @@ _HOMES = {
     "frameworks.casadi": ("casadi_flow", "casadi_step"),
     "frameworks.control_task": ("ControlledMotion",),
     "frameworks.optimal_control": ("optimal_control",),
-    "frameworks.jax": ("JaxFlow", "jax_flow"),
+    "frameworks.flow": ("JaxFlow", "jax_flow"),
     "frameworks.torch": ("TorchFlow", "torch_flow"),
     "frameworks.rebound": ("GravitatingBodies", "from_rebound", "to_rebound"),
     "files.cache": ("CacheInfo", "cache_info", "clear_cache"),

@@ -38,8 +38,8 @@ from scvi_codegen.files.cache import clear_cache as clear_cache
 from scvi_codegen.frameworks.casadi import casadi_flow as casadi_flow
 from scvi_codegen.frameworks.casadi import casadi_step as casadi_step
 from scvi_codegen.frameworks.control_task import ControlledMotion as ControlledMotion
-from scvi_codegen.frameworks.jax import JaxFlow as JaxFlow
-from scvi_codegen.frameworks.jax import jax_flow as jax_flow
+from scvi_codegen.frameworks.flow import JaxFlow as JaxFlow
+from scvi_codegen.frameworks.flow import jax_flow as jax_flow
 from scvi_codegen.frameworks.optimal_control import optimal_control as optimal_control
 from scvi_codegen.frameworks.rebound import GravitatingBodies as GravitatingBodies
 from scvi_codegen.frameworks.rebound import from_rebound as from_rebound

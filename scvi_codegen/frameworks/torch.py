@@ -19,15 +19,7 @@ def torch_flow(stepper: Stepper, *, steps: int, save_every: int | None = None) -
     ``jvp``, ``jacrev``, ``jacfwd``, ``hessian`` and ``vmap`` apply. Derivatives are those of the computed map, exact up
     to round-off, including second derivatives except forward over forward.
 
-    Args:
-        stepper: compiled stepper.
-        steps: number of steps.
-        save_every: save the initial state and every ``save_every``-th one; by default only the final state.
-
-    Raises:
-        MethodError: in transformed time, and for steps of a time-rescaling function.
-        MissingLibraryError: without PyTorch (extra ``torch``).
-        StateError: if ``steps`` is not a multiple of ``save_every``.
+    Arguments and errors are those of :func:`~scvi_codegen.jax_flow`; PyTorch is the extra ``torch``.
     """
     flow = TorchFlow.checked(stepper, steps, save_every)
     imported("torch", "torch")

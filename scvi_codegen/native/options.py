@@ -7,7 +7,7 @@ from typing import Any
 
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number
-from scvi_codegen.rendering.convergence import MAX_ITERATIONS, TOLERANCE
+from scvi_codegen.rendering.text import MAX_ITERATIONS, TOLERANCE
 from scvi_codegen.validation import checked_count
 
 STATUS = {

@@ -16,14 +16,13 @@ from scvi_codegen.ir.derivatives import Derivatives
 from scvi_codegen.ir.equations import Control, FixedPointIteration, StoredValues
 from scvi_codegen.ir.kernel import Kernel, is_divided
 from scvi_codegen.ir.program import Program
-from scvi_codegen.rendering.convergence import INPUT_PRECISION, LARGEST_VIOLATION, MAX_ITERATIONS, ROUNDING_UNITS
 from scvi_codegen.rendering.environment import support_text, template_environment
 from scvi_codegen.rendering.kernels.functions import unrolled_equations
 from scvi_codegen.rendering.kernels.loops import loop_context
 from scvi_codegen.rendering.kernels.printer import DOUBLE, SINGLE, Target, constants, inverse_roots
 from scvi_codegen.rendering.kernels.simd import POINTS, TRAJECTORIES, Fallback, iteration_source, predictor_text
 from scvi_codegen.rendering.source import Interface, Source
-from scvi_codegen.rendering.text import included
+from scvi_codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, MAX_ITERATIONS, ROUNDING_UNITS, included
 
 Embedded: TypeAlias = Literal["double", "single"]
 """Precision of C source for a microcontroller."""

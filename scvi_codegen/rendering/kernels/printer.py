@@ -13,7 +13,7 @@ from typing import TypeAlias
 from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.equations import FixedPointIteration
 from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Number, Operation, Part, kept_length, parts
-from scvi_codegen.rendering.convergence import TOLERANCE
+from scvi_codegen.rendering.text import TOLERANCE
 from scvi_codegen.tables.precision import mp, nearest_float, settled
 
 
@@ -26,7 +26,7 @@ class Target:
         scalar: the type, and the name of its support header.
         suffix: of the functions of libm and of literals.
         digits: of a literal that reads back as the same number; 0: the shortest that does.
-        tolerance: see :data:`scvi_codegen.rendering.convergence.TOLERANCE`.
+        tolerance: see :data:`scvi_codegen.rendering.text.TOLERANCE`.
         halvings: from 1 to the round-off unit.
         smallest, largest: numbers with full precision.
     """

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, warn
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import REASONS, STATUS
-from scvi_codegen.rendering.convergence import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
+from scvi_codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
 from scvi_codegen.runtime.constraints.rank import Jacobian, rank_deficiency
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import (
