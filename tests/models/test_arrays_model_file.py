@@ -90,6 +90,8 @@ def test_solver_is_read_from_the_file(net: Path) -> None:
     assert counts[:2] == counts[2:]
     assert counts[0] != counts[1]
     assert sc.load_model(net, {"method": {"method": "gauss:2"}}).solver == "newton"
+    sc.save_model(sc.load_model(net), net.with_name("again.toml"))
+    assert sc.load_model(net.with_name("again.toml")).solver == "newton"
 
 
 @pytest.mark.parametrize(
