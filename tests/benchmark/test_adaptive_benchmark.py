@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import sympy
 from mpmath import mp
 
 from scvi_codegen import benchmark as bench
@@ -22,25 +21,6 @@ needs_extended = pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason=
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path_factory, monkeypatch):
     monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "adaptive-cache"))
-
-
-@pytest.mark.parametrize("name", ["atwood", "pythagorean", pytest.param("comet", marks=pytest.mark.full)])
-def test_hand_solved_accelerations_obey_the_lagrangian(name):
-    chosen = adaptive_case(name)
-    system, m = chosen.system, chosen.dimension
-    x = [sympy.Rational(int(value), 1000) for value in np.random.default_rng(3).integers(100, 9000, 2 * m)]
-    values = dict(zip(system.parameters, map(sympy.Float, system.defaults), strict=True))
-    lagrangian = system.lagrangian.xreplace(values)
-    rates = chosen.formulations[0].rates(x, chosen.parameters, sympy)
-    place = dict(zip((*system.coordinates, *system.velocities), x, strict=True))
-    for q, v in zip(system.coordinates, system.velocities, strict=True):
-        momentum, force = lagrangian.diff(v), lagrangian.diff(q).subs(place)
-        residual = -force
-        for n, (other, its_velocity) in enumerate(zip(system.coordinates, system.velocities, strict=True)):
-            residual += (
-                momentum.diff(other).subs(place) * x[m + n] + momentum.diff(its_velocity).subs(place) * rates[m + n]
-            )
-        assert abs(float(residual)) < 1e-12 * (1.0 + abs(float(force)))
 
 
 def test_every_case_has_eight_states_of_one_energy_scale():

@@ -90,6 +90,8 @@ def test_threads_are_measured():
 
 @pytest.mark.full
 def test_energies_stay_at_rounding():
-    for row in energies.run_energies(QUICK, quiet).rows:
+    rows = energies.run_energies(QUICK, quiet).rows
+    assert rows
+    for row in rows:
         exact = row["by"].endswith("svi:8")
         assert row["largest"] < 1e-13 if exact else 1e-8 < row["largest"] < 1e-2

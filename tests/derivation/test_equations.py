@@ -166,12 +166,12 @@ def test_matrix_form_is_one_of_spectral_collocation():
         derive(planar_pendulum(), SVI(2)).matrix_form()
 
 
-@pytest.mark.parametrize("method", [SVI(3, "gauss-legendre:3"), SCVI(2), SpectralCollocation(4), Gauss(3), SVI(4)])
+@pytest.mark.parametrize("method", [SVI(3, "gauss-legendre:3"), SCVI(2), SpectralCollocation(4), Gauss(3)])
 def test_radicals_equal_the_values(method):
-    derived = derive(planar_pendulum(), method)
-    for entry in derived.entries:
-        if entry.exact is not None:
-            assert abs(sympy.N(entry.exact, 60) - sympy.Float(str(entry.value), 60)) < sympy.Float("1e-50")
+    entries = [entry for entry in derive(planar_pendulum(), method).entries if entry.exact is not None]
+    assert entries
+    for entry in entries:
+        assert abs(sympy.N(entry.exact, 60) - sympy.Float(str(entry.value), 60)) < sympy.Float("1e-50")
 
 
 def test_radicals_are_used_where_they_are_short():
