@@ -44,6 +44,7 @@ SYSTEMS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
         },
         {
             "q": RANDOM.normal(size=(40, 2)),
+            "velocity": np.zeros((40, 2)),
             "h": 0.02,
             "tables": {"bonds": [[k, (7 * k + 3) % 40] for k in range(40)]},
             "parameters": {"m": 1 + RANDOM.uniform(size=40)},

@@ -173,7 +173,7 @@ int NAME(project)(real t, const real *q0, const real *p0, const real *parameters
   memcpy(u, q0, sizeof(real) * M);
   memcpy(p, p0, sizeof p);
   if (status == OK)
-    status = project_position(t, u, parameters, &at);
+    status = project_position(t, u, parameters, at);
   if (status == OK)
     status = project_momentum(t, u, p, parameters, at, workspace);
   if (status != OK)
