@@ -1,7 +1,5 @@
 """Fixtures of all tests; what they are made from is in ``tools/samples.py``."""
 
-from __future__ import annotations
-
 import gc
 import os
 import signal

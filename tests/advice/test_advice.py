@@ -1,7 +1,5 @@
 """Recommended step sizes reach the requested error, against exact solutions; unreachable tolerances are reported."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Relative error of the conserved energy after a run to a tolerance, compared with its definition."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Arguments of advice: parameters, times and velocities other than defaults, worst and final errors, chaos."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

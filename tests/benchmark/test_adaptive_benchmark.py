@@ -1,7 +1,5 @@
 """The adaptive cases of the benchmark: their equations, their references, all modes of this project, the pictures."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

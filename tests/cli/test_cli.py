@@ -1,7 +1,5 @@
 """Command line: output, files and error messages."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

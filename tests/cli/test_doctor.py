@@ -1,7 +1,5 @@
 """``scvi-codegen doctor`` on machines that lack something, made for the occasion."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import importlib.util
 import json

@@ -1,7 +1,5 @@
 """``--json`` and ``--quiet``: the numbers behind the text, or neither."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -3,8 +3,6 @@
 Errors of positions and energies come from Runge-Kutta methods written out here and from SciPy's DOP853.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import math

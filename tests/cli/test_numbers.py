@@ -4,8 +4,6 @@ Energies, momentum maps and motions are written out here in NumPy; a classical R
 many steps says what is exact. A field or a line without a check fails.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

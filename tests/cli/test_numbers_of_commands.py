@@ -1,7 +1,5 @@
 """Numbers in the JSON of ``derive``, ``methods``, ``systems`` and ``verify``, recomputed by other code."""
 
-from __future__ import annotations
-
 import json
 import re
 from typing import Any

@@ -1,7 +1,5 @@
 """The table of ``docs/command_line.md``, which command serves which kind of model: each cell is tried."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

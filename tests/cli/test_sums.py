@@ -1,7 +1,5 @@
 """The commands with a model of an array system."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 from pathlib import Path

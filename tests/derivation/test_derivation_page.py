@@ -1,7 +1,5 @@
 """The derivation page: its equations are those that are compiled, its counts are counted, and browsers set it."""
 
-from __future__ import annotations
-
 import math
 import random
 import re

@@ -1,7 +1,5 @@
 """Sections of the derivation page: exact table entries, and the stationary function of methods with multipliers."""
 
-from __future__ import annotations
-
 import pytest
 import sympy
 

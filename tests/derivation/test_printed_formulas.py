@@ -5,8 +5,6 @@ written out, in HTML, LaTeX and text. Formulas of the system and its motion are 
 a text that stands here; those of kernels with the C beside them. An entry without a check fails.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """Printed derivations of array systems, read back from text and LaTeX: gradients, masses and complete steps."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Notebook displays of systems, methods, equations, steppers and trajectories."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from functools import cache

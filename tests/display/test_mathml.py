@@ -1,7 +1,5 @@
 """MathML equals the expression, symbol by symbol, and browsers can read it."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator

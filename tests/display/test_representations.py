@@ -1,7 +1,5 @@
 """The representation of every public object fits in a line: constructor-like, or a summary."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Iterator
 from pathlib import Path

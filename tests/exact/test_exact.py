@@ -1,7 +1,5 @@
 """The exact discrete Lagrangian and flow against closed forms, their own derivatives and another integrator."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Faults of what stands beside a Lagrangian, forces, inputs, constraints; of Hamiltonians, derivatives and lanes."""
 
-from __future__ import annotations
-
 import sympy
 from certified_cases import case
 from faults import constraints_off, function, here, moving_part, text, without_last_of, without_rates_of

@@ -1,7 +1,5 @@
 """A copy of the checkout, to put faults into, and commands that are run in it."""
 
-from __future__ import annotations
-
 import os
 import resource
 import shutil

@@ -1,7 +1,5 @@
 """What a fault may be: a changed function, an edit of the C text, a wrong table; and changes to make."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any

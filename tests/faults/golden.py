@@ -1,7 +1,5 @@
 """Golden programs whose output a fault in a header of C changes: headers are exchanged in programs generated once."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile

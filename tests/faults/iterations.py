@@ -1,7 +1,5 @@
 """Faults of what leads to a step: guesses, factors of masses, matrices in a band; none changes the step it leads to."""
 
-from __future__ import annotations
-
 from certified_cases import case
 from faults import text
 

@@ -12,8 +12,6 @@ the results, which has one line per fault; ``--again`` repeats survivors. ``resu
 with the text around it, by which they are found in files that changed.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import random

@@ -3,8 +3,6 @@
 Each is named for what is wrong and has a case in which it makes a difference.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import sympy

@@ -1,7 +1,5 @@
 """Where one small thing of a file may be wrong: a sign, an operator, an index, a constant, a name, a line left out."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Faults of transformed time, and of what chooses the length of steps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from certified_cases import CONTROLLED, REVERSIBLE, case

@@ -8,8 +8,6 @@ each file, so that every file derives and renders what it uses; compiled librari
 written after every file, is used by ``mutate.py``.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import json

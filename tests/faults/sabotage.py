@@ -4,8 +4,6 @@ It is in force while the integrator is built *and* while it is verified, as a re
 shares with the generator is faulty, too.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 import sys

@@ -1,7 +1,5 @@
 """Edits of the package that its own tests must notice, where no certificate looks: a line of edits.toml each."""
 
-from __future__ import annotations
-
 import re
 import sys
 import tomllib

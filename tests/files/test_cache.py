@@ -1,7 +1,5 @@
 """The cache folder: what is in it, what leaves it, what is not believed."""
 
-from __future__ import annotations
-
 import json
 import os
 import time

@@ -1,7 +1,5 @@
 """Files of NumPy arrays (.npz): every kind of result with all that describes it, where nothing is a default."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

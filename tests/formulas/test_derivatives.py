@@ -1,7 +1,5 @@
 """Sparse derivatives against SymPy's own, entry by entry."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import pytest

@@ -1,7 +1,5 @@
 """The grammar: what it accepts, everything it refuses, and the way back to text."""
 
-from __future__ import annotations
-
 import pytest
 import sympy
 from counting import at_most

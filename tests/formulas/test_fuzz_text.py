@@ -3,8 +3,6 @@
 The default tier tries a few thousand inputs, the full one a million. A failing input is found again by its number.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from contextlib import suppress

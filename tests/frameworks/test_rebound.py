@@ -1,7 +1,5 @@
 """Bodies to REBOUND and from it: the same motion by its IAS15 and by steps from the Lagrangian."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

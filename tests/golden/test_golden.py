@@ -4,8 +4,6 @@ A difference means that the arithmetic of generated C changed. If that is intend
 ``tools/record_golden.py``; otherwise it is an error. If the sources are equal but for comments, nothing is compiled.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

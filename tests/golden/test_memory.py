@@ -1,7 +1,5 @@
 """Memory of generated C: every array has exactly the documented length, and the sanitizers report no error."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

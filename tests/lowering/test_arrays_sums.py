@@ -1,7 +1,5 @@
 """Kernels in loops over index tables: a chain's bonds step as their unrolled terms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """LU factors in a band, with room for the fill-in of row exchanges, compared with NumPy's of the full matrix."""
 
-from __future__ import annotations
-
 from functools import cache
 from itertools import product
 from typing import Any

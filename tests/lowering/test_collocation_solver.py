@@ -1,7 +1,5 @@
 """Collocation in position form by its fixed-point iteration: where it exists, and that it finds what Newton finds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from samples import fixed_point

@@ -1,7 +1,5 @@
 """Slowly converging iterations end at round-off, as fast ones do: compared with the same equations in 60 digits."""
 
-from __future__ import annotations
-
 import ctypes
 import subprocess
 from contextlib import nullcontext, suppress

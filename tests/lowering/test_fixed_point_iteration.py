@@ -3,8 +3,6 @@
 What a sweep does wrong, the next ones mend as long as they contract: the solution does not show it.
 """
 
-from __future__ import annotations
-
 import itertools
 from functools import partial
 

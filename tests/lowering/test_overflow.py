@@ -1,7 +1,5 @@
 """Iterations that overflow fail, and errors are controlled for states of any size."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from samples import QUICK_FLAGS

@@ -1,7 +1,5 @@
 """Predictor of fixed-point iterations: exact where the motion is a polynomial of the degree of the method's curves."""
 
-from __future__ import annotations
-
 import pytest
 from numpy.polynomial import Polynomial
 

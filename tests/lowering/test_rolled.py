@@ -1,7 +1,5 @@
 """Families of like terms in loops: the same motion, energy and symmetries as written out, in a short text."""
 
-from __future__ import annotations
-
 from itertools import combinations, pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Error estimate of adaptive steps: Legendre coefficients of the curve of a step, compared with those of NumPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.polynomial import Legendre

@@ -1,7 +1,5 @@
 """Predictor tables of adaptive steps and the precision of their coefficients."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Newton's iteration ends where rounding does in a stiff system: a pendulum whose rod is a spring."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from samples import QUICK_FLAGS

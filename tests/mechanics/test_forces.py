@@ -1,7 +1,5 @@
 """Nonconservative forces: their definition and their derived expressions."""
 
-from __future__ import annotations
-
 import pytest
 import sympy
 from sympy.physics.mechanics import LagrangesMethod, Point, ReferenceFrame, dynamicsymbols

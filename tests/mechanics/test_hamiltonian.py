@@ -4,8 +4,6 @@ A regular Hamiltonian must give the steps of its Lagrangian (identity 10), which
 one is checked against closed solutions and against a Runge-Kutta step written out here.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import sympy

@@ -1,7 +1,5 @@
 """Trajectories of SymPy's mechanics agree with SymPy's own equations; missing parts are named."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

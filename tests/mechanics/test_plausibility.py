@@ -1,7 +1,5 @@
 """Warnings for definitions that are probably mistakes: unused parameters and negative masses."""
 
-from __future__ import annotations
-
 import warnings
 
 import pytest

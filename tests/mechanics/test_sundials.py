@@ -1,7 +1,5 @@
 """Constraints compared with IDA: multipliers as unknowns of a differential-algebraic equation."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Symmetries that are found, those that are refused, and what compiled runs conserve of their momentum maps."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, fields
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """Systems from text, from SymPy and from sympy.physics.mechanics; every definition that must be refused."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import pickle

@@ -1,7 +1,5 @@
 """Transformed time: L^ = g (L(q, q'/g) + E) and K = g (H - E), formulas of g, other coordinates."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import pytest

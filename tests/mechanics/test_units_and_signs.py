@@ -1,7 +1,5 @@
 """Signs and units against independent values: gauges, multipliers of orbits, constraints of arrays, forces with v."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import sympy

@@ -1,7 +1,5 @@
 """The mechanisms of ``examples/joints.py`` against closed forms, reduced coordinates and the statics of trusses."""
 
-from __future__ import annotations
-
 import runpy
 from pathlib import Path
 from types import SimpleNamespace

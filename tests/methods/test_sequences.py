@@ -1,7 +1,5 @@
 """Leapfrog steps in both sequences, of Lagrangians and of H = T(p) + V(q, t): explicit, and what they should be."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from samples import QUICK_FLAGS

@@ -1,7 +1,5 @@
 """Model files of array systems: arrays by number, list, file and formula; sizes; errors."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 from typing import Any

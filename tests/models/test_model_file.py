@@ -1,7 +1,5 @@
 """Model files: what is written reads back equal, and what is wrong is named."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace

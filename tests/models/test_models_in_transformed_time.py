@@ -1,7 +1,5 @@
 """Models in transformed time: files, the command line, and generated folders."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

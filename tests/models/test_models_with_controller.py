@@ -1,7 +1,5 @@
 """Models whose steps the reversible controller chooses: files, the command line, ``solve_ivp`` and inputs."""
 
-from __future__ import annotations
-
 import subprocess
 import warnings
 from dataclasses import replace

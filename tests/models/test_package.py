@@ -1,7 +1,5 @@
 """Generated folders: C that any compiler takes, Python that needs no SymPy, files that are not lost."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Generated folders with adaptive steps: from C, from Python, on a microcontroller."""
 
-from __future__ import annotations
-
 import subprocess
 from dataclasses import replace
 from pathlib import Path

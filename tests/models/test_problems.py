@@ -1,7 +1,5 @@
 """The catalogue: its Lagrangians give the known equations of motion, its entries are fit to start from."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import sympy

@@ -1,7 +1,5 @@
 """A folder that version 0.1 generated, as it was written, does here what it did there."""
 
-from __future__ import annotations
-
 import pickle
 import subprocess
 import sys

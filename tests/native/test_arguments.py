@@ -1,7 +1,5 @@
 """Numbers that carry a unit are not taken without it."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

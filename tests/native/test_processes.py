@@ -1,7 +1,5 @@
 """A compiler that takes long is spoken of, and ends with what waits for it, however that ends."""
 
-from __future__ import annotations
-
 import io
 import logging
 import os

@@ -1,7 +1,5 @@
 """Machines without a compiler, and without the headers of Python."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import re

@@ -1,7 +1,5 @@
 """Integrators that are certified, and sabotaged: systems at states without symmetry, and methods of every kind."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -5,8 +5,6 @@ n = 2, 4, .., 2 k substeps, extrapolated by the scheme of Aitken and Neville in 
 difference of the last two columns.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Mechanisms published with SymPy and PyDy, and their motion by SymPy's own equations and SciPy's DOP853."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache

@@ -5,8 +5,6 @@ differentiates it, mpmath evaluates it. Points are on [0, 1]; arrays hold mpmath
 coordinate. Numbers in parentheses are the paper's equations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Leapfrog of two coupled oscillators whose coupling depends on time, with exact first derivatives by all numbers."""
 
-from __future__ import annotations
-
 import numpy as np
 from samples import QUICK_FLAGS
 

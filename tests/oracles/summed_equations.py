@@ -1,7 +1,5 @@
 """Evaluates equations with sums, as the derivation page shows them, by writing every sum out term by term."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 

@@ -4,8 +4,6 @@ One angle is an elliptic function of time; the others are integrals of functions
 Whittaker, *Analytical Dynamics*, sections 69 to 72). Nothing of the package occurs.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from mpmath import mp
 

@@ -1,7 +1,5 @@
 """Animations: what moves is found, frames are states at equal times, files are whole."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from samples import compile_quickly

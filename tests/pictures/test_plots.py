@@ -1,7 +1,5 @@
 """Pictures: every kind of system gets one, equal trajectories give equal bytes."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Compiled steps equal those of the slow oracle, for every kind of Lagrangian and every family of methods."""
 
-from __future__ import annotations
-
 import numpy as np
 import oracle
 import pytest

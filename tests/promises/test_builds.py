@@ -1,7 +1,5 @@
 """Other builds of the same text: plain x86-64, AVX2, and one under the address and undefined-behaviour sanitizers."""
 
-from __future__ import annotations
-
 import os
 import platform
 import subprocess

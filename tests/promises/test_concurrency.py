@@ -1,7 +1,5 @@
 """Concurrency: processes that share a cache, threads that share a stepper, pickled steppers."""
 
-from __future__ import annotations
-
 import copy
 import json
 import multiprocessing

@@ -1,7 +1,5 @@
 """Whole numbers from users: one checker, one wording, whatever is counted."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import sympy

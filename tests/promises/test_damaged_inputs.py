@@ -4,8 +4,6 @@ Each case damages one thing (a file, an argument, a variable of the environment)
 exception must be a :class:`~scvi_codegen.errors.ScviCodegenError`.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import warnings

@@ -4,8 +4,6 @@
 ``docs/frameworks.md``.
 """
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import re

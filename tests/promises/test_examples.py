@@ -1,7 +1,5 @@
 """Examples run unchanged and produce their documented results."""
 
-from __future__ import annotations
-
 import os
 import re
 import runpy

@@ -1,7 +1,5 @@
 """The seams: what the developers' page adds in a file and a line works, and blocks may be of any size."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

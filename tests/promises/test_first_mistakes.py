@@ -1,7 +1,5 @@
 """Common first mistakes in Python and on the command line: errors name the argument, its value and the remedy."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

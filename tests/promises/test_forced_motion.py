@@ -3,8 +3,6 @@
 The reference is SciPy's DOP853 on accelerations that SymPy solves for, which shares nothing with the package.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

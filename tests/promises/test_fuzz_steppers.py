@@ -1,7 +1,5 @@
 """Extreme numbers: a compiled stepper is accurate to round-off or reports a failure."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from fractions import Fraction

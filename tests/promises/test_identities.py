@@ -3,8 +3,6 @@
 The other side of each identity is the oracle, or a stepper compiled from another stage system.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import oracle
 import pytest

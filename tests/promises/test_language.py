@@ -1,7 +1,5 @@
 """The words of the project are the field's: no retired term, no docstring that begins as a fragment."""
 
-from __future__ import annotations
-
 import re
 
 from language import (

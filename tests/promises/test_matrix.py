@@ -1,7 +1,5 @@
 """Every quantity, in systems and situations in which nothing is a default: a table, and a property for each column."""
 
-from __future__ import annotations
-
 import pytest
 from matrix_properties import PROPERTIES, SITUATIONS, Case
 from matrix_systems import PROBLEMS

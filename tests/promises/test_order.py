@@ -1,7 +1,5 @@
 """The claimed order of a method is the slope of its global error over the step size in logarithms."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

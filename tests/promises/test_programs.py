@@ -1,7 +1,5 @@
 """Tests call the programs that the README requires, and others only where they declare them."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

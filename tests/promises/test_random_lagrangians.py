@@ -1,7 +1,5 @@
 """Random regular Lagrangians and random methods: the compiled step is the oracle's."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
 

@@ -1,7 +1,5 @@
 """The Lagrangian of ``examples/solar_system``: its terms against forms found otherwise, and its runs against DE421."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import os

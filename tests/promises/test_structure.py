@@ -1,7 +1,5 @@
 """Preserved quantities: dq ^ dp, momentum maps, reversibility, energy without drift; and counterexamples."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tiers import family, first_of_each

@@ -1,7 +1,5 @@
 """Selection of combinations for the default and the full tier."""
 
-from __future__ import annotations
-
 import tomllib
 from collections import Counter
 from itertools import product

@@ -1,7 +1,5 @@
 """The oldest and the newest releases of what the project needs: tests of several rooms in fresh environments."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

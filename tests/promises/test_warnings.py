@@ -1,7 +1,5 @@
 """Warnings name the line of the user's that they are about."""
 
-from __future__ import annotations
-
 import pytest
 
 import scvi_codegen as sc

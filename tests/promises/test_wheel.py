@@ -1,7 +1,5 @@
 """Released archives: wheel and sdist are reproducible and work outside the checkout."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib.util
 import json

@@ -1,7 +1,5 @@
 """Public calls with an argument of the wrong type: an error of the project's own that names the argument, each time."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

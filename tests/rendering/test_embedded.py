@@ -1,7 +1,5 @@
 """C for microcontrollers: builds for ARM Cortex-M without a warning, runs under QEMU to the numbers of the host."""
 
-from __future__ import annotations
-
 import subprocess
 from dataclasses import dataclass, replace
 from functools import cache

@@ -4,8 +4,6 @@ The generated part consists of macros, sizes, tables and kernels, and requires t
 Where a source chooses one header among several, as the kind of iteration, users of the choice cannot include it.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 from functools import cache

@@ -1,7 +1,5 @@
 """C for machines that are not this one, by the cross compiler of the extra ``compiler``; one of them is emulated."""
 
-from __future__ import annotations
-
 import importlib.util
 import platform
 import subprocess

@@ -1,7 +1,5 @@
 """Support headers satisfy ``.clang-format``; generated sources are short, and amalgamation does not change results."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Parts of the C text called alone, where the end of a step would hide what they do wrong: what is chosen, and read."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

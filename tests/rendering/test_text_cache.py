@@ -1,7 +1,5 @@
 """Generated texts are made once, and again whenever anything they depend on is another."""
 
-from __future__ import annotations
-
 import copy
 import inspect
 import os

@@ -1,7 +1,5 @@
 """Two generated integrators, of named coordinates and of arrays, in one translation unit."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The vector functions of the generated C, against libm in extended precision."""
 
-from __future__ import annotations
-
 import ctypes
 import platform
 import subprocess

@@ -1,7 +1,5 @@
 """Everything of the paper is in the catalogue, and what an experiment decides is a claim that is listed."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """The numbers behind the Kepler figures 13-20 and 23-30 and behind the page on the chain-rule term."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The figures of systems with one degree of freedom have the numbers computed elsewhere, and verdicts can fail."""
 
-from __future__ import annotations
-
 import pickle
 from dataclasses import replace
 from functools import cache, partial

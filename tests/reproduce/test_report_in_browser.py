@@ -1,7 +1,5 @@
 """The report in a headless Chromium: formulas, widths, colours, paper, and that it asks for nothing."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The tables of the paper, section 4.3 and the claims: numbers against those measured by independent programs."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np

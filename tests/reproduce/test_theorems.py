@@ -1,7 +1,5 @@
 """Theorems 2.1 and 4.1 to 4.3 as measured."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Recorded runs with adaptive steps: continued bit for bit, extended, read, and on the command line."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

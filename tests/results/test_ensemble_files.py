@@ -1,7 +1,5 @@
 """Ensembles as HDF5, Zarr and xarray: what is read back is what was computed, also where some failed."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from samples import compile_quickly

@@ -1,7 +1,5 @@
 """Whatever ends the process, nothing written is lost or torn, and the run goes on bit for bit."""
 
-from __future__ import annotations
-
 import pickle
 import random
 import shutil

@@ -1,7 +1,5 @@
 """Runs in a folder: what is in it, how it is read, continued and exported."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

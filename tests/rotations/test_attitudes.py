@@ -1,7 +1,5 @@
 """Quaternions, matrices, Euler angles and angular velocities, against SciPy's rotations and finite differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """Systems with rotations from SymPy's frames, and after Legendre and time transformations."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import sympy

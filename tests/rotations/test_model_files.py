@@ -1,7 +1,5 @@
 """Model files with rotations, torques, directions and spins, read, run, written and read again."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

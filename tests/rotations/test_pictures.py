@@ -1,7 +1,5 @@
 """Plots and animations of rotations, directions and spins."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from samples import QUICK_FLAGS

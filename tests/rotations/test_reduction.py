@@ -3,8 +3,6 @@
 Expected values: linearised Euler equations about steady rotations, periods of pendulums by elliptic integrals.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from samples import QUICK_FLAGS

@@ -3,8 +3,6 @@
 References integrate Euler's equations for (q, omega), in which nothing of the package occurs, by SciPy's DOP853.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import sympy

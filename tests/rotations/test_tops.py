@@ -1,7 +1,5 @@
 """Classical tops: orders against elliptic functions, invariants of integrable cases, two bodies, published numbers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from samples import QUICK_FLAGS

@@ -1,7 +1,5 @@
 """Runs without saved states: a number of steps, a target time, inputs with zero-order hold."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np

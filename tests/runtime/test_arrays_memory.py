@@ -1,7 +1,5 @@
 """Memory of runs over arrays: nothing that a caller changes later, and no damaged bytes, lead C out of its arrays."""
 
-from __future__ import annotations
-
 import copy
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Steps that choose their own length: accuracy on exact motions, ends, refusals; the error of a step in every run."""
 
-from __future__ import annotations
-
 import math
 import pickle
 from contextlib import nullcontext

@@ -1,7 +1,5 @@
 """Dense output: continuous, of the method's order, equal to the saved states at both ends; the solve_ivp-like call."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Step density of a time transformation: the reversible controller of Hairer and Soederlind."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Ensembles over a cluster equal those of one machine, also when a worker is killed on the way."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import signal

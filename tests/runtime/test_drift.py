@@ -1,7 +1,5 @@
 """The energy of two million steps walks at random, and does not drift: every term of a step counts, however small."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

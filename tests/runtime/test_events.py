@@ -1,7 +1,5 @@
 """Zero crossings: none missed, none twice, at exact times, in the order of the run."""
 
-from __future__ import annotations
-
 import math
 import pickle
 import subprocess

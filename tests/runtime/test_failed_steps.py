@@ -1,7 +1,5 @@
 """Time and number of a failed step, in every kind of run: the force is undefined after t = stop."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

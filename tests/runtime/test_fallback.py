@@ -1,7 +1,5 @@
 """Newton's iteration from a fallback library equals a built-in one and is compiled on demand."""
 
-from __future__ import annotations
-
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache

@@ -1,7 +1,5 @@
 """A state may be given by its velocity, and a method by its name."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from samples import QUICK_FLAGS

@@ -1,7 +1,5 @@
 """Global error of whole runs: the estimate bounds the true error, chaos ends what is confirmed, defaults warn."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """Largest step of tau for a requested accuracy, and reports of runs that miss it."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

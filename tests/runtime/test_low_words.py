@@ -6,8 +6,6 @@ size, a thousandth of a rounding of the state at these steps; a low word that is
 sign shows as a rounding of the state.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from fractions import Fraction

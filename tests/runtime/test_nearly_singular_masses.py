@@ -1,7 +1,5 @@
 """Nearly singular masses: rounding alone changes velocities by 1e-12 and more, and motions are done all the same."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp

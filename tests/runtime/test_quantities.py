@@ -3,8 +3,6 @@
 Beside each stands its value from the formula of L alone, by SymPy's derivatives; states stand beside SciPy's.
 """
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Random single steps: none that is accepted is wrong by more than 100 times its estimate; spurious solutions."""
 
-from __future__ import annotations
-
 import dataclasses
 import warnings
 

@@ -1,7 +1,5 @@
 """The error estimate of a step compared with the error, also where a coefficient of the curve passes through zero."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Steps, runs, transforms and errors of a compiled stepper, as a user meets them."""
 
-from __future__ import annotations
-
 import math
 import pickle
 from concurrent.futures import ThreadPoolExecutor

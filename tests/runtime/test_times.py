@@ -1,7 +1,5 @@
 """Compensated time: t + n h to the last bit, in runs, ensembles and the arithmetic of the test."""
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 

@@ -1,7 +1,5 @@
 """Runs in transformed time: fixed steps of tau, and everything that users give and get in time."""
 
-from __future__ import annotations
-
 import pickle
 from functools import cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Time transformations that come to 0: refused in bounded work, and never gone round."""
 
-from __future__ import annotations
-
 import pytest
 
 import scvi_codegen as sc

@@ -1,7 +1,5 @@
 """Cardinal functions: exactness on polynomials in rational arithmetic, known matrices, and stability at degree 30."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Nodes: their values against NumPy, SciPy and radicals, their symmetry, and the errors of wrong arguments."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """Quadrature rules: points and weights against NumPy and SciPy, orders by exact moments, closed forms, errors."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import mpmath

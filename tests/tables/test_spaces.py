@@ -1,7 +1,5 @@
 """Curves other than polynomials, and quadratures with derivatives: exactness, order, structure, and where each wins."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

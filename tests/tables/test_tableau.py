@@ -1,7 +1,5 @@
 """Tableaux: the paper's tables 1 to 4, orders by two independent paths, stability against eigenvalues, closed forms."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from fractions import Fraction
 

@@ -1,7 +1,5 @@
 """Tests of pages in a headless Chromium: open a file in the size of a phone or a desk, and inspect its layout."""
 
-from __future__ import annotations
-
 import importlib.util
 import shutil
 from collections.abc import Iterator

@@ -7,8 +7,6 @@ A line of a support header counts as reached if any build reached it; so does ea
 rendered for one system is summed over the builds. What tests compile in caches of their own is not counted.
 """
 
-from __future__ import annotations
-
 import gzip
 import json
 import shutil

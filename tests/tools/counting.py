@@ -1,7 +1,5 @@
 """Work bounded by a number of function calls: the same on a quick, a slow and a busy machine, unlike seconds."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager

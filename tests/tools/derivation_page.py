@@ -1,7 +1,5 @@
 """A derivation page taken apart: what it prints, in order, with formulas read back into trees."""
 
-from __future__ import annotations
-
 import html
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Features of the table in docs/features.md, each as a function that uses it on one of three kinds of systems."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Minimal importer of FMUs for tests: the library called through ctypes, as specified by FMI 3.0."""
 
-from __future__ import annotations
-
 import ctypes
 import zipfile
 from ctypes import CFUNCTYPE, byref, c_bool, c_char_p, c_double, c_int, c_size_t, c_uint32, c_void_p

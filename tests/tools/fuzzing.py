@@ -3,8 +3,6 @@
 Everything is drawn from one ``random.Random``, so that a failing input is found again by its number alone.
 """
 
-from __future__ import annotations
-
 import signal
 import sys
 from collections.abc import Callable, Iterator

@@ -4,8 +4,6 @@ A cell is a system, a method and a kind of run. Its recorded source and the one 
 compiled with the same flags on the same machine and run by the same steps, so that no recorded number depends on libm.
 """
 
-from __future__ import annotations
-
 import json
 import lzma
 import re

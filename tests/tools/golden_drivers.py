@@ -2,8 +2,6 @@
 Python: what they print depends on the C source alone. With an argument n a program repeats its run n times and prints
 the shortest time in nanoseconds instead."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 __all__ = ["arrays_driver", "ensemble_driver", "run_driver", "tangent_driver"]

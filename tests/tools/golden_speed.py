@@ -4,8 +4,6 @@ Three programs take turns: the recorded one, the one generated now, and the reco
 the first shows how far minima may be trusted on this machine.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile

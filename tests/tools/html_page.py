@@ -1,7 +1,5 @@
 """A page of HTML taken apart; it fails where a tag is not closed."""
 
-from __future__ import annotations
-
 from html.parser import HTMLParser
 
 VOID = {"meta", "link", "br", "hr", "img", "input"}

@@ -5,8 +5,6 @@ python tests/tools/language.py docstrings   # first lines
 python tests/tools/language.py words        # retired words with their places
 """
 
-from __future__ import annotations
-
 import ast
 import io
 import re

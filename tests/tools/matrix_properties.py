@@ -4,8 +4,6 @@ States are compared with :class:`matrix_systems.Truth`, quantities with its form
 with difference quotients of whole runs, and what a run is after an interruption with the run that had none, bit by bit.
 """
 
-from __future__ import annotations
-
 import math
 import pickle
 import tempfile

@@ -5,8 +5,6 @@
 contains only a file name is written to that file. A ``text`` block is the output of the Python blocks before it.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import re

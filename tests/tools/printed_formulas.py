@@ -5,8 +5,6 @@ A tree is a tuple whose first entry is its kind. Names are text: letter, accent,
 a mathematician reads on the page is what is evaluated.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any

@@ -5,8 +5,6 @@ coreutils) and those that it has declared. ``audit`` enforces this on every mach
 found where the program happens to be installed, too.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys

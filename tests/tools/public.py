@@ -3,8 +3,6 @@
 python tests/tools/public.py      writes it to tests/corpus/public.txt, which test_public.py compares.
 """
 
-from __future__ import annotations
-
 import inspect
 import re
 import sys

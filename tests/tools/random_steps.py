@@ -5,8 +5,6 @@ short steps of SVI(12), kept where SVI(9) agrees; their difference, and what a c
 the end, are the noise of the error.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

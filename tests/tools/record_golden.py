@@ -3,8 +3,6 @@
 Do so where results change on purpose: say in the commit which bits changed, and why.
 """
 
-from __future__ import annotations
-
 import json
 import lzma
 import sys

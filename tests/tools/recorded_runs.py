@@ -1,7 +1,5 @@
 """Recorded runs as the tests make and compare them."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Systems beyond the catalogue, generic states, and compiled steppers shared between tests."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """C style as specified by clang-format."""
 
-from __future__ import annotations
-
 import subprocess
 import sysconfig
 from pathlib import Path

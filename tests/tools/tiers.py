@@ -6,8 +6,6 @@ value of each argument is in one; ``@pytest.mark.covering(2)`` so that each is i
 begins it before others, so that no process waits for another at the end.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Hashable, Iterable, Sequence

@@ -1,7 +1,5 @@
 """Certificates of array systems: correct integrators pass, faults in their loops are detected."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The certificate: whole integrators pass it, and no fault of the generator does."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Certificates of runs in transformed time and with adaptive steps. Planted faults: ``faults/paces.py``."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np
