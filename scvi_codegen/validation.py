@@ -118,6 +118,8 @@ def checked_count(
     value: Any, name: str, *, least: int, most: int = LARGEST_COUNT, error: type[ScviCodegenError] = StateError
 ) -> int:
     """Return the value as an int from ``least`` to ``most``, or raise an error that names it; booleans are rejected."""
+    if type(value) is int and least <= value <= most:
+        return value
     try:
         count = operator.index(value)
     except TypeError:
@@ -194,6 +196,13 @@ def check_kind(kind: ArgumentType, value: Any, name: str, error: type[ScviCodege
         raise error(f"{name} must be {kind.words}, not {shown}")
 
 
+def _check_sizes(kind: ArgumentType, value: Any, function: str, error: type[ScviCodegenError]) -> None:
+    """Raise an error for a value of the kind but for its sizes, which are unknown."""
+    reason = getattr(type(value), "REQUIRES_SIZES", "")
+    if reason and not kind.accepts(value):
+        raise error(f"{function}() is not available for {value!r:.60}: {reason}")
+
+
 def checks_arguments(
     error: type[ScviCodegenError] = ArgumentError, /, **kinds: ArgumentType
 ) -> Callable[[Called], Called]:
@@ -219,9 +228,13 @@ def checks_arguments(
         positions = [
             (names.index(name) if name in names else MOST_ARGUMENTS, name, kind) for name, kind in kinds.items()
         ]
+        unchecked = frozenset(known).difference(kinds)
+        first = min((position for position, _, _ in positions), default=MOST_ARGUMENTS)
 
         @functools.wraps(function)
         def checked(*arguments: Any, **keywords: Any) -> Any:
+            if len(arguments) <= first and unchecked.issuperset(keywords):
+                return function(*arguments, **keywords)
             if not (open_ended or keywords.keys() <= known.keys()):
                 name = next(name for name in keywords if name not in known)
                 raise ArgumentError(f"{function.__qualname__}() takes no {name!r}{keyword_hint(name, known)}")
@@ -229,9 +242,7 @@ def checks_arguments(
                 if position < len(arguments) or name in keywords:
                     value = arguments[position] if position < len(arguments) else keywords[name]
                     if not (value is None and name in optional):
-                        reason = getattr(type(value), "REQUIRES_SIZES", "")
-                        if reason and not kind.accepts(value):
-                            raise error(f"{function.__qualname__}() is not available for {value!r:.60}: {reason}")
+                        _check_sizes(kind, value, function.__qualname__, error)
                         check_kind(kind, value, name, error)
             return function(*arguments, **keywords)
 

@@ -31,7 +31,7 @@ def run_numbers(
         **(_array_numbers(model, outcome) if model.array_system else {}),
         "steps": trajectory.steps,
         "rejected_steps": run.rejected_steps,
-        "h": run.plan.tau or None if run.plan else model.h or run.h,
+        "h": model.h or run.h if run.plan.fixed else run.plan.tau or None,
         "states": len(trajectory),
         "seconds": outcome.seconds,
         "preparation_seconds": outcome.preparation,

@@ -150,7 +150,7 @@ class Recording:
             run,
             Path(folder),
             first=0,
-            steps=None if run.plan else model.whole_step_count(),
+            steps=model.whole_step_count() if run.plan.fixed else None,
             save_every=model.save_every,
             model=text,
             certificate=self.certificate,

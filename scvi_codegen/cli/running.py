@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -112,8 +112,10 @@ class _FileRecorder:
 
     def __init__(self, model: Model, run: Run) -> None:
         self.model, self.run, self.pieces = model, run, list[Trajectory]()
-        end = model.t + model.covered if model.in_transformed_time and model.ends_at_time else None
-        self.observed = None if end is None else Observation(run, save_every=model.save_every, end=end)
+        self.observed: Observation | None = None
+        if model.in_transformed_time and model.ends_at_time:
+            run.plan = replace(run.plan, t_end=model.t + model.covered)
+            self.observed = Observation(run, save_every=model.save_every)
 
     @property
     def ended(self) -> bool:
@@ -186,7 +188,7 @@ def _geometry(model: Model, run: Run) -> str:
     """Return whether the map is symplectic; adaptive steps destroy this property."""
     if not is_symplectic(model.method, model.system):
         return "not symplectic"
-    return "symplectic" if run.plan is None else "symplectic only at fixed step size"
+    return "symplectic" if run.plan.fixed else "symplectic only at fixed step size"
 
 
 def known_at_end(model: Model, outcome: RunOutcome) -> Known | None:
@@ -207,9 +209,10 @@ def describe_step_size(model: Model, run: Run) -> str:
     """Return a description of the step sizes of a run."""
     if model.in_transformed_time:
         return f"of {run.h:g} in tau"
-    if run.plan and run.plan.tau:
+    if run.plan.tau:
         return f"of {run.plan.tau:g} in tau by the reversible controller"
-    return f"of adaptive size ({run.rejected_steps} rejected)" if run.plan or model.h is None else f"of {model.h:g}"
+    adaptive = run.plan.adaptive or model.h is None
+    return f"of adaptive size ({run.rejected_steps} rejected)" if adaptive else f"of {model.h:g}"
 
 
 def _speed(outcome: RunOutcome, model: Model) -> str:

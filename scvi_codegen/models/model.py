@@ -248,7 +248,7 @@ class Model(TimeSpan):
             ModelFileError, StateError: for inputs that are missing, or do not cover the whole run.
         """
         if not self.has_segments:
-            yield None if run.plan or self.ends_at_time else self.step_count
+            yield None if not run.plan.fixed or self.ends_at_time else self.step_count
             return
         from scvi_codegen.runtime.inputs.segments import prepared_segments
 

@@ -65,9 +65,10 @@ class Binding:
         """Return ``<prefix>_<name>``, bound to this memory if one is given; it releases the GIL while it runs."""
         function: Callable[..., Any] = getattr(self._lib, f"{self._prefix}_{name}")
         leading = () if memory is None else (memory,)
+        called = partial(function, *leading) if leading else function
         if self._fallback_missing and name not in WITHOUT_STEPS:
-            return self._with_fallback(function, *leading)
-        return partial(function, *leading) if leading else function
+            return self._with_fallback(called, *leading)
+        return called
 
     def with_function(self, name: str) -> Self:
         """Return this binding, or that of the fallback if only it has the function; MethodError if neither has it."""
@@ -100,18 +101,18 @@ class Binding:
         """Return whether the library has the function ``<prefix>_<name>``."""
         return hasattr(self._lib, f"{self._prefix}_{name}")
 
-    def _with_fallback(self, function: Callable[..., Any], *leading: Any) -> Callable[..., Any]:
+    def _with_fallback(self, function: Callable[..., Any], *changed: Any) -> Callable[..., Any]:
         """Return the function; a call that requests the fallback is repeated with it, on the initial memory."""
-        memory = self._ffi.buffer(*leading) if leading else bytearray()
+        memory = self._ffi.buffer(*changed) if changed else bytearray()
 
         def call(*arguments: Any) -> Any:
-            before = bytes(memory)
-            status = function(*leading, *arguments)
+            before = memory[:]
+            status = function(*arguments)
             if status != FALLBACK_REQUIRED:
                 return status
             self.set_fallback()
             memory[:] = before
-            return function(*leading, *arguments)
+            return function(*arguments)
 
         return call
 

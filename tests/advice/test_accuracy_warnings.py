@@ -237,7 +237,7 @@ class TestTolerances:
         motion = sc.solve_ivp(system, (0.0, 6.0 * math.pi), [*NEARLY_RADIAL[0], *NEARLY_RADIAL[1]])
         assert motion.success
         assert motion.y[0, -1] == pytest.approx(1.999, abs=1e-6)
-        assert motion.trajectory.plan is not None
+        assert motion.trajectory.plan.adaptive
 
     def test_step_error_above_the_tolerance_is_a_violation(self, kepler):
         trajectory = kepler.integrate([0.4, 0.0], [0.0, 2.0], h=0.2, steps=100)

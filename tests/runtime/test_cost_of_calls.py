@@ -22,7 +22,7 @@ def stepper():
     return compile_stepper(problem("kepler").system, SVI(8))
 
 
-@pytest.mark.parametrize(("plan", "calls"), [(FIXED, 115), (ADAPTIVE, 178)])
+@pytest.mark.parametrize(("plan", "calls"), [(FIXED, 59), (ADAPTIVE, 82)])
 def test_a_call_takes_few_function_calls(stepper, plan, calls):
     """The limit is a tenth above the present number, and does not depend on the machine."""
     stepper.integrate(Q, P, **plan)

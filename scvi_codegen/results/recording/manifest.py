@@ -148,7 +148,7 @@ class Manifest:
             "format": FORMAT_TO_A_TIME if self.plan else FORMAT,
             **{field: getattr(self, field) for field in PLAIN},
             "options": None if self.options is None else asdict(self.options),
-            **({"plan": asdict(self.plan)} if self.plan else {}),
+            **({"plan": {name: getattr(self.plan, name) for name in PLAN}} if self.plan else {}),
             "builds": [asdict(build) for build in self.builds],
             "interface": self.interface.to_record(),
             "source": self.source.to_record(),
@@ -180,6 +180,7 @@ class Manifest:
         return manifest
 
 
+PLAN = ("t_end", "tolerance", "tau")
 PLAIN = ("flags", "parameters", "h", "t", "save_every", "steps", "rows", "model", "certificate")
 
 

@@ -237,7 +237,7 @@ class RecordedRun:
             iterations=iterations,
             step_sizes=self._lengths(t, rows),
             h=self.h,
-            plan=manifest.plan,
+            plan=run.plan,
             steps=run.steps,
             rejected_steps=run.rejected_steps,
             step_error=run.step_error,

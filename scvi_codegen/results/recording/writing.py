@@ -101,7 +101,7 @@ def record_run(
         t=run.t,
         save_every=checked_count(save_every, "save_every", least=1),
         steps=_checked_steps(run, steps),
-        plan=run.plan,
+        plan=None if run.plan.fixed else run.plan,
         rows=chunk_rows(run.stepper.dimension) if rows is None else checked_count(rows, "rows", least=1),
         model=model,
         certificate=_certificate(certificate),
@@ -305,20 +305,20 @@ def _check_inputs(run: Run) -> None:
 
 def _checked_steps(run: Run, steps: int | None) -> int | None:
     """Return the number of fixed steps; ``None`` for adaptive steps."""
-    if run.plan is None:
+    if run.plan.fixed:
         return checked_count(steps, "steps", least=0)
     if steps is not None:
         raise StateError(f"adaptive steps end at t_end={run.plan.t_end:g}: omit steps={steps}")
     return None
 
 
-def _extended(manifest: Manifest, run: Run, steps: int | None, t_end: float | None) -> tuple[Manifest, StepPlan | None]:
+def _extended(manifest: Manifest, run: Run, steps: int | None, t_end: float | None) -> tuple[Manifest, StepPlan]:
     """Return the manifest and the step plan of a run with a new end."""
-    if run.plan is None:
+    if run.plan.fixed:
         if t_end is not None:
             raise StateError(f"the run has fixed steps h = {run.h:g}: give steps instead of t_end")
         wanted = manifest.steps if steps is None else steps
-        return replace(manifest, steps=checked_count(wanted, "steps", least=0)), None
+        return replace(manifest, steps=checked_count(wanted, "steps", least=0)), run.plan
     _checked_steps(run, steps)
     plan = run.plan if t_end is None else replace(run.plan, t_end=checked_number(t_end, "t_end"))
     if (plan.t_end - run.t) * (run.plan.t_end - manifest.t) < 0.0:
@@ -338,10 +338,10 @@ def _of_known_sizes(run: Run) -> Run:
         return run
     known: Any = stepper.known
     return Run.started(
-        known if plan is None else known._adaptive(),
+        known if plan.fixed else known._adaptive(),
         run.q,
         run.p,
-        h=run.h if plan is None else plan,
+        plan=plan,
         t=run.t,
         parameters=run.parameters,
         options=run.options,

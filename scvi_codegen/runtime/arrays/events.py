@@ -21,6 +21,7 @@ from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.interface import Numbers, check_accesses
 from scvi_codegen.runtime.events.event import ACCUMULATED, Crossings, Event
 from scvi_codegen.runtime.run.memory import Memory
+from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 
 if TYPE_CHECKING:
@@ -221,7 +222,7 @@ class _Step:
     def __init__(self, states: SavedStates, number: int) -> None:
         self.states, self.number, self.t = states, number, float(states.t[number])
         self.start = np.concatenate([states.q[number], states.p[number]])
-        controlled = states.plan is not None or number + 1 == len(states)
+        controlled = not states.plan.fixed or number + 1 == len(states)
         self.h = (
             0.0
             if number + 1 == len(states)
@@ -240,7 +241,7 @@ class _Step:
         """Return a run after a fraction of the step."""
         q, p = np.split(self.start, 2)
         given: dict[str, Any] = {"t": self.t, "parameters": self.states.parameters, "options": self.states.options}
-        run = Memory.started(self.states.stepper, q, p, h=part * self.h, **given)
+        run = Memory.started(self.states.stepper, q, p, plan=StepPlan.with_step(part * self.h), **given)
         run.advance(1)
         return run
 

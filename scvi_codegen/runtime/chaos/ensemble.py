@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,6 +31,7 @@ from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runtime.run.accuracy import warn_of_large_steps
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.run_loop import record
+from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.validation import checked_count
 
@@ -96,9 +97,8 @@ class ChaosIndicatorsEnsemble:
         steps, runs = len(self.t) - 1, {}
         for j in range(0, len(self.q), CHECKED_STRIDE):
             start = self.q[j], self.p[j]
-            memory = Memory.started(
-                self.stepper, *start, h=self.h, t=self.t[0], parameters=self.parameters[j], options=self.options
-            )
+            given: dict[str, Any] = {"t": self.t[0], "parameters": self.parameters[j], "options": self.options}
+            memory = Memory.started(self.stepper, *start, plan=StepPlan.with_step(self.h), **given)
             with suppress(StepFailedError):
                 runs[j] = record(memory, steps, save_every=steps)
         worst = max(runs, key=lambda j: np.nan_to_num(runs[j].step_error), default=None)

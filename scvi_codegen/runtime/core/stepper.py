@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.arrays.interface import RunSizes
 from scvi_codegen.runtime.chaos.ensemble import ChaosIndicatorsEnsemble
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
@@ -40,13 +40,12 @@ from scvi_codegen.runtime.inputs.segments import (
 )
 from scvi_codegen.runtime.rotations.states import homogeneous_state
 from scvi_codegen.runtime.run.accuracy import warn_of_energy_error, warn_of_energy_errors, warn_of_large_steps
-from scvi_codegen.runtime.run.error_growth import GrowthCheck
+from scvi_codegen.runtime.run.error_growth import check_growth_requested, warn_of_error_growth
 from scvi_codegen.runtime.run.global_error import checked_error, confirmed_run, warn_of_unconfirmed
-from scvi_codegen.runtime.run.observation import Observation, observed_until
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.saving import read_checkpoint
-from scvi_codegen.runtime.run.step_plan import StepPlan
-from scvi_codegen.runtime.run.times import steps_to, times_after
+from scvi_codegen.runtime.run.step_plan import StepPlan, planned_steps
+from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import FUNCTION, MAPPING, checked_count, checks_arguments, of
@@ -77,7 +76,8 @@ class Stepper(Integrator):
         if self.origin is not None:
             return (_rebuild_bound, (self.origin, self.problem, self._plain, self.events))
         variants = Variants() if self._reason else self._variants
-        return (_rebuild, (self._plain, self.interface, variants, self.flags, self.events, self._reason))
+        further: dict[str, Any] = {"flags": self.flags, "events": self.events, "reason": self._reason}
+        return partial(Stepper, variants=variants, **further), (self._plain, self.interface)
 
     @checks_arguments(StateError, progress=FUNCTION, observe=FUNCTION, inputs=MAPPING)
     def integrate(
@@ -155,7 +155,7 @@ class Stepper(Integrator):
             StepFailedError: if a step fails; its ``trajectory`` contains the states before.
         """
         self._check_not_of_run(tables, threads)
-        stepper = self if events is None else self.with_events(events)
+        stepper, interface = self if events is None else self.with_events(events), self.interface
         if t_eval is not None and save_every != 1:
             raise StateError(f"give either t_eval or save_every={save_every}, not both")
         data = None if inputs is None else checked_inputs(self.interface, inputs)
@@ -175,25 +175,31 @@ class Stepper(Integrator):
                 {"t": t, "options": options, "parameters": parameters},
                 {"t_end": t_end, "save_every": save_every, "progress": progress, "t_eval": t_eval},
             )
-        to_end = h is None or bool(self.interface.time_transformation)
         if data is None:
-            plan = h, t_end if to_end else None, tolerance
+            controller, in_tau = interface.time_transformation, bool(interface.energy_parameter)
+            plan, count = planned_steps(h, steps, t_end, tolerance, save_every, t, controller, in_tau=in_tau)
             run = stepper._started(q, p, velocity, plan, t, parameters, options, reuse=True)
-            check = GrowthCheck(run, check_growth)
-            trajectory = _recorded(run, h, steps, t_end, save_every, t_eval, progress, observe)
-            check.warn(trajectory)
+            if check_growth:
+                check_growth_requested(plan)
+            times = None if t_eval is None else stepper._output_times(t_eval, run, count)
+            trajectory = run._recorded(count, save_every=save_every, times=times, progress=progress, observe=observe)
+            warn_of_large_steps(trajectory)
+            warn_of_energy_error(trajectory, run)
+            warn_of_error_growth(run, trajectory, check_growth)
             run._release()
             return trajectory
-        end = final_time(t, None if self.interface.time_transformation else h, steps, t_end)
+        to_end = h is None or bool(interface.time_transformation)
+        end = final_time(t, None if interface.time_transformation else h, steps, t_end)
         values = parameters_of(self, parameters, data)
-        plan = h, end if to_end else None, tolerance
+        plan = self._plan(h, end if to_end else None, tolerance)
         run = stepper._started(q, p, velocity, plan, t, values(first_inner_time(t, end)), options, reuse=True)
-        check = GrowthCheck(run, check_growth, lambda time: advance_to(run, data, time, values))
+        if check_growth:
+            check_growth_requested(plan)
         save_every = checked_count(save_every, "save_every", least=1)
-        driven = record_pieces(run, data, end, save_every=save_every, values=values, progress=progress)
-        check.warn(driven)
+        trajectory = record_pieces(run, data, end, save_every=save_every, values=values, progress=progress)
+        warn_of_error_growth(run, trajectory, check_growth, lambda time: advance_to(run, data, time, values))
         run._release()
-        return driven
+        return trajectory
 
     @property
     def _has_tau(self) -> bool:
@@ -223,46 +229,45 @@ class Stepper(Integrator):
         self._check_not_of_run(tables, threads)
         if self.interface.rotations:
             q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
-        return self._started(q, p, velocity, (h, t_end, tolerance), t, parameters, options)
+        return self._started(q, p, velocity, self._plan(h, t_end, tolerance), t, parameters, options)
 
     def _started(
         self,
         q: States,
         p: States | None,
         velocity: States | None,
-        step_plan: tuple[float | None, float | None, float | None],
+        plan: StepPlan,
         t: float,
         parameters: Parameters,
         options: SolverOptions | None,
         *,
         reuse: bool = False,
     ) -> Run:
-        """Return a run with (h, t_end, tolerance) as of :meth:`start`, in memory of an earlier one if ``reuse``."""
-        p = self._initial_momenta(q, p, velocity, t, parameters)
+        """Return a run with these arguments of :meth:`start`, in memory of an earlier one if ``reuse``."""
+        if p is None or velocity is not None:
+            p = self._initial_momenta(q, p, velocity, t, parameters)
         if self.interface.constraints:
             q, p = consistent(self, q, p, t, parameters)
-        plan = self._checked_plan(*step_plan)
-        stepper = self._adaptive() if isinstance(plan, StepPlan) else self
+        stepper = self if plan.fixed else self._adaptive()
         run = Run._reused(stepper) if reuse else Run(stepper)
-        run._start(q, p, h=plan, t=t, parameters=parameters, options=options)
+        run._start(q, p, plan=plan, t=t, parameters=parameters, options=options)
         return run
 
-    def _checked_plan(self, h: float | None, t_end: float | None, tolerance: float | None) -> StepPlan | float:
-        """Return the step plan of adaptive steps, or h; raise ``StateError`` for other combinations."""
-        if self.interface.time_transformation:
-            return StepPlan.in_tau(self.interface.time_transformation, h, t_end, tolerance)
-        if h is None and self.interface.energy_parameter:
-            raise StateError("adaptive steps are unavailable in transformed time: give h (fixed step in tau)")
-        if t_end is not None and h is None:
-            return StepPlan.checked(t_end, tolerance)
-        if t_end is not None or h is None:
-            raise StateError(
-                "give either h (fixed step size) or t_end (adaptive step size); got "
-                f"{'neither' if h is None else 'both'}"
-            )
-        if tolerance is not None:
-            raise StateError("tolerance requires adaptive steps: give t_end without h and steps")
-        return h
+    def _plan(self, h: float | None, t_end: float | None, tolerance: float | None) -> StepPlan:
+        """Return the step plan of these arguments of :meth:`start`."""
+        interface = self.interface
+        return StepPlan.checked(
+            h, t_end, tolerance, controller=interface.time_transformation, in_tau=bool(interface.energy_parameter)
+        )
+
+    def _output_times(self, t_eval: ArrayLike, run: Run, steps: int | None) -> Array:
+        """Return the checked output times of a run that begins."""
+        if steps is None:
+            return times_of_run(t_eval, run.t, run.plan.t_end)
+        if self.interface.energy_parameter:
+            raise StateError("t_eval requires t_end instead of steps in transformed time")
+        end = times_after(run.t, run.h, checked_count(steps, "steps", least=0))[0]
+        return times_of_run(t_eval, run.t, float(end))
 
     def from_checkpoint(
         self,
@@ -293,13 +298,10 @@ class Stepper(Integrator):
             parameters = known | dict(cast(Mapping[str, Any], parameters or {}))
         else:
             self._check_not_of_run(None, threads)
-        plan: StepPlan | None = None
-        if self.interface.time_transformation:
-            plan = StepPlan.in_tau(self.interface.time_transformation, h, t_end, tolerance)
-        elif h is not None:
+        transformed = bool(self.interface.time_transformation)
+        if h is not None and not transformed:
             raise StateError("omit h: the saved run contains its step size")
-        elif t_end is not None:
-            plan = StepPlan.checked(t_end, tolerance)
+        plan = self._plan(h, t_end, tolerance) if t_end is not None or transformed else None
         stepper = stepper if plan is None else stepper._adaptive()
         return Run.restored(stepper, saved, parameters=parameters, options=options, plan=plan)
 
@@ -479,63 +481,6 @@ class Stepper(Integrator):
         """
         g, rate = constraint_values(self, q, p, t, parameters)
         return (g[0], rate[0]) if is_one_state(self.interface, q) else (g, rate)
-
-
-def _recorded(
-    run: Run,
-    h: float | None,
-    steps: int | None,
-    t_end: float | None,
-    save_every: int,
-    t_eval: ArrayLike | None,
-    progress: Callable[[int], None] | None,
-    observe: Callable[[Run], ArrayLike] | None,
-) -> Trajectory:
-    """Return the states of a run without inputs; arguments as of :meth:`Stepper.integrate`."""
-    interface = run.stepper.interface
-    clocked = bool(interface.energy_parameter)
-    if h is not None and t_end is not None and not interface.time_transformation:
-        whole = None if clocked or steps is not None else steps_to(run.t, t_end, h)
-        if whole is None or whole % checked_count(save_every, "save_every", least=1):
-            return _with_warnings(observed_until(run, t_end, steps, save_every, t_eval, progress, observe))
-        steps = whole
-    _check_number(run, steps)
-    if t_eval is None:
-        return _with_warnings(run._recorded(steps, save_every=save_every, progress=progress, observe=observe))
-    if clocked:
-        raise StateError("t_eval requires t_end instead of steps in transformed time")
-    times = times_of_run(t_eval, run.t, _end_of(run, steps))
-    return _with_warnings(Observation(run, times=times).advance(steps, progress))
-
-
-def _check_number(run: Run, steps: int | None) -> None:
-    """Raise ``StateError`` for fixed steps without their number, and for adaptive steps with one."""
-    if run.plan is None and steps is None:
-        raise StateError("h requires steps or t_end (fixed step size); give t_end without h for adaptive steps")
-    if run.plan is not None and steps is not None:
-        raise StateError(f"adaptive steps end at t_end={run.plan.t_end:g}: omit steps={steps}, or give h and steps")
-
-
-def _with_warnings(trajectory: Trajectory) -> Trajectory:
-    """Return the trajectory after warnings about its step size and its energy."""
-    warn_of_large_steps(trajectory)
-    warn_of_energy_error(trajectory)
-    return trajectory
-
-
-def _end_of(run: Run, steps: int | None) -> float:
-    return run.plan.t_end if run.plan else float(times_after(run.t, run.h, checked_count(steps, "steps", least=0))[0])
-
-
-def _rebuild(
-    source: Source,
-    interface: Interface,
-    variants: Variants,
-    flags: tuple[str, ...],
-    events: tuple[Event, ...],
-    reason: str = "",
-) -> Stepper:
-    return Stepper(source, interface, variants=variants, flags=flags, events=events, reason=reason)
 
 
 def _rebuild_bound(origin: Stepper, problem: RunSizes, source: Source, events: tuple[Event, ...]) -> Stepper:

@@ -112,7 +112,7 @@ class AdaptiveEnsemble:
         ends = real_array(t_end, "t_end")
         if ends.shape not in ((), (len(self.q),)):
             raise StateError(f"t_end must be one time or {len(self.q)} times, not of shape {ends.shape}")
-        plans = [StepPlan.checked(float(end), tolerance) for end in np.broadcast_to(ends, len(self.q))]
+        plans = [StepPlan.checked(None, float(end), tolerance) for end in np.broadcast_to(ends, len(self.q))]
         signs = {np.sign(plan.t_end - self.t0) for plan in plans} - {0.0}
         if len(signs) > 1:
             raise StateError(f"t_end lies on both sides of t = {self.t0:g}: split the ensemble into two")
@@ -199,7 +199,7 @@ class AdaptiveEnsemble:
                 self.stepper,
                 self.q[j],
                 self.p[j],
-                h=self.plans[j],
+                plan=self.plans[j],
                 t=self.t0,
                 parameters=self._values(j, first_inner_time(self.t0, self.plans[j].t_end)),
                 options=self.options,

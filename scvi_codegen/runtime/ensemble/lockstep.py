@@ -16,7 +16,7 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import suppress
 from functools import partial
 from itertools import accumulate
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,6 +41,7 @@ from scvi_codegen.runtime.inputs.segments import (
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.run_loop import record
+from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import checked_count
@@ -418,7 +419,8 @@ class _SingleRun:
         work.done[j] = step
         h, time, parameters = work.step_data(step, j)
         try:
-            run = Memory.started(work.stepper, q, p, h=h, t=work.t0, parameters=parameters, options=work.options)
+            given: dict[str, Any] = {"t": work.t0, "parameters": parameters, "options": work.options}
+            run = Memory.started(work.stepper, q, p, plan=StepPlan.with_step(h), **given)
         except StateError:  # a sum of finite terms has overflowed
             work.status[j] = "not finite"
         else:

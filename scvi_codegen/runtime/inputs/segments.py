@@ -207,7 +207,7 @@ def prepared_segments(
     Yields:
         The number of steps of the segment; ``None`` for adaptive steps to the target time of the run.
     """
-    if run.plan is None:
+    if run.plan.fixed:
         for segment in planned_segments(run.t, t_end, run.h, inputs):
             run.update(parameters=values(segment.middle), h=segment.h)
             yield segment.steps

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -48,7 +47,7 @@ class StepData(Protocol):
     """Step data of a trajectory."""
 
     @property
-    def plan(self) -> StepPlan | None: ...
+    def plan(self) -> StepPlan: ...
     @property
     def h(self) -> float: ...
     @property
@@ -70,6 +69,12 @@ class EnergyData(StepData, Protocol):
     def p(self) -> Array: ...
     @property
     def parameters(self) -> Array: ...
+
+
+class RunWithEnergies(Protocol):
+    """Run whose states are checked."""
+
+    def _end_energies(self, t: Array, q: Array, p: Array) -> tuple[float, float] | None: ...
 
 
 class EnsembleEnergyData(Protocol):
@@ -102,8 +107,9 @@ def warnings_wanted() -> bool:
 def warn_of_large_steps(trajectory: StepData, *, before: float = 0.0, remedy: str = ADAPTIVE_REMEDY) -> None:
     """Issue an :class:`AccuracyWarning` for the worst fixed step, unless an error ``before`` already caused one."""
     error = trajectory.step_error
-    controlled = trajectory.plan is not None and not trajectory.plan.tau
-    if controlled or not error > TOLERABLE_ERROR or before > TOLERABLE_ERROR or not _warnings_enabled.get():
+    if not error > TOLERABLE_ERROR:
+        return
+    if trajectory.plan.adaptive or before > TOLERABLE_ERROR or not _warnings_enabled.get():
         return
     warn(
         f"the step size h = {trajectory.h:g} is too large: the relative error of the step from "
@@ -112,21 +118,26 @@ def warn_of_large_steps(trajectory: StepData, *, before: float = 0.0, remedy: st
     )
 
 
-def warn_of_energy_error(trajectory: EnergyData) -> None:
+def warn_of_energy_error(trajectory: EnergyData, run: RunWithEnergies) -> None:
     """Issue an :class:`AccuracyWarning` if an adaptive run does not conserve an energy that the system conserves.
 
     Runs over arrays of run-time sizes with fixed steps and no error estimate are checked for gross errors.
     """
     plan, stepper = trajectory.plan, trajectory.stepper
-    if stepper.interface.layout.coordinates and plan is None and math.isnan(trajectory.step_error):
-        limits: dict[str, Any] = {"tolerable": GROSS_ERROR, "why": FIXED_STEP_REMEDY}
-    elif plan is None or plan.tau:
+    limits: dict[str, Any] = {}
+    if plan.h and trajectory.step_error == trajectory.step_error:
         return
-    else:
-        limits = {}
+    if plan.h and stepper.interface.layout.coordinates:
+        limits = {"tolerable": GROSS_ERROR, "why": FIXED_STEP_REMEDY}
+    elif plan.h or plan.tau:
+        return
     if not stepper.interface.conserves_energy or not _warnings_enabled.get():
         return
-    if energies := _changed_energies(stepper, trajectory.t, trajectory.q, trajectory.p, trajectory.parameters):
+    t, q, p = trajectory.t, trajectory.q, trajectory.p
+    ends = run._end_energies(t, q, p)
+    if ends is None or not abs(ends[1] - ends[0]) > 0.5 * TOLERABLE_ERROR * max(abs(ends[0]), abs(ends[1])):
+        return
+    if energies := _changed_energies(stepper, t, q, p, trajectory.parameters):
         warn_of_energies(*energies, **limits)
 
 
@@ -179,8 +190,7 @@ def _changed_energies(
 
     ``None`` is also returned outside the domain of L. Velocities are computed only if the energies differ.
     """
-    if (apart := len(t) - 1) > 1:
-        t, q, p = t[::apart].copy(), q[::apart].copy(), p[::apart].copy()
+    t, q, p = (each[:: max(1, len(each) - 1)].copy() for each in (t, q, p))
     try:
         energies = stepper._energies_of(t, q, p, parameters)
         first, last = float(energies[0]), float(energies[-1])

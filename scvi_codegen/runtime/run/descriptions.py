@@ -13,7 +13,7 @@ from scvi_codegen.runtime.run.step_plan import StepPlan
 class DescribedRun(Protocol):
     """Interface required of a run."""
 
-    plan: StepPlan | None
+    plan: StepPlan
 
     @property
     def t(self) -> float: ...
@@ -55,7 +55,7 @@ def describe_run(
         tau: whether steps are of transformed time.
         unset_inputs: inputs that are not set.
     """
-    plan = "" if run.plan is None else f", t_end = {run.plan.t_end:g}"
+    plan = "" if run.plan.fixed else f", t_end = {run.plan.t_end:g}"
     solved = f", solver {solver}" if solver else ""
     waits = f", inputs not set: {', '.join(unset_inputs)}" if unset_inputs else ""
     steps = f"{run.steps} steps{describe_step_size(run.h, run.plan, tau=tau)}"
@@ -73,8 +73,8 @@ def short_title(interface: Titled) -> str:
     return f"{interface.system}, {interface.method}"
 
 
-def describe_step_size(h: float, plan: StepPlan | None, *, tau: bool) -> str:
+def describe_step_size(h: float, plan: StepPlan, *, tau: bool) -> str:
     """Describe the step size of a run."""
-    if plan is None:
+    if plan.fixed:
         return f" of {h:g}{' in tau' * tau}"
     return f" of {plan.tau:g} in tau" if plan.tau else " of adaptive size"

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,121 +55,136 @@ class ComparedStates(Protocol):
     def q(self) -> Array: ...
     @property
     def p(self) -> Array: ...
+    @property
+    def parameters(self) -> Array: ...
 
 
-class GrowthCheck:
-    """Check of error growth, with the initial state of the run.
+def check_growth_requested(plan: StepPlan) -> None:
+    """Raise ``StateError`` unless steps are adaptive."""
+    if not plan.adaptive:
+        raise StateError(
+            "check_growth=True requires adaptive steps, but the step size is fixed: give t_end without h, or omit "
+            "check_growth"
+        )
+
+
+def warn_of_error_growth(
+    run: Memory,
+    states: ComparedStates,
+    requested: bool | None,
+    advance_until: Callable[[float], None] | None = None,
+) -> None:
+    """Repeat an adaptive run and warn if its states differ by more than is tolerable; the run is left where that ends.
 
     Args:
-        run: the run at its start.
+        run: the run at its end.
+        states: its states.
         requested: ``True``: repeat the whole run; ``None``: repeat up to ``MOST_STEPS`` of its steps, and only if a
             coarse run shows exponential growth; ``False``: no check.
         advance_until: function that advances the run to a time; by default adaptive steps to that time.
-
-    Raises:
-        StateError: if the check is requested for a fixed step size.
     """
+    plan = run.plan
+    if plan.h or plan.tau or requested is False or len(states.t) < 2 or not warnings_wanted():
+        return
+    nudge, tolerable, decades = _thresholds(plan.tolerance)
+    if requested or run.steps * DECADES_PER_STEP >= decades:
+        repetition = _Repetition(run, states, advance_until, nudge, tolerable, decades)
+        repetition.warn(requested=bool(requested))
+
+
+@lru_cache(maxsize=64)
+def _thresholds(tolerance: float) -> tuple[float, float, float]:
+    """Return the perturbation, the tolerable difference, and the decades between them."""
+    nudge, tolerable = max(NUDGE, tolerance), min(max(TOLERABLE, LOOSE * tolerance), LARGEST)
+    return nudge, tolerable, math.log10(tolerable / nudge)
+
+
+class _Repetition:
+    """Repetition of a run from a perturbed initial state; arguments as of :func:`warn_of_error_growth`."""
 
     def __init__(
-        self, run: Memory, requested: bool | None, advance_until: Callable[[float], None] | None = None
+        self,
+        run: Memory,
+        states: ComparedStates,
+        advance_until: Callable[[float], None] | None,
+        nudge: float,
+        tolerable: float,
+        decades: float,
     ) -> None:
-        adaptive = run.plan is not None and not run.plan.tau
-        if requested and not adaptive:
-            raise StateError(
-                "check_growth=True requires adaptive steps, but the step size is fixed: give t_end without h, or omit "
-                "check_growth"
-            )
-        self.run, self.requested, self.advance_until = run, requested, advance_until or self._to
-        self.wanted = adaptive and requested is not False and warnings_wanted()
-        if self.wanted:
-            self.start: Any = run.snapshot
-            self.parameters = run.parameters  # inputs change them during the run
+        self.run, self.states, self.advance_until = run, states, advance_until or self._to
+        self.nudge, self.tolerable, self.decades = nudge, tolerable, decades
+        self.steps, self.tolerance = run.steps, run.plan.tolerance
 
-    def warn(self, states: ComparedStates) -> None:
-        """Repeat the run and warn if its states differ by more than is tolerable; the run is left where that ends."""
-        if not self.wanted or len(states.t) < 2:
-            return
-        assert self.run.plan is not None  # by construction
-        steps, tolerance = self.run.steps, self.run.plan.tolerance
-        nudge = max(NUDGE, tolerance)
-        tolerable = min(max(TOLERABLE, LOOSE * tolerance), LARGEST)
-        decades = math.log10(tolerable / nudge)
-        if not self.requested and steps * DECADES_PER_STEP < decades:
-            return
-        last = self._last(states, steps)
-        if last == 0 or (not self.requested and self._grows_slowly(states, last, max(nudge, COARSE), decades)):
+    def warn(self, *, requested: bool) -> None:
+        """Repeat the run; without a request only up to ``MOST_STEPS`` steps, and if errors grow exponentially."""
+        states, last = self.states, self._last(requested=requested)
+        if last == 0 or (not requested and self._grows_slowly(last, max(self.nudge, COARSE))):
             return
         try:
-            self._begin(nudge, tolerance)
+            self._begin(self.nudge, self.tolerance)
             for k in sorted({last // 2, last} - {0}):
                 self.advance_until(float(states.t[k]))
-                apart = self._relative_difference(states, k)
-                if not apart <= tolerable:
-                    self._report(nudge, f"differs by {apart:.1e} (relative) at t = {states.t[k]:g}")
+                apart = self._relative_difference(k)
+                if not apart <= self.tolerable:
+                    self._report(f"differs by {apart:.1e} (relative) at t = {states.t[k]:g}")
                     return
         except StepFailedError as failure:
-            self._report(nudge, f"fails at t = {failure.t:g}")
+            self._report(f"fails at t = {failure.t:g}")
 
-    def _grows_slowly(self, states: ComparedStates, last: int, tolerance: float, decades: float) -> bool:
+    def _grows_slowly(self, last: int, tolerance: float) -> bool:
         """Return whether errors grow too slowly to matter, by a coarse run of at most half of the steps.
 
         The growth A(k) until step k of n is extrapolated exponentially from the start, A(k)^(n/k), and from the
         previous comparison at step j, A(k) (A(k) / A(j))^((n - k) / (k - j)); the smaller value counts. For algebraic
         growth the second is smaller.
         """
-        first = {int(last * FIRST)} if last >= MANY else set()
+        first, needed = {int(last * FIRST)} if last >= MANY else set(), SLOW * self.decades
         before, grown_before = 0, 0.0
         try:
             self._begin(tolerance, tolerance)
             for k in sorted((first | {int(last * DECISIVE)}) - {0}):
-                self.advance_until(float(states.t[k]))
-                little = 0.0 if k in first else SLOW * decades * k / last
-                grown = math.log10(max(self._relative_difference(states, k, tolerance * 10.0**little) / tolerance, 1.0))
+                self.advance_until(float(self.states.t[k]))
+                little = 0.0 if k in first else needed * k / last
+                grown = math.log10(max(self._relative_difference(k, tolerance * 10.0**little) / tolerance, 1.0))
                 rate = max(grown - grown_before, 0.0) / (k - before)
-                if k not in first and (grown < little or grown + rate * (last - k) < SLOW * decades):
+                if k not in first and (grown < little or grown + rate * (last - k) < needed):
                     return True
                 before, grown_before = k, grown
         except StepFailedError:
             pass
         return False
 
-    def _last(self, states: ComparedStates, steps: int) -> int:
+    def _last(self, *, requested: bool) -> int:
         """Return the index of the last state to compare; 0 unless all states of the run are saved."""
-        count = len(states.t) - 1
-        if len(states.q) != len(states.t):
+        count = len(self.states.t) - 1
+        if len(self.states.q) != len(self.states.t):
             return 0
         most = float(min(MOST_STEPS, MOST_NUMBERS // len(self.run._q)))
-        return count if self.requested or steps <= most else int(count * most / steps)
+        return count if requested or self.steps <= most else int(count * most / self.steps)
 
     def _begin(self, nudge: float, tolerance: float) -> None:
-        """Reset the run to its perturbed initial state, on its constraints, with another local tolerance."""
-        run = self.run
-        run.rollback(self.start)
-        run._parameters[:] = self.parameters
-        run._pass_parameters()
-        assert run.plan is not None  # by construction
-        run.plan = StepPlan(t_end=run.plan.t_end, tolerance=tolerance)
-        q, p = run._q, run._p
-        factors = _factors(len(q), nudge)
-        q *= factors[0]
-        p *= factors[1]
+        """Start the run at its perturbed initial state, on its constraints, with another local tolerance."""
+        run, states = self.run, self.states
+        plan, t, given = StepPlan(t_end=run.plan.t_end, tolerance=tolerance), float(states.t[0]), states.parameters
+        factors = _factors(len(run._q), nudge)
+        q, p = np.asarray(states.q[0] * factors[0]), np.asarray(states.p[0] * factors[1])
         if run.stepper.interface.constraints:
-            q[:], p[:], _ = projected(run.stepper, q.copy(), p.copy(), run.t, run.parameters)
+            q, p, _ = projected(run.stepper, q, p, t, given)
+        run._start(q, p, plan=plan, t=t, parameters=given, options=run.options)
 
     def _to(self, t: float) -> None:
         run = self.run
-        assert run.plan is not None  # by construction
         run.plan = StepPlan(t_end=t, tolerance=run.plan.tolerance)
         while not run.arrived:
             run.advance(MOST_STEPS)
 
-    def _relative_difference(self, states: ComparedStates, k: int, small: float = 0.0) -> float:
+    def _relative_difference(self, k: int, small: float = 0.0) -> float:
         """Return the larger of |dq|/|q| and |dp|/|p| at a state, relative to the largest norms up to that state.
 
         If the difference relative to the state itself is at most ``small``, this cheaper bound is returned.
         """
         ratios = []
-        for mine, each in zip((self.run._q, self.run._p), (states.q, states.p), strict=True):
+        for mine, each in zip((self.run._q, self.run._p), (self.states.q, self.states.p), strict=True):
             row = each[k]
             difference = mine - row
             largest = float(np.abs(row).max())
@@ -184,10 +199,9 @@ class GrowthCheck:
             ratios.append(apart / size if apart and size else apart)
         return max(ratios)
 
-    @staticmethod
-    def _report(nudge: float, difference_text: str) -> None:
+    def _report(self, difference_text: str) -> None:
         warn(
-            f"the motion amplifies errors: a run with the initial state perturbed by {nudge:.1e} (relative) "
+            f"the motion amplifies errors: a run with the initial state perturbed by {self.nudge:.1e} (relative) "
             f"{difference_text}, so "
             "later states are not reproducible. Use error= to find the time until which digits are confirmed, or "
             "check_growth=False to skip this check",

@@ -104,7 +104,7 @@ def _longest(pilot: Callable[[float], _Pilot], h: float, allowed: float) -> floa
 def _pilot(run: Run, end: float) -> _Pilot:
     """Take the first steps of a run; the error is infinite if a step fails."""
     error, done = 0.0, 0
-    while done < PILOT_STEPS and not run.arrived and (run.plan or (end - run.t) * run.h > 0.0):
+    while done < PILOT_STEPS and not run.arrived and (not run.plan.fixed or (end - run.t) * run.h > 0.0):
         size = max(1, done)
         try:
             error = run.record(size, save_every=size).step_error

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterable
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
@@ -67,10 +67,14 @@ class Memory(OneThread):
         self._parameters = stepper.defaults
         self._arguments = binding.pointer(self._parameters), binding.null
         self._options: SolverOptions | None = None
-        self._plan: StepPlan | None = None
+        self._has_defaults = False  # whether no parameter differs from its default, also in C
+        self._energies: Any = None  # function of C, and memory for its results
+        self._rows: Any = None  # memory for states that every recording uses
         self._discarded = *(binding.numbers(f"double[{stepper.dimension}]"),) * 3, binding.numbers("int *")
         self._report, self._workspace = binding.new("report *"), binding.workspace()
         self._functions = {name: binding.function(name, memory) for name in FUNCTIONS if binding.has(name)}
+        self._step_error = self._functions.get("step_error")
+        self._plan = StepPlan()
         firsts = {name: parameter_index(stepper.interface, f"{name}_0") for name in stepper.interface.inputs}
         self._inputs = {name: slice(first, first + 5) for name, first in firsts.items()}
 
@@ -81,14 +85,14 @@ class Memory(OneThread):
         q: States,
         p: States,
         *,
-        h: float | StepPlan,
+        plan: StepPlan,
         t: float = 0.0,
         parameters: Parameters = None,
         options: SolverOptions | None = None,
     ) -> Self:
-        """Construct at (q, p) and t before the first step, with fixed step size or a step plan."""
+        """Construct at (q, p) and t before the first step."""
         run = cls(stepper)
-        run._start(q, p, h=h, t=t, parameters=parameters, options=options)
+        run._start(q, p, plan=plan, t=t, parameters=parameters, options=options)
         return run
 
     def _start(
@@ -96,28 +100,34 @@ class Memory(OneThread):
         q: States,
         p: States,
         *,
-        h: float | StepPlan,
+        plan: StepPlan,
         t: float,
         parameters: Parameters,
         options: SolverOptions | None,
     ) -> None:
-        """Start at (q, p) and t, with fixed step size or a step plan; nothing of an earlier run remains."""
+        """Start at (q, p) and t; nothing of an earlier run remains."""
         stepper, interface = self.stepper, self.stepper.interface
-        plan = h if isinstance(h, StepPlan) else None
-        q0, p0 = checked_vector(interface, q, "q"), checked_vector(interface, p, "p")
-        now, size = checked_number(t, "the time t"), 0.0 if isinstance(h, StepPlan) else checked_step(h)
-        self._functions["start"](now, size, *stepper.binding.pointers(q0, p0))
-        values = stepper._parameters_at(q0, p0, parameters)
-        self._set(values, checked_options(options), plan, inputs_not_given(interface, parameters))
+        t, rows = checked_number(t, "the time t"), self._rows
+        pointers: Iterable[Any] | None = None if rows is None else rows.begin(t, q, p)
+        if pointers is None:
+            q0, p0 = checked_vector(interface, q, "q"), checked_vector(interface, p, "p")
+            pointers = stepper.binding.pointers(q0, p0) if rows is None else rows.begin_checked(t, q0, p0)
+        self._functions["start"](t, plan.h, *pointers)
+        if parameters is not None or not self._has_defaults:
+            self._parameters[:] = stepper._parameters_at(self._q, self._p, parameters)
+            self._pass_parameters()
+            self._unset_inputs = inputs_not_given(interface, parameters)
+            self._has_defaults = parameters is None and not interface.energy_parameter
+        self._set(options, plan)
 
-    def _set(
-        self, values: Array, options: SolverOptions | None, plan: StepPlan | None, unset_inputs: tuple[str, ...]
-    ) -> None:
-        self._parameters[:], self.plan = values, plan
-        self._pass_parameters()
+    def _set(self, options: SolverOptions | None, plan: StepPlan) -> None:
+        """Set options and step plan of a run that begins."""
+        if plan is not self._plan:
+            self.plan = plan
         if options is not self._options:
+            checked_options(options)
             self._arguments, self._options = (self._arguments[0], self.stepper.binding.options(options)), options
-        self._unset_inputs, self.longest = unset_inputs, 0.0
+        self.longest = 0.0
         self._crossed: tuple[int, ...] = ()  # crossings of each event in earlier pieces, counted for terminal events
 
     @classmethod
@@ -139,27 +149,28 @@ class Memory(OneThread):
             raise StateError(f"invalid saved run: it has {len(saved)} bytes, those of this stepper have {len(buffer)}")
         buffer[:] = saved
         _check_memory(memory)
-        if (memory.h == 0.0) != (plan is not None):
-            raise StateError(
-                "the saved run has adaptive steps: give t_end"
-                if plan is None
-                else "the saved run has fixed steps: omit t_end"
-            )
+        if plan is None and memory.h == 0.0:
+            raise StateError("the saved run has adaptive steps: give t_end")
+        plan = StepPlan(h=memory.h) if plan is None else plan
+        if plan.h != memory.h:
+            raise StateError("the saved run has fixed steps: omit t_end")
         if not stepper._has_energy(parameters):
             raise StateError("a saved run in transformed time requires its energy: give parameters=run.parameters")
-        values = stepper._parameters(parameters)
-        run._set(values, checked_options(options), plan, inputs_not_given(stepper.interface, parameters))
+        run._parameters[:] = stepper._parameters(parameters)
+        run._pass_parameters()
+        run._set(options, plan)
+        run._unset_inputs = inputs_not_given(stepper.interface, parameters)
         return run
 
     @property
-    def plan(self) -> StepPlan | None:
-        """Step plan of adaptive steps, ``None`` for fixed steps."""
+    def plan(self) -> StepPlan:
+        """Step sizes and target time."""
         return self._plan
 
     @plan.setter
-    def plan(self, plan: StepPlan | None) -> None:
-        self._plan, self._plan_arguments = plan, (plan.t_end, plan.tau or plan.tolerance) if plan else ()
-        self._advance_function = self._functions["advance_to" if plan else "advance"]
+    def plan(self, plan: StepPlan) -> None:
+        self._plan, self._plan_arguments = plan, () if plan.fixed else (plan.t_end, plan.tau or plan.tolerance)
+        self._advance_function = self._functions["advance" if plan.fixed else "advance_to"]
 
     @property
     def h(self) -> float:
@@ -201,7 +212,8 @@ class Memory(OneThread):
             self._set_parameters(self.stepper._parameters(parameters, self._parameters))
             self._unset_inputs = tuple(name for name in self._unset_inputs if name in missing)
         if h is not None and checked_step(h) != self._memory.h:
-            self._memory.h, self._memory.guess = h, 0
+            self.plan = StepPlan.with_step(h)
+            self._memory.h, self._memory.guess = self.plan.h, 0
         if plan is not None:
             self.plan = plan
 
@@ -233,6 +245,7 @@ class Memory(OneThread):
 
     def _pass_parameters(self) -> None:
         """Pass the parameters to C where the functions of steps do not take them."""
+        self._has_defaults = False
         if "set_parameters" in self._functions:
             self._functions["set_parameters"](self._parameters)
 
@@ -326,6 +339,14 @@ class Memory(OneThread):
         taken: int = self._report.steps
         return taken
 
+    def _fill(self, steps: int, q: Array, p: Array) -> Array:
+        """Take steps in one C call, copy the states after each to the rows of q and p, and return their times."""
+        t, pointer = np.empty(steps), self.stepper.binding.pointer
+        arrays = (pointer(t), pointer(q), pointer(p), pointer(np.empty(steps, dtype=np.int32)))
+        if status := self._advance(steps, 1, arrays):
+            raise step_failure(status, self._report, step=self.steps, h=self.h)
+        return t
+
     def _run_to_target(self) -> None:
         """Advance to the target time without saving intermediate states."""
         while not self.arrived:
@@ -351,7 +372,7 @@ class Memory(OneThread):
 
     def has_arrived(self) -> bool:
         """Return whether the run has reached its target time."""
-        return self._plan is not None and self.left_to(self._plan.t_end) == 0.0
+        return not self._plan.h and self.left_to(self._plan.t_end) == 0.0
 
     @property
     def arrived(self) -> bool:
@@ -361,41 +382,37 @@ class Memory(OneThread):
     @property
     def rejected_steps(self) -> int:
         """Number of rejected steps."""
-        return int(self._memory.rejected) if self._plan is not None and not self._plan.tau else 0
+        return int(self._memory.rejected) if self._plan.adaptive else 0
 
     @property
     def step_error(self) -> float:
         """Estimated relative error of the worst step; NaN without an estimate."""
-        if "step_error" not in self._functions:
-            return np.nan
-        error: float = self._functions["step_error"]()
-        return error if error >= 0.0 else np.nan
+        if self._step_error is None:
+            return math.nan
+        error: float = self._step_error()
+        return error if error >= 0.0 else math.nan
 
     @property
     def worst_step_time(self) -> float:
         """Start time of the worst step; NaN without an error estimate."""
         return float(self._memory.error_t) if self.step_error >= 0.0 else np.nan
 
+    def _end_energies(self, t: Array, q: Array, p: Array) -> tuple[float, float] | None:
+        """Return the energies of the first and the last state of a run so far; ``None`` outside the domain of L."""
+        binding, m = self.stepper.binding, self.stepper.dimension
+        if self._energies is None:
+            self._energies = binding.function("energies"), binding.numbers("double[2]")
+        (function, energies), (at, positions, momenta) = self._energies, binding.pointers(t, q, p)
+        last, row, values = len(t) - 1, (len(q) - 1) * m, self._arguments[0]
+        status = function(1, at, positions, momenta, values, energies, self._workspace) or function(
+            1, at + last, positions + row, momenta + row, values, energies + 1, self._workspace
+        )
+        return None if status else (energies[0], energies[1])
+
     @property
     def _leaving(self) -> bool:
         """Return whether the run started at the origin and is still near it, where relative errors are undefined."""
         return bool(getattr(self._memory, "steps_from_rest", 0))
-
-
-def fill(
-    memory: Memory, steps: int, save_every: int, t: Array, q: Array, p: Array, iterations: NDArray[np.int32]
-) -> tuple[int, Any]:
-    """Advance by ``steps`` in one C call and store every ``save_every``-th state in the arrays.
-
-    With a step plan the run ends at the target time and its last state is stored; ``stored`` in the report counts the
-    states.
-
-    Returns:
-        The status, 0 unless a step failed, and the report, whose ``steps`` counts the completed steps.
-    """
-    pointer = memory.stepper.binding.pointer
-    status = memory._advance(steps, save_every, (pointer(t), pointer(q), pointer(p), pointer(iterations)))
-    return status, memory._report
 
 
 def _time(memory: Any) -> float:

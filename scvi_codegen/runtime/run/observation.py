@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.native.arguments import checked_number, real_array
+from scvi_codegen.native.arguments import real_array
 from scvi_codegen.runtime.events.detection import search_of
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.run_loop import record, trajectory_of
 from scvi_codegen.runtime.run.singular_time import ProgressWatch
 from scvi_codegen.runtime.run.times import WHOLE
-from scvi_codegen.runtime.trajectory.dense_output import states_and_steps_at, step_sizes_at, times_of_run
+from scvi_codegen.runtime.trajectory.dense_output import states_and_steps_at, step_sizes_at
 from scvi_codegen.runtime.trajectory.time_transformation import part_of_step
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import checked_count
@@ -37,10 +37,9 @@ class Observation:
     """Recorder of a run with events or with output at given times.
 
     Args:
-        run: the run to advance.
+        run: the run to advance; if its plan has fixed steps and a target time, the last step is shorter.
         save_every: without ``times``, save the present state and those whose step number is a multiple of this.
         times: (n,) output times, sorted in the direction of the run.
-        end: final time of fixed steps, also in transformed time; the last step is shorter.
         observe: function of the run that returns the data to save instead of the states between first and last.
     """
 
@@ -50,12 +49,13 @@ class Observation:
         *,
         save_every: int = 1,
         times: Array | None = None,
-        end: float | None = None,
         observe: Callable[[Any], ArrayLike] | None = None,
     ) -> None:
         self.run, self.save_every, self.times = run, checked_count(save_every, "save_every", least=1), times
         self.search = search_of(run.stepper, run._crossed) if run.stepper.events else None
-        self.end, self.arrived, self.partial_steps = end, False, 0
+        plan = run.plan
+        self.end = plan.t_end if plan.fixed and math.isfinite(plan.t_end) else None
+        self.arrived, self.partial_steps = False, 0
         self.states: list[tuple[Array, Array, Array, Array, Array, NDArray[np.int64]]] = []
         self.iterations, self.observe = 0, observe
         self.observed: list[Array] = []
@@ -82,12 +82,11 @@ class Observation:
             EventError: if an event function is not finite.
         """
         run, plan = self.run, self.run.plan
-        unbounded = steps is None and (plan or self.end is not None)
+        unbounded = steps is None and math.isfinite(plan.t_end)
         count = math.inf if unbounded else checked_count(steps, "steps", least=0)
         self._keep(record(run, 0), first=True)
         most = max(1, CHUNK_NUMBERS // run.stepper.dimension)
-        end = self.end if plan is None else plan.t_end if plan.tau else None
-        watch = None if end is None else ProgressWatch(run.stepper, end)
+        watch = None if plan.adaptive or not math.isfinite(plan.t_end) else ProgressWatch(run.stepper, plan.t_end)
 
         def advance(size: int) -> int:
             before, number = run.t, run.steps
@@ -208,7 +207,7 @@ class Observation:
         run = self.run
         if self.ended:
             here = {"t": part.t[-1], "parameters": run.parameters, "options": run.options}
-            run = type(run).started(run.stepper, part.q[-1], part.p[-1], h=run.plan or run.h, **here)
+            run = type(run).started(run.stepper, part.q[-1], part.p[-1], plan=run.plan, **here)
         assert self.observe is not None  # by the caller
         array, when = real_array(self.observe(run), "the result of observe"), f"at t = {run.t:g}"
         if self.observed and array.shape != self.observed[0].shape:
@@ -243,23 +242,4 @@ class Observation:
         crossings = self.search.crossings() if self.search is not None else ()
         tau = stepped if self.run.stepper.interface.energy_parameter else None
         steps = self.run.steps + (self.partial_steps if self.arrived else 0)
-        return trajectory_of(self.run, t, q, p, iterations, steps=steps, step_sizes=lengths, events=crossings, tau=tau)
-
-
-def observed_until(
-    run: Memory,
-    t_end: float,
-    steps: int | None,
-    save_every: int,
-    t_eval: ArrayLike | None,
-    progress: Callable[[int], None] | None,
-    observe: Callable[[Any], ArrayLike] | None = None,
-) -> Trajectory:
-    """Return the trajectory of a run with fixed steps to t_end, with the requested output."""
-    end = checked_number(t_end, "the time t_end")
-    if steps is not None:
-        raise StateError(f"give either steps={steps} or t_end={end:g} with h, not both")
-    if (end - run.t) * run.h < 0.0:
-        raise StateError(f"h = {run.h:g} has the wrong sign for a run from t = {run.t:g} to t_end = {end:g}")
-    times = None if t_eval is None else times_of_run(t_eval, run.t, end)
-    return Observation(run, save_every=save_every, times=times, end=end, observe=observe).advance(None, progress)
+        return trajectory_of(self.run, (t, q, p, iterations), lengths, steps=steps, events=crossings, tau=tau)

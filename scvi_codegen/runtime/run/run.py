@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, Self
 
@@ -17,7 +18,7 @@ from scvi_codegen.runtime.run.descriptions import describe_run, short_title
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.observation import Observation
 from scvi_codegen.runtime.run.one_thread import alone
-from scvi_codegen.runtime.run.run_loop import record
+from scvi_codegen.runtime.run.run_loop import FIRST_STEPS, StateRows, record
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
@@ -38,14 +39,15 @@ class Run(Memory):
         """Return a released run of the stepper, to be started, or a new one if all are in use."""
         try:
             run: Self = stepper._released_runs.pop()
-            return run
         except IndexError:
-            pass
-        return cls(stepper)
+            run = cls(stepper)
+            if stepper.binding.reusable and len(run._workspace) + FIRST_STEPS * len(run._q) <= MOST_KEPT:
+                run._rows = StateRows(run, FIRST_STEPS + 3)
+        return run
 
     def _release(self) -> None:
         """Let :meth:`_reused` return this run; the caller drops it. Large memory is freed instead."""
-        if self.stepper.binding.reusable and len(self._workspace) <= MOST_KEPT:
+        if self._rows is not None:
             self.stepper._released_runs.append(self)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -75,7 +77,7 @@ class Run(Memory):
         trajectory = self._recorded(steps, save_every=save_every, progress=progress)
         if not self._leaving:
             warn_of_large_steps(trajectory, before=before)
-        warn_of_energy_error(trajectory)
+        warn_of_energy_error(trajectory, self)
         return trajectory
 
     def _recorded(
@@ -83,12 +85,14 @@ class Run(Memory):
         steps: int | None,
         *,
         save_every: int = 1,
+        times: Array | None = None,
         progress: Callable[[int], None] | None = None,
         observe: Callable[[Run], ArrayLike] | None = None,
     ) -> Trajectory:
-        """Return the states as :meth:`record` does, without its warnings and its lock."""
-        if self.stepper.events or observe is not None:
-            return Observation(self, save_every=save_every, observe=observe).advance(steps, progress)
+        """Return the states as :meth:`record` does, or those at ``times``, without its warnings and its lock."""
+        plan, further = self._plan, times is not None or observe is not None
+        if self.stepper.events or further or (plan.h and plan.t_end != math.inf):
+            return Observation(self, save_every=save_every, times=times, observe=observe).advance(steps, progress)
         return record(self, steps, save_every=save_every, progress=progress)
 
     @property

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 from struct import Struct
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +14,7 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.native.arguments import empty_array
 from scvi_codegen.native.options import step_failure
-from scvi_codegen.runtime.core.validation import BINARY64, Array
+from scvi_codegen.runtime.core.validation import BINARY64, FEW, Array
 from scvi_codegen.runtime.events.event import Crossings
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.memory import Memory
@@ -22,6 +24,7 @@ from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import checked_count
 
+States = tuple[Array, Array, Array, NDArray[np.int32]]
 NATIVE_DOUBLE, INT32 = Struct("d"), np.dtype(np.int32)
 FIRST_STEPS = 256
 """Number of saved states of the first C call, before the speed of the steps is known."""
@@ -43,10 +46,16 @@ def record(
     Raises:
         StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
     """
-    count = None if steps is None and memory._plan is not None else checked_count(steps, "steps", least=0)
+    count = None if steps is None and not memory._plan.h else checked_count(steps, "steps", least=0)
     save_every = checked_count(save_every, "save_every", least=1)
-    recorder = _StateRecorder(memory, save_every, count)
+    first, filled, status = memory._memory.step, 0, 0
+    if progress is None and stop is None and memory._rows is not None:
+        trajectory, filled, status = _in_one_call(memory, memory._rows, count, save_every)
+        if trajectory is not None:
+            return trajectory
+    recorder = _StateRecorder(memory, save_every, count, first, filled)
     try:
+        recorder.check(status)
         drive(
             recorder.advance,
             math.inf if count is None else count,
@@ -64,127 +73,201 @@ def record(
     return trajectory
 
 
+def _in_one_call(
+    memory: Memory, rows: StateRows, steps: int | None, save_every: int
+) -> tuple[Trajectory | None, int, int]:
+    """Record a short run by one C call; return the trajectory if the run has ended, number of states and status.
+
+    No states: a longer run, or one that has arrived. Otherwise the recording continues after these states.
+    """
+    run, plan, most = memory._memory, memory._plan, FIRST_STEPS * save_every
+    first, size = run.step, most if steps is None else steps
+    if size > most or run.t == plan.t_end or plan.tau or memory.stepper.interface.energy_parameter:
+        return None, 0, 0
+    if first:
+        rows.begin_checked(run.t, memory._q, memory._p)
+    status, report = memory._advance(size, save_every, rows.next), memory._report
+    h, filled = plan.h, 1 + (run.step // save_every - first // save_every if plan.h else report.stored)
+    if status or (steps is None and report.steps == size):
+        return None, filled, status
+    states = rows.copies(filled)
+    step_sizes = _repeated(h, filled) if h else _differences(states[0], whole=save_every == 1)
+    return trajectory_of(memory, states, step_sizes), filled, status
+
+
+class StateRows:
+    """Memory for the times, positions, momenta and iterations of states of a run.
+
+    Attributes:
+        states: the arrays.
+        starts, next: pointers to their first and to their second rows.
+    """
+
+    __slots__ = ("_count", "_p", "_pointers", "_q", "_views", "next", "shape", "starts", "states")
+
+    def __init__(self, memory: Memory, rows: int) -> None:
+        m, binding = len(memory._q), memory.stepper.binding
+        t, q, p = empty_array((rows,)), empty_array((rows, m)), empty_array((rows, m))
+        self.states: States = t, q, p, np.zeros(rows, INT32)
+        self.starts = *binding.pointers(t, q, p), binding.integers(self.states[3])
+        self._q, self._p, self._pointers = q[0], p[0], self.starts[1:3]
+        self.shape = (m,) if m <= FEW else None  # of vectors that are checked as lists, faster than as arrays
+        self.next, self._count, self._views = self.after(1), 0, self.states
+
+    def begin(self, t: float, q: Any, p: Any) -> tuple[Any, Any] | None:
+        """Set the first state; return pointers to it, ``None`` unless q and p are short vectors of finite numbers."""
+        if not (
+            type(q) is type(p) is np.ndarray and q.shape == p.shape == self.shape and q.dtype is p.dtype is BINARY64
+        ):
+            return None
+        return self.begin_checked(t, q, p) if math.isfinite(sum(q.tolist()) + sum(p.tolist())) else None
+
+    def begin_checked(self, t: float, q: Array, p: Array) -> tuple[Any, Any]:
+        """Set the first state and return pointers to it."""
+        self.states[0][0] = t
+        self._q[:] = q
+        self._p[:] = p
+        return self._pointers
+
+    def after(self, row: int) -> tuple[Any, ...]:
+        """Return pointers to a row."""
+        (t, q, p, iterations), begin = self.starts, row * self.states[1].shape[1]
+        return t + row, q + begin, p + begin, iterations + row
+
+    def copies(self, count: int) -> States:
+        """Return copies of the first rows."""
+        if count != self._count:
+            self._count, self._views = count, self.first(count)
+        t, q, p, iterations = self._views
+        return t.copy(), q.copy(), p.copy(), iterations.copy()
+
+    def first(self, count: int) -> States:
+        """Return the first rows, in the same memory."""
+        t, q, p, iterations = self.states
+        return t[:count], q[:count], p[:count], iterations[:count]
+
+
 class _StateRecorder:
     """Present state of a run, and every ``save_every``-th of the following ones, in arrays that C fills.
 
     The number of states is known for fixed steps; for adaptive steps each chunk has arrays of its own.
     """
 
-    def __init__(self, memory: Memory, save_every: int, steps: int | None) -> None:
-        self.memory, self.save_every, self.first, plan = memory, save_every, memory.steps, memory._plan
-        self.earlier: list[tuple[Array, Array, Array, NDArray[np.int32]]] = []
-        if plan is None:
+    __slots__ = ("earlier", "filled", "first", "first_size", "memory", "rows", "save_every", "watch")
+
+    def __init__(self, memory: Memory, save_every: int, steps: int | None, first: int, filled: int) -> None:
+        plan = memory._plan
+        self.memory, self.save_every, self.first, self.filled = memory, save_every, first, filled or 1
+        if plan.h:
             assert steps is not None  # by the caller
             self.first_size = save_every * max(1, FIRST_STEPS // save_every)
-            self._allocate((self.first + steps) // save_every - self.first // save_every + 1)
+            rows = (first + steps) // save_every - first // save_every + 1
         else:
             self.first_size = FIRST_STEPS * save_every
-            self._allocate(min(FIRST_STEPS, (self.first_size if steps is None else steps) // save_every) + 3)
-        self.t[0], self.q[0], self.p[0], self.filled = memory.t, memory._q, memory._p, 1
-        self.watch = ProgressWatch(memory.stepper, plan.t_end) if plan and plan.tau else None
-
-    def _allocate(self, rows: int) -> None:
-        m, binding = len(self.memory._q), self.memory.stepper.binding
-        self.t, self.q, self.p = empty_array((rows,)), empty_array((rows, m)), empty_array((rows, m))
-        self.iterations, self.filled = np.zeros(rows, INT32), 0
-        self.starts = *binding.pointers(self.t, self.q, self.p), binding.integers(self.iterations)
+            rows = min(FIRST_STEPS, (self.first_size if steps is None else steps) // save_every) + 3
+        kept: StateRows | None = memory._rows
+        self.rows = kept if kept is not None and rows <= len(kept.states[0]) else StateRows(memory, rows)
+        if not filled:
+            self.rows.begin_checked(memory.t, memory._q, memory._p)
+        self.earlier: list[States] = []
+        self.watch = ProgressWatch(memory.stepper, plan.t_end) if plan.tau else None
 
     def advance(self, size: int) -> int:
         """Take ``size`` steps, fewer if the target time is reached; return their number."""
-        memory, save_every = self.memory, self.save_every
-        plan, watch, rows = memory._plan, self.watch, size // save_every + 2
+        memory, save_every, watch = self.memory, self.save_every, self.watch
+        to_end = not memory._plan.h
         before = None if watch is None else memory.t
-        if plan is not None and self.filled + rows > len(self.t):
+        if to_end and self.filled + size // save_every + 2 > len(self.rows.states[0]):
             self.earlier.append(self._states())
-            self._allocate(rows)
-        filled, (t, q, p, iterations) = self.filled, self.starts
-        start = filled * self.q.shape[1]
-        status = memory._advance(size, save_every, (t + filled, q + start, p + start, iterations + filled))
+            self.rows, self.filled = StateRows(memory, size // save_every + 2), 0
+        rows, filled = self.rows, self.filled
+        status = memory._advance(size, save_every, rows.next if filled == 1 else rows.after(filled))
         report = memory._report
-        if plan is None:
-            self.filled = 1 + memory.steps // save_every - self.first // save_every
-        else:
+        if to_end:
             self.filled += report.stored
-        if status:
-            raise step_failure(status, report, step=memory.steps, h=memory.h)
+        else:
+            self.filled = 1 + memory._memory.step // save_every - self.first // save_every
+        self.check(status)
         steps: int = report.steps
         if watch is not None and before is not None:
             watch.check_progress(before, memory.t, steps, memory.steps)
         return steps
 
-    def _states(self) -> tuple[Array, Array, Array, NDArray[np.int32]]:
-        """Return the rows in use; copies if most are not."""
-        k, t, q, p, iterations = self.filled, self.t, self.q, self.p, self.iterations
-        if k == len(t):
-            return t, q, p, iterations
-        if 2 * k > len(t):
-            return t[:k], q[:k], p[:k], iterations[:k]
-        return t[:k].copy(), q[:k].copy(), p[:k].copy(), iterations[:k].copy()
+    def check(self, status: int) -> None:
+        """Raise :class:`StepFailedError` for the status of a failed step."""
+        if status:
+            raise step_failure(status, self.memory._report, step=self.memory.steps, h=self.memory.h)
+
+    def _states(self) -> States:
+        """Return the rows in use; copies if most are not, or if the run uses the memory again."""
+        rows, count = self.rows, self.filled
+        capacity = len(rows.states[0])
+        if rows is self.memory._rows or 2 * count <= capacity:
+            return rows.copies(count)
+        return rows.states if count == capacity else rows.first(count)
 
     def trajectory(self) -> Trajectory:
         """Return the states saved so far."""
-        memory, save_every = self.memory, self.save_every
-        t, q, p, iterations = self._states()
+        memory, states = self.memory, self._states()
         if self.earlier:
-            blocks = zip(*self.earlier, (t, q, p, iterations), strict=True)
-            t, q, p, iterations = map(np.concatenate, blocks)
-        if memory._plan is not None:
-            step_sizes = np.empty(len(t))
-            if save_every == 1:
-                np.subtract(t[1:], t[:-1], step_sizes[:-1])
-                step_sizes[-1] = math.nan
-            else:
-                step_sizes.fill(math.nan)
-            return trajectory_of(memory, t, q, p, iterations, step_sizes=step_sizes)
-        tau = None
+            t, q, p, iterations = map(np.concatenate, zip(*self.earlier, states, strict=True))
+            states = t, q, p, iterations
+        if not memory._plan.h:
+            return trajectory_of(memory, states, _differences(states[0], whole=self.save_every == 1))
+        tau, h = None, memory._memory.h
         if memory.stepper.interface.energy_parameter:
-            numbers = save_every * (self.first // save_every + np.arange(len(t)))
+            numbers = self.save_every * (self.first // self.save_every + np.arange(len(states[0])))
             numbers[0] = self.first
-            tau = times_after(0.0, memory.h, numbers)[0]
-        return trajectory_of(memory, t, q, p, iterations, tau=tau)
+            tau = times_after(0.0, h, numbers)[0]
+        return trajectory_of(memory, states, _repeated(h, len(states[0])), tau=tau)
 
 
 def trajectory_of(
     memory: Memory,
-    t: Array,
-    q: Array,
-    p: Array,
-    iterations: NDArray[np.int32],
+    states: States,
+    step_sizes: Array,
     *,
     steps: int | None = None,
-    step_sizes: Array | None = None,
     events: tuple[Crossings, ...] = (),
     tau: Array | None = None,
 ) -> Trajectory:
-    """Return a trajectory of these states with the data of the run; by default each precedes a step of h."""
-    plan, h, stepper, step_error = memory._plan, memory.h, memory.stepper, memory.step_error
+    """Return a trajectory of these states with the data of the run."""
+    plan, stepper, run, step_error = memory._plan, memory.stepper, memory._memory, memory.step_error
+    # attribute by attribute: with 16 keywords the call of a class takes five times as long
+    trajectory = Trajectory.__new__(Trajectory)
+    t, q, p, trajectory.iterations = states
     if stepper.shapes is not None:
         q, p = stepper.named(q), stepper.named(p)
-    return Trajectory(
-        t=t,
-        q=q,
-        p=p,
-        iterations=iterations,
-        step_sizes=_repeated(h, len(t)) if step_sizes is None else step_sizes,
-        h=h if plan is None else first_step_size(plan, t),
-        plan=plan,
-        steps=memory.steps if steps is None else steps,
-        rejected_steps=memory.rejected_steps,
-        step_error=step_error,
-        worst_step_time=memory._memory.error_t if step_error >= 0.0 else np.nan,
-        parameters=memory.parameters,
-        stepper=stepper,
-        options=memory._options,
-        events=events,
-        tau=tau,
-    )
+    trajectory.t, trajectory.q, trajectory.p, trajectory.step_sizes = t, q, p, step_sizes
+    trajectory.h = plan.h or first_step_size(plan, t)
+    trajectory.plan, trajectory.stepper, trajectory.options = plan, stepper, memory._options
+    trajectory.steps = run.step if steps is None else steps
+    trajectory.rejected_steps = 0 if plan.h or plan.tau else run.rejected
+    trajectory.step_error = step_error
+    trajectory.worst_step_time = run.error_t if step_error >= 0.0 else math.nan
+    trajectory.parameters, trajectory.events, trajectory.tau = memory._parameters.copy(), events, tau
+    trajectory.confirmation = trajectory.observed = trajectory.conserved = None
+    trajectory.pieces = ()
+    return trajectory
 
 
+@lru_cache(maxsize=64)
 def _repeated(value: float, count: int) -> Array:
     """Return a read-only array of one number without memory for each; ``numpy.broadcast_to`` is ten times slower."""
     return np.ndarray((count,), BINARY64, NATIVE_DOUBLE.pack(value), 0, (0,))
 
 
+def _differences(t: Array, *, whole: bool) -> Array:
+    """Return the steps that follow states, NaN for the last one and unless all states are saved."""
+    step_sizes = np.empty(len(t))
+    if whole:
+        np.subtract(t[1:], t[:-1], step_sizes[:-1])
+        step_sizes[-1] = math.nan
+    else:
+        step_sizes.fill(math.nan)
+    return step_sizes
+
+
 def first_step_size(plan: StepPlan, t: Array) -> float:
     """Return the first step size between states of an adaptive run, or the direction of the run."""
-    return float(t[1] - t[0] if len(t) > 1 else plan.t_end - t[0])
+    return t.item(1) - t.item(0) if len(t) > 1 else plan.t_end - t.item(0)

@@ -34,7 +34,7 @@ def checkpoint(run: Any) -> bytes:
         "integrator": _integrator(stepper.origin.interface),
         "sizes": stepper.problem.sizes,
         "unset inputs": run._unset_inputs,
-        "adaptive": run.plan is not None,
+        "adaptive": not run.plan.fixed,
     }
     body = b"".join([json.dumps(header).encode(), b"\n", *(array.tobytes() for array in arrays), state])
     return MAGIC + hashlib.sha256(body).digest() + body

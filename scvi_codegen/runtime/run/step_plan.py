@@ -1,46 +1,165 @@
-"""Step plan of a run with adaptive steps: target time, tolerance or step in transformed time."""
+"""Step plan of a run: fixed step size, adaptive steps to a time, or constant steps in transformed time to a time."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
-from scvi_codegen.validation import check_tolerance
+from scvi_codegen.runtime.run.times import steps_to
+from scvi_codegen.validation import check_tolerance, checked_count
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepPlan:
-    """Target time and step-size control of a run.
+    """Step sizes of a run and the time at which it ends.
 
     Attributes:
-        t_end: target time.
-        tolerance: largest relative error of a step; 0 for round-off.
-        tau: instead of a tolerance, the constant step of fictitious time of a time transformation; 0 otherwise.
+        t_end: target time; infinite for a number of fixed steps.
+        tolerance: largest relative error of an adaptive step; 0 for round-off.
+        tau: constant step of fictitious time of the reversible controller; 0 otherwise.
+        h: fixed step size, of tau in transformed time; 0 otherwise.
     """
 
-    t_end: float
+    t_end: float = math.inf
     tolerance: float = 0.0
     tau: float = 0.0
+    h: float = 0.0
+
+    @property
+    def fixed(self) -> bool:
+        """Return whether h is the step size; then a last step that is shorter is not taken by the run itself."""
+        return self.h != 0.0
+
+    @property
+    def adaptive(self) -> bool:
+        """Return whether step sizes follow from the tolerance."""
+        return not (self.h or self.tau)
 
     @classmethod
-    def checked(cls, t_end: float, tolerance: float | None) -> StepPlan:
-        """Construct from user arguments; raise ``StateError`` unless they are a finite time and a relative error."""
-        if tolerance is None:
-            return cls(t_end=checked_number(t_end, "t_end"))
-        allowed = checked_number(tolerance, "the tolerance")
-        check_tolerance(allowed)
-        return cls(t_end=checked_number(t_end, "t_end"), tolerance=allowed)
+    def with_step(cls, h: float) -> StepPlan:
+        """Construct with a fixed step size; raise ``StateError`` unless it is finite and not 0."""
+        return cls(h=checked_step(h))
 
     @classmethod
-    def in_tau(cls, g: str, h: float | None, t_end: float | None, tolerance: float | None) -> StepPlan:
-        """Construct the step plan of a stepper with a time transformation from user arguments."""
+    def checked(
+        cls,
+        h: float | None = None,
+        t_end: float | None = None,
+        tolerance: float | None = None,
+        *,
+        controller: str = "",
+        in_tau: bool = False,
+    ) -> StepPlan:
+        """Construct from arguments of users; equal ones are checked once.
+
+        Args:
+            h, t_end, tolerance: step size; target time; relative error of an adaptive step.
+            controller: time transformation of the reversible controller, "" without one.
+            in_tau: whether the system is one in transformed time, which has fixed steps only.
+
+        Raises:
+            StateError: if a number is invalid, or they do not determine the steps.
+        """
+        plan: StepPlan = _from_cache(_checked, t_end, h, t_end, tolerance, controller, in_tau)
+        return plan
+
+
+def _from_cache(function: Any, t_end: Any, *arguments: Any) -> Any:
+    """Return the value of a function with a cache; without the cache for arrays, and 0, which equals -0."""
+    try:
+        if t_end != 0.0:
+            return function(*arguments)
+    except (TypeError, ValueError):
+        pass
+    return function.__wrapped__(*arguments)
+
+
+@lru_cache(maxsize=256, typed=True)
+def _checked(h: float | None, t_end: float | None, tolerance: float | None, controller: str, in_tau: bool) -> StepPlan:
+    if controller:
         if h is None or t_end is None or tolerance is not None:
             raise StateError(
-                f"a stepper with the time transformation {g} requires h (constant step in tau) and t_end, and no "
-                "tolerance"
+                f"a stepper with the time transformation {controller} requires h (constant step in tau) and t_end, and "
+                "no tolerance"
             )
         tau = checked_step(h)
         if tau < 0.0:
             raise StateError(f"h = {h:g} must be positive with a time transformation: t_end determines the direction")
-        return cls(t_end=checked_number(t_end, "t_end"), tau=tau)
+        return StepPlan(t_end=checked_number(t_end, "t_end"), tau=tau)
+    if h is None and in_tau:
+        raise StateError("adaptive steps are unavailable in transformed time: give h (fixed step in tau)")
+    if (t_end is None) == (h is None):
+        raise StateError(
+            f"give either h (fixed step size) or t_end (adaptive step size); got {'neither' if h is None else 'both'}"
+        )
+    if h is not None:
+        if tolerance is not None:
+            raise StateError("tolerance requires adaptive steps: give t_end without h and steps")
+        return StepPlan.with_step(h)
+    allowed = 0.0
+    if tolerance is not None:
+        check_tolerance(allowed := checked_number(tolerance, "the tolerance"))
+    return StepPlan(t_end=checked_number(t_end, "t_end"), tolerance=allowed)
+
+
+def planned_steps(
+    h: float | None,
+    steps: int | None,
+    t_end: float | None,
+    tolerance: float | None,
+    save_every: int,
+    t: float,
+    controller: str,
+    *,
+    in_tau: bool,
+) -> tuple[StepPlan, int | None]:
+    """Return the plan of :meth:`Stepper.integrate` and its number of steps, ``None`` to t_end; equal ones once.
+
+    Args:
+        h, steps, t_end, tolerance, save_every, t: arguments of :meth:`Stepper.integrate`.
+        controller, in_tau: as of :meth:`StepPlan.checked`.
+
+    Raises:
+        StateError: if a number is invalid, or they do not determine the steps.
+    """
+    start = 0.0 if h is None or t_end is None else t
+    planned: tuple[StepPlan, int | None] = _from_cache(
+        _planned, t_end, h, steps, t_end, tolerance, save_every, start, controller, in_tau
+    )
+    return planned
+
+
+@lru_cache(maxsize=256, typed=True)
+def _planned(
+    h: float | None,
+    steps: int | None,
+    t_end: float | None,
+    tolerance: float | None,
+    save_every: int,
+    t: float,
+    controller: str,
+    in_tau: bool,
+) -> tuple[StepPlan, int | None]:
+    fixed = h is not None and not controller
+    plan = StepPlan.checked(h, None if fixed else t_end, tolerance, controller=controller, in_tau=in_tau)
+    if not fixed:
+        if steps is not None:
+            raise StateError(f"adaptive steps end at t_end={plan.t_end:g}: omit steps={steps}, or give h and steps")
+        return plan, None
+    if t_end is None:
+        if steps is None:
+            raise StateError("h requires steps or t_end (fixed step size); give t_end without h for adaptive steps")
+        return plan, steps
+    count = None if in_tau or steps is not None else steps_to(t, t_end, plan.h)
+    if count is not None and count % checked_count(save_every, "save_every", least=1) == 0:
+        return plan, count
+    end = checked_number(t_end, "the time t_end")
+    if steps is not None:
+        raise StateError(f"give either steps={steps} or t_end={end:g} with h, not both")
+    if (end - checked_number(t, "the time t")) * plan.h < 0.0:
+        raise StateError(f"h = {plan.h:g} has the wrong sign for a run from t = {t:g} to t_end = {end:g}")
+    return replace(plan, t_end=end), None

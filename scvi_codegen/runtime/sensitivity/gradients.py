@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import real_array
-from scvi_codegen.native.options import step_failure
 from scvi_codegen.representation import summary
 from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.runtime.run.memory import Memory, fill
+from scvi_codegen.runtime.run.memory import Memory
+from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.sensitivity.step_derivatives import LinearisedMethod, Sensitivity, Starts
 from scvi_codegen.runtime.sensitivity.transformed_derivatives import time_of
 from scvi_codegen.runtime.trajectory.recomputation import check_recomputed, steps_between
@@ -209,15 +209,12 @@ def starts_of(states: SavedStates, first: int, last: int) -> tuple[Starts, NDArr
         states.stepper,
         states.q[first],
         states.p[first],
-        h=length,
+        plan=StepPlan.with_step(length),
         t=float(t[0]),
         parameters=states.parameters,
         options=states.options,
     )
-    times = np.empty(count)
-    status, report = fill(run, count, 1, times, starts.q[1:], starts.p[1:], np.empty(count, dtype=np.int32))
-    if status:
-        raise step_failure(status, report, step=run.steps, h=length)
+    times = run._fill(count, starts.q[1:], starts.p[1:])
     if states.tau is not None:
         starts.t[1:] = times[:-1]
     numbers = np.full(count + 1, -1)
@@ -228,7 +225,7 @@ def starts_of(states: SavedStates, first: int, last: int) -> tuple[Starts, NDArr
 
 def _has_fixed_step_size(states: SavedStates) -> bool:
     """Return whether all steps have size h."""
-    if states.plan is not None:
+    if not states.plan.fixed:
         return False
     spans = np.diff(states.stepped)
     steps = np.rint(spans / states.h)

@@ -133,6 +133,7 @@ def _before_last(states: SavedStates) -> SavedStates:
         h=states.h,
         parameters=states.parameters,
         stepper=states.stepper,
+        plan=states.plan,
         options=states.options,
         tau=states.tau[:-1],
     )

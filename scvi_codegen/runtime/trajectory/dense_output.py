@@ -50,7 +50,7 @@ def states_and_steps_at(states: SavedStates, times: Array) -> tuple[Array, Array
         _check_on_grid(states)
         return states_in_transformed_time(states, times)
     left = np.searchsorted(states.forward * states.t, states.forward * times, side="right") - 1
-    if states.plan is not None and np.isnan(states.step_sizes[:-1]).any():
+    if not states.plan.fixed and np.isnan(states.step_sizes[:-1]).any():
         return *_integrate_to_each(states, left, times, states.plan), times
     _check_on_grid(states)
     t, q, p = states.t[left], states.q[left], states.p[left]
@@ -71,7 +71,7 @@ def _integrate_to_each(
             states.stepper,
             q[k],
             p[k],
-            h=replace(plan, t_end=float(times[k])),
+            plan=replace(plan, t_end=float(times[k])),
             t=states.t[left[k]],
             parameters=states.parameters,
             options=states.options,
@@ -107,7 +107,7 @@ def _take_whole_steps(
                 states.stepper,
                 q[k],
                 p[k],
-                h=states.step_sizes[saved],
+                plan=StepPlan.with_step(float(states.step_sizes[saved])),
                 t=t[k],
                 parameters=states.parameters,
                 options=states.options,

@@ -56,8 +56,8 @@ class SavedStates:
     h: float
     parameters: Array
     stepper: Integrator = field(repr=False)
+    plan: StepPlan = field(repr=False)
     options: SolverOptions | None = field(default=None, repr=False)
-    plan: StepPlan | None = field(default=None, repr=False)
     tau: Array | None = None
 
     @property

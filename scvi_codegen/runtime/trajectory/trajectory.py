@@ -63,7 +63,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
         stepper: the compiled integrator.
         options: convergence criterion of the solver, ``None`` for the defaults.
         events: zero crossings found, parallel to ``stepper.events``.
-        plan: step plan of adaptive steps, else ``None``.
+        plan: step sizes and target time of the run.
         steps, rejected_steps: numbers of completed and of rejected steps since the start of the run.
         step_error, worst_step_time: estimated relative error of the worst step of the run, and its start time. The
             error is relative to the state, or to the largest state of the run near rest at the origin; NaN for methods
@@ -114,7 +114,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
         if self.pieces:
             return self._slice_of_pieces(first, last, stride, rows)
         lengths = self.step_sizes[rows]
-        if stride > 1 and self.plan is not None:  # the next saved state is not the end of the step
+        if stride > 1 and not self.plan.fixed:  # the next saved state is not the end of the step
             lengths = np.full_like(lengths, np.nan)
         low, high = sorted((self.t[first], self.t[range(first, last, stride)[-1]]))
         return replace(
@@ -334,7 +334,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
         return card(self.stepper.title, facts, grid(rows))
 
     def _steps(self) -> str:
-        if self.plan:
+        if not self.plan.fixed:
             return f"{self.steps} adaptive steps, {self.rejected_steps} rejected"
         return f"h = {self.h:g}"
 
