@@ -6,8 +6,9 @@
 #include "../iteration/point_weights.h"
 #include "arrays.h"
 
-/* Fixed-point iteration of a step of an array Hamiltonian system: positions and momenta y at the points are updated
- * from their rates until they converge. Requires: one_trajectory.h, point_weights.h, the tables, forces_at, which
+/* Fixed-point iteration of a step of an array Hamiltonian system, with the equations of hamiltonian_iteration.h.
+ * Since one function computes all rates from terms that contain positions and momenta, both are updated together
+ * (Jacobi), not in turn. Requires: one_trajectory.h, point_weights.h, the tables, forces_at, which
  * computes the rates at the points: -H_q of the momenta, then H_p of the positions. Momenta follow positions in
  * memory. */
 

@@ -4,8 +4,9 @@
 #include "../core/step.h"
 #include "arrays.h"
 
-/* Splitting step of an array system: kicks h KICK[n] F, each followed by a drift h DRIFT[n] v. Requires:
- * arrays.h, add_forces, LEAPS, CHUNK, the tables. */
+/* Splitting step of an array system, with the equations of splitting.h. Forces are added to the increments of the
+ * momenta term by term, without an array of their own: a pass less over memory. Requires: arrays.h, add_forces, LEAPS,
+ * CHUNK, the tables. */
 
 /* Parts of work: positions of the next kick, forces at the end of a step, increments of positions and momenta. */
 typedef struct {

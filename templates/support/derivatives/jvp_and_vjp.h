@@ -2,12 +2,31 @@
 #define SUPPORT_JVP_AND_VJP_H
 
 #include "../newton/newton_from_line.h"
-#include "linearised.h"
+#include "../newton/newton.h"
+#include "linear_maps.h"
 
-/* Tangent and adjoint vectors over a step solved by Newton's method; TIME_TRANSFORMATION: time depends on the state. */
+/* Tangent and adjoint vectors over a step solved by Newton's method. The step is a function of its inputs x and the
+ * unknowns z, which satisfy R(z, x) = 0: dz = -R_z^-1 R_x dx forward (JVP), and with the transposed matrices backward
+ * (VJP; Griewank & Walther, Evaluating Derivatives, ch. 15). TIME_TRANSFORMATION: time depends on the state. */
+
+enum {
+  COUNT_OF_GROUPS = sizeof STAGE_GROUPS / sizeof *STAGE_GROUPS
+};
+
+/* The solved step, its derivatives at the points, and memory for tangent or adjoint vectors. */
+typedef struct {
+  const step_data *step;
+  newton_data *data;
+  band shape;
+  real *partials;
+  wide *v, *dz, *rows, *x, *points;
+  wide *grown; /* variations of gamma h; NULL without damping */
+  real growth; /* gamma h */
+  real p1[M];
+} linearised_step;
 #ifdef TIME_TRANSFORMATION
 /* Linearised time of a time-transformed system: time is an integral along the curve, by the weights of the first
- * points. Requires: linearised.h, INTEGRAL_WEIGHT, RATE_ENTRY, RATE_DERIVATIVES, the kernels rate_derivatives and
+ * points. Requires: INTEGRAL_WEIGHT, RATE_ENTRY, RATE_DERIVATIVES, the kernels rate_derivatives and
  * energy_derivatives. */
 
 /* Derivative of the time at the end with respect to that at the start, q0, parameters, h and the unknowns; back: its
@@ -53,7 +72,7 @@ int NAME(energy_gradient)(const real *q, const real *p, const real *parameters, 
   return status == OK && !all_finite(partials, STEP_INPUTS - 2) ? NOT_FINITE : status;
 }
 #else
-/* Linearised time without time transformation: t + h. Requires: linearised.h. */
+/* Linearised time without time transformation: t + h. */
 
 /* Derivative of the time at the end with respect to that at the start and h; back: its transpose. */
 static void end_time(const linearised_step *at, int back)
@@ -63,8 +82,8 @@ static void end_time(const linearised_step *at, int back)
 #endif
 
 /* Derivative of a step (JVP) and its transpose (VJP) by implicit differentiation of the stage equations. Requires:
- * newton_from_line.h, newton_from_line.h, linear_maps.h, and STAGE_GROUPS, the stage groups; linearised.h; if
- * DAMPED, growth_wide, from inputs to gamma h; end_time, the derivative of the time at the end. */
+ * newton_from_line.h and STAGE_GROUPS, the stage groups; if DAMPED, growth_wide, from inputs to gamma h; end_time, the
+ * derivative of the time at the end. */
 
 static linearised_step linearised_in(const step_data *step, real *workspace)
 {

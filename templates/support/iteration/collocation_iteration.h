@@ -3,8 +3,8 @@
 
 #include "curve.h"
 
-/* Fixed-point iteration of a collocation method: momenta at the ends, by quadrature of the action (NODES) or by the
- * Legendre transform, and the iteration. */
+/* Fixed-point iteration of a collocation method, z_n = h a(q_n, v_n) on the curve of curve.h. The momenta at the ends
+ * are quadratures of the action (NODES) or Legendre transforms. */
 #ifdef NODES
 /* Momenta at both ends of a curve by quadrature of the action; p0 determines the initial velocity. Requires:
  * curve.h, the tables of the contributions of the points to p0 and p1, the kernel action_lanes. */

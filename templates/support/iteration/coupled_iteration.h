@@ -4,7 +4,10 @@
 #include "convergence.h"
 #include "corrections.h"
 
-/* Fixed-point iteration of a step for any regular Lagrangian. Requires: points.h or trajectories.h with what they
+/* Fixed-point iteration of a step for any regular Lagrangian L(q, v, t). With the weights beta and w, the velocities z
+ * at the points satisfy L_v(q_n, z_n) = P_n, where
+ *   q_n = q0 + h sum_j POSITION_nj beta_j z_j,      P_n = p0 + h sum_j MOMENTUM_nj w_j L_q(q_j, z_j),
+ * and an iteration is z_n += L_vv^-1 (P_n - L_v(q_n, z_n)). Requires: points.h or trajectories.h with what they
  * require, point_weights.h, a mass, corrections.h, velocity corrections, the tables, the kernel point_lanes. */
 
 /* Computes the increments of one step: the velocities z at the points are corrected by mass^-1 (P - L_v) until they

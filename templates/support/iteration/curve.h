@@ -6,8 +6,10 @@
 #include "mass_matrix.h"
 #include "one_trajectory.h"
 
-/* Collocation curve of a step: its initial velocity, known from p0 (HAMILTONIAN) or an unknown, and with NODES its
- * quadrature points. */
+/* Collocation curve of a step (Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. II.1.2) from its initial
+ * velocity v0 and z = h a, a the accelerations at the nodes, with A the table COLLOCATION:
+ *   v_n = v0 + sum_j A_nj z_j,      q_n = q0 + h sum_j A_nj v_j.
+ * v0 is known from p0 (HAMILTONIAN) or an unknown; with NODES there are quadrature points, too. */
 #ifdef HAMILTONIAN
 /* Initial velocity of a curve from p0. Requires: HAMILTONIAN, 1 for Hamiltonian systems. */
 static int nearby_velocity(const step_data *step, double *v0)
@@ -31,8 +33,7 @@ static int nearby_velocity(const step_data *step, double *v0)
 }
 #endif
 
-/* Collocation curve of a step: initial velocity v0 and scaled accelerations z = h a at the nodes. Requires:
- * one_trajectory.h, a mass, the tables COLLOCATION, NODE_END, NODE_MASK, whose column j multiplies node j. */
+/* Requires: one_trajectory.h, a mass, the tables COLLOCATION, NODE_END, NODE_MASK, whose column j multiplies node j. */
 typedef struct {
   double v0[M];
   lanes z[1][M];

@@ -5,8 +5,11 @@
 #include "one_trajectory.h"
 #include "point_weights.h"
 
-/* Fixed-point iteration of a step for any Hamiltonian (Li, Wu & Leok, eq. (35)). Requires: one_trajectory.h,
- * point_weights.h, the tables, the kernels velocity_lanes and force_lanes. */
+/* Fixed-point iteration of a step for any Hamiltonian H(q, p, t) (Li, Wu & Leok, eq. (35)). With the weights beta and
+ * w, the velocities z and forces f at the points are updated in turn:
+ *   q_n = q0 + h sum_j POSITION_nj beta_j z_j,      p_n = p0 + h sum_j MOMENTUM_nj w_j f_j,
+ *   f_n = -H_q(q_n, p_n),                           z_n = H_p(q_n, p_n).
+ * Requires: one_trajectory.h, point_weights.h, the tables, the kernels velocity_lanes and force_lanes. */
 
 /* Positions at the points of the curve with velocities z. */
 static inline void place(const step_data *step, const iteration_data *data, lanes (*z)[M], lanes (*u)[2 * M])

@@ -4,9 +4,11 @@
 #include "../core/status_codes.h"
 #include "../core/step.h"
 
-/* Explicit splitting method: drifts by constant masses (CONSTANT_MASSES) or by velocities v(p, t), and kicks. */
+/* Explicit splitting method (Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. II.5): for every n
+ *   p += h KICK[n] F(q, t + h KICK_ABSCISSA[n]),      q += h DRIFT[n] v,
+ * with v = M^-1 p for constant masses (CONSTANT_MASSES), else v(p, t). */
 #ifdef CONSTANT_MASSES
-/* Drift of splitting methods with constant masses: dq += h part M^-1 p. Requires: step.h, the kernel mass. */
+/* Drift with constant masses. Requires: the kernel mass. */
 typedef struct {
   real inverse_mass[M];
 } solver_data;
@@ -25,7 +27,7 @@ static inline void drift(const step_data *step, const solver_data *data, real pa
     dq[i] += step->h * part * data->inverse_mass[i] * (step->p0[i] + (step->carry_p[i] + dp[i]));
 }
 #else
-/* Drift of splitting methods with velocities v(p, t): dq += h part v. Requires: step.h, the kernel drift_velocity. */
+/* Drift with velocities v(p, t). Requires: the kernel drift_velocity. */
 typedef struct {
   int unused;
 } solver_data;
@@ -49,8 +51,7 @@ static inline void drift(const step_data *step, const solver_data *data, real pa
 }
 #endif
 
-/* Splitting step: kicks h KICK[n] L_q, each followed by a drift h DRIFT[n] v. Requires: a drift, LEAPS, the tables,
- * KICK_ABSCISSA, and the kernel force. */
+/* Requires: a drift, LEAPS, the tables, and the kernel force. */
 
 /* Computes the increments of one step; memory contains the last force, which the next step reuses if it starts with a
  * kick. */

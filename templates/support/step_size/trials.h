@@ -1,17 +1,143 @@
 #ifndef SUPPORT_TRIALS_H
 #define SUPPORT_TRIALS_H
 
-#include "trial.h"
+#include "observed_error.h"
+#include "step_size_levels.h"
 
-/* Trials of an adaptive step until its error estimate is admissible, and comparison with two half steps. Requires:
- * step_size_levels.h; the type trial with at.t, at.t_low, t_end, limits, change, error, guess, last
- * and apart; try_step, which sets error, guess and last; compare_trial, which compares a trial with its half steps,
- * in momenta too if requested; changes_little, 1 if the momenta change by a small part of the largest one;
- * SHORT_STEPS_FAIL, 1 if rounding alone may make a step fail; DOUBTS, 1 if momenta may be compared; HOT. */
+/* Adaptive steps: trials of a step until its error estimate is admissible (Hairer, Norsett & Wanner, Solving ODEs I,
+ * sec. II.4), with comparisons with two half steps. The equations of a trial are solved by fixed-point iteration, by
+ * Newton's method (NEWTON_ALONE) or, for arrays, by Newton-GMRES (NEWTON_KRYLOV). Requires: run.h or array_step.h. */
 
 #define ALLOWED_TO_HALVES 100 /* admissible difference of the half steps, relative to the admissible error estimate */
 #define SPURIOUS REAL(1e-8) /* relative to the state: spurious solutions of the equations differ by more */
 #define STEPS_COMPARED_AFTER_DOUBT 16 /* steps that are compared after one that was shortened by a comparison */
+
+#ifdef ARRAYS
+#define SHARE_OF_TRIAL ALL
+
+/* State of a run: vectors of the caller. */
+typedef struct {
+  double t, t_low, *q, *p, *carry_q, *carry_p;
+} state;
+#else
+#include "../run/run.h"
+
+#define SHARE_OF_TRIAL EACH
+#endif
+
+#ifdef NEWTON_ALONE
+#define HOT static
+#define SHORT_STEPS_FAIL 0
+
+static inline real smaller(real a, real b)
+{
+  return a < b ? a : b;
+}
+
+/* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
+ * failed. afresh: without the predictor, which requires the step size of the previous step. */
+static real attempt(run_memory *run, step_data *step, const solver_data *data, int afresh, long long *guess, real *dq,
+    real *dp, real decay, real least, const solver_options *options, solver_report *report)
+{
+  *guess = !afresh && run->change == 0 && run->guess > 0;
+  if (solve(step, data, run->memory, guess, dq, dp, options, report, step->scratch + SCRATCH) != OK)
+    return INFINITY;
+  *guess = 1;
+  return stage_error(step, run->memory, dq, EACH, decay, least);
+}
+#else
+#define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
+
+/* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
+ * failed. afresh: without the predictor. */
+static inline double attempt(run_memory *run, step_data *step, const solver_data *data, int afresh, long long *guess,
+    double *dq, double *dp, double decay, double least, const solver_options *options, solver_report *report)
+{
+  struct predictor_tables_of tables = {NULL, NULL, NULL};
+  int status;
+  step->tables = &tables;
+  *guess = afresh || !choose_tables(run, &tables) ? 0 : run->guess;
+#ifdef NEWTON_KRYLOV
+  status = solve(step, data, STORED(run, step), guess, dq, dp, options, report, NULL);
+#else
+  status = fixed_point(step, data, STORED(run, step), guess, dq, dp, options, report);
+#endif
+  step->tables = NULL;
+  if (status != OK)
+    return INFINITY;
+  return curve_error(step, data, STORED(run, step), dq, SHARE_OF_TRIAL, decay, least);
+}
+#endif
+
+#ifdef NEWTON_KRYLOV
+#define DOUBTS 0 /* steps may leave vibrations unresolved */
+#else
+#define DOUBTS SHORT_STEPS_FAIL
+#endif
+
+/* Data shared by the trials of a step. */
+typedef struct {
+  state at;
+  step_data step;
+  solver_data data;
+  error_limits limits;
+  real t_end, error;
+#ifdef ARRAYS
+  double *dq, *dp;
+#else
+  real dq[2 * M], dp[2 * M]; /* increments, then their low words */
+#endif
+  real apart; /* error estimate by two half steps, in the measure of `error`; 0 if they were not computed */
+  long long guess, grid_level; /* level of the step size */
+  long long change; /* of the level, from the previous step to this */
+  real length; /* step size; 0 before the first trial */
+  int last; /* 1 if the step ends at t_end */
+} trial;
+
+/* Performs one trial of the next step: its increments and the error estimate of the curve if it exceeds `least`,
+ * infinite if the step failed. */
+HOT void try_step(run_memory *run, trial *now, real least, const solver_options *options, solver_report *report)
+{
+  const real rest = (now->t_end - now->at.t) - now->at.t_low;
+  real h;
+  if (now->length == 0 || now->grid_level != run->grid_level) {
+    now->grid_level = run->grid_level;
+    now->length = size_of_level(run->grid_level);
+  }
+  h = next_size(now->length, rest, &now->last);
+  report->t = now->step.t = now->at.t;
+  if (now->last || now->step.h != h) {
+    now->step.h = h;
+    prepare(&now->step, &now->data);
+  }
+  now->error = attempt(run, &now->step, &now->data, now->last, &now->guess, now->dq, now->dp, now->limits.decay, least,
+      options, report);
+}
+
+/* Returns 1 if the momenta change by a small part of the largest one, as they do where nonsmooth forces shorten a
+ * step. */
+static SELDOM int changes_little(const trial *now)
+{
+  const step_data *step = &now->step;
+  sums all;
+  begin_blocks(&all, step);
+  EACH_BLOCK (all) {
+    real change = 0, size = 0;
+    for (long long i = all.here.first; i < all.here.end; i++) {
+      change = larger(change, MATH(fabs)(now->dp[i]));
+      size = larger(size, MATH(fabs)(now->at.p[i]));
+    }
+    add_block(&all, change, size);
+  }
+  meet(step);
+  return largest_over(&all, 0) < SMALL_PART * largest_over(&all, 1);
+}
+
+/* Compares a trial with two half steps, in momenta too if requested. */
+static inline int compare_trial(const trial *now, int momenta, const solver_options *options, real *apart)
+{
+  return compare_with_halves(&now->step, now->dq, momenta ? now->dp : NULL, options, apart);
+}
 
 /* Number of levels by which the first step may be increased at once. */
 static int levels_up(const trial *now)
