@@ -1,9 +1,14 @@
-"""Animations of trajectories, for a notebook or a file."""
+"""Animations of trajectories, for a notebook or a file, and recognition of the shapes to animate.
+
+Shapes are recognised from coordinates and energies: bodies, chained pendulums, chains, points.
+"""
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,15 +18,165 @@ import numpy as np
 
 from scvi_codegen.errors import PlotError, StateError
 from scvi_codegen.files.atomic import replaced
-from scvi_codegen.pictures.canvas import check_plot_path, color, plain, style
-from scvi_codegen.pictures.shapes import MovingPoints, shape_of
-from scvi_codegen.pictures.trajectory_interface import MOTION, Array, DrawnMotion
+from scvi_codegen.mechanics.symmetry.sampling import bodies
+from scvi_codegen.pictures.attitudes import solids
+from scvi_codegen.pictures.canvas import MOTION, Array, DrawnMotion, check_plot_path, color, plain, style
 from scvi_codegen.representation import summary
 from scvi_codegen.validation import FUNCTION, PATH, REAL, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
     from matplotlib.axes import Axes
+
+NUMBERED = re.compile(r"(.*?)_?(\d+)")
+LENGTHS = ("l", "L", "length")
+"""Names of parameters that are rod lengths, alone or followed by a number."""
+MAX_RODS = 6
+GENERIC = 0.3, 0.17
+"""First angle, and difference between angles, of a state without accidental symmetry."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MovingPoints:
+    """Points, lines and labels that represent a state.
+
+    Attributes:
+        points: function from q and p (n, m) to (n, k, d) positions of k points in the plane or in space.
+        joined: draw a line through the points of a state.
+        solids: slices of points that a line joins each, or none.
+        trails: indices of the points whose paths are drawn.
+        labels: labels of the d axes.
+        names: names of the points, or none.
+        equal: use one scale for all axes.
+    """
+
+    points: Callable[[Array, Array], Array]
+    labels: tuple[str, ...]
+    joined: bool = False
+    solids: tuple[slice, ...] = ()
+    trails: tuple[int, ...] = ()
+    names: tuple[str, ...] = ()
+    equal: bool = True
+
+
+def shape_of(motion: DrawnMotion, positions: Callable[[Array], Array] | None = None) -> MovingPoints:
+    """Return the shape of a system: bodies by coordinate names, pendulums by energy, else a point or a chain.
+
+    Args:
+        motion: trajectory whose coordinates are examined.
+        positions: function from q (n, m) to (n, k, 2) or (n, k, 3) positions of k points, instead of those recognised.
+
+    Raises:
+        StateError: if ``positions`` returns another shape.
+    """
+    coordinates, m = motion.stepper.interface.coordinates, motion.q.shape[1]
+    if positions is not None:
+        return _given(motion, positions)
+    if motion.stepper.interface.rotations:
+        return _solids(motion)
+    if result := bodies(coordinates):
+        columns = np.array([body.columns for body in result])
+        names = tuple(body.name for body in result if body.name)
+        labels = tuple("xyz"[: columns.shape[1]])
+        return MovingPoints(
+            points=lambda q, p: q[:, columns], labels=labels, trails=tuple(range(len(result))), names=names
+        )
+    if (sign := _hanging(motion)) is not None:
+        return _pendulum(_lengths(motion), sign)
+    if m == 1:
+        labels = (coordinates[0], motion.stepper.interface.momenta[0])
+        return MovingPoints(points=lambda q, p: np.stack([q, p], axis=2), labels=labels, trails=(0,), equal=False)
+    if m == 2:
+        return MovingPoints(points=lambda q, p: q[:, np.newaxis], labels=tuple(coordinates), trails=(0,))
+    positions_of_indices = np.arange(1.0, m + 1)
+    return MovingPoints(
+        points=lambda q, p: np.stack([np.broadcast_to(positions_of_indices, q.shape), q], axis=2),
+        labels=("number of the coordinate", "q"),
+        joined=True,
+        equal=False,
+    )
+
+
+def _given(motion: DrawnMotion, positions: Callable[[Array], Array]) -> MovingPoints:
+    tried = np.shape(positions(motion.q[:1]))
+    if len(tried) != 3 or tried[0] != 1 or tried[2] not in (2, 3):
+        raise StateError(f"positions(q) must have shape (n, k, 2) or (n, k, 3); for n = 1 it has {tried}")
+    return MovingPoints(
+        points=lambda q, p: np.asarray(positions(q), dtype=float),
+        labels=tuple("xyz"[: tried[2]]),
+        trails=tuple(range(tried[1])),
+    )
+
+
+def _solids(motion: DrawnMotion) -> MovingPoints:
+    """Return a box for each rotation, an arrow for each direction and spin, at (x, y, z) if these are coordinates."""
+    coordinates = motion.stepper.interface.coordinates
+    columns = [coordinates.index(name) for name in "xyz" if name in coordinates]
+    centres = motion.q[:, columns] if len(columns) == 3 else np.zeros((len(motion.q), 3))
+    points, parts, trails = solids(motion, centres)
+    return MovingPoints(points=lambda q, p: points, labels=tuple("xyz"), solids=parts, trails=trails)
+
+
+def _pendulum(lengths: Array, sign: float) -> MovingPoints:
+    """Return a chain of rods, each hanging from (sign 1) or standing on (-1) the end of the previous one."""
+
+    def points(q: Array, p: Array) -> Array:
+        rods = np.stack([lengths * np.sin(q), -sign * lengths * np.cos(q)], axis=2)
+        ends = np.cumsum(rods, axis=1)
+        return np.concatenate([np.zeros_like(ends[:, :1]), ends], axis=1)
+
+    return MovingPoints(points=points, labels=("x", "y"), joined=True, trails=(len(lengths),))
+
+
+def _hanging(motion: DrawnMotion) -> float | None:
+    """Return 1 if the coordinates are angles of pendulums that hang at 0, -1 if they stand there, else ``None``.
+
+    The potential energy must be that of weights, sum a_i (1 - cos q_i) with all a_i of one sign, and neighbours must be
+    coupled: the kinetic energy of two momenta must not be the sum of that of each.
+    """
+    numbers, m = _numbers(motion.stepper.interface.coordinates), motion.q.shape[1]
+    if m > MAX_RODS or (m > 1 and numbers is None):
+        return None
+    generic = GENERIC[0] + GENERIC[1] * np.arange(m)
+    q = np.concatenate([np.zeros((1, m)), math.pi * np.eye(m), [generic]])
+    try:
+        at_rest = _energies(motion, q, np.zeros_like(q))
+        a = (at_rest[1:-1] - at_rest[0]) / 2
+        expected = at_rest[0] + a @ (1.0 - np.cos(generic))
+        alone, both = np.eye(m), np.eye(m)[:-1] + np.eye(m)[1:]
+        kinetic = _energies(motion, np.zeros_like(alone), alone) - at_rest[0]
+        coupled = _energies(motion, np.zeros_like(both), both) - at_rest[0] - kinetic[:-1] - kinetic[1:]
+    except StateError:
+        return None
+    close = math.isclose(at_rest[-1], expected, rel_tol=0.0, abs_tol=1e-9 * float(np.abs(a).max()))
+    one_sign = bool((a > 0.0).all() or (a < 0.0).all())
+    together = bool((np.abs(coupled) > 1e-9 * np.abs(kinetic).max()).all())
+    return float(np.sign(a[0])) if close and one_sign and together else None
+
+
+def _energies(motion: DrawnMotion, q: Array, p: Array) -> Array:
+    return np.asarray(motion.stepper.energy(q, p, motion.t[0], motion.parameters), dtype=float)
+
+
+def _numbers(names: Sequence[str]) -> tuple[int, ...] | None:
+    """Return the numbers of theta_1, theta_2, .. or theta1, theta2, ..; ``None`` for other names."""
+    result = [NUMBERED.fullmatch(name) for name in names]
+    if not all(result) or len({match[1] for match in result if match}) > 1:
+        return None
+    return tuple(int(match[2]) for match in result if match)
+
+
+def _lengths(motion: DrawnMotion) -> Array:
+    """Return (m,) rod lengths, from parameters by name; 1 if there is none."""
+    interface, m = motion.stepper.interface, motion.q.shape[1]
+    values = dict(zip(interface.parameters, motion.parameters, strict=True))
+    numbers = _numbers(interface.coordinates) or (0,) * m
+    lengths = []
+    for number in numbers:
+        names = [f"{name}{end}" for end in (number, f"_{number}", "") for name in LENGTHS]
+        lengths.append(next((float(values[name]) for name in names if name in values), 1.0))
+    return np.array(lengths)
+
 
 FILMS = (".gif", ".html", ".mp4")
 FRAMES_PER_SECOND = 25

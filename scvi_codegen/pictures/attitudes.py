@@ -8,8 +8,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.pictures.canvas import check_plot_path, color, new_figure, plain, save, style
-from scvi_codegen.pictures.trajectory_interface import MOTION, Array, DrawnMotion
+from scvi_codegen.pictures.canvas import (
+    MOTION,
+    Array,
+    DrawnMotion,
+    check_plot_path,
+    color,
+    new_figure,
+    plain,
+    save,
+    style,
+)
 from scvi_codegen.validation import CANVAS, PATH, WHOLE, checks_arguments
 
 if TYPE_CHECKING:

@@ -1,20 +1,60 @@
-"""Plots of conserved quantities over time: energy error and momentum maps."""
+"""Plots over time: energy error, momentum maps, and residuals of a fit."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.pictures.canvas import color, panel
-from scvi_codegen.pictures.trajectory_interface import HISTORIES, MOTION, Array, DrawnMotion, EnergyHistory, several
+from scvi_codegen.pictures.canvas import (
+    HISTORIES,
+    MOTION,
+    Array,
+    DrawnMotion,
+    EnergyHistory,
+    color,
+    panel,
+    plain,
+    several,
+)
 from scvi_codegen.validation import CANVAS, PATH, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ResidualPlot:
+    """Plot ``fit.plot()``: measured minus computed values over time, with bands of two standard deviations.
+
+    Attributes:
+        t: (n,) times.
+        residuals: (n, c), NaN where nothing was measured.
+        deviations: (c,) standard deviations of the noise.
+        names: names of the quantities.
+    """
+
+    t: Array
+    residuals: Array
+    deviations: Array
+    names: tuple[str, ...]
+
+    def __call__(self, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
+        """Draw on the axes ``ax`` or on new ones; write a .png or .svg if a path is passed."""
+        with panel(path, ax) as drawn:
+            curves = zip(self.names, self.residuals.T, self.deviations, strict=True)
+            for number, (name, column, deviation) in enumerate(curves):
+                drawn.plot(self.t, column, ".", markersize=4, color=color(number), label=plain(name))
+                drawn.axhspan(-2.0 * deviation, 2.0 * deviation, color=color(number), alpha=0.1, linewidth=0)
+            drawn.axhline(0.0, color="black", linewidth=0.6)
+            drawn.set(xlabel="t", title="measured minus computed; bands of two standard deviations")
+            drawn.legend(loc="best", fontsize=8)
+        return drawn
+
 
 BINS = 600
 

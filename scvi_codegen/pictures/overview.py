@@ -13,10 +13,25 @@ from typing import TYPE_CHECKING
 from scvi_codegen.errors import StateError
 from scvi_codegen.mechanics.symmetry.sampling import bodies
 from scvi_codegen.pictures.attitudes import plot_attitude
-from scvi_codegen.pictures.canvas import COLORS, check_plot_path, color, new_figure, panel, plain, save, style
+from scvi_codegen.pictures.canvas import (
+    COLORS,
+    MOTION,
+    MOTIONS,
+    Array,
+    DrawnMotion,
+    Motions,
+    check_plot_path,
+    color,
+    column,
+    new_figure,
+    panel,
+    plain,
+    save,
+    several,
+    style,
+)
 from scvi_codegen.pictures.conserved import draw_energy_error, plot_energy, plot_momentum_maps
 from scvi_codegen.pictures.paths import draw_paths, path_panels, plot_motion, plot_phase
-from scvi_codegen.pictures.trajectory_interface import MOTION, MOTIONS, Array, DrawnMotion, Motions, column, several
 from scvi_codegen.validation import CANVAS, NAMES, PATH, checks_arguments
 
 if TYPE_CHECKING:

@@ -11,8 +11,18 @@ import numpy as np
 
 from scvi_codegen.mechanics.symmetry.sampling import AXES, Body, bodies
 from scvi_codegen.pictures.attitudes import draw_unit_vectors
-from scvi_codegen.pictures.canvas import color, panel, plain
-from scvi_codegen.pictures.trajectory_interface import MOTION, MOTIONS, Array, DrawnMotion, Motions, column, several
+from scvi_codegen.pictures.canvas import (
+    MOTION,
+    MOTIONS,
+    Array,
+    DrawnMotion,
+    Motions,
+    color,
+    column,
+    panel,
+    plain,
+    several,
+)
 from scvi_codegen.validation import CANVAS, NAMES, PATH, checks_arguments
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from samples import compile_quickly
 
 import scvi_codegen as sc
 from scvi_codegen.errors import PlotError, StateError
-from scvi_codegen.pictures.shapes import shape_of
+from scvi_codegen.pictures.animation import shape_of
 
 pytest.importorskip("matplotlib")
 

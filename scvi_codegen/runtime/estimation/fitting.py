@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import AccuracyWarning, FitError, StateError, StepFailedError, closest, warn
 from scvi_codegen.native.arguments import real_array
-from scvi_codegen.pictures.residuals import ResidualPlot
+from scvi_codegen.pictures.conserved import ResidualPlot
 from scvi_codegen.representation import summary
 from scvi_codegen.runtime.core.stepper import STEPPER, Stepper
 from scvi_codegen.runtime.core.validation import Array, checked_vector
