@@ -160,7 +160,7 @@ BASELINE, FAST, DEFAULT = "heyoka", "fast_math", "tol=default"
 OURS = "scvi-codegen"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Contender:
     """Compiled integrator at one setting.
 

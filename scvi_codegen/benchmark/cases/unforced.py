@@ -206,7 +206,7 @@ def rotated(vector: Sequence[float], axes: int) -> Array:
     return np.array([(parts @ matrix.T).ravel() for matrix in matrices])
 
 
-def _small_case(name: str, rates: tuple[Formulation, ...], **changes: Any) -> Case:
+def _small_case(name: str, accelerations: Callable[..., list[Any]], *others: Formulation, **changes: Any) -> Case:
     """Return a problem of the catalogue with its own state (or another one), spread by 5 %."""
     entry = problem(name)
     fields = {field: changes.pop(field) for field in ("span", "fine", "loops") if field in changes}
@@ -215,7 +215,7 @@ def _small_case(name: str, rates: tuple[Formulation, ...], **changes: Any) -> Ca
     return Case(
         name=name,
         system=entry.system.with_parameters(**changes),
-        formulations=rates,
+        formulations=(*hand_solved(accelerations), *others),
         q=scaled(q, 0.05),
         velocity=scaled(velocity, 0.05),
         step=step,
@@ -226,38 +226,6 @@ def _small_case(name: str, rates: tuple[Formulation, ...], **changes: Any) -> Ca
 def hand_solved(accelerations: Callable[..., list[Any]]) -> tuple[Formulation, ...]:
     """Return the formulation in (q, v) with these accelerations."""
     return (Formulation(name="hand-solved accelerations", rates=second_order(accelerations)),)
-
-
-def _pendulum_case() -> Case:
-    return _small_case("planar-pendulum", hand_solved(pendulum), span=1000.0, fine=0.5, q=(0.5,), step=0.8)
-
-
-def _duffing_case() -> Case:
-    return _small_case("duffing", hand_solved(duffing), span=2000.0, fine=0.25)
-
-
-def _henon_heiles_case() -> Case:
-    """Return the problem at energy 0.055, where motion is regular."""
-    return _small_case(
-        "henon-heiles",
-        hand_solved(henon_heiles),
-        span=1000.0,
-        fine=0.375,
-        q=(0.0, 0.1),
-        velocity=(0.3, 0.1),
-    )
-
-
-def _double_pendulum_case() -> Case:
-    return _small_case(
-        "double-pendulum",
-        hand_solved(double_pendulum),
-        span=1000.0,
-        fine=0.25,
-        q=(0.5, 0.5),
-        step=0.4,
-        g=1.0,
-    )
 
 
 def kepler_case(eccentricity: float, *, step: float, fine: float) -> Case:
@@ -298,23 +266,26 @@ def _outer_solar_system() -> Case:
 
 def _chain_case(n: int, *, step: float, fine: float) -> Case:
     loops = CHAIN_LOOPS.format(n=n, beta=1.0)
-    return _small_case(f"fput-chain:{n}", hand_solved(chain), span=1000.0, fine=fine, step=step, loops=loops)
+    return _small_case(f"fput-chain:{n}", chain, span=1000.0, fine=fine, step=step, loops=loops)
 
 
-def _relativistic_case() -> Case:
-    momenta = Formulation(name="Hamilton's equations", rates=relativistic_in_momenta, momenta=True)
-    return _small_case("relativistic-particle", (*hand_solved(relativistic), momenta), span=1000.0, fine=0.25)
-
+MOMENTA = Formulation(name="Hamilton's equations", rates=relativistic_in_momenta, momenta=True)
 
 CASES: Mapping[str, Callable[[], Case]] = {
-    "planar-pendulum": _pendulum_case,
-    "duffing": _duffing_case,
+    "planar-pendulum": partial(_small_case, "planar-pendulum", pendulum, span=1000.0, fine=0.5, q=(0.5,), step=0.8),
+    "duffing": partial(_small_case, "duffing", duffing, span=2000.0, fine=0.25),
     "kepler:0.2": partial(kepler_case, 0.2, step=0.5, fine=0.375),
     "kepler:0.5": partial(kepler_case, 0.5, step=0.25, fine=0.1875),
-    "henon-heiles": _henon_heiles_case,
+    "henon-heiles": partial(  # at energy 0.055, where motion is regular
+        _small_case, "henon-heiles", henon_heiles, span=1000.0, fine=0.375, q=(0.0, 0.1), velocity=(0.3, 0.1)
+    ),
     "outer-solar-system": _outer_solar_system,
-    "double-pendulum": _double_pendulum_case,
-    "relativistic-particle": _relativistic_case,
+    "double-pendulum": partial(
+        _small_case, "double-pendulum", double_pendulum, span=1000.0, fine=0.25, q=(0.5, 0.5), step=0.4, g=1.0
+    ),
+    "relativistic-particle": partial(
+        _small_case, "relativistic-particle", relativistic, MOMENTA, span=1000.0, fine=0.25
+    ),
     "fput-chain:8": partial(_chain_case, 8, step=1.0, fine=1.0),
     "fput-chain:64": partial(_chain_case, 64, step=2.0, fine=3.0),
     "fput-chain:256": partial(_chain_case, 256, step=2.0, fine=2.0),

@@ -9,6 +9,8 @@ import itertools
 import tempfile
 import time
 from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any, cast
 
 import numpy as np
 
@@ -22,9 +24,6 @@ from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native import building
 from scvi_codegen.runtime.core.stepper import Stepper
-
-__all__ = ["OURS", "Contender", "advised_counts", "compiled", "momenta_of", "our_contenders", "our_ensembles"]
-
 
 TOLERANCES = (1e-6, 1e-8, 1e-9, 1e-10, 3e-11, 1e-11, 3e-12, 1e-12, 5e-13, 3e-13, 2e-13, 1e-13)
 """Tolerances for which a step size is recommended; the errors reached are measured."""
@@ -49,17 +48,10 @@ def our_contenders(case: Case, *, methods: Iterable[Method] = (), quick: bool = 
     for method in methods or (SVI(8),):
         stepper, seconds = compiled(case, method)
         momenta = momenta_of(stepper, case)
-        for count, tolerance in advised_counts(case, method, momenta[0], quick=quick).items():
-            result.append(
-                Contender(
-                    method=f"{OURS} {method.name}",
-                    setting=_setting(case, count, tolerance),
-                    options=f"{stepper.title}, solver auto, {' '.join(stepper.flags)}",
-                    compile_seconds=seconds,
-                    prepare=_preparation(stepper, case, momenta, count),
-                    momenta=momenta,
-                )
-            )
+        options = f"{stepper.title}, solver auto, {' '.join(stepper.flags)}"
+        for count, setting in _settings(case, method, momenta, quick).items():
+            prepare = partial(_prepared, stepper, case, momenta, count)
+            result.append(Contender(f"{OURS} {method.name}", setting, options, seconds, prepare, momenta))
     return result
 
 
@@ -70,18 +62,18 @@ def our_ensembles(case: Case, *, quick: bool = False) -> list[Contender]:
     began = time.perf_counter()
     stepper.integrate_ensemble(case.q, momenta, h=case.step, steps=1, threads=1)  # compiled on first use
     seconds += time.perf_counter() - began
-    return [
-        Contender(
-            method=f"{OURS} ensemble",
-            setting=_setting(case, count, tolerance),
-            options=f"{stepper.title}, one thread",
-            compile_seconds=seconds,
-            prepare=_ensemble_preparation(stepper, case, momenta, count),
-            momenta=momenta,
-            trajectories=len(case.q),
-        )
-        for count, tolerance in advised_counts(case, SVI(8), momenta[0], quick=quick).items()
-    ]
+    options, size = f"{stepper.title}, one thread", len(case.q)
+    result = []
+    for count, setting in _settings(case, SVI(8), momenta, quick).items():
+        prepare = partial(_prepared_ensemble, stepper, case, momenta, count)
+        result.append(Contender(f"{OURS} ensemble", setting, options, seconds, prepare, momenta, size))
+    return result
+
+
+def _settings(case: Case, method: Method, momenta: Array, quick: bool) -> dict[int, str]:
+    """Return the recommended step sizes by number of steps, as text."""
+    counts = advised_counts(case, method, momenta[0], quick=quick)
+    return {count: f"h={case.span / count:.4g} for {tolerance:.0e}" for count, tolerance in counts.items()}
 
 
 def advised_counts(case: Case, method: Method, momentum: Array, *, quick: bool) -> dict[int, float]:
@@ -113,31 +105,11 @@ def momenta_of(stepper: Stepper, case: Case) -> Array:
     return np.array([stepper.momentum(q, v) for q, v in zip(case.q, case.velocity, strict=True)])
 
 
-def _setting(case: Case, count: int, tolerance: float) -> str:
-    return f"h={case.span / count:.4g} for {tolerance:.0e}"
+def _prepared(stepper: Stepper, case: Case, momenta: Array, count: int, index: int) -> Callable[[], Array]:
+    run = stepper.start(case.q[index], momenta[index], h=case.span / count)
+    return lambda: cast("Array", run.record(count, save_every=count).q[-1])
 
 
-def _preparation(stepper: Stepper, case: Case, momenta: Array, count: int) -> Callable[[int], Callable[[], Array]]:
-    def prepare(index: int) -> Callable[[], Array]:
-        run = stepper.start(case.q[index], momenta[index], h=case.span / count)
-
-        def integrate() -> Array:
-            final: Array = run.record(count, save_every=count).q[-1]
-            return final
-
-        return integrate
-
-    return prepare
-
-
-def _ensemble_preparation(
-    stepper: Stepper, case: Case, momenta: Array, count: int
-) -> Callable[[int], Callable[[], Array]]:
-    def integrate() -> Array:
-        result = stepper.integrate_ensemble(
-            case.q, momenta, h=case.span / count, steps=count, save_every=count, threads=1
-        )
-        final: Array = result.q[-1]
-        return final
-
-    return lambda index: integrate
+def _prepared_ensemble(stepper: Stepper, case: Case, momenta: Array, count: int, _: int) -> Callable[[], Array]:
+    arguments: dict[str, Any] = {"h": case.span / count, "steps": count, "save_every": count, "threads": 1}
+    return lambda: cast("Array", stepper.integrate_ensemble(case.q, momenta, **arguments).q[-1])

@@ -28,7 +28,7 @@ SAME_EQUATIONS = 1e-11
 SETTLED = 7
 """Largest number of points for which the order shows above round-off."""
 SETTING = (
-    "Not a figure of the paper. First the derivation, in general and for the pendulum with three points; then Kepler's "
+    "Not a figure of the paper. The derivation for the pendulum with three points is below; measured is Kepler's "
     "problem: one step h = 0.3 from q = (0.3, 0.8), p = (-1.1, 0.4), derivatives of the step by central differences of "
     "order six (noise 1e-13), and runs over 2.4 with steps down to 0.025 for the order. "
     "With nine points the errors reach round-off before their slope settles.",
@@ -118,7 +118,7 @@ def _check_orders(results: Found) -> Comparison:
         abs(pair[0].order - (s - 1)) < 0.3 and abs(pair[1].order - 2 * s) < 0.3 for s, pair in settled.items()
     )
     return Comparison(
-        claim="The missing term lowers the order from 2s to s - 1, for degree s >= 2 (derived below).",
+        claim="The missing term lowers the order from 2s to s - 1, for degree s >= 2.",
         measured=f"Degrees 2 to {SETTLED - 1}: as printed {printed}; in full {full}.",
         verdict=holds(as_derived),
     )
@@ -127,7 +127,7 @@ def _check_orders(results: Found) -> Comparison:
 def _check_two_points(printed: Structure) -> Comparison:
     agree = two_points_agree()
     return Comparison(
-        claim="With two points the printed equations are complete (derived below).",
+        claim="With two points the printed equations are complete.",
         measured=(
             f"The printed (34d), (34e) {'are' if agree else 'are not'}, term by term, the derivatives of L_d (27a), "
             f"(27c); defect {printed.defect:.1e}, change of momentum {abs(printed.momentum):.0e}, order "

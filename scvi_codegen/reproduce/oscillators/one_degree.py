@@ -1,19 +1,25 @@
-"""Quantities of runs with one degree of freedom: energy errors, drift, area in the phase plane."""
+"""Runs with one degree of freedom: energy errors, drift, area in the phase plane, and their tables and pictures."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import MethodWarning
 from scvi_codegen.methods import SVI
-from scvi_codegen.reproduce.laboratory.drawing import largest_in_bins
-from scvi_codegen.reproduce.laboratory.experiment import Cell, TableBlock, series_table
+from scvi_codegen.reproduce.laboratory.drawing import draw_error, draw_orbit, largest_in_bins, panels
+from scvi_codegen.reproduce.laboratory.experiment import Cell, Comparison, Picture, Result, TableBlock, series_table
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 
@@ -108,3 +114,55 @@ def curves_table(name: str, t: Array, errors: Mapping[str, Array], *, bins: int 
     columns = [largest_in_bins(t, error, bins=bins) for error in errors.values()]
     named = {scheme: values.tolist() for scheme, (_, values) in zip(errors, columns, strict=True)}
     return series_table({"t": columns[0][0].tolist(), **named}, name)
+
+
+DOTS = {"linestyle": "", "marker": ".", "markersize": 2}
+"""Style of states in the phase plane."""
+
+
+def draw_phase(
+    orbits: Mapping[str, tuple[Array, ...]], exact: tuple[Array, Array], style: Mapping[str, Any], figure: Figure
+) -> None:
+    """Draw orbits in the phase plane by scheme, over the exact one."""
+    limit = 1.05 * max(largest(np.concatenate(orbit)) for orbit in orbits.values())
+    for axes, (scheme, (q, p)) in zip(panels(figure, 1, len(orbits)), orbits.items(), strict=True):
+        draw_orbit(axes, q, p, scheme_name(scheme), scheme, **style)
+        axes.plot(*exact, color="black", linestyle="--", linewidth=0.7, label="exact")
+        axes.set(xlabel="q", ylabel="p", title=scheme, aspect="equal", xlim=(-limit, limit), ylim=(-limit, limit))
+        axes.legend(loc="center", markerscale=3)
+
+
+def scheme_name(scheme: str) -> str:
+    """Return the name of a scheme without its degree or order."""
+    return scheme.partition(",")[0].rstrip("46")
+
+
+def energy_result(
+    setting: tuple[str, ...],
+    runs: Mapping[str, Trajectory],
+    checks: Callable[[Mapping[str, Array]], tuple[Comparison, ...]],
+) -> Result:
+    """Return the result for the energy errors of several runs of equal steps."""
+    errors, t = {scheme: energy_error(run) for scheme, run in runs.items()}, next(iter(runs.values())).t
+    return Result(
+        setting=setting,
+        checks=checks(errors),
+        tables=(energy_table(runs), curves_table("curves", t, errors)),
+        picture=Picture(draw=partial(draw_energy, t, errors), width=7.0),
+    )
+
+
+LINES = ("-", ":", "--")
+"""Styles of the curves of a scheme, in turn."""
+
+
+def draw_energy(t: Array, errors: Mapping[str, Array], figure: Figure) -> None:
+    """Draw energy errors over time: a colour for each scheme."""
+    (axes,) = panels(figure, 1, 1)
+    drawn = Counter[str]()
+    for label, error in errors.items():
+        scheme = scheme_name(label)
+        draw_error(axes, t, error, scheme, label, linestyle=LINES[drawn[scheme]])
+        drawn[scheme] += 1
+    axes.set(xlabel="t", ylabel="|H - H(0)|")
+    axes.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scvi_codegen.methods import SpectralCollocation
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import harmonic_oscillator
-from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels
+from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
     Picture,
@@ -26,9 +26,11 @@ from scvi_codegen.reproduce.laboratory.experiment import (
 )
 from scvi_codegen.reproduce.laboratory.running import trajectory
 from scvi_codegen.reproduce.oscillators.one_degree import (
+    DOTS,
     curves_table,
+    draw_phase,
     drifts,
-    energy_error,
+    energy_result,
     largest,
     svi_with_points,
 )
@@ -80,6 +82,8 @@ def _phase_trajectories(_: Mapping[str, Result]) -> Result:
         scheme: largest(np.hypot(run.q[:, 0] - np.sin(run.t), run.p[:, 0] - np.cos(run.t)))
         for scheme, run in runs.items()
     }
+    angle = np.linspace(0.0, 2.0 * np.pi, 400)
+    exact = np.sin(angle), np.cos(angle)
     points = {scheme: (run.q[::5, 0], run.p[::5, 0]) for scheme, run in runs.items()}
     named = {f"{letter} {s}": x.tolist() for s, pair in points.items() for letter, x in zip("qp", pair, strict=True)}
     return Result(
@@ -99,20 +103,8 @@ def _phase_trajectories(_: Mapping[str, Result]) -> Result:
             ),
         ),
         tables=(series_table({"t": runs["SVI"].t[::5].tolist(), **named}, ""),),
-        picture=Picture(draw=partial(_draw_phase, points)),
+        picture=Picture(draw=partial(draw_phase, points, exact, DOTS | {"markersize": 7}), height=4.6),
     )
-
-
-def _draw_phase(points: Mapping[str, tuple[Array, Array]], figure: Figure) -> None:
-    angle = np.linspace(0.0, 2.0 * np.pi, 400)
-    for axes, (scheme, (q, p)) in zip(panels(figure, 1, 2), points.items(), strict=True):
-        axes.plot(np.sin(angle), np.cos(angle), color=COLORS["exact"], linewidth=0.8, label="exact")
-        axes.plot(q, p, "o", color=COLORS[scheme], markersize=4, label=scheme)
-        ticks = (-1.0, -0.5, 0.0, 0.5, 1.0)
-        axes.set(
-            xlabel="q", ylabel="p", title=f"{scheme}, every fifth step", aspect="equal", xticks=ticks, yticks=ticks
-        )
-        axes.legend(loc="center")
 
 
 @experiment("figure-4", "Harmonic oscillator: position error of SVI and SC")
@@ -170,45 +162,27 @@ def _draw_position(t: Array, errors: Mapping[str, Array], figure: Figure) -> Non
 
 @experiment("figure-5", "Harmonic oscillator: energy error of SVI and SC")
 def _energy_errors(_: Mapping[str, Result]) -> Result:
-    errors = {scheme: energy_error(_run(scheme, 500.0)) for scheme in METHODS}
+    runs = {scheme: _run(scheme, 500.0) for scheme in METHODS}
+    return energy_result((SYSTEM, "h = 1, T = 500.", NINE_POINTS, QUADRATURES, TOLERANCE), runs, _checks_of_energy)
+
+
+def _checks_of_energy(errors: Mapping[str, Array]) -> tuple[Comparison, ...]:
     sizes = {scheme: largest(error) for scheme, error in errors.items()}
     svi = [scheme for scheme in METHODS if scheme != "SC"]
-    return Result(
-        setting=(SYSTEM, "h = 1, T = 500.", NINE_POINTS, QUADRATURES, TOLERANCE),
-        checks=(
-            Comparison(
-                claim="The energy error of SC is much bigger than that of SVI.",
-                measured="Largest energy errors: " + _listed(sizes) + ".",
-                verdict=judged(*(sizes["SC"] > 100.0 * sizes[scheme] for scheme in svi)),
-                bears_on=("accuracy",),
-            ),
-            Comparison(
-                claim="The energy error of SC grows much faster than that of SVI.",
-                measured=f"Drift: {', '.join(f'{s}: ' + ('yes' if drifts(errors[s]) else 'no') for s in METHODS)}.",
-                verdict=holds(drifts(errors["SC"]) and not any(drifts(errors[scheme]) for scheme in svi)),
-                bears_on=("long-time",),
-            ),
+    return (
+        Comparison(
+            claim="The energy error of SC is much bigger than that of SVI.",
+            measured="Largest energy errors: " + _listed(sizes) + ".",
+            verdict=judged(*(sizes["SC"] > 100.0 * sizes[scheme] for scheme in svi)),
+            bears_on=("accuracy",),
         ),
-        tables=(
-            TableBlock(
-                columns=("scheme", "largest energy error"),
-                rows=tuple(sizes.items()),
-                formats={"largest energy error": ".2e"},
-            ),
-            curves_table("curves", _run("SC", 500.0).t, errors),
+        Comparison(
+            claim="The energy error of SC grows much faster than that of SVI.",
+            measured=f"Drift: {', '.join(f'{s}: ' + ('yes' if drifts(errors[s]) else 'no') for s in METHODS)}.",
+            verdict=holds(drifts(errors["SC"]) and not any(drifts(errors[scheme]) for scheme in svi)),
+            bears_on=("long-time",),
         ),
-        picture=Picture(draw=partial(_draw_energy, _run("SC", 500.0).t, errors), width=7.0),
     )
-
-
-def _draw_energy(t: Array, errors: Mapping[str, Array], figure: Figure) -> None:
-    (axes,) = panels(figure, 1, 1)
-    draw_error(axes, t, errors["SC"], "SC")
-    for points, style in zip(POINTS, (":", "-", "--"), strict=True):
-        label = f"SVI, {points} Gauss points"
-        draw_error(axes, t, errors[label], "SVI", label, linestyle=style)
-    axes.set(xlabel="t", ylabel="|H - H(0)|", ylim=(1e-17, 1e-6))
-    axes.legend(loc="center right")
 
 
 def _listed(sizes: Mapping[str, float]) -> str:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import duffing, planar_pendulum
-from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, draw_orbit, panels, thinned
+from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels, thinned
 from scvi_codegen.reproduce.laboratory.experiment import (
     Cell,
     Comparison,
@@ -26,15 +26,17 @@ from scvi_codegen.reproduce.laboratory.experiment import (
 )
 from scvi_codegen.reproduce.laboratory.running import SECTION_4, stepper_of, trajectory
 from scvi_codegen.reproduce.oscillators.one_degree import (
+    DOTS,
     area_change,
     area_factor,
-    curves_table,
+    draw_phase,
     drift,
     drifts,
-    energy_error,
+    energy_result,
     energy_table,
     largest,
     offset_from_curve,
+    scheme_name,
 )
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
@@ -55,11 +57,8 @@ LONG_RUN: dict[str, Method] = {
 }
 TWO_POINTS: dict[str, Method] = {"SCVI": SCVI(1, "gauss-legendre:2"), "SC": SpectralCollocation(1)}
 DRAWN = ("SVI, degree 3", "SC, degree 3", "SRK4")
-FINER = ("SVI, degree 4", "SC, degree 4", "SVI, degree 6", "SC, degree 6")
-"""Schemes of one degree more, which are drawn dotted."""
 SMALL_STEP = 0.005
 MOST_DOTS = 700
-DOTS = {"linestyle": "", "marker": ".", "markersize": 2}
 SMALL_AREA = 1e-3
 """Relative change of an area that its polygon does not resolve."""
 
@@ -120,44 +119,13 @@ def _phase_of_long_run(_: Mapping[str, Result]) -> Result:
             ),
         ),
         tables=(energy_table(runs),),
-        picture=Picture(draw=partial(_draw_phase, orbits, _energy_curve(), DOTS), width=10.0, height=3.7),
+        picture=Picture(draw=partial(draw_phase, orbits, _energy_curve(), DOTS), width=10.0, height=3.7),
     )
-
-
-def _draw_phase(
-    orbits: Mapping[str, tuple[Array, ...]], exact: tuple[Array, Array], style: Mapping[str, Any], figure: Figure
-) -> None:
-    limit = 1.05 * max(largest(np.concatenate(orbit)) for orbit in orbits.values())
-    for axes, (scheme, (q, p)) in zip(panels(figure, 1, len(orbits)), orbits.items(), strict=True):
-        draw_orbit(axes, q, p, _scheme_name(scheme), scheme, **style)
-        axes.plot(*exact, color="black", linestyle="--", linewidth=0.7, label="exact")
-        axes.set(xlabel="q", ylabel="p", title=scheme, aspect="equal", xlim=(-limit, limit), ylim=(-limit, limit))
-        axes.legend(loc="center", markerscale=3)
-
-
-def _scheme_name(scheme: str) -> str:
-    """Return the name of a scheme without its degree or order."""
-    return scheme.partition(",")[0].rstrip("46")
 
 
 @experiment("figure-10", "Pendulum: energy error of SVI, SC and the 4th-order symplectic Runge-Kutta method")
 def _energy_of_long_run(_: Mapping[str, Result]) -> Result:
-    return _energy_result(LONG_SETTING, {scheme: _long_run(scheme) for scheme in LONG_RUN}, _checks_of_energy)
-
-
-def _energy_result(
-    setting: tuple[str, ...],
-    runs: Mapping[str, Trajectory],
-    checks: Callable[[Mapping[str, Array]], tuple[Comparison, ...]],
-) -> Result:
-    """Return the result for the energy errors of several runs of equal steps."""
-    errors, t = {scheme: energy_error(run) for scheme, run in runs.items()}, next(iter(runs.values())).t
-    return Result(
-        setting=setting,
-        checks=checks(errors),
-        tables=(energy_table(runs), curves_table("curves", t, errors)),
-        picture=Picture(draw=partial(_draw_energy, t, errors), width=7.0),
-    )
+    return energy_result(LONG_SETTING, {scheme: _long_run(scheme) for scheme in LONG_RUN}, _checks_of_energy)
 
 
 def _more_accurate_in_energy(errors: Mapping[str, Array], degree: int) -> Comparison:
@@ -200,15 +168,6 @@ def _checks_of_energy(errors: Mapping[str, Array]) -> tuple[Comparison, ...]:
     )
 
 
-def _draw_energy(t: Array, errors: Mapping[str, Array], figure: Figure) -> None:
-    (axes,) = panels(figure, 1, 1)
-    for scheme, error in errors.items():
-        style = ":" if scheme in FINER else "-"
-        draw_error(axes, t, error, _scheme_name(scheme), scheme, linestyle=style)
-    axes.set(xlabel="t", ylabel="|H - H(0)|")
-    axes.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
-
-
 @experiment("figure-21", "Pendulum: phase trajectories of SCVI and SC with two points")
 def _phase_with_two_points(_: Mapping[str, Result]) -> Result:
     runs = {scheme: _two_points(scheme) for scheme in TWO_POINTS}
@@ -236,13 +195,13 @@ def _phase_with_two_points(_: Mapping[str, Result]) -> Result:
             ),
         ),
         tables=(energy_table(runs),),
-        picture=Picture(draw=partial(_draw_phase, orbits, _energy_curve(), {}), width=8.0, height=4.2),
+        picture=Picture(draw=partial(draw_phase, orbits, _energy_curve(), {}), width=8.0, height=4.2),
     )
 
 
 @experiment("figure-22", "Pendulum: energy error of SCVI and SC with two points")
 def _energy_with_two_points(_: Mapping[str, Result]) -> Result:
-    return _energy_result(SHORT_SETTING, {scheme: _two_points(scheme) for scheme in TWO_POINTS}, _checks_of_two_points)
+    return energy_result(SHORT_SETTING, {scheme: _two_points(scheme) for scheme in TWO_POINTS}, _checks_of_two_points)
 
 
 def _checks_of_two_points(errors: Mapping[str, Array]) -> tuple[Comparison, ...]:
@@ -353,7 +312,7 @@ def _phase_of_duffing(_: Mapping[str, Result]) -> Result:
 def _draw_phase_magnified(orbits: Mapping[str, tuple[Array, ...]], exact: tuple[Array, Array], figure: Figure) -> None:
     rows = np.reshape(np.array(panels(figure, 3, len(orbits)), dtype=object), (3, -1))
     for (whole, part, distance), (scheme, (q, p, offset)) in zip(rows.T, orbits.items(), strict=True):
-        color = COLORS[_scheme_name(scheme)]
+        color = COLORS[scheme_name(scheme)]
         near = (q > WINDOW[0]) & (q < WINDOW[1]) & (p > WINDOW[0]) & (p < WINDOW[1])
         whole.plot(*thinned(q, p, most=DUFFING_DOTS), ".", color=color, markersize=2)
         part.plot(q[near], p[near], ".", color=color, markersize=4)
@@ -371,7 +330,7 @@ def _draw_phase_magnified(orbits: Mapping[str, tuple[Array, ...]], exact: tuple[
 @experiment("figure-12", "Duffing oscillator: energy error of SVI, SC and the 6th-order symplectic Runge-Kutta method")
 def _energy_of_duffing(_: Mapping[str, Result]) -> Result:
     runs = {scheme: _duffing_run(scheme, 2000.0) for scheme in DUFFING_RUN}
-    return _energy_result((*DUFFING_SETTING, "T = 2000."), runs, _checks_of_duffing)
+    return energy_result((*DUFFING_SETTING, "T = 2000."), runs, _checks_of_duffing)
 
 
 def _checks_of_duffing(errors: Mapping[str, Array]) -> tuple[Comparison, ...]:
