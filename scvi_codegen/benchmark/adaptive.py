@@ -59,56 +59,36 @@ def run_adaptive(name: str, plan: Plan, report_activity: ReportActivity) -> Case
 
 def _ours(chosen: Case, *, quick: bool) -> list[Contender]:
     stepper, seconds = compiled(chosen, SVI(8))
-    momenta = momenta_of(stepper, chosen)
-    runs = [("controlled", _tolerance(each), {"t_end": chosen.span, "tolerance": each}) for each in TOLERANCES]
-    count = stepper.integrate(chosen.q[0], momenta[0], t_end=chosen.span, check_growth=False).steps
-    fixed = [("fixed", max(1, round(count * factor))) for factor in FIXED]
-    made = [
-        _contender(stepper, chosen, momenta, seconds, mode, setting, partial(_to_its_end, stepper, arguments))
-        for mode, setting, arguments in (runs[:2] if quick else runs)
+    momenta, span = momenta_of(stepper, chosen), chosen.span
+    adaptive = stepper.integrate(chosen.q[0], momenta[0], t_end=span, check_growth=False).steps
+    counts = [max(1, round(adaptive * factor)) for factor in FIXED[: 1 if quick else None]]
+    settings: list[tuple[str, str, Stepper, Callable[..., Callable[[], Array]], dict[str, Any]]] = [
+        ("controlled", f"tol={each:.0e}" if each else "tol=default", stepper, _to_its_end, {"tolerance": each})
+        for each in TOLERANCES[: 2 if quick else None]
     ]
-    made += [
-        _contender(stepper, chosen, momenta, seconds, mode, f"{n} steps", partial(_by_so_many, stepper, chosen.span, n))
-        for mode, n in (fixed[:1] if quick else fixed)
-    ]
-    return made if quick or "kepler" not in chosen.name else [*made, *_transformed(chosen, momenta, seconds)]
+    settings += [("fixed", f"{n} steps", stepper, _by_so_many, {"steps": n}) for n in counts]
+    if "kepler" in chosen.name and not quick:
+        transformed = compile_stepper(reparametrise(chosen.system, "frequency"), SVI(8))
+        settings += [("transformed", f"h={h:g}", transformed, _transformed, {"h": h}) for h in TRANSFORMED]
 
+    def prepare(used: Stepper, start: Callable[..., Callable[[], Array]], how: dict[str, Any], k: int) -> Any:
+        return start(used, chosen.q[k], momenta[k], span, **how)
 
-def _tolerance(tolerance: float | None) -> str:
-    return f"tol={tolerance:.0e}" if tolerance else "tol=default"
-
-
-def _transformed(chosen: Case, momenta: Array, seconds: float) -> list[Contender]:
-    """Return contenders with fixed steps in transformed time."""
-    stepper = compile_stepper(reparametrise(chosen.system, "frequency"), SVI(8))
-    settings: list[dict[str, Any]] = [{"h": h, "t_end": chosen.span} for h in TRANSFORMED]
     return [
-        _contender(stepper, chosen, momenta, seconds, "transformed", f"h={each['h']:g}", partial(_whole, stepper, each))
-        for each in settings
+        Contender(
+            method=f"{OURS} {mode}",
+            setting=setting,
+            options=f"{used.title}, {' '.join(used.flags)}",
+            compile_seconds=seconds,
+            prepare=partial(prepare, used, start, how),
+            momenta=momenta,
+        )
+        for mode, setting, used, start, how in settings
     ]
 
 
-def _contender(
-    stepper: Stepper,
-    chosen: Case,
-    momenta: Array,
-    seconds: float,
-    mode: str,
-    setting: str,
-    start: Callable[[Array, Array], Callable[[], Array]],
-) -> Contender:
-    return Contender(
-        method=f"{OURS} {mode}",
-        setting=setting,
-        options=f"{stepper.title}, {' '.join(stepper.flags)}",
-        compile_seconds=seconds,
-        prepare=lambda index: start(chosen.q[index], momenta[index]),
-        momenta=momenta,
-    )
-
-
-def _to_its_end(stepper: Stepper, arguments: dict[str, Any], q: Array, p: Array) -> Callable[[], Array]:
-    run = stepper.start(q, p, **arguments)
+def _to_its_end(stepper: Stepper, q: Array, p: Array, t_end: float, tolerance: float | None) -> Callable[[], Array]:
+    run = stepper.start(q, p, t_end=t_end, tolerance=tolerance)
 
     def integrate() -> Array:
         """Integrate and return the final state alone, as heyoka's propagate_until."""
@@ -118,18 +98,18 @@ def _to_its_end(stepper: Stepper, arguments: dict[str, Any], q: Array, p: Array)
     return integrate
 
 
-def _by_so_many(stepper: Stepper, span: float, count: int, q: Array, p: Array) -> Callable[[], Array]:
-    run = stepper.start(q, p, h=span / count)
+def _by_so_many(stepper: Stepper, q: Array, p: Array, t_end: float, steps: int) -> Callable[[], Array]:
+    run = stepper.start(q, p, h=t_end / steps)
 
     def integrate() -> Array:
-        run.advance(count)
+        run.advance(steps)
         return run.q
 
     return integrate
 
 
-def _whole(stepper: Stepper, arguments: dict[str, Any], q: Array, p: Array) -> Callable[[], Array]:
-    return lambda: stepper.integrate(q, p, save_every=LAST, check_growth=False, **arguments).q[-1]
+def _transformed(stepper: Stepper, q: Array, p: Array, t_end: float, h: float) -> Callable[[], Array]:
+    return lambda: stepper.integrate(q, p, h=h, t_end=t_end, save_every=LAST, check_growth=False).q[-1]
 
 
 def adaptive_reference(chosen: Case, momenta: Array | None = None) -> Reference:
