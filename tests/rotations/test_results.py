@@ -80,5 +80,12 @@ def test_attitudes_between_saved_states_are_dense_output(stepper, run):
         between = getattr(run, quantity)(t=0.05)
         np.testing.assert_allclose(between, getattr(middle, quantity)()[-1], atol=1e-13, err_msg=quantity)
     together = stepper.integrate_ensemble(Q | {"x": [0.0, 0.0]}, velocity=V, h=0.1, steps=2)
-    with pytest.raises(StateError, match="ensembles have no dense output"):
+    with pytest.raises(StateError, match="no dense output"):
         together.rotation(t=0.05)
+
+
+def test_a_run_in_progress_has_the_attitude_of_its_state(stepper, run):
+    running = stepper.start(Q, velocity=V, h=0.1)
+    running.advance(20)
+    for quantity in ("rotation", "angular_velocity", "body_momentum", "direction"):
+        np.testing.assert_array_equal(getattr(running, quantity)(), getattr(run, quantity)()[-1], err_msg=quantity)

@@ -27,19 +27,19 @@ Array = NDArray[np.float64]
 
 
 class AttitudeHistory:
-    """Rotations, directions and spins at the states (q, p) of a trajectory; names may be omitted if there is one.
+    """Rotations, directions and spins at the states (q, p) of a trajectory or run; the name may be omitted for one.
 
+    Of a run in progress values are those of its state, without the axis of n states.
     ``t``, a time or times within a single trajectory, selects dense output as of :meth:`Trajectory.at` instead.
     """
 
     __slots__ = ()
 
     if TYPE_CHECKING:
-        q: Array
-        p: Array
-        t: Array
+        q: Any
+        p: Any
         stepper: Any
-        parameters: Array
+        parameters: Any
         each: Any
         at: Any
         pieces: Any
@@ -87,13 +87,13 @@ class AttitudeHistory:
         if t is None:
             return self.q, self.p
         if not hasattr(self, "at"):
-            raise StateError("ensembles have no dense output: omit t")
+            raise StateError("ensembles and runs in progress have no dense output: omit t")
         q, p = self.at(t)
         return q, p
 
     def _velocities(self, q: Array, p: Array, t: ArrayLike | None) -> Array:
         """Return velocities of the shape of q; NaN after the end of a trajectory of an ensemble."""
-        if self.q.ndim == 2 and t is None:
+        if self.q.ndim < 3 and t is None:
             return np.asarray(self.velocity)
         if t is not None:
             if self.pieces:

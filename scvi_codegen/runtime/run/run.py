@@ -13,6 +13,7 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.constraints.projection import constraint_values, multipliers
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, Parameters
+from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.run.accuracy import warn_of_energy_error, warn_of_large_steps
 from scvi_codegen.runtime.run.descriptions import describe_run, short_title
 from scvi_codegen.runtime.run.memory import Memory
@@ -26,7 +27,7 @@ MOST_KEPT = 2**16
 """Largest number of doubles of workspace of a run that is kept for later calls."""
 
 
-class Run(Memory):
+class Run(Memory, AttitudeHistory):
     """Run in progress: :class:`Memory` with recording of states."""
 
     def __repr__(self) -> str:
