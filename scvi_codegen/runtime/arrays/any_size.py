@@ -16,7 +16,7 @@ from scvi_codegen.indices import MOST_THREADS, SIZES_REQUIRED, Loop
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.rendering.source import ArrayLayout, Interface
 from scvi_codegen.runtime.arrays.interface import RunSizes, first_state, read_arrays
-from scvi_codegen.runtime.core.named_arrays import EntryNames
+from scvi_codegen.runtime.core.validation import EntryNames
 from scvi_codegen.runtime.rotations.attitudes import quaternions
 from scvi_codegen.validation import MAPPING, check_kind, checked_count
 

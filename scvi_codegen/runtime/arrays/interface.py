@@ -13,7 +13,7 @@ from scvi_codegen.errors import StateError, closest
 from scvi_codegen.indices import Array, Loop, Place
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.rendering.source import ArrayLayout, Interface
-from scvi_codegen.runtime.core.named_arrays import NamedState
+from scvi_codegen.runtime.core.validation import NamedState
 
 Numbers = NDArray[np.float64]
 IndexTable = NDArray[np.int32]

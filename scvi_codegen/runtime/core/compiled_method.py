@@ -24,8 +24,7 @@ from scvi_codegen.runtime.arrays.any_size import (
 )
 from scvi_codegen.runtime.arrays.binding import ArrayBinding
 from scvi_codegen.runtime.arrays.interface import RunSizes
-from scvi_codegen.runtime.core.named_arrays import flat_state, named, shapes_of
-from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.core.validation import Array, flat_state, named, shapes_of
 from scvi_codegen.runtime.events.event import Event, EventLike, as_events
 
 MOST_EVENT_SETS = 16

@@ -17,7 +17,6 @@ from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import REASONS, SolverOptions, step_failure
 from scvi_codegen.runtime.arrays.any_size import constraint_shapes
-from scvi_codegen.runtime.core.named_arrays import flat_state, state_by_name
 from scvi_codegen.runtime.core.validation import (
     Array,
     Parameters,
@@ -26,8 +25,10 @@ from scvi_codegen.runtime.core.validation import (
     checked_parameters,
     checked_states,
     checked_vector,
+    flat_state,
     is_one_state,
     parameter_index,
+    state_by_name,
 )
 from scvi_codegen.runtime.sensitivity.step_derivatives import LinearisedMethod
 

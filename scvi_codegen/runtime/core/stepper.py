@@ -39,8 +39,13 @@ from scvi_codegen.runtime.inputs.segments import (
     record_pieces,
 )
 from scvi_codegen.runtime.rotations.states import homogeneous_state
-from scvi_codegen.runtime.run.accuracy import warn_of_energy_error, warn_of_energy_errors, warn_of_large_steps
-from scvi_codegen.runtime.run.error_growth import check_growth_requested, warn_of_error_growth
+from scvi_codegen.runtime.run.accuracy import (
+    check_growth_requested,
+    warn_of_energy_error,
+    warn_of_energy_errors,
+    warn_of_error_growth,
+    warn_of_large_steps,
+)
 from scvi_codegen.runtime.run.global_error import checked_error, confirmed_run, warn_of_unconfirmed
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.saving import read_checkpoint

@@ -12,8 +12,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.runtime.constraints.projection import consistent
 from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.core.named_arrays import flat_state
-from scvi_codegen.runtime.core.validation import Array, States, check_inputs_given, parameter_columns
+from scvi_codegen.runtime.core.validation import Array, States, check_inputs_given, flat_state, parameter_columns
 
 EnsembleParameters = Mapping[str, ArrayLike] | Sequence[Any] | Array | None
 

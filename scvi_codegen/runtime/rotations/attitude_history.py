@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.rendering.source import Interface
-from scvi_codegen.runtime.core.named_arrays import shapes_of
+from scvi_codegen.runtime.core.validation import shapes_of
 from scvi_codegen.runtime.rotations.attitudes import (
     angular_velocity,
     body_momentum,

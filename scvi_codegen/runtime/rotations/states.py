@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.rendering.source import COMPONENTS, Interface
-from scvi_codegen.runtime.core.named_arrays import Shapes, shapes_of
+from scvi_codegen.runtime.core.validation import Shapes, shapes_of
 from scvi_codegen.runtime.rotations.attitudes import (
     matrices,
     momenta_of_body,

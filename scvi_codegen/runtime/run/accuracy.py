@@ -1,18 +1,28 @@
-"""Accuracy warnings: steps too large for the motion, and energy errors at the end of a run."""
+"""Accuracy warnings: steps too large for the motion, energy errors at the end of a run, exponential error growth.
+
+Error growth is checked after an adaptive run, by repeating it from a perturbed initial state: the difference of two
+runs shows how the motion amplifies an initial error. A coarse run with a larger tolerance shows in the first half of
+the steps whether errors grow exponentially; only then is the run repeated from a state perturbed in its last place. The
+repeated run stores no states and has a bounded number of steps.
+"""
 
 from __future__ import annotations
 
+import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import lru_cache
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import AccuracyWarning, StateError, warn
+from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
+from scvi_codegen.runtime.constraints.projection import projected
+from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.step_plan import StepPlan
 
 if TYPE_CHECKING:
@@ -200,3 +210,195 @@ def _changed_energies(
     except StateError:
         return None
     return first, last, float(np.abs(sizes).max())
+
+
+MOST_STEPS, MOST_NUMBERS = 2048, 2**18
+"""Default limits of the second run: number of steps, and that number times the number of coordinates."""
+DECADES_PER_STEP = math.log10(1.15)
+"""Assumed largest growth of an error per step; runs with too few steps to reach the threshold are not checked."""
+NUDGE = 2.0**-50
+"""Relative perturbation of the initial state, unless the local tolerance is larger."""
+TOLERABLE, LOOSE, LARGEST = 1e-7, 1e5, 0.1
+"""Reporting threshold of the relative difference: max(TOLERABLE, LOOSE * tolerance), at most LARGEST."""
+COARSE = 1e-8
+"""Local tolerance and relative perturbation of the coarse run, unless the tolerance of the run is larger."""
+FIRST, DECISIVE = 1.0 / 4.0, 1.0 / 2.0
+"""Fractions of the steps at which the coarse run is compared: for the growth rate, and for the decision.
+
+A decision after a quarter misses half of the chaotic motions with late close encounters.
+"""
+MANY = 256
+"""Number of steps from which on the coarse run is also compared at the fraction FIRST."""
+SMALLEST = 1e-140
+"""Numbers below this, or above its inverse, are scaled before squaring to avoid underflow and overflow."""
+SLOW = 0.9
+"""Fraction of the decades to the threshold that the extrapolated growth must reach for the run to be repeated."""
+
+
+class ComparedStates(Protocol):
+    """States of a run for comparison."""
+
+    @property
+    def t(self) -> Array: ...
+    @property
+    def q(self) -> Array: ...
+    @property
+    def p(self) -> Array: ...
+    @property
+    def parameters(self) -> Array: ...
+
+
+def check_growth_requested(plan: StepPlan) -> None:
+    """Raise ``StateError`` unless steps are adaptive."""
+    if not plan.adaptive:
+        raise StateError(
+            "check_growth=True requires adaptive steps, but the step size is fixed: give t_end without h, or omit "
+            "check_growth"
+        )
+
+
+def warn_of_error_growth(
+    run: Memory,
+    states: ComparedStates,
+    requested: bool | None,
+    advance_until: Callable[[float], None] | None = None,
+) -> None:
+    """Repeat an adaptive run and warn if its states differ by more than is tolerable; the run is left where that ends.
+
+    Args:
+        run: the run at its end.
+        states: its states.
+        requested: ``True``: repeat the whole run; ``None``: repeat up to ``MOST_STEPS`` of its steps, and only if a
+            coarse run shows exponential growth; ``False``: no check.
+        advance_until: function that advances the run to a time; by default adaptive steps to that time.
+    """
+    plan = run.plan
+    if plan.h or plan.tau or requested is False or len(states.t) < 2 or not warnings_wanted():
+        return
+    nudge, tolerable, decades = _thresholds(plan.tolerance)
+    if requested or run.steps * DECADES_PER_STEP >= decades:
+        repetition = _Repetition(run, states, advance_until, nudge, tolerable, decades)
+        repetition.warn(requested=bool(requested))
+
+
+@lru_cache(maxsize=64)
+def _thresholds(tolerance: float) -> tuple[float, float, float]:
+    """Return the perturbation, the tolerable difference, and the decades between them."""
+    nudge, tolerable = max(NUDGE, tolerance), min(max(TOLERABLE, LOOSE * tolerance), LARGEST)
+    return nudge, tolerable, math.log10(tolerable / nudge)
+
+
+class _Repetition:
+    """Repetition of a run from a perturbed initial state; arguments as of :func:`warn_of_error_growth`."""
+
+    def __init__(
+        self,
+        run: Memory,
+        states: ComparedStates,
+        advance_until: Callable[[float], None] | None,
+        nudge: float,
+        tolerable: float,
+        decades: float,
+    ) -> None:
+        self.run, self.states, self.advance_until = run, states, advance_until or self._to
+        self.nudge, self.tolerable, self.decades = nudge, tolerable, decades
+        self.steps, self.tolerance = run.steps, run.plan.tolerance
+
+    def warn(self, *, requested: bool) -> None:
+        """Repeat the run; without a request only up to ``MOST_STEPS`` steps, and if errors grow exponentially."""
+        states, last = self.states, self._last(requested=requested)
+        if last == 0 or (not requested and self._grows_slowly(last, max(self.nudge, COARSE))):
+            return
+        try:
+            self._begin(self.nudge, self.tolerance)
+            for k in sorted({last // 2, last} - {0}):
+                self.advance_until(float(states.t[k]))
+                apart = self._relative_difference(k)
+                if not apart <= self.tolerable:
+                    self._report(f"differs by {apart:.1e} (relative) at t = {states.t[k]:g}")
+                    return
+        except StepFailedError as failure:
+            self._report(f"fails at t = {failure.t:g}")
+
+    def _grows_slowly(self, last: int, tolerance: float) -> bool:
+        """Return whether errors grow too slowly to matter, by a coarse run of at most half of the steps.
+
+        The growth A(k) until step k of n is extrapolated exponentially from the start, A(k)^(n/k), and from the
+        previous comparison at step j, A(k) (A(k) / A(j))^((n - k) / (k - j)); the smaller value counts. For algebraic
+        growth the second is smaller.
+        """
+        first, needed = {int(last * FIRST)} if last >= MANY else set(), SLOW * self.decades
+        before, grown_before = 0, 0.0
+        try:
+            self._begin(tolerance, tolerance)
+            for k in sorted((first | {int(last * DECISIVE)}) - {0}):
+                self.advance_until(float(self.states.t[k]))
+                little = 0.0 if k in first else needed * k / last
+                grown = math.log10(max(self._relative_difference(k, tolerance * 10.0**little) / tolerance, 1.0))
+                rate = max(grown - grown_before, 0.0) / (k - before)
+                if k not in first and (grown < little or grown + rate * (last - k) < needed):
+                    return True
+                before, grown_before = k, grown
+        except StepFailedError:
+            pass
+        return False
+
+    def _last(self, *, requested: bool) -> int:
+        """Return the index of the last state to compare; 0 unless all states of the run are saved."""
+        count = len(self.states.t) - 1
+        if len(self.states.q) != len(self.states.t):
+            return 0
+        most = float(min(MOST_STEPS, MOST_NUMBERS // len(self.run._q)))
+        return count if requested or self.steps <= most else int(count * most / self.steps)
+
+    def _begin(self, nudge: float, tolerance: float) -> None:
+        """Start the run at its perturbed initial state, on its constraints, with another local tolerance."""
+        run, states = self.run, self.states
+        plan, t, given = StepPlan(t_end=run.plan.t_end, tolerance=tolerance), float(states.t[0]), states.parameters
+        factors = _factors(len(run._q), nudge)
+        q, p = np.asarray(states.q[0] * factors[0]), np.asarray(states.p[0] * factors[1])
+        if run.stepper.interface.constraints:
+            q, p, _ = projected(run.stepper, q, p, t, given)
+        run._start(q, p, plan=plan, t=t, parameters=given, options=run.options)
+
+    def _to(self, t: float) -> None:
+        run = self.run
+        run.plan = StepPlan(t_end=t, tolerance=run.plan.tolerance)
+        while not run.arrived:
+            run.advance(MOST_STEPS)
+
+    def _relative_difference(self, k: int, small: float = 0.0) -> float:
+        """Return the larger of |dq|/|q| and |dp|/|p| at a state, relative to the largest norms up to that state.
+
+        If the difference relative to the state itself is at most ``small``, this cheaper bound is returned.
+        """
+        ratios = []
+        for mine, each in zip((self.run._q, self.run._p), (self.states.q, self.states.p), strict=True):
+            row = each[k]
+            difference = mine - row
+            largest = float(np.abs(row).max())
+            apart = size = 0.0
+            if SMALLEST < max(largest, float(np.abs(difference).max())) < 1.0 / SMALLEST:  # squares do not overflow
+                apart, size = math.sqrt(difference @ difference), math.sqrt(row @ row)
+            if not (size > 0.0 and apart <= small * size):
+                rows = each[: k + 1]
+                unit = float(np.abs(rows).max()) or 1.0
+                size = float(np.linalg.norm(rows / unit, axis=1).max())
+                apart = float(np.linalg.norm(difference / unit))
+            ratios.append(apart / size if apart and size else apart)
+        return max(ratios)
+
+    def _report(self, difference_text: str) -> None:
+        warn(
+            f"the motion amplifies errors: a run with the initial state perturbed by {self.nudge:.1e} (relative) "
+            f"{difference_text}, so "
+            "later states are not reproducible. Use error= to find the time until which digits are confirmed, or "
+            "check_growth=False to skip this check",
+            AccuracyWarning,
+        )
+
+
+@lru_cache(maxsize=8)
+def _factors(size: int, nudge: float) -> tuple[Array, Array]:
+    """Return factors for positions and momenta that change them by about ``nudge``, relatively."""
+    return 1.0 + nudge * np.cos(np.arange(size)), 1.0 + nudge * np.cos(np.arange(size) + 1)
