@@ -225,6 +225,51 @@ def formulas(case: Case) -> None:
     q, p, at, values = run.q[-1], run.p[-1], float(t[-1]), run.parameters
     assert case.stepper.energy(q, p, at, values) == run.energy()[-1]
     near(case.stepper.momentum(q, run.velocity[-1], at, values), p, 1e-12)
+    near(case.stepper.velocity(q, p, at, values), run.velocity[-1], 1e-12)
+    near(case.stepper.momentum_maps(q, p, at, values), maps[-1], 1e-12)
+    assert np.abs(run.momentum_errors()).max(initial=0.0) < 10 * case.error
+
+
+def tables(case: Case) -> None:
+    """Columns of data frames, of files and of data sets."""
+    run, truth, m = case.run, case.truth, len(case.problem.q)
+    table, data = run.to_dataframe(), run.to_xarray()
+    assert np.array_equal(table.index, run.t)
+    assert np.array_equal(table.iloc[:, : 2 * m], np.hstack([run.q, run.p]))
+    columns = ["iterations", *(f"{name}_dot" for name in case.problem.coordinates), "energy"]
+    assert [*table.columns][2 * m :] == columns
+    near(table[columns[1:-1]].to_numpy(), truth.v(run.t), 10 * case.error)
+    near(table["energy"].to_numpy(), truth.energy(run.t), 10 * case.error)
+    for name in ("q", "p", "velocity"):
+        assert np.array_equal(data[name].values, getattr(run, name))
+    assert np.array_equal(data["energy"].values, run.energy())
+    with tempfile.TemporaryDirectory() as folder:
+        run.save(f"{folder}/run.csv")
+        header, lines = Path(folder, "run.csv").read_text().split("\n", 1)
+    assert header.split(",") == ["t", *table.columns]
+    assert np.array_equal(np.loadtxt(lines.splitlines(), delimiter=","), table.reset_index().to_numpy())
+
+
+def slices(case: Case) -> None:
+    """Parts of a trajectory, by rows."""
+    run = case.run
+    for rows in (slice(2, None), slice(None, 5), slice(1, -1, 2), slice(3, 4)):
+        part = run[rows]
+        for name in ("t", "q", "p"):
+            assert np.array_equal(getattr(part, name), getattr(run, name)[rows])
+        assert np.array_equal(part.energy(), run.energy()[rows])
+        between = (part.t[0] + part.t[-1]) / 2
+        near(part.at(between)[0], case.truth.q(between)[0], case.error)
+        assert part.tau is None or np.array_equal(part.tau, run.tau[rows])
+    for k in (0, 3, -1):
+        t, q, p = run[k]
+        assert (t, *q, *p) == (run.t[k], *run.q[k], *run.p[k])
+    assert len(list(run)) == len(run)
+    for rows in (len(run), slice(4, 4), slice(None, None, -1)):
+        with pytest.raises(IndexError, match=r"out of range|must be ascending"):
+            run[rows]
+    with pytest.raises(TypeError, match=r"whole number or a slice.*not 'q'"):
+        run["q"]
 
 
 def work_and_impulses(case: Case) -> None:
@@ -347,6 +392,7 @@ def ensembles(case: Case) -> None:
         found = ensemble_of(case, others, save_every=case.given.save_every, **way)
         assert found.ok.all()
         energies, maps = found.energy(), found.momentum_maps()
+        data = found.to_xarray() if case.kind != "slowed" and "t_end" not in way else None
         for j in (0, 3, 9):
             rows = np.flatnonzero(np.isfinite(found.q[:, j, 0]))
             t = found.t if found.times is None else found.times[rows, j]
@@ -355,6 +401,9 @@ def ensembles(case: Case) -> None:
             near(found.q[rows, j], motion.q(t), 10 * case.error)
             near(found.p[rows, j], motion.p(t), 10 * case.error)
             near(energies[rows, j], motion.energy(t), 30 * case.error)
+            if data is not None:
+                near(data["velocity"].values[rows, j], motion.v(t), 30 * case.error)
+                assert np.array_equal(data["energy"].values[rows, j], energies[rows, j])
             near(maps[rows, j], motion.maps(t), 30 * case.error)
             if case.kind != "slowed" and "t_end" not in way:
                 assert t[0] == case.given.t
@@ -402,6 +451,9 @@ def restarts(case: Case) -> None:
         assert any(low_words(whole)[4])
     if case.kind != "array":
         copy = pickle.loads(pickle.dumps(first))
+        for other in (copy, again):
+            assert other.options == first.options
+            assert np.array_equal(other.parameters, first.parameters)
         copy.advance(9)
         assert low_words(copy) == low_words(whole)
 
@@ -582,6 +634,8 @@ Property = Callable[[Case], None]
 PROPERTIES: dict[str, tuple[Property, Callable[[Case], bool]]] = {
     "states": (states, lambda case: True),
     "formulas": (formulas, lambda case: True),
+    "tables": (tables, lambda case: case.kind == "plain" and "constraints" not in case.problem.text),
+    "slices": (slices, lambda case: case.kind in ("plain", "slowed")),
     "work_and_impulses": (
         work_and_impulses,
         lambda case: (

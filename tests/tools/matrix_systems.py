@@ -300,6 +300,26 @@ PROBLEMS: tuple[Problem, ...] = (
         falls_back=True,
     ),
     Problem(
+        name="falling",
+        q=(0.3, 0.8),
+        x=(-0.5, 0.4),
+        own={"m": 2.3, "g": 3.1},
+        methods=(("svi:5", "auto", HIGH),),
+        event="(x - 0.3)**2 - 0.01",
+        text={
+            "coordinates": ["x", "y"],
+            "lagrangian": "m*(x_dot**2 + y_dot**2)/2 - m*g*y",
+            "parameters": {"m": 1.0, "g": 9.81},
+        },
+        maps=(
+            "m*x_dot",
+            "m*(y_dot + g*t)",
+            "m*(x*(y_dot + g*t) - y*x_dot - g*x_dot*t**2/2)",
+            "m*(x - x_dot*t)",
+            "m*(y - y_dot*t - g*t**2/2)",
+        ),
+    ),
+    Problem(
         name="damped",
         q=(0.6, 0.2),
         x=(-0.3, 0.5),
