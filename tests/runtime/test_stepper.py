@@ -533,13 +533,6 @@ def test_methods_without_a_discrete_lagrangian_are_reported(compiled):
 # Threads and copies.
 
 
-def test_threads_may_share_a_stepper(kepler):
-    expected = kepler.integrate(*STATE, h=0.05, steps=4000)
-    with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda _: kepler.integrate(*STATE, h=0.05, steps=4000), range(8)))
-    assert all(same(run, expected) for run in found)
-
-
 def test_threads_with_different_parameters_are_independent(kepler):
     values = [0.8 + 0.05 * k for k in range(8)]
 
@@ -549,12 +542,6 @@ def test_threads_with_different_parameters_are_independent(kepler):
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(final, values))
     assert np.array_equal(found, [final(mu) for mu in values])
-
-
-def test_pickled_stepper_is_equal(kepler):
-    copy = pickle.loads(pickle.dumps(kepler))
-    assert (copy.title, copy.coordinates, copy.parameters) == (kepler.title, ("q1", "q2"), ("mu",))
-    assert np.array_equal(copy.step(*STATE, 0.1), kepler.step(*STATE, 0.1))
 
 
 def test_a_stepper_shows_system_and_method(kepler):
