@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 
 from sympy import Expr
@@ -33,6 +34,7 @@ from scvi_codegen.lowering.control import control_of, density_of
 from scvi_codegen.lowering.derivatives import derivatives_of
 from scvi_codegen.lowering.loops import with_sums
 from scvi_codegen.lowering.program import lower
+from scvi_codegen.mechanics.arrays.legendre import site_hamiltonian
 from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.derived_systems import with_tangent_vectors
@@ -294,6 +296,8 @@ class ArraySources:
         self.solver = "fixed-point" if solver == "auto" else solver
         check_solver_of_arrays(self.solver)
         self.system, self.method, self.g = system, method, g
+        convertible = system.coupled_terms and g is None and self.solver == "fixed-point"
+        self.sites = site_hamiltonian(system) if convertible else None
         self.prefix = c_identifier(prefix or f"{system.name}_{method.name}")
 
     @cached_property
@@ -303,19 +307,26 @@ class ArraySources:
         Raises:
             SizesRequiredError: if there is none for arrays of any size.
         """
-        self.system.check_run_time_sizes()
+        system = self.sites.system if self.sites else self.system
+        system.check_run_time_sizes()
         with announced(f"deriving the equations of {self.system.name} by {self.method.name}"):
             try:
                 if self.g is not None:
                     raise SizesRequiredError("time_transformation is not available for arrays of any size")
-                return lower(self.system, self.method, prefix=self.prefix, solver=self.solver)
+                return lower(system, self.method, prefix=self.prefix, solver=self.solver)
             except SizesRequiredError as error:
                 raise SizesRequiredError(f"{error}. This concerns '{self.system.name}': {SIZES_REQUIRED}") from error
 
     @property
     def interface(self) -> Interface:
         """Interface of the generated library."""
-        return describe_arrays(self.system, self.method, prefix=self.prefix, solver=self.solver)
+        interface = describe_arrays(self.system, self.method, prefix=self.prefix, solver=self.solver)
+        if self.sites is None:
+            return interface
+        layout = replace(
+            interface.layout, momentum_formulas=self.sites.momenta, velocity_formulas=self.sites.velocities
+        )
+        return replace(interface, layout=layout)
 
     def integrator(self) -> tuple[Source, Interface]:
         """Return the C source with fixed step size and its interface."""
@@ -345,6 +356,7 @@ def generate_array_source(
     system: ArraySystem, method: Method | str, *, solver: str = "auto", prefix: str | None = None
 ) -> tuple[Source, Interface]:
     """Return the C source and interface for arrays of run-time sizes; arguments as of :func:`compile_stepper`."""
+    system.check_run_time_sizes()
     return ArraySources(system, as_method(method), solver, prefix).integrator()
 
 

@@ -185,8 +185,10 @@ def derive(
     """
     if isinstance(system, ArraySystem):
         from scvi_codegen.derivation.arrays import ArrayStepEquations
+        from scvi_codegen.mechanics.arrays.legendre import site_hamiltonian
 
-        return ArrayStepEquations(system, as_method(method))
+        sites = site_hamiltonian(system) if system.coupled_terms else None
+        return ArrayStepEquations(sites.system if sites else system, as_method(method))
     method = as_method(method, system)
     system = discretised_form(system, method)
     stages = paper_equations(system, method)

@@ -41,7 +41,7 @@ def legendre_dual(system: MechanicalSystem, variables: Sequence[Symbol], duals: 
     if all(not (entry.free_symbols & set(variables)) for entry in hessian_entries.values()):
         shifted = [y - derivatives[i].xreplace(origin) for i, y in enumerate(duals)]
         forms = [
-            _inverse_form(hessian_entries, block, shifted) for block in coupled_blocks(hessian_entries, len(variables))
+            inverse_form(hessian_entries, block, shifted) for block in coupled_blocks(hessian_entries, len(variables))
         ]
         return sympy.Add(*forms, -f.xreplace(origin))
     solution = {x: _inverse_derivative(system, derivatives[i], x, duals[i], variables) for i, x in enumerate(variables)}
@@ -63,7 +63,7 @@ def positive_parameters(system: MechanicalSystem) -> dict[Symbol, Symbol]:
     }
 
 
-def _inverse_form(hessian_entries: Mapping[tuple[int, int], Expr], block: Sequence[int], y: Sequence[Expr]) -> Expr:
+def inverse_form(hessian_entries: Mapping[tuple[int, int], Expr], block: Sequence[int], y: Sequence[Expr]) -> Expr:
     """Return y . C^-1 y / 2 over one block."""
     if len(block) == 1:
         (i,) = block

@@ -178,6 +178,8 @@ class ArrayLayout(ArrayDeclarations):
         depends_on_time: whether L or H depends on t explicitly.
         constraints: loops of each constraint.
         continued: whether the predictor extrapolates previous steps instead of reusing the forces at their end.
+        momentum_formulas, velocity_formulas: L_v in (q, v) and H_p in (q, p) of a Lagrangian that is integrated by its
+            Hamiltonian (:class:`~scvi_codegen.formulas.array_statements.ArrayForce`).
     """
 
     field_defaults: tuple[float, ...] = ()
@@ -186,6 +188,8 @@ class ArrayLayout(ArrayDeclarations):
     depends_on_time: bool = False
     constraints: tuple[tuple[Loop, ...], ...] = ()
     continued: bool = False
+    momentum_formulas: tuple[Any, ...] = ()
+    velocity_formulas: tuple[Any, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

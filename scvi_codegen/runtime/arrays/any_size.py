@@ -70,9 +70,10 @@ def _call(
     threads = others.pop("threads", None) if name in AT_REST else None
     bound, state = stepper.bind(q, parameters, tables, threads)
     if name in AT_REST and not arguments and others.get("p") is None and others.get("velocity") is None:
-        known_lagrangian = stepper._reason and not stepper.interface.layout.momenta
+        layout = stepper.interface.layout
+        general = layout.momentum_formulas or (stepper._reason and not layout.momenta)
         if not any(each.startswith("spin") for each in bound.interface.rotations):  # spins have momenta of their own
-            others["velocity" if known_lagrangian else "p"] = np.zeros(bound.dimension)
+            others["velocity" if general else "p"] = np.zeros(bound.dimension)
     return getattr(bound, name)(state, *arguments, parameters=parameters, **others)
 
 

@@ -288,10 +288,14 @@ class ArrayBinding(Binding):
                 memory.q[:], memory.p[:] = self._vector(q + k * n), self._vector(p + k * n)
                 arrays = (memory.run.q, memory.run.p, memory.run.inverse_mass, parts + 3 * k)
                 self.raw.function("energies")(memory.problem, t[k], *arrays)
+        if self.interface.layout.velocity_formulas:  # the terms of H are no parts of the energy
+            self._vector(parts, 3 * count).reshape(-1, 3)[:, :2] = np.nan
 
     def _velocity(self, t: float, q: Any, p: Any, parameters: Any, result: Any, _: Any) -> int:
         if self.interface.layout.momenta:
             raise StateError("velocities are unavailable for a system defined by a Hamiltonian: use the momenta p")
+        if formulas := self.interface.layout.velocity_formulas:
+            return self._evaluate(formulas, ("p_{}", "{}_dot"), t, q, p, parameters, result)
         with self._at(t, q, p, parameters) as memory:
             self._vector(result)[:] = memory.p * memory.numbers["inverse_mass"]
         return 0
@@ -299,8 +303,34 @@ class ArrayBinding(Binding):
     def _momentum(self, t: float, q: Any, v: Any, parameters: Any, result: Any, _: Any) -> int:
         if self.interface.layout.momenta:
             raise StateError("the system is defined by a Hamiltonian: give momenta p instead of velocity")
+        if formulas := self.interface.layout.momentum_formulas:
+            return self._evaluate(formulas, ("{}_dot", "p_{}"), t, q, v, parameters, result)
         with self._at(t, q, v, parameters) as memory:
             self._vector(result)[:] = memory.p / memory.numbers["inverse_mass"]
+        return 0
+
+    def _evaluate(
+        self, formulas: Any, names: tuple[str, str], t: float, q: Any, moving: Any, parameters: Any, result: Any
+    ) -> int:
+        """Compute momenta from velocities, or the reverse; ``names``: of the arrays of both, as formats."""
+        from scvi_codegen.formulas.numpy_values import Elements  # here, because it imports SymPy
+        from scvi_codegen.formulas.symbols import TIME, symbol
+
+        values, sizes = self._vector(parameters, self.parameter_count), self.arrays.sizes
+        numbers: dict[Any, float] = {symbol(TIME): t}
+        numbers |= {symbol(name): x for name, x in zip(self.interface.parameters, values.tolist(), strict=False)}
+        arrays = self.by_name(self._vector(q))
+        arrays |= {names[0].format(name): each for name, each in self.by_name(self._vector(moving)).items()}
+        arrays |= {
+            field.name: values[first:end].reshape(field.shape(sizes))
+            for field, (first, end) in zip(self.interface.layout.fields, self.field_rows, strict=True)
+        }
+        targets = {names[1].format(name): each for name, each in self.by_name(self._vector(result)).items()}
+        for force in formulas:
+            elements = Elements(force.loops, sizes, self.arrays.places)
+            for access, formula in force.targets:
+                value = elements.values(formula, force.slots, arrays, numbers)
+                targets[access.array.name][elements.of(access)] = value
         return 0
 
     def _momentum_maps(self, count: int, t: Any, q: Any, p: Any, parameters: Any, values: Any, sizes: Any) -> int:

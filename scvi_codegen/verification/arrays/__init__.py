@@ -67,7 +67,7 @@ def verify_arrays(
     stepper = stepper or compile_stepper(system, chosen, flags=tuple(flags))
     run = stepper.start(q, p, h=h, t=t, **arrays_of_run)
     arrays = read_arrays(stepper.interface, q, arrays_of_run["parameters"], arrays_of_run["tables"])
-    if stepper.source is None or tolerance is not None or system.constraints:
+    if stepper.source is None or system.coupled_terms or tolerance is not None or system.constraints:
         numbers = dict(zip(stepper.interface.parameters, arrays.numbers, strict=True))
         known = unroll_sums(system, arrays.sizes, tables=arrays.places, parameters={**numbers, **arrays.fields})
         return of_known_sizes(known, chosen, run.q, run.p, h=run.h, t=run.t, tolerance=tolerance, flags=flags)
