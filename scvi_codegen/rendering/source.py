@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from scvi_codegen.indices import Access, ArrayDeclarations, ArrayMap, Loop
-from scvi_codegen.rendering.text import preprocessed, with_own_names
+from scvi_codegen.rendering.text import preprocessed, specialised, with_own_names
 from scvi_codegen.version import __version__
 
 TEXTS = ("header", "code", "declarations")
@@ -69,6 +69,10 @@ class Source:
     def sources(self) -> tuple[Source, ...]:
         """Sources to compile: this one, and :attr:`beside`."""
         return (self, self.beside) if self.beside else (self,)
+
+    def specialised(self) -> Source:
+        """Return the source with support headers for it alone, without alternatives that it does not use."""
+        return replace(self, support=tuple(specialised(self.code, dict(self.support).__getitem__).items()))
 
     def amalgamated(self) -> Source:
         """Return the source as one file: support headers inserted, without alternatives that it does not use."""

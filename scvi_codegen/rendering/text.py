@@ -14,7 +14,7 @@ import operator
 import posixpath
 import re
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -209,24 +209,31 @@ class _Preprocessor:
     def __init__(self, read: Callable[[str], str]) -> None:
         self.read = read
         self.files: dict[str, str] = {}
+        self.specialised: dict[str, str] = {}
         self.macros = _Macros()
         self.chains: list[_Chain] = []
         self.branches: dict[str, _Macros] = {}
 
-    def lines(self, text: str, folder: str) -> Iterator[str]:
+    def lines(self, text: str, folder: str) -> Generator[str, None, list[str]]:
+        """Yield the lines with headers inserted; return those of the text itself."""
+        own: list[str] = []
         for line in text.split("\n"):
             match = DIRECTIVE.match(line)
             word, rest = (match["word"], match["rest"]) if match else ("", "")
             if word in ("if", "ifdef", "ifndef", "elif", "else", "endif"):
-                yield from self.condition(word, COMMENT.sub("", rest), line)
+                for kept in self.condition(word, COMMENT.sub("", rest), line):
+                    own.append(kept)
+                    yield kept
             elif not any(chain.active is False for chain in self.chains):
                 if word in ("define", "undef"):
                     self.define(word, rest)
                 self.macros.failed |= word == "error"
+                own.append(line)
                 if word == "include" and (OWN if folder else SUPPORT).match(rest):
                     yield from self.include(posixpath.normpath(posixpath.join(folder, rest.strip('"'))))
                 else:
                     yield line
+        return own
 
     def define(self, word: str, rest: str) -> None:
         name, value = re.split(r"\b", COMMENT.sub("", rest) + " ", maxsplit=2)[1:]
@@ -238,7 +245,13 @@ class _Preprocessor:
     def include(self, name: str) -> Iterator[str]:
         if name not in self.files:
             self.files[name] = self.read(name)
-        yield from self.lines(self.files[name].removesuffix("\n"), posixpath.dirname(name))
+        text = self.files[name]
+        own = yield from self.lines(text.removesuffix("\n"), posixpath.dirname(name))
+        if any(own):
+            guarded = text.startswith("#ifndef ")
+            kept = "\n".join([text.partition("\n")[0], *own, "#endif", ""] if guarded else [*own, ""])
+            same = self.specialised.setdefault(name, kept) == kept
+            self.specialised[name] = re.sub(r"\n{3,}", "\n\n", kept) if same else text
 
     def condition(self, word: str, rest: str, line: str) -> Iterator[str]:
         if word == "endif":
@@ -272,6 +285,13 @@ class _Preprocessor:
             yield f"#if {rest}"
         else:
             chain.active, chain.chosen = holds, chain.chosen or holds
+
+
+def specialised(text: str, read: Callable[[str], str]) -> dict[str, str]:
+    """Return the support headers that a source includes, in order, without alternatives that it does not use."""
+    work = _Preprocessor(read)
+    list(work.lines(text, ""))
+    return {name: work.specialised[name] for name in work.files}
 
 
 def preprocessed(text: str, read: Callable[[str], str]) -> tuple[str, dict[str, str]]:

@@ -123,3 +123,13 @@ def test_header_without_an_integrator_names_what_is_missing(tmp_path):
     command = [needs("cc"), "-std=c99", "-fsyntax-only", "alone.c"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert "NAME is not defined" in done.stderr
+
+
+@pytest.mark.parametrize("k", range(len(CELLS)), ids=CELLS)
+def test_headers_of_one_integrator_lack_its_unused_alternatives(k):
+    source = sources()[k]
+    own = source.specialised()
+    assert own.amalgamated() == source.amalgamated()
+    assert [name for name, _ in own.support] == [name for name, _ in source.support]
+    names = re.findall(r"\bdefined\((\w+)\)|^#ifn?def (\w+)", "".join(dict(own.support).values()), re.MULTILINE)
+    assert {a or b for a, b in names} & {"ARRAYS", "HAMILTONIAN_SYSTEM", "SINGLE_PRECISION", "DAMPED"} == set()

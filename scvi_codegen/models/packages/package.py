@@ -1,8 +1,7 @@
 """Generated folders: a complete integrator as C code for C programs, and as an importable package for Python.
 
     pendulum_svi/  pendulum_svi.h  pendulum_svi.c   the integrator, C99
-                   support/                         headers, the same for every integrator except for the tables of
-                                                    adaptive steps
+                   support/                         headers, without alternatives that the integrator does not use
                    main.c  Makefile                 ``make run`` runs the example with a C compiler and libm
                    __init__.py  interface.json      ``import pendulum_svi`` provides ``pendulum_svi.stepper``
                    model.toml  README.md            the model file, and instructions
@@ -150,8 +149,7 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
         controlled=not embedded or model.h is None,
         time_transformation=model.time_transformation,
     )
-    if single_file:
-        source = source.single_file()
+    source = source.single_file() if single_file else source.specialised()
     texts = source.files
     texts |= render_example(interface, example_of(model, controlled=ADVANCE_TO in source.header), embedded or "double")
     described = model_texts(model)
@@ -175,7 +173,7 @@ def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, si
     source, interface = generate_array_source(model.array_system, model.method, solver=model.solver, prefix=prefix)
     example, arrays = array_example_of(model, interface)
     lines = {f"{name}.txt": "".join(f"{x!r}\n" for x in each.reshape(-1).tolist()) for name, each in arrays.items()}
-    source = source.single_file() if single_file else source
+    source = source.single_file() if single_file else source.specialised()
     texts = {**source.files, **render_example(interface, example), **lines}
     if described := model_texts(model):
         texts |= {**described, "__init__.py": package_template("__init__.py")}
