@@ -21,7 +21,7 @@ def texts() -> dict[str, str]:
     files = {}
     for prefix, (name, method) in INTEGRATORS.items():
         source, _ = generate_source(problem(name).system, method, prefix=prefix)
-        files |= source.files
+        files |= {f"{prefix}/{name}": text for name, text in source.specialised().files.items()}
     return files
 
 
