@@ -1,4 +1,4 @@
-"""Evaluation of formulas by NumPy, node by node, without generated code: on arrays, and at all elements of loops."""
+"""Evaluation of formulas by NumPy at all elements of loops, without generated code."""
 
 from __future__ import annotations
 
@@ -11,38 +11,8 @@ from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.formulas.expressions import NAME_OF
+from scvi_codegen.formulas.expressions import array_value
 from scvi_codegen.indices import Access, Loop, Place
-
-
-def on_arrays(formula: Expr, known: Mapping[Expr, Any]) -> Any:
-    """Return the values of a formula, with the broadcast shape of the arrays in ``known``.
-
-    Args:
-        formula: of :mod:`scvi_codegen.formulas.grammar`.
-        known: a number or an array for each symbol.
-
-    >>> from scvi_codegen.formulas.grammar import parse_expression
-    >>> from sympy import Symbol
-    >>> x = Symbol("x", real=True)
-    >>> on_arrays(parse_expression("x**2 + 1", {"x": x}), {x: np.arange(3.0)}).tolist()
-    [1.0, 2.0, 5.0]
-    """
-    if formula in known:
-        return known[formula]
-    if not formula.args:
-        return float(formula)
-    operands = [on_arrays(part, known) for part in formula.args]
-    if formula.is_Pow:
-        return np.power(*(np.asarray(operand, dtype=float) for operand in operands))
-    if formula.is_Add or formula.is_Mul:
-        total = operands[0]
-        for operand in operands[1:]:
-            total = total + operand if formula.is_Add else total * operand
-        return total
-    name = NAME_OF[formula.func]
-    return getattr(np, name.replace("a", "arc", 1) if name.startswith("a") else name)(*operands)
-
 
 MAX_ELEMENTS = 5_000_000
 """Maximum number of elements of the loops of a term that are evaluated at once."""
@@ -106,6 +76,6 @@ class Elements:
             numbers: values by symbol.
         """
         known: dict[Expr, Any] = {slot: arrays[access.array.name][self.of(access)] for slot, access in slots}
-        entries = on_arrays(formula, {**known, **numbers})
+        entries = array_value(formula, {**known, **numbers})
         count = next((len(values) for values in self.index.values()), 1)
         return np.broadcast_to(entries, (count,)) if self.index else entries

@@ -52,9 +52,8 @@ class Model(TimeSpan):
         q: (m,) initial coordinates.
         p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
         velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
-        h, tolerance, error, span, steps, save_every, t: as of :class:`~scvi_codegen.models.time_span.TimeSpan`.
-        time_transformation: time-rescaling function of the reversible controller, as text, see
-            :func:`~scvi_codegen.compile_stepper`; requires a span. A system in transformed time has its own.
+        h, tolerance, error, span, steps, save_every, t, time_transformation: as of
+            :class:`~scvi_codegen.models.time_span.TimeSpan`.
         inputs: by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as :meth:`Stepper.integrate` accepts
             it; a run requires all inputs of the system.
         fields: arrays of parameters by name, for array sizes known at run time; others keep their default value.
@@ -72,7 +71,6 @@ class Model(TimeSpan):
     p: Any = None
     velocity: Any = None
     solver: str = "auto"
-    time_transformation: str | None = None
     inputs: Mapping[str, InputTable] = field(default_factory=dict)
     fields: Mapping[str, Any] = field(default_factory=dict)
     tables: Mapping[str, Any] = field(default_factory=dict)
@@ -90,7 +88,7 @@ class Model(TimeSpan):
                     object.__setattr__(self, name, self._vector(name, vector))
         else:
             self._check_arrays()
-        if self._varies_steps and (self.system.clock is not None or self.span is None):
+        if self.time_transformation is not None and (self.system.clock is not None or self.span is None):
             raise ModelFileError(
                 f"the reversible controller of the time transformation {self.time_transformation} requires a time "
                 "span (give span, not steps), and a system without a time transformation"
@@ -175,11 +173,6 @@ class Model(TimeSpan):
     def ends_at_time(self) -> bool:
         """True if the run ends at a time, after a number of steps that is not known in advance."""
         return self.h is None or (self.has_time_transformation and self.span is not None)
-
-    @property
-    def _varies_steps(self) -> bool:
-        """True if the reversible controller varies the step size."""
-        return self.time_transformation is not None
 
     @property
     def has_time_transformation(self) -> bool:

@@ -27,6 +27,8 @@ class TimeSpan:
         steps: number of fixed steps, or ``None`` if ``span`` is given.
         save_every: stride of saved states, in steps.
         t: initial time.
+        time_transformation: time-rescaling function of the reversible controller, as text, see
+            :func:`~scvi_codegen.compile_stepper`; requires a span. A system in transformed time has its own.
     """
 
     h: float | None = None
@@ -36,6 +38,7 @@ class TimeSpan:
     steps: int | None = None
     save_every: int = 1
     t: float = 0.0
+    time_transformation: str | None = None
 
     def _check_time_span(self, *, has_time_transformation: bool) -> None:
         """Raise :class:`ModelFileError`, naming the field, for invalid values, and convert the others."""
@@ -59,18 +62,13 @@ class TimeSpan:
         return self.h is None
 
     @property
-    def _varies_steps(self) -> bool:
-        """True if a controller varies the step size h."""
-        return False
-
-    @property
     def step(self) -> float:
         """Fixed step size h; ModelFileError for adaptive steps."""
         if self.h is None:
             raise ModelFileError(
                 "this requires a fixed step size, but the model has adaptive steps: give a step h (--step, [run] step)"
             )
-        if self._varies_steps:
+        if self.time_transformation is not None:
             raise ModelFileError(
                 "this requires a fixed step size, but the reversible controller varies it: leave out the controller"
             )

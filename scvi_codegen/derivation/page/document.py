@@ -27,19 +27,16 @@ from scvi_codegen.rendering.program_source import render
 from scvi_codegen.version import __version__
 
 
-def derivation_html(
-    system: MechanicalSystem, method: Method, *, solver: str = "auto", start: Start | None = None
-) -> str:
+def derivation_html(system: MechanicalSystem, method: Method, *, start: Start | None = None) -> str:
     """Return the derivation of ``method`` for ``system`` as a self-contained page of HTML.
 
     Args:
         system: the mechanical system.
         method: its discretisation.
-        solver: of the C that is shown; as in :func:`~scvi_codegen.compiler.compile_stepper`.
         start: of a step, at whose initial guess the entries of the Jacobian are evaluated.
 
     Raises:
-        MethodError: for a solver that the method does not have, or a system that the method does not support.
+        MethodError: for a system that the method does not support.
     """
     check_regular(method, system)
     return page_template("derivation.html.jinja").render(
@@ -47,14 +44,14 @@ def derivation_html(
         body_class="derivation",
         system=system,
         method=method,
-        sections=list(_sections(system, method, solver, start)),
+        sections=list(_sections(system, method, start)),
         css=style_sheet("page.css", "derivation.css"),
         version=__version__,
     )
 
 
-def _sections(system: MechanicalSystem, method: Method, solver: str, start: Start | None) -> Iterator[Section]:
-    program = program_of(system, method, solver=solver, prefix=c_identifier(system.name))
+def _sections(system: MechanicalSystem, method: Method, start: Start | None) -> Iterator[Section]:
+    program = program_of(system, method, prefix=c_identifier(system.name))
     functions = functions_of(render(program).amalgamated().code)
     stages = paper_equations(system, method)
     derived = component_equations(system, method, stages)

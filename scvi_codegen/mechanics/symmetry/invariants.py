@@ -21,9 +21,9 @@ import sympy
 from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
-from scvi_codegen.formulas.expressions import gradient, parts
+from scvi_codegen.formulas.expressions import array_value, gradient, parts
 from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.symmetry.sampling import Rates, Sample, array_value, drawn_parameters
+from scvi_codegen.mechanics.symmetry.sampling import Rates, Sample, drawn_parameters
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import mp
 

@@ -21,7 +21,7 @@ import sympy
 from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
-from scvi_codegen.formulas.expressions import Tape, evaluate, parts
+from scvi_codegen.formulas.expressions import LARGEST, Tape, array_value, evaluate, parts
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.forces import constraint_multipliers, with_constraint_forces
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -74,8 +74,6 @@ def _grouped(coordinates: Sequence[str]) -> tuple[Body, ...]:
     return tuple(Body(name=stem, columns=tuple(group[axis] for axis in shape)) for stem, group in groups.items())
 
 
-LARGEST = 10**300
-"""Bound below which numbers can be converted to binary64."""
 FEW = 12
 """Number of bodies per term group that :func:`terms_among_few_bodies` selects."""
 
@@ -128,27 +126,6 @@ def exact_forces(
             for index, force_term in zip(row, derivatives, strict=True):
                 force[index] += force_term
     return force
-
-
-def array_value(expression: Any, known: dict[Any, Any]) -> Any:
-    """Return the values of an expression, NaN where undefined; ``known`` has its symbols and caches subexpressions."""
-    if expression not in known:
-        known[expression] = _array_node(expression, known)
-    return known[expression]
-
-
-def _array_node(expression: Any, known: dict[Any, Any]) -> Any:
-    if not expression.args:
-        return float(expression) if not expression.is_Rational or abs(expression) < LARGEST else np.nan
-    arguments = [array_value(argument, known) for argument in expression.args]
-    if expression.is_Add:
-        return functools.reduce(np.add, arguments)
-    if expression.is_Mul:
-        return functools.reduce(np.multiply, arguments)
-    if expression.is_Pow:
-        return np.power(arguments[0], float(arguments[1]) if expression.exp.is_Number else arguments[1])
-    name = type(expression).__name__
-    return getattr(np, f"arc{name[1:]}" if name.startswith("a") else name)(*arguments)
 
 
 Array = NDArray[np.float64]

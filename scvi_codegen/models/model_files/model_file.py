@@ -19,7 +19,7 @@
     # [torques]                                         # on rotations, in the body frame; [torques_space] in space
     # R = ["0", "0", "-c*omega_3"]
 
-    [inputs]                                            # of the inputs named above; see input_files.py
+    [inputs]                                            # of the inputs named above; see input_tables.py
     # u = { file = "u.csv", kind = "cubic" }            # relative to this file; or constant, linear (default)
     # w = { t = [0.0, 1.0, 2.0], values = [0.0, 0.5, 0.0] }
 

@@ -49,8 +49,8 @@ from sympy import Expr
 from scvi_codegen.errors import ExpressionError, ModelFileError, closest
 from scvi_codegen.files.export import loaded
 from scvi_codegen.formulas.arrays import parse_array
+from scvi_codegen.formulas.expressions import array_value
 from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.formulas.numpy_values import on_arrays
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.indices import Array
 from scvi_codegen.mechanics.arrays.system import ArraySystem
@@ -308,7 +308,7 @@ def _filled(value: Any, shape: tuple[int, ...], where: str, names: Mapping[str, 
     coordinates = zip(indices, np.indices(shape, dtype=float, sparse=True), strict=True)
     known: dict[Expr, Any] = {symbol(name): number for name, number in (*names.items(), *coordinates)}
     with np.errstate(all="ignore"):
-        return np.array(np.broadcast_to(on_arrays(formula, known), shape), dtype=float)
+        return np.array(np.broadcast_to(array_value(formula, known), shape), dtype=float)
 
 
 def _from_list(value: list[Any], where: str) -> Numbers:
