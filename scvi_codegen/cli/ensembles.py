@@ -16,8 +16,7 @@ from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.ensemble_file import EnsembleStates
 from scvi_codegen.native.options import FAILURES, SolverOptions
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.ensemble.independent import AdaptiveEnsemble
-from scvi_codegen.runtime.ensemble.lockstep import Ensemble
+from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 from scvi_codegen.runtime.ensemble.selection import ensemble_work
 
@@ -79,9 +78,7 @@ def integrate_states(states: EnsembleStates, *, options: SolverOptions | None = 
     )
 
 
-def _work(
-    model: Model, stepper: Stepper, states: EnsembleStates, options: SolverOptions | None
-) -> Ensemble | AdaptiveEnsemble:
+def _work(model: Model, stepper: Stepper, states: EnsembleStates, options: SolverOptions | None) -> Ensemble:
     """Return the compiled ensemble; Ctrl-C still ends the process here."""
     start = stepper, states.q, states.momenta(stepper)
     common: dict[str, Any] = {
@@ -94,9 +91,10 @@ def _work(
         inputs = model.all_inputs()
         return ensemble_work(*start, inputs=inputs, h=model.step, t_end=model.end, **common)
     if model.h is None:
-        return AdaptiveEnsemble(*start, t_end=model.t + model.covered, tolerance=model.tolerance, **common)
+        return Ensemble(*start, t_end=model.t + model.covered, tolerance=model.tolerance, **common)
     work = Ensemble(*start, h=model.h, steps=model.step_count, **common)
-    work.blocks()
+    assert work.common is not None
+    work.common.blocks()
     return work
 
 

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
-from scvi_codegen.runtime.ensemble.independent import AdaptiveEnsemble
+from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters
-from scvi_codegen.runtime.ensemble.lockstep import Ensemble
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 from scvi_codegen.runtime.ensemble.selection import ensemble_work
 from scvi_codegen.validation import checked_count
@@ -122,9 +121,7 @@ def _slices(count: int, blocks: int) -> Iterator[slice]:
         yield slice(first, min(first + size, count))
 
 
-def _gather(
-    client: Any, work: Ensemble | AdaptiveEnsemble, parts: list[slice], progress: Callable[[int], None] | None
-) -> None:
+def _gather(client: Any, work: Ensemble, parts: list[slice], progress: Callable[[int], None] | None) -> None:
     """Submit the slices and store their results."""
     from distributed import as_completed
 

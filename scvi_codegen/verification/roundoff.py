@@ -25,7 +25,8 @@ from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.methods import SCVI
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.ensemble.lockstep import Ensemble, LaneBlock
+from scvi_codegen.runtime.ensemble.ensemble import Ensemble
+from scvi_codegen.runtime.ensemble.lanes import LaneBlock
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, ViolationError, checked
 from scvi_codegen.verification.system_under_test import EPSILON, State, SystemUnderTest
@@ -165,7 +166,9 @@ def _lanes(tested: SystemUnderTest, starts: list[State], steps: int, carry: Arra
     """Yield final state and compensation terms of each lane, as :func:`_advanced`."""
     q, p = (np.array([getattr(start, name) for start in starts]) for name in "qp")
     first, m = starts[0], len(carry) // 2
-    work = Ensemble(tested.stepper, q, p, h=first.h, steps=steps, t=first.t, parameters=tested.parameters)
+    ensemble = Ensemble(tested.stepper, q, p, h=first.h, steps=steps, t=first.t, parameters=tested.parameters)
+    work = ensemble.common
+    assert work is not None
     make, width = work.blocks()
     block = make(0)
     assert isinstance(block, LaneBlock)

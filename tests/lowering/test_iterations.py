@@ -17,7 +17,8 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.ensemble.lockstep import Ensemble, LaneBlock
+from scvi_codegen.runtime.ensemble.ensemble import Ensemble
+from scvi_codegen.runtime.ensemble.lanes import LaneBlock
 
 STEPS = 100
 ROUNDING = 0.02
@@ -60,7 +61,7 @@ def test_lanes_use_as_many_iterations_as_single_runs(name):
     for part in (1, 8, 64):
         h = given.h / part
         work = Ensemble(own, [given.q] * 8, [given.p] * 8, h=h, steps=STEPS)
-        make, _ = work.blocks()
+        make, _ = work.common.blocks()
         block = make(0)
         assert isinstance(block, LaneBlock)
         block.advance(STEPS)

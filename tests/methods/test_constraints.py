@@ -29,7 +29,7 @@ from scvi_codegen import (
     symmetries,
 )
 from scvi_codegen.models.model_files.model_file import parse_model
-from scvi_codegen.runtime.ensemble.lockstep import Ensemble
+from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 
 G = 9.81
 
@@ -250,7 +250,7 @@ def test_initial_states_are_projected_or_rejected():
     assert np.isfinite(ensemble.q).all()
     with pytest.warns(AccuracyWarning, match=r"projected onto the constraints"):
         moved = Ensemble(stepper, [[1.061, -1.061]], [[0.0, 0.0]], h=0.1, steps=1)
-    assert np.abs(stepper.constraint_values(moved.q[0], moved.p[0])).max() < 1e-15
+    assert np.abs(stepper.constraint_values(*moved.start)).max() < 1e-15
 
 
 @pytest.mark.parametrize("unit", [1e3, 1e-3])

@@ -27,7 +27,7 @@ from scvi_codegen.models.model_files.ensemble_file import load_ensemble
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.ensemble.lockstep import Ensemble
+from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 
 pytestmark = pytest.mark.usefixtures("as_users_compile")
@@ -252,7 +252,7 @@ class TestThreadsAndInterruption:
         def fail(*arguments: object) -> None:
             raise RuntimeError("out of order")
 
-        monkeypatch.setattr("scvi_codegen.runtime.ensemble.lockstep.LaneBlock.advance", fail)
+        monkeypatch.setattr("scvi_codegen.runtime.ensemble.lanes.LaneBlock.advance", fail)
         with pytest.raises(RuntimeError, match="out of order"):
             kepler.integrate_ensemble(*states("kepler", 20), h=0.05, steps=10)
 

@@ -91,9 +91,9 @@ def test_interrupt_returns_completed_states(kepler):
     class Enough(Exception):  # noqa: N818
         pass
 
-    from scvi_codegen.runtime.ensemble.independent import AdaptiveEnsemble
+    from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 
-    work = AdaptiveEnsemble(kepler, Q, P, t_end=[5.0, 5.0, 5.0, 1e7], tolerance=TOLERANCE)
+    work = Ensemble(kepler, Q, P, t_end=[5.0, 5.0, 5.0, 1e7], tolerance=TOLERANCE)
 
     def stop(done: int) -> None:
         if done:

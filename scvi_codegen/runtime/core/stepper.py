@@ -25,7 +25,6 @@ from scvi_codegen.runtime.constraints.projection import consistent, constraint_v
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, Parameters, States, is_one_state
-from scvi_codegen.runtime.ensemble.independent import AdaptiveEnsemble
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, momenta_of_each
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 from scvi_codegen.runtime.ensemble.selection import ensemble_work
@@ -379,7 +378,7 @@ class Stepper(Integrator):
             parameters=parameters,
             options=options,
         )
-        if error is not None and isinstance(work, AdaptiveEnsemble):
+        if error is not None:
             work.confirm(self, error, threads=threads)
         work.run(progress=progress, threads=threads)
         trajectories = work.result()

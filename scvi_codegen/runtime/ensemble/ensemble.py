@@ -1,7 +1,8 @@
-"""Ensembles with adaptive step size: each trajectory has its own steps and final time; threads share the work.
+"""Ensembles: many trajectories with common fixed steps, or each with adaptive steps of its own.
 
-Trajectories are computed by the single integrator, so results are bitwise equal to those of :meth:`Stepper.integrate`
-for any number of threads. C runs without the GIL.
+With common fixed steps trajectories are SIMD lanes (:mod:`scvi_codegen.runtime.ensemble.lanes`). Trajectories with
+adaptive steps are computed by the single integrator, so they are bitwise equal to those of :meth:`Stepper.integrate`.
+C runs without the GIL, so threads share the work; results are bitwise equal for any number of threads.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,9 +21,11 @@ from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.core.validation import Array, States, columns_of_inputs
+from scvi_codegen.runtime.core.validation import Array, States, columns_of_inputs, parameter_index
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, start_of_ensemble
+from scvi_codegen.runtime.ensemble.lanes import CommonRuns
 from scvi_codegen.runtime.ensemble.result import INTERRUPTED, OK, EnsembleTrajectory, Span
+from scvi_codegen.runtime.ensemble.schedule import CommonSteps
 from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runtime.inputs.segments import (
     Input,
@@ -33,6 +36,7 @@ from scvi_codegen.runtime.inputs.segments import (
     prepared_segments,
 )
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
+from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.global_error import GlobalError
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.observation import Observation
@@ -43,21 +47,12 @@ from scvi_codegen.runtime.trajectory.joining import joined
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import checked_count
 
-
-class LaneStates(Protocol):
-    """Saved states of one trajectory."""
-
-    @property
-    def t(self) -> Array:
-        """(n,) times."""
-
-    @property
-    def q(self) -> Array:
-        """(n, m) positions."""
-
-    @property
-    def p(self) -> Array:
-        """(n, m) momenta."""
+FIRST_CHUNK_STEPS = 64
+"""Steps of the first chunk of a block, before its speed is known."""
+CHUNK_SECONDS = 0.02
+"""Target duration of a chunk in seconds; bounds the delay of an interruption."""
+GROWTH = 8.0
+"""Largest ratio of successive chunk sizes."""
 
 
 class SavedLane(NamedTuple):
@@ -70,8 +65,20 @@ class SavedLane(NamedTuple):
     steps: int
 
 
-class AdaptiveEnsemble:
-    """Ensemble integration with adaptive steps; arguments as of ``integrate_ensemble``."""
+class Ensemble:
+    """Integration of many trajectories; arguments as of ``integrate_ensemble``.
+
+    Args:
+        h, steps, t_end: common step size with the number of steps, or with the final time and a shorter step before
+            each breakpoint and at the end; without h the final time or times of adaptive steps.
+        inputs: validated inputs, with ``t_end``.
+
+    Attributes:
+        start: (k, m) initial positions and momenta.
+        common: the trajectories with common steps, ``None`` with adaptive steps.
+        plans: step plan of each trajectory with adaptive steps.
+        saved: completed trajectories with adaptive steps.
+    """
 
     def __init__(
         self,
@@ -79,7 +86,9 @@ class AdaptiveEnsemble:
         q: States,
         p: States,
         *,
-        t_end: ArrayLike,
+        h: float | None = None,
+        steps: int | None = None,
+        t_end: Any = None,
         inputs: Mapping[str, Input] | None = None,
         tolerance: float | None = None,
         save_every: int = 1,
@@ -88,58 +97,92 @@ class AdaptiveEnsemble:
         parameters: EnsembleParameters = None,
         options: SolverOptions | None = None,
     ) -> None:
-        if stepper.interface.energy_parameter:
+        interface = stepper.interface
+        if h is None and interface.energy_parameter:
             raise StateError("adaptive steps are unavailable in transformed time: give h and steps (fixed step in tau)")
-        self.stepper, self.options, self.inputs = stepper._adaptive(), checked_options(options), inputs or {}
+        self.stepper = stepper if h is not None else stepper._adaptive()
+        self.options, self.inputs = checked_options(options), inputs or {}
         self.t0, self.save_every = checked_number(t, "the time t"), checked_count(save_every, "save_every", least=1)
-        self.q, self.p, self.parameters = start_of_ensemble(stepper, q, p, self.t0, parameters)
-        self.plans = self._plans(t_end, tolerance)
-        self.t_eval = None
-        if t_eval is not None:
-            if self.save_every != 1:
-                raise StateError(f"give either t_eval or save_every={save_every}, not both")
-            farthest = max((plan.t_end for plan in self.plans), key=lambda end: abs(end - self.t0))
-            self.t_eval = times_of_run(t_eval, self.t0, farthest)
-        for plan in self.plans if inputs else ():
-            breakpoints_until(self.t0, plan.t_end, self.inputs)
-        if inputs:
-            self.parameters[:, columns_of_inputs(stepper.interface)] = 0.0
+        settings: dict[str, Any] = {"inputs": self.inputs, "save_every": self.save_every}
+        fixed = None if h is None else CommonSteps(self.t0, h, steps=steps, t_end=t_end, **settings)
+        *start, self.parameters = start_of_ensemble(stepper, q, p, self.t0, parameters)
+        self.start = start[0], start[1]
+        if not stepper._has_energy(parameters):
+            energy = parameter_index(interface, interface.energy_parameter)
+            for values, at, momenta in zip(self.parameters, *self.start, strict=True):
+                values[energy] = stepper.energy(at, momenta, 0.0, values)
+        self.values_at = partial(parameters_at, stepper.parameters, self.parameters, self.inputs)
+        self.common: CommonRuns | None = None
+        self.plans: list[StepPlan] = []
         self.saved: dict[int, SavedLane] = {}
         self.confirmations: list[GlobalError | None] = []
+        self.t_eval: Array | None = None
+        if fixed is None:
+            self.plans = self._plans(t_end, tolerance)
+            self.t_eval = self._output_times(t_eval)
+        if self.inputs:
+            self.parameters[:, columns_of_inputs(interface)] = 0.0
+        if fixed is not None:
+            self.common = CommonRuns(stepper, self.options, self.start, self.parameters, self.values_at, fixed)
 
     def _plans(self, t_end: ArrayLike, tolerance: float | None) -> list[StepPlan]:
         """Return the step plan of each trajectory; all must run forward or all backward."""
         ends = real_array(t_end, "t_end")
-        if ends.shape not in ((), (len(self.q),)):
-            raise StateError(f"t_end must be one time or {len(self.q)} times, not of shape {ends.shape}")
-        plans = [StepPlan.checked(None, float(end), tolerance) for end in np.broadcast_to(ends, len(self.q))]
+        if ends.shape not in ((), (len(self),)):
+            raise StateError(f"t_end must be one time or {len(self)} times, not of shape {ends.shape}")
+        plans = [StepPlan.checked(None, float(end), tolerance) for end in np.broadcast_to(ends, len(self))]
         signs = {np.sign(plan.t_end - self.t0) for plan in plans} - {0.0}
         if len(signs) > 1:
             raise StateError(f"t_end lies on both sides of t = {self.t0:g}: split the ensemble into two")
         return plans
 
+    def _output_times(self, t_eval: ArrayLike | None) -> Array | None:
+        """Return the validated output times; raise ``StateError`` if inputs do not cover a run."""
+        for plan in self.plans if self.inputs else ():
+            breakpoints_until(self.t0, plan.t_end, self.inputs)
+        if t_eval is None:
+            return None
+        if self.save_every != 1:
+            raise StateError(f"give either t_eval or save_every={self.save_every}, not both")
+        farthest = max((plan.t_end for plan in self.plans), key=lambda end: abs(end - self.t0))
+        return times_of_run(t_eval, self.t0, farthest)
+
     def __len__(self) -> int:
-        return len(self.q)
+        return len(self.start[0])
 
     @property
     def length(self) -> int:
-        """Final value of ``progress``: the number of trajectories."""
-        return len(self)
+        """Final value of ``progress``: the number of common steps, or of trajectories with adaptive steps."""
+        return len(self) if self.common is None else self.common.steps.steps
 
     def part(self, part: slice) -> dict[str, object]:
         """Return keyword arguments that construct the ensemble of a slice of the trajectories."""
-        return {
-            "q": self.q[part],
-            "p": self.p[part],
-            "t_end": [plan.t_end for plan in self.plans[part]],
+        arguments: dict[str, object] = {
+            "q": self.start[0][part],
+            "p": self.start[1][part],
             "inputs": inputs_of_slice(self.inputs, part) or None,
-            "tolerance": self.plans[0].tolerance or None,
             "save_every": self.save_every,
             "t": self.t0,
-            "t_eval": self.t_eval,
             "parameters": self.parameters[part],
             "options": self.options,
         }
+        if self.common is None:
+            ends = [plan.t_end for plan in self.plans[part]]
+            return arguments | {"t_end": ends, "tolerance": self.plans[0].tolerance or None, "t_eval": self.t_eval}
+        fixed = self.common.steps
+        return arguments | {"h": fixed.h} | ({"steps": fixed.steps} if fixed.t_end is None else {"t_end": fixed.t_end})
+
+    def keep(self, part: slice, trajectories: EnsembleTrajectory) -> None:
+        """Store the results of a slice that was integrated elsewhere."""
+        if self.common is None:
+            for j, each in zip(range(part.start, part.stop), trajectories.each(), strict=True):
+                self.saved[j] = SavedLane(*each)
+            return
+        found = self.common
+        found.q[:, part], found.p[:, part] = trajectories.q, trajectories.p
+        found.status[part], found.done[part] = trajectories.status, trajectories.steps
+        if found.times is not None:
+            found.times[:, part] = trajectories.times
 
     def confirm(self, stepper: Any, wanted: float, *, threads: int | None = None) -> None:
         """Choose the local tolerance of each trajectory for a global error, as ``stepper.integrate(error=)`` does.
@@ -157,7 +200,7 @@ class AdaptiveEnsemble:
             }
             arguments |= {"error": wanted, "progress": check_stop, **self._parameters_and_inputs(j)}
             with without_accuracy_warnings(), suppress(StateError, StepFailedError):
-                self.confirmations[j] = stepper.integrate(self.q[j], self.p[j], **arguments).confirmation
+                self.confirmations[j] = stepper.integrate(self.start[0][j], self.start[1][j], **arguments).confirmation
 
         run_jobs(len(self), confirm_one, progress=None, threads=threads)
         self.plans = [
@@ -181,40 +224,64 @@ class AdaptiveEnsemble:
     def run(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> None:
         """Integrate all trajectories with ``threads`` threads; an exception raised by ``progress`` stops them promptly.
 
-        Afterwards, also after an exception, :meth:`result` returns the completed trajectories.
+        Afterwards, also after an exception, :meth:`result` returns what was computed.
 
         Args:
-            progress: called with the number of completed trajectories.
+            progress: called with the number of completed steps or trajectories, see :attr:`length`.
             threads: number of threads, by default one per core.
         """
+        if self.common is not None:
+            self._run_blocks(self.common, progress, threads)
+            return
 
         def advance(j: int, check_stop: StopCheck) -> None:
             self.saved[j] = self._trajectory(j, check_stop)
 
         run_jobs(len(self), advance, progress=progress, threads=threads)
 
+    def _run_blocks(self, common: CommonRuns, progress: Callable[[int], None] | None, threads: int | None) -> None:
+        make, width = common.blocks()
+        firsts = range(0, len(self), width)
+        reached = np.zeros(len(firsts))
+
+        def advance(number: int, check_stop: StopCheck) -> None:
+            block = make(firsts[number])
+
+            def advance_chunk(size: int) -> int:
+                check_stop(size)
+                block.advance(size)
+                reached[number] += size
+                return size
+
+            drive(
+                advance_chunk,
+                common.steps.steps,
+                first=FIRST_CHUNK_STEPS,
+                growth=GROWTH,
+                seconds=CHUNK_SECONDS,
+                ended=lambda: False,
+            )
+
+        report = None if progress is None else lambda _: progress(int(reached.mean()))
+        run_jobs(len(firsts), advance, progress=report, threads=threads)
+
     def _trajectory(self, j: int, check_stop: StopCheck) -> SavedLane:
         try:
             run = Memory.started(
                 self.stepper,
-                self.q[j],
-                self.p[j],
+                self.start[0][j],
+                self.start[1][j],
                 plan=self.plans[j],
                 t=self.t0,
-                parameters=self._values(j, first_inner_time(self.t0, self.plans[j].t_end)),
+                parameters=self.values_at(first_inner_time(self.t0, self.plans[j].t_end), slice(j, j + 1))[0],
                 options=self.options,
             )
             states, status = self._states(j, run, check_stop)
         except StateError:  # a sum of finite terms has overflowed
-            return SavedLane(np.array([self.t0]), self.q[[j]], self.p[[j]], "not finite", 0)
+            return SavedLane(np.array([self.t0]), self.start[0][[j]], self.start[1][[j]], "not finite", 0)
         return SavedLane(states.t, states.q, states.p, status, run.steps)
 
-    def _values(self, j: int, t: float) -> Array:
-        """Return the parameters of trajectory j for the pieces of the inputs that contain t."""
-        values: Array = parameters_at(self.stepper.parameters, self.parameters, self.inputs, t, slice(j, j + 1))[0]
-        return values
-
-    def _states(self, j: int, run: Memory, check_stop: StopCheck) -> tuple[LaneStates, str]:
+    def _states(self, j: int, run: Memory, check_stop: StopCheck) -> tuple[Trajectory, str]:
         """Return the saved states of trajectory j and its status."""
         pieces: list[Trajectory] = []
         try:
@@ -223,7 +290,8 @@ class AdaptiveEnsemble:
                 return Observation(run, times=self.t_eval[reached]).advance(None, check_stop), OK
             if not self.inputs:
                 return record(run, None, save_every=self.save_every, progress=check_stop), OK
-            segments = prepared_segments(run, self.inputs, self.plans[j].t_end, partial(self._values, j))
+            part = slice(j, j + 1)
+            segments = prepared_segments(run, self.inputs, self.plans[j].t_end, lambda t: self.values_at(t, part)[0])
             pieces.extend(record(run, steps, save_every=self.save_every, progress=check_stop) for steps in segments)
         except StepFailedError as failure:
             last = Trajectory.before(failure)
@@ -231,7 +299,28 @@ class AdaptiveEnsemble:
         return joined(pieces or [record(run, 0)]), OK
 
     def result(self) -> EnsembleTrajectory:
-        """Return the trajectories; incomplete ones are ``"interrupted"`` after their initial state."""
+        """Return the trajectories; those neither completed nor failed have the status ``"interrupted"``."""
+        if self.common is None:
+            return self._adaptive_result()
+        common, fixed = self.common, self.common.steps
+        unfinished = (common.status == OK) & (common.done < fixed.steps)
+        spans: tuple[Span, ...] = ()
+        if fixed.t_end is not None:
+            spans = tuple((rows, slice(None), partial(self.values_at, each.middle)) for rows, each in fixed.spans())
+        return EnsembleTrajectory(
+            t=fixed.times(tau=common.times is not None),
+            times=common.times,
+            q=common.q,
+            p=common.p,
+            status=np.where(unfinished, INTERRUPTED, common.status),
+            steps=common.done,
+            h=fixed.h,
+            parameters=self.parameters,
+            stepper=self.stepper,
+            spans=spans,
+        )
+
+    def _adaptive_result(self) -> EnsembleTrajectory:
         lanes = [self.saved.get(j) or self._unfinished(j) for j in range(len(self))]
         if self.t_eval is None:
             t, times, rows = self._by_number(lanes)
@@ -266,8 +355,7 @@ class AdaptiveEnsemble:
         ends = breakpoints_until(self.t0, plan, self.inputs) or [plan]
         last = np.searchsorted(forward * t[np.isfinite(t)], forward * np.array(ends), side="right").tolist()
         for (start, end), (first, until) in zip(pairwise([self.t0, *ends]), pairwise([0, *last]), strict=True):
-            values = partial(parameters_at, self.stepper.parameters, self.parameters, self.inputs, (start + end) / 2)
-            yield slice(first, until), slice(j, j + 1), values
+            yield slice(first, until), slice(j, j + 1), partial(self.values_at, (start + end) / 2)
 
     def _by_number(self, lanes: list[SavedLane]) -> tuple[Array, Array, list[slice]]:
         """Return row numbers, (n, k) times padded with NaN, and the rows of each trajectory."""
@@ -280,9 +368,6 @@ class AdaptiveEnsemble:
 
     def _unfinished(self, j: int) -> SavedLane:
         first = slice(0, 1 if self.t_eval is None else 0)
-        return SavedLane(np.array([self.t0])[first], self.q[[j]][first], self.p[[j]][first], INTERRUPTED, 0)
-
-    def keep(self, part: slice, trajectories: EnsembleTrajectory) -> None:
-        """Store the results of a slice that was integrated elsewhere."""
-        for j, each in zip(range(part.start, part.stop), trajectories.each(), strict=True):
-            self.saved[j] = SavedLane(*each)
+        return SavedLane(
+            np.array([self.t0])[first], self.start[0][[j]][first], self.start[1][[j]][first], INTERRUPTED, 0
+        )

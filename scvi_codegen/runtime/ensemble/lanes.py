@@ -1,0 +1,240 @@
+"""Blocks of an ensemble with common fixed steps: trajectories in the SIMD lanes of C, or alone.
+
+A lane whose step fails keeps its last good state and is continued by the single integrator (which falls back on
+Newton's iteration); if that fails too, its later states are NaN and its status gives the reason. Other lanes are
+unaffected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.native import building
+from scvi_codegen.native.arguments import empty_array
+from scvi_codegen.native.binding import Binding
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.core.integrator import Integrator
+from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.ensemble.result import OK
+from scvi_codegen.runtime.ensemble.schedule import CommonSteps
+from scvi_codegen.runtime.run.memory import Memory
+from scvi_codegen.runtime.run.run_loop import record
+from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
+
+
+@dataclass(eq=False)
+class CommonRuns:
+    """Trajectories with common fixed steps: the arrays that blocks of trajectories fill.
+
+    Attributes:
+        stepper, options: the integrator and its solver options.
+        start: (k, m) initial positions and momenta.
+        parameters: (k, number of parameters) values.
+        values_at: function that returns the parameters at a time of a slice of trajectories, one row each.
+        steps: the steps.
+        q, p: (n, k, m) saved states; NaN where not reached.
+        times: (n, k) times in transformed time, else ``None``.
+        status, done: reason of the end and number of completed steps of each trajectory.
+    """
+
+    stepper: Integrator
+    options: SolverOptions | None
+    start: tuple[Array, Array]
+    parameters: Array
+    values_at: Callable[[float, slice], Array]
+    steps: CommonSteps
+
+    def __post_init__(self) -> None:
+        shape = (len(self.steps.numbers), *self.start[0].shape)
+        self.q, self.p = empty_array(shape), empty_array(shape)
+        self.q[:] = self.p[:] = np.nan
+        self.q[0], self.p[0] = self.start
+        self.times = np.full(shape[:2], np.nan) if self.stepper.interface.energy_parameter else None
+        if self.times is not None:
+            self.times[0] = self.steps.t0
+        self.status, self.done = np.full(len(self), OK, dtype="<U32"), np.zeros(len(self), dtype=np.int64)
+
+    def __len__(self) -> int:
+        return len(self.start[0])
+
+    def blocks(self) -> tuple[Callable[[int], LaneBlock | SingleBlock], int]:
+        """Return a function that makes the block beginning at a trajectory, and the trajectories per block."""
+        source = self.stepper.ensemble
+        if source is None:
+            return lambda first: SingleBlock(self, first), 1
+        binding = Binding(building.load(source, flags=self.stepper.flags), source.prefix)
+        return lambda first: LaneBlock(self, first, binding), len(binding.new("block *").active)
+
+
+class LaneBlock:
+    """Trajectories in the SIMD lanes of one C block, and those that left it after a failed step."""
+
+    def __init__(self, work: CommonRuns, first: int, binding: Binding) -> None:
+        self.work, self.first, self.binding = work, first, binding
+        self.memory = binding.new("block *")
+        binding.function("start")(self.memory, work.steps.t0, work.steps.h)
+        self.active = np.frombuffer(binding.buffer(self.memory.active), dtype=np.float64)
+        lanes = np.frombuffer(binding.buffer(self.memory.parameters), dtype=np.float64).reshape(-1, len(self.active))
+        self.parameters = lanes[: work.parameters.shape[1]]
+        self.count, self.step = min(len(self.active), len(work) - first), 0
+        self.left: dict[int, SingleRun] = {}
+        self._fill()
+
+    def _fill(self) -> None:
+        """Put a trajectory into each lane; surplus lanes repeat the last one and are inactive."""
+        work, call, pointer = self.work, self.binding.function("set"), self.binding.pointer
+        v = self._velocities()
+        for lane in range(len(self.active)):
+            k = min(lane, self.count - 1)
+            j = self.first + k
+            velocity = self.binding.null if v is None else pointer(v[k])
+            call(self.memory, lane, pointer(work.q[0, j]), pointer(work.p[0, j]), velocity, pointer(work.parameters[j]))
+        self.active[self.count :] = 0.0
+        if v is not None:
+            self.active[: self.count] *= np.isfinite(v).all(axis=1)
+
+    def _velocities(self) -> Array | None:
+        """Return (count, m) initial velocities if the predictor needs them, NaN where undefined; else ``None``."""
+        if not self.binding.constant("NEEDS_VELOCITIES"):
+            return None
+        work, v = self.work, np.full((self.count, self.work.stepper.dimension), np.nan)
+        for k in range(self.count):
+            j = self.first + k
+            with suppress(StateError):
+                v[k] = work.stepper.velocity(work.q[0, j], work.p[0, j], work.steps.t0, work.parameters[j])
+        return v
+
+    def lanes(self, name: str) -> Array:
+        """Return a (m, lanes) view of a field of the block: ``q``, ``p``, ``carry_q`` or ``carry_p``."""
+        field = np.frombuffer(self.binding.buffer(getattr(self.memory, name)), dtype=np.float64)
+        return field.reshape(self.work.stepper.dimension, -1)
+
+    def advance(self, size: int) -> None:
+        """Advance by ``size`` steps."""
+        for chunk in self.work.steps.chunks(self.step, size):
+            if chunk.entered is not None:
+                part = slice(self.first, self.first + self.count)
+                self._change(chunk.entered.h, self.work.values_at(chunk.entered.middle, part))
+            self._advance(chunk.steps, chunk.save_every)
+
+    def _change(self, h: float, parameters: Array) -> None:
+        """Set step size and parameters; a new step size invalidates the predictor."""
+        for lane, alone in self.left.items():
+            alone.update(h, parameters[lane])
+        self.parameters[:, : self.count] = parameters.T
+        self.parameters[:, self.count :] = parameters[-1:].T
+        if h == self.memory.h:
+            return
+        self.memory.h, self.memory.guess = h, 0
+        if self.binding.constant("NEEDS_VELOCITIES"):
+            self._reset_predictor(parameters)
+
+    def _reset_predictor(self, parameters: Array) -> None:
+        """Reset the predictor to the current velocities, as initially; deactivate lanes without velocities."""
+        at_points = np.frombuffer(self.binding.buffer(self.memory.memory), dtype=np.float64)
+        at_points = at_points.reshape(-1, self.work.stepper.dimension, len(self.active))
+        q, p, t = self.lanes("q").T, self.lanes("p").T, float(self.memory.t)
+        for lane in np.flatnonzero(self.active[: self.count] > 0.0):
+            try:
+                at_points[:, :, lane] = self.work.stepper.velocity(q[lane], p[lane], t, parameters[lane])
+            except StateError:
+                self.active[lane] = 0.0
+
+    def _advance(self, size: int, save_every: int) -> None:
+        work, begin, self.step = self.work, self.step, self.step + size
+        if len(self.left) < self.count:
+            row = work.steps.row(begin)
+            stride = len(work) * work.stepper.dimension
+            offset = row * stride + self.first * work.stepper.dimension if row < len(work.q) else 0
+            self.binding.function("advance")(
+                self.memory,
+                self.count,
+                size,
+                save_every,
+                self.binding.options(work.options),
+                self.binding.pointer(work.q) + offset,
+                self.binding.pointer(work.p) + offset,
+                stride,
+            )
+        running = self.active[: self.count] > 0.0
+        work.done[self.first : self.first + self.count][running] = self.step
+        for lane in np.flatnonzero(~running):
+            self._continue_singly(int(lane), begin, save_every)
+
+    def _continue_singly(self, lane: int, begin: int, save_every: int) -> None:
+        """Replace the states that a call from step ``begin`` stored for an inactive lane by those of a single run."""
+        work, j = self.work, self.first + lane
+        if lane not in self.left:
+            step = int(self.memory.last_step[lane])
+            q, p, *carries = (self.lanes(name)[:, lane].copy() for name in ("q", "p", "carry_q", "carry_p"))
+            self.left[lane] = SingleRun(work, j, q, p, step, (carries[0], carries[1]))
+            begin = step
+        rows = slice(work.steps.row(begin), work.steps.row(self.step))
+        work.q[rows, j] = work.p[rows, j] = np.nan
+        self.left[lane].advance_to(self.step, save_every)
+
+
+class SingleBlock:
+    """Block of one trajectory, for methods without SIMD lanes."""
+
+    def __init__(self, work: CommonRuns, first: int) -> None:
+        self.step, self.run = 0, SingleRun(work, first, work.q[0, first], work.p[0, first])
+
+    def advance(self, size: int) -> None:
+        """Advance by ``size`` steps."""
+        run = self.run
+        for chunk in run.work.steps.chunks(self.step, size):
+            self.step += chunk.steps
+            if chunk.entered is not None:
+                run.update(chunk.entered.h, run.work.values_at(chunk.entered.middle, slice(run.j, run.j + 1))[0])
+            run.advance_to(self.step, chunk.save_every)
+
+
+class SingleRun:
+    """Trajectory j computed by the single integrator from its state after ``step`` steps."""
+
+    def __init__(
+        self, work: CommonRuns, j: int, q: Array, p: Array, step: int = 0, carries: tuple[Array, Array] | None = None
+    ) -> None:
+        self.work, self.j = work, j
+        self.run: Memory | None = None
+        work.done[j] = step
+        segment, time = work.steps.at(step)
+        values = work.values_at(segment.middle, slice(j, j + 1))[0]
+        try:
+            given: dict[str, Any] = {"t": work.steps.t0, "parameters": values, "options": work.options}
+            run = Memory.started(work.stepper, q, p, plan=StepPlan.with_step(segment.h), **given)
+        except StateError:  # a sum of finite terms has overflowed
+            work.status[j] = "not finite"
+        else:
+            if carries is not None:
+                run._resume_at(step, time, carries)
+            self.run = run
+
+    def update(self, h: float, parameters: Array) -> None:
+        """Set step size and parameters."""
+        if self.run is not None:
+            self.run.update(h=h, parameters=parameters)
+
+    def advance_to(self, step: int, save_every: int) -> None:
+        """Advance to step number ``step``, unless the trajectory has failed."""
+        work, j, run = self.work, self.j, self.run
+        if run is None:
+            return
+        row = work.steps.row(run.steps)
+        try:
+            trajectory = record(run, step - run.steps, save_every=save_every)
+        except StepFailedError as failure:
+            work.status[j], trajectory, self.run = failure.status, Trajectory.before(failure), None
+        work.done[j] = run.steps
+        rows = slice(row, row + len(trajectory) - 1)
+        work.q[rows, j], work.p[rows, j] = trajectory.q[1:], trajectory.p[1:]
+        if work.times is not None:
+            work.times[rows, j] = trajectory.t[1:]

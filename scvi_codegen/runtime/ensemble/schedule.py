@@ -1,0 +1,108 @@
+"""Common fixed steps of an ensemble, in segments of equal steps between the breakpoints of inputs."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping
+from itertools import accumulate
+from typing import NamedTuple
+
+import numpy as np
+
+from scvi_codegen.native.arguments import checked_step, empty_array
+from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.inputs.segments import Input, Segment, planned_segments, time_after_steps
+from scvi_codegen.runtime.run.times import times_after
+from scvi_codegen.validation import checked_count
+
+
+class StepChunk(NamedTuple):
+    """Chunk of steps for one call into C.
+
+    Attributes:
+        save_every: steps between saved states.
+        entered: segment that begins with the chunk, or ``None``.
+    """
+
+    steps: int
+    save_every: int
+    entered: Segment | None = None
+
+
+class CommonSteps:
+    """Fixed steps that all trajectories share, and the states that are saved.
+
+    Args:
+        t0, h: initial time and step size.
+        steps, t_end: number of steps, or final time, with a shorter step before each breakpoint and at the end.
+        inputs: validated inputs, with ``t_end``.
+        save_every: steps between saved states.
+
+    Attributes:
+        segments: segments of equal steps.
+        ends: number of steps up to the end of each segment.
+        numbers: step numbers of the saved states.
+    """
+
+    def __init__(
+        self,
+        t0: float,
+        h: float,
+        *,
+        steps: int | None,
+        t_end: float | None,
+        inputs: Mapping[str, Input],
+        save_every: int,
+    ) -> None:
+        self.t0, self.h, self.t_end, self.save_every = t0, checked_step(h), t_end, save_every
+        count = 0 if t_end is not None else checked_count(steps, "steps", least=0)
+        self.segments = [Segment(count, self.h, (t0, 0.0), t0)]
+        if t_end is not None:
+            self.segments = planned_segments(t0, t_end, self.h, inputs) or self.segments
+        self.ends = list(accumulate(segment.steps for segment in self.segments))
+        self.steps = self.ends[-1]
+        empty_array((self.steps // save_every + 1,))  # rejects numbers of states beyond any memory
+        multiples = np.arange(0, self.steps + 1, save_every)
+        self.numbers = multiples if t_end is None else np.union1d(multiples, self.ends)
+
+    def row(self, step: int) -> int:
+        """Return the index of the first saved state after ``step`` steps."""
+        return int(self.numbers.searchsorted(step, side="right"))
+
+    def chunks(self, begin: int, size: int) -> Iterator[StepChunk]:
+        """Split steps at breakpoints; the last step of a segment is separate if the output stride skips its state."""
+        end, step = begin + size, begin
+        while step < end:
+            k = bisect_right(self.ends, step)
+            last, entering = self.ends[k], self.t_end is not None and step == self._first(k)
+            odd = self.t_end is not None and last % self.save_every != 0
+            until = min(end, last - 1 if odd and step < last - 1 else last)
+            save_every = last if odd and until == last else self.save_every
+            yield StepChunk(until - step, save_every, self.segments[k] if entering else None)
+            step = until
+
+    def at(self, step: int) -> tuple[Segment, tuple[float, float]]:
+        """Return the segment and the double-double time after ``step`` steps."""
+        k = min(bisect_right(self.ends, step), len(self.ends) - 1)
+        segment = self.segments[k]
+        return segment, time_after_steps(segment.start, segment.h, step - self._first(k))
+
+    def _first(self, k: int) -> int:
+        """Return the number of steps before segment k."""
+        return self.ends[k] - self.segments[k].steps
+
+    def times(self, *, tau: bool) -> Array:
+        """Return the (n,) times of the saved states; tau from 0 in transformed time."""
+        times = np.empty(len(self.numbers))
+        for k, (rows, segment) in enumerate(self.spans()):
+            start, low = (0.0, 0.0) if tau else segment.start
+            high, rest = times_after(start, segment.h, self.numbers[rows] - self._first(k))
+            times[rows] = high + (rest + low)
+        return times
+
+    def spans(self) -> Iterator[tuple[slice, Segment]]:
+        """Yield the saved states of each segment; a breakpoint belongs to the earlier one."""
+        first = 0
+        for end, segment in zip(self.ends, self.segments, strict=True):
+            yield slice(first, self.row(end)), segment
+            first = self.row(end)
