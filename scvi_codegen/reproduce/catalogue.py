@@ -8,7 +8,6 @@ from scvi_codegen.reproduce.kepler import (
     figures_23_to_30,
     many_points,
     overview,
-    phase_plane,
 )
 from scvi_codegen.reproduce.laboratory.experiment import REGISTERED, Experiment
 from scvi_codegen.reproduce.oscillators import (
@@ -40,7 +39,7 @@ MODULES = (
         figures_13_to_20,
         figures_23_to_30,
     ),
-    *(many_points, phase_plane, correction, tableaux, properties, outlines, costs),
+    *(many_points, correction, tableaux, properties, outlines, costs),
     *(iterations, two_point_pendulum, collocation, kronecker, order, rates, claims),
 )
 """Modules whose import registers the experiments."""

@@ -10,7 +10,6 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
     Paragraph,
     Result,
-    TableBlock,
     Verdict,
     common_verdict,
     experiment,
@@ -114,7 +113,6 @@ def claims(results: Mapping[str, Result]) -> Result:
             + (f"; without {_listed(results)}." if len(results) < len(EVIDENCE) else "."),
         ),
         checks=tuple(_check(claim, result[key]) for key, claim in CLAIMS.items()),
-        tables=(_summary(result), _details(result)),
         body=tuple(block for key in CLAIMS for block in _blocks(CLAIMS[key], result[key])),
     )
 
@@ -147,36 +145,6 @@ def _counted(count: int, verdict: Verdict) -> str:
 
 def _unique(names: list[str]) -> str:
     return ", ".join(dict.fromkeys(names))
-
-
-def _summary(result: Mapping[str, tuple[tuple[str, Comparison], ...]]) -> TableBlock:
-    return TableBlock(
-        columns=("claim", "place", "checks", *(verdict.value for verdict in Verdict), "verdict"),
-        rows=tuple(
-            (
-                key,
-                CLAIMS[key].place,
-                len(evidence),
-                *(sum(check.verdict is verdict for _, check in evidence) for verdict in Verdict),
-                common_verdict(check for _, check in evidence).value,
-            )
-            for key, evidence in result.items()
-        ),
-        formats=dict.fromkeys(("checks", *(verdict.value for verdict in Verdict)), "d"),
-    )
-
-
-def _details(result: Mapping[str, tuple[tuple[str, Comparison], ...]]) -> TableBlock:
-    return TableBlock(
-        name="checks",
-        columns=("claim", "experiment", "paper", "measured", "verdict"),
-        rows=tuple(
-            (key, name, check.claim, check.measured, check.verdict.value)
-            for key, evidence in result.items()
-            for name, check in evidence
-        ),
-        shown=False,
-    )
 
 
 def _blocks(claim: Claim, evidence: tuple[tuple[str, Comparison], ...]) -> Iterator[Block]:

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.methods import SCVI, SpectralCollocation
-from scvi_codegen.reproduce.correction.example import largest_difference, multipliers_agree, two_points_agree
+from scvi_codegen.reproduce.correction.example import body, largest_difference, multipliers_agree, two_points_agree
 from scvi_codegen.reproduce.correction.structure import Structure, structure_of
-from scvi_codegen.reproduce.correction.text import body
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
 from scvi_codegen.reproduce.laboratory.experiment import Comparison, Picture, Result, TableBlock, experiment, holds
 

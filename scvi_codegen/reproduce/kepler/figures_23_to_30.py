@@ -1,7 +1,7 @@
 """Section 4.3.2: SCVI on Kepler's problem.
 
-This module has Figs. 23-26, with two points. With more points the printed and the variational equations differ: Fig. 27
-is in :mod:`.phase_plane`, Figs. 28-30 in :mod:`.many_points`.
+This module has Figs. 23-26, with two points. With more points the printed and the variational equations differ: Figs.
+27-30 are in :mod:`.many_points`.
 """
 
 from __future__ import annotations

@@ -157,20 +157,6 @@ def _tableaux() -> list[tuple[str, Tableau]]:
     return [(family, collocation_tableau(abscissae(family, s))) for family, s in stages]
 
 
-def _coefficients() -> TableBlock:
-    rows = [
-        (family, tableau.stages, i, float(c), float(b), " ".join(f"{float(a):.17g}" for a in row))
-        for family, tableau in _tableaux()
-        for i, (c, b, row) in enumerate(zip(tableau.c, tableau.b, tableau.A, strict=True), start=1)
-    ]
-    return TableBlock(
-        name="coefficients",
-        columns=("abscissae", "s", "i", "c_i", "b_i", "a_i1 .. a_is"),
-        rows=tuple(rows),
-        shown=False,
-    )
-
-
 def _body() -> tuple[Paragraph | Formula, ...]:
     tau, end, a, b = sympy.symbols("tau c_i a_ij b_j")
     cardinal = sympy.Function("ell_j")(tau)
@@ -214,7 +200,6 @@ def _run(_: Mapping[str, Result]) -> Result:
                 rows=tuple(rows + control),
                 formats=dict.fromkeys(("defect of (23)", "difference, pendulum", "difference, Kepler"), ".1e"),
             ),
-            _coefficients(),
         ),
         body=_body(),
     )

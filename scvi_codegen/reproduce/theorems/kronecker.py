@@ -8,7 +8,6 @@ from itertools import product
 import sympy
 
 from scvi_codegen.derivation.equations import derive
-from scvi_codegen.derivation.matrix_form import MatrixForm
 from scvi_codegen.derivation.page.curve import kronecker_form
 from scvi_codegen.exact.step import derived_step
 from scvi_codegen.methods import SpectralCollocation
@@ -16,7 +15,6 @@ from scvi_codegen.models.problems import problem
 from scvi_codegen.reproduce.laboratory.experiment import (
     Block,
     Comparison,
-    Formula,
     Paragraph,
     Result,
     TableBlock,
@@ -64,11 +62,6 @@ def residual(name: str, form: str, degree: int) -> float:
     return float(max(abs(row.xreplace(values).evalf(50)) for row in derived.matrix_form().residual))
 
 
-def _example() -> MatrixForm:
-    """Return the matrix form for two coordinates; the entries are the same for every system."""
-    return derive(problem("double-pendulum").system, SpectralCollocation(SHOWN_DEGREE)).matrix_form()
-
-
 def _body() -> Iterator[Block]:
     yield Paragraph(
         "vec stacks the rows of a matrix. Lemma 2.1, vec(A B C) = (A x C^T) vec(B), turns the differentiation of all "
@@ -78,23 +71,6 @@ def _body() -> Iterator[Block]:
     for form in FORMS:
         yield Paragraph(f"In {'positions' if form == 'position' else 'phase space'}:")
         yield from kronecker_form(SpectralCollocation(SHOWN_DEGREE, form=form))
-    yield Paragraph(
-        "With three Chebyshev points (degree 2) and two coordinates, the rows of vec(Q) being Q^1 and Q^2 of the first "
-        "node and of the second:"
-    )
-    shown = _example()
-    h = next(iter(shown.A.free_symbols))
-    factor = 2 / h
-    yield Formula(_scaled(shown.A, factor), sympy.Symbol("A"), "11")
-    yield Formula(_scaled(shown.a0, factor), sympy.Symbol("a_0"), "11")
-    A_letter = sympy.MatrixSymbol("A", SHOWN_DEGREE, SHOWN_DEGREE)
-    yield Formula(_scaled(shown.operator, factor**2), sympy.KroneckerProduct(A_letter**2, sympy.Identity(2)), "18")
-
-
-def _scaled(matrix: sympy.Matrix, factor: sympy.Expr) -> sympy.Expr:
-    """Return a matrix as a factor times a matrix of rationals."""
-    rational = (matrix / factor).applyfunc(lambda entry: sympy.nsimplify(sympy.simplify(entry), rational=True))
-    return sympy.MatMul(factor, sympy.ImmutableMatrix(rational), evaluate=False)
 
 
 @experiment("section-2.1", "Spectral collocation with Kronecker products, (18) and (21)")
