@@ -147,7 +147,7 @@ class _Record:
         """Integrate from every state once."""
         taken, final = [], []
         size = self.contender.trajectories
-        for index in range(STATES if size == 1 else 1):
+        for index in range(self.contender.starts if size == 1 else 1):
             integrate = self.contender.prepare(index)
             began = time.process_time()
             q = integrate()

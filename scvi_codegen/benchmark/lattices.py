@@ -5,9 +5,8 @@ Every contender runs with smaller and smaller steps, or tolerances; the times at
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from importlib.resources import files
 from importlib.util import find_spec
@@ -17,11 +16,12 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from scvi_codegen.benchmark.cases.large import Lattice, atoms, bodies, field, ring
+from scvi_codegen.benchmark.cases.references import Reference, rms_error
 from scvi_codegen.benchmark.cases.unforced import Array, case
-from scvi_codegen.benchmark.report import Point, ResultTable, time_at
-from scvi_codegen.benchmark.settings import Plan, ReportActivity, timed
+from scvi_codegen.benchmark.comparison import measure
+from scvi_codegen.benchmark.report import Contender, Point, ResultTable, time_at
+from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import StepFailedError
 from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.leapfrog_stages import kicks_and_drifts
 from scvi_codegen.native import building
@@ -42,12 +42,10 @@ DECLARATIONS = (
     "void leapfrog(int is_field, double *q, double *v, double *work, long n, double strength, double h, long steps, "
     "const double *kicks, const double *drifts, int leaps);"
 )
-PATIENCE = 0.3
-"""Seconds above which a setting is timed only twice."""
 
 
-Prepare = Callable[[], Callable[[], Array]]
-"""Contender at one setting: returns a function that integrates, which is timed, and returns the final positions."""
+Prepare = Callable[[int], Callable[[], Array]]
+"""Contender at one setting, as :attr:`~scvi_codegen.benchmark.report.Contender.prepare`."""
 
 
 def lattices(plan: Plan) -> tuple[Lattice, ...]:
@@ -90,9 +88,9 @@ def _table(name: str, problems: Sequence[Lattice], plan: Plan, report_activity: 
     rows: list[dict[str, Any]] = []
     for each in problems:
         report_activity(f"{name}: {each.name} of {each.q.size} coordinates")
-        reference, doubt = reference_of(each)
+        reference = reference_of(each)
         curves = _curves(_contenders(each, plan), reference, plan)
-        rows += [_row(each, error, curves, doubt) for error in ERRORS]
+        rows += [_row(each, error, curves, reference.accuracy) for error in ERRORS]
     measured = dict.fromkeys(key for row in rows for key in row if key not in ("doubt", "ours_ms", "by"))
     first = {"problem": "", "coordinates": "d", "error": ".0e", "ours_ms": ".2f", "by": ""}
     return ResultTable(
@@ -120,35 +118,26 @@ def _row(each: Lattice, error: float, curves: Mapping[str, list[Point]], doubt: 
     return result | {"ours_ms": 1e3 * ours[best], "by": best} | ratios
 
 
-def reference_of(each: Lattice) -> tuple[Array, float]:
-    """Return the final state by SVI(10), and its distance from a composition of order 10."""
-    result = _ours(each, "svi:10", _count(each, each.longest / 8))()()
-    other = _ours(each, Composition(10), _count(each, each.longest / 32))()()
-    return result, rms(other, result)
+def reference_of(each: Lattice) -> Reference:
+    """Return the final state by SVI(10); its accuracy is the distance from a composition of order 10."""
+    ends = (("svi:10", _count(each, each.longest / 8)), (Composition(10), _count(each, each.longest / 32)))
+    result, other = (_ours(each, method, count)(0)().reshape(1, -1) for method, count in ends)
+    reference = Reference(high=result, low=np.zeros_like(result), accuracy=0.0)
+    return replace(reference, accuracy=rms_error(other, reference))
 
 
-def _curves(contenders: Mapping[str, Sequence[Prepare]], reference: Array, plan: Plan) -> dict[str, list[Point]]:
-    """Measure all settings of all contenders in turn, for several rounds; slow ones twice, too large steps not."""
-    seconds: dict[tuple[str, int], list[float]] = {}
-    errors: dict[tuple[str, int], float] = {}
-    for number in range(plan.rounds + 1):
-        for name, settings in contenders.items():
-            for k, setting in enumerate(settings):
-                known = seconds.setdefault((name, k), [])
-                if number < 2 or min(known, default=math.inf) < PATIENCE:
-                    with suppress(StepFailedError):
-                        elapsed, end = timed(setting())
-                        known.append(elapsed)
-                        errors[name, k] = rms(end, reference)
+def _curves(contenders: Mapping[str, Sequence[Prepare]], reference: Reference, plan: Plan) -> dict[str, list[Point]]:
+    """Measure all settings of all contenders in turn; steps that are too large are left out."""
+    settings = [
+        Contender(method=name, setting="", options="", compile_seconds=0.0, prepare=prepare, starts=1)
+        for name, several in contenders.items()
+        for prepare in several
+    ]
+    measured = measure(settings, lambda _: reference, repeats=plan.rounds)
     return {
-        name: [Point(seconds=min(seconds[key]), error=error) for key, error in errors.items() if key[0] == name]
+        name: [each.fastest_point for each in measured if each.method == name and not each.failure]
         for name in contenders
     }
-
-
-def rms(end: Array, reference: Array) -> float:
-    """Return the root mean square of the differences, relative to that of the reference."""
-    return float(np.sqrt(np.mean((end - reference) ** 2) / np.mean(reference**2)))
 
 
 def _count(each: Lattice, h: float) -> int:
@@ -182,7 +171,7 @@ def _contenders(each: Lattice, plan: Plan) -> dict[str, list[Prepare]]:
 def _ours(each: Lattice, method: Any, steps: int) -> Prepare:
     stepper = compile_stepper(each.system, method)
 
-    def prepare() -> Callable[[], Array]:
+    def prepare(_: int) -> Callable[[], Array]:
         run = stepper.start(each.q, velocity=each.v, h=each.span / steps, parameters=each.parameters)
 
         def integrate() -> Array:
@@ -202,7 +191,7 @@ def _by_hand(each: Lattice, order: int, steps: int) -> Prepare:
     kicks, drifts = (np.array([float(x) for x in row]) for row in kicks_and_drifts(Composition(order)))
     is_field, count, strength = each.by_hand
 
-    def prepare() -> Callable[[], Array]:
+    def prepare(_: int) -> Callable[[], Array]:
         q, v = each.q.reshape(-1).copy(), each.v.reshape(-1).copy()
         arrays = [library.ffi.from_buffer("double[]", array) for array in (q, v, np.empty(q.size), kicks, drifts)]
         state, tables = arrays[:3], arrays[3:]
@@ -233,14 +222,14 @@ def _dop853(each: Lattice, accelerations: Callable[[Array], Array], tolerance: f
         end: Array = result.y[:size, -1].reshape(shape)
         return end
 
-    return lambda: integrate
+    return lambda _: integrate
 
 
 def _rebound(each: Lattice, integrator: str, steps: int | None) -> Prepare:
     """Return REBOUND's final positions of bodies; ``None``: adaptive steps."""
     import rebound
 
-    def prepare() -> Callable[[], Array]:
+    def prepare(_: int) -> Callable[[], Array]:
         simulation = rebound.Simulation()
         simulation.softening = float(each.system.defaults[1])
         for q, v in zip(each.q, each.v, strict=True):
@@ -285,7 +274,7 @@ def openmm_run(name: str, each: Lattice, steps: int) -> Prepare:
     assert each.accelerations is not None
     half_before = each.v - h / 2 * each.accelerations(each.q)
 
-    def prepare() -> Callable[[], Array]:
+    def prepare(_: int) -> Callable[[], Array]:
         context.setPositions(each.q)
         context.setVelocities(half_before)
         return integrate

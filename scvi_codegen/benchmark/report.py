@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.benchmark.cases.unforced import STATES
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResultTable:
@@ -173,6 +175,7 @@ class Contender:
             from it and returns the final q.
         momenta: (k, m) initial momenta, if they are its state; ``None`` if it starts from velocities.
         trajectories: number of trajectories of one run; the final q of an ensemble is (trajectories, m).
+        starts: number of initial states, each of which is a run unless one run has all.
     """
 
     method: str
@@ -182,6 +185,7 @@ class Contender:
     prepare: Callable[[int], Callable[[], NDArray[np.float64]]]
     momenta: NDArray[np.float64] | None = None
     trajectories: int = 1
+    starts: int = STATES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -21,7 +21,7 @@ def quiet(text):
 def test_lattices_by_hand_move_as_generated_ones(lattice):
     steps = 10
     by_hand, ours = (
-        prepare()()
+        prepare(0)()
         for prepare in (lattices._by_hand(lattice, 8, steps), lattices._ours(lattice, Composition(8), steps))
     )
     assert np.abs(by_hand - ours).max() < 1e-14
@@ -47,8 +47,8 @@ def test_accelerations_by_numpy_are_those_of_the_formula(each):
 def test_openmm_makes_the_steps_of_leapfrog(name):
     pytest.importorskip("openmm", reason="needs the extra 'bench'")
     crystal, steps = atoms(1, 0.5), 50
-    theirs = lattices.openmm_run(name, crystal, steps)()()
-    ours = lattices._ours(crystal, "stoermer-verlet", steps)()()
+    theirs = lattices.openmm_run(name, crystal, steps)(0)()
+    ours = lattices._ours(crystal, "stoermer-verlet", steps)(0)()
     rounding = {"OpenMM_CPU": 1e-5, "OpenMM_double": 1e-13}[name]
     assert np.abs(theirs - ours).max() < rounding
     assert np.abs(ours - crystal.q).max() > 0.1
@@ -58,7 +58,7 @@ def test_openmm_makes_the_steps_of_leapfrog(name):
 def test_rebound_converges_to_the_same_state():
     pytest.importorskip("rebound", reason="needs the extra 'bench'")
     each = bodies(10, 0.5)
-    ours, theirs = lattices._ours(each, "svi:8", 32)()(), lattices._rebound(each, "ias15", None)()()
+    ours, theirs = lattices._ours(each, "svi:8", 32)(0)(), lattices._rebound(each, "ias15", None)(0)()
     assert np.abs(ours - theirs).max() < 1e-14
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +12,8 @@ from numpy.typing import NDArray
 from scvi_codegen.methods import SCVI, SpectralCollocation
 from scvi_codegen.reproduce.correction.example import body, largest_difference, multipliers_agree, two_points_agree
 from scvi_codegen.reproduce.correction.structure import Structure, structure_of
-from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
+from scvi_codegen.reproduce.laboratory.drawing import COLORS, Axes, Figure, panels
 from scvi_codegen.reproduce.laboratory.experiment import Comparison, Picture, Result, TableBlock, experiment, holds
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 ROWS = ((2, 2), (3, 2), (4, 3), (5, 4), (6, 5), (7, 6), (9, 7))
 """Numbers of points and of Gauss points."""
@@ -53,7 +49,6 @@ def _order_bound(points: int, gauss: int) -> int:
 def _correction(_: Mapping[str, Result]) -> Result:
     results = {row: _both(*row) for row in ROWS}
     return Result(
-        title="Why (34d) needs the chain-rule term",
         setting=SETTING,
         checks=(
             _check_derivation(),

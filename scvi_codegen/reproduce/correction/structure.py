@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.methods.method import Method
 from scvi_codegen.reproduce.kepler.orbits import SYSTEM, angular_momentum, exact_flow
+from scvi_codegen.reproduce.laboratory.drawing import Array
 from scvi_codegen.reproduce.laboratory.running import stepper_of
 from scvi_codegen.runtime.core.stepper import Stepper
-
-Array = NDArray[np.float64]
 
 STATE = np.array([0.3, 0.8]), np.array([-1.1, 0.4])
 """State (q, p) off the symmetry axes of the orbit (eccentricity 0.17), so that no error vanishes by symmetry."""

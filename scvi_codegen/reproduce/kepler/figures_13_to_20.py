@@ -8,10 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.methods import SVI, SpectralCollocation
 from scvi_codegen.reproduce.kepler.orbits import (
@@ -26,7 +24,7 @@ from scvi_codegen.reproduce.kepler.orbits import (
     perihelion,
     time_series,
 )
-from scvi_codegen.reproduce.laboratory.drawing import draw_error, panels
+from scvi_codegen.reproduce.laboratory.drawing import Array, Figure, draw_error, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
     Picture,
@@ -36,11 +34,6 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     holds,
 )
 from scvi_codegen.reproduce.laboratory.running import SECTION_3
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 
 ECCENTRICITY, STEP, SPAN = 0.5, 0.2, 2000.0
 DEGREE = 5
@@ -104,7 +97,6 @@ def _table() -> TableBlock:
 def _figure_13(_: Mapping[str, Result]) -> Result:
     svi, sc = numbers("SVI"), numbers("SC")
     return Result(
-        title="Kepler two body, orbit",
         setting=SETTING,
         checks=(
             Comparison(
@@ -150,7 +142,6 @@ def _invariant(name: str, values: Mapping[str, Array], check: Comparison) -> Res
     columns = {f"{name} {scheme}": series for scheme, series in values.items()}
     t = _orbit("SVI").run.t
     return Result(
-        title=f"Kepler two body, {name}",
         setting=SETTING,
         checks=(check,),
         tables=(_table(), time_series(t, columns)),

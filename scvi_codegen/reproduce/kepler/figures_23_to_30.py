@@ -10,10 +10,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.methods import SCVI, SpectralCollocation
 from scvi_codegen.reproduce.kepler.orbits import (
@@ -28,7 +26,7 @@ from scvi_codegen.reproduce.kepler.orbits import (
     revolutions,
     time_series,
 )
-from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
+from scvi_codegen.reproduce.laboratory.drawing import COLORS, Array, Figure, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
     Picture,
@@ -39,11 +37,6 @@ from scvi_codegen.reproduce.laboratory.experiment import (
 )
 from scvi_codegen.reproduce.laboratory.running import SECTION_4, stepper_of
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 
 ECCENTRICITY = 0.5
 TWO_POINTS = SCVI(1, "gauss-legendre:2")
@@ -92,7 +85,6 @@ def _figure_23(_: Mapping[str, Result]) -> Result:
     momentum = max(part.momentum for part in parts)
     runs = {f"steps {a} to {b}": (part.q, "SCVI") for (a, b), part in zip(SEGMENTS, parts, strict=True)}
     return Result(
-        title="Orbit of the Kepler problem computed using SCVI with 2 collocation points",
         setting=("Kepler's problem, e = 0.5, from the perihelion, h = pi/20, T = 20000 pi: 400000 steps.", QUADRATURE),
         checks=(
             Comparison(
@@ -175,7 +167,6 @@ def _figure_24(_: Mapping[str, Result]) -> Result:
     scvi, sc = periods("SCVI"), periods("SC")
     time, energy = two_points_fail_at()
     return Result(
-        title="Kepler problem, orbit of SCVI with 2 collocation points and of SC with 3",
         setting=SETTING,
         checks=(
             Comparison(
@@ -248,7 +239,6 @@ def _figure_25(_: Mapping[str, Result]) -> Result:
     error = {scheme: _orbit(scheme).largest[1] for scheme in COMPARED}
     t = _orbit("SC").run.t / (2 * math.pi)
     return Result(
-        title="Kepler problem, momentum of SCVI with 2 collocation points and of SC with 3",
         setting=SETTING,
         checks=(
             Comparison(
@@ -272,7 +262,6 @@ def _figure_26(_: Mapping[str, Result]) -> Result:
     early, late = _orbit("SCVI").halves()
     columns = {f"{part} {s}": series for s, parts in energies.items() for part, series in parts.items()}
     return Result(
-        title="Kepler problem, energy of SCVI with 2 collocation points and of SC with 3",
         setting=SETTING,
         checks=(
             Comparison(

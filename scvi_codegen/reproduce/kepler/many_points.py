@@ -13,15 +13,12 @@ import math
 from collections.abc import Mapping
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, TypeAlias
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any, TypeAlias
 
 from scvi_codegen.methods import SCVI, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.methods.method import Method
 from scvi_codegen.reproduce.kepler.orbits import PRESERVED, Orbit, draw_orbits, ellipse, orbit_of, time_series
-from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels
+from scvi_codegen.reproduce.laboratory.drawing import COLORS, Array, Axes, Figure, draw_error, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
     Picture,
@@ -32,12 +29,6 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     holds,
     judged,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 
 ECCENTRICITY, STEP = 0.5, 0.3
 PRINTED, VARIATIONAL = "as printed", "variational"
@@ -103,7 +94,6 @@ def _figure_28(_: Mapping[str, Result]) -> Result:
     )
     runs = {f"9 points, {g} Gauss points, {form}": (o.run.q, FORM_COLORS[form]) for (form, g), o in orbits.items()}
     return Result(
-        title="Two-body Kepler problem, orbit of SCVI with 9 points and 5, 6, 7 Gauss points",
         setting=SETTING,
         checks=(precession,),
         tables=(_many_table(),),
@@ -116,7 +106,6 @@ def _figure_29(_: Mapping[str, Result]) -> Result:
     orbits = _orbits()
     errors = {form: [orbits[form, g].largest[1] for g in GAUSS] for form in FORMS}
     return Result(
-        title="Two-body Kepler problem, momentum of SCVI with 9 points and 5, 6, 7 Gauss points",
         setting=SETTING,
         checks=(
             *(
@@ -148,7 +137,6 @@ def _figure_30(_: Mapping[str, Result]) -> Result:
     orbits = _orbits()
     errors = {form: [orbits[form, g].largest[0] for g in GAUSS] for form in FORMS}
     return Result(
-        title="Two-body Kepler problem, energy error of SCVI with 9 points and 5, 6, 7 Gauss points",
         setting=SETTING,
         checks=(
             *(_bounded_check(form, [orbits[form, g] for g in GAUSS]) for form in FORMS),
@@ -227,7 +215,6 @@ PHASE_SETTING = (
 def _figure_27(_: Mapping[str, Result]) -> Result:
     orbits = {name: orbit_of(method, h, SHORT_SPAN) for name, (method, h, _) in METHODS.items()}
     return Result(
-        title="Phase trajectories for the Kepler two-body problem",
         setting=PHASE_SETTING,
         checks=(
             _kept_check(orbits, [name for name in orbits if name not in ("SC", PRINTED_NAME)]),

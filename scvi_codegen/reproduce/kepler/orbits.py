@@ -12,26 +12,21 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.methods import SCVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import kepler
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels, thinned
+from scvi_codegen.reproduce.laboratory.drawing import COLORS, Array, Axes, Figure, draw_error, panels, thinned
 from scvi_codegen.reproduce.laboratory.experiment import TableBlock, series_table
 from scvi_codegen.reproduce.laboratory.running import SECTION_4, trajectory
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 Pair = tuple[float, float]
 
 SYSTEM = kepler()

@@ -6,17 +6,15 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.exact.step import derived_step
 from scvi_codegen.methods import SVI, ExplicitEuler, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import planar_pendulum
 from scvi_codegen.reproduce.kepler.orbits import SYSTEM, angular_momentum, perihelion
-from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_orbit, panels
+from scvi_codegen.reproduce.laboratory.drawing import COLORS, Array, Axes, Figure, draw_orbit, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Cell,
     Comparison,
@@ -34,13 +32,6 @@ from scvi_codegen.tables.basis import cardinal_values
 from scvi_codegen.tables.nodes import chebyshev_lobatto, equispaced, legendre_lobatto
 from scvi_codegen.tables.precision import Vector
 from scvi_codegen.tables.quadrature import gauss_legendre, gauss_lobatto
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
-
 
 ECCENTRICITY = 0.6
 POSITION, VELOCITY = perihelion(ECCENTRICITY)

@@ -16,8 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.pictures.canvas import STYLE as TRAJECTORY_STYLE
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
+else:
+    Axes = Figure = Any  # Matplotlib is imported when a picture is drawn
 
 Array = NDArray[np.float64]
 

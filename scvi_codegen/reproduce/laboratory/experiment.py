@@ -9,12 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 from scvi_codegen.display.page.blocks import Block, Cell, Formula, Listing, Paragraph, TableBlock
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from scvi_codegen.reproduce.laboratory.drawing import Figure
 
 __all__ = [
     "REGISTERED",

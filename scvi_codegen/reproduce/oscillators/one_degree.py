@@ -6,22 +6,16 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.errors import MethodWarning
 from scvi_codegen.methods import SVI
-from scvi_codegen.reproduce.laboratory.drawing import draw_error, draw_orbit, largest_in_bins, panels
+from scvi_codegen.reproduce.laboratory.drawing import Array, Figure, draw_error, draw_orbit, largest_in_bins, panels
 from scvi_codegen.reproduce.laboratory.experiment import Cell, Comparison, Picture, Result, TableBlock, series_table
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 
 NO_DRIFT = 1e-12
 """Largest error that counts as round-off."""

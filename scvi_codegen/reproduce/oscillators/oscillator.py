@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.methods import SpectralCollocation
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import harmonic_oscillator
-from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
+from scvi_codegen.reproduce.laboratory.drawing import COLORS, Array, Figure, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
     Picture,
@@ -35,11 +33,6 @@ from scvi_codegen.reproduce.oscillators.one_degree import (
     svi_with_points,
 )
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 
 OSCILLATOR = harmonic_oscillator()
 POSITION, VELOCITY = (0.0,), (1.0,)

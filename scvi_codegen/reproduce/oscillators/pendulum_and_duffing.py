@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import duffing, planar_pendulum
-from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels, thinned
+from scvi_codegen.reproduce.laboratory.drawing import COLORS, Array, Figure, panels, thinned
 from scvi_codegen.reproduce.laboratory.experiment import (
     Cell,
     Comparison,
@@ -39,12 +37,6 @@ from scvi_codegen.reproduce.oscillators.one_degree import (
     scheme_name,
 )
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
-
 
 PENDULUM = planar_pendulum()
 POSITION, VELOCITY = (0.5,), (0.0,)

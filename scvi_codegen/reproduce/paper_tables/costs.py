@@ -157,7 +157,6 @@ def _result(setting: Setting, _: Mapping[str, Result]) -> Result:
     names = {scheme: method.name for scheme, method in setting.methods.items()}
     doubt = float(np.abs(_reference(setting, FINER) - _reference(setting, 2 * FINER)).max())
     return Result(
-        title=f"Computational cost of SRK, SVI and SC, {setting.problem}",
         setting=(
             f"{setting.problem.capitalize()}, h = {setting.h}, T = {setting.span:g} ({setting.steps} steps), "
             "iteration ended by the paper's rule, TOL = 1e-14: "

@@ -17,16 +17,15 @@ from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.reproduce.kepler.orbits import SYSTEM, perihelion
+from scvi_codegen.reproduce.laboratory.drawing import Array
 from scvi_codegen.reproduce.laboratory.running import BY_POINTS, SCHEMES, SECTION_3, Reading, steps_in, trajectory
 from scvi_codegen.tables.basis import cardinal_derivatives, cardinal_values, differentiation_matrix
 from scvi_codegen.tables.nodes import chebyshev_lobatto
 from scvi_codegen.tables.quadrature import gauss_legendre
 
-Array = NDArray[np.float64]
 Force: TypeAlias = Callable[[Array], Array]
 """Function that returns accelerations (points, m) at positions (points, m); masses are 1."""
 

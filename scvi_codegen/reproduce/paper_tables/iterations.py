@@ -50,7 +50,6 @@ def table(number: int, _: Mapping[str, Result]) -> Result:
     """Return Table 8 or 9."""
     e, printed, result = ECCENTRICITY[number], printed_counts(number), _all_counts(number)
     return Result(
-        title=f"Kepler problem, number of iterations with eccentricity e = {e}",
         setting=(
             f"Kepler's problem, e = {e}, T = {SPAN:g}, from perihelion; SVI has N Gauss points, which the paper leaves "
             "open.",

@@ -66,7 +66,6 @@ def precise_errors(e: float, method: Method, h: Number) -> Mapping[str, Number]:
 
 POINTS = (8, 9, 10, 11, 12, 14, 16, 18, 20, 22)
 OVER_N = Study(
-    title="Kepler two body, error of q1 and q2 over a single step h = 5 with N-refinement",
     sentences=(
         "Kepler's problem, one step h = 5 from the perihelion, N = 8, 10, ..., 22 Chebyshev points, which is degree N "
         "- 1; SVI has N - 1 Gauss points. The error is that at the end of the step.",
@@ -90,7 +89,6 @@ OVER_N = Study(
 )
 OF_INVARIANTS = replace(
     OVER_N,
-    title="Kepler two body, error of momentum and energy over a single step h = 5 with N-refinement",
     quantities=("momentum", "energy"),
     lines={("SC", "momentum"): (1e6, 0.1), ("SC", "energy"): (1e6, 0.1), ("SVI", "energy"): (1e13, 0.004)},
 )
@@ -114,7 +112,6 @@ CIRCLE, ELLIPSE = (
     )
 )
 OVER_H = Study(
-    title="Kepler two body, error of q1 and q2 with h-refinement",
     sentences=(
         "Kepler's problem, one step of h = 0.001 to 3 from the perihelion; SVI has as many Gauss points as its degree. "
         "The error is that at the end of the step.",
@@ -139,7 +136,7 @@ for number, run, study, title in (
     *(
         (
             *(19 + k, over_h),
-            replace(OVER_H, quantities=(what,), title=f"Kepler two body, error of {what} with h-refinement"),
+            replace(OVER_H, quantities=(what,)),
             f"error of the {what} in one step over the step",
         )
         for k, what in enumerate(("momentum", "energy"))

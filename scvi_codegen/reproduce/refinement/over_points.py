@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from scvi_codegen.reproduce.laboratory.drawing import Panel, Series
+from scvi_codegen.reproduce.laboratory.drawing import Array, Panel, Series
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,
     Result,
@@ -27,7 +27,6 @@ from scvi_codegen.reproduce.laboratory.geometric import (
 from scvi_codegen.reproduce.laboratory.running import SCHEMES
 from scvi_codegen.reproduce.refinement.study import (
     ROUNDOFF,
-    Array,
     Setting,
     Study,
     cells_of,
@@ -61,7 +60,6 @@ def over_n(study: Study, _: Mapping[str, Result], **changes: Any) -> Result:
         for scheme in SCHEMES
     }
     return Result(
-        title=study.title,
         setting=study.sentences,
         checks=(_geometric(study, fits), _bases(study, fits), _along(study), _superior_n(study)),
         tables=(_fits_table(study, fits), _errors_over_n(study)),

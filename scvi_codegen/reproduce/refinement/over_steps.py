@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from scvi_codegen.reproduce.laboratory.drawing import Panel, Series
+from scvi_codegen.reproduce.laboratory.drawing import Array, Panel, Series
 from scvi_codegen.reproduce.laboratory.experiment import (
     Cell,
     Comparison,
@@ -24,7 +24,6 @@ from scvi_codegen.reproduce.laboratory.geometric import AGREEMENT_FACTOR
 from scvi_codegen.reproduce.laboratory.running import SCHEMES
 from scvi_codegen.reproduce.refinement.study import (
     ROUNDOFF,
-    Array,
     Setting,
     Study,
     cells_of,
@@ -78,7 +77,6 @@ def over_h(study: Study, _: Mapping[str, Result], **changes: Any) -> Result:
     study = replace(study, **changes)
     with_lines = [quantity for quantity in study.quantities if quantity in study.powers]
     return Result(
-        title=study.title,
         setting=study.sentences,
         checks=(
             *(_powers(study, quantity) for quantity in with_lines),

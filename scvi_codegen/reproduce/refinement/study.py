@@ -13,10 +13,9 @@ from functools import lru_cache, partial
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.methods.method import Method
-from scvi_codegen.reproduce.laboratory.drawing import Panel, draw_panels
+from scvi_codegen.reproduce.laboratory.drawing import Array, Panel, draw_panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Cell,
     Comparison,
@@ -27,8 +26,6 @@ from scvi_codegen.reproduce.laboratory.experiment import (
 from scvi_codegen.reproduce.laboratory.geometric import Line
 from scvi_codegen.reproduce.laboratory.running import Reading
 from scvi_codegen.tables.precision import Number
-
-Array = NDArray[np.float64]
 
 ROUNDOFF = 1e-13
 """Round-off level of the error of a step."""
@@ -75,7 +72,6 @@ class Study:
     """Errors over N or over h.
 
     Attributes:
-        title: title of the result.
         sentences: setting of the result.
         settings: columns (over N: rows) of panels.
         quantities: names of the errors.
@@ -87,7 +83,6 @@ class Study:
         exact: over h, True if curves are computed in 60 digits, and the compiled code only where it is judged.
     """
 
-    title: str = ""
     sentences: tuple[str, ...]
     settings: tuple[Setting, ...]
     quantities: tuple[str, ...]

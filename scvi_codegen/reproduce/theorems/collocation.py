@@ -178,7 +178,6 @@ def _run(_: Mapping[str, Result]) -> Result:
     least_control = min(min(row[4:]) for row in control)
     compiled = max(_compiled_difference(family, "kepler") for family in FAMILIES)
     return Result(
-        title="Collocation methods are Runge-Kutta methods with the coefficients (23)",
         setting=(
             f"One step h = {mp.nstr(STEP, 3)} of Hamilton's equations of the pendulum from (q, p) = (0.7, 0.4) and of "
             "Kepler's problem from (0.3, 0.8; -1.1, 0.4); the theorem names no problem.",

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StepFailedError
@@ -22,10 +21,9 @@ from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.problems import problem
+from scvi_codegen.reproduce.laboratory.drawing import Array
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.tables.quadrature import Quadrature, gauss_legendre
-
-Array = NDArray[np.float64]
 
 STARTS: Mapping[str, tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]] = {
     "planar-pendulum": (((0.7,), (0.4,)), ((1.5,), (-0.6,)), ((-0.4,), (1.3,))),

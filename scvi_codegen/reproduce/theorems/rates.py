@@ -115,7 +115,6 @@ def _run_rates(_: Mapping[str, Result]) -> Result:
         (TITLES[name], label, QUANTITIES[key], *map(cell, _series(name, label, key))) for name, label, key in rates
     )
     return Result(
-        title="Geometric convergence of map, Legendre transforms and discrete Lagrangian",
         setting=(
             START,
             f"{_steps()}, s Gauss points. {EXACT}",
@@ -198,7 +197,6 @@ def _run_bounds(_: Mapping[str, Result]) -> Result:
                 by_degree = dict(zip(degrees, map(cell, values), strict=True))
                 rows.append((TITLES[name], label, part, *rate(degrees, values), *map(by_degree.get, DEGREES)))
     return Result(
-        title="Geometric convergence of the spectral-collocation discrete Lagrangian",
         setting=(
             START,
             f"{_steps()}; s Gauss points, and few: s // 2, even degrees. {EXACT}",
