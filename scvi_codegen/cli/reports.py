@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import MethodWarning, ScviCodegenError, StateError, warn
-from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
-from scvi_codegen.runtime.trajectory.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from scvi_codegen.mechanics.system import MechanicalSystem
+    from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
+    from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 
 def counted(count: int, what: str) -> str:

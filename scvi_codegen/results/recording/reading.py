@@ -16,8 +16,7 @@ from scvi_codegen.errors import RecordingError
 from scvi_codegen.files.export import COLUMNS, Piece, States, write_states
 from scvi_codegen.files.labelled_arrays import checked_units
 from scvi_codegen.representation import LONGEST, clipped
-from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states, read_chunk
-from scvi_codegen.results.recording.manifest import read_manifest
+from scvi_codegen.results.recording.manifest import Chunk, chunk_paths, no_states, read_chunk, read_manifest
 from scvi_codegen.runtime.rotations.quantities import named_quantities
 from scvi_codegen.runtime.run.run_loop import first_step_size
 from scvi_codegen.runtime.run.times import times_after

@@ -20,8 +20,19 @@ from scvi_codegen.files.atomic import sync_folder
 from scvi_codegen.files.export import Piece, chunk_rows
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.compilers import check_flags
-from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states, read_chunk, unfinished, write_chunk
-from scvi_codegen.results.recording.manifest import MANIFEST, Build, Manifest, read_manifest, write_manifest
+from scvi_codegen.results.recording.manifest import (
+    MANIFEST,
+    Build,
+    Chunk,
+    Manifest,
+    chunk_paths,
+    no_states,
+    read_chunk,
+    read_manifest,
+    unfinished,
+    write_chunk,
+    write_manifest,
+)
 from scvi_codegen.results.recording.reading import RecordedRun, load_run
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.run import Run
