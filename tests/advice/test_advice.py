@@ -22,7 +22,7 @@ from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI, ExplicitEuler, Gauss, Method, RadauIIA, StoermerVerlet
 from scvi_codegen.models.problems import problem
 
-pytestmark = [pytest.mark.long, pytest.mark.usefixtures("as_users_compile")]
+pytestmark = pytest.mark.long
 
 Exact = Callable[[float], np.ndarray]
 
