@@ -1,39 +1,18 @@
-"""Compiled method for one system: steps, Legendre transforms and energies as pure functions of their arguments.
-
-All C calls release the GIL and share no state, so one integrator may be used from many threads.
-"""
+"""Compiled method for one system: single steps and the discrete Lagrangian as pure functions of their arguments."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.errors import MethodError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.binding import Binding
-from scvi_codegen.native.options import REASONS, SolverOptions, step_failure
-from scvi_codegen.runtime.arrays.any_size import constraint_shapes
-from scvi_codegen.runtime.core.validation import (
-    Array,
-    Parameters,
-    States,
-    check_inputs_given,
-    checked_parameters,
-    checked_states,
-    checked_vector,
-    flat_state,
-    is_one_state,
-    parameter_index,
-    state_by_name,
-)
+from scvi_codegen.native.options import SolverOptions, step_failure
+from scvi_codegen.runtime.core.validation import Array, Parameters, States, check_inputs_given
 from scvi_codegen.runtime.sensitivity.step_derivatives import LinearisedMethod
-
-REPORTED = 1e-3
-"""Largest relative difference between a velocity and the velocity recomputed from its momentum."""
 
 
 class Integrator(LinearisedMethod):
@@ -96,158 +75,6 @@ class Integrator(LinearisedMethod):
         )
         if status:
             raise step_failure(status, report, step=0, h=h)
-
-    def _parameters_at(self, q: Array, p: Array, parameters: Parameters = None) -> Array:
-        """Return (k,) values in order; in transformed time the energy defaults to that of the state (q, p)."""
-        values = self._parameters(parameters)
-        if not self._has_energy(parameters):
-            values[parameter_index(self.interface, self.interface.energy_parameter)] = self.energy(q, p, 0.0, values)
-        return values
-
-    def _has_energy(self, parameters: Mapping[str, Any] | Sequence[Any] | Array | None) -> bool:
-        """Return whether the parameters contain the energy required by transformed time, or none is required."""
-        name = self.interface.energy_parameter
-        return not name or (parameters is not None and (not isinstance(parameters, Mapping) or name in parameters))
-
-    def rates(self, q: States, p: States, parameters: Parameters = None) -> Array:
-        """Return (n,) rates dt/dtau at (n, m) states; 1 if time is not transformed."""
-        _, positions, momenta = checked_states(self.interface, q, p, 0.0)
-        rates = np.ones(positions.size // self.dimension)
-        if not self.interface.energy_parameter:
-            return rates
-        values = self.binding.pointer(self._parameters(parameters))
-        pointers = map(self.binding.pointer, (positions, momenta))
-        if self.binding.function("rates")(len(rates), *pointers, values, self.binding.pointer(rates)):
-            raise StateError("the rate dt/dtau of the time transformation must be positive at every state")
-        return rates
-
-    def momentum(self, q: States, v: States, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
-        """Return momenta p = dL/dv at (q, v, t), the Legendre transform: (m,), or (n, m) for (n, m) states."""
-        return self._transform("momentum", q, v, t, parameters, "v")
-
-    def velocity(self, q: States, p: States, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
-        """Return velocities v with dL/dv(q, v, t) = p, the inverse Legendre transform (Newton's iteration from v = 0).
-
-        Returns:
-            (m,), or (n, m) for (n, m) states with one time or (n,) times.
-        """
-        return self.named(self._transform("velocity", q, p, t, parameters, "p"))
-
-    def _initial_momenta(
-        self, q: States, p: States | None, velocity: States | None, t: float, parameters: Parameters
-    ) -> States:
-        """Return the momenta of a state specified by p or by velocity.
-
-        Raises:
-            StateError: unless exactly one of both is passed.
-        """
-        name, values = self.momentum_or_velocity(p, velocity)
-        return values if name == "p" else self.initial_momentum(q, values, t, parameters)
-
-    def initial_momentum(self, q: States, velocity: States, t: float, parameters: Parameters) -> Array:
-        """Return the (m,) momentum of the initial state of a run.
-
-        Raises:
-            StateError: if the mass matrix is singular along the velocity, so the momentum does not determine it.
-        """
-        p, v = (
-            self._transform("momentum", q, velocity, t, parameters, "velocity"),
-            np.asarray(flat_state(self.interface, velocity, "velocity"), dtype=float),
-        )
-        dropped = (p == 0.0) & (v != 0.0)
-        if dropped.any():
-            try:
-                back = self.velocity(q, p, t, parameters)
-            except StateError:
-                back = np.full_like(v, np.nan)
-            dropped &= ~(np.abs(back - v) <= REPORTED * np.abs(v).max())
-        if not dropped.any():
-            return p
-        i = int(np.flatnonzero(dropped)[0])
-        name = self.coordinates[i]
-        raise StateError(
-            f"the velocity {name}_dot = {v.ravel()[i]:g} at q = {np.asarray(q)} has no momentum: the mass matrix is "
-            f"singular there in the direction of '{name}', so the motion is undetermined. Start from a state where the "
-            f"kinetic energy depends on {name}_dot, or use coordinates that are regular there (Cartesian instead of "
-            "polar coordinates at the origin)"
-        )
-
-    def momentum_or_velocity(self, p: States | None, velocity: States | None) -> tuple[str, States]:
-        """Return the name and the value of the one of both that is passed.
-
-        Raises:
-            StateError: unless exactly one of both is passed.
-        """
-        if p is not None and velocity is None:
-            return "p", p
-        if velocity is not None and p is None:
-            return "velocity", velocity
-        raise StateError(f"give either p or velocity with q; got {'neither' if p is None else 'both'}")
-
-    def energy(self, q: States, p: States, t: ArrayLike = 0.0, parameters: Parameters = None) -> Any:
-        """Return the energy p.v - L: a float for (m,) states, (n,) for (n, m) with one time or (n,) times."""
-        times, positions, momenta = checked_states(self.interface, q, p, t)
-        result = self._energies_of(times, positions, momenta, self._parameters(parameters))
-        return float(result[0]) if is_one_state(self.interface, q) else result
-
-    def _energy_parts(self, q: Array, p: Array, t: Array, parameters: Array) -> Array:
-        """Return (n, 3) kinetic, potential and total energies of (n, m) states; parts of run-time sizes, else NaN."""
-        parts = np.full((len(q), 3), np.nan)
-        if self.binding.has("energy_parts"):
-            arrays = (np.ascontiguousarray(each, dtype=float) for each in (t, q, p, parameters))
-            self.binding.function("energy_parts")(len(t), *map(self.binding.pointer, (*arrays, parts)))
-        else:
-            parts[:, 2] = self.energy(q, p, t, parameters)
-        return parts
-
-    def _energies_of(self, t: Array, q: Array, p: Array, parameters: Array) -> Array:
-        """Return (n,) energies of unchecked contiguous arrays of shapes (n,), (n, m), (n, m) and (k,).
-
-        Raises:
-            StateError: if a state is outside the domain of L.
-        """
-        result, binding = np.empty(len(t)), self.binding
-        at, positions, momenta, energies = binding.pointers(t, q, p, result)
-        values, workspace = binding.pointer(parameters), binding.workspace()
-        status = binding.function("energies")(len(t), at, positions, momenta, values, energies, workspace)
-        if status:
-            raise StateError(f"the energy of a state cannot be computed: {REASONS[status]}")
-        if name := self.interface.energy_parameter:
-            result = parameters[parameter_index(self.interface, name)] + result / self.rates(q, p, parameters)
-        return result
-
-    def momentum_maps(self, q: States, p: States, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
-        """Return the k conserved quantities in the order of ``momentum_map_names``.
-
-        Returns:
-            (k,) for (m,) states, (n, k) for (n, m) states with one time or (n,) times.
-
-        Raises:
-            StateError: if a shape, name or number is invalid.
-        """
-        values = self._momentum_maps_and_sizes(q, p, t, parameters)[0]
-        return values[0] if is_one_state(self.interface, q) else values
-
-    def _momentum_maps_and_sizes(
-        self, q: States, p: States, t: ArrayLike = 0.0, parameters: Parameters = None
-    ) -> tuple[Array, Array]:
-        """Return (n, k) momentum maps and the root sum of squares of their terms, the scale of rounding errors."""
-        times, positions, momenta = checked_states(self.interface, q, p, t)
-        values, sizes = np.empty((2, len(times), len(self.momentum_map_names)))
-        if not values.size:
-            return values, sizes
-        status = self.binding.function("momentum_maps")(
-            len(times),
-            self.binding.pointer(times),
-            self.binding.pointer(positions),
-            self.binding.pointer(momenta),
-            self.binding.pointer(self._parameters(parameters)),
-            self.binding.pointer(values),
-            self.binding.pointer(sizes),
-        )
-        if status:
-            raise StateError(f"the momentum maps of a state cannot be computed: {REASONS[status]}")
-        return values, sizes
 
     def discrete_lagrangian(
         self,
@@ -366,77 +193,3 @@ class Integrator(LinearisedMethod):
         binding = self.binding.with_function("discrete_legendre")
         self._solve(binding, "discrete_legendre", t, h, ends, options, (p0, p1, action))
         return p0, p1, float(action[0])
-
-    def _transform(
-        self, name: str, q: States, other: States, t: ArrayLike, parameters: Parameters, label: str
-    ) -> Array:
-        if is_one_state(self.interface, q):
-            at, values = checked_number(t, "the time t"), self._parameters(parameters)
-            return self._transformed(name, at, self._vector(q, "q"), self._vector(other, label), values)
-        times, positions, others = checked_states(self.interface, q, other, t, second=label)
-        values, result = self._parameters(parameters), np.empty_like(others)
-        for k, (at, position, row) in enumerate(zip(times.tolist(), positions, others, strict=True)):
-            result[k] = self._transformed(name, at, position, row, values)
-        return result
-
-    def _transformed(self, name: str, t: float, q: Array, other: Array, values: Array) -> Array:
-        """Transform between p and dq/dt in transformed time, on the energy surface of the state."""
-        if not self.interface.energy_parameter:
-            return self._called(name, t, q, other, values)
-        if name == "velocity":
-            values[parameter_index(self.interface, self.interface.energy_parameter)] = self.energy(q, other, t, values)
-            return self._called(name, t, q, other, values) / self.rates(q, other, values)
-        rate = self.rates(q, np.zeros_like(q), values)
-        p = self._called(name, t, q, other * rate, values)
-        if self.rates(q, p, values) != rate:
-            raise StateError("dt/dtau depends on the momenta, so velocity does not determine them: give p")
-        return p
-
-    def _called(self, name: str, t: float, q: Array, other: Array, values: Array) -> Array:
-        result = np.empty_like(other)
-        status = self.binding.function(name)(
-            t,
-            self.binding.pointer(q),
-            self.binding.pointer(other),
-            self.binding.pointer(values),
-            self.binding.pointer(result),
-            self.binding.workspace(),
-        )
-        if status:
-            hint = "; if the Hamiltonian is singular in p, give p instead of velocity" if name == "momentum" else ""
-            raise StateError(f"the {name} at q = {q} and {other} cannot be computed: {REASONS[status]}{hint}")
-        return result
-
-    def arrays(self, values: Array) -> dict[str, Array]:
-        """Return (.., m) positions, momenta or velocities by the names of coordinates and of arrays of known sizes.
-
-        States are accepted in the same form, ``{"x": 0.0, "q": [..]}`` of ``coordinates=["x", "q[8]"]``.
-        """
-        return state_by_name(self.interface, values)
-
-    def _vector(self, value: States, name: str) -> Array:
-        return checked_vector(self.interface, value, name)
-
-    def _parameters(self, parameters: Parameters, base: Array | None = None) -> Array:
-        """Return the (k,) parameters; those that are not passed by name are those of ``base``, or defaults."""
-        return checked_parameters(self.interface, parameters, base)
-
-    def parameters_by_name(self, values: Array) -> dict[str, Any]:
-        """Return (k,) parameters by name; those of arrays of run-time sizes as arrays."""
-        interface = self.interface if self.problem is None or self.origin is None else self.origin.interface
-        result: dict[str, Any] = dict(zip(interface.parameters, values.tolist(), strict=self.problem is None))
-        if self.problem is not None:
-            fields, first = np.asarray(values), len(interface.parameters)
-            for field in interface.layout.fields:
-                shape = field.shape(self.problem.sizes)
-                result[field.name] = fields[first : first + math.prod(shape)].reshape(shape)
-                first += math.prod(shape)
-        return result
-
-    def constraint_arrays(self, values: Array) -> Any:
-        """Return numbers of all constraints in the form of :attr:`Run.multipliers`."""
-        if self.problem is None:
-            return values
-        shapes = constraint_shapes(self.interface.layout, self.problem.sizes)
-        ends = np.cumsum([math.prod(shape) for shape in shapes], dtype=int)
-        return tuple(part.reshape(shape) for part, shape in zip(np.split(values, ends), shapes, strict=False))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, TypedDict, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -48,29 +48,11 @@ from scvi_codegen.runtime.run.accuracy import (
 from scvi_codegen.runtime.run.global_error import checked_error, confirmed_run, warn_of_unconfirmed
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.saving import read_checkpoint
-from scvi_codegen.runtime.run.step_plan import StepPlan, planned_steps
+from scvi_codegen.runtime.run.step_plan import StepPlan, checked_plan, planned_steps
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import FUNCTION, MAPPING, checked_count, checks_arguments, of
-
-
-class RunSettings(TypedDict, total=False):
-    """Keyword arguments of :meth:`Stepper.integrate` but for the data of the system."""
-
-    h: float | None
-    steps: int | None
-    t_end: float | None
-    tolerance: float | None
-    save_every: int
-    t: float
-    options: SolverOptions | None
-    progress: Callable[[int], None] | None
-    t_eval: ArrayLike | None
-    observe: Callable[[Run], ArrayLike] | None
-    events: EventLike | Sequence[EventLike] | None
-    error: float | None
-    check_growth: bool | None
 
 
 class Stepper(Integrator):
@@ -158,17 +140,18 @@ class Stepper(Integrator):
             EventError: if an event function has an unknown symbol or is not finite.
             StepFailedError: if a step fails; its ``trajectory`` contains the states before.
         """
-        self._check_not_of_run(tables, threads)
+        if tables is not None or threads is not None:
+            self._check_not_of_run(tables, threads)
         stepper, interface = self if events is None else self.with_events(events), self.interface
         if t_eval is not None and save_every != 1:
             raise StateError(f"give either t_eval or save_every={save_every}, not both")
-        data = None if inputs is None else checked_inputs(self.interface, inputs)
+        data = None if inputs is None else checked_inputs(interface, inputs)
         if data is not None and t_eval is not None:
             raise StateError("t_eval is not supported with inputs: omit t_eval")
         if observe is not None and (data is not None or t_eval is not None):
             raise StateError("observe is not supported with inputs or t_eval: omit observe")
-        if self.interface.rotations:
-            q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
+        if interface.rotations:
+            q, p, velocity = homogeneous_state(interface, q, p, velocity)
         if error is not None:
             alternatives = {"h": h, "steps": steps, "tolerance": tolerance, "observe": observe}
             return confirmed_run(
@@ -180,8 +163,9 @@ class Stepper(Integrator):
                 {"t_end": t_end, "save_every": save_every, "progress": progress, "t_eval": t_eval},
             )
         if data is None:
-            controller, in_tau = interface.time_transformation, bool(interface.energy_parameter)
-            plan, count = planned_steps(h, steps, t_end, tolerance, save_every, t, controller, in_tau=in_tau)
+            begin = 0.0 if h is None or t_end is None else t
+            transformed = interface.time_transformation, bool(interface.energy_parameter)
+            plan, count = planned_steps(h, steps, t_end, tolerance, save_every, begin, *transformed)
             run = stepper._started(q, p, velocity, plan, t, parameters, options, reuse=True)
             if check_growth:
                 check_growth_requested(plan)
@@ -260,9 +244,7 @@ class Stepper(Integrator):
     def _plan(self, h: float | None, t_end: float | None, tolerance: float | None) -> StepPlan:
         """Return the step plan of these arguments of :meth:`start`."""
         interface = self.interface
-        return StepPlan.checked(
-            h, t_end, tolerance, controller=interface.time_transformation, in_tau=bool(interface.energy_parameter)
-        )
+        return checked_plan(h, t_end, tolerance, interface.time_transformation, bool(interface.energy_parameter))
 
     def _output_times(self, t_eval: ArrayLike, run: Run, steps: int | None) -> Array:
         """Return the checked output times of a run that begins."""
@@ -360,8 +342,7 @@ class Stepper(Integrator):
             q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
         if error is not None:
             others = {"h": h, "steps": steps, "tolerance": tolerance}
-            tau = self.interface.energy_parameter or self.interface.time_transformation
-            error = checked_error(error, others, has_tau=bool(tau))
+            error = checked_error(error, others, has_tau=self._has_tau)
         work = ensemble_work(
             self,
             q,

@@ -6,7 +6,7 @@ import difflib
 import math
 import re
 from collections.abc import Collection, Iterator, KeysView, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -110,6 +110,8 @@ def flat_state(interface: Interface, value: Any, name: str) -> Any:
 
     The only array of a system need not be named: numbers of its shape suffice.
     """
+    if not interface.arrays and not isinstance(value, Mapping):
+        return value
     arrays = _coordinates(interface)
     if isinstance(value, Mapping):
         return _joined(arrays, value, name)
@@ -175,22 +177,6 @@ States = ArrayLike | Mapping[str, ArrayLike]
 """Positions, momenta or velocities: numbers in order, or arrays by name."""
 Parameters = Mapping[str, Any] | Sequence[float] | Array | None
 """Parameters, also arrays of known sizes, by name (others have their defaults), or all in order."""
-
-
-class TakesInputs(Protocol):
-    """Part of an interface that concerns inputs."""
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs."""
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-
-    @property
-    def energy_parameter(self) -> str:
-        """Name of the energy parameter of transformed time, or ""."""
 
 
 def checked_vector(interface: Interface, value: States, name: str) -> Array:
@@ -285,20 +271,20 @@ def parameter_columns(interface: Interface, parameters: Mapping[str, Any]) -> It
         yield name, slice(first, first + size), array.reshape(*leading, size) if array.ndim else array
 
 
-def inputs_not_given(interface: TakesInputs, parameters: Any) -> tuple[str, ...]:
+def inputs_not_given(interface: Interface, parameters: Any) -> tuple[str, ...]:
     """Return the names of inputs that the parameters do not set; parameters in order set all."""
     if not interface.inputs or (parameters is not None and not isinstance(parameters, Mapping)):
         return ()
     return tuple(name for name in interface.inputs if f"{name}_0" not in (parameters or {}))
 
 
-def check_inputs_given(interface: TakesInputs, parameters: Any) -> None:
+def check_inputs_given(interface: Interface, parameters: Any) -> None:
     """Raise :class:`StateError` if an input is not set."""
     if missing := inputs_not_given(interface, parameters):
         raise missing_input(missing[0])
 
 
-def check_left_to_inputs(interface: TakesInputs, parameters: Any) -> None:
+def check_left_to_inputs(interface: Interface, parameters: Any) -> None:
     """Raise :class:`StateError` if named parameters belong to inputs given as data."""
     for k in columns_of_inputs(interface):
         if isinstance(parameters, Mapping) and (name := interface.parameters[k]) in parameters:
@@ -322,7 +308,7 @@ def no_input(name: str, inputs: Collection[str]) -> StateError:
     )
 
 
-def columns_of_inputs(interface: TakesInputs) -> list[int]:
+def columns_of_inputs(interface: Interface) -> list[int]:
     """Return the indices of the parameters of inputs: coefficients by power, and the breakpoint they refer to."""
     return [interface.parameters.index(f"{name}_{part}") for name in interface.inputs for part in "0123t"]
 

@@ -41,7 +41,7 @@ from scvi_codegen.runtime.run.global_error import GlobalError
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.observation import Observation
 from scvi_codegen.runtime.run.run_loop import record
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import StepPlan, checked_plan
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.joining import joined
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
@@ -130,7 +130,7 @@ class Ensemble:
         ends = real_array(t_end, "t_end")
         if ends.shape not in ((), (len(self),)):
             raise StateError(f"t_end must be one time or {len(self)} times, not of shape {ends.shape}")
-        plans = [StepPlan.checked(None, float(end), tolerance) for end in np.broadcast_to(ends, len(self))]
+        plans = [checked_plan(None, float(end), tolerance) for end in np.broadcast_to(ends, len(self))]
         signs = {np.sign(plan.t_end - self.t0) for plan in plans} - {0.0}
         if len(signs) > 1:
             raise StateError(f"t_end lies on both sides of t = {self.t0:g}: split the ensemble into two")

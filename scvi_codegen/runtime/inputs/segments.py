@@ -8,17 +8,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
-from scvi_codegen.runtime.core.validation import Array, TakesInputs, check_left_to_inputs, no_input
+from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.core.validation import Array, check_left_to_inputs, no_input
 from scvi_codegen.runtime.run.accuracy import warn_of_large_steps
-from scvi_codegen.runtime.run.descriptions import DescribedRun
-from scvi_codegen.runtime.run.memory import STEPS_PER_CALL
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.dense_output import checked_times
 from scvi_codegen.runtime.trajectory.joining import joined
@@ -56,7 +55,7 @@ class Input:
 
 
 def checked_inputs(
-    interface: TakesInputs, argument: Mapping[str, Any] | None, trajectories: int | None = None
+    interface: Interface, argument: Mapping[str, Any] | None, trajectories: int | None = None
 ) -> dict[str, Input]:
     """Return validated inputs: (t, values), (t, values, kind) or a piecewise polynomial of SciPy for each name.
 
@@ -200,7 +199,7 @@ def record_pieces(
 
 
 def prepared_segments(
-    run: RunWithInputs, inputs: Mapping[str, Input], t_end: float, values: Callable[[float], Array]
+    run: Memory, inputs: Mapping[str, Input], t_end: float, values: Callable[[float], Array]
 ) -> Iterator[int | None]:
     """Prepare the run for each segment between breakpoints, in order.
 
@@ -217,25 +216,10 @@ def prepared_segments(
         yield None
 
 
-def advance_to(run: RunWithInputs, inputs: Mapping[str, Input], t_end: float, values: Callable[[float], Array]) -> None:
+def advance_to(run: Memory, inputs: Mapping[str, Input], t_end: float, values: Callable[[float], Array]) -> None:
     """Advance a run with adaptive steps to a time without saving intermediate states."""
     for _ in prepared_segments(run, inputs, t_end, values):
-        while not run.arrived:
-            run.advance(STEPS_PER_CALL)
-
-
-class RunWithInputs(DescribedRun, Protocol):
-    """Interface required of a run with inputs."""
-
-    @property
-    def arrived(self) -> bool:
-        """Return whether the run has reached its target time."""
-
-    def advance(self, steps: int) -> None:
-        """Take ``steps`` steps, fewer if the target time is reached."""
-
-    def update(self, *, parameters: Array, h: float | None = None, plan: StepPlan | None = None) -> None:
-        """Set parameters and optionally the step size or the target time."""
+        run._run_to_target()
 
 
 class Segment(NamedTuple):

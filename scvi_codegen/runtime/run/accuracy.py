@@ -24,6 +24,7 @@ from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, wa
 from scvi_codegen.runtime.constraints.projection import projected
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 
 if TYPE_CHECKING:
     from scvi_codegen.runtime.core.integrator import Integrator
@@ -53,40 +54,6 @@ Array = NDArray[np.float64]
 _warnings_enabled: ContextVar[bool] = ContextVar("accuracy warnings are wanted", default=True)
 
 
-class StepData(Protocol):
-    """Step data of a trajectory."""
-
-    @property
-    def plan(self) -> StepPlan: ...
-    @property
-    def h(self) -> float: ...
-    @property
-    def step_error(self) -> float: ...
-    @property
-    def worst_step_time(self) -> float: ...
-
-
-class EnergyData(StepData, Protocol):
-    """States of a trajectory, including the first and the last."""
-
-    @property
-    def stepper(self) -> Integrator: ...
-    @property
-    def t(self) -> Array: ...
-    @property
-    def q(self) -> Array: ...
-    @property
-    def p(self) -> Array: ...
-    @property
-    def parameters(self) -> Array: ...
-
-
-class RunWithEnergies(Protocol):
-    """Run whose states are checked."""
-
-    def _end_energies(self, t: Array, q: Array, p: Array) -> tuple[float, float] | None: ...
-
-
 class EnsembleEnergyData(Protocol):
     """States of an ensemble; ``each`` yields times, positions, momenta, status and step count of each trajectory."""
 
@@ -114,7 +81,7 @@ def warnings_wanted() -> bool:
     return _warnings_enabled.get()
 
 
-def warn_of_large_steps(trajectory: StepData, *, before: float = 0.0, remedy: str = ADAPTIVE_REMEDY) -> None:
+def warn_of_large_steps(trajectory: SavedStates, *, before: float = 0.0, remedy: str = ADAPTIVE_REMEDY) -> None:
     """Issue an :class:`AccuracyWarning` for the worst fixed step, unless an error ``before`` already caused one."""
     error = trajectory.step_error
     if not error > TOLERABLE_ERROR:
@@ -128,7 +95,7 @@ def warn_of_large_steps(trajectory: StepData, *, before: float = 0.0, remedy: st
     )
 
 
-def warn_of_energy_error(trajectory: EnergyData, run: RunWithEnergies) -> None:
+def warn_of_energy_error(trajectory: SavedStates, run: Memory) -> None:
     """Issue an :class:`AccuracyWarning` if an adaptive run does not conserve an energy that the system conserves.
 
     Runs over arrays of run-time sizes with fixed steps and no error estimate are checked for gross errors.
@@ -235,19 +202,6 @@ SLOW = 0.9
 """Fraction of the decades to the threshold that the extrapolated growth must reach for the run to be repeated."""
 
 
-class ComparedStates(Protocol):
-    """States of a run for comparison."""
-
-    @property
-    def t(self) -> Array: ...
-    @property
-    def q(self) -> Array: ...
-    @property
-    def p(self) -> Array: ...
-    @property
-    def parameters(self) -> Array: ...
-
-
 def check_growth_requested(plan: StepPlan) -> None:
     """Raise ``StateError`` unless steps are adaptive."""
     if not plan.adaptive:
@@ -259,7 +213,7 @@ def check_growth_requested(plan: StepPlan) -> None:
 
 def warn_of_error_growth(
     run: Memory,
-    states: ComparedStates,
+    states: SavedStates,
     requested: bool | None,
     advance_until: Callable[[float], None] | None = None,
 ) -> None:
@@ -275,10 +229,8 @@ def warn_of_error_growth(
     plan = run.plan
     if plan.h or plan.tau or requested is False or len(states.t) < 2 or not warnings_wanted():
         return
-    nudge, tolerable, decades = _thresholds(plan.tolerance)
-    if requested or run.steps * DECADES_PER_STEP >= decades:
-        repetition = _Repetition(run, states, advance_until, nudge, tolerable, decades)
-        repetition.warn(requested=bool(requested))
+    if requested or run.steps * DECADES_PER_STEP >= _thresholds(plan.tolerance)[2]:
+        _Repetition(run, states, advance_until).warn(requested=bool(requested))
 
 
 @lru_cache(maxsize=64)
@@ -291,18 +243,10 @@ def _thresholds(tolerance: float) -> tuple[float, float, float]:
 class _Repetition:
     """Repetition of a run from a perturbed initial state; arguments as of :func:`warn_of_error_growth`."""
 
-    def __init__(
-        self,
-        run: Memory,
-        states: ComparedStates,
-        advance_until: Callable[[float], None] | None,
-        nudge: float,
-        tolerable: float,
-        decades: float,
-    ) -> None:
+    def __init__(self, run: Memory, states: SavedStates, advance_until: Callable[[float], None] | None) -> None:
         self.run, self.states, self.advance_until = run, states, advance_until or self._to
-        self.nudge, self.tolerable, self.decades = nudge, tolerable, decades
         self.steps, self.tolerance = run.steps, run.plan.tolerance
+        self.nudge, self.tolerable, self.decades = _thresholds(self.tolerance)
 
     def warn(self, *, requested: bool) -> None:
         """Repeat the run; without a request only up to ``MOST_STEPS`` steps, and if errors grow exponentially."""
@@ -362,10 +306,8 @@ class _Repetition:
         run._start(q, p, plan=plan, t=t, parameters=given, options=run.options)
 
     def _to(self, t: float) -> None:
-        run = self.run
-        run.plan = StepPlan(t_end=t, tolerance=run.plan.tolerance)
-        while not run.arrived:
-            run.advance(MOST_STEPS)
+        self.run.plan = StepPlan(t_end=t, tolerance=self.run.plan.tolerance)
+        self.run._run_to_target()
 
     def _relative_difference(self, k: int, small: float = 0.0) -> float:
         """Return the larger of |dq|/|q| and |dp|/|p| at a state, relative to the largest norms up to that state.

@@ -18,7 +18,7 @@ def drive(
     most: float = math.inf,
     growth: float = 2.0,
     seconds: float | None = None,
-    ended: Callable[[], bool] | None = None,
+    ended: Callable[[], bool],
     progress: Callable[[int], None] | None = None,
 ) -> None:
     """Take steps in chunks of bounded duration, so that Python regains control regularly.
@@ -29,11 +29,11 @@ def drive(
         first, most: steps of the first chunk, and largest chunk size.
         growth: largest ratio of successive chunk sizes.
         seconds: target duration of a chunk, by default ``CALL_SECONDS``.
-        ended: function that returns whether the run has ended before its last step; called before each chunk.
+        ended: function that returns whether the run has ended; called before each chunk.
         progress: called with the number of steps after each chunk.
     """
     done, size, began, wanted = 0, first, -math.inf, CALL_SECONDS if seconds is None else seconds
-    while done < steps and not (ended and ended()):
+    while done < steps and not ended():
         now = time.perf_counter()
         if done:
             faster = min(growth, wanted / max(now - began, 1e-6))

@@ -2,50 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
+from scvi_codegen.rendering.source import Interface
 from scvi_codegen.representation import one_line
-from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 
 
-class DescribedRun(Protocol):
-    """Interface required of a run."""
-
-    plan: StepPlan
-
-    @property
-    def t(self) -> float: ...
-    @property
-    def h(self) -> float: ...
-    @property
-    def steps(self) -> int: ...
-
-
-class Titled(Protocol):
-    """Interface required of the description of an integrator."""
-
-    @property
-    def system(self) -> str: ...
-    @property
-    def method(self) -> str: ...
-
-
-class DescribedStates(Protocol):
-    """Interface required of the states of a run."""
-
-    @property
-    def stepper(self) -> Integrator: ...
-    @property
-    def t(self) -> Array: ...
-    @property
-    def steps(self) -> int: ...
-
-
-def describe_run(
-    title: str, solver: str, run: DescribedRun, *, tau: bool = False, unset_inputs: tuple[str, ...] = ()
-) -> str:
+def describe_run(title: str, solver: str, run: Memory, *, tau: bool = False, unset_inputs: tuple[str, ...] = ()) -> str:
     """Return ``<Run of TITLE; t = 3 after 30 steps of 0.1, solver fixed-point>``.
 
     Args:
@@ -62,13 +26,13 @@ def describe_run(
     return one_line(run, title, f"t = {run.t:g} after {steps}{plan}{solved}{waits}")
 
 
-def describe_states(result: DescribedStates, lengths: str) -> str:
+def describe_states(result: SavedStates, lengths: str) -> str:
     """Return ``<Trajectory of TITLE; 31 states from t = 0 to 3, 30 steps of 0.1>``; ``lengths`` follows "steps"."""
     span = f"{len(result.t)} states from t = {result.t[0]:g} to {result.t[-1]:g}"
     return one_line(result, short_title(result.stepper.interface), f"{span}, {result.steps} steps{lengths}")
 
 
-def short_title(interface: Titled) -> str:
+def short_title(interface: Interface) -> str:
     """Return the system and the short name of the method."""
     return f"{interface.system}, {interface.method}"
 

@@ -44,8 +44,8 @@ RANGES = {
 """Smallest and largest values of whole numbers in the memory of a run, which C uses as counts and indices."""
 FUNCTIONS = ("start", "set_parameters", "advance", "advance_to", "step_error")
 """Functions of C that take a run; sources of version 0.1 have no error estimate."""
-NO_OUTPUT = LARGEST_COUNT
-"""Output stride that saves no state."""
+NO_OUTPUT, NO_PLAN = LARGEST_COUNT, StepPlan()
+"""Output stride that saves no state; plan of a run that was not started."""
 
 
 class Memory(OneThread):
@@ -68,13 +68,14 @@ class Memory(OneThread):
         self._arguments = binding.pointer(self._parameters), binding.null
         self._options: SolverOptions | None = None
         self._has_defaults = False  # whether no parameter differs from its default, also in C
+        self._crossed: tuple[int, ...] = ()  # crossings of each event in earlier pieces, counted for terminal events
         self._energies: Any = None  # function of C, and memory for its results
         self._rows: Any = None  # memory for states that every recording uses
         self._discarded = *(binding.numbers(f"double[{stepper.dimension}]"),) * 3, binding.numbers("int *")
         self._report, self._workspace = binding.new("report *"), binding.workspace()
         self._functions = {name: binding.function(name, memory) for name in FUNCTIONS if binding.has(name)}
         self._step_error = self._functions.get("step_error")
-        self._plan = StepPlan()
+        self._plan, self.longest = NO_PLAN, 0.0
         firsts = {name: parameter_index(stepper.interface, f"{name}_0") for name in stepper.interface.inputs}
         self._inputs = {name: slice(first, first + 5) for name, first in firsts.items()}
 
@@ -118,17 +119,15 @@ class Memory(OneThread):
             self._pass_parameters()
             self._unset_inputs = inputs_not_given(interface, parameters)
             self._has_defaults = parameters is None and not interface.energy_parameter
-        self._set(options, plan)
-
-    def _set(self, options: SolverOptions | None, plan: StepPlan) -> None:
-        """Set options and step plan of a run that begins."""
         if plan is not self._plan:
             self.plan = plan
         if options is not self._options:
-            checked_options(options)
-            self._arguments, self._options = (self._arguments[0], self.stepper.binding.options(options)), options
-        self.longest = 0.0
-        self._crossed: tuple[int, ...] = ()  # crossings of each event in earlier pieces, counted for terminal events
+            self._set_options(options)
+        self.longest, self._crossed = 0.0, ()
+
+    def _set_options(self, options: SolverOptions | None) -> None:
+        self._arguments = self._arguments[0], self.stepper.binding.options(checked_options(options))
+        self._options = options
 
     @classmethod
     def restored(
@@ -158,7 +157,8 @@ class Memory(OneThread):
             raise StateError("a saved run in transformed time requires its energy: give parameters=run.parameters")
         run._parameters[:] = stepper._parameters(parameters)
         run._pass_parameters()
-        run._set(options, plan)
+        run.plan = plan
+        run._set_options(options)
         run._unset_inputs = inputs_not_given(stepper.interface, parameters)
         return run
 
@@ -349,8 +349,7 @@ class Memory(OneThread):
 
     def _run_to_target(self) -> None:
         """Advance to the target time without saving intermediate states."""
-        while not self.arrived:
-            self.advance(STEPS_PER_CALL)
+        self.advance(LARGEST_COUNT)
 
     def _advance(self, steps: int, save_every: int, output_arrays: tuple[Any, ...]) -> int:
         """Take steps in one C call; every ``save_every``-th state goes to ``output_arrays``. Return the status."""
@@ -370,14 +369,10 @@ class Memory(OneThread):
     def iterations(self, count: int) -> None:
         self._memory.iterations = count
 
-    def has_arrived(self) -> bool:
-        """Return whether the run has reached its target time."""
-        return not self._plan.h and self.left_to(self._plan.t_end) == 0.0
-
     @property
     def arrived(self) -> bool:
         """Return whether the run has reached its target time."""
-        return self.has_arrived()
+        return not self._plan.h and self.left_to(self._plan.t_end) == 0.0
 
     @property
     def rejected_steps(self) -> int:

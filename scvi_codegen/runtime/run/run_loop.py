@@ -60,7 +60,7 @@ def record(
             recorder.advance,
             math.inf if count is None else count,
             first=1 if stop else recorder.first_size,
-            ended=memory.has_arrived if stop is None else lambda: memory.has_arrived() or stop(),
+            ended=lambda: memory.arrived or bool(stop and stop()),
             progress=progress,
         )
     except StepFailedError as failure:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import Any
+from functools import lru_cache, wraps
+from typing import Any, TypeVar, cast
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.runtime.run.times import steps_to
 from scvi_codegen.validation import check_tolerance, checked_count
+
+Evaluated = TypeVar("Evaluated", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,42 +47,35 @@ class StepPlan:
         """Construct with a fixed step size; raise ``StateError`` unless it is finite and not 0."""
         return cls(h=checked_step(h))
 
-    @classmethod
-    def checked(
-        cls,
-        h: float | None = None,
-        t_end: float | None = None,
-        tolerance: float | None = None,
-        *,
-        controller: str = "",
-        in_tau: bool = False,
-    ) -> StepPlan:
-        """Construct from arguments of users; equal ones are checked once.
 
-        Args:
-            h, t_end, tolerance: step size; target time; relative error of an adaptive step.
-            controller: time transformation of the reversible controller, "" without one.
-            in_tau: whether the system is one in transformed time, which has fixed steps only.
+def evaluated_once(function: Evaluated) -> Evaluated:
+    """Decorate a function of numbers: equal arguments of equal types are evaluated once."""
+    known = lru_cache(maxsize=256, typed=True)(function)
 
-        Raises:
-            StateError: if a number is invalid, or they do not determine the steps.
-        """
-        plan: StepPlan = _from_cache(_checked, t_end, h, t_end, tolerance, controller, in_tau)
-        return plan
-
-
-def _from_cache(function: Any, t_end: Any, *arguments: Any) -> Any:
-    """Return the value of a function with a cache; without the cache for arrays, and 0, which equals -0."""
-    try:
-        if t_end != 0.0:
+    @wraps(function)
+    def evaluated(*arguments: Any) -> Any:
+        try:
+            return known(*arguments)
+        except TypeError:  # of an argument that is not hashable, as an array
             return function(*arguments)
-    except (TypeError, ValueError):
-        pass
-    return function.__wrapped__(*arguments)
+
+    return cast(Evaluated, evaluated)
 
 
-@lru_cache(maxsize=256, typed=True)
-def _checked(h: float | None, t_end: float | None, tolerance: float | None, controller: str, in_tau: bool) -> StepPlan:
+@evaluated_once
+def checked_plan(
+    h: float | None, t_end: float | None, tolerance: float | None, controller: str = "", in_tau: bool = False, /
+) -> StepPlan:
+    """Return the step plan of arguments of users.
+
+    Args:
+        h, t_end, tolerance: step size; target time; relative error of an adaptive step.
+        controller: time transformation of the reversible controller, "" without one.
+        in_tau: whether the system is one in transformed time, which has fixed steps only.
+
+    Raises:
+        StateError: if a number is invalid, or they do not determine the steps.
+    """
     if controller:
         if h is None or t_end is None or tolerance is not None:
             raise StateError(
@@ -106,6 +102,7 @@ def _checked(h: float | None, t_end: float | None, tolerance: float | None, cont
     return StepPlan(t_end=checked_number(t_end, "t_end"), tolerance=allowed)
 
 
+@evaluated_once
 def planned_steps(
     h: float | None,
     steps: int | None,
@@ -114,38 +111,20 @@ def planned_steps(
     save_every: int,
     t: float,
     controller: str,
-    *,
     in_tau: bool,
+    /,
 ) -> tuple[StepPlan, int | None]:
-    """Return the plan of :meth:`Stepper.integrate` and its number of steps, ``None`` to t_end; equal ones once.
+    """Return the plan of :meth:`Stepper.integrate` and its number of steps, ``None`` to t_end.
 
     Args:
-        h, steps, t_end, tolerance, save_every, t: arguments of :meth:`Stepper.integrate`.
-        controller, in_tau: as of :meth:`StepPlan.checked`.
+        h, steps, t_end, tolerance, save_every, t: arguments of :meth:`Stepper.integrate`; t matters with h and t_end.
+        controller, in_tau: as of :func:`checked_plan`.
 
     Raises:
         StateError: if a number is invalid, or they do not determine the steps.
     """
-    start = 0.0 if h is None or t_end is None else t
-    planned: tuple[StepPlan, int | None] = _from_cache(
-        _planned, t_end, h, steps, t_end, tolerance, save_every, start, controller, in_tau
-    )
-    return planned
-
-
-@lru_cache(maxsize=256, typed=True)
-def _planned(
-    h: float | None,
-    steps: int | None,
-    t_end: float | None,
-    tolerance: float | None,
-    save_every: int,
-    t: float,
-    controller: str,
-    in_tau: bool,
-) -> tuple[StepPlan, int | None]:
     fixed = h is not None and not controller
-    plan = StepPlan.checked(h, None if fixed else t_end, tolerance, controller=controller, in_tau=in_tau)
+    plan = checked_plan(h, None if fixed else t_end, tolerance, controller, in_tau)
     if not fixed:
         if steps is not None:
             raise StateError(f"adaptive steps end at t_end={plan.t_end:g}: omit steps={steps}, or give h and steps")

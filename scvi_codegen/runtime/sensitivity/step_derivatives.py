@@ -7,7 +7,6 @@ are composed of these. In transformed time the energy is one of the parameters, 
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +16,7 @@ from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.native.arguments import checked_number, checked_step, real_array
 from scvi_codegen.native.options import REASONS, SolverOptions, step_failure
 from scvi_codegen.representation import summary
-from scvi_codegen.runtime.core.compiled_method import CompiledMethod
+from scvi_codegen.runtime.core.state_functions import StateFunctions
 from scvi_codegen.runtime.core.validation import Array, Parameters, check_inputs_given, checked_vector
 
 
@@ -90,7 +89,7 @@ class Starts:
         return Starts(self.t[steps], self.h[steps], self.q[states], self.p[states], self.chained)
 
 
-class LinearisedMethod(CompiledMethod):
+class LinearisedMethod(StateFunctions):
     """Compiled method with the derivatives of its steps, in a separate library that is compiled on first use."""
 
     @property
@@ -108,14 +107,6 @@ class LinearisedMethod(CompiledMethod):
     def _energy_index(self) -> int:
         """Index of the energy parameter of transformed time among the variables."""
         return 2 * self.dimension + self.parameters.index(self.interface.energy_parameter)
-
-    @abstractmethod
-    def _parameters_at(self, q: Array, p: Array, parameters: Parameters = None) -> Array:
-        """Return (k,) values in order; in transformed time the energy defaults to that of the state (q, p)."""
-
-    @abstractmethod
-    def _has_energy(self, parameters: Parameters) -> bool:
-        """Return whether the parameters contain the energy required by transformed time, or none is required."""
 
     def _check_fixed_steps(self, what: str) -> None:
         """Raise :class:`MethodError` for steppers whose step size is not the fixed h."""

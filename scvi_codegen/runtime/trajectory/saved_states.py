@@ -59,6 +59,9 @@ class SavedStates:
     plan: StepPlan = field(repr=False)
     options: SolverOptions | None = field(default=None, repr=False)
     tau: Array | None = None
+    steps: int = 0
+    step_error: float = math.nan
+    worst_step_time: float = math.nan
 
     @property
     def stepped(self) -> Array:

@@ -79,10 +79,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
 
     iterations: NDArray[np.int32]
     events: tuple[Crossings, ...] = ()
-    steps: int = 0
     rejected_steps: int = 0
-    step_error: float = np.nan
-    worst_step_time: float = np.nan
     confirmation: GlobalError | None = field(default=None, repr=False)
     observed: Array | None = field(default=None, repr=False)
     conserved: Array | None = field(default=None, repr=False)
