@@ -84,3 +84,11 @@ def test_pendulums_in_spherical_angles():
     known = stepper.with_sizes(N=4).integrate(q, velocity=q, h=0.05, steps=10)
     assert np.abs(run.q - known.q).max() < 1e-14
     assert run.momentum_maps() == pytest.approx(known.momentum_maps()[:, :1], abs=1e-13)
+
+
+def test_many_coupled_velocities_are_solved_by_newton():
+    """Full mass matrices at all points, on the stack, are left to the banded ones of Newton's method."""
+    text = "sum(i in N, q_dot[i]**2/2 - q[i]**2/2) + sum(i in 0..N-2, q_dot[i]*q_dot[i+1]/9)"
+    chain = sc.LagrangianSystem.from_text("chain", ["q[N]"], text)
+    solvers = [sc.generate_source(sc.unroll_sums(chain, {"N": n}), "svi:3")[1].solver for n in (20, 200)]
+    assert solvers == ["fixed-point", "newton"]

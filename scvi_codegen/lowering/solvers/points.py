@@ -182,17 +182,22 @@ MOST_LINEARISED = 8
 """Largest number of coordinates with linearised forces; beyond, their derivatives cost more than they save."""
 
 
+LARGEST_MASS_MATRICES = 2**17
+"""Largest number of entries of the full mass matrices at all points, which are on the stack (1 MiB)."""
+
+
 def coupled_iteration(problem: StepProblem) -> FixedPointIteration | None:
-    """Return the fixed-point iteration of a Lagrangian; ``None`` with too many points."""
+    """Return the fixed-point iteration of a Lagrangian; ``None`` with too many points or coupled velocities."""
     system, tables = problem.lagrangian, velocity_tables(problem.shape)
     return _coupled(system, tables) if system and tables else None
 
 
 def _coupled(system: LagrangianSystem, tables: VelocityTables) -> FixedPointIteration | None:
-    lanes = lane_count(max(len(tables.abscissae), len(tables.blocks)))
-    if lanes > MOST_LANES:
+    lanes, forms = lane_count(max(len(tables.abscissae), len(tables.blocks))), forms_of(system)
+    full = any(i != j for i, j in forms.lower_mass)
+    if lanes > MOST_LANES or (full and lanes * system.dimension**2 > LARGEST_MASS_MATRICES):
         return None
-    forms, of, projected = forms_of(system), (*system.coordinates, *system.velocities), bool(tables.velocity)
+    of, projected = (*system.coordinates, *system.velocities), bool(tables.velocity)
     followed = () if tables.projection else _linearised_forces(system)
     evaluated = "L_q, L_v, their derivatives F_q, F_v and L_vq" if followed else "L_q, L_v"
     force = system_kernel(system, "force_lanes", forms.force, of=of, purpose="L_q at all points.")
