@@ -167,9 +167,13 @@ class CompiledMethod:
 
     def _check_not_of_run(self, tables: object, threads: object) -> None:
         """Raise :class:`StateError` for arguments of arrays of run-time sizes."""
-        if tables is not None or threads is not None:
-            what = "tables are" if tables is not None else "threads per step are"
-            raise StateError(f"{what} for arrays whose sizes are known at run time only: omit them here")
+        if tables is not None:
+            raise StateError("tables are for arrays whose sizes are known at run time only: omit them here")
+        if threads is not None:
+            raise StateError(
+                "threads share the steps of arrays whose sizes are known at run time only: omit threads, compile "
+                "without sizes, or compile roll_sums(system).system, whose runs take its tables and parameters"
+            )
 
     def _bound_to(self, problem: RunSizes) -> Self:
         """Return the stepper bound to these sizes and tables; the last one is kept for later calls."""
