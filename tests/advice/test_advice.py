@@ -78,6 +78,7 @@ def assert_achieved(advice: Advice, error: float, tolerance: float) -> None:
 
 
 class TestAchievedErrors:
+    @pytest.mark.covering
     @pytest.mark.parametrize("tolerance", [1e-6, 1e-9, 1e-11])
     @pytest.mark.parametrize("eccentricity", [0.2, 0.5])
     @pytest.mark.parametrize("method", [SVI(8), SVI(4), Gauss(3), RadauIIA(3), SCVI(4)], ids=name)
@@ -113,6 +114,7 @@ class TestAchievedErrors:
         error = achieved(system, advice, q, p, kepler_end(0.2, span), 1.0)
         assert_achieved(advice, error, tolerance)
 
+    @pytest.mark.covering
     @pytest.mark.parametrize("tolerance", [1e-6, 1e-9, 1e-11])
     @pytest.mark.parametrize("method", [SVI(8), SVI(4), RadauIIA(3)], ids=name)
     def test_advised_step_achieves_the_tolerance_for_the_pendulum(self, method: Method, tolerance: float):

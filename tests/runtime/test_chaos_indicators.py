@@ -250,10 +250,10 @@ OPEN = HamiltonianSystem.from_text(
     ("system", "method", "options"),
     [
         (FORCED, SVI(3), {"count": 1, "parameters": {"u_0": 0.3, "m": np.linspace(0.5, 2.0, 11)}}),
-        (FORCED, Gauss(2), {"h": -0.1, "t": 3.0, "parameters": {"u_0": 0.3}}),
+        pytest.param(FORCED, Gauss(2), {"h": -0.1, "t": 3.0, "parameters": {"u_0": 0.3}}, marks=pytest.mark.full),
         (FORCED, SpectralCollocation(4), {"directions": np.ones((4, 2)), "parameters": {"u_0": 0.3}}),
         (OPEN, SVI(3), {"count": 3, "save_every": 1, "steps": 20}),
-        (OPEN, SVI(2, "gauss-lobatto:3"), {"directions": [1.0, 0.0, 2.0, 0.0]}),
+        pytest.param(OPEN, SVI(2, "gauss-lobatto:3"), {"directions": [1.0, 0.0, 2.0, 0.0]}, marks=pytest.mark.full),
     ],
 )
 def test_lanes_have_the_derivatives_of_the_steps(system, method, options):
