@@ -12,8 +12,6 @@ from scvi_codegen.mechanics import derived_expressions as mechanics
 from scvi_codegen.methods import constraints as constrained_stages
 from scvi_codegen.tables.quadrature import gauss_lobatto
 
-__all__ = ["PARTS"]
-
 FORCES_AND_INPUTS = (
     text(
         "an input from t = 0",

@@ -7,8 +7,6 @@ import subprocess
 from functools import partial
 from pathlib import Path
 
-__all__ = ["ROOT", "copied", "run"]
-
 ROOT = Path(__file__).resolve().parents[2]
 TOO_LONG = 300
 """Seconds of work of one process, after which what does not end counts as noticed, on a busy machine, too."""

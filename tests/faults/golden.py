@@ -13,8 +13,6 @@ sys.path[:0] = [str(ROOT), *(str(ROOT / name) for name in OF_TESTS)]
 
 from golden_cells import CELLS, Program, output, plain, program  # noqa: E402
 
-__all__ = ["changed_program"]
-
 
 def changed_program(header: str, faulty: str) -> str:
     """Return the name of a golden program whose output changes; empty if there is none or it does not compile."""

@@ -3,8 +3,6 @@
 from certified_cases import case
 from faults import text
 
-__all__ = ["ITERATIONS"]
-
 ITERATIONS = (
     text(
         "guesses from one step by the table for two",

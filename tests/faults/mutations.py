@@ -52,8 +52,6 @@ from scvi_codegen.tables import quadrature, tableau
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.spaces import Splines, Trigonometric
 
-__all__ = ["MUTATIONS"]
-
 ROUNDOFF = (
     ("carry lost", "kepler/svi-3", "add_compensated", r"carry\[i\] = rest - .*;", "carry[i] = 0;"),
     ("carry lost", "double/scvi", "add_compensated", r"carry\[i\] = rest - .*;", "carry[i] = 0;"),

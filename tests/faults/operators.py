@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Place", "places"]
-
 
 @dataclass(frozen=True)
 class Place:

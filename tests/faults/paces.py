@@ -9,8 +9,6 @@ from sabotage import changed_result
 from scvi_codegen.lowering import derivatives as lowered_derivatives
 from scvi_codegen.runtime.core.integrator import Integrator
 
-__all__ = ["STEP_SIZE_FAULTS"]
-
 TO_NINE_DIGITS = replace(CONTROLLED, tolerance=1e-9)
 
 STEP_SIZE_FAULTS = (

@@ -23,8 +23,6 @@ from pathlib import Path
 from checkout import ROOT
 from coverage import CoverageData
 
-__all__ = ["COLLECTOR", "Reach"]
-
 FOLDER_VARIABLE = "SCVI_CODEGEN_REACH"
 COLLECTOR = f'''\
 import atexit, os, sys

@@ -24,8 +24,6 @@ from scvi_codegen.methods import Method
 from scvi_codegen.rendering import program_source
 from scvi_codegen.verification import Certificate, verify
 
-__all__ = ["Case", "Make", "Sabotage", "certified", "changed_property", "changed_result", "of_entries"]
-
 Make = Callable[[Any], Any]
 
 _numbers = count(1)

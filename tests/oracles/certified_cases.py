@@ -39,8 +39,6 @@ from scvi_codegen.methods import (
 from scvi_codegen.models.problems import problem
 from scvi_codegen.models.systems import point_vortices
 
-__all__ = ["CASES", "CONTROLLED", "REVERSIBLE", "case"]
-
 STATES: dict[str, tuple[MechanicalSystem, tuple[float, ...], tuple[float, ...], float]] = {
     "pendulum": (problem("planar-pendulum").system, (0.7,), (0.9,), 0.2),
     "driven": (driven_duffing(), (0.6,), (-0.3,), 0.2),

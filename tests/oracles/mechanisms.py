@@ -32,8 +32,6 @@ from sympy.physics.mechanics.models import multi_mass_spring_damper, n_link_pend
 
 from scvi_codegen import LagrangianSystem
 
-__all__ = ["MECHANISMS", "Mechanism", "bicycle", "links_on_a_cart", "masses_in_a_row"]
-
 T = dynamicsymbols._t
 G = 9.81
 EASY = 5

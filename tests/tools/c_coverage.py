@@ -17,8 +17,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-__all__ = ["collect", "table"]
-
 Reached = dict[tuple[str, int, int], int]
 """Counts by (file, line, branch); branch is -1 for the line itself."""
 

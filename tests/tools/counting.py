@@ -5,8 +5,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-__all__ = ["TooMuchWorkError", "at_most"]
-
 
 class TooMuchWorkError(BaseException):
     """Base exception, so that code under test does not catch it."""

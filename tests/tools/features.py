@@ -10,8 +10,6 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 
-__all__ = ["FEATURES", "KINDS", "Kind"]
-
 ENDS = {
     "named coordinates": ("x", "y", "z"),
     "known sizes": ("x", "q[2]"),

@@ -6,8 +6,6 @@ from ctypes import CFUNCTYPE, byref, c_bool, c_char_p, c_double, c_int, c_size_t
 from pathlib import Path
 from xml.etree import ElementTree
 
-__all__ = ["DISCARD", "ERROR", "OK", "Fmu", "Slave"]
-
 OK, _, DISCARD, ERROR, _ = range(5)
 LOG = CFUNCTYPE(None, c_void_p, c_int, c_char_p, c_char_p)
 

@@ -27,8 +27,6 @@ from scvi_codegen.native.compilers import find_compiler
 from scvi_codegen.pipeline import ArraySources, Sources, generate_source
 from scvi_codegen.rendering.source import Source
 
-__all__ = ["CELLS", "FLAGS", "RECORDED", "TIMED", "Program", "build", "output", "program", "recorded"]
-
 RECORDED = Path(__file__).parents[1] / "golden" / "sources.json.xz"
 FLAGS = ("-std=gnu99", *samples.UNOPTIMISED, "-ffp-contract=off", "-w", "-DSCVI_THREADS", "-pthread")
 """Neither contraction nor other freedoms: the bits do not depend on the level of optimisation."""

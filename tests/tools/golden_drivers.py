@@ -4,8 +4,6 @@ the shortest time in nanoseconds instead."""
 
 from collections.abc import Sequence
 
-__all__ = ["arrays_driver", "ensemble_driver", "run_driver", "tangent_driver"]
-
 HEAD = """#include <math.h>
 #include <stdint.h>
 #include <stdio.h>

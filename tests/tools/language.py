@@ -14,20 +14,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-__all__ = [
-    "FRAGMENT",
-    "RETIRED_NAMES",
-    "RETIRED_NAMES_OF_TESTS",
-    "RETIRED_PHRASES",
-    "Text",
-    "docstrings",
-    "identifiers",
-    "is_retired_in_tests",
-    "messages",
-    "names_in_tests",
-    "prose",
-]
-
 ROOT = Path(__file__).resolve().parents[2]
 FRAGMENT = re.compile(
     r"(What|Of|Whether|How|Those|The same|One|From|With|As|Which|Where|When|All of|And|But|For|In|On|By|To|So|That|"

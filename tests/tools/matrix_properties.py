@@ -29,8 +29,6 @@ from scvi_codegen.results.recording import load_run, record_run, resume_run
 from scvi_codegen.runtime.run import chunks, memory
 from scvi_codegen.runtime.sensitivity import gradients
 
-__all__ = ["PROPERTIES", "SITUATIONS", "Case"]
-
 STEPS = 24
 
 SITUATIONS: dict[str, SimpleNamespace] = {

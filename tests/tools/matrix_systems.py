@@ -18,8 +18,6 @@ from scipy.interpolate import CubicSpline
 
 import scvi_codegen as sc
 
-__all__ = ["PROBLEMS", "STOP", "Problem", "Truth"]
-
 STOP = "stop"
 """The parameter after which a force is the root of a negative number; by default far away."""
 

@@ -17,8 +17,6 @@ from math import isclose
 from pathlib import Path
 from typing import Any, NamedTuple
 
-__all__ = ["BLOCK", "PROGRAM", "ROOT", "Part", "agree", "commands", "run_command", "run_page", "runnable"]
-
 ROOT = Path(__file__).parents[2]
 BLOCK = re.compile(r"^(?:`([\w./-]+)`\n\n)?```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 PROGRAM = "scvi-codegen "

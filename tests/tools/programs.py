@@ -13,8 +13,6 @@ from typing import Any
 
 import pytest
 
-__all__ = ["REQUIRED", "UndeclaredProgramError", "audit", "forget", "needs"]
-
 REQUIRED = frozenset(Path(__file__).with_name("required_programs.txt").read_text(encoding="utf-8").split())
 """Names of the programs that the test command of the README may call on any machine, in addition to Python."""
 

@@ -21,8 +21,6 @@ from scvi_codegen.methods import ARGUMENTS
 from scvi_codegen.models.model_files import model_file
 from scvi_codegen.runtime import distributed
 
-__all__ = ["RECORDED", "public"]
-
 RECORDED = Path(__file__).parents[1] / "corpus" / "public.txt"
 PACKAGE = "scvi_codegen."
 METHOD = scvi_codegen.SVI(2, "gauss-lobatto:3")

@@ -15,8 +15,6 @@ import pytest
 
 from scvi_codegen.methods.method import Method
 
-__all__ = ["DEFAULT", "cover", "family", "first_of_each", "long_ones_first", "mark_the_rest_full"]
-
 DEFAULT = "not full"
 """The expression of the default tier, as in pyproject.toml."""
 
