@@ -23,6 +23,7 @@ from scvi_codegen.runtime.core.validation import Array, checked_vector
 from scvi_codegen.runtime.estimation.measurements import Measurements, distinct, state_names
 from scvi_codegen.runtime.estimation.multiple_shooting import LOOSE, TIGHT, Chain, Limits, chained, joined
 from scvi_codegen.runtime.inputs.segments import checked_inputs
+from scvi_codegen.runtime.rotations.states import homogeneous_state
 from scvi_codegen.validation import MAPPING, NAMES, SWITCH, checked_count, checks_arguments
 
 SAME = 1e-10
@@ -136,7 +137,8 @@ def fit(
         fit_initial_state: whether to estimate the initial state as well.
         start: time of the initial state, by default that of the first measurement.
         observed: names of the columns of ``measured``, coordinates and momenta (``"p_x"``, or the names of the
-            Hamiltonian); by default the coordinates in order.
+            Hamiltonian), ``"R_11"``, ``"p_R_1"``, ``"n_1"``, ``"s_1"`` of rotations (body momentum), directions and
+            spins; by default the coordinates in order.
         deviations: number or (c,), standard deviations of the noise; by default equal and estimated from the residuals.
         inputs: as of :meth:`Stepper.integrate`.
         bounds: (lower, upper) by names of unknowns; infinite for no bound.
@@ -155,6 +157,7 @@ def fit(
         StepFailedError: if a step of the initial guess fails.
     """
     stepper = stepper.bind(q, parameters)[0].known
+    q, p, velocity = homogeneous_state(stepper.interface, q, p, velocity)
     measurements = Measurements.checked(
         stepper, t, measured, observed, deviations, start, h, checked_inputs(stepper.interface, inputs)
     )

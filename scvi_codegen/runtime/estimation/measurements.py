@@ -18,6 +18,7 @@ from scvi_codegen.native.arguments import checked_number, checked_step, real_arr
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.inputs.segments import Input, parameters_of
+from scvi_codegen.runtime.rotations.quantities import observable_derivatives, observable_names, observables
 from scvi_codegen.runtime.run.times import steps_within
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
 from scvi_codegen.runtime.trajectory.dense_output import checked_times
@@ -29,7 +30,7 @@ class Measurements:
 
     Attributes:
         measured, used: (n, c) values, and mask of the values that exist.
-        columns: (c,) indices of the measured quantities in (q, p).
+        columns: (c,) indices of the measured quantities in (q, p) and the entries of rotations, directions and spins.
         pieces: times and sizes of the steps, grouped by pieces of the inputs.
         step_numbers: (n,) number of steps up to each measurement.
     """
@@ -119,8 +120,8 @@ class Measurements:
             state, (k, variables) final variations.
         """
         m, done = self.stepper.dimension, 0
-        values = np.tile(state[self.columns], (len(self.t), 1))  # at the start, also where no step follows
-        derivatives = np.tile(tangents[:, self.columns].T, (len(self.t), 1, 1))
+        values, derivatives = self._observed(state[np.newaxis], tangents[np.newaxis])  # where no step follows
+        values, derivatives = np.tile(values, (len(self.t), 1)), np.tile(derivatives, (len(self.t), 1, 1))
         for t, h in self.pieces:
             at = parameters_of(self.stepper, parameters, self.inputs)(float(t[0]) + 0.5 * float(h[0]))
             starts = Starts.chain(state[:m], state[m:], t, h)
@@ -130,10 +131,20 @@ class Measurements:
             states = np.concatenate([starts.q, starts.p], axis=1)
             here = np.flatnonzero((self.step_numbers >= done) & (self.step_numbers <= done + len(h)))
             rows = self.step_numbers[here] - done
-            values[here] = states[rows][:, self.columns]
-            derivatives[here] = vectors[rows][:, :, self.columns].transpose(0, 2, 1)
+            values[here], derivatives[here] = self._observed(states[rows], vectors[rows])
             state, tangents, done = states[-1], vectors[-1], done + len(h)
         return values, derivatives, state, tangents
+
+    def _observed(self, states: Array, vectors: Array) -> tuple[Array, Array]:
+        """Return the (n, c) measured quantities of states (n, 2m), and their (n, c, k) derivatives by vectors."""
+        interface, size = self.stepper.interface, states.shape[1]
+        if interface.rotations:
+            states, by_states = (
+                np.concatenate([states, observables(interface, states)], axis=1),
+                observable_derivatives(interface, states),
+            )
+            vectors = np.concatenate([vectors[..., :size], vectors[..., :size] @ by_states.swapaxes(1, 2)], axis=2)
+        return states[:, self.columns], vectors[:, :, self.columns].transpose(0, 2, 1)
 
 
 def _steps(
@@ -168,7 +179,9 @@ def distinct(names: Sequence[str], what: str) -> tuple[str, ...]:
 
 
 def _column(stepper: Stepper, name: str) -> int:
-    names = state_names(stepper)
+    names = (*state_names(stepper), *observable_names(stepper.interface))
     if name not in names:
-        raise StateError(f"'{name}' cannot be observed, only coordinates and momenta{closest(name, names)}")
+        known = "coordinates, momenta, R_11, p_R_1, n_1 and the like" if stepper.interface.rotations else ""
+        known = known or "coordinates and momenta"
+        raise StateError(f"'{name}' cannot be observed, only {known}{closest(name, names)}")
     return names.index(name)

@@ -19,6 +19,7 @@ from scvi_codegen.errors import FitError, StepFailedError
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.estimation.measurements import Measurements
 from scvi_codegen.runtime.inputs.segments import parameters_at
+from scvi_codegen.runtime.rotations.reduction import Reduction
 
 LOOSE, TIGHT = 0.1, 1e-9
 """Jumps, relative to the size of states, that weigh as much as a measurement residual: initially, and finally."""
@@ -36,6 +37,8 @@ SMALL = 1e-6
 """Residuals, relative to the measurements, below which the fit counts as exact."""
 BOUNDED, RELEASED = 8, 1e-9
 """Limits of the active-set iteration: base number of updates, and gradient (relative) that releases a bound."""
+GAUGE = 1e3
+"""Weight of the equations that fix the lengths of quaternions, relative to that of a measurement."""
 PARABOLA_NEIGHBOURS = 3
 """Number of measurements on each side of a node for a parabola fit."""
 
@@ -123,6 +126,9 @@ class Chain:
             for part, (computed, by, *_) in zip(self.parts, by_part, strict=True):
                 rows.append(((computed - part.measured) / part.deviations)[part.used])
                 jacobian.append((by / part.deviations[:, np.newaxis])[part.used])
+            gauge, by_gauge = self._gauge(x)
+            rows.append(gauge)
+            jacobian.append(by_gauge)
             weights = self.unit / (self.jump * self.sizes)
             for j, (*_, by) in enumerate(by_part[:-1]):
                 by[:, self._node(j + 1)] -= np.eye(self.state)
@@ -130,6 +136,19 @@ class Chain:
                 jacobian.append(by * weights[:, np.newaxis])
             self.at, self.evaluation = x.copy(), (np.concatenate(rows), np.concatenate(jacobian))
         return self.evaluation
+
+    def _gauge(self, x: Array) -> tuple[Array, Array]:
+        """Return residuals, with derivatives, that fix the gauge of rotations in the initial state if it is unknown."""
+        stepper, size = self.parts[0].stepper, self.state
+        if not stepper.interface.rotations or size - 1 not in self.unknown_indices:
+            return np.zeros(0), np.zeros((0, len(x)))
+        weight = GAUGE / min(float(part.deviations.min()) for part in self.parts)
+        values, rows = Reduction(stepper.interface).gauge(self.values(x)[:size], self.known[:size])
+        by_all = np.zeros((len(values), len(self.known)))
+        by_all[:, :size] = rows
+        jacobian = np.zeros((len(values), len(x)))
+        jacobian[:, : len(self.unknown_indices)] = by_all[:, self.unknown_indices]
+        return weight * values, weight * jacobian
 
     def _node(self, j: int) -> slice:
         """Return the indices of the state of node j among the unknowns."""

@@ -103,7 +103,7 @@ def _of_matrices(matrix: Array, name: str) -> Array:
 
 def unit_vectors(q: Array) -> Array:
     """Return vectors or quaternions of length 1 along a run, whose sign is continuous as that of q is."""
-    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
+    return np.asarray(q / np.sqrt((q * q).sum(axis=-1, keepdims=True)))
 
 
 def matrices(q: Array) -> Array:

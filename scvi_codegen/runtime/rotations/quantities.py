@@ -12,6 +12,7 @@ from scvi_codegen.runtime.rotations.states import Member, members_of
 
 Array = NDArray[np.float64]
 
+COMPLEX_STEP = 1e-30
 SPACE, BODY = (("space_axis",), ("body_axis",))
 
 
@@ -40,9 +41,41 @@ def values_by_name(interface: Interface, q: Array, p: Array, velocity: Array) ->
 
 def spins(q: Array, p: Array) -> Array:
     """Return (.., 3) spins of (.., 2) canonical pairs (:class:`scvi_codegen.formulas.rotations.members.Spin`)."""
-    a, b = np.moveaxis(q + 1j * p, -1, 0)
-    transverse = np.conj(a) * b / 2
-    return np.stack([transverse.real, transverse.imag, (np.abs(a) ** 2 - np.abs(b) ** 2) / 4], axis=-1)
+    (a, b), (c, d) = np.moveaxis(q, -1, 0), np.moveaxis(p, -1, 0)
+    return np.stack([(a * b + c * d) / 2, (a * d - b * c) / 2, (a * a + c * c - b * b - d * d) / 4], axis=-1)
+
+
+def observable_names(interface: Interface) -> tuple[str, ...]:
+    """Return the names of the entries of rotation matrices, body momenta, directions and spins."""
+    return tuple(
+        name for member in members_of(interface.dimension, interface.rotations) for name in _observables(member)
+    )
+
+
+def observables(interface: Interface, states: Array) -> Array:
+    """Return the (.., k) values of :func:`observable_names` at states (.., 2m)."""
+    q, p = states[..., : interface.dimension], states[..., interface.dimension :]
+    parts = []
+    for member in members_of(interface.dimension, interface.rotations):
+        own, momenta = q[..., member.columns], p[..., member.columns]
+        if member.kind == "rotation":
+            parts += [matrices(own).reshape(*own.shape[:-1], 9), body_momentum(own, momenta)]
+        else:
+            parts.append(unit_vectors(own) if member.kind == "direction" else spins(own, momenta))
+    return np.concatenate(parts, axis=-1)
+
+
+def observable_derivatives(interface: Interface, states: Array) -> Array:
+    """Return the (n, k, 2m) derivatives of :func:`observables`, by complex steps."""
+    moved = states[:, np.newaxis] + 1j * COMPLEX_STEP * np.eye(states.shape[1])
+    return np.asarray(observables(interface, moved).imag.swapaxes(1, 2) / COMPLEX_STEP)
+
+
+def _observables(member: Member) -> tuple[str, ...]:
+    """Return the columns of the quantities of a member that are functions of (q, p)."""
+    quantities = _names(member)
+    chosen = quantities[::2] if member.kind == "rotation" else quantities[:1]
+    return tuple(name for each in chosen for name in each.columns)
 
 
 def _names(member: Member) -> tuple[NamedQuantity, ...]:

@@ -96,6 +96,29 @@ class Reduction:
             q[rows], p[rows] = q[rows] * factor, p[rows] / factor
         return state
 
+    def gauge(self, state: Array, like: Array) -> tuple[Array, Array]:
+        """Return values that depend only on the gauge of a state (2m,), 0 for a normalised one, and their derivatives.
+
+        They are (|q|^2 - 1)/2 and q . p of rotations and directions, and the phase of spins relative to ``like``.
+        """
+        m, values, rows = self.dimension, [], []
+
+        def add(value: Array, by_position: Array, by_momentum: Array, columns: slice) -> None:
+            row = np.zeros(2 * m)
+            row[:m][columns], row[m:][columns] = by_position, by_momentum
+            values.append(value)
+            rows.append(row)
+
+        for member, columns, _ in self._parts():
+            q, p = state[:m][columns], state[m:][columns]
+            if member.kind == "spin":
+                other, momentum = like[:m][columns], like[m:][columns]
+                add(other @ p - momentum @ q, -momentum, other, columns)
+            else:
+                add((q @ q - 1) / 2, q, np.zeros_like(q), columns)
+                add(q @ p, p, q, columns)
+        return np.array(values), np.array(rows).reshape(-1, 2 * m)
+
     def normalised(self, q: Array, p: Array) -> tuple[Array, Array]:
         """Return the state with unit quaternions and directions, and q . p = 0."""
         q, p = q.copy(), p.copy()
