@@ -31,7 +31,6 @@ from scvi_codegen.errors import (
     closest,
 )
 from scvi_codegen.files.atomic import write_atomically
-from scvi_codegen.models.model_files.key_hints import EVENTS
 from scvi_codegen.native.announcements import announce_to
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -113,6 +112,8 @@ class Commands(click.Group):
         except click.NoSuchOption as error:
             if error.option_name not in ("--event", "--events"):
                 raise
+            from scvi_codegen.models.model_files.sections import EVENTS  # here, because it imports NumPy
+
             raise click.UsageError(f"there is no option '{error.option_name}': {EVENTS}", error.ctx) from error
         except (StepFailedError, BuildError, RecordingError) as error:
             raise CommandFailure(str(error), FAILURE) from error

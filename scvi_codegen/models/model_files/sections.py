@@ -1,10 +1,10 @@
-"""Sections of model files: merging, validation of keys, methods, and systems with their forces and declarations."""
+"""Sections of model files: merging, validation of keys, methods, systems with their forces, hints for unknown keys."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from scvi_codegen.errors import ModelFileError, ScviCodegenError, closest
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
@@ -13,10 +13,41 @@ from scvi_codegen.mechanics.legendre import lagrangian_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification, sized, specification_of
 from scvi_codegen.models.model import DEFAULT_METHOD
-from scvi_codegen.models.model_files.key_hints import key_hint
 from scvi_codegen.models.problems import Problem, problem
 from scvi_codegen.models.time_span import real
-from scvi_codegen.validation import FORMULA, checked_count
+from scvi_codegen.validation import FORMULA, checked_count, likely_names, synonym_hint
+
+KEYS: Final = {
+    "run": "step span steps tolerance save_every controller",
+    "initial": "q q_dot p t",
+    "method": "method degree quadrature",
+    "system": "lagrangian hamiltonian damping dissipation constraints time_transformation inputs",
+}
+EVENTS: Final = "events are supported in Python only, as stepper.integrate(..., events=[...])"
+LOCATIONS: Final = {
+    **{key: f"'{key}' belongs in [{section}]" for section, keys in KEYS.items() for key in keys.split()},
+    **{section: f"there is a section [{section}]" for section in ("parameters", "forces", "initial", "run")},
+}
+"""Location of each key in a model file."""
+
+
+def key_hint(key: str, names: Iterable[str]) -> str:
+    """Return ``"; did you mean 'step'?"`` or ``"; it belongs in [run], as 'step'."``, or a full stop.
+
+    Args:
+        key: the unknown key.
+        names: known keys of its section.
+    """
+    known = list(names)
+    if key in ("event", "events"):
+        return f"; {EVENTS}."
+    if here := synonym_hint(key, known):
+        return here
+    if (hint := closest(key, known)) != ".":
+        return hint
+    locations = [LOCATIONS[name] for name in ([key] if key in LOCATIONS else likely_names(key)) if name in LOCATIONS]
+    return f"; {locations[0]}." if locations else "."
+
 
 Built = TypeVar("Built")
 Section = Mapping[str, Any]
