@@ -92,7 +92,8 @@ def compile_stepper(
             the C source nor its compile time depends on the number of coordinates, and the solver is ``"fixed-point"``,
             without fallback, or ``"newton"``, Newton-GMRES with Jacobian-vector products of the forces, preconditioned
             by the diagonal of the Jacobian or, on lattices, by its circulant (Fourier) average. Methods are explicit,
-            or have a fixed-point iteration over stage positions (SVI, SC, Runge-Kutta).
+            or have a fixed-point iteration over stage positions (SVI, SC, Runge-Kutta); others, and systems without
+            such loops, are compiled with the sizes of each call, once.
         tables: with ``sizes``, index tables of shape (rows, columns) by name.
 
     Raises:

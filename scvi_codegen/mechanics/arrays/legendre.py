@@ -136,11 +136,11 @@ def _transformed(group: ArrayTerm, moving: dict[str, Array]) -> tuple[ArrayTerm,
     v = [slot for slot, _ in pairs]
     p_accesses = [replace(access, array=moving[access.array.name]) for _, access in pairs]
     p = [symbol(str(access)) for access in p_accesses]
-    entries, slopes = hessian(group.formula, v), gradient(group.formula, v)
+    entries, derivatives = hessian(group.formula, v), gradient(group.formula, v)
     if any(entry.free_symbols & set(v) for entry in entries.values()):
         return None
     at_rest = dict.fromkeys(v, S.Zero)
-    shifted = [each - slopes.get(k, S.Zero).xreplace(at_rest) for k, each in enumerate(p)]
+    shifted = [each - derivatives.get(k, S.Zero).xreplace(at_rest) for k, each in enumerate(p)]
     blocks = coupled_blocks(entries, len(v))
     if any(len(block) == 1 and (block[0], block[0]) not in entries for block in blocks):
         return None
@@ -152,7 +152,7 @@ def _transformed(group: ArrayTerm, moving: dict[str, Array]) -> tuple[ArrayTerm,
     rates = gradient(energy, p)
     return (
         term_of(group.loops, energy, accesses),
-        _gradient(group, p_accesses, [slopes.get(k, S.Zero) for k in range(len(v))], accesses),
+        _gradient(group, p_accesses, [derivatives.get(k, S.Zero) for k in range(len(v))], accesses),
         _gradient(group, [access for _, access in pairs], [rates.get(k, S.Zero) for k in range(len(p))], accesses),
     )
 

@@ -4,7 +4,8 @@
 
 Only the kernels l_f are differentiated, so neither compile time nor code size depends on the number of coordinates,
 which is determined by the arrays that a run starts from; kinetic energy is then a sum of m v**2/2 with constant m that
-may differ between elements. With known sizes they are systems of named coordinates
+may differ between elements, or quadratic in the velocities of each element
+(:mod:`scvi_codegen.mechanics.arrays.legendre`). With known sizes they are systems of named coordinates
 (:mod:`scvi_codegen.mechanics.arrays.rolling`), without restrictions.
 """
 
