@@ -41,7 +41,7 @@ REFERENCE, FINER = SVI(12), 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Setting:
+class CostSetting:
     """Setting of a table.
 
     Attributes:
@@ -68,8 +68,8 @@ class Setting:
         return steps_in(self.span, self.h)
 
 
-SETTINGS: Mapping[int, Setting] = {
-    6: Setting(
+SETTINGS: Mapping[int, CostSetting] = {
+    6: CostSetting(
         number=6,
         problem="planar pendulum",
         system=planar_pendulum(),
@@ -80,7 +80,7 @@ SETTINGS: Mapping[int, Setting] = {
         methods={"SRK": Gauss(2), "SVI": SVI(3), "SC": SpectralCollocation(3)},
         seconds={"SRK": 13.73, "SVI": 4.94, "SC": 1.85},
     ),
-    7: Setting(
+    7: CostSetting(
         number=7,
         problem="Duffing oscillator",
         system=duffing(),
@@ -125,14 +125,14 @@ def costs(number: int) -> Mapping[str, Cost]:
     }
 
 
-def _seconds(stepper: Stepper, setting: Setting) -> float:
+def _seconds(stepper: Stepper, setting: CostSetting) -> float:
     run = stepper.start(setting.q, stepper.momentum(setting.q, setting.velocity), h=setting.h, options=SECTION_3)
     began = time.process_time()
     run.record(setting.steps, save_every=setting.steps)
     return time.process_time() - began
 
 
-def _errors(stepper: Stepper, setting: Setting, end: NDArray[np.float64]) -> dict[str, float]:
+def _errors(stepper: Stepper, setting: CostSetting, end: NDArray[np.float64]) -> dict[str, float]:
     p = stepper.momentum(setting.q, setting.velocity)
     run = stepper.integrate(setting.q, p, h=setting.h, steps=setting.steps, options=SECTION_3)
     energy = run.energy()
@@ -142,7 +142,7 @@ def _errors(stepper: Stepper, setting: Setting, end: NDArray[np.float64]) -> dic
     }
 
 
-def _reference(setting: Setting, finer: int) -> NDArray[np.float64]:
+def _reference(setting: CostSetting, finer: int) -> NDArray[np.float64]:
     """Return the position at the end of the last step."""
     stepper = compile_stepper(setting.system, REFERENCE)
     p, steps = stepper.momentum(setting.q, setting.velocity), setting.steps * finer
@@ -152,7 +152,7 @@ def _reference(setting: Setting, finer: int) -> NDArray[np.float64]:
     return end
 
 
-def _result(setting: Setting, _: Mapping[str, Result]) -> Result:
+def _result(setting: CostSetting, _: Mapping[str, Result]) -> Result:
     result = costs(setting.number)
     names = {scheme: method.name for scheme, method in setting.methods.items()}
     doubt = float(np.abs(_reference(setting, FINER) - _reference(setting, 2 * FINER)).max())
@@ -173,7 +173,7 @@ def _result(setting: Setting, _: Mapping[str, Result]) -> Result:
     )
 
 
-def _table(setting: Setting, result: Mapping[str, Cost]) -> TableBlock:
+def _table(setting: CostSetting, result: Mapping[str, Cost]) -> TableBlock:
     return TableBlock(
         columns=(
             "scheme",
@@ -205,7 +205,7 @@ def _table(setting: Setting, result: Mapping[str, Cost]) -> TableBlock:
     )
 
 
-def _checks(setting: Setting, result: Mapping[str, Cost]) -> Sequence[Comparison]:
+def _checks(setting: CostSetting, result: Mapping[str, Cost]) -> Sequence[Comparison]:
     srk, svi, sc = (result[scheme] for scheme in ("SRK", "SVI", "SC"))
     ratio, printed = svi.seconds / srk.seconds, setting.seconds["SVI"] / setting.seconds["SRK"]
     share = svi.seconds_a_digit / srk.seconds_a_digit

@@ -36,18 +36,18 @@ from scvi_codegen.reproduce.refinement.study import (
 )
 
 
-class Curve(NamedTuple):
+class ErrorCurve(NamedTuple):
     """Errors over N."""
 
     n: Array
     errors: Array
 
 
-def curve(study: Study, setting: Setting, scheme: str, quantity: str) -> Curve:
+def curve(study: Study, setting: Setting, scheme: str, quantity: str) -> ErrorCurve:
     """Return the errors of a scheme in one quantity."""
     counts = [degree + setting.reading.beyond_degree for degree in study.degrees[scheme]]
     errors = [step_errors(setting, scheme, n, study.steps[0])[quantity] for n in counts]
-    return Curve(np.array(counts, dtype=float), np.array(errors))
+    return ErrorCurve(np.array(counts, dtype=float), np.array(errors))
 
 
 def over_n(study: Study, _: Mapping[str, Result], **changes: Any) -> Result:
