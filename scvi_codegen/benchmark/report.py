@@ -40,7 +40,9 @@ class ResultTable:
         """Return the table for the terminal."""
         header = [name.replace("_", " ") for name in self.columns]
         cells = [[_cell(row.get(name), form) for name, form in self.columns.items()] for row in self.rows]
-        return "\n  ".join([f"{self.name}: {self.title}", *lines_of([header, *cells]), *self.remarks])
+        widths = [max(map(len, column)) for column in zip(header, *cells, strict=True)]
+        aligned = ("  ".join(map(str.ljust, row, widths)).rstrip() for row in (header, *cells))
+        return "\n  ".join([f"{self.name}: {self.title}", *aligned, *self.remarks])
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any]) -> ResultTable:
@@ -57,12 +59,6 @@ class ResultTable:
             "rows": rows,
             "remarks": list(self.remarks),
         }
-
-
-def lines_of(cells: list[list[str]]) -> list[str]:
-    """Return cells as lines with aligned columns."""
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells]
 
 
 def finite(entries: dict[str, Any]) -> dict[str, Any]:
@@ -245,8 +241,16 @@ class CaseResult:
         return list(dict.fromkeys(measurement.method for measurement in self.measurements))
 
     def text(self) -> str:
-        """Return a block of the report for the terminal."""
-        return _block(self)
+        """Return the table for the terminal."""
+        failures = [f"{each.method} {each.setting}: {each.failure}" for each in self.measurements if each.failure]
+        good = {row.method: _shown(row) for row in rows(self)}
+        return ResultTable(
+            name=self.name,
+            title=f"T = {self.span:g}, m = {self.dimension} (reference accurate to {self.accuracy:.0e})",
+            columns=COLUMNS,
+            rows=tuple(good.get(method, {"method": method, "setting": "failed"}) for method in self.methods()),
+            remarks=(*failures, *(f"skipped {name}: {why}" for name, why in self.skipped.items())),
+        ).text()
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any]) -> CaseResult:
@@ -342,8 +346,8 @@ def _ratio(reference: Sequence[Point], points: Sequence[Point]) -> float | None:
     return None if theirs is None or ours is None else theirs / ours
 
 
-HEADER = ["", "setting", "time", "error", "compile", "default", "best", "peer", "at error", "options"]
-_FAILED = ["failed", *("-" for _ in HEADER[2:-1]), ""]
+COLUMNS = {"method": "", "setting": "", "time_ms": ".3g", "error": ".1e", "compile_s": ".2f"}
+COLUMNS |= {"default": ".2f", "best": ".2f", "peer": ".2f", "at_error": ".1e", "options": ""}
 LEGEND = """Times are processor times of stepping one trajectory to the end, medians; of an ensemble, the whole over the
 number of trajectories. Errors are those of q at the end, relative, in root mean square over the initial states. The
 setting shown is the fastest that reaches the error named. Ratios are times of others over that of the method, at equal
@@ -359,27 +363,12 @@ def header_lines(description: Mapping[str, Any]) -> str:
     return f"{first}\n{description['compiler']}, {description['flags']}\n{versions}"
 
 
-def _block(result: CaseResult) -> str:
-    title = f"{result.name}, T = {result.span:g}, m = {result.dimension} (reference accurate to {result.accuracy:.0e})"
-    good = {row.method: _cells(row) for row in rows(result)}
-    text = lines_of([HEADER, *(good.get(method, [method, *_FAILED]) for method in result.methods())])
-    failures = [f"{each.method} {each.setting}: {each.failure}" for each in result.measurements if each.failure]
-    notes = [f"skipped {name}: {why}" for name, why in result.skipped.items()]
-    return "\n  ".join([title, *text, *failures, *notes])
-
-
-def _cells(row: ReportRow) -> list[str]:
-    measurement = row.measurement
-    return [
-        row.method,
-        measurement.setting,
-        f"{1e3 * measurement.seconds:.3g} ms",
-        f"{measurement.error:.1e}",
-        f"{measurement.compile_seconds:.2f} s",
-        *("-" if ratio is None else f"{ratio:.2f}" for ratio in (row.default, row.best, row.peer)),
-        f"{row.at_error:.1e}",
-        "" if row.method.startswith(OURS) else measurement.options,
-    ]
+def _shown(row: ReportRow) -> dict[str, Any]:
+    """Return the entries of the table."""
+    shown = row.measurement
+    times = {"time_ms": 1e3 * shown.seconds, "error": shown.error, "compile_s": shown.compile_seconds}
+    options = "" if row.method.startswith(OURS) else shown.options
+    return finite(asdict(row)) | times | {"setting": shown.setting, "options": options}
 
 
 def _row_data(row: ReportRow) -> dict[str, Any]:

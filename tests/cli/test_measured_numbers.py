@@ -128,7 +128,7 @@ def test_rows_of_bench_follow_from_its_measurements():
         reaching = [each for each in of[name] if max(each["error"], 1e-13) <= at_error]
         shown = min(reaching, key=lambda each: each["seconds"])
         assert row["setting"] == shown["setting"]
-        cells = f"{1e3 * shown['seconds']:.3g} ms +{shown['error']:.1e} +{shown['compile_seconds']:.2f} s +- +- "
+        cells = f"{1e3 * shown['seconds']:.3g} +{shown['error']:.1e} +{shown['compile_seconds']:.2f} +- +- "
         assert re.search(rf"\n  {name} .* {cells} +{row['peer']:.2f} +{at_error:.1e}\b", text)
 
 
