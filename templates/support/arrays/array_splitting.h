@@ -29,8 +29,10 @@ static int all_sums_finite(const run_memory *run, const parts_of_work *parts, lo
   begin_sums(&all, run, n);
   while (next_block(&all)) {
     int faults = 0;
-    for (long long i = all.here.first; i < all.here.end; i++)
-      faults |= (0.0 * (run->q[i] + parts->dq[i]) != 0.0) | (0.0 * (run->p[i] + parts->dp[i]) != 0.0);
+    for (long long i = all.here.first; i < all.here.end; i++) {
+      faults |= !is_finite(run->q[i] + parts->dq[i]);
+      faults |= !is_finite(run->p[i] + parts->dp[i]);
+    }
     add_block(&all, faults, 0.0);
   }
   wait_at_barrier(run);

@@ -124,7 +124,7 @@ static int project_position(real t, real *u, const real *parameters, saddle *at)
       g[j] = -g[j];
     solve_saddle(at, NULL, g, update, y);
     size = largest_of(update);
-    if (!(0 * size == 0))
+    if (!is_finite(size))
       return SINGULAR;
     do {
       for (int i = 0; i < M; i++)

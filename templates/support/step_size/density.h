@@ -59,7 +59,7 @@ static int next_density(const run_memory *run, trial *now)
   step_density(u, now->at.t, now->step.parameters, value);
   now->growth = half * value[1];
   now->density = run->density > 0 ? run->density + halves * now->growth : value[0] + now->growth;
-  return now->density > 0 && 0 * now->density == 0 ? OK : NOT_FINITE;
+  return now->density > 0 && is_finite(now->density) ? OK : NOT_FINITE;
 }
 
 /* Computes the increments of the next step. */

@@ -82,8 +82,10 @@ static inline int reaches(const step_data *step, const real *dq, const real *dp)
   begin_blocks(&all, step);
   EACH_BLOCK (all) {
     int faults = 0;
-    for (long long i = all.here.first; i < all.here.end; i++)
-      faults |= (0 * (step->q0[i] + dq[i]) != 0) | (0 * (step->p0[i] + dp[i]) != 0);
+    for (long long i = all.here.first; i < all.here.end; i++) {
+      faults |= !is_finite(step->q0[i] + dq[i]);
+      faults |= !is_finite(step->p0[i] + dp[i]);
+    }
     add_block(&all, (real)faults, 0);
   }
   meet(step);

@@ -57,7 +57,7 @@ static SELDOM int add_part(step_data *part, const solver_options *options, real 
     dq[i] += own_q[i];
     dp[i] += own_p[i];
   }
-  return 0 * part->t == 0 ? OK : NOT_FINITE;
+  return is_finite(part->t) ? OK : NOT_FINITE;
 }
 
 /* Solves two steps of h/2: the increments of both, and those of q by the first. */

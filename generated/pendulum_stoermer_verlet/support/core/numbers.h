@@ -37,12 +37,18 @@ static inline real larger(real a, real b)
   return a > b ? a : b;
 }
 
+/* Returns 1 if x is neither infinite nor NaN; vectorises, and requires IEEE arithmetic (no -ffast-math). */
+static inline int is_finite(real x)
+{
+  return 0 * x == 0;
+}
+
 /* Returns 1 if no x is infinite or NaN. */
 static inline int all_finite(const real *x, int n)
 {
   int faults = 0;
   for (int i = 0; i < n; i++)
-    faults |= 0 * x[i] != 0;
+    faults |= !is_finite(x[i]);
   return !faults;
 }
 

@@ -61,7 +61,7 @@ int NAME(step)(real t, real h, const real *q0, const real *p0, const real *param
   if (status != OK)
     return status;
   report->duration = step_duration(&step, &data, memory, guess, memory + MEMORY);
-  if (0 * report->duration != 0)
+  if (!is_finite(report->duration))
     return NOT_FINITE;
   report->steps = 1;
   for (int i = 0; i < M; i++) {
@@ -134,7 +134,7 @@ int NAME(advance)(run_memory *run, long long steps, long long every, const real 
         workspace + SCRATCH);
     if (status == OK)
       passed = step_duration(&step, &data, run->memory, run->guess, workspace + SCRATCH);
-    if (status == OK && 0 * passed != 0)
+    if (status == OK && !is_finite(passed))
       status = NOT_FINITE;
     if (status == OK) {
       status = observe_error(run, &step, &data, dq, dp, options ? options : &standard, workspace + SCRATCH);
