@@ -53,12 +53,12 @@ from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.spaces import Splines, Trigonometric
 
 ROUNDOFF = (
-    ("carry lost", "kepler/svi-3", "add_compensated", r"carry\[i\] = rest - .*;", "carry[i] = 0;"),
-    ("carry lost", "double/scvi", "add_compensated", r"carry\[i\] = rest - .*;", "carry[i] = 0;"),
-    ("carry lost", "kepler/composition", "add_compensated", r"carry\[i\] = rest - .*;", "carry[i] = 0;"),
+    ("carry lost", "kepler/svi-3", "add_compensated", r"\*low = rest - .*;", "*low = 0;"),
+    ("carry lost", "double/scvi", "add_compensated", r"\*low = rest - .*;", "*low = 0;"),
+    ("carry lost", "kepler/composition", "add_compensated", r"\*low = rest - .*;", "*low = 0;"),
     ("carry lost in lanes", "double/svi", "add_compensated", r"\{rest - \(\(sum", "{0.0 * ((sum"),
-    ("carry of the wrong sign", "driven/svi", "add_compensated", r"\(carry\[i\] \+", "(-carry[i] +"),
-    ("low increments lost", "kepler/svi-3", "add_compensated", r" \+ increment\[M \+ i\]", ""),
+    ("carry of the wrong sign", "driven/svi", "add_compensated", r"\(\*low \+", "(-*low +"),
+    ("low increments lost", "kepler/svi-3", "add_compensated", r" \+ increment_low\)", ")"),
     ("carries exchanged", "cart/svi", "place", r"step->carry_q\[i\]", "step->carry_p[i]"),
     ("carry left out of momenta", "double/svi", "fixed_point", r"carry_p\[i\] (?=.* - value)", "carry_p[i] * 0.0 "),
     (

@@ -12,7 +12,13 @@ from scvi_codegen.runtime.core.integrator import Integrator
 TO_NINE_DIGITS = replace(CONTROLLED, tolerance=1e-9)
 
 STEP_SIZE_FAULTS = (
-    text("a clock that is fast", case("slowed/svi-3"), r"\? sum\[0\] :", "? sum[0] * 1.00000001 :", within="duration"),
+    text(
+        "a clock that is fast",
+        case("slowed/svi-3"),
+        r"\? sum\[0\] :",
+        "? sum[0] * 1.00000001 :",
+        within="step_duration",
+    ),
     text("a time that is met to eight digits", case("slowed/svi-3"), r"\(4 \* REAL_EPSILON\)", "1e-8"),
     function(
         "transformed time at another energy",
