@@ -69,7 +69,8 @@ def _call(
     """Call a method of the stepper that is bound to the arrays of the call."""
     threads = others.pop("threads", None) if name in AT_REST else None
     bound, state = stepper.bind(q, parameters, tables, threads)
-    arguments = () if arguments == (None,) else arguments  # p=None by position
+    if len(arguments) == 1 and arguments[0] is None:  # p=None by position
+        arguments = ()
     if name in AT_REST and not arguments and others.get("p") is None and others.get("velocity") is None:
         layout = stepper.interface.layout
         general = layout.momentum_formulas or (stepper._reason and not layout.momenta)

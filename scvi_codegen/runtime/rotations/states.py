@@ -64,7 +64,7 @@ def members_of(dimension: int, declarations: Sequence[str]) -> tuple[Member, ...
 
 def homogeneous_state(interface: Interface, q: Any, p: Any, velocity: Any) -> tuple[Any, Any, Any]:
     """Return (q, p, velocity) with states by name as (.., m) numbers, and numbers as they are; see :func:`state_of`."""
-    if not isinstance(q, Mapping):
+    if not isinstance(q, Mapping) or not interface.rotations:
         return q, p, velocity
     members = members_of(interface.dimension, interface.rotations)
     return state_of(interface.coordinates, members, q, p, velocity, shapes_of(interface) or ())
