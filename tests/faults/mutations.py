@@ -75,9 +75,9 @@ ROUNDOFF = (
         r"\(step->carry_q\[i\] \+",
         "(0 * step->carry_q[i] +",
     ),
-    ("weights of 53 bits", "round/svi-8", "fixed_point", r"data->kick_low, F", "(const weight[GROUPS]){0}, F"),
-    ("h^2 of 53 bits", "kepler/svi-3", "prepare_iteration", r"data->square_low = .*;", "data->square_low = 0.0;"),
-    ("drifts of 53 bits", "oscillator/svi-8", "fixed_point", r" \+ DRIFT_LOW\[n\] \* drift\[i\]", ""),
+    ("weights of 53 bits", "round/svi-8", "increments_of", r"data->kick_low, F", "(const weight[GROUPS]){0}, F"),
+    ("h^2 of 53 bits", "kepler/svi-3", "prepare_step_size", r"data->square_low = .*;", "data->square_low = 0.0;"),
+    ("drifts of 53 bits", "oscillator/svi-8", "low_words", r" \+ DRIFT_LOW\[g\] \* of\.high", ""),
 )
 
 MUTATIONS = (
