@@ -13,7 +13,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.indices import ArrayMap
@@ -22,8 +21,7 @@ from scvi_codegen.native.building import Library
 from scvi_codegen.native.options import FAILURES, NOT_CONVERGED
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.interface import Numbers, RunSizes
-from scvi_codegen.runtime.arrays.memory import COMPUTED, REAL_FIELDS, RUN_FIELDS, STATE, aligned, constraint_memory
-from scvi_codegen.validation import LARGEST_COUNT
+from scvi_codegen.runtime.arrays.memory import ArrayMemory
 
 FAILURES_BY_SOLVER = {
     "fixed-point": FAILURES
@@ -44,133 +42,6 @@ FAILURES_BY_SOLVER = {
         ),
     },
 }
-
-
-class ArrayMemory:
-    """Memory of a run over n coordinates: the C structs of problem and run, and the arrays to which they point.
-
-    Attributes:
-        run, problem: the C structs; scalar fields of ``run`` are also attributes of the memory.
-        numbers: arrays of ``run`` by name.
-        iterations: solver iterations since the last saved state.
-        adaptive: whether steps are adaptive; ``h`` is then 0.
-        parameters: current scalar parameters and fields, in one vector.
-        ready: whether they are set.
-    """
-
-    binding: ArrayBinding
-    run: Any
-    problem: Any
-    numbers: dict[str, NDArray[Any]]
-    parameters: Numbers
-    iterations: int
-    adaptive: bool
-    ready: bool
-
-    def __init__(self, binding: ArrayBinding) -> None:
-        n, vector = binding.count, dict[str, NDArray[Any]]()
-        run, problem = binding.raw.new("run *"), binding.raw.new("problem *")
-        self.__dict__.update(binding=binding, run=run, problem=problem, iterations=0, adaptive=False)
-        for k, name in enumerate(binding.interface.layout.sizes):
-            problem.size[k] = binding.arrays.sizes[name]
-        for k, table in enumerate(binding.interface.layout.tables):
-            problem.table[k] = binding.raw.pointer(binding.arrays.places[table.name].reshape(-1))
-        state, rest_of = aligned(2 * n), aligned(2 * n)  # Hamiltonian kernels expect p directly after q
-        vector |= {"q": state[:n], "p": state[n:], "carry_q": rest_of[:n], "carry_p": rest_of[n:]}
-        vector |= {"inverse_mass": aligned(n), "work": aligned(n * binding.raw.constant("WORK"))}
-        if binding.interface.layout.constraints:
-            vector |= constraint_memory(binding.raw, run, problem, n)
-        for name, array in vector.items():
-            setattr(run, name, binding.raw.pointer(array))
-        run.threads = binding.arrays.threads
-        self.__dict__.update(numbers=vector, parameters=np.zeros(binding.parameter_count), ready=False)
-
-    def __getattr__(self, name: str) -> Any:
-        if name in STATE:
-            return self.numbers[name]
-        if name == "h" and self.adaptive:
-            return 0.0
-        return getattr(self.run, name)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name in self.__dict__:
-            self.__dict__[name] = value
-        else:
-            setattr(self.run, name, value)
-
-    def set_parameters(self, values: Numbers) -> bool:
-        """Set scalar parameters and fields; return whether there were others.
-
-        Reused forces are then discarded; an extrapolated predictor is kept.
-
-        Raises:
-            StateError: if a coordinate has no positive mass.
-        """
-        binding, problem = self.binding, self.problem
-        changed = self.ready
-        if changed and np.array_equal(values, self.parameters):
-            return False
-        self.parameters[:], self.ready = values, True
-        scalars = len(binding.interface.parameters)
-        problem.parameters[0:scalars] = self.parameters[:scalars].tolist()
-        for k, (first, end) in enumerate(binding.field_rows):
-            problem.field[k] = binding.raw.pointer(self.parameters[first:end])
-        if changed:
-            self.run.guess *= binding.interface.layout.continued
-        inverse = self.numbers["inverse_mass"]
-        if binding.raw.function("inverse_masses")(problem, self.run.inverse_mass):
-            index = int(np.argmin(np.where((inverse > 0) & np.isfinite(inverse), 1.0, -1.0)))
-            what = f"coordinate {index} of {len(inverse)}"
-            raise StateError(f"{what} has no positive mass: add its kinetic energy to L, or check the parameters")
-        return changed
-
-    def start(self, t: float, h: float, q: Numbers, p: Numbers) -> None:
-        """Start at a state; nothing of an earlier run remains."""
-        for name in RUN_FIELDS:
-            setattr(self.run, name, 0)
-        self.run.t, self.run.h, self.iterations, self.adaptive = t, h, 0, h == 0.0
-        self.numbers["q"][:], self.numbers["p"][:] = q, p
-        self.numbers["carry_q"][:] = self.numbers["carry_p"][:] = 0.0
-
-    def state_bytes(self) -> bytes:
-        """Return scalar fields and arrays as bytes."""
-        fields = np.array([float(getattr(self.run, name)) for name in RUN_FIELDS] + [self.iterations, self.adaptive])
-        return b"".join([fields.tobytes(), *(array.tobytes() for _, array in self._stored())])
-
-    def set_state_bytes(self, saved: bytes) -> None:
-        """Restore the state of :meth:`state_bytes`."""
-        fields = np.frombuffer(saved, count=len(RUN_FIELDS) + 2)
-        for name, value in zip((*RUN_FIELDS, "iterations", "adaptive"), fields.tolist(), strict=True):
-            if name not in REAL_FIELDS and not (value.is_integer() and abs(value) <= LARGEST_COUNT):
-                raise StateError(f"invalid saved run: {name} is {value:g}, which is no count")
-            setattr(self, name, value if name in REAL_FIELDS else int(value))
-        first = fields.nbytes
-        for _, array in self._stored():
-            array[:] = np.frombuffer(saved, array.dtype, array.size, first)
-            first += array.nbytes
-
-    def size(self) -> int:
-        """Return the number of bytes of the state."""
-        return 8 * (len(RUN_FIELDS) + 2) + sum(array.nbytes for _, array in self._stored())
-
-    def _stored(self) -> list[tuple[str, NDArray[Any]]]:
-        return [(name, array) for name, array in self.numbers.items() if name not in COMPUTED]
-
-
-class _StateBytes:
-    """Bytes of the state of an :class:`ArrayMemory`, readable and assignable as a whole."""
-
-    def __init__(self, memory: ArrayMemory) -> None:
-        self.memory = memory
-
-    def __len__(self) -> int:
-        return self.memory.size()
-
-    def __bytes__(self) -> bytes:
-        return self.memory.state_bytes()
-
-    def __setitem__(self, _: slice, saved: bytes) -> None:
-        self.memory.set_state_bytes(saved)
 
 
 class ArrayBinding(Binding):
@@ -202,8 +73,8 @@ class ArrayBinding(Binding):
         return SimpleNamespace(steps=0, stored=0, iterations=0, change=0.0, t=0.0, failures=failures)
 
     def buffer(self, struct: Any) -> Any:
-        """Return the state of a run as bytes, writable; arrays as they are."""
-        return _StateBytes(struct) if isinstance(struct, ArrayMemory) else struct
+        """Return the memory of a run, whose bytes are readable and writable, and arrays as they are."""
+        return struct
 
     def has(self, name: str) -> bool:
         """Return whether there is such a function."""
