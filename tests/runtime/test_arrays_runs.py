@@ -303,6 +303,8 @@ def test_advice_solutions_and_recorded_runs_are_those_of_known_sizes(ring, stepp
     named = sc.solve_ivp(steppers[0], (0.0, 1.0), {"q": Q}, velocity={"q": V}, h=0.1)
     _, q, p = steppers[1].integrate(Q, V, h=0.1, steps=10)[-1]
     assert named.y[:, -1] == pytest.approx(np.concatenate([q, p]), abs=1e-13)
+    rest = [steppers[0].start(Q, *none, h=0.1, parameters={"beta": 0.3}) for none in ((), (None,))]
+    assert all((run.p == 0.0).all() for run in rest)
     with pytest.raises(StateError, match="give velocity"):
         sc.solve_ivp(ring, (0.0, 1.0), {"q": Q})
     for k, plan in enumerate(({"h": 0.1}, {"t_end": 1.0, "tolerance": 1e-8})):
