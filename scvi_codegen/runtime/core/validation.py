@@ -225,8 +225,8 @@ def checked_states(
 
 def is_one_state(interface: Interface, q: States) -> bool:
     """Return whether these are the positions of one state, not of several."""
-    plain = not isinstance(q, Mapping) and np.ndim(q) == 1
-    return plain or np.ndim(flat_state(interface, q, "q")) == 1
+    plain = not isinstance(q, Mapping) and real_array(q, "q").ndim == 1
+    return plain or real_array(flat_state(interface, q, "q"), "q").ndim == 1
 
 
 def checked_parameters(interface: Interface, parameters: Parameters, base: Array | None = None) -> Array:
