@@ -27,6 +27,8 @@ _HOMES = {
     "frameworks.flow": ("JaxFlow", "jax_flow"),
     "frameworks.torch": ("TorchFlow", "torch_flow"),
     "frameworks.rebound": ("GravitatingBodies", "from_rebound", "to_rebound"),
+    "fields.mesh": ("MeshSystem",),
+    "fields.system": ("FieldSystem",),
     "files.cache": ("CacheInfo", "cache_info", "clear_cache"),
     "compiler": ("compile_stepper",),
     "pipeline": ("generate_source",),

@@ -32,6 +32,8 @@ from scvi_codegen.errors import SystemDefinitionWarning as SystemDefinitionWarni
 from scvi_codegen.exact.discrete_lagrangian import ExactStep as ExactStep
 from scvi_codegen.exact.discrete_lagrangian import exact_discrete_lagrangian as exact_discrete_lagrangian
 from scvi_codegen.exact.discrete_lagrangian import exact_map as exact_map
+from scvi_codegen.fields.mesh import MeshSystem as MeshSystem
+from scvi_codegen.fields.system import FieldSystem as FieldSystem
 from scvi_codegen.files.cache import CacheInfo as CacheInfo
 from scvi_codegen.files.cache import cache_info as cache_info
 from scvi_codegen.files.cache import clear_cache as clear_cache

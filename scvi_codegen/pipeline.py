@@ -172,6 +172,7 @@ def describe_arrays(system: ArraySystem, method: Method, *, prefix: str, solver:
         depends_on_time=system.depends_on_time,
         constraints=tuple(term.loops for term in system.constraints),
         continued=not (method.fractions or system.constraints),
+        data=system.data,
     )
     return Interface(
         prefix=prefix,

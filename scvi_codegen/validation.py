@@ -177,6 +177,10 @@ SWITCH = of("True or False", bool, np.bool_)
 WHOLE = ArgumentType("a whole number", lambda value: hasattr(value, "__index__") and not isinstance(value, bool))
 REAL = of("a number", numbers.Real)
 PATH = of("a path", str, os.PathLike)
+TABLES = ArgumentType(
+    "a list of declarations, as ['bonds[B, 2]'], or a mapping from them to arrays",
+    lambda value: (_is_sequence(value) or isinstance(value, Mapping)) and all(isinstance(each, str) for each in value),
+)
 MAPPING = ArgumentType(
     "a mapping from names, as {'k': 2.0}",
     lambda value: isinstance(value, Mapping) and all(isinstance(name, str) for name in value),

@@ -21,6 +21,7 @@ from scvi_codegen.validation import (
     MAPPED,
     MAPPING,
     NAMES,
+    TABLES,
     TEXT,
     TEXTS,
     checks_arguments,
@@ -83,7 +84,7 @@ class HamiltonianSystem(MechanicalSystem):
         damping=FORMULA,
         constraints=TEXTS,
         inputs=NAMES,
-        tables=TEXTS,
+        tables=TABLES,
     )
     def from_text(
         cls,
@@ -99,7 +100,7 @@ class HamiltonianSystem(MechanicalSystem):
         damping: str | float | None = None,
         constraints: Sequence[str] = (),
         inputs: Sequence[str] = (),
-        tables: Sequence[str] = (),
+        tables: Sequence[str] | Mapping[str, Any] = (),
     ) -> HamiltonianSystem | Any:
         """Read H from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 

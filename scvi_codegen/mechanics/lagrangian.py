@@ -18,6 +18,7 @@ from scvi_codegen.validation import (
     NUMBERS,
     PATH,
     SWITCH,
+    TABLES,
     TEXT,
     TEXTS,
     ArgumentType,
@@ -95,7 +96,7 @@ class LagrangianSystem(MechanicalSystem):
         damping=FORMULA,
         constraints=TEXTS,
         inputs=NAMES,
-        tables=TEXTS,
+        tables=TABLES,
     )
     def from_text(
         cls,
@@ -113,7 +114,7 @@ class LagrangianSystem(MechanicalSystem):
         damping: str | float | None = None,
         constraints: Sequence[str] = (),
         inputs: Sequence[str] = (),
-        tables: Sequence[str] = (),
+        tables: Sequence[str] | Mapping[str, Any] = (),
     ) -> LagrangianSystem | Any:
         """Read L from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 
@@ -174,7 +175,7 @@ class LagrangianSystem(MechanicalSystem):
         forces=MAPPED,
         constraints=FORMULAS,
         inputs=FORMULAS,
-        tables=TEXTS,
+        tables=TABLES,
     )
     def from_sympy(
         cls,
@@ -194,7 +195,7 @@ class LagrangianSystem(MechanicalSystem):
         damping: Expr | float | None = None,
         constraints: Sequence[Expr] = (),
         inputs: Sequence[Any] = (),
-        tables: Sequence[str] = (),
+        tables: Sequence[str] | Mapping[str, Any] = (),
     ) -> LagrangianSystem | Any:
         """Create the system from a SymPy expression in plain symbols or in functions of time.
 

@@ -118,7 +118,7 @@ def system_from_sympy(
     damping: Any = None,
     constraints: Sequence[Any] = (),
     inputs: Sequence[Any] = (),
-    tables: Sequence[str] = (),
+    tables: Sequence[str] | Mapping[str, Any] = (),
     **turning: Any,
 ) -> Any:
     """Return the system of a SymPy expression, its ``function`` ``"Lagrangian"`` or ``"Hamiltonian"``.

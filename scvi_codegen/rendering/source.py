@@ -10,7 +10,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -184,6 +184,7 @@ class ArrayLayout(ArrayDeclarations):
         continued: whether the predictor extrapolates previous steps instead of reusing the forces at their end.
         momentum_formulas, velocity_formulas: L_v in (q, v) and H_p in (q, p) of a Lagrangian that is integrated by its
             Hamiltonian (:class:`~scvi_codegen.formulas.array_statements.ArrayForce`).
+        data: values of fields and tables by name for runs that pass none.
     """
 
     field_defaults: tuple[float, ...] = ()
@@ -194,6 +195,7 @@ class ArrayLayout(ArrayDeclarations):
     continued: bool = False
     momentum_formulas: tuple[Any, ...] = ()
     velocity_formulas: tuple[Any, ...] = ()
+    data: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -27,7 +27,7 @@ FLOORS = """
     tables files
     formulas display ir
     mechanics rendering
-    methods native pictures
+    fields methods native pictures
     lowering exact runtime
     pipeline
     compiler frameworks results

@@ -31,7 +31,9 @@ def unrolled_fields(
     parameters: Mapping[str, ArrayLike] | None = None,
 ) -> dict[str, Any]:
     """Return the fields of the system of named coordinates; arguments and errors as of :func:`unroll_sums`."""
-    remaining, columns = dict(parameters or {}), {name: _columns(table) for name, table in (tables or {}).items()}
+    in_tables = {table.name: system.data[table.name] for table in system.tables if table.name in system.data}
+    columns = {name: _columns(table) for name, table in {**in_tables, **(tables or {})}.items()}
+    remaining = dict(parameters or {})
     rows = {table.axes[0].name: len(columns[table.name]) for table in system.tables if table.name in columns}
     sizes = {**rows, **sizes}
     for known, named, what in (
@@ -43,7 +45,7 @@ def unrolled_fields(
                 f"the {what}s of '{system.name}' are {', '.join(known) or 'none'}: give exactly these"
             )
     fields = {
-        array.name: _filled(array, remaining.pop(array.name, default), sizes)
+        array.name: _filled(array, remaining.pop(array.name, system.data.get(array.name, default)), sizes)
         for array, default in zip(system.fields, system.field_defaults, strict=True)
     }
     names = {array.name: _names(array, sizes) for array in (*system.state, *system.fields)}

@@ -12,10 +12,11 @@ may differ between elements, or quadratic in the velocities of each element
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any, ClassVar
 
+import numpy as np
 from sympy import Expr, S, Symbol
 
 from scvi_codegen.errors import SizesRequiredError, SystemDefinitionError
@@ -45,7 +46,7 @@ from scvi_codegen.mechanics.definition_checks import warn_of_negative, warn_of_u
 from scvi_codegen.mechanics.forces import check_damping, damping_rate
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.representation import LONGEST, clipped
-from scvi_codegen.validation import FORMULA, MAPPING, NAMES, TEXT, TEXTS, checks_arguments, of
+from scvi_codegen.validation import FORMULA, MAPPING, NAMES, TABLES, TEXT, TEXTS, checks_arguments, of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,6 +70,7 @@ class ArraySystem:
         damping: damping rate of all momenta, see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
         rotations: rotations, directions and spins, which require known sizes.
         definition: the arguments of :meth:`from_text` other than name and parameters, for model files.
+        data: values of fields and tables by name for runs that pass none.
     """
 
     name: str
@@ -87,6 +89,7 @@ class ArraySystem:
     damping: Expr = S.Zero
     rotations: tuple[MemberArray, ...] = ()
     definition: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    data: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
     REQUIRES_SIZES: ClassVar[str] = SIZES_REQUIRED
 
     def __repr__(self) -> str:
@@ -146,7 +149,7 @@ class ArraySystem:
         hamiltonian=TEXT,
         momenta=TEXTS,
         parameters=MAPPING,
-        tables=TEXTS,
+        tables=TABLES,
         forces=MAPPING,
         dissipation=TEXT,
         damping=FORMULA,
@@ -162,7 +165,7 @@ class ArraySystem:
         hamiltonian: str | None = None,
         momenta: Sequence[str] | None = None,
         parameters: Mapping[str, float] | None = None,
-        tables: Sequence[str] = (),
+        tables: Sequence[str] | Mapping[str, Any] = (),
         forces: Mapping[str, str] | None = None,
         dissipation: str | None = None,
         damping: str | float | None = None,
@@ -183,8 +186,9 @@ class ArraySystem:
             hamiltonian: in place of ``lagrangian``, H in coordinates and momenta, of any form.
             momenta: of H, declarations like those of the coordinates; by default ``["p_q[N]"]``.
             parameters: default value by name, or by declaration of an array, as ``{"k": 1, "m[N]": 1}``; the values of
-                an array, one per element, are passed to each run.
-            tables: declarations of index tables with their columns, as ``["bonds[B, 2]"]``, or ``["pins[P]"]``.
+                an array, one per element, are passed to each run, or are default values here, ``{"m[N]": [1, 2, 3]}``.
+            tables: declarations of index tables with their columns, as ``["bonds[B, 2]"]``, or ``["pins[P]"]``; a
+                mapping from them to default values.
             forces: formula by coordinate, ``{"q[i]": "-c*q_dot[i]"}`` for every index, ``{"q[0]": "cos(t)"}`` for one.
             dissipation: Rayleigh's function, a sum of sums over velocities, whose forces -dD/dq_dot are added.
             damping: damping rate of all momenta, a number or a formula of parameters.
@@ -225,7 +229,10 @@ class ArraySystem:
         arrays = tuple(map(parse_coordinate, coordinates))
         conjugate = momenta_of(arrays, momenta, lagrangian, hamiltonian)
         index_tables = tuple(map(table_of, tables))
-        values = with_inputs({key: number(key, value) for key, value in (parameters or {}).items()}, inputs)
+        data = {key: value for key, value in (parameters or {}).items() if "[" in key and np.ndim(value)}
+        numbers = {key: 1.0 if key in data else number(key, value) for key, value in (parameters or {}).items()}
+        data |= tables if isinstance(tables, Mapping) else {}
+        values = with_inputs(numbers, inputs)
         fields = {key: parse_array(key) for key in values if "[" in key}
         scalars = {key: value for key, value in values.items() if key not in fields}
         velocities = () if conjugate else tuple(Array(array.name + DOT, array.axes) for array in arrays)
@@ -268,12 +275,13 @@ class ArraySystem:
             damping=damping_rate(damping, lambda formula: parse_expression(str(formula), known)),
             rotations=turning,
             definition={key: value for key, value in definition.items() if value not in (None, [], {})},
+            data={parse_array(key).name: value for key, value in data.items()},
         )
         system.warn_of_mistakes()
         return system
 
     @classmethod
-    @checks_arguments(SystemDefinitionError, name=TEXT, coordinates=TEXTS, parameters=MAPPING, tables=TEXTS)
+    @checks_arguments(SystemDefinitionError, name=TEXT, coordinates=TEXTS, parameters=MAPPING, tables=TABLES)
     def from_sympy(
         cls,
         *,
@@ -281,7 +289,7 @@ class ArraySystem:
         coordinates: Sequence[str],
         lagrangian: Expr,
         parameters: Mapping[str, float] | None = None,
-        tables: Sequence[str] = (),
+        tables: Sequence[str] | Mapping[str, Any] = (),
     ) -> ArraySystem:
         """Create the system from a SymPy expression of ``Sum`` and ``Indexed``; see also :meth:`from_text`.
 
@@ -401,8 +409,8 @@ class ArraySystem:
         return any(self.time in formula.free_symbols for formula in formulas)
 
     def key(self) -> tuple[str, ...]:
-        """Return the key of this system in caches, made from all of its fields."""
-        return (key_of(self),)
+        """Return the key of this system in caches, made from all of its fields but the data of runs."""
+        return (key_of(replace(self, data={})),)
 
     def __str__(self) -> str:
         arguments = ", ".join(map(str, self.state))

@@ -133,11 +133,14 @@ def interface_of_sizes(interface: Interface, sizes: Mapping[str, int]) -> Interf
     shapes = [(array.name, array.shape(sizes)) for array in (*layout.coordinates, *layout.fields)]
     count = len(layout.coordinates)
     momenta = [(array.name, array.shape(sizes)) for array in layout.momenta]
-    of_fields = zip(shapes[count:], layout.field_defaults, strict=True)
+    of_fields = [
+        np.broadcast_to(layout.data.get(name, default), shape).ravel()
+        for (name, shape), default in zip(shapes[count:], layout.field_defaults, strict=True)
+    ]
     names: dict[str, Any] = {
         "coordinates": EntryNames(shapes[:count]),
         "parameters": EntryNames([*((name, ()) for name in interface.parameters), *shapes[count:]]),
-        "defaults": np.concatenate([interface.defaults, *(np.full(shape, x).ravel() for (_, shape), x in of_fields)]),
+        "defaults": np.concatenate([interface.defaults, *of_fields]),
         "momentum_names": EntryNames(momenta) if momenta else (),
         "constraints": tuple(
             f"constraint {number}" + (str(list(map(int, index))) if shape else "")

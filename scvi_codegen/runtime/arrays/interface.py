@@ -56,7 +56,8 @@ def read_arrays(
     index_tables, state = read_tables(interface, tables), read_state(interface, q, "positions")
     shapes = [(array, state[array.name].shape) for array in interface.layout.coordinates]
     shapes += [(table, index_tables[table.name].shape) for table in interface.layout.tables]
-    argument = dict(parameters or {})
+    known = {field.name for field in interface.layout.fields}
+    argument = {name: value for name, value in interface.layout.data.items() if name in known} | dict(parameters or {})
     numbers = number_values(interface, argument)
     shapes += [
         (field, real_array(argument[field.name], field.name).shape)
@@ -131,11 +132,13 @@ def field_values(
 
 def read_tables(interface: Interface, argument: Mapping[str, ArrayLike] | None) -> dict[str, IndexTable]:
     """Return read-only copies of the tables by name, so that indices cannot change after validation."""
-    _check_named(argument or {}, [table.name for table in interface.layout.tables], "tables", whole=True)
+    names = [table.name for table in interface.layout.tables]
+    given = {name: value for name, value in interface.layout.data.items() if name in names} | dict(argument or {})
+    _check_named(given, names, "tables", whole=True)
     result = {}
     for table in interface.layout.tables:
         try:
-            values = np.asarray((argument or {})[table.name])
+            values = np.asarray(given[table.name])
         except (TypeError, ValueError, OverflowError) as error:
             raise StateError(
                 f"the table '{table.name}' must be an array of whole numbers with {table.axes[1].number} columns: "

@@ -1,0 +1,1 @@
+"""Fields from densities: Lagrangian densities, meshes, and their semi-discrete systems."""

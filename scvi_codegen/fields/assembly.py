@@ -1,0 +1,301 @@
+"""Semi-discrete Lagrangian or Hamiltonian of a density on a tensor product of axes, in index notation.
+
+Terms of the density without derivatives in space are summed over points, terms with derivatives along some axes over
+the cells of these axes and the points of the others, which keeps the cost of tensor products. Momenta b of a
+Hamiltonian density are p_i = W_i b_i at points with the weights W_i: sum_i dq_i ^ dp_i is the symplectic form.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import sympy
+from sympy import Add, Expr
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.fields.axes import Axis, Cells, digits, same
+from scvi_codegen.fields.density import Density
+from scvi_codegen.fields.mesh import MeshSystem
+from scvi_codegen.formulas.array_notation import array_text
+from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.tables.precision import mp
+
+NAME = re.compile(r"[A-Za-z_]\w*")
+
+
+def semidiscrete_system(system: Density, axes: Mapping[str, Axis]) -> MeshSystem:
+    """Return the semi-discrete system of a density on a tensor product of axes."""
+    return _Assembly(system, axes).result()
+
+
+class _Assembly:
+    """Texts of the sums of a semi-discrete Lagrangian, and the arrays that they use."""
+
+    def __init__(self, system: Density, axes: Mapping[str, Axis]) -> None:
+        self.system = system
+        self.axes = axes
+        self.used: dict[str, tuple[str, Any]] = {}
+
+    def result(self) -> MeshSystem:
+        system = self.system
+        sizes = ", ".join(f"N{axis}" for axis in self.axes)
+        terms = [*self.kinetic(), *self.in_space()]
+        tables = {f"nodes_{name}": axis.table for name, axis in self.axes.items() if axis.table is not None}
+        text = "\n+ ".join(terms)
+        tables = {name: table for name, table in tables.items() if f"{name}[" in text}
+        conjugate = [f"{each}[{sizes}]" for each in system.momenta]
+        arguments: dict[str, Any] = {
+            "name": system.name,
+            "coordinates": [f"{each}[{sizes}]" for each in system.fields],
+            "parameters": {
+                **dict(zip(map(str, system.parameters), system.defaults, strict=True)),
+                **{f"{name}[{size}]": values for name, (size, values) in self.used.items()},
+            },
+            "tables": {
+                f"{name}[E{name.removeprefix('nodes_')}, {table.shape[1]}]": table for name, table in tables.items()
+            },
+        }
+        if conjugate:
+            assembled: Any = HamiltonianSystem.from_text(**arguments, momenta=conjugate, hamiltonian=text)
+        else:
+            assembled = LagrangianSystem.from_text(**arguments, lagrangian=text)
+        grids = np.meshgrid(*(axis.points for axis in self.axes.values()), indexing="ij")
+        masses = np.meshgrid(*(axis.weights for axis in self.axes.values()), indexing="ij")
+        return MeshSystem(
+            system=assembled,
+            field_system=system,
+            axes=tuple(self.axes.values()),
+            points=dict(zip(self.axes, grids, strict=True)),
+            weights=np.prod(masses, axis=0),
+        )
+
+    def array(self, name: str, size: str, values: Any, index: str) -> str:
+        """Return the text of an entry of an array, or its number if all entries are equal."""
+        if (value := same(values)) is not None:
+            return digits(mp.mpf(value))
+        self.used[name] = (size, values)
+        return f"{name}[{index}]"
+
+    def weight(self, axis: str) -> str:
+        return self.array(f"weight_{axis}", f"N{axis}", self.axes[axis].weights, f"i{axis}")
+
+    def at_points(self, axes: Sequence[str]) -> dict[str, str]:
+        """Return the texts of the coordinates of points along axes."""
+        return {axis: f"{axis}_points[i{axis}]" for axis in axes}
+
+    def at(self, each: str, indices: Mapping[str, str]) -> str:
+        """Return the text of a field at a point; that of a momentum is divided by the weight of the point."""
+        entry = f"{each}[{', '.join(indices.values())}]"
+        if each not in self.system.momenta:
+            return entry
+        inverse = [
+            self.array(f"per_weight_{axis}", f"N{axis}", 1 / self.axes[axis].weights, index)
+            for axis, index in indices.items()
+        ]
+        return f"{'*'.join(inverse)}*{entry}"
+
+    def kinetic(self) -> Iterator[str]:
+        if self.system.momenta:
+            return
+        for each, rate in zip(self.system.fields, self.system.rates, strict=True):
+            mass = self.system.density.diff(rate, 2)
+            here = ", ".join(f"i{axis}" for axis in self.axes)
+            yield self.over_points(f"({self.written(mass, self.at_points([*self.axes]))})*{each}_dot[{here}]**2/2")
+
+    def over_points(self, body: str) -> str:
+        loops = ", ".join(f"i{axis} in N{axis}" for axis in self.axes)
+        return f"sum({loops}, {'*'.join(map(self.weight, self.axes))}*{body})"
+
+    def in_space(self) -> Iterator[str]:
+        """Yield the sums of the terms without velocities, grouped by the axes of their derivatives."""
+        derivatives = self.system.derivatives
+        groups: dict[tuple[str, ...], Expr] = {}
+        for term in Add.make_args(sympy.expand_mul(self.system.potential)):
+            names = {each.name for each in term.free_symbols}
+            along = {axis for name, (_, orders) in derivatives.items() if name in names for axis in orders}
+            key = tuple(axis for axis in self.axes if axis in along)
+            groups[key] = groups.get(key, sympy.S.Zero) + term
+        for key, term in groups.items():
+            if not term.free_symbols & {symbol(each) for each in (*self.system.variables, *derivatives)}:
+                continue
+            if any(self.axes[axis].pairs for axis in key):
+                yield from self.over_pairs(term)
+            elif key:
+                yield from self.over_cells(key, term)
+            else:
+                here = {axis: f"i{axis}" for axis in self.axes}
+                texts = {each: self.at(each, here) for each in self.system.variables} | self.at_points([*self.axes])
+                yield self.over_points(f"({self.written(term, texts)})")
+
+    def over_pairs(self, term: Expr) -> Iterator[str]:
+        """Yield the sums over pairs of points of a term that is quadratic in derivatives along one axis."""
+        rest = term
+        for name, (each, orders) in self.system.derivatives.items():
+            factor = term.diff(symbol(name), 2)
+            if factor == 0 or len(orders) > 1 or factor.free_symbols - set(self.system.parameters):
+                continue
+            ((axis, order),) = orders.items()
+            rest -= factor * symbol(name) ** 2 / 2
+            matrix, pair = f"pairs{order}_{axis}", f"i{axis}, j{axis}"
+            self.used[matrix] = (f"N{axis}, N{axis}", self.axes[axis].pairs[order - 1])
+            others = [a for a in self.axes if a != axis]
+            loops = ", ".join([*(f"i{a} in N{a}" for a in others), f"i{axis} < j{axis} in N{axis}"])
+            one, two = (self.at(each, {a: f"{letter if a == axis else 'i'}{a}" for a in self.axes}) for letter in "ij")
+            factors = "*".join([f"({self.written(factor, {})})", *map(self.weight, others), f"{matrix}[{pair}]"])
+            yield f"sum({loops}, {factors}*({one} - {two})**2/2)"
+        if sympy.expand(rest) != 0:
+            raise SystemDefinitionError(
+                f'"fourier" needs densities that are quadratic in derivatives along one axis with constant factors, '
+                f'not {sympy.expand(rest)}: use "finite-differences" or "spectral-elements"'
+            )
+
+    def over_cells(self, key: tuple[str, ...], term: Expr) -> Iterator[str]:
+        """Yield the sums over cells of the axes of the derivatives, and over the points of the other axes."""
+        others = [axis for axis in self.axes if axis not in key]
+        for cells in itertools.product(*(self.axes[axis].cells for axis in key)):
+            chosen = dict(zip(key, cells, strict=True))
+            loops = [each.loop for each in cells if each.loop] + [f"i{axis} in N{axis}" for axis in others]
+            factors = [
+                self.array(f"jacobian_{axis}", self.extent(axis), self.axes[axis].jacobians, each.index)
+                for axis, each in chosen.items()
+            ]
+            factors += map(self.weight, others)
+            body = f"{'*'.join(factors)}*({self.quadrature(chosen, others, term)})"
+            yield f"sum({', '.join(loops)}, {body})" if loops else f"({body})"
+
+    def extent(self, axis: str) -> str:
+        """Return the size that counts the cells of an axis."""
+        return f"N{axis}" if self.axes[axis].table is None else f"E{axis}"
+
+    def quadrature(self, chosen: Mapping[str, Cells], others: Sequence[str], term: Expr) -> str:
+        """Return the text of the weighted sum of a term over the quadrature points of a cell.
+
+        Along an axis whose cells have as many points as quadrature points, all of them unknown, this is a sum over an
+        index, ``ax``; otherwise the terms are written out.
+        """
+        nodes: list[list[str]] = []
+        sums: list[str] = []
+        for name, cells in chosen.items():
+            count = len(self.axes[name].quadrature)
+            alike = cells.rule is not None
+            nodes.append([f"a{name}"] if alike else [str(k) for k in range(count)])
+            sums += [f"a{name} in {count}"] * alike
+        parts = []
+        for node in itertools.product(*nodes):
+            at = dict(zip(chosen, node, strict=True))
+            texts = self.at_points(others)
+            texts |= {name: f"{name}_in_cells[{chosen[name].index}, {k}]" for name, k in at.items()}
+            texts |= {each: self.combined(each, {}, chosen, at) for each in self.system.variables}
+            for name, (each, orders) in self.system.derivatives.items():
+                if set(orders) <= set(chosen) and symbol(name) in term.free_symbols:
+                    texts[name] = self.derivative(each, orders, chosen, at)
+            weights = [self.coefficient(None, name, (k,)) for name, k in at.items()]
+            parts.append("*".join([*(each for each in weights if each != "1"), f"({self.written(term, texts)})"]))
+        body = " + ".join(parts)
+        for each in reversed(sums):
+            body = f"sum({each}, {body})"
+        return body
+
+    def coefficient(self, order: int | None, axis: str, index: tuple[str, ...]) -> str:
+        """Return the text of an entry of the operator of a derivative, or of the quadrature for ``None``."""
+        entries: Any = self.axes[axis].quadrature if order is None else self.axes[axis].operators[order]
+        if self.axes[axis].table is None:
+            for k in index:
+                entries = entries[int(k)]
+            return digits(entries)
+        name = f"weights_{axis}" if order is None else f"D_{axis}"
+        values = np.array([list(map(float, row)) for row in entries] if order else list(map(float, entries)))
+        self.used[name] = (", ".join(map(str, values.shape)), values)
+        return f"{name}[{', '.join(index)}]"
+
+    def derivative(
+        self, each: str, orders: Mapping[str, int], chosen: Mapping[str, Cells], at: Mapping[str, str]
+    ) -> str:
+        """Return the text of a derivative of a field at a quadrature point of a cell."""
+        factors = []
+        for axis, order in orders.items():
+            discretised = self.axes[axis]
+            if order >= len(discretised.operators):
+                raise SystemDefinitionError(
+                    f'the density contains the second derivative {each}_{axis * order}, which "spectral-elements" '
+                    'of continuous functions do not have: use "finite-differences" or "fourier"'
+                )
+            by = self.array(f"inverse_{axis}", self.extent(axis), 1 / discretised.jacobians, chosen[axis].index)
+            factors += [by] * order
+        return f"{'*'.join(factors)}*({self.combined(each, orders, chosen, at)})"
+
+    def combined(
+        self,
+        each: str,
+        orders: Mapping[str, int],
+        chosen: Mapping[str, Cells],
+        at: Mapping[str, str],
+        slots: Mapping[str, str] | None = None,
+    ) -> str:
+        """Return the text of sums over the points of a cell of coefficients times the values of a field.
+
+        Args:
+            each: the field.
+            orders: order of the derivative by axis; along others values are interpolated.
+            chosen, at: kind of cells and index of the quadrature point by axis.
+            slots: index of the point within the cell along the axes that are summed already.
+        """
+        slots = slots or {}
+        left = [axis for axis in chosen if axis not in slots]
+        if not left:
+            return self.entry(each, chosen, slots)
+        axis = left[0]
+        cells, order = chosen[axis], orders.get(axis, 0)
+        if order == 0 and self.axes[axis].table is not None:
+            return self.combined(each, orders, chosen, at, {**slots, axis: at[axis]})
+        if cells.rule is not None:
+            index = f"b{axis}"
+            inner = self.combined(each, orders, chosen, at, {**slots, axis: index})
+            return f"sum({index} in {len(cells.places)}, {self.coefficient(order, axis, (at[axis], index))}*{inner})"
+        terms = []
+        for slot in map(str, range(len(cells.places))):
+            value = self.combined(each, orders, chosen, at, {**slots, axis: slot})
+            factor = self.coefficient(order, axis, (at[axis], slot))
+            if value != "0":
+                terms.append(f"({factor})*({value})")
+        return " + ".join(terms) or "0"
+
+    def entry(self, each: str, chosen: Mapping[str, Cells], at: Mapping[str, str]) -> str:
+        """Return the text of a field at the points ``at`` of a cell, or of its prescribed value at an end."""
+        indices: dict[str, str] = {}
+        for axis in self.axes:
+            if axis not in chosen:
+                indices[axis] = f"i{axis}"
+            elif chosen[axis].rule is not None:
+                indices[axis] = f"{chosen[axis].rule}, {at[axis]}]"
+            else:
+                place = chosen[axis].places[int(at[axis])]
+                if place.index is None:
+                    prescribed = self.system.boundary[axis][place.end][each]
+                    return "0" if prescribed == 0 else f"({self.written(prescribed, {})})"
+                indices[axis] = place.index
+        return self.at(each, indices)
+
+    def written(self, formula: Expr, texts: Mapping[str, str]) -> str:
+        """Return a formula as text, with texts in place of names; arrays that it uses are recorded."""
+
+        def replaced(match: re.Match[str]) -> str:
+            name = match[0]
+            if name not in texts:
+                return name
+            if name in self.axes:
+                axis = self.axes[name]
+                self.used |= (
+                    {f"{name}_points": (f"N{name}", axis.points)}
+                    if texts[name].startswith(f"{name}_points")
+                    else {f"{name}_in_cells": (f"{self.extent(name)}, {len(axis.quadrature)}", axis.cell_points)}
+                )
+            return f"({texts[name]})"
+
+        return NAME.sub(replaced, array_text(formula))

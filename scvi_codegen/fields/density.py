@@ -1,0 +1,114 @@
+"""Lagrangian or Hamiltonian density of fields: symbols, derivatives, and the parts of a Lagrangian density."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import sympy
+from sympy import Add, Expr, S, Symbol
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.expressions import evaluated, hessian
+from scvi_codegen.formulas.symbols import TIME, symbol
+from scvi_codegen.representation import summary
+
+Boundary = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Density:
+    """Lagrangian density L(u, u_t, u_x, .., x, .., t; parameters) or Hamiltonian density of fields in space.
+
+    A Hamiltonian density H(u, p, u_x, p_x, ..) describes fields of first order in time, u_t = dH/dp, p_t = -dH/du, with
+    variational derivatives.
+
+    Attributes:
+        name: name of the system.
+        fields: names of the fields.
+        momenta: of a Hamiltonian density, names of the conjugate fields; else empty.
+        space: lower and upper bound by axis.
+        boundary: by axis ``"periodic"`` or, for the lower and upper end, ``"natural"`` or the prescribed value as a
+            formula in t by field.
+        parameters, defaults: adjustable numbers and their default values.
+        density: L or H; ``u_t``, ``u_x``, ``u_xx``, ``u_xy`` are the derivatives of ``u``.
+    """
+
+    name: str
+    fields: tuple[str, ...]
+    momenta: tuple[str, ...] = ()
+    space: Mapping[str, tuple[float, float]]
+    boundary: Boundary
+    parameters: tuple[Symbol, ...]
+    defaults: tuple[float, ...]
+    density: Expr
+
+    __repr__ = summary("name", "fields", "space")
+
+    def __post_init__(self) -> None:
+        if not self.momenta:
+            self._check_regular()
+
+    def _check_regular(self) -> None:
+        rates = self.rates
+        masses = hessian(self.density, rates)
+        for (i, j), entry in masses.items():
+            if i != j:
+                raise SystemDefinitionError(
+                    f"the density of '{self.name}' contains {rates[i]}*{rates[j]}: velocities are supported as "
+                    "m*u_t**2/2 only, with m a function of position and parameters"
+                )
+            known = {symbol(axis) for axis in self.space} | set(self.parameters)
+            if wrong := sorted(map(str, entry.free_symbols - known)):
+                raise SystemDefinitionError(
+                    f"the density of '{self.name}' contains {rates[i]}**2 with a factor that depends on {wrong[0]}; "
+                    "it may depend on position and parameters only"
+                )
+        for i, rate in enumerate(rates):
+            if (i, i) not in masses:
+                raise SystemDefinitionError(
+                    f"the density of '{self.name}' is not regular in {rate}: add a kinetic term such as {rate}**2/2, "
+                    "or describe fields of first order in time by hamiltonian="
+                )
+        linear = self.density - self.kinetic - self.potential
+        if sympy.expand(linear) != 0:
+            raise SystemDefinitionError(
+                f"the density of '{self.name}' has terms linear in velocities, {sympy.expand(linear)}, which are not "
+                "supported"
+            )
+
+    @property
+    def rates(self) -> tuple[Symbol, ...]:
+        """Symbols of the derivatives of the fields in time."""
+        return tuple(symbol(f"{each}_{TIME}") for each in self.fields)
+
+    @property
+    def derivatives(self) -> dict[str, tuple[str, dict[str, int]]]:
+        """Field, and order by axis, of each derivative in space by its name: ``u_x``, ``u_xx``, ``u_xy``."""
+        return derivatives_of(self.variables, [*self.space])
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """Names of the fields and momenta."""
+        return (*self.fields, *self.momenta)
+
+    @property
+    def kinetic(self) -> Expr:
+        """Kinetic part of the density."""
+        masses = hessian(self.density, self.rates)
+        return Add(*(masses[i, i] * rate**2 / 2 for i, rate in enumerate(self.rates)))
+
+    @property
+    def potential(self) -> Expr:
+        """Density at zero velocities, minus the density of the potential energy."""
+        return evaluated(self.density, dict.fromkeys(self.rates, S.Zero))
+
+
+def derivatives_of(fields: Sequence[str], axes: Sequence[str]) -> dict[str, tuple[str, dict[str, int]]]:
+    """Return field and order by axis of the derivatives in space of order one and two."""
+    orders: dict[str, dict[str, int]] = {axis: {axis: 1} for axis in axes}
+    orders |= {axis * 2: {axis: 2} for axis in axes}
+    orders |= {one + two: {one: 1, two: 1} for one, two in combinations(axes, 2)}
+    return {f"{each}_{name}": (each, order) for each in fields for name, order in orders.items()}

@@ -1,0 +1,117 @@
+"""Semi-discrete system of a density: points, quadrature, derivatives, frequencies and resolution."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import sympy
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.errors import StateError, closest
+from scvi_codegen.fields.axes import Axis
+from scvi_codegen.fields.density import Density
+from scvi_codegen.formulas.symbols import TIME, symbol
+from scvi_codegen.representation import summary
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeshSystem:
+    """Fields of a density at the points of a mesh.
+
+    Attributes:
+        system: system of arrays ``u[Nx]``, ``u[Nx, Ny]``, .. for :func:`~scvi_codegen.compile_stepper`. The momenta of
+            a Hamiltonian density are the densities at the points times ``weights``.
+        field_system: the density.
+        axes: discretisations of the axes.
+        points: coordinates of the points by axis, in the shape of the fields, (Nx,), (Nx, Ny), ..
+        weights: quadrature weights at the points, in the same shape.
+    """
+
+    system: Any
+    field_system: Density
+    axes: tuple[Axis, ...]
+    points: Mapping[str, Array]
+    weights: Array
+
+    __repr__ = summary("system")
+
+    def integral(self, values: ArrayLike) -> Any:
+        """Return the integral over space of values at the points, (..., *shape of the fields), by quadrature."""
+        return np.sum(self.weights * self._at_points(values), axis=tuple(range(-len(self.axes), 0)))
+
+    def derivative(self, values: ArrayLike, axis: str) -> Array:
+        """Return the derivative along an axis at the points, (..., *shape), of the spectral interpolant.
+
+        Elements share end points, at which the mean of both derivatives is returned, weighted by length. Prescribed
+        values at ends are taken as 0.
+        """
+        position = self._position(axis)
+        return self.axes[position].differentiated(self._at_points(values), position - len(self.axes))
+
+    def unresolved(self, values: ArrayLike) -> Any:
+        """Return the part of the squared amplitude in the highest sixth of the modes, (...), the largest of all axes.
+
+        The modes are Legendre polynomials on each element, or Fourier modes; constant parts do not count. A field is
+        resolved if it is small, and the error of the discretisation is about its square root. On elements it is
+        relative to the largest element.
+        """
+        array = self._at_points(values)
+        count, parts = len(self.axes), []
+        for k, each in enumerate(self.axes):
+            others = tuple(range(-count, -1))
+            highest, every = (x.sum(others) for x in each.spectrum(np.moveaxis(array, k - count, -1)))
+            largest = every.max(-1)
+            parts.append(highest.max(-1) / np.where(largest > 0, largest, 1.0))
+        return np.max(parts, axis=0)[()]
+
+    def highest_frequency(self, **parameters: float) -> float:
+        """Return an upper bound of the highest frequency of the equations linearised about u = 0 at t = 0.
+
+        Explicit methods of second order are stable for h below 2/frequency; fixed-point iterations converge for h times
+        frequency below about 1 to 3. The bound is the sum over axes of the largest factors of u_x**2 and u_xx**2 times
+        the largest eigenvalues of the derivatives on an element, plus that of u**2.
+
+        Args:
+            parameters: values of parameters that differ from the defaults.
+        """
+        system = self.field_system
+        known = dict(zip(map(str, system.parameters), system.defaults, strict=True))
+        for name in parameters:
+            if name not in known:
+                raise StateError(f"'{system.name}' has no parameter '{name}'{closest(name, known)}")
+        values = {symbol(name): value for name, value in {**known, **parameters}.items()} | {symbol(TIME): 0.0}
+        at_rest = {symbol(each): 0 for each in (*system.variables, *system.derivatives)}
+        places = [symbol(axis) for axis in self.points]
+
+        def largest(formula: sympy.Expr) -> float:
+            evaluated = sympy.lambdify(places, formula.xreplace(at_rest).xreplace(values), "numpy")
+            return float(np.max(np.abs(evaluated(*self.points.values()))))
+
+        by_name = {axis.name: axis for axis in self.axes}
+        total = {each: largest(system.density.diff(symbol(each), 2)) for each in system.variables}
+        for name, (each, orders) in system.derivatives.items():
+            if symbol(name) in system.density.free_symbols:
+                powers = [by_name[axis].stiffness[order - 1] for axis, order in orders.items()]
+                total[each] += largest(system.density.diff(symbol(name), 2)) * float(np.prod(powers))
+        if system.momenta:
+            pairs = zip(system.fields, system.momenta, strict=True)
+            return max(float(np.sqrt(total[one] * total[two])) for one, two in pairs)
+        masses = [1 / largest(1 / system.density.diff(rate, 2)) for rate in system.rates]
+        return max(float(np.sqrt(total[each] / mass)) for each, mass in zip(system.fields, masses, strict=True))
+
+    def _at_points(self, values: ArrayLike) -> Array:
+        array = np.asarray(values, float)
+        if array.shape[array.ndim - self.weights.ndim :] != self.weights.shape:
+            raise StateError(f"values at the points must have the shape (.., {self.weights.shape}), not {array.shape}")
+        return array
+
+    def _position(self, axis: str) -> int:
+        names = [each.name for each in self.axes]
+        if axis not in names:
+            raise StateError(f"there is no axis '{axis}'{closest(axis, names)}")
+        return names.index(axis)

@@ -1,0 +1,317 @@
+"""Lagrangian density of fields, and its discretisation in space."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from math import isfinite
+from typing import Any
+
+import numpy as np
+import sympy
+from sympy import Add, Expr, Function, Symbol
+
+from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.fields.assembly import semidiscrete_system
+from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis, differences, fourier, spectral_elements
+from scvi_codegen.fields.density import Density, derivatives_of
+from scvi_codegen.fields.mesh import MeshSystem
+from scvi_codegen.formulas.array_notation import array_text
+from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.symbols import TIME, check_names, number, symbol
+from scvi_codegen.validation import MAPPING, NAMES, TEXT, checks_arguments
+
+MOST_AXES = 3
+DISCRETISATIONS = {
+    "spectral-elements": ("degree", "elements"),
+    "finite-differences": ("order", "points"),
+    "fourier": ("points",),
+}
+"""Options by discretisation in space."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldSystem(Density):
+    """Lagrangian density L(u, u_t, u_x, .., x, .., t; parameters) of fields on an interval, rectangle or box.
+
+    A Hamiltonian density H(u, p, u_x, p_x, ..) describes fields of first order in time, u_t = dH/dp, p_t = -dH/du, with
+    variational derivatives. Build it with :meth:`from_text` or :meth:`from_sympy`; :meth:`discretise` returns a system
+    that :func:`~scvi_codegen.compile_stepper` compiles. The attributes are those of
+    :class:`~scvi_codegen.fields.density.Density`.
+    """
+
+    @classmethod
+    @checks_arguments(
+        SystemDefinitionError,
+        name=TEXT,
+        fields=NAMES,
+        space=MAPPING,
+        density=TEXT,
+        hamiltonian=TEXT,
+        momenta=NAMES,
+        boundary=MAPPING,
+        parameters=MAPPING,
+    )
+    def from_text(
+        cls,
+        name: str,
+        fields: Sequence[str],
+        space: Mapping[str, Sequence[Any]],
+        density: str | None = None,
+        *,
+        hamiltonian: str | None = None,
+        momenta: Sequence[str] = (),
+        boundary: Mapping[str, Any] | None = None,
+        parameters: Mapping[str, float] | None = None,
+    ) -> FieldSystem:
+        """Read a density from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
+
+        Args:
+            name: name of the system.
+            fields: names of the fields, functions of time and of the axes.
+            space: lower and upper bound by axis, numbers or formulas of numbers: ``{"x": (0, "2*pi")}``; one to three
+                axes.
+            density: L in the fields, their derivatives ``u_t``, ``u_x``, ``u_xx``, ``u_xy``, .., the axes and the time.
+            hamiltonian: in place of it the density of H in the fields, momenta, and their derivatives in space.
+            momenta: names of the conjugate fields of H.
+            boundary: ``"periodic"`` by axis, or two ends. An end is ``"natural"`` (dL/du_x = 0; Neumann), or the
+                prescribed value: a number or a formula in t and parameters (Dirichlet), or these by field,
+                ``{"u": "sin(t)", "v": 0}``. By default natural ends.
+            parameters: default value by name.
+
+        Raises:
+            SystemDefinitionError: naming the symbol, if the density is outside the grammar, not regular in the
+                velocities, or an axis or boundary is malformed.
+
+        >>> waves = FieldSystem.from_text("waves", ["u"], {"x": (0, 1)}, "u_t**2/2 - u_x**2/2", boundary={"x": (0, 0)})
+        >>> waves.euler_lagrange()["u"]
+        Eq(Derivative(u(x, t), (t, 2)), Derivative(u(x, t), (x, 2)))
+        """
+        text = density if hamiltonian is None else hamiltonian
+        if text is None or (density is not None and hamiltonian is not None):
+            raise SystemDefinitionError("give exactly one of density and hamiltonian")
+        first_order = hamiltonian is not None
+        read = partial(parse_expression, text)
+        return cls._of(name, fields, momenta, space, boundary, parameters, first_order, read)
+
+    @classmethod
+    @checks_arguments(SystemDefinitionError, name=TEXT, space=MAPPING, boundary=MAPPING, parameters=MAPPING)
+    def from_sympy(
+        cls,
+        *,
+        name: str,
+        fields: Sequence[Expr],
+        space: Mapping[str, Sequence[Any]],
+        density: Expr,
+        boundary: Mapping[str, Any] | None = None,
+        parameters: Mapping[str, float] | None = None,
+    ) -> FieldSystem:
+        """Create the system from a SymPy expression in functions ``u(x, t)`` and their derivatives.
+
+        Args:
+            name, space, boundary, parameters: as of :meth:`from_text`.
+            fields: functions of the axes and of the time, ``Function("u")(x, t)``.
+            density: L.
+
+        >>> from sympy import Function, symbols
+        >>> x, t = symbols("x t")
+        >>> u = Function("u")(x, t)
+        >>> density = (u.diff(t)**2 - u.diff(x)**2)/2
+        >>> FieldSystem.from_sympy(name="waves", fields=[u], space={"x": (0, 1)}, density=density)
+        FieldSystem(name='waves', fields=('u',), space={'x': (0.0, 1.0)})
+        """
+        names = [str(each.func) for each in fields]
+
+        def read(known: Mapping[str, Symbol]) -> Expr:
+            values: dict[Expr, Expr] = {}
+            for each, function in zip(names, fields, strict=True):
+                marks = {str(argument): argument for argument in function.args}
+                if missing := [axis for axis in (*space, TIME) if axis not in marks]:
+                    raise SystemDefinitionError(f"the field {function} must be a function of '{missing[0]}'")
+                values[function] = known[each]
+                values[function.diff(marks[TIME])] = known[f"{each}_{TIME}"]
+                for derived, (_, orders) in derivatives_of([each], [*space]).items():
+                    values[function.diff(*((marks[axis], order) for axis, order in orders.items()))] = known[derived]
+            formula = density.xreplace(values)
+            plain = {each: known[each.name] for each in formula.free_symbols if each.name in known}
+            if unknown := sorted(map(str, formula.free_symbols - set(plain))):
+                raise SystemDefinitionError(f"the density contains '{unknown[0]}'{closest(unknown[0], [*known])}")
+            return parse_expression(array_text(formula.xreplace(plain)), known)
+
+        return cls._of(name, names, (), space, boundary, parameters, False, read)
+
+    @classmethod
+    def _of(
+        cls,
+        name: str,
+        fields: Sequence[str],
+        momenta: Sequence[str],
+        space: Mapping[str, Sequence[Any]],
+        boundary: Mapping[str, Any] | None,
+        parameters: Mapping[str, float] | None,
+        first_order: bool,
+        read: Callable[[Mapping[str, Symbol]], Expr],
+    ) -> FieldSystem:
+        values = {key: number(key, value) for key, value in (parameters or {}).items()}
+        if not 1 <= len(space) <= MOST_AXES:
+            raise SystemDefinitionError(f"space has {len(space)} axes; one to three are supported")
+        if len(momenta) != len(fields) * first_order:
+            raise SystemDefinitionError(
+                f"there are {len(fields)} fields and {len(momenta)} momenta: a Hamiltonian density needs one momentum "
+                "by field, a Lagrangian density none"
+            )
+        variables = (*fields, *momenta)
+        rates = [] if first_order else [f"{each}_{TIME}" for each in fields]
+        derivatives = [*rates, *derivatives_of(variables, [*space])]
+        check_names(variables, (*values, *space, *derivatives), ())
+        known = {each: symbol(each) for each in (*variables, *derivatives, *space, TIME, *values)}
+        kinds = dict(boundary or {})
+        for axis in kinds:
+            if axis not in space:
+                raise SystemDefinitionError(f"there is a boundary for '{axis}'{closest(axis, [*space])}")
+        prescribed = {each: known[each] for each in (TIME, *values)}
+        natural = (NATURAL, NATURAL)
+        return cls(
+            name=name,
+            fields=tuple(fields),
+            momenta=tuple(momenta),
+            space={axis: _bounds(axis, ends) for axis, ends in space.items()},
+            boundary={axis: _boundary(axis, kinds.get(axis, natural), variables, prescribed) for axis in space},
+            parameters=tuple(known[key] for key in values),
+            defaults=tuple(values.values()),
+            density=read(known),
+        )
+
+    def euler_lagrange(self) -> dict[str, Expr]:
+        """Return u_tt of each field by the Euler-Lagrange equation d/dt dL/du_t = dL/du - sum d/dx dL/du_x + .."""
+        if self.momenta:
+            raise SystemDefinitionError(f"'{self.name}' has a Hamiltonian density, whose equations are of first order")
+        variables = {each: symbol(each) for each in (*self.space, TIME)}
+        functions = {each: Function(each)(*variables.values()) for each in self.fields}
+        values = {symbol(each): function for each, function in functions.items()}
+        in_space = {
+            name: (each, [(variables[axis], order) for axis, order in orders.items()])
+            for name, (each, orders) in self.derivatives.items()
+        }
+        values |= {symbol(name): functions[each].diff(*along) for name, (each, along) in in_space.items()}
+        values |= {
+            rate: functions[each].diff(variables[TIME]) for each, rate in zip(self.fields, self.rates, strict=True)
+        }
+        equations = {}
+        for (each, function), rate in zip(functions.items(), self.rates, strict=True):
+            second = function.diff(variables[TIME], 2)
+            terms = [self.density.diff(symbol(each)).xreplace(values)]
+            for name, (of, along) in in_space.items():
+                if of == each:
+                    sign = (-1) ** sum(order for _, order in along)
+                    terms.append(sign * self.density.diff(symbol(name)).xreplace(values).diff(*along))
+            mass = self.density.diff(rate, 2).xreplace(values)
+            equations[each] = sympy.Eq(second, sympy.expand(Add(*terms).doit() / mass))
+        return equations
+
+    def discretise(self, method: str, **options: Any) -> MeshSystem:
+        """Return the semi-discrete Lagrangian system on a mesh.
+
+        Args:
+            method: ``"spectral-elements"`` with ``degree=`` and ``elements=``, the number of equal elements or their
+                ends; ``"finite-differences"`` (periodic) with ``order=`` 2, 4, 6 or 8 and ``points=``; ``"fourier"``
+                (periodic, densities quadratic in the derivatives with constant coefficients) with ``points=``.
+            options: as above; a mapping gives each axis its own value, ``points={"x": 64, "y": 32}``.
+
+        Raises:
+            SystemDefinitionError: if an option is missing or unknown, or the method does not suit the boundary or the
+                density.
+        """
+        if method not in DISCRETISATIONS:
+            known = ", ".join(DISCRETISATIONS)
+            raise SystemDefinitionError(
+                f"there is no discretisation '{method}'{closest(method, DISCRETISATIONS)}: {known}"
+            )
+        needed = DISCRETISATIONS[method]
+        for name in options:
+            if name not in needed:
+                raise SystemDefinitionError(f"'{method}' has no option '{name}'; it needs {' and '.join(needed)}")
+        axes = {}
+        for axis in self.space:
+            chosen = {}
+            for name in needed:
+                value = options.get(name)
+                value = value.get(axis) if isinstance(value, Mapping) else value
+                if value is None:
+                    raise SystemDefinitionError(f"'{method}' needs {name}= for the axis '{axis}'")
+                chosen[name] = value
+            axes[axis] = self._axis(axis, method, chosen)
+        return semidiscrete_system(self, axes)
+
+    def _axis(self, axis: str, method: str, options: Mapping[str, Any]) -> Axis:
+        start, end = self.space[axis]
+        boundary = self.boundary[axis]
+        if method == "spectral-elements":
+            fixed = None if boundary == PERIODIC else tuple(each != NATURAL for each in boundary)
+            return spectral_elements(axis, _breaks(axis, start, end, options["elements"]), options["degree"], fixed)
+        if boundary != PERIODIC:
+            raise SystemDefinitionError(
+                f"'{method}' needs a periodic axis, and '{axis}' has ends: use \"spectral-elements\""
+            )
+        if method == "fourier":
+            return fourier(axis, start, end, options["points"])
+        second = any(
+            orders.get(axis) == 2 and symbol(name) in self.density.free_symbols
+            for name, (_, orders) in self.derivatives.items()
+        )
+        return differences(axis, start, end, options["points"], options["order"], second=second)
+
+
+def _bounds(axis: str, ends: Any) -> tuple[float, float]:
+    if isinstance(ends, str) or len(ends) != 2:
+        raise SystemDefinitionError(f"the axis '{axis}' needs a lower and an upper bound, not {ends!r}")
+    values = []
+    for each in ends:
+        value = parse_expression(str(each), {})
+        values.append(float(value))
+    lower, upper = values
+    if not (isfinite(lower) and isfinite(upper) and lower < upper):
+        raise SystemDefinitionError(f"the bounds of the axis '{axis}' must be finite and ascending, not {ends!r}")
+    return lower, upper
+
+
+def _boundary(axis: str, boundary: Any, fields: Sequence[str], known: Mapping[str, Symbol]) -> Any:
+    """Return ``"periodic"``, or for each end ``"natural"`` or the prescribed value by field."""
+    if boundary in (PERIODIC, NATURAL):
+        return PERIODIC if boundary == PERIODIC else (NATURAL, NATURAL)
+    if isinstance(boundary, str) or not hasattr(boundary, "__len__") or len(boundary) != 2:
+        raise SystemDefinitionError(
+            f'the boundary of \'{axis}\' must be "periodic" or two ends, each "natural" or a value, not {boundary!r}'
+        )
+    ends: list[Any] = []
+    for end in boundary:
+        if end == NATURAL:
+            ends.append(NATURAL)
+            continue
+        values = dict(end) if isinstance(end, Mapping) else dict.fromkeys(fields, end)
+        if set(values) != set(fields):
+            raise SystemDefinitionError(f"an end of '{axis}' has values of {sorted(values)}, not of {sorted(fields)}")
+        ends.append({each: parse_expression(str(value), known) for each, value in values.items()})
+    return tuple(ends)
+
+
+def _breaks(axis: str, start: float, end: float, elements: Any) -> Any:
+    """Return the ends of the elements."""
+    if np.ndim(elements) == 0:
+        count = int(elements)
+        if isinstance(elements, bool) or count != elements or count < 1:
+            raise SystemDefinitionError(
+                f"elements= of '{axis}' must be a number of elements or their ends, not {elements!r}"
+            )
+        return np.linspace(start, end, count + 1)
+    breaks = np.asarray(elements, float)
+    if (
+        breaks.ndim != 1
+        or len(breaks) < 2
+        or not (np.diff(breaks) > 0).all()
+        or breaks[0] != start
+        or breaks[-1] != end
+    ):
+        raise SystemDefinitionError(f"the ends of the elements of '{axis}' must ascend from {start:g} to {end:g}")
+    return breaks

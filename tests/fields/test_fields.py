@@ -1,0 +1,388 @@
+"""Fields from densities: convergence to exact solutions in space and time, conservation, and errors by name."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import sympy
+from numpy import cos, exp, pi, sin
+from samples import QUICK_FLAGS
+
+import scvi_codegen as sc
+from scvi_codegen import FieldSystem, StateError, SystemDefinitionError
+
+W = 0.6
+
+
+def breather(x, t):
+    """Sine-Gordon breather of frequency W, 4 arctan(sqrt(1 - W^2)/W sin(W t)/cosh(sqrt(1 - W^2) x)), and its rate."""
+    e = np.sqrt(1 - W * W)
+    inner = e / W * sin(W * t) / np.cosh(e * x)
+    return 4 * np.arctan(inner), 4 * e * cos(W * t) / np.cosh(e * x) / (1 + inner**2)
+
+
+def sine_gordon():
+    return FieldSystem.from_text(
+        "sine-Gordon",
+        fields=["u"],
+        space={"x": (-40.0, 40.0)},
+        boundary={"x": "periodic"},
+        density="u_t**2/2 - u_x**2/2 - (1 - cos(u))",
+    )
+
+
+def errors(field, method, options, exact, rates=None, *, h=0.01, steps=50, by="svi:3"):
+    """Largest errors of the fields after some steps, from exact initial values at t = 0."""
+    mesh = field.discretise(method, **options)
+    grid = [mesh.points[axis] for axis in field.space]
+    rates = rates or {each: lambda *place: 0 * place[0] for each in exact}
+    stepper = sc.compile_stepper(mesh.system, by, flags=QUICK_FLAGS)
+    start = {each: value(*grid, 0.0) for each, value in exact.items()}
+    run = stepper.integrate(start, velocity={each: v(*grid, 0.0) for each, v in rates.items()}, h=h, steps=steps)
+    return [float(np.abs(run.q[each][-1] - value(*grid, h * steps)).max()) for each, value in exact.items()]
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "bound"),
+    [
+        ("spectral-elements", {"degree": 8, "elements": 40}, 6e-7),
+        ("finite-differences", {"order": 8, "points": 320}, 2e-6),
+        ("fourier", {"points": 256}, 2e-9),
+    ],
+)
+def test_breather_is_within_the_error_of_the_mesh(method, options, bound):
+    mesh = sine_gordon().discretise(method, **options)
+    x = mesh.points["x"]
+    u, v = breather(x, 1.0)
+    stepper = sc.compile_stepper(mesh.system, "svi:8", flags=QUICK_FLAGS)
+    run = stepper.integrate({"u": u}, velocity={"u": v}, h=0.05, steps=200)
+    assert bound / 20 < np.abs(run.q["u"][-1] - breather(x, 11.0)[0]).max() < bound
+    assert np.ptp(run.energy()) / run.energy()[0] < 1e-14
+
+
+def test_errors_of_elements_fall_exponentially_with_the_degree():
+    found, exact = [], {"u": lambda x, t: sin(2 * pi * x) * cos(2 * pi * t)}
+    for degree in (4, 6, 8, 10):
+        field = string(boundary={"x": (0, 0)})
+        found += errors(
+            field, "spectral-elements", {"degree": degree, "elements": 4}, exact, h=0.005, steps=50, by="svi:4"
+        )
+    assert all(b < a / 50 for a, b in pairwise(found)), found
+    assert found[-1] < 1e-10
+
+
+@pytest.mark.parametrize("order", [2, 4, 6, 8])
+def test_differences_have_their_order(order):
+    field = FieldSystem.from_text("ring", ["u"], {"x": (0, "2*pi")}, "u_t**2/2 - u_x**2/2", boundary={"x": "periodic"})
+    exact, rate = {"u": lambda x, t: sin(2 * (x - t))}, {"u": lambda x, t: -2 * cos(2 * (x - t))}
+    options = [{"order": order, "points": points} for points in (24, 48)]
+    (one,), (two,) = (errors(field, "finite-differences", each, exact, rate, by="svi:4") for each in options)
+    assert np.log2(one / two) == pytest.approx(order, abs=0.35)
+
+
+@pytest.mark.parametrize(("method", "order"), [("svi:1", 2), ("svi:2", 4)])
+def test_order_in_time_is_twice_the_number_of_points(method, order):
+    mesh = sine_gordon().discretise("spectral-elements", degree=6, elements=40)
+    u, v = breather(mesh.points["x"], 1.0)
+    stepper = sc.compile_stepper(mesh.system, method, flags=QUICK_FLAGS)
+    ends = [stepper.integrate({"u": u}, velocity={"u": v}, h=2.0 / n, steps=n).q["u"][-1] for n in (40, 80, 160)]
+    assert np.log2(np.abs(ends[0] - ends[1]).max() / np.abs(ends[1] - ends[2]).max()) == pytest.approx(order, abs=0.2)
+
+
+def string(density="u_t**2/2 - u_x**2/2", **others):
+    return FieldSystem.from_text("string", ["u"], {"x": (0, 1)}, density, **others)
+
+
+BOUNDARIES = {
+    "fixed": (string(boundary={"x": (0, 0)}), lambda x, t: sin(pi * x) * cos(pi * t), None),
+    "natural": (string(), lambda x, t: cos(pi * x) * cos(pi * t), None),
+    "left": (string(boundary={"x": ("0", "natural")}), lambda x, t: sin(pi / 2 * x) * cos(pi / 2 * t), None),
+    "right": (string(boundary={"x": ("natural", 0)}), lambda x, t: cos(pi / 2 * x) * cos(pi / 2 * t), None),
+    "moving": (
+        string(boundary={"x": ("sin(k*t)", "sin(k*(t - 1))")}, parameters={"k": 3}),
+        lambda x, t: sin(3 * (t - x)),
+        lambda x, t: 3 * cos(3 * (t - x)),
+    ),
+    "variable": (
+        string("u_t**2/(2*(1 + x)) - (1 + x)*u_x**2/2", boundary={"x": (0, 0)}),
+        lambda x, t: sin(pi * np.log(1 + x) / np.log(2)) * cos(pi * t / np.log(2)),
+        None,
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", BOUNDARIES)
+@pytest.mark.parametrize("elements", [2, [0, 0.3, 0.6, 1]])
+def test_boundaries_of_elements(kind, elements):
+    field, exact, rate = BOUNDARIES[kind]
+    rates = {"u": rate} if rate else None
+    (error,) = errors(field, "spectral-elements", {"degree": 10, "elements": elements}, {"u": exact}, rates, h=0.004)
+    assert error < 2e-8
+
+
+def test_one_element_between_fixed_ends():
+    field, exact, _ = BOUNDARIES["fixed"]
+    (error,) = errors(field, "spectral-elements", {"degree": 12, "elements": 1}, {"u": exact}, h=0.01)
+    assert error < 1e-10
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "bound"),
+    [
+        ("spectral-elements", {"degree": 8, "elements": 4}, 1e-9),
+        ("finite-differences", {"order": 6, "points": 64}, 1e-9),
+        ("fourier", {"points": 16}, 1e-11),
+    ],
+)
+def test_two_coupled_fields(method, options, bound):
+    field = FieldSystem.from_text(
+        "two",
+        ["u", "v"],
+        {"x": (0, "2*pi")},
+        "u_t**2/2 + v_t**2/2 - u_x**2/2 - v_x**2/2 - k*(u - v)**2/2",
+        boundary={"x": "periodic"},
+        parameters={"k": 1.5},
+    )
+    exact = {
+        "u": lambda x, t: sin(x - t) + sin(x) * cos(2 * t),
+        "v": lambda x, t: sin(x - t) - sin(x) * cos(2 * t),
+    }
+    rates = dict.fromkeys("uv", lambda x, t: -cos(x - t))
+    assert max(errors(field, method, options, exact, rates)) < bound
+
+
+PLANE = {"x": (0, "2*pi"), "y": (0, "2*pi")}
+PERIODIC = dict.fromkeys(PLANE, "periodic")
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "bound"),
+    [
+        ("spectral-elements", {"degree": 6, "elements": {"x": 3, "y": 4}}, 2e-5),
+        ("finite-differences", {"order": 6, "points": 32}, 5e-6),
+        ("fourier", {"points": {"x": 12, "y": 16}}, 1e-11),
+    ],
+)
+def test_waves_in_the_plane(method, options, bound):
+    field = FieldSystem.from_text("torus", ["u"], PLANE, "u_t**2/2 - u_x**2/2 - u_y**2/2", boundary=PERIODIC)
+    exact = {"u": lambda x, y, t: sin(x) * sin(2 * y) * cos(np.sqrt(5) * t)}
+    assert max(errors(field, method, options, exact)) < bound
+
+
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [("spectral-elements", {"degree": 9, "elements": 3}), ("finite-differences", {"order": 6, "points": 40})],
+)
+@pytest.mark.parametrize("density", ["u_x**2/2 + u_y**2/2 + u_x*u_y/2", "(u_x + u_y)**2/4 + u_x**2/4 + u_y**2/4"])
+def test_products_of_derivatives_along_two_axes(density, method, options):
+    field = FieldSystem.from_text("oblique", ["u"], PLANE, f"u_t**2/2 - ({density})", boundary=PERIODIC)
+    w = np.sqrt(7)
+    exact = {"u": lambda x, y, t: sin(x + 2 * y - w * t)}
+    assert max(errors(field, method, options, exact, {"u": lambda x, y, t: -w * cos(x + 2 * y - w * t)})) < 2e-5
+
+
+@pytest.mark.full
+def test_waves_in_a_box():
+    space = {"x": (0, pi), "y": (0, "pi"), "z": (0, "2*pi")}
+    density = "u_t**2/2 - u_x**2/2 - u_y**2/2 - u_z**2/2"
+    field = FieldSystem.from_text("box", ["u"], space, density, boundary={"x": (0, 0), "z": "periodic"})
+    exact = {"u": lambda x, y, z, t: sin(x) * cos(y) * sin(z) * cos(np.sqrt(3) * t)}
+    assert max(errors(field, "spectral-elements", {"degree": 6, "elements": 2}, exact)) < 2e-5
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "bound"),
+    [
+        ("fourier", {"points": 16}, 1e-12),
+        ("finite-differences", {"order": 4, "points": 32}, 1e-4),
+        ("finite-differences", {"order": 8, "points": 32}, 1e-8),
+    ],
+)
+def test_beam_with_second_derivatives(method, options, bound):
+    field = FieldSystem.from_text("beam", ["u"], {"x": (0, "2*pi")}, "u_t**2/2 - u_xx**2/2", boundary={"x": "periodic"})
+    assert bound / 1e4 < errors(field, method, options, {"u": lambda x, t: sin(x) * cos(t)}, h=0.005)[0] < bound
+
+
+def soliton(x, t, c=0.5):
+    """Soliton sech(x - c t) exp(i (c x + (1 - c^2) t/2)) of i psi_t = -psi_xx/2 - |psi|^2 psi."""
+    return exp(1j * (c * x + (1 - c * c) / 2 * t)) / np.cosh(x - c * t)
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "h"),
+    [
+        ("finite-differences", {"order": 8, "points": 256}, 0.005),
+        ("spectral-elements", {"degree": 8, "elements": 30}, 0.002),
+        ("fourier", {"points": 128}, 0.01),
+    ],
+)
+def test_nonlinear_schroedinger_soliton_conserves_mass(method, options, h):
+    field = FieldSystem.from_text(
+        "Schroedinger",
+        ["a"],
+        {"x": (-20, 20)},
+        hamiltonian="(a_x**2 + b_x**2)/4 - (a**2 + b**2)**2/4",
+        momenta=["b"],
+        boundary={"x": "periodic"},
+    )
+    mesh = field.discretise(method, **options)
+    x = mesh.points["x"]
+    start = soliton(x, 0.0)
+    stepper = sc.compile_stepper(mesh.system, "svi:2", flags=QUICK_FLAGS)
+    run = stepper.integrate({"a": start.real}, p={"a": mesh.weights * start.imag}, h=h, t_end=0.5)
+    a, b = run.q["a"], run.p["a"] / mesh.weights
+    assert np.abs(a[-1] + 1j * b[-1] - soliton(x, 0.5)).max() < 2e-6
+    assert np.ptp(mesh.integral(a**2 + b**2)) < 5e-15
+    assert np.ptp(run.energy()) < 1e-9
+    assert mesh.unresolved(a)[-1] < 1e-9
+
+
+def test_momentum_of_waves_is_conserved_by_fourier():
+    field = FieldSystem.from_text(
+        "Klein-Gordon", ["u"], {"x": (0, "2*pi")}, "u_t**2/2 - u_x**2/2 - u**2/2", boundary={"x": "periodic"}
+    )
+    mesh = field.discretise("fourier", points=24)
+    draw = np.random.default_rng(0).normal(size=(2, 24))
+    stepper = sc.compile_stepper(mesh.system, "svi:2", flags=QUICK_FLAGS)
+    run = stepper.integrate({"u": draw[0]}, velocity={"u": draw[1]}, h=0.02, steps=200)
+    momentum = mesh.integral(run.p["u"] / mesh.weights * mesh.derivative(run.q["u"], "x"))
+    assert np.ptp(momentum) < 2e-13 < abs(momentum[0])
+
+
+@pytest.mark.parametrize(
+    ("method", "options"), [("spectral-elements", {"degree": 9, "elements": 5}), ("fourier", {"points": 24})]
+)
+def test_integral_derivative_and_resolution(method, options):
+    field = FieldSystem.from_text("torus", ["u"], PLANE, "u_t**2/2 - u_x**2/2 - u_y**2/2", boundary=PERIODIC)
+    mesh = field.discretise(method, **options)
+    x, y = mesh.points["x"], mesh.points["y"]
+    u = sin(2 * x) * cos(y)
+    assert mesh.integral(np.stack([u**2, 0 * u + 1])) == pytest.approx([pi**2, 4 * pi**2], rel=1e-9)
+    assert mesh.derivative(u, "x") == pytest.approx(2 * cos(2 * x) * cos(y), abs=1e-5)
+    assert mesh.derivative(u, "y") == pytest.approx(-sin(2 * x) * sin(y), abs=1e-5)
+    assert mesh.unresolved(u) < 1e-8
+    assert mesh.unresolved(np.random.default_rng(0).normal(size=(3, *u.shape))).shape == (3,)
+    assert mesh.unresolved(np.random.default_rng(0).normal(size=u.shape)) > 0.02
+    assert mesh.unresolved(0 * u) == 0
+
+
+def test_derivative_at_prescribed_ends_and_between_elements():
+    mesh = string(boundary={"x": (0, "natural")}).discretise("spectral-elements", degree=8, elements=[0, 0.3, 1])
+    x = mesh.points["x"]
+    assert mesh.derivative(x * (1 + x), "x") == pytest.approx(1 + 2 * x, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("field", "method", "options"),
+    [
+        (string(boundary={"x": (0, 0)}), "spectral-elements", {"degree": 6, "elements": [0, 0.4, 1]}),
+        (string("u_t**2 - 3*u_x**2/2 - 50*u**2", boundary={"x": "periodic"}), "fourier", {"points": 16}),
+        (string(boundary={"x": "periodic"}), "finite-differences", {"order": 4, "points": 16}),
+        (string("u_t**2/2 - u_xx**2/2", boundary={"x": "periodic"}), "finite-differences", {"order": 2, "points": 16}),
+    ],
+)
+def test_highest_frequency_is_a_close_upper_bound(field, method, options):
+    mesh = field.discretise(method, **options)
+    count = len(mesh.points["x"])
+    stepper = sc.compile_stepper(mesh.system, "svi:1", flags=QUICK_FLAGS)
+    h = 1e-4
+    jacobian = np.asarray(stepper.jacobian({"u": np.zeros(count)}, np.zeros(count), h))
+    highest = np.abs(np.log(np.linalg.eigvals(jacobian).astype(complex)).imag).max() / h
+    assert highest * (1 - 1e-6) < mesh.highest_frequency() < 2 * highest
+
+
+def test_equations_are_those_of_euler_and_lagrange():
+    x, y, t = sympy.symbols("x y t")
+    u = sympy.Function("u")(x, y, t)
+    field = FieldSystem.from_text(
+        "plate", ["u"], {"x": (0, 1), "y": (0, 1)}, "2*u_t**2 - u_xy**2/2 - y*u_x**2/2 - u**4/4", parameters={}
+    )
+    equation = field.euler_lagrange()["u"]
+    expected = (y * u.diff(x, 2) - u**3 - u.diff(x, 2, y, 2)) / 4
+    assert str(equation.rhs) == str(sympy.expand(expected))
+    density = 2 * u.diff(t) ** 2 - u.diff(x, y) ** 2 / 2 - y * u.diff(x) ** 2 / 2 - u**4 / 4
+    space = {"x": (0, 1), "y": (0, 1)}
+    assert FieldSystem.from_sympy(name="plate", fields=[u], space=space, density=density) == field
+
+
+def test_other_parameters_and_arrays_of_a_run_replace_those_of_the_mesh():
+    mesh = string("u_t**2/2 - c*u_x**2/2", boundary={"x": (0, 0)}, parameters={"c": 1}).discretise(
+        "spectral-elements", degree=6, elements=2
+    )
+    x = mesh.points["x"]
+    stepper = sc.compile_stepper(mesh.system, "svi:2", flags=QUICK_FLAGS)
+    one, two = (
+        stepper.integrate({"u": sin(pi * x)}, h=0.01, steps=20, parameters=each).q["u"][-1]
+        for each in ({"c": 4.0}, {"c": 4.0, "weight_x": 4 * mesh.weights})
+    )
+    assert one == pytest.approx(sin(pi * x) * cos(0.4 * pi), abs=2e-4)
+    assert two == pytest.approx(sin(pi * x) * cos(0.2 * pi), abs=2e-4)
+
+
+PROBLEMS = {
+    "no kinetic term": ({"density": "u_t - u_x**2"}, "not regular in u_t"),
+    "linear in velocities": ({"density": "u_t**2/2 + u*u_t"}, "linear in velocities"),
+    "mass of the field": ({"density": "u*u_t**2/2"}, "factor that depends on u"),
+    "coupled velocities": ({"density": "u_t**2 + v_t**2 + u_t*v_t", "fields": ["u", "v"]}, "u_t*v_t"),
+    "unknown name": ({"density": "u_t**2/2 - w**2"}, "'w'"),
+    "both": ({"density": "u_t**2", "hamiltonian": "u**2"}, "exactly one of"),
+    "no momentum": ({"hamiltonian": "u**2"}, "1 fields and 0 momenta"),
+    "bounds": ({"space": {"x": (1, 0)}}, "finite and ascending"),
+    "one bound": ({"space": {"x": (1,)}}, "lower and an upper bound"),
+    "four axes": ({"space": dict.fromkeys("xyzw", (0, 1))}, "one to three"),
+    "axis": ({"boundary": {"y": "periodic"}}, "boundary for 'y'"),
+    "boundary": ({"boundary": {"x": "open"}}, 'must be "periodic"'),
+    "field of a boundary": ({"boundary": {"x": ({"v": 0}, 0)}}, "not of"),
+}
+
+
+@pytest.mark.parametrize("problem", PROBLEMS)
+def test_malformed_densities_are_refused_by_name(problem):
+    changed, message = PROBLEMS[problem]
+    arguments = {"name": "field", "fields": ["u"], "space": {"x": (0, 1)}, "density": "u_t**2/2 - u_x**2/2"}
+    if "hamiltonian" in changed and "density" not in changed:
+        del arguments["density"]
+    with pytest.raises((SystemDefinitionError, sc.ExpressionError), match=message.replace("*", r"\*")):
+        FieldSystem.from_text(**arguments | changed)
+
+
+MESHES = {
+    "method": (("elements", {}), "no discretisation 'elements'"),
+    "missing": (("fourier", {}), "needs points="),
+    "unknown": (("fourier", {"points": 8, "degree": 3}), "no option 'degree'"),
+    "ends": (("fourier", {"points": 8}), "needs a periodic axis"),
+    "order": (("finite-differences", {"points": 8, "order": 3}), "2, 4, 6 or 8"),
+    "few": (("finite-differences", {"points": 3, "order": 4}), "at least 8"),
+    "elements": (("spectral-elements", {"degree": 2, "elements": 0}), "a number of elements or their ends"),
+    "breaks": (("spectral-elements", {"degree": 2, "elements": [0, 0.5, 0.4, 1]}), "must ascend"),
+    "degree": (("spectral-elements", {"degree": 0, "elements": 3}), "at least 1"),
+    "beam": (("spectral-elements", {"degree": 3, "elements": 3}), "second derivative u_xx"),
+    "not quadratic": (("fourier", {"points": 8}), "quadratic in derivatives"),
+    "variable": (("fourier", {"points": 8}), "constant factors"),
+    "oblique": (("fourier", {"points": 8}), "along one axis"),
+}
+DENSITIES = {
+    "beam": "u_t**2/2 - u_xx**2/2",
+    "not quadratic": "u_t**2/2 - u_x**4/4 - u_x**2/2",
+    "variable": "u_t**2/2 - x*u_x**2/2",
+    "oblique": "u_t**2/2 - u*u_x",
+}
+
+
+@pytest.mark.parametrize("problem", MESHES)
+def test_meshes_that_do_not_suit_are_refused_by_name(problem):
+    (method, options), message = MESHES[problem]
+    ends = {"ends": (0, 0), "beam": (0, 0), "elements": (0, 0)}.get(problem, "periodic")
+    field = string(DENSITIES.get(problem, "u_t**2/2 - u_x**2/2"), boundary={"x": ends})
+    with pytest.raises((SystemDefinitionError, sc.MethodError), match=message):
+        field.discretise(method, **options)
+
+
+def test_wrong_shapes_and_axes_are_refused():
+    mesh = string(boundary={"x": "periodic"}).discretise("fourier", points=8)
+    with pytest.raises(StateError, match="must have the shape"):
+        mesh.integral(np.zeros(7))
+    with pytest.raises(StateError, match="no axis 'y'"):
+        mesh.derivative(np.zeros(8), "y")
+    with pytest.raises(StateError, match="no parameter 'c'"):
+        mesh.highest_frequency(c=1)
