@@ -31,7 +31,7 @@ DISCRETISATIONS = {
 """Options by discretisation in space."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class FieldSystem(Density):
     """Lagrangian density L(u, u_t, u_x, .., x, .., t; parameters) of fields on an interval, rectangle or box.
 

@@ -177,6 +177,7 @@ class TestTrajectory:
             step_sizes=run.step_sizes,
             parameters=run.parameters,
             stepper=run.stepper,
+            plan=run.plan,
         )
         assert 'aria-label="energy"' not in broken._repr_html_()
 

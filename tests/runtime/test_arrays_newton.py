@@ -108,12 +108,13 @@ def test_step_without_convergence_fails():
     assert (run.q["q"] == q).all()
 
 
-def test_methods_without_newton_are_rejected():
-    damped = sc.LagrangianSystem.from_text(
-        name="damped", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2)", forces={"q[i]": "-q_dot[i]"}
-    )
-    for system, method in ((field(1.0), "stoermer-verlet"), (damped, "svi:4")):
-        with pytest.raises(MethodError, match="leave out solver"):
-            sc.compile_stepper(system, method, solver="newton").integrate(np.zeros(3), h=0.1, steps=1)
+def test_newton_of_explicit_methods_is_compiled_with_the_sizes_of_the_call():
+    q = np.array([0.3, -0.2, 0.5])
+    one, two = (sc.compile_stepper(field(1.0), "stoermer-verlet", solver=each) for each in ("newton", "auto"))
+    ends = [each.integrate(q, h=0.1, steps=20).q["q"][-1] for each in (one, two)]
+    assert ends[0] == pytest.approx(ends[1], abs=1e-13)
+
+
+def test_unknown_solvers_are_rejected():
     with pytest.raises(MethodError, match="use 'fixed-point' or 'newton'"):
         sc.compile_stepper(field(1.0), "svi:4", solver="krylov")

@@ -82,10 +82,10 @@ def _in_one_call(
     """
     run, plan, most = memory._memory, memory._plan, FIRST_STEPS * save_every
     first, size = run.step, most if steps is None else steps
-    if size > most or run.t == plan.t_end or plan.tau or memory.stepper.interface.energy_parameter:
+    if size > most or memory.t == plan.t_end or plan.tau or memory.stepper.interface.energy_parameter:
         return None, 0, 0
     if first:
-        rows.begin_checked(run.t, memory._q, memory._p)
+        rows.begin_checked(memory.t, memory._q, memory._p)
     status, report = memory._advance(size, save_every, rows.next), memory._report
     h, filled = plan.h, 1 + (run.step // save_every - first // save_every if plan.h else report.stored)
     if status or (steps is None and report.steps == size):
