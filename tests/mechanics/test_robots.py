@@ -254,6 +254,7 @@ MUJOCO_CHANGES = {
     "gravity compensation": ('name="hand"', 'name="hand" gravcomp="1"', "gravity compensation"),
     "replicate": ("</worldbody>", "<replicate/></worldbody>", "write its bodies out"),
     "ball spring": (' stiffness="0"', "", "hinges and slides only"),
+    "axes": ('eulerseq="zyx"', 'eulerseq="zy"', "is not three of the letters"),
     "name": ('name="slip"', 'name="flex"', "two joints are called 'flex'"),
     "include": ("<option", '<include file="none.xml"/><option', "none.xml cannot be read"),
 }

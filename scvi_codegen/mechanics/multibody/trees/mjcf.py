@@ -6,8 +6,10 @@ https://mujoco.readthedocs.io/en/stable/XMLreference.html.
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
@@ -215,7 +217,12 @@ class _MujocoModel:
             return about(np.array(axis) / length, angle * self.turn)
         if kind == "euler":
             rotation = np.eye(3)
-            for letter, angle in zip(self.settings.get("eulerseq", "xyz"), element.vector("euler"), strict=True):
+            sequence = self.settings.get("eulerseq", "xyz")
+            if not re.fullmatch("[xyzXYZ]{3}", sequence):
+                element.refuse(
+                    f"has euler, and eulerseq='{sequence}' is not three of the letters xyzXYZ"
+                )
+            for letter, angle in zip(sequence, element.vector("euler"), strict=True):
                 turned = about(AXES[letter.lower()], angle * self.turn)
                 rotation = rotation @ turned if letter.islower() else turned @ rotation
             return rotation
@@ -229,20 +236,11 @@ class _MujocoModel:
 
     def scaled(self) -> list[Link]:
         """Return the links, with inertias scaled to ``settotalmass``."""
-        total = float(self.settings.get("settotalmass", "-1"))
+        total = Element(self.root.file, self.root.node, self.settings).number("settotalmass", -1)
         masses = sum(link.inertia.mass for link in self.links)
         if total <= 0 or masses == 0:
             return self.links
-        by = total / masses
-        return [
-            Link(
-                each.name,
-                each.parent,
-                each.joint,
-                Inertia(each.inertia.mass * by, each.inertia.center, each.inertia.matrix * by),
-            )
-            for each in self.links
-        ]
+        return [replace(each, inertia=each.inertia.scaled(total / masses)) for each in self.links]
 
 
 def _sections(root: Element, depth: int) -> Iterator[Element]:
