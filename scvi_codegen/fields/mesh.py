@@ -41,11 +41,11 @@ class MeshSystem:
     __repr__ = summary("system")
 
     def integral(self, values: ArrayLike) -> Any:
-        """Return the integral over space of values at the points, (..., *shape of the fields), by quadrature."""
+        """Return the integral over space of values at the points, (.., shape of the fields), by quadrature."""
         return np.sum(self.weights * self._at_points(values), axis=tuple(range(-len(self.axes), 0)))
 
     def derivative(self, values: ArrayLike, axis: str) -> Array:
-        """Return the derivative along an axis at the points, (..., *shape), of the spectral interpolant.
+        """Return the derivative along an axis at the points, (.., shape of the fields), of the spectral interpolant.
 
         Elements share end points, at which the mean of both derivatives is returned, weighted by length. Prescribed
         values at ends are taken as 0.

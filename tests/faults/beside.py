@@ -177,8 +177,8 @@ CONSTRAINTS = (
     text(
         "steps of positions 1e-7 too long",
         case("sleigh/lobatto-svi"),
-        r"1, step->h, data\.z",
-        "1, 1.0000001 * step->h, data.z",
+        r"1, step->h, data->z",
+        "1, 1.0000001 * step->h, data->z",
     ),
 )
 
@@ -299,8 +299,8 @@ SECOND = (
     text(
         "arguments that h moves bend once too often",
         case("kepler/svi-3"),
-        r"add_product\(by, -by_h\[k\] / h, to->pulled \+ k, dh\);",
-        "add_product(by, by_h[k] / h, to->pulled + k, dh);",
+        r"add_product\(by, -by_h\[k\] / h, to->adjoints \+ k, dh\);",
+        "add_product(by, by_h[k] / h, to->adjoints + k, dh);",
     ),
     text(
         "multipliers that do not change with unknowns",

@@ -62,16 +62,14 @@ STEP_SIZE_FAULTS = (
     text(
         "time that runs ahead of chosen steps",
         CONTROLLED,
-        r"now->step.h\);",
-        "now->step.h * (1 + 1e-10));",
-        within="take_step",
+        r"now->at\.t_low, h, 0\);",
+        "now->at.t_low, h * (1 + 1e-10), 0);",
     ),
     text(
         "time that runs ahead of the steps of a time transformation",
         REVERSIBLE,
-        r"now->step.h\);",
-        "now->step.h * (1 + 1e-10));",
-        within="take_step",
+        r"now->at\.t_low, now->step\.h, 0\);",
+        "now->at.t_low, now->step.h * (1 + 1e-10), 0);",
     ),
     text("a density that is forgotten", REVERSIBLE, r"run->density = now->density;", "run->density = 0;"),
     text(

@@ -74,7 +74,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
         pieces: with inputs, the trajectories between their breakpoints, each with its parameters; the first state of
             each is the last of the previous one. ``parameters`` are then those of the first.
 
-    Positions and momenta of arrays are also indexed by name: ``q["u"]`` has the shape (n, *shape of u).
+    Positions and momenta of arrays are also indexed by name: ``q["u"]`` has the axes n and those of u.
     """
 
     iterations: NDArray[np.int32]

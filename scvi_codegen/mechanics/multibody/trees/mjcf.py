@@ -219,9 +219,7 @@ class _MujocoModel:
             rotation = np.eye(3)
             sequence = self.settings.get("eulerseq", "xyz")
             if not re.fullmatch("[xyzXYZ]{3}", sequence):
-                element.refuse(
-                    f"has euler, and eulerseq='{sequence}' is not three of the letters xyzXYZ"
-                )
+                element.refuse(f"has euler, and eulerseq='{sequence}' is not three of the letters xyzXYZ")
             for letter, angle in zip(sequence, element.vector("euler"), strict=True):
                 turned = about(AXES[letter.lower()], angle * self.turn)
                 rotation = rotation @ turned if letter.islower() else turned @ rotation
