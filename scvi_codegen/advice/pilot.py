@@ -46,7 +46,7 @@ quarter and over the second half."""
 
 
 class PilotRun(NamedTuple):
-    """One run: (samples, m) positions at equal intervals, iterations per step, seconds, reason of failure or ``""``."""
+    """Result of a run: (samples, m) positions at equal intervals, iterations per step, seconds, reason of failure."""
 
     q: Array
     iterations: float

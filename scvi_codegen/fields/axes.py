@@ -157,6 +157,8 @@ def spectral_elements(name: str, breaks: Array, degree: int, fixed: tuple[bool, 
     points[places[:, ::-1]] = at[:, ::-1]
     np.add.at(masses, places.ravel(), np.outer(half, np.array([float(each) for each in rule.weights])).ravel())
     left, right = fixed or (False, False)
+    if count <= left + right:
+        raise SystemDefinitionError(f"'{name}' has no points between its prescribed ends: use more elements")
     inside = slice(int(left), count - int(right))
     size, index = f"E{name}", f"e{name}"
     table = f"nodes_{name}"

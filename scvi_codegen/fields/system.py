@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -223,11 +224,9 @@ class FieldSystem(Density):
             SystemDefinitionError: if an option is missing or unknown, or the method does not suit the boundary or the
                 density.
         """
-        if method not in DISCRETISATIONS:
+        if not isinstance(method, str) or method not in DISCRETISATIONS:
             known = ", ".join(DISCRETISATIONS)
-            raise SystemDefinitionError(
-                f"there is no discretisation '{method}'{closest(method, DISCRETISATIONS)}: {known}"
-            )
+            raise SystemDefinitionError(f"there is no discretisation '{method}'; possible: {known}")
         needed = DISCRETISATIONS[method]
         for name in options:
             if name not in needed:
@@ -264,7 +263,7 @@ class FieldSystem(Density):
 
 
 def _bounds(axis: str, ends: Any) -> tuple[float, float]:
-    if isinstance(ends, str) or len(ends) != 2:
+    if isinstance(ends, str) or not hasattr(ends, "__len__") or len(ends) != 2:
         raise SystemDefinitionError(f"the axis '{axis}' needs a lower and an upper bound, not {ends!r}")
     values = []
     for each in ends:
@@ -299,8 +298,8 @@ def _boundary(axis: str, boundary: Any, fields: Sequence[str], known: Mapping[st
 def _breaks(axis: str, start: float, end: float, elements: Any) -> Any:
     """Return the ends of the elements."""
     if np.ndim(elements) == 0:
-        count = int(elements)
-        if isinstance(elements, bool) or count != elements or count < 1:
+        whole = hasattr(elements, "__index__") and not isinstance(elements, bool)
+        if not whole or (count := operator.index(elements)) < 1:
             raise SystemDefinitionError(
                 f"elements= of '{axis}' must be a number of elements or their ends, not {elements!r}"
             )

@@ -328,6 +328,7 @@ PROBLEMS = {
     "both": ({"density": "u_t**2", "hamiltonian": "u**2"}, "exactly one of"),
     "no momentum": ({"hamiltonian": "u**2"}, "1 fields and 0 momenta"),
     "bounds": ({"space": {"x": (1, 0)}}, "finite and ascending"),
+    "no bounds": ({"space": {"x": None}}, "lower and an upper bound"),
     "one bound": ({"space": {"x": (1,)}}, "lower and an upper bound"),
     "four axes": ({"space": dict.fromkeys("xyzw", (0, 1))}, "one to three"),
     "axis": ({"boundary": {"y": "periodic"}}, "boundary for 'y'"),
@@ -354,6 +355,9 @@ MESHES = {
     "order": (("finite-differences", {"points": 8, "order": 3}), "2, 4, 6 or 8"),
     "few": (("finite-differences", {"points": 3, "order": 4}), "at least 8"),
     "elements": (("spectral-elements", {"degree": 2, "elements": 0}), "a number of elements or their ends"),
+    "text": (("spectral-elements", {"degree": 2, "elements": "four"}), "a number of elements or their ends"),
+    "no points": (("spectral-elements", {"degree": 1, "elements": 1}), "no points between its prescribed ends"),
+    "number": ((3, {"points": 8}), "no discretisation '3'"),
     "breaks": (("spectral-elements", {"degree": 2, "elements": [0, 0.5, 0.4, 1]}), "must ascend"),
     "degree": (("spectral-elements", {"degree": 0, "elements": 3}), "at least 1"),
     "beam": (("spectral-elements", {"degree": 3, "elements": 3}), "second derivative u_xx"),
@@ -372,7 +376,7 @@ DENSITIES = {
 @pytest.mark.parametrize("problem", MESHES)
 def test_meshes_that_do_not_suit_are_refused_by_name(problem):
     (method, options), message = MESHES[problem]
-    ends = {"ends": (0, 0), "beam": (0, 0), "elements": (0, 0)}.get(problem, "periodic")
+    ends = {"ends": (0, 0), "beam": (0, 0), "elements": (0, 0), "no points": (0, 0)}.get(problem, "periodic")
     field = string(DENSITIES.get(problem, "u_t**2/2 - u_x**2/2"), boundary={"x": ends})
     with pytest.raises((SystemDefinitionError, sc.MethodError), match=message):
         field.discretise(method, **options)

@@ -207,7 +207,7 @@ def _example() -> tuple[Block, ...]:
             "is a parabola,"
         ),
         Formula(hand.curve, sympy.Function("q")(tau)),
-        Paragraph("its slopes at the middle and at the end are the velocities V = A Q + a0 q_k, and these give Acc:"),
+        Paragraph("its derivatives at the middle and at the end are V = A Q + a0 q_k, and these give Acc:"),
         *(Formula(v, sympy.Symbol(f"V_{i}")) for i, v in enumerate(hand.velocities, 1)),
         *(Formula(sympy.expand(a), sympy.Symbol(f"Acc_{i}")) for i, a in enumerate(hand.accelerations, 1)),
         Paragraph("From the Lagrangian alone the compiler derives, as printed in the paper:"),

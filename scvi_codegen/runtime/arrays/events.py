@@ -217,7 +217,7 @@ class ArraySearch:
 
 
 class _Step:
-    """One step between two saved states, and states within it."""
+    """Step between two saved states, and states within it."""
 
     def __init__(self, states: SavedStates, number: int) -> None:
         self.states, self.number, self.t = states, number, float(states.t[number])
