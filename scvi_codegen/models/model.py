@@ -88,6 +88,9 @@ class Model(TimeSpan):
                     object.__setattr__(self, name, self._vector(name, vector))
         else:
             self._check_arrays()
+            for name, declared in (("fields", arrays.fields), ("tables", arrays.tables)):
+                default = {each.name: arrays.data[each.name] for each in declared if each.name in arrays.data}
+                object.__setattr__(self, name, default | dict(getattr(self, name)))
         if self.time_transformation is not None and (self.system.clock is not None or self.span is None):
             raise ModelFileError(
                 f"the reversible controller of the time transformation {self.time_transformation} requires a time "

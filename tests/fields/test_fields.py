@@ -390,3 +390,12 @@ def test_wrong_shapes_and_axes_are_refused():
         mesh.derivative(np.zeros(8), "y")
     with pytest.raises(StateError, match="no parameter 'c'"):
         mesh.highest_frequency(c=1)
+
+
+def test_model_file_contains_the_arrays_of_the_mesh(tmp_path):
+    mesh = string(boundary={"x": "periodic"}).discretise("spectral-elements", degree=3, elements=[0, 0.4, 1])
+    start = {"u": sin(2 * pi * mesh.points["x"])}
+    model = sc.Model(system=mesh.system, method=sc.SVI(2), q=start, h=0.01, steps=5)
+    sc.save_model(model, tmp_path / "string.toml")
+    again = sc.load_model(tmp_path / "string.toml")
+    assert np.asarray(again.integrate().q) == pytest.approx(np.asarray(model.integrate().q), abs=1e-15)
