@@ -1,13 +1,12 @@
 """Benchmark: this package and other integrators, compared at equal error.
 
     cases/              problems, eight initial states each, accelerations derived by hand (unforced, adaptive, rods
-                        with forces or constraints, large array systems, texts of systems), and their final
+                        with forces or constraints, rotations, large array systems, texts of systems), and their final
                         states in extended precision, independent of the package's steppers (references)
     contenders/         steppers of this package, at the step sizes that advise() recommends; its peers: REBOUND, CyRK,
-                        JiTCODE, SciPy and heyoka at several tolerances
+                        JiTCODE, SciPy, heyoka and MuJoCo (engines) at several tolerances
     comparison          timing of all of them in turn, in one process, for one case, or an ensemble of 64 trajectories
     report              time at equal error, by interpolation; tables and JSON of results; plots: their pictures
-    adaptive            adaptive step size
     energies            energy drift over ten million steps, and of array systems over a hundred thousand
     hand_written        generated C and hand-written C; cost of a control step, and of the bare C function
     first_step          time from text to the first step, also for larger systems and SymPy's bodies and loads
@@ -30,12 +29,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from scvi_codegen.benchmark.adaptive import run_adaptive
 from scvi_codegen.benchmark.array_systems import run_growth, run_threads
 from scvi_codegen.benchmark.cases.adaptive import ADAPTIVE_CASES
 from scvi_codegen.benchmark.cases.rods import CONSTRAINED_CASES, FORCED_CASES
+from scvi_codegen.benchmark.cases.rotations import ROTATIONS
 from scvi_codegen.benchmark.cases.unforced import CASES
-from scvi_codegen.benchmark.comparison import ENSEMBLES, run_case, run_constrained, run_ensemble, run_forced
+from scvi_codegen.benchmark.comparison import (
+    ENSEMBLES,
+    run_adaptive,
+    run_bodies,
+    run_case,
+    run_constrained,
+    run_ensemble,
+    run_forced,
+    run_rotations,
+)
 from scvi_codegen.benchmark.constrained_bodies import run_constrained_bodies
 from scvi_codegen.benchmark.contenders.peers import PEERS
 from scvi_codegen.benchmark.energies import run_drift, run_energies
@@ -59,6 +67,8 @@ SECTIONS: Mapping[str, Callable[[Plan, ReportActivity], CaseResult | ResultTable
     **{f"forced:{name}": partial(run_forced, name) for name in FORCED_CASES},
     **{f"constrained:{name}": partial(run_constrained, name) for name in CONSTRAINED_CASES},
     **{f"adaptive:{name}": partial(run_adaptive, name) for name in ADAPTIVE_CASES},
+    **{f"rotations:{name}": partial(run_rotations, name) for name in ROTATIONS},
+    "rotations:bodies": run_bodies,
     "drift": run_drift,
     "compositions": run_compositions,
     "hand-written": run_hand_written,

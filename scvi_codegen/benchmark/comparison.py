@@ -16,10 +16,12 @@ from functools import partial
 
 import numpy as np
 
-from scvi_codegen.benchmark.cases.references import Reference, reference, rms_error
+from scvi_codegen.benchmark.cases.adaptive import adaptive_case
+from scvi_codegen.benchmark.cases.references import Reference, adaptive_reference, reference, rms_error
 from scvi_codegen.benchmark.cases.rods import CONSTRAINED_CASES, FORCED_CASES, constrained_contenders
+from scvi_codegen.benchmark.cases.rotations import BODIES, FEW_BODIES, ROTATIONS, bodies
 from scvi_codegen.benchmark.cases.unforced import STATES, Array, Case, case
-from scvi_codegen.benchmark.contenders.ours import our_contenders, our_ensembles
+from scvi_codegen.benchmark.contenders.ours import adaptive_contenders, our_contenders, our_ensembles
 from scvi_codegen.benchmark.contenders.peers import PEERS, missing_module, peer_contenders
 from scvi_codegen.benchmark.contenders.taylor import heyoka_ensembles
 from scvi_codegen.benchmark.report import CaseResult, Contender, Measurement
@@ -80,6 +82,42 @@ def run_ensemble(name: str, plan: Plan, report_activity: ReportActivity) -> Case
     many = replace(few, q=np.tile(few.q, (copies, 1)), velocity=np.tile(few.velocity, (copies, 1)))
     makers: Makers = {"heyoka": partial(heyoka_ensembles, many, plan.quick)} if "heyoka" in plan.peers else {}
     return race(few, partial(our_ensembles, many, quick=plan.quick), makers, plan, report_activity)
+
+
+@without_accuracy_warnings()
+def run_adaptive(name: str, plan: Plan, report_activity: ReportActivity) -> CaseResult:
+    """Compare problems with close encounters in all modes of this package with peers of adaptive step size."""
+    chosen = adaptive_case(name)
+    peers = ("heyoka", "rebound")
+    makers: Makers = {peer: partial(peer_contenders, peer, chosen, quick=True) for peer in peers if peer in plan.peers}
+    ours = partial(adaptive_contenders, chosen, quick=plan.quick)
+    return race(chosen, ours, makers, plan, report_activity, adaptive_reference)
+
+
+@without_accuracy_warnings()
+def run_rotations(name: str, plan: Plan, report_activity: ReportActivity) -> CaseResult:
+    """Compare a rigid body in this package with peers that integrate quaternion and angular velocity."""
+    chosen = ROTATIONS[name]()
+    chosen = replace(chosen, span=chosen.span * plan.share)
+
+    def ours() -> list[Contender]:
+        both = (our_contenders, adaptive_contenders)
+        return [contender for make in both for contender in make(chosen, quick=plan.quick)]
+
+    return race(chosen, ours, _makers(chosen, plan), plan, report_activity)
+
+
+@without_accuracy_warnings()
+def run_bodies(plan: Plan, report_activity: ReportActivity) -> CaseResult:
+    """Compare many free bodies in this package, in heyoka's batch mode and in one model of MuJoCo."""
+    chosen = bodies(FEW_BODIES if plan.quick else BODIES)
+    chosen = replace(chosen, span=chosen.span * plan.share)
+    makers: Makers = {
+        "heyoka": partial(heyoka_ensembles, chosen, plan.quick),
+        "mujoco": partial(peer_contenders, "mujoco", chosen, quick=plan.quick),
+    }
+    makers = {name: make for name, make in makers.items() if name in plan.peers}
+    return race(chosen, partial(our_ensembles, chosen, quick=plan.quick), makers, plan, report_activity)
 
 
 def race(

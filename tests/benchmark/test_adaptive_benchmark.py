@@ -7,9 +7,10 @@ import pytest
 from mpmath import mp
 
 from scvi_codegen import benchmark as bench
-from scvi_codegen.benchmark import adaptive
+from scvi_codegen.benchmark.cases import references
 from scvi_codegen.benchmark.cases.adaptive import ADAPTIVE_CASES, adaptive_case
-from scvi_codegen.benchmark.cases.references import field_of, final_states, states_after
+from scvi_codegen.benchmark.cases.references import adaptive_reference, field_of, final_states, states_after
+from scvi_codegen.benchmark.contenders.ours import adaptive_contenders
 from scvi_codegen.errors import StateError
 from scvi_codegen.native import building
 
@@ -31,18 +32,18 @@ def test_every_case_has_eight_states_of_one_energy_scale():
 @pytest.mark.parametrize("e", [0.0, 0.9, 0.999])
 def test_keplers_reference_returns_after_a_period(e):
     chosen = replace(adaptive_case(f"kepler:{e}"), span=2.0 * np.pi)
-    found = adaptive.adaptive_reference(chosen)
+    found = adaptive_reference(chosen)
     assert np.abs(found.high - chosen.q).max() < 1e-14 / (1.0 - e)  # the period of rounded states
     q, v = chosen.q[2], chosen.velocity[2]
     with mp.workdps(30):
-        assert float(abs(mp.mpf(found.high[2, 0]) - adaptive._kepler_end(q, v, chosen.span)[0])) < 1e-16
+        assert float(abs(mp.mpf(found.high[2, 0]) - references._kepler_end(q, v, chosen.span)[0])) < 1e-16
 
 
 @pytest.mark.full
 @needs_extended
 def test_references_on_selected_steps_equal_those_on_uniform_steps():
     chosen = replace(adaptive_case("atwood"), span=3.0)
-    found = adaptive.adaptive_reference(chosen)
+    found = adaptive_reference(chosen)
     assert found.accuracy < 1e-17
     start = np.concatenate([chosen.q, chosen.velocity], axis=1).astype(np.longdouble)
     equal = final_states(field_of(chosen), start, chosen.span, 1.0 / 64.0)
@@ -53,9 +54,9 @@ def test_references_on_selected_steps_equal_those_on_uniform_steps():
 
 def test_steps_of_a_reference_are_the_shortest_of_its_runs():
     runs = np.array([0.0, 1.0, 1.5, 2.0, 4.0]), np.array([0.0, 0.75, 2.75, 4.0])
-    steps = adaptive._shortest(runs)
+    steps = references._shortest(runs)
     assert np.array_equal(steps, [0.75, 1.0, 0.5, 1.75])
-    third = adaptive._shortest([np.linspace(0.0, 4.0, 4), np.linspace(0.0, 4.0, 3)])
+    third = references._shortest([np.linspace(0.0, 4.0, 4), np.linspace(0.0, 4.0, 3)])
     assert third.sum() == 4.0
 
 
@@ -68,19 +69,19 @@ def test_reference_uses_smaller_steps_where_large_ones_fail(monkeypatch):
             raise StateError("no")
         return start
 
-    monkeypatch.setattr(adaptive, "states_after", states_after)
-    adaptive._with_two_steps(lambda x: x, np.zeros((1, 2)), np.ones(3, dtype=np.longdouble))
+    monkeypatch.setattr(references, "states_after", states_after)
+    references._with_two_steps(lambda x: x, np.zeros((1, 2)), np.ones(3, dtype=np.longdouble))
     assert asked == [1.0, 0.5, 0.25, 0.125]
     with pytest.raises(StateError):
-        adaptive._with_two_steps(lambda x: x, np.zeros((1, 2)), np.full(3, 9.0))
+        references._with_two_steps(lambda x: x, np.zeros((1, 2)), np.full(3, 9.0))
 
 
 @needs_extended
 def test_all_modes_run_and_agree():
     chosen = replace(adaptive_case("kepler:0.5"), span=20.0)
-    made = adaptive._ours(chosen, quick=False)
+    made = adaptive_contenders(chosen, quick=False)
     assert {each.method.split()[1] for each in made} == {"controlled", "fixed", "transformed"}
-    exact = adaptive.adaptive_reference(chosen)
+    exact = adaptive_reference(chosen)
     tight = [each for each in made if each.setting in ("tol=default", "h=0.1")]
     for each in tight:
         assert np.abs(each.prepare(3)() - exact.high[3]).max() < 1e-12
@@ -91,4 +92,4 @@ def test_all_modes_run_and_agree():
 def test_the_reference_of_the_pythagorean_problem_passes_its_encounters():
     chosen = adaptive_case("pythagorean")
     one = replace(chosen, q=chosen.q[:1], velocity=chosen.velocity[:1])
-    assert adaptive.adaptive_reference(one).accuracy < 1e-4
+    assert adaptive_reference(one).accuracy < 1e-4

@@ -4,6 +4,9 @@ NumPy's ``longdouble`` has 80 bits on x86 and 128 on 64-bit Arm under Linux. The
 package's steppers: right-hand sides are the hand-derived ones of :mod:`.unforced`, tables come from mpmath. Tables are
 sums of two numbers and steps are short binary fractions, so that neither causes a systematic error. Each reference is
 computed with two step sizes, and their difference is stored as its accuracy.
+
+With close encounters the steps are the adaptive ones of this package, which a method of twice the order resolves by
+far, and halves of them; Kepler's problem is solved by Kepler's equation in 40 digits.
 """
 
 from __future__ import annotations
@@ -23,8 +26,10 @@ from numpy.typing import NDArray
 
 from scvi_codegen.benchmark.cases.unforced import Array, Case
 from scvi_codegen.benchmark.contenders.tracing import rates_text
+from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError
 from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.native import building
 
 Extended = NDArray[np.longdouble]
@@ -37,6 +42,8 @@ STAGNATED, ROUNDED = 1e-16, 1e-14
 """Relative changes below which the iteration has converged: once they hardly shrink, or, near collisions, grow."""
 
 DIGITS = 50
+HALVINGS = 2
+"""Largest number of halvings of a reference's steps, if a step of a close encounter is too large for Gauss."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -71,10 +78,14 @@ def reference(case: Case, momenta: Array | None = None) -> Reference:
         momenta: (k, m) doubles to start from instead of the case's velocities, for steppers whose state is (q, p);
             relevant only for cases with masses.
     """
+    return remembered(case, _velocity(case, momenta), _compute)
+
+
+def _velocity(case: Case, momenta: Array | None) -> Extended:
     velocity = case.velocity.astype(np.longdouble)
     if momenta is not None and case.masses is not None:
         velocity = momenta.astype(np.longdouble) / np.array(case.masses, dtype=np.longdouble)
-    return remembered(case, velocity, _compute)
+    return velocity
 
 
 def remembered(case: Case, velocity: Extended, compute: Callable[[Case, Extended], Reference]) -> Reference:
@@ -90,7 +101,7 @@ def remembered(case: Case, velocity: Extended, compute: Callable[[Case, Extended
 def _key(case: Case, velocity: Extended, kind: str) -> str:
     """Return a hash of everything that the result depends on."""
     digest = hashlib.sha256(inspect.getsource(inspect.getmodule(_key)).encode())  # type: ignore[arg-type]
-    digest.update(rates_text(case.formulations[0].rates, case.parameters, 2 * case.dimension).encode())
+    digest.update(rates_text(case.formulations[0].rates, case.parameters, case.size).encode())
     for array in (case.q, *two_doubles(velocity)):
         digest.update(array.tobytes())
     digest.update(repr((kind, case.span, case.fine, np.finfo(np.longdouble).machep)).encode())
@@ -238,3 +249,66 @@ def _exact(x: np.longdouble) -> Any:
     high = float(x)
     middle = float(x - np.longdouble(high))
     return mp.mpf(high) + mp.mpf(middle) + mp.mpf(float(x - np.longdouble(high) - np.longdouble(middle)))
+
+
+def adaptive_reference(chosen: Case, momenta: Array | None = None) -> Reference:
+    """Return the final states of a case: exact, or in extended precision (minutes, then cached on disk)."""
+    return remembered(chosen, _velocity(chosen, momenta), kepler_ends if "kepler" in chosen.name else _ends)
+
+
+def kepler_ends(chosen: Case, velocity: Extended) -> Reference:
+    """Return exact final states from Kepler's equation and Lagrange coefficients in 40 digits."""
+    ends = [_kepler_end(q, v, chosen.span) for q, v in zip(chosen.q, velocity.astype(float), strict=True)]
+    high = np.array([[float(x) for x in end] for end in ends])
+    low = np.array([[float(x - mp.mpf(float(x))) for x in end] for end in ends])
+    return Reference(high=high, low=low, accuracy=1e-30)
+
+
+def _kepler_end(q: Array, v: Array, t: float) -> tuple[Any, Any]:
+    with mp.workdps(40):
+        # Lagrange's f and g functions of the change E of the eccentric anomaly.
+        (x, y), (u, w) = map(mp.mpf, q.tolist()), map(mp.mpf, v.tolist())
+        r = mp.hypot(x, y)
+        a = 1 / (2 / r - (u * u + w * w))
+        n, cosine, sine = a ** mp.mpf("-1.5"), 1 - r / a, (x * u + y * w) / mp.sqrt(a)
+        anomaly = mp.findroot(
+            lambda E: E - cosine * mp.sin(E) + sine * (1 - mp.cos(E)) - n * t,
+            (n * t - 2, n * t + 2),
+            solver="anderson",
+            tol=1e-70,
+            maxsteps=200,
+        )
+        f, g = 1 - a / r * (1 - mp.cos(anomaly)), t - (anomaly - mp.sin(anomaly)) / n
+        return f * x + g * u, f * y + g * w
+
+
+def _ends(chosen: Case, velocity: Extended) -> Reference:
+    stepper, field, m = compile_stepper(chosen.system, SVI(8)), field_of(chosen), chosen.dimension
+    runs = [
+        stepper.integrate(q, velocity=v, t_end=chosen.span, check_growth=False).t
+        for q, v in zip(chosen.q, velocity.astype(float), strict=True)
+    ]
+    start = np.concatenate([chosen.q.astype(np.longdouble), velocity], axis=1)
+    rough, fine = (ends[:, :m] for ends in _with_two_steps(field, start, _shortest(runs)))
+    high, low = two_doubles(fine)
+    return Reference(high=high, low=low, accuracy=rms(rough - fine) / rms(high))
+
+
+def _shortest(runs: Sequence[Array]) -> Extended:
+    """Return common steps for all runs from the times of each: the smallest that any of them takes at that time."""
+    times, end = [float(runs[0][0])], float(runs[0][-1])
+    while times[-1] < end:
+        indices = [np.searchsorted(run[1:-1], times[-1], side="right") for run in runs]
+        times.append(min(end, times[-1] + min(run[k + 1] - run[k] for run, k in zip(runs, indices, strict=True))))
+    return np.diff(np.array(times, dtype=np.longdouble))
+
+
+def _with_two_steps(field: Field, start: Extended, steps: Extended) -> tuple[Extended, Extended]:
+    """Return the final states with these steps and with halves of them, or with smaller ones if Gauss fails."""
+    for parts in 2 ** np.arange(HALVINGS + 1):
+        short = np.repeat(steps / parts, parts)
+        try:
+            return states_after(field, start, short), states_after(field, start, np.repeat(short / 2, 2))
+        except StateError as error:
+            failure = error
+    raise failure

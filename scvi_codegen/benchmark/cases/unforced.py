@@ -53,7 +53,8 @@ class Case:
         name: name on the command line.
         system: Lagrangian system, with the parameters of this case.
         formulations: hand-derived first-order systems; the first one is in (q, v).
-        q, velocity: (8, m) initial states, possibly repeated.
+        q, velocity: (8, m) initial states, possibly repeated; of rotations quaternions (w, x, y, z) after the other
+            coordinates, and angular velocities in the body frame.
         span: duration.
         step: step size that gives about ten digits; the catalogue's own for its problems.
         fine: step size with which a Gauss method of 16 stages reaches 1e-18, for the reference.
@@ -61,6 +62,7 @@ class Case:
         loops: source of ``rates(out, t, x, unused)`` in Python with loops, for Numba, if faster than unrolled code.
         masses: (m,) constant masses of the coordinates if momenta differ from velocities by a rounding; ``None`` if
             p = dL/dv is exact at the initial states (unit masses, or rest).
+        mjcf: the same system as a model of MuJoCo, if there is one.
     """
 
     name: str
@@ -74,6 +76,7 @@ class Case:
     bodies: Bodies | None = None
     loops: str | None = None
     masses: tuple[float, ...] | None = None
+    mjcf: str | None = None
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -82,8 +85,18 @@ class Case:
 
     @property
     def dimension(self) -> int:
-        """Number of degrees of freedom m."""
+        """Number of coordinates m."""
         return int(self.q.shape[1])
+
+    @property
+    def states(self) -> tuple[Array, Array]:
+        """Initial positions and velocities."""
+        return self.q, self.velocity
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates and velocities."""
+        return self.dimension + int(self.velocity.shape[1])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,23 +12,29 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, cast
 
-import numpy as np
-
 from scvi_codegen.advice.advice import advise
 from scvi_codegen.benchmark.cases.unforced import Array, Case
 from scvi_codegen.benchmark.report import OURS, Contender
 from scvi_codegen.benchmark.settings import set_variable
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError
+from scvi_codegen.mechanics.time_transformation import reparametrise
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native import building
 from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.rotations.states import homogeneous_state, members_of
 
 TOLERANCES = (1e-6, 1e-8, 1e-9, 1e-10, 3e-11, 1e-11, 3e-12, 1e-12, 5e-13, 3e-13, 2e-13, 1e-13)
 """Tolerances for which a step size is recommended; the errors reached are measured."""
 
 QUICK_TOLERANCES = (1e-8, 1e-10, 1e-12)
+ADAPTIVE_TOLERANCES = (None, 1e-15, 1e-14, 1e-13, 1e-12, 1e-10, 1e-8)
+FIXED = tuple(2.0 ** (k / 2) for k in range(-2, 9))
+"""Fixed steps, as multiples of the number of adaptive steps."""
+TRANSFORMED = (0.4, 0.3, 0.2, 0.15, 0.1)
+"""Step sizes of tau for dt = g dtau with the time-rescaling function "frequency"."""
+LAST = 10**15
 LARGEST_NEWTON = 18
 """Largest number of degrees of freedom for which Newton's method is used; beyond, its larger steps take seconds
 each."""
@@ -101,8 +107,15 @@ def compiled(case: Case, method: Method) -> tuple[Stepper, float]:
 
 
 def momenta_of(stepper: Stepper, case: Case) -> Array:
-    """Return (k, m) initial momenta."""
-    return np.array([stepper.momentum(q, v) for q, v in zip(case.q, case.velocity, strict=True)])
+    """Return (k, m) initial momenta, of rotations those of their quaternions."""
+    members = members_of(stepper.dimension, stepper.interface.rotations)
+    ordinary = stepper.dimension - 4 * len(members)
+    q, velocity = ({name: part[:, k] for k, name in enumerate(stepper.coordinates[:ordinary])} for part in case.states)
+    for k, member in enumerate(members):
+        q[member.name] = case.q[:, member.columns]
+        velocity[member.rate] = case.velocity[:, ordinary + 3 * k : ordinary + 3 * k + 3]
+    positions, _, velocities = homogeneous_state(stepper.interface, q, None, velocity)
+    return stepper.momentum(positions, velocities) if members else stepper.momentum(*case.states)
 
 
 def _prepared(stepper: Stepper, case: Case, momenta: Array, count: int, index: int) -> Callable[[], Array]:
@@ -113,3 +126,59 @@ def _prepared(stepper: Stepper, case: Case, momenta: Array, count: int, index: i
 def _prepared_ensemble(stepper: Stepper, case: Case, momenta: Array, count: int, _: int) -> Callable[[], Array]:
     arguments: dict[str, Any] = {"h": case.span / count, "steps": count, "save_every": count, "threads": 1}
     return lambda: cast("Array", stepper.integrate_ensemble(case.q, momenta, **arguments).q[-1])
+
+
+def adaptive_contenders(chosen: Case, *, quick: bool) -> list[Contender]:
+    """Return contenders by SVI(8) with adaptive and fixed step size and, for ellipses, with time transformation."""
+    stepper, seconds = compiled(chosen, SVI(8))
+    momenta, span = momenta_of(stepper, chosen), chosen.span
+    adaptive = stepper.integrate(chosen.q[0], momenta[0], t_end=span, check_growth=False).steps
+    counts = [max(1, round(adaptive * factor)) for factor in FIXED[: 1 if quick else None]]
+    settings: list[tuple[str, str, Stepper, Callable[..., Callable[[], Array]], dict[str, Any]]] = [
+        ("controlled", f"tol={each:.0e}" if each else "tol=default", stepper, _to_its_end, {"tolerance": each})
+        for each in ADAPTIVE_TOLERANCES[: 2 if quick else None]
+    ]
+    settings += [("fixed", f"{n} steps", stepper, _by_so_many, {"steps": n}) for n in counts]
+    if "kepler" in chosen.name and not quick:
+        transformed = compile_stepper(reparametrise(chosen.system, "frequency"), SVI(8))
+        settings += [("transformed", f"h={h:g}", transformed, _transformed, {"h": h}) for h in TRANSFORMED]
+
+    def prepare(used: Stepper, start: Callable[..., Callable[[], Array]], how: dict[str, Any], k: int) -> Any:
+        return start(used, chosen.q[k], momenta[k], span, **how)
+
+    return [
+        Contender(
+            method=f"{OURS} {mode}",
+            setting=setting,
+            options=f"{used.title}, {' '.join(used.flags)}",
+            compile_seconds=seconds,
+            prepare=partial(prepare, used, start, how),
+            momenta=momenta,
+        )
+        for mode, setting, used, start, how in settings
+    ]
+
+
+def _to_its_end(stepper: Stepper, q: Array, p: Array, t_end: float, tolerance: float | None) -> Callable[[], Array]:
+    run = stepper.start(q, p, t_end=t_end, tolerance=tolerance)
+
+    def integrate() -> Array:
+        """Integrate and return the final state alone, as heyoka's propagate_until."""
+        run._run_to_target()
+        return run.q
+
+    return integrate
+
+
+def _by_so_many(stepper: Stepper, q: Array, p: Array, t_end: float, steps: int) -> Callable[[], Array]:
+    run = stepper.start(q, p, h=t_end / steps)
+
+    def integrate() -> Array:
+        run.advance(steps)
+        return run.q
+
+    return integrate
+
+
+def _transformed(stepper: Stepper, q: Array, p: Array, t_end: float, h: float) -> Callable[[], Array]:
+    return lambda: stepper.integrate(q, p, h=h, t_end=t_end, save_every=LAST, check_growth=False).q[-1]

@@ -2,6 +2,7 @@
 
 heyoka      adaptive Taylor series, compiled by LLVM: see :mod:`.taylor`.
 rebound     IAS15, for gravitating bodies, with its default step control.
+mujoco      its integrators, for multibody systems: see :mod:`.engines`.
 cyrk        DOP853 in C++ (CyRK), right-hand side compiled by Numba.
 jitcode     SciPy's Fortran DOP853, right-hand side compiled by C with JiTCODE's default flags (-Ofast -march=native).
 scipy       ``solve_ivp`` with DOP853, right-hand side compiled by Numba if it is there, else plain Python.
@@ -23,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.benchmark.cases.unforced import Array, Case
+from scvi_codegen.benchmark.contenders.engines import mujoco_contenders
 from scvi_codegen.benchmark.contenders.taylor import heyoka_contenders
 from scvi_codegen.benchmark.contenders.tracing import rates_text
 from scvi_codegen.benchmark.report import Contender
@@ -111,7 +113,7 @@ def _start(case: Case, index: int) -> Array:
 def _right_hand_side(case: Case) -> Callable[..., None]:
     """Return a Python function ``rates(out, t, x, unused)``: the loops of the case if any, else unrolled."""
     names: dict[str, Any] = {"sin": math.sin, "cos": math.cos, "sqrt": math.sqrt}
-    text = case.loops or rates_text(case.formulations[0].rates, case.parameters, 2 * case.dimension)
+    text = case.loops or rates_text(case.formulations[0].rates, case.parameters, case.size)
     exec(compile(text, f"<rates of {case.name}>", "exec"), names)
     function: Callable[..., None] = names["rates"]
     return function
@@ -179,7 +181,7 @@ def _jitcode(case: Case, quick: bool) -> Iterator[Contender]:
     import symengine
 
     began = time.perf_counter()
-    x = [jitcode.y(n) for n in range(2 * case.dimension)]
+    x = [jitcode.y(n) for n in range(case.size)]
     functions = SimpleNamespace(sin=symengine.sin, cos=symengine.cos, sqrt=symengine.sqrt, time=jitcode.t)
     rates = case.formulations[0].rates(x, case.parameters, functions)
     system = jitcode.jitcode(rates, n=len(x), verbose=False)
@@ -211,7 +213,7 @@ def _scipy(case: Case, quick: bool) -> Iterator[Contender]:
     from scipy.integrate import solve_ivp
 
     began = time.perf_counter()
-    plain, size = _right_hand_side(case), 2 * case.dimension
+    plain, size = _right_hand_side(case), case.size
     fast, options = plain, "right-hand side in Python"
     if importlib.util.find_spec("numba") is not None:
         import numba
@@ -246,6 +248,7 @@ def _scipy(case: Case, quick: bool) -> Iterator[Contender]:
 PEERS = {
     "heyoka": Peer(modules=("heyoka",), contenders=heyoka_contenders),
     "rebound": Peer(modules=("rebound",), contenders=_rebound, suits=lambda case: case.bodies is not None),
+    "mujoco": Peer(modules=("mujoco",), contenders=mujoco_contenders, suits=lambda case: case.mjcf is not None),
     "cyrk": Peer(modules=("CyRK", "numba"), contenders=_cyrk),
     "jitcode": Peer(modules=("jitcode",), contenders=_jitcode),
     "scipy": Peer(modules=("scipy",), contenders=_scipy),

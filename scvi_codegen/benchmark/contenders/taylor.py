@@ -184,13 +184,12 @@ def _formulations(case: Case) -> Iterator[tuple[str, list[Any], Formulation]]:
     import heyoka
 
     m = case.dimension
-    q, v = (heyoka.make_vars(*[f"{letter}{n}" for n in range(m)]) for letter in "qv")
-    x = [*q, *v] if m > 1 else [q, v]
+    x = heyoka.make_vars(*[f"q{n}" for n in range(m)], *[f"v{n}" for n in range(case.size - m)])
     for formulation in case.formulations:
         yield formulation.name, list(zip(x, formulation.rates(x, case.parameters, heyoka), strict=True)), formulation
     plain = case.formulations[0]
     most = LARGEST_LAGRANGIAN if forms_of(case.system).separable else LARGEST_COUPLED
-    if m <= most and not any(case.system.forces):
+    if 2 * m == case.size and m <= most and not any(case.system.forces):
         yield LAGRANGIAN, _from_lagrangian(case), plain
     if case.bodies is not None and not case.bodies.fixed_centre:
         yield "heyoka.model.nbody", _n_bodies(case), plain

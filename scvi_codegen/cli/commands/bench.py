@@ -12,7 +12,7 @@ from scvi_codegen.cli.command_group import INTERRUPTED, CommandFailure, check_wr
 
 @click.command()
 @click.argument("sections", nargs=-1, metavar="[SECTION ...]")
-@click.option("--peers", metavar="NAME,..", help="Peers: some of heyoka, rebound, cyrk, jitcode, scipy; '' for none.")
+@click.option("--peers", metavar="NAME,..", help="Peers: some of heyoka, mujoco, rebound, cyrk, ..; '' for none.")
 @click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Write all measurements as JSON.")
 @click.option("--plot", type=click.Path(), metavar="FILE", help="Work-precision plot, .png or .svg.")
 @click.option("--repeats", type=int, default=5, show_default=True, help="Timed rounds.")
@@ -39,6 +39,7 @@ def bench(
       constrained:pendulum, :double-pendulum, :chain:5, :chain:20           constraints; peers in angles
       ensemble:planar-pendulum, :kepler:0.2, :outer-solar-system            64 trajectories at once
       adaptive:kepler:0.9, ..   adaptive and fixed step size, time transformation; heyoka and IAS15
+      rotations:free-top, :heavy-top, :dumbbell, :bodies                    rigid bodies; heyoka, MuJoCo
       drift                     energy over ten million steps
       compositions              explicit composition methods, at equal error
       hand-written              hand-written C
