@@ -7,8 +7,7 @@ brace alone on a line.
 from __future__ import annotations
 
 import re
-import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 HEAD = re.compile(
@@ -18,7 +17,6 @@ HEAD = re.compile(
     re.MULTILINE | re.DOTALL,
 )
 HOT = re.compile(r"^#define HOT (.*)$", re.MULTILINE)
-WIDTH = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,32 +83,3 @@ def reached(functions: Mapping[str, Function], start: str) -> tuple[Function, ..
             found[name] = functions[name]
             pending.extend(reversed(functions[name].calls))
     return tuple(found.values())
-
-
-def outline(functions: Mapping[str, Function], start: str) -> str:
-    """Return the call tree below ``start``: heads, and the first sentences of comments.
-
-    A function without a comment is replaced by the functions that it calls; each function is shown once.
-    """
-    return "\n".join(_lines(functions, start, 0, set()))
-
-
-def _lines(functions: Mapping[str, Function], name: str, depth: int, printed: set[str]) -> Iterator[str]:
-    function = functions[name]
-    visible = bool(function.comment) or depth == 0
-    if name in printed:
-        return
-    printed.add(name)
-    if visible:
-        indent = "  " * depth
-        yield from textwrap.wrap(
-            f"{name}({', '.join(function.arguments)})", WIDTH, initial_indent=indent, subsequent_indent=indent + "    "
-        )
-        comment = _first_sentence(function.comment)
-        yield from textwrap.wrap(comment, WIDTH, initial_indent=f"{indent}  | ", subsequent_indent=f"{indent}  | ")
-    for called in function.calls:
-        yield from _lines(functions, called, depth + visible, printed)
-
-
-def _first_sentence(comment: str) -> str:
-    return re.split(r"(?<=[a-z0-9)])[.] (?=[A-Z])", comment)[0].removesuffix(".")

@@ -10,37 +10,21 @@ from scvi_codegen.reproduce.kepler import (
     overview,
 )
 from scvi_codegen.reproduce.laboratory.experiment import REGISTERED, Experiment
-from scvi_codegen.reproduce.oscillators import (
-    oscillator,
-    pendulum_and_duffing,
-    two_point_pendulum,
-)
-from scvi_codegen.reproduce.paper_tables import costs, iterations, outlines, properties, tableaux
+from scvi_codegen.reproduce.oscillators import oscillator, pendulum_and_duffing
+from scvi_codegen.reproduce.paper_tables import costs, iterations, tableaux
 from scvi_codegen.reproduce.refinement import kepler as kepler_refinement
 from scvi_codegen.reproduce.refinement import oscillator as oscillator_refinement
-from scvi_codegen.reproduce.theorems import collocation, kronecker, order, rates
 
 ORDER = """
-    section-2.1 theorem-2.1 table-1 table-2 table-3 table-4 figure-1
-    figure-2 table-5 figure-3 figure-4 figure-5 figure-6 figure-7 figure-8
+    table-1 table-2 table-3 figure-1 figure-3 figure-4 figure-5 figure-6 figure-7 figure-8
     figure-9 figure-10 table-6 figure-11 figure-12 table-7
     figure-13 figure-14 figure-15 figure-16 figure-17 figure-18 figure-19 figure-20 table-8 table-9
-    theorem-4.1 theorem-4.2 theorem-4.3 table-10
-    section-4.3 figure-21 figure-22 figure-23 figure-24 figure-25 figure-26 figure-27 figure-28 figure-29 figure-30
+    figure-21 figure-22 figure-23 figure-24 figure-25 figure-26 figure-27 figure-28 figure-29 figure-30
     correction claims
 """
 MODULES = (
-    *(
-        overview,
-        oscillator,
-        oscillator_refinement,
-        kepler_refinement,
-        pendulum_and_duffing,
-        figures_13_to_20,
-        figures_23_to_30,
-    ),
-    *(many_points, correction, tableaux, properties, outlines, costs),
-    *(iterations, two_point_pendulum, collocation, kronecker, order, rates, claims),
+    *(overview, oscillator, oscillator_refinement, kepler_refinement, pendulum_and_duffing, figures_13_to_20),
+    *(figures_23_to_30, many_points, correction, tableaux, costs, iterations, claims),
 )
 """Modules whose import registers the experiments."""
 

@@ -89,12 +89,7 @@ CLAIMS: Mapping[str, Claim] = {
 EVIDENCE: tuple[str, ...] = (
     "figure-1",
     *(f"figure-{number}" for number in range(3, 31)),
-    "table-4",
     *(f"table-{number}" for number in range(6, 10)),
-    "theorem-4.1",
-    "theorem-4.2",
-    "theorem-4.3",
-    "section-4.3",
     "correction",
 )
 """Experiments whose checks are collected."""

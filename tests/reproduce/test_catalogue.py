@@ -1,4 +1,4 @@
-"""Everything of the paper is in the catalogue, and what an experiment decides is a claim that is listed."""
+"""Every numerical figure and table of the paper is in the catalogue; checks name claims that exist."""
 
 import re
 
@@ -10,13 +10,13 @@ from scvi_codegen.reproduce.laboratory.experiment import Verdict
 from scvi_codegen.reproduce.runner import Failure, run_experiments
 
 PAPER = {
-    *(f"figure-{n}" for n in range(1, 31)),
-    *(f"table-{n}" for n in range(1, 11)),
-    *("section-2.1", "theorem-2.1", "theorem-4.1", "theorem-4.2", "theorem-4.3", "section-4.3", "claims", "correction"),
+    *(f"figure-{n}" for n in range(1, 31) if n != 2),
+    *(f"table-{n}" for n in (1, 2, 3, 6, 7, 8, 9)),
+    *("claims", "correction"),
 }
 
 
-def test_every_figure_table_theorem_and_claim_is_there() -> None:
+def test_every_numerical_figure_and_table_is_there() -> None:
     assert set(EXPERIMENTS) == PAPER
     for name, experiment in EXPERIMENTS.items():
         assert experiment.name == name
@@ -41,5 +41,5 @@ def test_whole_paper_runs_and_every_claim_is_evaluated() -> None:
     assert len(verdicts) == len(CLAIMS)
     assert Verdict.SHOWN not in verdicts
     failing = {name for name, result in results.items() for check in result.checks if check.verdict is Verdict.FAILS}
-    assert {"figure-29", "correction", "section-4.3", "theorem-4.1", "theorem-4.2"} <= failing
-    assert not failing & {"figure-5", "figure-10", "figure-12", "figure-14", "figure-15", "figure-24", "theorem-4.3"}
+    assert {"figure-29", "correction"} <= failing
+    assert not failing & {"figure-5", "figure-10", "figure-12", "figure-14", "figure-15", "figure-24"}

@@ -1,4 +1,4 @@
-"""Figures 1 and 2: four methods on Kepler's problem; nodes of a step, and why they are not equispaced."""
+"""Figure 1: four methods on Kepler's problem."""
 
 from __future__ import annotations
 
@@ -9,12 +9,10 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from scvi_codegen.exact.step import derived_step
-from scvi_codegen.methods import SVI, ExplicitEuler, Gauss, SpectralCollocation, StoermerVerlet
+from scvi_codegen.methods import ExplicitEuler, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.systems import planar_pendulum
 from scvi_codegen.reproduce.kepler.orbits import SYSTEM, angular_momentum, perihelion
-from scvi_codegen.reproduce.laboratory.drawing import COLORS, Array, Axes, Figure, draw_orbit, panels
+from scvi_codegen.reproduce.laboratory.drawing import Array, Figure, draw_orbit, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Cell,
     Comparison,
@@ -25,13 +23,9 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     holds,
     judged,
 )
-from scvi_codegen.reproduce.laboratory.running import stepper_of, trajectory
+from scvi_codegen.reproduce.laboratory.running import trajectory
 from scvi_codegen.reproduce.oscillators.one_degree import drift, largest
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-from scvi_codegen.tables.basis import cardinal_values
-from scvi_codegen.tables.nodes import chebyshev_lobatto, equispaced, legendre_lobatto
-from scvi_codegen.tables.precision import Vector
-from scvi_codegen.tables.quadrature import gauss_legendre, gauss_lobatto
 
 ECCENTRICITY = 0.6
 POSITION, VELOCITY = perihelion(ECCENTRICITY)
@@ -163,115 +157,3 @@ def _draw_orbits(orbits: Mapping[str, tuple[Array, Array]], figure: Figure) -> N
         axes.plot(0.0, 0.0, "+", color="black", markersize=6)
         axes.set(xlabel="q1", ylabel="q2", title=f"({letter}) {name}, h = {RUNS[name].h:g}")
         axes.set_aspect("equal", adjustable="datalim")
-
-
-CURVE = SVI(4, gauss_legendre(5), chebyshev_lobatto(4))
-START, MOMENTUM, CURVE_STEP = 1.0, 1.0, 2.5
-NODE_TYPES = {"Legendre": legendre_lobatto, "Chebyshev": chebyshev_lobatto, "equispaced": equispaced}
-COUNTS = (2, 4, 7)
-RUNGE_COUNTS = range(3, 32, 4)
-FAMILY_STYLES = {"Legendre": ("SVI", "o"), "Chebyshev": ("SC", "s"), "equispaced": ("exact", "^")}
-
-
-@experiment("figure-2", "The trial curve of a step, its nodes and its quadrature points")
-def _points_of_a_step(_: Mapping[str, Result]) -> Result:
-    solved = derived_step(planar_pendulum(), CURVE)([START], [MOMENTUM], CURVE_STEP)
-    values = np.array([START, *map(float, solved.unknowns)])
-    nodes, points = (_numbers(family) for family in (CURVE.node_set.points, CURVE.rule.points))
-    compiled = stepper_of(planar_pendulum(), CURVE).step([START], [MOMENTUM], h=CURVE_STEP)[0][0]
-    common = int(np.sum(np.min(np.abs(points[:, None] - nodes), axis=1) < 1e-12))
-    at_lobatto = sum(any(abs(x - y) < 1e-30 for y in legendre_lobatto(4).points) for x in gauss_lobatto(5).points)
-    counts = RUNGE_COUNTS
-    errors = {name: np.array([_interpolation_error(name, n) for n in counts]) for name in NODE_TYPES}
-    rows = tuple(zip(counts, *(error.tolist() for error in errors.values()), strict=True))
-    end = {name: float(error[-1]) for name, error in errors.items()}
-    return Result(
-        setting=(
-            "The paper's drawing is a sketch. Here: one step of SVI for the pendulum, degree 4, five Chebyshev nodes, "
-            f"five Gauss points, q = {START:g}, p = {MOMENTUM:g}, h = {CURVE_STEP:g}.",
-            "The second panel is the unnumbered picture of section 2.1, with equispaced points, too; Legendre points "
-            "are the Legendre-Gauss-Lobatto points, which contain the ends.",
-            "Third panel: the interpolation of 1/(1 + 16 x^2), Runge's function, with n points.",
-        ),
-        checks=(
-            Comparison(
-                claim="The quadrature points may or may not be the interpolation points.",
-                measured=f"{common} of 5 Gauss points is a Chebyshev node (the middle), {at_lobatto} of 5 "
-                "Gauss-Lobatto points are Legendre-Gauss-Lobatto nodes.",
-                verdict=judged(common < len(points), at_lobatto == len(points)),
-            ),
-            Comparison(
-                claim="The trajectory on a step is the polynomial through Q^0 = q_k, .., Q^s = q_{k+1}.",
-                measured=f"Its end and the compiled step differ by {abs(values[-1] - compiled):.0e}.",
-                verdict=holds(abs(values[-1] - compiled) < 1e-14),
-            ),
-            Comparison(
-                claim="Interpolation at Chebyshev and Legendre points converges faster than at equispaced points.",
-                measured=f"Largest error with {RUNGE_COUNTS[-1]} points: "
-                + ", ".join(f"{name} {error:.1e}" for name, error in end.items())
-                + ".",
-                verdict=judged(*(end[name] < 0.01 * end["equispaced"] for name in ("Legendre", "Chebyshev"))),
-            ),
-        ),
-        tables=(
-            TableBlock(columns=("n", *NODE_TYPES), rows=rows, formats=dict.fromkeys(NODE_TYPES, ".1e"), shown=False),
-            TableBlock(
-                name="curve",
-                columns=("node", "Q"),
-                rows=tuple(zip(nodes.tolist(), values.tolist(), strict=True)),
-                formats={"node": ".4f", "Q": ".6f"},
-            ),
-        ),
-        picture=Picture(draw=partial(_draw_points, values, errors), width=11.0, height=3.8),
-    )
-
-
-def _numbers(points: Vector) -> Array:
-    return np.array([float(point) for point in points])
-
-
-def _interpolated(points: Vector, values: Array, at: Array) -> Array:
-    """Return the values at ``at`` of the polynomial through ``values`` at ``points``."""
-    table = np.array([_numbers(row) for row in cardinal_values(points, [float(x) for x in at])])
-    result: Array = table @ values
-    return result
-
-
-def _interpolation_error(family: str, count: int) -> float:
-    """Return the largest interpolation error of Runge's function on [-1, 1] at 101 points."""
-    points, at = NODE_TYPES[family](count - 1).points, np.linspace(-1.0, 1.0, 101)
-    return largest(_interpolated(points, _runge(_numbers(points)), at) - _runge(at))
-
-
-def _runge(x: Array) -> Array:
-    return 1.0 / (1.0 + 16.0 * x**2)
-
-
-def _draw_points(values: Array, errors: Mapping[str, Array], figure: Figure) -> None:
-    curve, families, convergence = panels(figure, 1, 3)
-    _draw_curve(curve, values)
-    for row, (name, family) in enumerate(NODE_TYPES.items()):
-        color, mark = FAMILY_STYLES[name]
-        for block, count in enumerate(COUNTS):
-            height = -(row + 4.0 * block)
-            families.axhline(height, color="#cccccc", linewidth=0.8, zorder=0)
-            families.plot(_numbers(family(count - 1).points), [height] * count, mark, color=COLORS[color], markersize=4)
-        convergence.semilogy(RUNGE_COUNTS, errors[name], f"{mark}-", color=COLORS[color], markersize=3, label=name)
-    ticks = [-(1.0 + 4.0 * block) for block in range(len(COUNTS))]
-    families.set(yticks=ticks, yticklabels=[f"{count} points" for count in COUNTS], title="families of points")
-    convergence.set(xlabel="points n", title="error of interpolation, 1/(1 + 16 x$^2$)")
-    convergence.legend(loc="upper left")
-
-
-def _draw_curve(axes: Axes, values: Array) -> None:
-    nodes, points, t = CURVE.node_set.points, CURVE.rule.points, np.linspace(-1.0, 1.0, 200)
-    at_points = _interpolated(nodes, values, _numbers(points))
-    axes.plot(t, _interpolated(nodes, values, t), color=COLORS["exact"], linewidth=1.2)
-    axes.plot(_numbers(nodes), values, "o", color="black", markersize=5, label="nodes $c_v$, values $Q^v$")
-    axes.plot(_numbers(points), at_points, "o", color="red", markersize=4, label="quadrature points $d_n$")
-    axes.vlines(_numbers(points), 0.0, at_points, color="red", linestyle=":", linewidth=0.7)
-    axes.vlines(_numbers(nodes), 0.0, values, color="black", linestyle=":", linewidth=0.7)
-    axes.set(
-        xticks=(-1.0, 1.0), xticklabels=("kh", "(k+1)h"), ylabel="q", title="trial curve of one step", ylim=(0.0, 2.1)
-    )
-    axes.legend(loc="upper left")

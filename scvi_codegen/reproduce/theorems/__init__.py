@@ -1,1 +1,0 @@
-"""Lemmas and theorems of the paper, checked numerically."""
