@@ -173,6 +173,7 @@ def describe_arrays(system: ArraySystem, method: Method, *, prefix: str, solver:
         constraints=tuple(term.loops for term in system.constraints),
         continued=not (method.fractions or system.constraints),
         data=system.data,
+        mesh=system.mesh,
     )
     return Interface(
         prefix=prefix,

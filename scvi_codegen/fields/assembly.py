@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from sympy import Add, Expr
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.fields.axes import Axis, Cells, digits, same
 from scvi_codegen.fields.density import Density
-from scvi_codegen.fields.mesh import MeshSystem
+from scvi_codegen.fields.mesh import Mesh, MeshSystem
 from scvi_codegen.formulas.array_notation import array_text
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
@@ -67,13 +68,13 @@ class _Assembly:
             assembled = LagrangianSystem.from_text(**arguments, lagrangian=text)
         grids = np.meshgrid(*(axis.points for axis in self.axes.values()), indexing="ij")
         masses = np.meshgrid(*(axis.weights for axis in self.axes.values()), indexing="ij")
-        return MeshSystem(
-            system=assembled,
-            field_system=system,
-            axes=tuple(self.axes.values()),
-            points=dict(zip(self.axes, grids, strict=True)),
-            weights=np.prod(masses, axis=0),
-        )
+        parts: dict[str, Any] = {
+            "field_system": system,
+            "axes": tuple(self.axes.values()),
+            "points": dict(zip(self.axes, grids, strict=True)),
+            "weights": np.prod(masses, axis=0),
+        }
+        return MeshSystem(system=replace(assembled, mesh=Mesh(**parts)), **parts)
 
     def array(self, name: str, size: str, values: Any, index: str) -> str:
         """Return the text of an entry of an array, or its number if all entries are equal."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -93,6 +94,8 @@ class FieldSystem(Density):
         if text is None or (density is not None and hamiltonian is not None):
             raise SystemDefinitionError("give exactly one of density and hamiltonian")
         first_order = hamiltonian is not None
+        for match in re.finditer(rf"\b({'|'.join((*fields, *momenta))})_((?:{'|'.join((*space, TIME))})+)\b", text):
+            _check_derivative(match[0], match[1], [*space], parameters or {})
         read = partial(parse_expression, text)
         return cls._of(name, fields, momenta, space, boundary, parameters, first_order, read)
 
@@ -135,6 +138,9 @@ class FieldSystem(Density):
                 for derived, (_, orders) in derivatives_of([each], [*space]).items():
                     values[function.diff(*((marks[axis], order) for axis, order in orders.items()))] = known[derived]
             formula = density.xreplace(values)
+            for each in density.atoms(sympy.Derivative) - set(values):
+                letters = "".join(str(name) * int(order) for name, order in each.variable_count)
+                _check_derivative(f"{each.expr.func}_{letters}", str(each.expr.func), [*space], {})
             plain = {each: known[each.name] for each in formula.free_symbols if each.name in known}
             if unknown := sorted(map(str, formula.free_symbols - set(plain))):
                 raise SystemDefinitionError(f"the density contains '{unknown[0]}'{closest(unknown[0], [*known])}")
@@ -260,6 +266,22 @@ class FieldSystem(Density):
             for name, (_, orders) in self.derivatives.items()
         )
         return differences(axis, start, end, options["points"], options["order"], second=second)
+
+
+def _check_derivative(name: str, field: str, axes: Sequence[str], parameters: Mapping[str, float]) -> None:
+    """Raise an error for a derivative of a field that densities cannot contain."""
+    if name in {*derivatives_of([field], axes), f"{field}_{TIME}", *parameters}:
+        return
+    letters = name.removeprefix(f"{field}_")
+    if TIME in letters:
+        raise SystemDefinitionError(
+            f"the density contains {name}: of the derivatives in time only the first, {field}_{TIME}, is supported; "
+            "integrate higher ones by parts, or describe their momenta by hamiltonian="
+        )
+    raise SystemDefinitionError(
+        f"the density contains {name}: derivatives in space have order 1 or 2, with axes in the order of space=: "
+        f"{', '.join(derivatives_of([field], axes))}"
+    )
 
 
 def _bounds(axis: str, ends: Any) -> tuple[float, float]:

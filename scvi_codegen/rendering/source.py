@@ -185,6 +185,7 @@ class ArrayLayout(ArrayDeclarations):
         momentum_formulas, velocity_formulas: L_v in (q, v) and H_p in (q, p) of a Lagrangian that is integrated by its
             Hamiltonian (:class:`~scvi_codegen.formulas.array_statements.ArrayForce`).
         data: values of fields and tables by name for runs that pass none.
+        mesh: of the fields of a density (:class:`~scvi_codegen.fields.mesh.Mesh`).
     """
 
     field_defaults: tuple[float, ...] = ()
@@ -196,6 +197,7 @@ class ArrayLayout(ArrayDeclarations):
     momentum_formulas: tuple[Any, ...] = ()
     velocity_formulas: tuple[Any, ...] = ()
     data: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    mesh: Any = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -27,10 +27,10 @@ FLOORS = """
     tables files
     formulas display ir
     mechanics rendering
-    fields methods native pictures
+    methods native pictures
     lowering exact runtime
     pipeline
-    compiler frameworks results
+    compiler fields frameworks results
     derivation models advice verification
     benchmark reproduce
     package distributed __init__

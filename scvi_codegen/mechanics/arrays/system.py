@@ -71,6 +71,7 @@ class ArraySystem:
         rotations: rotations, directions and spins, which require known sizes.
         definition: the arguments of :meth:`from_text` other than name and parameters, for model files.
         data: values of fields and tables by name for runs that pass none.
+        mesh: of the fields of a density, their :class:`~scvi_codegen.fields.mesh.Mesh`.
     """
 
     name: str
@@ -90,6 +91,7 @@ class ArraySystem:
     rotations: tuple[MemberArray, ...] = ()
     definition: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
     data: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    mesh: Any = field(default=None, compare=False, repr=False)
     REQUIRES_SIZES: ClassVar[str] = SIZES_REQUIRED
 
     def __repr__(self) -> str:
@@ -410,7 +412,7 @@ class ArraySystem:
 
     def key(self) -> tuple[str, ...]:
         """Return the key of this system in caches, made from all of its fields but the data of runs."""
-        return (key_of(replace(self, data={})),)
+        return (key_of(replace(self, data={}, mesh=None)),)
 
     def __str__(self) -> str:
         arguments = ", ".join(map(str, self.state))

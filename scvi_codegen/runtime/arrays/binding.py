@@ -44,6 +44,20 @@ FAILURES_BY_SOLVER = {
 }
 
 
+class _Report(SimpleNamespace):
+    """Report of a call, with the messages of its failures."""
+
+    interface: Interface
+
+    @property
+    def failures(self) -> dict[str, tuple[str, str]]:
+        failures = FAILURES_BY_SOLVER.get(self.interface.solver, FAILURES)
+        if (mesh := self.interface.layout.mesh) is None:
+            return failures
+        limit = f". The highest frequency of the mesh is at most {mesh.highest_frequency():.3g}: see its largest_step()"
+        return {word: (what, remedy + limit) for word, (what, remedy) in failures.items()}
+
+
 class ArrayBinding(Binding):
     """Binding of arrays of given sizes and tables; states and parameters are vectors, as for known sizes.
 
@@ -69,8 +83,7 @@ class ArrayBinding(Binding):
         """Return memory of a run, or a report, as :meth:`Binding.new` does."""
         if what == "run *":
             return ArrayMemory(self)
-        failures = FAILURES_BY_SOLVER[self.interface.solver]
-        return SimpleNamespace(steps=0, stored=0, iterations=0, change=0.0, t=0.0, failures=failures)
+        return _Report(interface=self.interface, steps=0, stored=0, iterations=0, change=0.0, t=0.0)
 
     def buffer(self, struct: Any) -> Any:
         """Return the memory of a run, whose bytes are readable and writable, and arrays as they are."""

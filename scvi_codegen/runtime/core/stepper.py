@@ -44,6 +44,7 @@ from scvi_codegen.runtime.run.accuracy import (
     warn_of_energy_errors,
     warn_of_error_growth,
     warn_of_large_steps,
+    warn_of_unresolved_fields,
 )
 from scvi_codegen.runtime.run.global_error import checked_error, confirmed_run, warn_of_unconfirmed
 from scvi_codegen.runtime.run.run import Run
@@ -173,6 +174,7 @@ class Stepper(Integrator):
             trajectory = run._recorded(count, save_every=save_every, times=times, progress=progress, observe=observe)
             warn_of_large_steps(trajectory)
             warn_of_energy_error(trajectory, run)
+            warn_of_unresolved_fields(trajectory)
             warn_of_error_growth(run, trajectory, check_growth)
             run._release()
             return trajectory
@@ -185,6 +187,7 @@ class Stepper(Integrator):
             check_growth_requested(plan)
         save_every = checked_count(save_every, "save_every", least=1)
         trajectory = record_pieces(run, data, end, save_every=save_every, values=values, progress=progress)
+        warn_of_unresolved_fields(trajectory)
         warn_of_error_growth(run, trajectory, check_growth, lambda time: advance_to(run, data, time, values))
         run._release()
         return trajectory

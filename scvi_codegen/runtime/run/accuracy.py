@@ -40,6 +40,12 @@ GROSS_ERROR: Final = 0.5
 MOST_CHECKED: Final = 1000
 """Largest number of trajectories of an ensemble whose energy is checked."""
 
+UNRESOLVED: Final = 1e-5
+"""Largest part of the squared amplitude of fields in the highest modes of their mesh without a warning."""
+
+MOST_SPECTRA, MOST_VALUES = 64, 2**20
+"""Largest numbers of saved states whose spectrum is checked, and of their values; at least four are checked."""
+
 ERROR_AMPLIFIED: Final = (
     "although every step met the tolerance: the motion amplifies errors, as close encounters do. Reduce the tolerance, "
     "or use regularised coordinates"
@@ -130,6 +136,33 @@ def warn_of_energy_errors(ensemble: EnsembleEnergyData) -> None:
     worst = max(by_trajectory, key=lambda j: relative_energy_change(*by_trajectory[j]), default=None)
     if worst is not None:
         warn_of_energies(*by_trajectory[worst], where=f" of trajectory {worst}")
+
+
+def unresolved_parts(states: SavedStates, rows: slice = slice(None)) -> Array | None:
+    """Return (n,) parts of the squared amplitude of fields in the highest modes of their mesh; ``None`` without one."""
+    mesh = states.stepper.interface.layout.mesh
+    if mesh is None:
+        return None
+    q: Any = states.q[rows]
+    return np.asarray(np.max([mesh.unresolved(q[name]) for name in mesh.field_system.fields], axis=0))
+
+
+def warn_of_unresolved_fields(trajectory: SavedStates) -> None:
+    """Issue an :class:`AccuracyWarning` if the highest modes of a mesh contain too much in one of some saved states."""
+    count = max(4, min(MOST_SPECTRA, MOST_VALUES // max(1, trajectory.q.shape[-1])))
+    stride = -(-max(len(trajectory.t) - 1, 1) // count)
+    rows = slice((len(trajectory.t) - 1) % stride, None, stride)
+    parts = unresolved_parts(trajectory, rows) if warnings_wanted() else None
+    if parts is None or parts.max() <= UNRESOLVED:
+        return
+    first = int(np.argmax(~(parts <= UNRESOLVED)))
+    phase = abs(trajectory.h) * trajectory.stepper.interface.layout.mesh.highest_frequency()
+    warn(
+        f"the mesh does not resolve the fields: at t = {trajectory.t[rows][first]:g} the highest modes have "
+        f"{parts[first]:.1e} of the squared amplitude ({UNRESOLVED:g} is tolerable). Use more elements or points, or a "
+        f"smaller h if the run is unstable (h times the highest frequency is {phase:.2g}); shocks are not supported",
+        AccuracyWarning,
+    )
 
 
 def warn_of_energies(

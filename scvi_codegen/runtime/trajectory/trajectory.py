@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.display.cards import Html, card, grid, listed, plain, sparkline
-from scvi_codegen.errors import EventError, StateError, StepFailedError
+from scvi_codegen.errors import EventError, MethodError, StateError, StepFailedError
 from scvi_codegen.files.export import States, to_dataframe, write_states
 from scvi_codegen.files.labelled_arrays import checked_units, to_dataset
 from scvi_codegen.runtime.constraints.projection import constraint_values, multipliers
@@ -23,7 +23,7 @@ from scvi_codegen.runtime.events.detection import crossings_of
 from scvi_codegen.runtime.events.event import Crossings, Event, EventLike, as_events
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.rotations.quantities import named_quantities
-from scvi_codegen.runtime.run.accuracy import TOLERABLE_ERROR
+from scvi_codegen.runtime.run.accuracy import TOLERABLE_ERROR, unresolved_parts
 from scvi_codegen.runtime.run.descriptions import describe_states, describe_step_size
 from scvi_codegen.runtime.run.global_error import Confirmed, GlobalError
 from scvi_codegen.runtime.sensitivity.trajectory_derivatives import TrajectoryDerivatives
@@ -253,6 +253,18 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
             quantities=derived,
             units=checked_units(units),
         )
+
+    def unresolved(self) -> Array:
+        """Return (n,) parts of the squared amplitude in the highest modes of the mesh of fields (resolution monitor).
+
+        See :meth:`~scvi_codegen.fields.mesh.Mesh.unresolved`; the largest of all fields.
+
+        Raises:
+            MethodError: if the system is not that of a mesh.
+        """
+        if (parts := unresolved_parts(self)) is None:
+            raise MethodError("the system is not discretised from a density: unresolved() requires a mesh")
+        return parts
 
     @property
     def ended_by(self) -> Event | None:

@@ -1,0 +1,90 @@
+"""Resolution monitor of runs, largest step sizes of meshes, and derivatives that densities cannot contain."""
+
+import numpy as np
+import pytest
+from samples import QUICK_FLAGS
+from sympy import Function, symbols
+
+import scvi_codegen as sc
+from scvi_codegen import AccuracyWarning, FieldSystem, MethodError, StepFailedError, SystemDefinitionError
+
+STRING = "u_t**2/2 - u_x**2/2"
+MESHES = {
+    "spectral-elements": {"degree": 8, "elements": 6},
+    "finite-differences": {"order": 4, "points": 48},
+    "fourier": {"points": 48},
+}
+
+
+def ring(density=STRING, **others):
+    return FieldSystem.from_text("ring", ["u"], {"x": (0, "2*pi")}, density, boundary={"x": "periodic"}, **others)
+
+
+@pytest.mark.parametrize("method", MESHES)
+def test_runs_report_the_unresolved_part_and_warn_of_it(method, recwarn):
+    mesh = ring("u_t**2/2 - u_x**2/2 - u_x**3/6").discretise("spectral-elements", degree=6, elements=20)
+    mesh = mesh if method == "spectral-elements" else ring().discretise(method, **MESHES[method])
+    x = mesh.points["x"]
+    stepper = sc.compile_stepper(mesh.system, "svi:2", flags=QUICK_FLAGS)
+    run = stepper.integrate({"u": np.sin(x)}, h=0.01, steps=20)
+    assert run.unresolved().shape == (21,)
+    assert run.unresolved().max() < 1e-8
+    assert not recwarn.list
+    if method == "spectral-elements":  # the wave steepens: u_x has a shock at about t = 2
+        with pytest.warns(AccuracyWarning, match="does not resolve the fields: at t = "):
+            run = stepper.integrate({"u": np.sin(x)}, h=0.01, steps=300)
+        assert run.unresolved()[0] < 1e-8 < 1e-5 < run.unresolved().max()
+    else:
+        with pytest.warns(AccuracyWarning, match=r"highest modes have .*h times the highest frequency"):
+            stepper.integrate({"u": np.random.default_rng(0).normal(size=x.shape)}, h=0.01, steps=3)
+
+
+def test_systems_without_a_mesh_report_no_resolution():
+    chain = sc.LagrangianSystem.from_text("c", ["q[N]"], "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)")
+    run = sc.compile_stepper(chain, "svi:2", flags=QUICK_FLAGS).integrate(np.ones(3), h=0.1, steps=2)
+    with pytest.raises(MethodError, match="requires a mesh"):
+        run.unresolved()
+
+
+@pytest.mark.parametrize("method", ["stoermer-verlet", "composition:8"])
+def test_explicit_steps_are_stable_up_to_the_largest_step(method):
+    mesh = ring().discretise("fourier", points=16)  # its bound of the frequency is exact
+    assert mesh.highest_frequency() == pytest.approx(8)
+    stepper = sc.compile_stepper(mesh.system, method, flags=QUICK_FLAGS)
+    highest, largest = np.cos(8 * mesh.points["x"]), mesh.largest_step(method)
+    with pytest.warns(AccuracyWarning):
+        stable = stepper.integrate({"u": highest}, h=0.998 * largest, steps=3000)
+    with pytest.warns(AccuracyWarning):
+        unstable = stepper.integrate({"u": highest}, h=1.002 * largest, steps=3000)
+    assert np.abs(stable.q["u"]).max() < 50
+    assert np.abs(unstable.q["u"]).max() > 1e3
+
+
+@pytest.mark.parametrize("points", [1, 2, 4, 8])
+def test_fixed_point_iterations_converge_up_to_the_largest_step(points):
+    mesh, method = ring().discretise("fourier", points=32), f"svi:{points}"
+    stepper = sc.compile_stepper(mesh.system, method, flags=QUICK_FLAGS)
+    with pytest.warns(AccuracyWarning):
+        stepper.integrate({"u": np.cos(16 * mesh.points["x"])}, h=0.98 * mesh.largest_step(method), steps=20)
+    with pytest.raises(StepFailedError, match="highest frequency of the mesh is at most 16: see its largest_step"):
+        stepper.integrate({"u": np.cos(16 * mesh.points["x"])}, h=3 * mesh.largest_step(method), steps=100)
+
+
+X, T = symbols("x t")
+U = Function("u")(X, T)
+
+
+@pytest.mark.parametrize(
+    ("density", "name"),
+    [
+        ("u_tt**2/2 - u_x**2", "u_tt: of the derivatives in time only the first"),
+        ("u_t**2/2 - u_xt*u", "u_xt: of the derivatives in time"),
+        ("u_t**2/2 - u_xxx**2", "u_xxx: derivatives in space have order 1 or 2"),
+        (U.diff(T, 2) ** 2 / 2, "u_tt: of the derivatives in time"),
+        (U.diff(T) ** 2 - U.diff(X, 3) ** 2, "u_xxx: derivatives in space"),
+    ],
+)
+def test_higher_derivatives_are_refused_by_name(density, name):
+    arguments = {"name": "ring", "fields": [U], "space": {"x": (0, 1)}}
+    with pytest.raises(SystemDefinitionError, match=name):
+        ring(density) if isinstance(density, str) else FieldSystem.from_sympy(density=density, **arguments)
