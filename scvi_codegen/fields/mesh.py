@@ -13,6 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.fields.axes import Axis
 from scvi_codegen.fields.density import Density
+from scvi_codegen.fields.derivation import FieldDerivation, derivation_of
+from scvi_codegen.fields.laws import Variations
+from scvi_codegen.fields.local import FieldHistory, LocalLaw, chosen_laws, local_laws
 from scvi_codegen.formulas.symbols import TIME, symbol
 from scvi_codegen.lowering.arrays import one_coordinate
 from scvi_codegen.methods import as_method
@@ -77,6 +80,32 @@ class Mesh:
             largest = every.max(-1)
             parts.append(highest.max(-1) / np.where(largest > 0, largest, 1.0))
         return np.max(parts, axis=0)[()]
+
+    def derive(self) -> FieldDerivation:
+        """Return the equations and conservation laws of the density, with the semi-discrete L and its energy."""
+        return derivation_of(self.field_system, self)
+
+    def local_laws(self, run: Any, *names: str) -> dict[str, LocalLaw]:
+        """Return density, flux and residual of the conservation laws of the density along a run, by name.
+
+        Args:
+            run: trajectory of ``system``; the residual is accurate if its states are close in time.
+            names: of some laws, ``"energy"``, ``"momentum_x"``; by default all.
+
+        Raises:
+            StateError: for an unknown name, and for a run with ``observe``.
+        """
+        return local_laws(self, chosen_laws(Variations(self.field_system).laws(), names), run)
+
+    def conserved(self, run: Any, *names: str) -> dict[str, Array]:
+        """Return (n,) integrals over space of the conserved densities along a run, by name; see :meth:`local_laws`.
+
+        They are constant in the solution if the fluxes at the ends vanish or the axes are periodic (boosts and angular
+        momenta depend on position and are not constant on periodic axes).
+        """
+        history = FieldHistory(self, run)
+        laws = chosen_laws(Variations(self.field_system).laws(), names)
+        return {law.name: history.integral(history.values(law.density)) for law in laws}
 
     def highest_frequency(self, **parameters: float) -> float:
         """Return an upper bound of the highest frequency of the equations linearised about u = 0 at t = 0.

@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 import sympy
-from sympy import Add, Expr, Function, Symbol
+from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.fields.assembly import semidiscrete_system
 from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis, differences, fourier, spectral_elements
 from scvi_codegen.fields.density import Density, derivatives_of
+from scvi_codegen.fields.derivation import FieldDerivation, derivation_of
 from scvi_codegen.fields.mesh import MeshSystem
 from scvi_codegen.formulas.array_notation import array_text
 from scvi_codegen.formulas.grammar import parse_expression
@@ -194,28 +195,33 @@ class FieldSystem(Density):
         """Return u_tt of each field by the Euler-Lagrange equation d/dt dL/du_t = dL/du - sum d/dx dL/du_x + .."""
         if self.momenta:
             raise SystemDefinitionError(f"'{self.name}' has a Hamiltonian density, whose equations are of first order")
-        variables = {each: symbol(each) for each in (*self.space, TIME)}
-        functions = {each: Function(each)(*variables.values()) for each in self.fields}
-        values = {symbol(each): function for each, function in functions.items()}
-        in_space = {
-            name: (each, [(variables[axis], order) for axis, order in orders.items()])
-            for name, (each, orders) in self.derivatives.items()
-        }
-        values |= {symbol(name): functions[each].diff(*along) for name, (each, along) in in_space.items()}
-        values |= {
-            rate: functions[each].diff(variables[TIME]) for each, rate in zip(self.fields, self.rates, strict=True)
-        }
-        equations = {}
-        for (each, function), rate in zip(functions.items(), self.rates, strict=True):
-            second = function.diff(variables[TIME], 2)
-            terms = [self.density.diff(symbol(each)).xreplace(values)]
-            for name, (of, along) in in_space.items():
-                if of == each:
-                    sign = (-1) ** sum(order for _, order in along)
-                    terms.append(sign * self.density.diff(symbol(name)).xreplace(values).diff(*along))
-            mass = self.density.diff(rate, 2).xreplace(values)
-            equations[each] = sympy.Eq(second, sympy.expand(Add(*terms).doit() / mass))
-        return equations
+        return dict(self.derive().equations)
+
+    def derive(self) -> FieldDerivation:
+        """Return the equations of motion and the local conservation laws of the symmetries of the density.
+
+        The symmetries tested are translations in time and space, shifts and rotations of fields, Lorentz and Galilei
+        transformations, and rotations of space.
+
+        >>> waves = FieldSystem.from_text("waves", ["u"], {"x": (0, 1)}, "u_t**2/2 - u_x**2/2 - u**4/4")
+        >>> print(waves.derive().to_text(), end="")
+        waves: L = -u**4/4 + u_t**2/2 - u_x**2/2
+        <BLANKLINE>
+        Euler-Lagrange equations
+          u_tt = -u**3 + u_xx
+        <BLANKLINE>
+        conservation laws, d/dt Jt + d/dx Jx = 0
+          energy: translation in t
+            Jt = u**4/4 + u_t**2/2 + u_x**2/2
+            Jx = -u_t*u_x
+          momentum_x: translation in x
+            Jt = -u_t*u_x
+            Jx = -u**4/4 + u_t**2/2 + u_x**2/2
+          boost_x: Lorentz transformation along x
+            Jt = t*u_t*u_x + u**4*x/4 + u_t**2*x/2 + u_x**2*x/2
+            Jx = t*u**4/4 - t*u_t**2/2 - t*u_x**2/2 - u_t*u_x*x
+        """
+        return derivation_of(self)
 
     def discretise(self, method: str, **options: Any) -> MeshSystem:
         """Return the semi-discrete Lagrangian system on a mesh.

@@ -1,0 +1,116 @@
+"""Derivation of a density: equations, semi-discrete system and conservation laws, as text and LaTeX."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import sympy
+from sympy import Eq, Expr
+
+from scvi_codegen.fields.density import Density
+from scvi_codegen.fields.laws import ConservationLaw, Variations, names_of
+from scvi_codegen.formulas.symbols import TIME, symbol
+from scvi_codegen.formulas.translation import format_expression
+from scvi_codegen.representation import summary
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldDerivation:
+    """Equations of motion and local conservation laws of a density; of a mesh also its semi-discrete system.
+
+    Attributes:
+        field_system: the density.
+        equations: Euler-Lagrange equation of each field; of a Hamiltonian density its equations of first order.
+        laws: conservation laws of the symmetries of the density.
+        semidiscrete: the semi-discrete L or H and its energy in index notation by name; empty without a mesh.
+    """
+
+    field_system: Density
+    equations: Mapping[str, Eq]
+    laws: tuple[ConservationLaw, ...]
+    semidiscrete: Mapping[str, str]
+
+    __repr__ = summary("field_system", "laws")
+
+    def to_text(self) -> str:
+        """Return plain text: density, equations, semi-discrete system, and conservation laws."""
+        return "".join(f"{line}\n" for line in self._lines())
+
+    def to_latex(self) -> str:
+        """Return LaTeX: an ``align*`` environment of the density, the equations and the conservation laws."""
+        rows = [(f"\\mathcal{{{self._letter}}}", _latex(self.field_system.density), "")]
+        rows += [(_latex(each.lhs), _latex(each.rhs), "") for each in self.equations.values()]
+        for law in self.laws:
+            rows.append(("J^t", _latex(law.density), f"\\text{{{law.name.replace('_', ' ')}: {law.symmetry}}}"))
+            rows += [(f"J^{{{axis}}}", _latex(part), "") for axis, part in law.flux.items()]
+        body = " \\\\\n".join(f"{left} &= {right}{f' && {note}' if note else ''}" for left, right, note in rows)
+        return f"\\begin{{align*}}\n{body}\n\\end{{align*}}\n"
+
+    def _repr_latex_(self) -> str:
+        return self.to_latex()
+
+    @property
+    def _letter(self) -> str:
+        return "H" if self.field_system.momenta else "L"
+
+    def _lines(self) -> Iterator[str]:
+        yield f"{self.field_system.name}: {self._letter} = {format_expression(self.field_system.density)}"
+        yield ""
+        yield f"{'Hamilton' if self.field_system.momenta else 'Euler-Lagrange'} equations"
+        for each in self.equations.values():
+            yield f"  {_written(each.lhs)} = {_written(each.rhs)}"
+        for name, text in self.semidiscrete.items():
+            yield f"\n{name}"
+            yield from (f"  {line}" for line in text.split("\n"))
+        axes = [*self.field_system.space]
+        divergence = " + ".join(f"d/d{axis} J{axis}" for axis in axes)
+        yield f"\nconservation laws, d/d{TIME} J{TIME} + {divergence} = 0"
+        for law in self.laws:
+            yield f"  {law.name}: {law.symmetry}"
+            yield f"    J{TIME} = {_written(law.density)}"
+            yield from (f"    J{axis} = {_written(part)}" for axis, part in law.flux.items())
+
+
+def derivation_of(system: Density, mesh: Any = None) -> FieldDerivation:
+    """Return the derivation of a density, with the semi-discrete system of a mesh."""
+    variations = Variations(system)
+    order = 1 if system.momenta else 2
+    equations = {
+        each: Eq(variations.functions[each].diff(symbol(TIME), order), formula)
+        for each, formula in variations.equations.items()
+    }
+    return FieldDerivation(
+        field_system=system,
+        equations=equations,
+        laws=variations.laws(),
+        semidiscrete={} if mesh is None else _semidiscrete(mesh),
+    )
+
+
+def _semidiscrete(mesh: Any) -> dict[str, str]:
+    """Return the texts of the semi-discrete Lagrangian and of its energy, or of the semi-discrete Hamiltonian."""
+    if mesh.field_system.momenta:
+        return {"semi-discrete Hamiltonian": mesh.system.definition["hamiltonian"]}
+    text = mesh.system.definition["lagrangian"]
+    terms = text.split("\n+ ")
+    kinetic = [each for each in terms if "_dot[" in each]
+    others = [each for each in terms if each not in kinetic]
+    energy = "\n+ ".join(kinetic) + "".join(f"\n- {each}" for each in others)
+    return {"semi-discrete Lagrangian": text, "semi-discrete energy": energy}
+
+
+def _named(formula: Expr) -> Expr:
+    return formula.xreplace(names_of(formula))
+
+
+def _written(formula: Expr) -> str:
+    return format_expression(_named(formula))
+
+
+def _latex(formula: Expr) -> str:
+    named = _named(formula)
+    marks = {each: each.name.split("_", 1) for each in named.free_symbols if "_" in each.name}
+    names = {each: f"{field}_{{{along}}}" for each, (field, along) in marks.items()}
+    return str(sympy.latex(named, symbol_names=names))

@@ -1,0 +1,262 @@
+"""Euler-Lagrange equations and conservation laws of a density by Noether's theorem.
+
+A variation ``du = Q`` of the fields that changes L by a divergence, ``dL = D_t K^t + sum_i D_i K^i``, implies the local
+conservation law ``D_t J^t + sum_i D_i J^i = 0`` of every solution, with
+
+    J^t = sum_u L_(u_t) Q - K^t,
+    J^i = sum_u [L_(u_i) Q + sum_j (L_(u_ij) D_j Q - D_j L_(u_ij) Q)] - K^i
+
+(P. J. Olver, Applications of Lie Groups to Differential Equations, Springer 1993, section 4.4). A Hamiltonian density H
+has L = sum p u_t - H. Candidates for Q and K are tested: ``dL - D_t K^t - sum D_i K^i`` must be zero identically.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import combinations
+from random import Random
+
+import sympy
+from sympy import Add, Derivative, Expr, Function, S, Symbol
+from sympy.core.function import AppliedUndef
+
+from scvi_codegen.fields.density import Density
+from scvi_codegen.formulas.symbols import TIME, symbol
+from scvi_codegen.representation import summary
+
+DRAWS = 3
+"""Arguments at which an expression is evaluated to decide whether it is zero identically."""
+DIGITS = 30
+Variation = dict[str, Expr]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConservationLaw:
+    """Local conservation law d/dt density + sum over axes of d/dx flux = 0 of the solutions of a field system.
+
+    Attributes:
+        name: ``"energy"``, ``"momentum_x"``, ``"charge"``, ``"shift"``, ``"boost_x"`` or ``"angular_momentum_xy"``; of
+            several fields with that of the fields, ``"shift_u"``.
+        symmetry: transformation that the law follows from.
+        density: conserved density in the fields, functions of the axes and of the time, and their derivatives.
+        flux: flux by axis.
+    """
+
+    name: str
+    symmetry: str
+    density: Expr
+    flux: Mapping[str, Expr]
+
+    __repr__ = summary("name", "symmetry")
+
+
+@dataclass(frozen=True)
+class Variations:
+    """Fields of a density as functions of space and time, their equations and conservation laws."""
+
+    system: Density
+    functions: dict[str, Expr] = field(init=False)
+    values: dict[Expr, Expr] = field(init=False)
+
+    def __post_init__(self) -> None:
+        places = [symbol(axis) for axis in (*self.system.space, TIME)]
+        functions = {each: Function(each)(*places) for each in self.system.variables}
+        values = {symbol(each): function for each, function in functions.items()}
+        for name, (each, orders) in self.derivatives.items():
+            values[symbol(name)] = functions[each].diff(*((symbol(axis), order) for axis, order in orders.items()))
+        object.__setattr__(self, "functions", functions)
+        object.__setattr__(self, "values", values)
+
+    @cached_property
+    def derivatives(self) -> dict[str, tuple[str, dict[str, int]]]:
+        """Field, and order by axis and time, of the derivatives that L may contain."""
+        rates = {f"{each}_{TIME}": (each, {TIME: 1}) for each in self.system.variables}
+        return rates | self.system.derivatives
+
+    @cached_property
+    def formula(self) -> Expr:
+        """L in symbols; of a Hamiltonian density sum p u_t - H."""
+        system = self.system
+        if not system.momenta:
+            return system.density
+        pairs = zip(system.fields, system.momenta, strict=True)
+        return Add(*(symbol(p) * symbol(f"{u}_{TIME}") for u, p in pairs)) - system.density
+
+    @cached_property
+    def lagrangian(self) -> Expr:
+        """L along the fields."""
+        return self.along(self.formula)
+
+    def along(self, formula: Expr) -> Expr:
+        """Return a formula in symbols ``u``, ``u_x`` as one in functions of space and time."""
+        return formula.xreplace(self.values)
+
+    def partial(self, name: str) -> Expr:
+        """Return the partial derivative of L with respect to ``u``, ``u_t``, ``u_x``, .. along the fields."""
+        return self.along(self.formula.diff(symbol(name)))
+
+    @cached_property
+    def used(self) -> dict[str, tuple[str, dict[str, int]]]:
+        """Field and order of the derivatives that L contains."""
+        return {name: each for name, each in self.derivatives.items() if symbol(name) in self.formula.free_symbols}
+
+    @cached_property
+    def equations(self) -> dict[str, Expr]:
+        """Highest derivative in time of each field, u_tt or of a Hamiltonian density u_t, in derivatives in space."""
+        system, forces = self.system, {}
+        for each in system.variables:
+            terms = [self.partial(each)]
+            for name, (of, orders) in self.used.items():
+                if of == each and TIME not in orders:
+                    sign = (-1) ** sum(orders.values())
+                    terms.append(sign * self.partial(name).diff(*((symbol(a), n) for a, n in orders.items())))
+            forces[each] = Add(*terms).doit()
+        if not system.momenta:
+            masses = {each: self.along(system.density.diff(symbol(f"{each}_{TIME}"), 2)) for each in system.fields}
+            return {each: sympy.expand(forces[each] / masses[each]) for each in system.fields}
+        pairs = [*zip(system.fields, system.momenta, strict=True)]
+        rates = {u: u_t for u, p in pairs for u_t in [sympy.expand(self.values[symbol(f"{u}_{TIME}")] - forces[p])]}
+        return rates | {p: sympy.expand(forces[u]) for u, p in pairs}
+
+    def laws(self) -> tuple[ConservationLaw, ...]:
+        """Return the conservation laws of the candidates that are symmetries."""
+        found = {}
+        for name, symmetry, variation, divergence in self._candidates():
+            if name not in found and self._is_symmetry(variation, divergence):
+                found[name] = self._law(name, symmetry, variation, divergence)
+        return tuple(found.values())
+
+    def _is_symmetry(self, variation: Variation, divergence: Mapping[str, Expr]) -> bool:
+        terms = [self.partial(each) * change for each, change in variation.items()]
+        for name, (each, orders) in self.used.items():
+            change = variation[each].diff(*((symbol(axis), order) for axis, order in orders.items()))
+            terms.append(self.partial(name) * change)
+        terms += [-part.diff(symbol(axis)) for axis, part in divergence.items()]
+        return vanishes(Add(*terms).doit())
+
+    def _law(self, name: str, symmetry: str, variation: Variation, divergence: Mapping[str, Expr]) -> ConservationLaw:
+        current = {axis: -divergence.get(axis, S.Zero) for axis in (TIME, *self.system.space)}
+        for derived, (each, orders) in self.used.items():
+            along = [axis for axis, order in orders.items() for _ in range(order)]
+            change, factor = variation[each], self.partial(derived)
+            current[along[0]] += factor * (change.diff(symbol(along[1])) if len(along) == 2 else change)
+            if len(along) == 2:
+                current[along[1]] -= factor.diff(symbol(along[0])) * change
+        rates = {self.values[symbol(f"{u}_{TIME}")]: self.equations[u] for u in self.system.variables}
+        reduced = {}
+        for axis, part in current.items():
+            formula = part.doit()
+            reduced[axis] = sympy.expand(formula.subs(rates).doit() if self.system.momenta else formula)
+        return ConservationLaw(name=name, symmetry=symmetry, density=reduced.pop(TIME), flux=reduced)
+
+    def _candidates(self) -> Iterator[tuple[str, str, Variation, dict[str, Expr]]]:
+        """Yield name, description, Q by field and K by axis of transformations that may be symmetries."""
+        yield "energy", f"translation in {TIME}", self._rates(TIME), {TIME: self.lagrangian}
+        for axis in self.system.space:
+            backward = {each: -rate for each, rate in self._rates(axis).items()}
+            yield f"momentum_{axis}", f"translation in {axis}", backward, {axis: -self.lagrangian}
+        variables, pairs = self.system.variables, [*self._pairs()]
+        for pair in pairs:
+            suffix = f"_{pair[0]}_{pair[1]}" if len(variables) > 2 else ""
+            yield f"charge{suffix}", f"rotation of ({pair[0]}, {pair[1]})", *self._rotated([pair], S.One)
+        if self.system.momenta and len(pairs) > 1:
+            yield "charge", "rotation of all pairs", *self._rotated(pairs, S.One)
+        for each in variables:
+            shifted: Variation = {other: S.One if other == each else S.Zero for other in variables}
+            divergence = {TIME: self._conjugate_part(each)}
+            yield f"shift_{each}" if len(variables) > 1 else "shift", f"shift of {each}", shifted, divergence
+        yield from self._boosts(pairs)
+        yield from self._rotations_of_space()
+
+    def _rates(self, axis: str) -> Variation:
+        return {each: function.diff(symbol(axis)) for each, function in self.functions.items()}
+
+    def _pairs(self) -> Iterator[tuple[str, str]]:
+        """Yield pairs of real and imaginary parts."""
+        if self.system.momenta:
+            yield from zip(self.system.fields, self.system.momenta, strict=True)
+        else:
+            yield from combinations(self.system.fields, 2)
+
+    def _conjugate_part(self, each: str) -> Expr:
+        """Return K^t of a shift of a field: that of a momentum p adds u_t to L."""
+        if each not in self.system.momenta:
+            return S.Zero
+        return self.functions[self.system.fields[self.system.momenta.index(each)]]
+
+    def _rotated(self, pairs: list[tuple[str, str]], angle: Expr) -> tuple[Variation, dict[str, Expr]]:
+        """Return the rotation of pairs (a, b) by an angle that may depend on space, and its K."""
+        variation: Variation = dict.fromkeys(self.functions, S.Zero)
+        part = S.Zero
+        for one, two in pairs:
+            a, b = self.functions[one], self.functions[two]
+            variation |= {one: angle * b, two: -angle * a}
+            part += angle * (b**2 - a**2) / 2 if self.system.momenta else S.Zero
+        return variation, {TIME: part}
+
+    def _boosts(self, pairs: list[tuple[str, str]]) -> Iterator[tuple[str, str, Variation, dict[str, Expr]]]:
+        """Yield Lorentz boosts with the wave speed of the first field, or Galilei boosts of complex fields."""
+        first, time = self.system.fields[0], symbol(TIME)
+        for axis in self.system.space:
+            along, x = self._rates(axis), symbol(axis)
+            stiffness = self.system.density.diff(symbol(f"{first}_{axis}"), 2)
+            if stiffness == 0 or stiffness.free_symbols - set(self.system.parameters):
+                continue
+            if self.system.momenta:
+                variation, divergence = self._rotated(pairs, -x / (2 * stiffness))
+                moved = {each: variation[each] - time * along[each] for each in variation}
+                products = Add(*(self.functions[u] * self.functions[p] for u, p in pairs))
+                divergence |= {axis: -time * self.lagrangian - products / 2}
+                yield f"boost_{axis}", f"Galilei transformation along {axis}", moved, divergence
+            else:
+                squared = -stiffness / self.system.density.diff(symbol(f"{first}_{TIME}"), 2)
+                rates = self._rates(TIME)
+                moved = {each: x * rates[each] + squared * time * along[each] for each in rates}
+                divergence = {TIME: x * self.lagrangian, axis: squared * time * self.lagrangian}
+                yield f"boost_{axis}", f"Lorentz transformation along {axis}", moved, divergence
+
+    def _rotations_of_space(self) -> Iterator[tuple[str, str, Variation, dict[str, Expr]]]:
+        """Yield rotations in the planes of two axes: of scalars, and of the components of a vector field."""
+        axes, fields = [*self.system.space], self.system.fields
+        for one, two in combinations(range(len(axes)), 2):
+            x, y = symbol(axes[one]), symbol(axes[two])
+            along_x, along_y = self._rates(axes[one]), self._rates(axes[two])
+            turned = {each: y * along_x[each] - x * along_y[each] for each in self.functions}
+            divergence = {axes[one]: y * self.lagrangian, axes[two]: -x * self.lagrangian}
+            name, plane = f"angular_momentum_{axes[one]}{axes[two]}", f"({axes[one]}, {axes[two]})"
+            yield name, f"rotation of {plane}", turned, divergence
+            if len(fields) == len(axes) and not self.system.momenta:
+                vector = dict(turned)
+                vector[fields[one]] -= self.functions[fields[two]]
+                vector[fields[two]] += self.functions[fields[one]]
+                yield name, f"rotation of {plane} and of the vector field", vector, divergence
+
+
+def vanishes(formula: Expr) -> bool:
+    """Return whether an expression in functions and their derivatives is zero identically, by evaluation."""
+    if (expanded := sympy.expand(formula)) == 0:
+        return True
+    atoms = sorted(expanded.atoms(Derivative, AppliedUndef) | expanded.free_symbols, key=sympy.default_sort_key)
+    random = Random(0)
+    for _ in range(DRAWS):
+        values = {each: sympy.Float(random.uniform(0.3, 1.3), DIGITS) for each in atoms}
+        terms = [sympy.N(term.xreplace(values), DIGITS) for term in Add.make_args(expanded)]
+        if abs(complex(Add(*terms))) > 10.0 ** (10 - DIGITS) * max(abs(complex(each)) for each in terms):
+            return False
+    return True
+
+
+def names_of(formula: Expr) -> dict[Expr, Symbol]:
+    """Return the symbols ``u``, ``u_x``, ``u_tx`` of the functions and derivatives in a formula."""
+    found: dict[Expr, Symbol] = {}
+    for each in formula.atoms(Derivative, AppliedUndef):
+        if isinstance(each, Derivative):
+            orders = "".join(
+                str(axis) * order for axis, order in sorted(each.variable_count, key=lambda v: str(v[0]) != TIME)
+            )
+            found[each] = symbol(f"{each.expr.func}_{orders}")
+        else:
+            found[each] = symbol(str(each.func))
+    return found
