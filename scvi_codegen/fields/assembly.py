@@ -22,6 +22,7 @@ from scvi_codegen.fields.axes import Axis, Cells, digits, same
 from scvi_codegen.fields.density import Density
 from scvi_codegen.fields.mesh import Mesh, MeshSystem
 from scvi_codegen.formulas.array_notation import array_text
+from scvi_codegen.formulas.arrays import MAX_UNROLLED_TERMS
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -135,7 +136,7 @@ class _Assembly:
                 yield self.over_points(f"({self.written(term, texts)})")
 
     def over_pairs(self, term: Expr) -> Iterator[str]:
-        """Yield the sums over pairs of points of a term that is quadratic in derivatives along one axis."""
+        """Yield the terms of Fourier axes: sums over pairs of points of quadratic terms, then the others."""
         rest = term
         for name, (each, orders) in self.system.derivatives.items():
             factor = term.diff(symbol(name), 2)
@@ -151,10 +152,29 @@ class _Assembly:
             factors = "*".join([f"({self.written(factor, {})})", *map(self.weight, others), f"{matrix}[{pair}]"])
             yield f"sum({loops}, {factors}*({one} - {two})**2/2)"
         if sympy.expand(rest) != 0:
-            raise SystemDefinitionError(
-                f'"fourier" needs densities that are quadratic in derivatives along one axis with constant factors, '
-                f'not {sympy.expand(rest)}: use "finite-differences" or "spectral-elements"'
-            )
+            yield self.over_points(f"({self.written(rest, self.dense_derivatives(rest))})")
+
+    def dense_derivatives(self, term: Expr) -> dict[str, str]:
+        """Return the texts of fields and their derivatives at a point by dense matrices of Fourier derivatives."""
+        here = {axis: f"i{axis}" for axis in self.axes}
+        texts = {each: self.at(each, here) for each in self.system.variables} | self.at_points([*self.axes])
+        for name, (each, orders) in self.system.derivatives.items():
+            if symbol(name) not in term.free_symbols:
+                continue
+            if any(len(self.axes[axis].points) > MAX_UNROLLED_TERMS for axis in orders):
+                raise SystemDefinitionError(
+                    f'"fourier" with more than {MAX_UNROLLED_TERMS} points along an axis needs densities that are '
+                    f"quadratic in derivatives along one axis with constant factors, not {sympy.expand(term)}: use "
+                    'fewer points, "finite-differences" or "spectral-elements"'
+                )
+            text = self.at(each, {axis: f"j{axis}" if axis in orders else f"i{axis}" for axis in self.axes})
+            for axis, order in orders.items():
+                matrix, count = f"derivatives{order}_{axis}", len(self.axes[axis].points)
+                first = self.axes[axis].differentiated(np.eye(count), 0)
+                self.used[matrix] = (f"{count}, {count}", np.linalg.matrix_power(first, order))
+                text = f"sum(j{axis} in {count}, {matrix}[i{axis}, j{axis}]*{text})"
+            texts[name] = text
+        return texts
 
     def over_cells(self, key: tuple[str, ...], term: Expr) -> Iterator[str]:
         """Yield the sums over cells of the axes of the derivatives, and over the points of the other axes."""

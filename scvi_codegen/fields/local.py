@@ -180,7 +180,7 @@ class FieldHistory:
     def derivative(self, values: Array, name: str) -> Array:
         """Return the derivative along an axis."""
         position = [each.name for each in self.mesh.axes].index(name)
-        axis = self.mesh.axes[position]
+        axis: Axis = self.mesh.axes[position]
         if axis.table is None:
             return axis.differentiated(values, position + 1)
         matrix = np.array([[float(x) for x in row] for row in axis.operators[1]])

@@ -229,7 +229,7 @@ class FieldSystem(Density):
         Args:
             method: ``"spectral-elements"`` with ``degree=`` and ``elements=``, the number of equal elements or their
                 ends; ``"finite-differences"`` (periodic) with ``order=`` 2, 4, 6 or 8 and ``points=``; ``"fourier"``
-                (periodic, densities quadratic in the derivatives with constant coefficients) with ``points=``.
+                (periodic; at most 64 points unless the density is quadratic in the derivatives) with ``points=``.
             options: as above; a mapping gives each axis its own value, ``points={"x": 64, "y": 32}``.
 
         Raises:

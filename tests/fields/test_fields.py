@@ -361,9 +361,9 @@ MESHES = {
     "breaks": (("spectral-elements", {"degree": 2, "elements": [0, 0.5, 0.4, 1]}), "must ascend"),
     "degree": (("spectral-elements", {"degree": 0, "elements": 3}), "at least 1"),
     "beam": (("spectral-elements", {"degree": 3, "elements": 3}), "second derivative u_xx"),
-    "not quadratic": (("fourier", {"points": 8}), "quadratic in derivatives"),
-    "variable": (("fourier", {"points": 8}), "constant factors"),
-    "oblique": (("fourier", {"points": 8}), "along one axis"),
+    "not quadratic": (("fourier", {"points": 128}), "quadratic in derivatives"),
+    "variable": (("fourier", {"points": 128}), "constant factors"),
+    "oblique": (("fourier", {"points": 128}), "along one axis"),
 }
 DENSITIES = {
     "beam": "u_t**2/2 - u_xx**2/2",
