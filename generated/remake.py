@@ -17,11 +17,11 @@ INTEGRATORS = {
 
 
 def texts() -> dict[str, str]:
-    """Text by file name."""
+    """Return the text of each file by its name; the support headers serve all integrators."""
     files = {}
     for prefix, (name, method) in INTEGRATORS.items():
         source, _ = generate_source(problem(name).system, method, prefix=prefix)
-        files |= {f"{prefix}/{name}": text for name, text in source.specialised().files.items()}
+        files |= source.files
     return files
 
 

@@ -1,0 +1,105 @@
+#ifndef SUPPORT_CONVERGENCE_H
+#define SUPPORT_CONVERGENCE_H
+
+#include "../core/numbers.h"
+
+/* Convergence criterion of the fixed-point iteration. Requires: FINAL_ITERATIONS, the number of iterations after the
+ * last one that is measured. Changes are squared, and so are the thresholds here. */
+
+#define MARGIN 16.0 /* the remaining change must be below 1/4 of the tolerance, or 1/2 if the convergence is slow */
+#define FASTEST_CONVERGENCE 1e-6 /* fastest credible convergence: a factor of 1000 per iteration */
+#define SLOWEST_CONVERGENCE 0.5 /* slowest convergence rate assumed; a slower iteration ends where its changes stop
+                                 * decreasing */
+#define SUDDEN_CONVERGENCE 1e-3 /* an iteration reduces the change at most 30 times more than the previous one; more is
+                                 * accidental */
+#define LARGEST_CHANGE 1e75 /* the fourth power of a larger change may overflow */
+#define ROUNDING_LEVEL 1e-25 /* changes below 3e-13 of the state may be rounding errors */
+#define CERTAIN_ROUNDING 1e-28 /* changes below 1e-14 that do not decrease are rounding errors */
+#define STAGNATION 0.25 /* changes above that only if they decreased by less than half in two iterations */
+#define PROGRESS_LEVEL 1e-20 /* above 1e-10, iterations that gain less than a factor of 1.4 (two: 2) are abandoned */
+#define FIRST_ITERATIONS 4 /* but not among the first ones, which need not contract */
+#define LEAST_SQUARED 1e-100 /* squares of smaller numbers, or of small parts of them, may be subnormal */
+#define LARGEST_SQUARED 1e100 /* squares of larger numbers, or sums of many, may overflow */
+#define GOOD_GUESS 1e-6 /* after a prediction with an error below 1e-3 of the state, the next one uses two steps */
+
+static inline double smaller(double a, double b)
+{
+  return a < b ? a : b;
+}
+
+/* Factor by which numbers of this size are scaled before they are squared: 1 unless squares overflow or underflow. */
+static inline double scale_of(double size)
+{
+  return size > LEAST_SQUARED && size < LARGEST_SQUARED ? 1.0 : 1.0 / (size + DBL_MIN);
+}
+
+/* Returns 1 if all further iterations would change the points by less than the tolerance, with a margin: the remaining
+ * change is change r / (1 - r), with r the convergence rate estimated from the previous change `last`, which is
+ * infinite at first. Squared, 1 / (1 - r) is at most 2 / (1 - r^2); the 4 is part of MARGIN. The inequality is
+ * multiplied out because a division costs as much as an iteration. If the eigenvalues of the iteration are complex, its
+ * rate varies, so r is at least 1/30 of the rate that follows from the change `before` the last one. */
+static inline int is_small_remainder(double change, double last, double before, const solver_options *options,
+    double margin)
+{
+  const double tolerance = options->tolerance * options->tolerance, rest = margin * change;
+  const double seen = smaller(larger(change, FASTEST_CONVERGENCE * last), SLOWEST_CONVERGENCE * last);
+  const double gap = last - seen, expected = SUDDEN_CONVERGENCE * last;
+  const int rests = rest * seen * (FINAL_ITERATIONS ? seen : last) <= tolerance * (gap * gap);
+  const int sure = rest * expected * (FINAL_ITERATIONS ? expected : before) <= tolerance * (before * before);
+  if (options->absolute)
+    return change <= tolerance;
+  return last < LARGEST_CHANGE ? rests & sure : rest <= tolerance;
+}
+
+/* Returns 1 if the iteration that changed the points by sqrt(change) relative to the state is accepted: the remaining
+ * change is below a quarter of the tolerance, or rounding stops the decrease; 0: continue; -1: it converges too slowly
+ * or not at all. Branch-free, so that it vectorises over trajectories. */
+static inline int iteration_status(double change, double last, double before, const solver_options *options, int k)
+{
+  const int small = is_small_remainder(change, last, before, options, MARGIN);
+  const int stagnated = (change < CERTAIN_ROUNDING) | ((change < ROUNDING_LEVEL) & (change >= STAGNATION * before));
+  const int stopped = (change == 0.0) | ((k > 0) & (change >= last) & stagnated);
+  const int creeping = (change > 0.5 * last) & (change > STAGNATION * before) & (change > PROGRESS_LEVEL);
+  const int slow = (k >= options->max_iterations) | ((k > FIRST_ITERATIONS) & creeping);
+  return change < INFINITY ? (small | stopped ? 1 : -slow) : -1;
+}
+
+/* Number of previous steps for the next predictor: a polynomial of high degree through two steps is better while
+ * predictions are accurate, and worse for large steps. */
+static inline long long steps_to_continue(long long steps, double first_change)
+{
+  return steps > 0 && first_change < GOOD_GUESS ? 2 : 1;
+}
+
+#ifdef ARRAYS
+#define LEAST_SIZE 1e-6 /* relative to the largest coordinate: added to the size of each */
+
+/* Replaces sizes by inverse sizes whose squared changes add up to the mean over n coordinates, so that the sum of the
+ * rounding errors of many is not above the tolerance; with absolute = 1, to the 2-norm. NaN if a size is not finite. */
+static inline void invert_sizes(const solver_options *options, double largest, long long n, section here, double *size)
+{
+  const double unit = 1.0 / sqrt((double)n), least = LEAST_SIZE * largest + DBL_MIN;
+  for (long long i = here.first; i < here.end; i++)
+    size[i] = (options->absolute ? 1.0 : unit / (size[i] + least)) + 0.0 * largest;
+}
+
+/* Squared change relative to the squared size of a state in the 2-norm; NaN if that is not finite. */
+static inline double relative_change(double change, double size)
+{
+  return (size == 0.0 ? change : change / size) + 0.0 * size;
+}
+#else
+/* Inverse sizes, in units of which changes are measured. Requires: points.h or trajectories.h. */
+
+/* 1 / (size + a little of the largest), so that a coordinate at 0 has a size, too; or `absolute`, which converts to
+ * changes of q. An infinite size gives NaN. */
+static inline void invert_sizes(const solver_options *options, double absolute, number *size)
+{
+  const number largest = largest_number(size);
+  for (int i = 0; i < M; i++)
+    size[i] =
+        (options->absolute ? number_of(absolute) : 1.0 / (size[i] + (DBL_EPSILON * largest + DBL_MIN))) + 0.0 * largest;
+}
+#endif
+
+#endif

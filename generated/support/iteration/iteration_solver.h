@@ -1,0 +1,79 @@
+#ifndef SUPPORT_ITERATION_SOLVER_H
+#define SUPPORT_ITERATION_SOLVER_H
+
+#include "../core/status_codes.h"
+#include "one_trajectory.h"
+
+/* Step by fixed-point iteration. If it fails, the step is solved by Newton's method, by that of another library
+ * (LIBRARY_FALLBACK) or not at all (NO_FALLBACK). Requires: a fixed-point iteration. */
+
+#ifdef LIBRARY_FALLBACK
+#include "../newton/library_fallback.h"
+#elif defined(NO_FALLBACK)
+/* No fallback: if the fixed-point iteration fails, the step fails. */
+static int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
+    solver_report *report, double *workspace)
+{
+  (void)step, (void)dq, (void)dp, (void)options, (void)report, (void)workspace;
+  return status;
+}
+#else
+#include "../newton/newton_from_line.h"
+
+/* Fallback to Newton's method when the fixed-point iteration fails. */
+
+static SELDOM int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
+    solver_report *report, double *workspace)
+{
+  newton_data *newtons = newton_in(workspace);
+  const long long before = report->iterations;
+  int keep;
+  status = newton_from_line(step, newtons, dp, &keep, options, report);
+  gather(END_POSITION, 1, step->h, newtons->z, M, dq, 0, 1);
+  memset(dq + M, 0, sizeof(double) * M);
+  memset(dp + M, 0, sizeof(double) * M);
+  if (status == OK && is_spurious(step, newtons->z, dq, report->iterations - before))
+    return STATUS(SPURIOUS_SOLUTION);
+  return status;
+}
+#endif
+
+typedef iteration_data solver_data;
+
+static void prepare(const step_data *step, solver_data *data)
+{
+  prepare_iteration(step, data);
+}
+
+/* Computes the increments by fixed-point iteration from the straight line, else by fall_back. */
+static __attribute__((noinline)) int solve_afresh(const step_data *step, const solver_data *data, history memory,
+    long long *guess, double *dq, double *dp, const solver_options *options, solver_report *report, double *workspace)
+{
+  long long steps = 0;
+  int status = fixed_point(step, data, memory, &steps, dq, dp, options, report);
+  if (status != OK) {
+    status = fall_back(status, step, dq, dp, options, report, workspace);
+    if (status == OK && !reaches(step, dq, dp))
+      status = NOT_FINITE;
+    steps = 0;
+  }
+  if (status == OK)
+    *guess = steps;
+  return status;
+}
+
+/* Computes the increments by fixed-point iteration from the curve extrapolated from *guess former steps, or from the
+ * straight line if there are none or it fails. On success *guess is the number of steps for the next predictor. On
+ * failure the increments are undefined. */
+HOT int solve(const step_data *step, const solver_data *data, history memory, long long *guess, double *dq, double *dp,
+    const solver_options *options, solver_report *report, double *workspace)
+{
+  long long steps = *guess;
+  if (steps > 0 && fixed_point(step, data, memory, &steps, dq, dp, options, report) == OK) {
+    *guess = steps;
+    return OK;
+  }
+  return solve_afresh(step, data, memory, guess, dq, dp, options, report, workspace);
+}
+
+#endif

@@ -1,0 +1,58 @@
+#ifndef SUPPORT_MASS_MATRIX_H
+#define SUPPORT_MASS_MATRIX_H
+
+/* Linear systems with the mass matrix in every lane, which is diagonal (DIAGONAL_MASS) or full. */
+#ifdef DIAGONAL_MASS
+/* Diagonal mass matrices. Requires: points.h or trajectories.h. */
+enum { DIAGONAL = 1,
+  MASS = M };
+
+/* Inverts the masses; the division overlaps with the evaluation of the forces. */
+static inline void factor_mass(lanes *mass)
+{
+  for (int i = 0; i < M; i++)
+    mass[i] = 1.0 / mass[i];
+}
+
+/* r = mass^-1 r in every lane, with the inverted masses. */
+static inline void solve_mass(const lanes *mass, lanes *r)
+{
+  for (int i = 0; i < M; i++)
+    r[i] *= mass[i];
+}
+#else
+/* Full mass matrices in every lane, in their lower triangles. Requires: points.h or trajectories.h. */
+enum { DIAGONAL = 0,
+  MASS = M * M };
+
+/* L D L^T factors of the mass matrix without pivoting, 1 / D on the diagonal; a zero pivot gives NaN. */
+static inline void factor_mass(lanes *mass)
+{
+  for (int j = 0; j < M; j++) {
+    const lanes inverse = 1.0 / mass[j * M + j];
+    for (int i = j + 1; i < M; i++) {
+      const lanes entry = mass[i * M + j], factor = entry * inverse;
+      for (int k = j + 1; k < i; k++)
+        mass[i * M + k] -= entry * mass[k * M + j];
+      mass[i * M + i] -= entry * factor;
+      mass[i * M + j] = factor;
+    }
+    mass[j * M + j] = inverse;
+  }
+}
+
+/* r = mass^-1 r with the factors. */
+static inline void solve_mass(const lanes *mass, lanes *r)
+{
+  for (int j = 0; j < M; j++) {
+    for (int i = j + 1; i < M; i++)
+      r[i] -= mass[i * M + j] * r[j];
+    r[j] *= mass[j * M + j];
+  }
+  for (int j = M - 1; j > 0; j--)
+    for (int i = 0; i < j; i++)
+      r[i] -= mass[j * M + i] * r[j];
+}
+#endif
+
+#endif

@@ -1,0 +1,393 @@
+#ifndef SUPPORT_SEPARABLE_ITERATION_H
+#define SUPPORT_SEPARABLE_ITERATION_H
+
+#include "../core/vectors.h"
+
+/* Fixed-point iteration of a step for constant diagonal masses and forces F(q, t) (Li, Wu & Leok, eqs. (25)-(30)): X_n
+ * = q0 + h c_n v0 + h^2 sum_j (a A)_nj F(X_j) / m, with the quadrature points or the trajectories as SIMD lanes.
+ * Coefficients are double-double: the sum of a table and its _LOW partner. Values at the points are in flat arrays,
+ * [group of points][coordinate], whose groups are EXTENT(n) elements apart: M coordinates or, if ARRAYS is defined, n,
+ * which is known at run time. Requires: points.h or trajectories.h with what they require, the tables, the kernels
+ * force_lanes and mass; with ARRAYS forces_at, and FORCES_OF_VELOCITIES if forces depend on velocities, too. */
+
+#ifdef ARRAYS
+#define EXTENT(n) (n)
+#define PASS static inline
+#else
+#define EXTENT(n) M
+#define PASS static inline __attribute__((always_inline))
+#endif
+
+#ifdef FORCES_OF_VELOCITIES
+#define VELOCITIES 1
+#else
+#define VELOCITIES 0
+#endif
+
+enum { OF_EACH = 1 + VELOCITIES }; /* values per coordinate in X: positions, then velocities */
+
+#define FEW 8 /* coordinates, whose squared changes are added, which is faster */
+
+/* Constants of a step size: h^2 = square + square_low, h w = kick + kick_low. */
+typedef struct {
+  weight kick[GROUPS], kick_low[GROUPS];
+#ifdef ARRAYS
+  const number *inverse_mass;
+#else
+  number inverse_mass[M];
+#endif
+  double square, square_low;
+} iteration_data;
+
+/* h v of a coordinate. */
+typedef struct {
+  number high, low;
+} drift_words;
+
+/* Arguments and arrays of a step: the points X and the forces F there. */
+typedef struct {
+  const step_data *step;
+  const iteration_data *data;
+  lanes *X, *F;
+  long long n;
+  number *inverse_size;
+#ifndef ARRAYS
+  drift_words *drifts;
+  lanes *base, *rests; /* points of the straight line; low words of the iteration, with the first forces */
+#endif
+} step_points;
+
+static void prepare_step_size(double h, iteration_data *data)
+{
+  data->square = h * h;
+  data->square_low = fma(h, h, -data->square);
+  for (int n = 0; n < GROUPS; n++) {
+    data->kick[n] = h * POINT_END_MOMENTUM[n];
+    data->kick_low[n] = fused_weights(h, POINT_END_MOMENTUM[n], -data->kick[n]) + h * POINT_END_MOMENTUM_LOW[n];
+  }
+}
+
+PASS drift_words find_drift(const step_points *w, long long i)
+{
+  const double h = w->step->h;
+  const number inverse = w->data->inverse_mass[i], v = inverse * w->step->p0[i];
+  const number v_low = fused_numbers(inverse, w->step->p0[i], -v);
+  drift_words of;
+  of.high = h * v;
+  of.low = fused_numbers(number_of(h), v, -of.high) + h * (v_low + inverse * w->step->carry_p[i]);
+  return of;
+}
+
+/* The drift of a coordinate, its points without forces and the unit of their changes. Those of few coordinates are
+ * stored, those of many are computed again. Rounding of the coefficients would displace the points to the same side in
+ * every step, and the last iteration alone would leave a part of that, so that for few coordinates all iterations
+ * include the low words, with the first forces. */
+#ifdef ARRAYS
+#define DRIFT_OF(w, i) find_drift(w, i)
+#define STRAIGHT_LINE(w, g, i, of) ((w)->step->q0[i] + DRIFT[g] * (of).high)
+#define WITH_LOW_WORDS(w, g, i, x) (x)
+#else
+#define DRIFT_OF(w, i) ((w)->drifts[i])
+#define STRAIGHT_LINE(w, g, i, of) ((void)(of), (w)->base[(g) * M + (i)])
+#define WITH_LOW_WORDS(w, g, i, x) ((x) + (w)->rests[(g) * M + (i)])
+#endif
+
+/* sum_j table_gj F_j of a coordinate. */
+#define SUM_OF_FORCES(table, w, g, i) contribution_of_points(table, g, &(w)->F[i], EXTENT((w)->n))
+
+/* h^2 / m. */
+PASS number unit_of(const step_points *w, long long i)
+{
+  return w->data->square * w->data->inverse_mass[i];
+}
+
+/* Size of a coordinate in the step: |q| + |h v| + |h^2 F / m|. */
+PASS number size_of(const step_points *w, drift_words of, long long i)
+{
+  return magnitude(w->step->q0[i]) + magnitude(of.high) + magnitude(unit_of(w, i) * at_first(&w->F[i]));
+}
+
+/* Low words of a point without forces. */
+PASS lanes low_words(const step_points *w, int g, drift_words of, long long i)
+{
+  return w->step->carry_q[i] + DRIFT[g] * of.low + DRIFT_LOW[g] * of.high;
+}
+
+/* x + (y + rest), where rest is below the rounding error of x + y, by a two-sum. */
+static inline lanes sum_of_three(lanes x, lanes y, lanes rest)
+{
+  const lanes sum = x + y, part = sum - x;
+  return sum + (((x - (sum - part)) + (y - part)) + rest);
+}
+
+/* A point with double-double coefficients. */
+PASS lanes accurate_point(const step_points *w, int g, drift_words of, long long i)
+{
+  const iteration_data *data = w->data;
+  const lanes sum = SUM_OF_FORCES(PRODUCT, w, g, i), low = SUM_OF_FORCES(PRODUCT_LOW, w, g, i);
+  return sum_of_three(lanes_of_number(w->step->q0[i]),
+      DRIFT[g] * of.high + data->inverse_mass[i] * (data->square * sum),
+      low_words(w, g, of, i) + data->inverse_mass[i] * (data->square * low + data->square_low * sum));
+}
+
+/* Increments of a coordinate: of q, with its low word, and of p. */
+typedef struct {
+  number q, q_low, p;
+} end_increments;
+
+PASS end_increments increments_of(const step_points *w, long long i)
+{
+  const iteration_data *data = w->data;
+  const lanes *F = &w->F[i];
+  const drift_words of = DRIFT_OF(w, i);
+  const number sum = weigh_apart_twice(POINT_END_POSITION, POINT_END_POSITION_LOW, F, EXTENT(w->n));
+  const number kick = data->inverse_mass[i] * (data->square * sum), q = of.high + kick, part = q - of.high;
+  end_increments end;
+  end.q = q;
+  end.q_low =
+      (of.high - (q - part)) + (kick - part) + (of.low + data->inverse_mass[i] * (data->square_low * sum));
+  end.p = weigh_apart_twice(data->kick, data->kick_low, F, EXTENT(w->n));
+  return end;
+}
+
+/* Adds the square of a change. For many coordinates with names the sum of the rounding errors would stay above the
+ * tolerance: there it is the largest. A NaN is detected later, by the increments. */
+static inline lanes with_change(lanes change, lanes moved)
+{
+#ifndef ARRAYS
+  if (M > FEW)
+    return larger_lanes(change, moved * moved);
+#endif
+  return change + moved * moved;
+}
+
+/* Updates the points of a range of coordinates from the forces; returns the sum of the squared relative changes. */
+PASS lanes improve_points(const step_points *w, section here)
+{
+  lanes change = lanes_of(0.0);
+  for (long long i = here.first; i < here.end; i++) {
+    const drift_words of = DRIFT_OF(w, i);
+    const number unit = unit_of(w, i);
+    for (int g = 0; g < GROUPS; g++) {
+      lanes *X = &w->X[g * OF_EACH * EXTENT(w->n) + i];
+      const lanes curved = unit * SUM_OF_FORCES(PRODUCT, w, g, i);
+      const lanes x = STRAIGHT_LINE(w, g, i, of) + WITH_LOW_WORDS(w, g, i, curved);
+      change = with_change(change, (x - *X) * w->inverse_size[i]);
+      *X = x;
+    }
+  }
+  return change;
+}
+
+/* Computes the points of a range of coordinates with double-double coefficients. */
+PASS void refine_points(const step_points *w, section here)
+{
+  for (long long i = here.first; i < here.end; i++)
+    for (int g = 0; g < GROUPS; g++)
+      w->X[g * OF_EACH * EXTENT(w->n) + i] = accurate_point(w, g, DRIFT_OF(w, i), i);
+}
+
+/* Computes the increments of a range of coordinates; low words follow those of q. */
+PASS void find_increments(const step_points *w, section here, number *dq, number *dp)
+{
+  for (long long i = here.first; i < here.end; i++) {
+    const end_increments end = increments_of(w, i);
+    dq[i] = end.q, dq[EXTENT(w->n) + i] = end.q_low, dp[i] = end.p;
+  }
+}
+
+#ifdef ARRAYS
+#define KEPT_FIRST(apart) 0
+
+static history history_in(const step_data *step)
+{
+  return history_of(step->run, OF_EACH * GROUPS * step->n, step->n);
+}
+
+static void prepare_iteration(const step_data *step, iteration_data *data)
+{
+  prepare_step_size(step->h, data);
+  data->inverse_mass = step->run->inverse_mass;
+}
+
+static step_points points_in(const step_data *step, const iteration_data *data, history past)
+{
+  const step_points points = {step, data, (lanes *)step->run->work, past.now, step->n, step->scratch};
+  return points;
+}
+
+static void forces(const step_points *w)
+{
+  forces_at(w->step, w->X, OF_EACH * w->n, w->F);
+}
+
+#ifdef FORCES_OF_VELOCITIES
+/* Updates the velocities at the points from the forces; returns the sum of the squared relative changes times h. */
+static lanes improve_velocities(const step_points *w, section here)
+{
+  const step_data *step = w->step;
+  lanes change = lanes_of(0.0);
+  for (int g = 0; g < GROUPS; g++) {
+    lanes *V = w->X + (g * OF_EACH + 1) * w->n;
+    for (long long i = here.first; i < here.end; i++) {
+      const lanes kick = step->carry_p[i] + step->h * SUM_OF_FORCES(VELOCITY, w, g, i);
+      const lanes v = w->data->inverse_mass[i] * (step->p0[i] + kick);
+      change = with_change(change, step->h * (v - V[i]) * w->inverse_size[i]);
+      V[i] = v;
+    }
+  }
+  return change;
+}
+#else
+static lanes improve_velocities(const step_points *w, section here)
+{
+  (void)w, (void)here;
+  return lanes_of(0.0);
+}
+#endif
+
+/* Points of the straight line or, if there are former steps, with extrapolated forces. */
+static void first_points(const step_points *w, history past, long long steps)
+{
+  const section own = own_part(w->step);
+  for (long long i = own.first; i < own.end; i++) {
+    const drift_words of = find_drift(w, i);
+    for (int g = 0; g < GROUPS; g++) {
+      const lanes force = extrapolated(w->step, past, steps, g, i);
+      if (VELOCITIES) /* the extrapolation is of forces, from which velocities follow, too */
+        w->F[g * w->n + i] = force;
+      w->X[g * OF_EACH * w->n + i] = STRAIGHT_LINE(w, g, i, of);
+      if (!VELOCITIES && steps > 0)
+        w->X[g * OF_EACH * w->n + i] += unit_of(w, i) * force;
+    }
+    for (int g = 0; VELOCITIES && g < GROUPS; g++)
+      w->X[g * OF_EACH * w->n + i] += unit_of(w, i) * SUM_OF_FORCES(PRODUCT, w, g, i);
+  }
+  improve_velocities(w, own);
+}
+
+/* Sizes of the coordinates. */
+static inline void measure_points(const step_points *w, const solver_options *options)
+{
+  sums all;
+  begin_blocks(&all, w->step);
+  EACH_BLOCK (all) {
+    double largest = 0.0;
+    for (long long i = all.here.first; i < all.here.end; i++) {
+      w->inverse_size[i] = size_of(w, find_drift(w, i), i);
+      largest = larger(largest, w->inverse_size[i]);
+    }
+    add_block(&all, largest, 0.0);
+  }
+  meet(w->step);
+  invert_sizes(options, largest_over(&all, 0), w->n, own_part(w->step), w->inverse_size);
+}
+
+static inline double improve(const step_points *w)
+{
+  sums all;
+  begin_blocks(&all, w->step);
+  EACH_BLOCK (all) {
+    const lanes change = improve_points(w, all.here);
+    add_block(&all, lanes_total(change + improve_velocities(w, all.here)), 0.0);
+  }
+  meet(w->step);
+  return sum_of(&all, 0);
+}
+#else
+static void prepare_iteration(const step_data *step, iteration_data *data)
+{
+  prepare_step_size(step->h, data);
+  mass(NULL, step->t, step->parameters, data->inverse_mass);
+  for (int i = 0; i < M; i++)
+    data->inverse_mass[i] = 1.0 / data->inverse_mass[i];
+}
+
+PASS void forces(const step_points *w)
+{
+  for (int g = 0; g < GROUPS; g++)
+    force_lanes(w->X + g * M, w->step->t + w->step->h * ABSCISSA[g], w->step->parameters, w->F + g * M);
+}
+
+/* Points of the straight line or, if there are former steps, with extrapolated forces. */
+PASS void first_points(const step_points *w, history past, long long steps)
+{
+  for (int i = 0; i < M; i++) {
+    w->drifts[i] = find_drift(w, i);
+    for (int g = 0; g < GROUPS; g++)
+      w->X[g * M + i] = w->base[g * M + i] = w->step->q0[i] + DRIFT[g] * w->drifts[i].high;
+  }
+  if (steps == 0)
+    return;
+  continue_curve(w->step, past, steps, (coordinates *)w->F);
+  for (int i = 0; i < M; i++)
+    for (int g = 0; g < GROUPS; g++)
+      w->X[g * M + i] += unit_of(w, i) * w->F[g * M + i];
+}
+
+/* Sizes of the coordinates, and low words of their iteration, with the first forces. */
+PASS void measure_points(const step_points *w, const solver_options *options)
+{
+  for (int i = 0; i < M; i++)
+    w->inverse_size[i] = size_of(w, w->drifts[i], i);
+  invert_sizes(options, 1.0, w->inverse_size);
+  for (int i = 0; i < M; i++)
+    for (int g = 0; g < GROUPS; g++)
+      w->rests[g * M + i] = low_words(w, g, w->drifts[i], i) +
+          w->data->inverse_mass[i] * (w->data->square * SUM_OF_FORCES(PRODUCT_LOW, w, g, i));
+}
+
+PASS number improve(const step_points *w)
+{
+  const section all = {0, M};
+  return total_change(improve_points(w, all));
+}
+#endif
+
+#ifndef NEWTON_KRYLOV
+/* Computes the increments of one step and their low words. The points X are iterated until they converge, then once
+ * more with double-double coefficients; the forces are stored for the predictor. On failure the increments are
+ * undefined. */
+HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, number *dq,
+    number *dp, const solver_options *options, solver_report *report)
+{
+#ifdef ARRAYS
+  const section own = own_part(step);
+  const step_points w = points_in(step, data, past);
+#else
+  const section own = {0, M};
+  coordinates X[GROUPS], base[GROUPS], rests[GROUPS], local[GROUPS], *F = kept(past, local);
+  drift_words drifts[M];
+  number inverse_size[M];
+  const step_points w = {step, data, X[0], F[0], M, inverse_size, drifts, base[0], rests[0]};
+#endif
+  progress now = before_iterations();
+  int status;
+  first_points(&w, past, *steps);
+  forces(&w);
+  measure_points(&w, options);
+  for (int k = 0; needs_iteration(&now); k++) {
+    const number change = improve(&w);
+    forces(&w);
+    take_change(&now, change, options, k, report);
+  }
+  status = outcome(&now, report);
+  if (status != OK)
+    return status;
+  refine_points(&w, own);
+#ifdef ARRAYS
+  improve_velocities(&w, own);
+#endif
+  forces(&w);
+  find_increments(&w, own, dq, dp);
+  if (!accept(step, dq, dp, report))
+    return NOT_FINITE;
+#ifndef ARRAYS
+  remember_curve(F, past);
+#endif
+  *steps = next_guess(*steps, &now, report);
+  return OK;
+}
+#endif
+
+#endif

@@ -1,0 +1,87 @@
+#ifndef SUPPORT_SPLITTING_H
+#define SUPPORT_SPLITTING_H
+
+#include "../core/status_codes.h"
+#include "../core/step.h"
+
+/* Explicit splitting method (Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. II.5): for every n
+ *   p += h KICK[n] F(q, t + h KICK_ABSCISSA[n]),      q += h DRIFT[n] v,
+ * with v = M^-1 p for constant masses (CONSTANT_MASSES), else v(p, t). */
+#ifdef CONSTANT_MASSES
+/* Drift with constant masses. Requires: the kernel mass. */
+typedef struct {
+  real inverse_mass[M];
+} solver_data;
+
+static void prepare(const step_data *step, solver_data *data)
+{
+  mass(NULL, step->t, step->parameters, data->inverse_mass);
+  for (int i = 0; i < M; i++)
+    data->inverse_mass[i] = 1 / data->inverse_mass[i];
+}
+
+/* Advances the positions by a part of the step with the momenta p0 + dp. */
+static inline void drift(const step_data *step, const solver_data *data, real part, const real *dp, real *dq)
+{
+  for (int i = 0; i < M; i++)
+    dq[i] += step->h * part * data->inverse_mass[i] * (step->p0[i] + (step->carry_p[i] + dp[i]));
+}
+#else
+/* Drift with velocities v(p, t). Requires: the kernel drift_velocity. */
+typedef struct {
+  int unused;
+} solver_data;
+
+static void prepare(const step_data *step, solver_data *data)
+{
+  (void)step;
+  data->unused = 0;
+}
+
+/* Advances the positions by a part of the step with the momenta p0 + dp. */
+static inline void drift(const step_data *step, const solver_data *data, real part, const real *dp, real *dq)
+{
+  real p[M], v[M];
+  (void)data;
+  for (int i = 0; i < M; i++)
+    p[i] = step->p0[i] + (step->carry_p[i] + dp[i]);
+  drift_velocity(p, step->t, step->parameters, v);
+  for (int i = 0; i < M; i++)
+    dq[i] += step->h * part * v[i];
+}
+#endif
+
+/* Requires: a drift, LEAPS, the tables, and the kernel force. */
+
+/* Computes the increments of one step; memory contains the last force, which the next step reuses if it starts with a
+ * kick. */
+static int solve(const step_data *step, const solver_data *data, real *memory, long long *guess, real *dq, real *dp,
+    const solver_options *options, solver_report *report, real *workspace)
+{
+  real F[M], u[M];
+  (void)options;
+  (void)workspace;
+  memcpy(F, memory, sizeof F);
+  memset(dq, 0, sizeof(real) * M);
+  memset(dp, 0, sizeof(real) * M);
+  for (int n = 0; n < LEAPS; n++) {
+    if (KICK[n] != 0) {
+      for (int i = 0; i < M; i++)
+        u[i] = step->q0[i] + (step->carry_q[i] + dq[i]);
+      if (n > 0 || !*guess)
+        force(u, step->t + KICK_ABSCISSA[n] * step->h, step->parameters, F);
+      for (int i = 0; i < M; i++)
+        dp[i] += step->h * KICK[n] * F[i];
+    }
+    if (DRIFT[n] != 0)
+      drift(step, data, DRIFT[n], dp, dq);
+  }
+  report->iterations++;
+  if (!reaches(step, dq, dp))
+    return NOT_FINITE;
+  memcpy(memory, F, sizeof F);
+  *guess = 1;
+  return OK;
+}
+
+#endif

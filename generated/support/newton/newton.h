@@ -1,0 +1,193 @@
+#ifndef SUPPORT_NEWTON_H
+#define SUPPORT_NEWTON_H
+
+#include "../core/status_codes.h"
+#include "../core/step.h"
+#include "band.h"
+
+/* Newton's method for the stage equations, with reuse of the Jacobian's factors (simplified Newton; Hairer & Wanner,
+ * Solving ODEs II, sec. IV.8). Requires: stages.h, the tables END_POSITION, MOMENTUM_ROW, STRAIGHT, MOMENTA and MOVES,
+ * and evaluate, which computes the equations and their Jacobian; if DAMPED, damping.h. */
+
+#define STOPPED_SHRINKING REAL(0.25) /* Newton updates converge quadratically: one that decreases by less is rounding */
+#define STAGE_ROUNDOFF (REAL(32.0) * REAL_EPSILON) /* rounding error of positions that a stiff force determines */
+#define STAGNATIONS (SITES > M ? 2 : 1) /* with frozen factors positions and multipliers converge one after the other */
+#define REUSE_CHANGE REAL(1e-2) /* factors are reused while updates are below this part of the state */
+#define REUSE_RATE REAL(0.1) /* and decrease at least tenfold: then another iteration costs less than new factors */
+
+/* Change of the stages and the end momentum by the last update: the largest ratio to the own size, the ratio of the
+ * largest to the largest size, and the largest itself. */
+typedef struct {
+  real relative, overall, absolute, stages; /* stages: overall, of the positions of the stages alone */
+} movement;
+
+static movement no_movement(void)
+{
+  const movement none = {0};
+  return none;
+}
+
+static void measure(movement *moved, const real *change, const real *size)
+{
+  real largest_change = 0, largest_size = 0;
+  for (int i = 0; i < M; i++) {
+    const real ratio = change[i] != 0 ? MATH(fabs)(change[i]) / size[i] : 0;
+    moved->relative = larger(moved->relative, ratio);
+    largest_change = larger(largest_change, MATH(fabs)(change[i]));
+    largest_size = larger(largest_size, size[i]);
+  }
+  if (largest_change > moved->overall * largest_size)
+    moved->overall = largest_change / largest_size;
+  moved->absolute = larger(moved->absolute, largest_change);
+}
+
+/* Workspace of Newton's method. */
+typedef struct {
+  real z[N]; /* unknowns */
+  real rows[N + SITES], update[N + SITES]; /* residuals of the equations, and the solution of the linear system */
+  real factors[JACOBIAN], pivot[N + SITES]; /* of the Jacobian */
+  real point[]; /* t, q0 with its compensation and z where the factors were computed, if they are reused (POINT > 0) */
+} newton_data;
+
+static newton_data *newton_in(real *workspace)
+{
+  return (newton_data *)workspace;
+}
+
+/* Stages of a straight line with velocity v and momentum p0; other unknowns are 0. */
+static void start_on_line(const real *v, const real *p0, real *z)
+{
+  memset(z + M * B, 0, sizeof(real) * (N - M * B));
+  for (int i = 0; i < M; i++)
+    for (int b = 0; b < B; b++)
+      z[i * B + b] = STRAIGHT[b] * v[i] + MOMENTA[b] * p0[i];
+}
+
+/* z -= update, the solution with the current factors; p0 likewise, if it is not NULL. Measures the update. */
+static void apply_update(newton_data *data, const band *shape, real h, real *p0, const real *size_p,
+    const real *size_q, movement *moved)
+{
+  const int blocks = shape->rows / SITES;
+  real change[SITES];
+  for (int i = 0; i < SITES; i++)
+    memcpy(data->update + POSITION_IN_MATRIX[i] * blocks, data->rows + i * (B + 1), sizeof(real) * (size_t)blocks);
+  back_substitute(data->factors, shape, data->pivot, data->update);
+  for (int i = 0; i < SITES; i++) {
+    const real *update = data->update + POSITION_IN_MATRIX[i] * blocks;
+    change[i] = 0;
+    for (int b = 0; b < B; b++) {
+      data->z[i * B + b] -= update[b];
+      change[i] = larger(change[i], MATH(fabs)(h * MOVES[b] * update[b]));
+    }
+  }
+  measure(moved, change, size_q);
+  moved->stages = moved->overall;
+  for (int i = 0; p0 && i < M; i++) {
+    change[i] = data->update[POSITION_IN_MATRIX[i] * blocks + B];
+    p0[i] -= change[i];
+  }
+  if (p0)
+    measure(moved, change, size_p);
+}
+
+/* Returns 1 if an update at round-off level no longer decreases. A stiff force amplifies the rounding of positions in
+ * the momenta: then only the positions are at round-off, and the momenta cannot be computed more accurately. */
+static int has_stagnated(const movement *moved, real last)
+{
+  return moved->relative >= STOPPED_SHRINKING * last &&
+      (moved->overall <= ROUNDOFF_LEVEL || moved->stages <= STAGE_ROUNDOFF);
+}
+
+/* Returns 1 if the iterate that `moved` led to is accepted: its update is below the tolerance, or has stalled at
+ * round-off level. With frozen factors convergence is linear: one decrease is required, and two to distinguish
+ * round-off from slow convergence. */
+static int has_converged(const solver_options *options, const movement *moved, int stagnations, int trials)
+{
+  if (trials < 2)
+    return 0;
+  if (options->absolute)
+    return moved->absolute < options->tolerance;
+  if (moved->relative <= options->tolerance)
+    return 1;
+  return trials > 2 && stagnations >= STAGNATIONS;
+}
+
+/* Replaces the row of p1 - p0 by q0 + h sum_b beta_b z_b = q1, with p0 as a further unknown. */
+static void add_boundary(const step_data *step, newton_data *data, const real *q1, int with_jacobian,
+    const band *shape)
+{
+  for (int i = 0; i < M; i++) {
+    real *row = data->rows + i * (B + 1) + B;
+    *row = -(q1[i] - step->q0[i]) / step->h;
+    for (int b = 0; b < B; b++)
+      *row += END_POSITION[b] * data->z[i * B + b];
+  }
+  for (int i = 0; with_jacobian && i < M; i++) {
+    real *corner = data->factors + shape->first + POSITION_IN_MATRIX[i] * (B + 1) * (shape->stride + 1);
+    for (int b = 0; b < B; b++) {
+      corner[B * shape->stride + b] = MOMENTUM_ROW[b];
+      corner[b * shape->stride + B] = END_POSITION[b];
+    }
+  }
+}
+
+/* Factorises the Jacobian and stores where it was evaluated. Returns 0 if it is singular. */
+static int linearise(const step_data *step, newton_data *data, const band *shape)
+{
+  if (POINT > 0) {
+    data->point[0] = step->t;
+    memcpy(data->point + 1, step->q0, sizeof(real) * M);
+    memcpy(data->point + 1 + M, step->carry_q, sizeof(real) * M);
+    memcpy(data->point + 1 + 2 * M, data->z, sizeof(real) * N);
+  }
+  return factorise(data->factors, shape, data->pivot);
+}
+
+/* Solves the stage equations from the initial guess in z; on success z and the increment p1 - p0 are consistent, on
+ * failure they are undefined. The factors, of an earlier step if *keep, are reused as long as updates are small and
+ * decrease fast. With an end position q1, p0 is unknown, too, and solved for in place. */
+static int newton(const step_data *step, newton_data *data, const real *q1, real *p0, real *increment, int *keep,
+    const solver_options *options, solver_report *report)
+{
+  const band shape = band_of(SITES, q1 ? B + 1 : B);
+  real size_q[M], size_p[SITES], change[M], last = (real)INFINITY;
+  movement moved = no_movement();
+  int trials = 0, stagnations = 0;
+  memset(increment, 0, sizeof(real) * M);
+  for (int k = 0;; k++) {
+    evaluate(step, data->z, data->rows, size_p, size_q, *keep ? NULL : data->factors, &shape);
+    for (int i = 0; i < M; i++) {
+      change[i] = data->rows[i * (B + 1) + B] - increment[i];
+      increment[i] = data->rows[i * (B + 1) + B];
+    }
+    if (q1)
+      add_boundary(step, data, q1, !*keep, &shape);
+    if (!all_finite(data->rows, N + SITES) || !all_finite(increment, M) || !all_finite(size_p, M) ||
+        !all_finite(size_q, M))
+      return NOT_FINITE;
+    if (k > 0) {
+      measure(&moved, change, size_p);
+      report->change = options->absolute ? moved.absolute : moved.relative;
+      stagnations += has_stagnated(&moved, last);
+      if (has_converged(options, &moved, stagnations, trials)) {
+#ifdef DAMPED
+        shrink(step, increment);
+#endif
+        return OK;
+      }
+      last = moved.relative;
+    }
+    if (k >= least(options->max_iterations, MOST_ITERATIONS))
+      return NOT_CONVERGED;
+    trials = *keep ? trials + 1 : 3;
+    if (!*keep && !linearise(step, data, &shape))
+      return SINGULAR;
+    moved = no_movement();
+    apply_update(data, &shape, step->h, p0, size_p, size_q, &moved);
+    *keep = has_converged(options, &moved, stagnations + has_stagnated(&moved, last), trials) ||
+        (moved.overall < REUSE_CHANGE && moved.relative < REUSE_RATE * last);
+    report->iterations++;
+  }
+}
+
+#endif

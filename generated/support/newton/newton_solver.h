@@ -1,0 +1,76 @@
+#ifndef SUPPORT_NEWTON_SOLVER_H
+#define SUPPORT_NEWTON_SOLVER_H
+
+#include "newton_from_line.h"
+#include "stages.h"
+
+/* Step by Newton's method. Requires: newton.h, the table EXTRAPOLATION: the predictor is sum_c EXTRAPOLATION[c][b] z_c
+ * of the previous step; for multipliers the rows from B on. */
+typedef struct {
+  int unused;
+} solver_data;
+
+static void prepare(const step_data *step, solver_data *data)
+{
+  (void)step;
+  data->unused = 0;
+}
+
+/* Recomputes the factors at a stored point, bit for bit; returns 0 if that fails. */
+static int remake_factors(const step_data *step, const real *point, newton_data *data)
+{
+  const band shape = band_of(SITES, B);
+  real size_p[SITES], size_q[M];
+  step_data then = *step;
+  then.t = point[0];
+  then.q0 = point + 1;
+  then.carry_q = point + 1 + M;
+  memcpy(data->z, point + 1 + 2 * M, sizeof(real) * N);
+  evaluate(&then, data->z, data->rows, size_p, size_q, data->factors, &shape);
+  return linearise(&then, data, &shape);
+}
+
+/* Extrapolates the unknowns of the previous step. */
+static void guess_from(const real *memory, newton_data *data)
+{
+  gather(EXTRAPOLATION[0], B, 1, memory, M, data->z, 1, B);
+  gather(EXTRAPOLATION[SITES > M ? B : 0], B, 1, memory + M * B, SITES - M, data->z + M * B, 1, B);
+}
+
+/* Computes the increments by RATTLE if applicable, else by Newton's method from the extrapolated stages of the previous
+ * step, and from the straight line if there are none or the iteration fails. memory contains the stages and, if factors
+ * are reused, the point of the factors; guess is 1 if the stages are valid, 2 if both are. On failure the increments
+ * are undefined and memory and guess are unchanged. */
+static int solve(const step_data *step, const solver_data *unused, real *memory, long long *guess, real *dq, real *dp,
+    const solver_options *options, solver_report *report, real *workspace)
+{
+  newton_data *data = newton_in(workspace);
+  int status = NOT_CONVERGED, keep = 0;
+  (void)unused;
+  if (POINT > 0 && *guess == 2)
+    keep = step->first ? remake_factors(step, memory + N, data) : 1;
+#ifdef RATTLE
+  if (*guess)
+    guess_from(memory, data);
+  if (*guess || line_from(step, data) == OK)
+    status = rattle(step, data, dp, options, report);
+  keep = 0;
+#endif
+  if (status != OK && *guess) {
+    guess_from(memory, data);
+    status = newton(step, data, NULL, NULL, dp, &keep, options, report);
+  }
+  if (status != OK)
+    status = newton_from_line(step, data, dp, &keep, options, report);
+  if (status != OK)
+    return status;
+  gather(END_POSITION, 1, step->h, data->z, M, dq, 0, 1);
+  if (!reaches(step, dq, dp))
+    return NOT_FINITE;
+  memcpy(memory, data->z, sizeof(real) * N);
+  memcpy(memory + N, data->point, sizeof(real) * POINT);
+  *guess = POINT > 0 && keep ? 2 : 1;
+  return status;
+}
+
+#endif
