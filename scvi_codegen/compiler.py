@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     from scvi_codegen.mechanics.arrays.system import ArraySystem
     from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
-    from scvi_codegen.pipeline import ArraySources, Sources
+    from scvi_codegen.pipeline import Sources
 
 SYSTEM_OR_ARRAYS = ArgumentType(
     "a LagrangianSystem or a HamiltonianSystem", lambda value: isinstance(value, MechanicalSystem)
@@ -156,11 +156,11 @@ class CachedSources:
         self.key = (*system.key(), *method.key(), key_of((solver, prefix, tuple(symmetries), g)))
 
     @cached_property
-    def derived(self) -> Sources | ArraySources:
+    def derived(self) -> Sources:
         """The sources that are not in the cache."""
-        from scvi_codegen.pipeline import sources_of
+        from scvi_codegen.pipeline import Sources
 
-        return sources_of(self.system, self.method, self.solver, self.prefix, self.symmetries, self.g)
+        return Sources(self.system, self.method, self.solver, self.prefix, self.symmetries, self.g)
 
     def integrator(self) -> tuple[Source, Interface]:
         """Return the C source and its interface."""

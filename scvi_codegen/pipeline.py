@@ -20,21 +20,20 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
+from typing import Any
 
 from sympy import Expr
 
 from scvi_codegen.errors import MethodError, SizesRequiredError
 from scvi_codegen.indices import SIZES_REQUIRED
-from scvi_codegen.ir.equations import Control
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.arrays import check_solver as check_solver_of_arrays
 from scvi_codegen.lowering.control import control_of, density_of
 from scvi_codegen.lowering.derivatives import derivatives_of
 from scvi_codegen.lowering.loops import with_sums
 from scvi_codegen.lowering.program import lower
-from scvi_codegen.mechanics.arrays.legendre import site_hamiltonian
+from scvi_codegen.mechanics.arrays.legendre import SiteHamiltonian, site_hamiltonian
 from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.derived_systems import with_tangent_vectors
@@ -47,6 +46,7 @@ from scvi_codegen.methods.discretise import discretise, discretised_form
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.announcements import announced
 from scvi_codegen.rendering.events import with_events
+from scvi_codegen.rendering.kernels.simd import Fallback
 from scvi_codegen.rendering.program_source import (
     EMBEDDED,
     Embedded,
@@ -158,7 +158,9 @@ def _solver_of(program: Program) -> str:
     return "rattle" if program.rattle else "fixed-point" if program.fixed_point else "newton"
 
 
-def describe_arrays(system: ArraySystem, method: Method, *, prefix: str, solver: str) -> Interface:
+def describe_arrays(
+    system: ArraySystem, method: Method, *, prefix: str, solver: str, sites: SiteHamiltonian | None
+) -> Interface:
     """Return the interface of an integrator of arrays whose sizes are known at run time."""
     layout = ArrayLayout(
         sizes=system.sizes,
@@ -172,6 +174,8 @@ def describe_arrays(system: ArraySystem, method: Method, *, prefix: str, solver:
         depends_on_time=system.depends_on_time,
         constraints=tuple(term.loops for term in system.constraints),
         continued=not (method.fractions or system.constraints),
+        momentum_formulas=sites.momenta if sites else (),
+        velocity_formulas=sites.velocities if sites else (),
         data=system.data,
         mesh=system.mesh,
     )
@@ -191,21 +195,47 @@ def describe_arrays(system: ArraySystem, method: Method, *, prefix: str, solver:
 
 
 class Sources:
-    """C sources of one integrator and its variants; the equations are derived on first use."""
+    """C sources of one integrator and its variants; the equations are derived on first use.
+
+    Those of arrays whose sizes are known at run time consist of loops over the arrays and have no variants.
+    """
 
     def __init__(
         self,
-        system: MechanicalSystem,
+        system: MechanicalSystem | ArraySystem,
         method: Method,
-        solver: str,
-        prefix: str | None,
-        symmetries: Sequence[Symmetry],
-        g: str | Expr | None,
+        solver: str = "auto",
+        prefix: str | None = None,
+        symmetries: Sequence[Symmetry] = (),
+        g: str | Expr | None = None,
     ) -> None:
-        system = discretised_form(system, method)
-        self.system, self.method, self.solver, self.g = system, method, solver, g
-        self._derived = partial(program_of, system, method, prefix=prefix, symmetries=symmetries)
+        self.method, self.solver, self.g = method, solver, g
+        self.prefix = c_identifier(prefix or f"{system.name}_{method.name}")
         self._programs: dict[bool, Program] = {}
+        self.system: Any
+        self.sites: SiteHamiltonian | None = None
+        self._derived: Callable[..., Program]
+        self.of_arrays = isinstance(system, ArraySystem)
+        if isinstance(system, ArraySystem):
+            self.system, self._derived = system, self._program_of_arrays
+            self.solver = "fixed-point" if solver == "auto" else solver
+            check_solver_of_arrays(self.solver)
+            if system.coupled_terms and g is None and self.solver == "fixed-point":
+                self.sites = site_hamiltonian(system)
+        else:
+            self.system = form = discretised_form(system, method)
+            self._derived = partial(program_of, form, method, prefix=self.prefix, symmetries=symmetries)
+
+    def _program_of_arrays(self, **_: bool) -> Program:
+        """Return the program of arrays; raise :class:`SizesRequiredError` if there is none for any size."""
+        system = self.sites.system if self.sites else self.system
+        system.check_run_time_sizes()
+        try:
+            if self.g is not None:
+                raise SizesRequiredError("time_transformation is not available for arrays of any size")
+            return lower(system, self.method, prefix=self.prefix, solver=self.solver)
+        except SizesRequiredError as error:
+            raise SizesRequiredError(f"{error}. This concerns '{self.system.name}': {SIZES_REQUIRED}") from error
 
     def program(self, *, fallback: bool = False) -> Program:
         """Return the lowered program; with ``fallback`` it also contains Newton's iteration as a fallback."""
@@ -222,6 +252,8 @@ class Sources:
     @property
     def interface(self) -> Interface:
         """Interface of the generated library."""
+        if self.of_arrays:
+            return describe_arrays(self.system, self.method, prefix=self.prefix, solver=self.solver, sites=self.sites)
         return describe(
             self.program(),
             self.system,
@@ -230,14 +262,16 @@ class Sources:
             g=self.g,
         )
 
-    def integrator(self) -> tuple[Source, Interface]:
-        """Return the C source and its interface."""
-        return self._rendered(), self.interface
+    def integrator(self, *, controlled: bool = True) -> tuple[Source, Interface]:
+        """Return the C source and its interface.
 
-    def controlled(self) -> Source | None:
-        """Return the source with adaptive steps, or with the step-density controller; else ``None``."""
-        control = control_of(self.program()) if self.g is None else density_of(self.system, self.g)
-        return self._rendered(control) if control else None
+        It has fixed steps and, if ``controlled`` and the method has an error estimate, adaptive steps; with a time
+        transformation the step-density controller.
+        """
+        program = self.program()
+        control = control_of(program) if self.g is None else density_of(self.system, self.g)
+        fallback: Fallback | None = "external" if self.uses_fallback_library else None
+        return render(program, control if controlled else None, fallback=fallback), self.interface
 
     def fallback(self) -> Source | None:
         """Return the source with Newton's iteration if the integrator itself contains none."""
@@ -260,106 +294,24 @@ class Sources:
     def changes(self, count: int) -> Source | None:
         """Return the ensemble source with tangent vectors; ``None`` unless it is a fixed point with constant mass."""
         twin, fixed_point = equivalent_lagrangian(self.system), self.program().fixed_point
-        varied = (
-            with_tangent_vectors(twin, count)
-            if twin and fixed_point and fixed_point.serves_many and fixed_point.constant_mass
-            else None
-        )
+        if not (twin and fixed_point and fixed_point.serves_many and fixed_point.constant_mass):
+            return None
+        varied = with_tangent_vectors(twin, count)
         if varied is None:
             return None
-        return render_ensemble(lower(varied, self.method, prefix=self.program().prefix, solver="fixed-point"))
-
-    def _rendered(self, control: Control | None = None) -> Source:
-        return render(self.program(), control, fallback="external" if self.uses_fallback_library else None)
+        return render_ensemble(lower(varied, self.method, prefix=self.prefix, solver="fixed-point"))
 
     def variant(self, name: str) -> Source | None:
         """Return the source of a variant, named as in :class:`~scvi_codegen.runtime.core.compiled_method.Variants`."""
         kind, _, count = name.partition(" ")
         made: dict[str, Callable[[], Source | None]] = {
             "ensemble": lambda: render_ensemble(self.program()),
-            "controlled": self.controlled,
             "fallback": self.fallback,
             "derivatives": self.tangent,
             "second_derivatives": lambda: self.tangent(second=True),
             "changes": lambda: self.changes(int(count)),
         }
-        return made[kind]()
-
-
-class ArraySources:
-    """C sources of one integrator of arrays whose sizes are known at run time, derived on first use.
-
-    ArraySystem, Method -> lower -> Program (kernels of terms, tables of one coordinate) -> render -> Source.
-    """
-
-    def __init__(
-        self, system: ArraySystem, method: Method, solver: str, prefix: str | None, g: str | Expr | None = None
-    ) -> None:
-        self.solver = "fixed-point" if solver == "auto" else solver
-        check_solver_of_arrays(self.solver)
-        self.system, self.method, self.g = system, method, g
-        convertible = system.coupled_terms and g is None and self.solver == "fixed-point"
-        self.sites = site_hamiltonian(system) if convertible else None
-        self.prefix = c_identifier(prefix or f"{system.name}_{method.name}")
-
-    @cached_property
-    def program(self) -> Program:
-        """Lowered program with fixed step size.
-
-        Raises:
-            SizesRequiredError: if there is none for arrays of any size.
-        """
-        system = self.sites.system if self.sites else self.system
-        system.check_run_time_sizes()
-        with announced(f"deriving the equations of {self.system.name} by {self.method.name}"):
-            try:
-                if self.g is not None:
-                    raise SizesRequiredError("time_transformation is not available for arrays of any size")
-                return lower(system, self.method, prefix=self.prefix, solver=self.solver)
-            except SizesRequiredError as error:
-                raise SizesRequiredError(f"{error}. This concerns '{self.system.name}': {SIZES_REQUIRED}") from error
-
-    @property
-    def interface(self) -> Interface:
-        """Interface of the generated library."""
-        interface = describe_arrays(self.system, self.method, prefix=self.prefix, solver=self.solver)
-        if self.sites is None:
-            return interface
-        layout = replace(
-            interface.layout, momentum_formulas=self.sites.momenta, velocity_formulas=self.sites.velocities
-        )
-        return replace(interface, layout=layout)
-
-    def integrator(self) -> tuple[Source, Interface]:
-        """Return the C source with fixed step size and its interface."""
-        return render(self.program), self.interface
-
-    def variant(self, name: str) -> Source | None:
-        """Return the source with adaptive steps, ``"controlled"``, the only variant; ``None`` without one."""
-        control = control_of(self.program) if name == "controlled" else None
-        return render(self.program, control) if control else None
-
-
-def sources_of(
-    system: MechanicalSystem | ArraySystem,
-    method: Method,
-    solver: str,
-    prefix: str | None,
-    symmetries: Sequence[Symmetry],
-    g: str | Expr | None,
-) -> Sources | ArraySources:
-    """Return the sources of an integrator; arguments as of :func:`~scvi_codegen.compile_stepper`."""
-    if isinstance(system, ArraySystem):
-        return ArraySources(system, method, solver, prefix, g)
-    return Sources(system, method, solver, prefix, symmetries, g)
-
-
-def generate_array_source(
-    system: ArraySystem, method: Method | str, *, solver: str = "auto", prefix: str | None = None
-) -> tuple[Source, Interface]:
-    """Return the C source and interface for arrays of run-time sizes; arguments as of :func:`compile_stepper`."""
-    system.check_run_time_sizes()
-    return ArraySources(system, as_method(method), solver, prefix).integrator()
+        return None if self.of_arrays else made[kind]()
 
 
 @checks_arguments(system=SYSTEM, solver=TEXT, prefix=TEXT, symmetries=SYMMETRIES, amalgamate=SWITCH)

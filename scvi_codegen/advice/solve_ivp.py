@@ -14,7 +14,7 @@ from sympy import Expr
 from scvi_codegen.advice.advice import advise
 from scvi_codegen.advice.tolerance_check import missed_tolerance
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import MethodError, StateError, StepFailedError
+from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.mechanics.arrays.rolling import unrolled_at
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -234,7 +234,8 @@ def _plan(
         error = request.rtol or 0.0
         tau = largest_step(stepper, *motion, error, **along)
         return _StepChoice(tau, None, lambda run: accuracy_message(run.step_error, run.worst_step_time, error) or "")
-    advised = request.tolerance if request.tolerance is not None or _has_adaptive_steps(stepper) else DEFAULT_TOLERANCE
+    adaptive = request.tolerance is not None or stepper.binding.has("advance_to")
+    advised = request.tolerance if adaptive else DEFAULT_TOLERANCE
     if request.rtol is not None or uncompiled is None or advised is None:
         return _StepChoice(None, request.rtol)
     (system, method), (q, p, span) = uncompiled, motion
@@ -269,15 +270,6 @@ def _refuse(arguments: Mapping[str, float | None]) -> None:
 def _is_time_transformed(stepper: Stepper) -> bool:
     """Return True if the steps are of tau."""
     return bool(stepper.interface.energy_parameter or stepper.interface.time_transformation)
-
-
-def _has_adaptive_steps(stepper: Stepper) -> bool:
-    """Return True if the stepper has adaptive steps."""
-    try:
-        stepper._adaptive()
-    except MethodError:
-        return False
-    return True
 
 
 def _steps(stepper: Stepper, start: float, end: float, plan: _StepChoice) -> dict[str, Any]:

@@ -159,6 +159,6 @@ def _runner(name: str, degree: int, steps: int, command: str, flags: tuple[str, 
     chosen = problem(name)
     with set_variable("CC", command):
         stepper = compile_stepper(chosen.system, SVI(degree), flags=flags)
-    stepper.prepare(adaptive=False)
+    stepper.prepare()
     start: dict[str, Any] = {"q": chosen.q, "velocity": chosen.velocity, "p": chosen.p}
     return lambda: stepper.integrate(**start, h=chosen.step, steps=steps, save_every=steps)

@@ -168,8 +168,8 @@ def test_sources_for_this_machine_compile_without_warnings(name, solver, compile
     stepper = compile_stepper(
         system, SVI(3), solver=solver, time_transformation=time_transformation, prefix="own", flags=QUICK_FLAGS
     )
-    texts = [stepper.source, stepper._adaptive().source, *([stepper.fallback] if stepper.fallback else [])]
-    assert len(texts) == (3 if solver == "auto" else 2)
+    texts = [stepper.source, *([stepper.fallback] if stepper.fallback else [])]
+    assert len(texts) == (2 if solver == "auto" else 1)
     for number, text in enumerate(texts):
         folder = tmp_path / str(number)
         folder.mkdir()

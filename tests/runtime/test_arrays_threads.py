@@ -20,7 +20,7 @@ from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.methods import as_method
 from scvi_codegen.native.compilers import find_compiler
-from scvi_codegen.pipeline import generate_array_source
+from scvi_codegen.pipeline import Sources
 from scvi_codegen.rendering.kernels.loop_nests import Sharing, sharing_of
 
 RNG = np.random.default_rng(5)
@@ -308,7 +308,7 @@ int main(void)
 def windows(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], list[list[int]]]:
     """Return rounds and windows of term groups of several sizes, as computed in C."""
     folder = tmp_path_factory.mktemp("windows")
-    source, _ = generate_array_source(system_of(CASES["ring"]), "stoermer-verlet", prefix="shared")
+    source, _ = Sources(system_of(CASES["ring"]), as_method("stoermer-verlet"), prefix="shared").integrator()
     for path, text in {**source.files, "main.c": WINDOWS}.items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_text(text)
@@ -390,7 +390,7 @@ static int create(pthread_t *thread, const pthread_attr_t *attributes, void *(*g
 
 def program(name: str, method: str, solver: str, folder: Path, **numbers: int) -> None:
     """Write the source of a run with threads, and the C program that makes it."""
-    source, interface = generate_array_source(system_of(CASES[name]), method, solver=solver, prefix="shared")
+    source, interface = Sources(system_of(CASES[name]), as_method(method), solver, "shared").integrator()
     for path, text in source.files.items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_text(text)

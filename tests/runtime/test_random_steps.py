@@ -9,7 +9,6 @@ from random_steps import FAMILIES, WANTED, compiled, displaced, outcome, trials
 
 import scvi_codegen as sc
 from scvi_codegen.mechanics.arrays.system import ArraySystem
-from scvi_codegen.runtime.core.compiled_method import Variants
 
 QUICK = {
     "duffing": ("scvi:3", "auto"),
@@ -179,8 +178,7 @@ def test_comparison_with_half_steps_does_not_change_an_array_run(solver, steps):
         assert headers != source.support
         return dataclasses.replace(source, support=headers)
 
-    controlled = comparing(few._variants["controlled"])
-    all_of_them = sc.Stepper(comparing(few.source), few.interface, variants=Variants({"controlled": controlled}))
+    all_of_them = sc.Stepper(comparing(few.source), few.interface)
     start = np.random.default_rng(1).normal(size=1100)
     wanted = few.integrate(start, **steps)
     assert wanted.steps > 5

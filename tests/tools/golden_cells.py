@@ -24,7 +24,7 @@ from scvi_codegen.mechanics.time_transformation import reparametrise
 from scvi_codegen.methods import as_method
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.compilers import find_compiler
-from scvi_codegen.pipeline import ArraySources, Sources, generate_source
+from scvi_codegen.pipeline import Sources, generate_source
 from scvi_codegen.rendering.source import Source
 
 RECORDED = Path(__file__).parents[1] / "golden" / "sources.json.xz"
@@ -88,9 +88,9 @@ def single(
         source = generate_source(found, as_method(method, found), prefix=name, embedded="double")[0]
         return of_source(source, run_driver(name, q, p, parameters, h, steps))
     if kind == "adaptive":
-        source = sources.variant("controlled")
+        source = sources.integrator()[0]
         return of_source(source, run_driver(name, q, p, parameters, h, steps, t_end=t_end, tolerance=tolerance))
-    source = sources.variant("fallback") or sources._rendered()
+    source = sources.variant("fallback") or sources.integrator()[0]
     return of_source(source, run_driver(name, q, p, parameters, h, steps))
 
 
@@ -111,7 +111,7 @@ def arrays(
 ) -> Program:
     """A run of a system with array coordinates."""
     found = system()
-    sources = ArraySources(found, as_method(method), solver, name)
+    sources = Sources(found, as_method(method), solver, name)
     main = arrays_driver(
         name,
         sizes,
@@ -125,7 +125,7 @@ def arrays(
         tolerance=tolerance,
         constrained=constrained,
     )
-    return of_source(sources.variant("controlled") if adaptive else sources.integrator()[0], main)
+    return of_source(sources.integrator(controlled=adaptive)[0], main)
 
 
 def catalogue(name: str) -> Callable[[], MechanicalSystem]:

@@ -33,7 +33,6 @@ from scvi_codegen.models.packages.folders import (
     write_folder,
 )
 from scvi_codegen.rendering.source import Interface, Source, check_interface
-from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.validation import PATH, SWITCH, TEXT, ArgumentType, checks_arguments
 
@@ -116,19 +115,18 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
         check_interface(source, interface)
     except ValueError as error:
         raise damaged(target, error) from error
-    controlled = source if ADVANCE_TO in source.declarations else None
-    return Stepper(source, interface, variants=Variants({"controlled": controlled}))
+    return Stepper(source, interface)
 
 
 def _stepper_of_arrays(folder: Path) -> Stepper:
     """Return the stepper of a folder with arrays whose sizes are known at run time; its model has their layout."""
     from scvi_codegen.models.model_files.model_file import load_model
-    from scvi_codegen.pipeline import generate_array_source
+    from scvi_codegen.pipeline import Sources
 
     model, prefix = load_model(folder / MODEL_FILE), prefix_of(folder)
     if model.array_system is None:
         raise damaged(folder, KeyError("interface"))
-    _, interface = generate_array_source(model.array_system, model.method, solver=model.solver, prefix=prefix)
+    interface = Sources(model.array_system, model.method, model.solver, prefix).interface
     return Stepper(source_in(folder, prefix), interface)
 
 
@@ -166,11 +164,11 @@ def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, si
     """Return the texts of a model whose array sizes are known at run time."""
     from scvi_codegen.models.model_files.model_file import model_texts
     from scvi_codegen.models.packages.example import array_example_of, package_template
-    from scvi_codegen.pipeline import generate_array_source
+    from scvi_codegen.pipeline import Sources
     from scvi_codegen.rendering.program_source import render_example
 
     assert model.array_system is not None  # by the caller
-    source, interface = generate_array_source(model.array_system, model.method, solver=model.solver, prefix=prefix)
+    source, interface = Sources(model.array_system, model.method, model.solver, prefix).integrator(controlled=False)
     example, arrays = array_example_of(model, interface)
     lines = {f"{name}.txt": "".join(f"{x!r}\n" for x in each.reshape(-1).tolist()) for name, each in arrays.items()}
     source = source.single_file() if single_file else source.specialised()

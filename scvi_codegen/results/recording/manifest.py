@@ -186,8 +186,7 @@ class Manifest:
 
     def stepper(self) -> Stepper:
         """Return the integrator, compiled or loaded from the cache."""
-        variants = Variants({"controlled": self.source if self.plan else None, "fallback": self.fallback})
-        return Stepper(self.source, self.interface, variants=variants, flags=self.flags)
+        return Stepper(self.source, self.interface, variants=Variants({"fallback": self.fallback}), flags=self.flags)
 
     def reached(self, run: Run) -> bool:
         """Return whether a run has reached its end."""

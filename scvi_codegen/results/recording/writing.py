@@ -347,9 +347,8 @@ def _of_known_sizes(run: Run) -> Run:
     stepper, plan = run.stepper, run.plan
     if stepper.known is stepper:
         return run
-    known: Any = stepper.known
     return Run.started(
-        known if plan.fixed else known._adaptive(),
+        stepper.known,
         run.q,
         run.p,
         plan=plan,

@@ -1,4 +1,4 @@
-"""Compiled method: generated C source, its loaded libraries (plain, adaptive, with events) and its interface."""
+"""Compiled method: generated C source, its loaded libraries and its interface."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ OF_KNOWN_SIZES = ("derivatives", "second_derivatives", "changes")
 class Variants:
     """C sources of the variants of a method by name, derived on first use.
 
-    The names are ``"ensemble"``, ``"controlled"`` (adaptive steps), ``"fallback"`` (Newton's iteration),
-    ``"derivatives"`` and ``"second_derivatives"`` of steps, and ``"changes K"`` (ensembles with K tangent vectors).
+    The names are ``"ensemble"``, ``"fallback"`` (Newton's iteration), ``"derivatives"`` and ``"second_derivatives"`` of
+    steps, and ``"changes K"`` (ensembles with K tangent vectors).
 
     Args:
         made: sources by name; ``None`` for a variant that the method lacks.
@@ -58,7 +58,7 @@ class Variants:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # second derivatives and tangent-vector variants are slow to derive: included only if already made
-        for name in ("ensemble", "controlled", "fallback", "derivatives"):
+        for name in ("ensemble", "fallback", "derivatives"):
             _ = self[name]
         return (Variants, (self._made,))
 
@@ -99,7 +99,6 @@ class CompiledMethod:
         self._variants = Variants() if variants is None else variants
         self._with_tangent: Binding | None = None
         self._with_curvature: Binding | None = None
-        self._with_control: Self | None = None
         self._event_variants: dict[tuple[Event, ...], Self] = {}
         self._released_runs: list[Any] = []
         self._known: dict[Hashable, Self] = {}
@@ -123,10 +122,10 @@ class CompiledMethod:
         library = building.load(self.source, flags=self.flags)
         self.binding = Binding(library, interface.prefix, interface.workspace, fallback=self._load_fallback)
 
-    def _copy(self, source: Source, events: tuple[Event, ...]) -> Self:
-        """Return the integrator with another source or other events."""
+    def _copy(self, events: tuple[Event, ...]) -> Self:
+        """Return the integrator with other events."""
         return type(self)(
-            source,
+            self._plain,
             self.interface,
             variants=self._variants,
             flags=self.flags,
@@ -281,7 +280,6 @@ class CompiledMethod:
     def prepare(
         self,
         *,
-        adaptive: bool = True,
         tangent: bool = False,
         second: bool = False,
         ensemble: bool = False,
@@ -292,7 +290,6 @@ class CompiledMethod:
         The Newton fallback of a fixed-point iteration is always compiled. Variants that the method lacks are skipped.
 
         Args:
-            adaptive: the variant with adaptive step size, for ``t_end=``.
             tangent: derivatives of steps, for ``jacobian``, ``tangent``, ``sensitivity``, ``pullback`` and the like.
             second: second derivatives, for ``hessian_product``.
             ensemble: the variant for many trajectories at once.
@@ -300,8 +297,6 @@ class CompiledMethod:
         """
         for each in (self,) if events is None else (self, self.with_events(events)):
             each._compile()
-            if adaptive and not each._reason and each._variants["controlled"] is not None:
-                each._adaptive()._compile()
         wanted = {"derivatives": tangent, "second_derivatives": second, "ensemble": ensemble}
         for source in [self._variants[name] for name, is_wanted in wanted.items() if is_wanted]:
             if source is not None:
@@ -403,26 +398,17 @@ class CompiledMethod:
         if wanted not in self._event_variants:
             while len(self._event_variants) >= MOST_EVENT_SETS:
                 self._event_variants.pop(next(iter(self._event_variants)), None)
-            self._event_variants[wanted] = self._copy(self._plain, wanted)
+            self._event_variants[wanted] = self._copy(wanted)
         return self._event_variants[wanted]
 
-    def _adaptive(self) -> Self:
-        """Return the integrator with adaptive steps, loaded once; raise ``MethodError`` if the method has none."""
-        if self._with_control is None:
-            self._with_control = self._loaded_with_control()
-        return self._with_control
-
-    def _loaded_with_control(self) -> Self:
-        source = self._variants["controlled"]
-        if source is None:
+    def _check_adaptive(self) -> None:
+        """Raise :class:`MethodError` if the method has no adaptive steps for this system."""
+        if not self.binding.has("advance_to"):
             raise MethodError(
                 f"adaptive steps are unavailable for {self.interface.method} and this system: the error estimate "
                 "requires forces at two or more stages, or velocities that vary along a step; give h and steps (fixed "
                 "step size)"
             )
-        if source == self._plain:
-            return self
-        return self._copy(source, self.events)
 
 
 def _event_variant(source: Source, interface: Interface, events: tuple[Event, ...]) -> Source:

@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.arrays.interface import RunSizes
 from scvi_codegen.runtime.chaos.ensemble import ChaosIndicatorsEnsemble
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
@@ -61,7 +60,7 @@ class Stepper(Integrator):
 
     def __reduce__(self) -> tuple[Any, ...]:
         if self.origin is not None:
-            return (_rebuild_bound, (self.origin, self.problem, self._plain, self.events))
+            return (_rebuild_bound, (self.origin, self.problem, self.events))
         variants = Variants() if self._reason else self._variants
         further: dict[str, Any] = {"flags": self.flags, "events": self.events, "reason": self._reason}
         return partial(Stepper, variants=variants, **further), (self._plain, self.interface)
@@ -239,8 +238,7 @@ class Stepper(Integrator):
             p = self._initial_momenta(q, p, velocity, t, parameters)
         if self.interface.constraints:
             q, p = consistent(self, q, p, t, parameters)
-        stepper = self if plan.fixed else self._adaptive()
-        run = Run._reused(stepper) if reuse else Run(stepper)
+        run = Run._reused(self) if reuse else Run(self)
         run._start(q, p, plan=plan, t=t, parameters=parameters, options=options)
         return run
 
@@ -291,7 +289,6 @@ class Stepper(Integrator):
         if h is not None and not transformed:
             raise StateError("omit h: the saved run contains its step size")
         plan = self._plan(h, t_end, tolerance) if t_end is not None or transformed else None
-        stepper = stepper if plan is None else stepper._adaptive()
         return Run.restored(stepper, saved, parameters=parameters, options=options, plan=plan)
 
     @checks_arguments(StateError, progress=FUNCTION, inputs=MAPPING)
@@ -471,8 +468,8 @@ class Stepper(Integrator):
         return (g[0], rate[0]) if is_one_state(self.interface, q) else (g, rate)
 
 
-def _rebuild_bound(origin: Stepper, problem: RunSizes, source: Source, events: tuple[Event, ...]) -> Stepper:
-    return origin._bound_to(problem)._copy(source, events)
+def _rebuild_bound(origin: Stepper, problem: RunSizes, events: tuple[Event, ...]) -> Stepper:
+    return origin._bound_to(problem)._copy(events)
 
 
 STEPPER = of("a compiled stepper", Stepper)

@@ -100,7 +100,9 @@ class Ensemble:
         interface = stepper.interface
         if h is None and interface.energy_parameter:
             raise StateError("adaptive steps are unavailable in transformed time: give h and steps (fixed step in tau)")
-        self.stepper = stepper if h is not None else stepper._adaptive()
+        if h is None:
+            stepper._check_adaptive()
+        self.stepper = stepper
         self.options, self.inputs = checked_options(options), inputs or {}
         self.t0, self.save_every = checked_number(t, "the time t"), checked_count(save_every, "save_every", least=1)
         settings: dict[str, Any] = {"inputs": self.inputs, "save_every": self.save_every}

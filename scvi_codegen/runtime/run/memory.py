@@ -169,6 +169,8 @@ class Memory(OneThread):
 
     @plan.setter
     def plan(self, plan: StepPlan) -> None:
+        if not plan.fixed:
+            self.stepper._check_adaptive()
         self._plan, self._plan_arguments = plan, () if plan.fixed else (plan.t_end, plan.tau or plan.tolerance)
         self._advance_function = self._functions["advance" if plan.fixed else "advance_to"]
 

@@ -49,9 +49,9 @@ static real attempt(run_memory *run, step_data *step, const solver_data *data, i
 #define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
 
 /* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
- * failed. afresh: without the predictor. */
-static inline double attempt(run_memory *run, step_data *step, const solver_data *data, int afresh, long long *guess,
-    double *dq, double *dp, double decay, double least, const solver_options *options, solver_report *report)
+ * failed. afresh: without the predictor. Out of line, one copy compiles faster than two. */
+static __attribute__((noinline)) double attempt(run_memory *run, step_data *step, const solver_data *data, int afresh,
+    long long *guess, double *dq, double *dp, double decay, double least, const solver_options *options, solver_report *report)
 {
   struct predictor_tables_of tables = {NULL, NULL, NULL};
   int status;
@@ -153,7 +153,7 @@ static int levels_up(const trial *now)
 /* Determines the first step size by increasing one that is certainly too small. The smallest trials may fail, with
  * fixed-point iteration larger ones, too: if some velocities are zero, rounding dominates them. Or their error estimate
  * is only rounding, of any size; the estimate of a curve grows as expected. */
-static void try_first_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
+static SELDOM void try_first_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const real span = MATH(fabs)(now->t_end - now->at.t);
   real shorter = run->h != 0 ? REAL_MIN : (real)INFINITY;
