@@ -176,6 +176,7 @@ def describe_arrays(
         continued=not (method.fractions or system.constraints),
         momentum_formulas=sites.momenta if sites else (),
         velocity_formulas=sites.velocities if sites else (),
+        couplings=system.potentials if solver == "newton" else (),
         data=system.data,
         mesh=system.mesh,
     )

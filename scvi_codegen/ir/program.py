@@ -165,6 +165,23 @@ class Quantities:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ShiftTables:
+    """Decomposition A = V diag(mu) V^-1 of the matrix of a step, with one eigenvalue of each complex pair.
+
+    Attributes:
+        count: number of eigenvalues, padded to a power of two with zeros.
+        mu: (2 count,) real parts, then imaginary parts.
+        into: V^-1 by points, each with count real parts, then imaginary parts.
+        back: (2 count, lanes) such that x = sum_k Re z_k back_k + Im z_k back_(count + k) for z = V^-1 x.
+    """
+
+    count: int
+    mu: tuple[Number, ...]
+    into: tuple[Number, ...]
+    back: tuple[tuple[Number, ...], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LoopedTerms:
     """Terms of a system of arrays, each in its loops.
 
@@ -175,6 +192,7 @@ class LoopedTerms:
         products, diagonals: the Jacobian of the forces times a direction, and its diagonal, if Newton's method replaces
             the fixed-point iteration.
         reach: largest distance of lattice places that these couple; 0 if none, or if distances are not constant.
+        shifts: with Newton's method, the eigenvectors of the method's matrix (:class:`ShiftTables`).
     """
 
     forces: tuple[LoopedKernel, ...] = ()
@@ -184,6 +202,7 @@ class LoopedTerms:
     products: tuple[LoopedKernel, ...] = ()
     diagonals: tuple[LoopedKernel, ...] = ()
     reach: int = 0
+    shifts: ShiftTables | None = None
 
     @property
     def applied(self) -> tuple[LoopedKernel, ...]:

@@ -8,6 +8,7 @@ accelerations, or on accelerations and multipliers (:mod:`~scvi_codegen.lowering
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import sympy
@@ -32,7 +33,7 @@ from scvi_codegen.lowering.constraints import constrained_steps, lowered_constra
 from scvi_codegen.lowering.loops import looped_terms
 from scvi_codegen.lowering.solvers.curves import position_iteration, printed_iteration, shooting_iteration
 from scvi_codegen.lowering.solvers.points import coupled_iteration, hamiltonian_iteration, separable_iteration
-from scvi_codegen.lowering.solvers.tables import Solver, StepProblem, resolved_degree, velocity_tables
+from scvi_codegen.lowering.solvers.tables import Solver, StepProblem, resolved_degree, shift_tables, velocity_tables
 from scvi_codegen.lowering.stage_groups import (
     bandwidth,
     bandwidth_ordering,
@@ -172,6 +173,9 @@ def lower(
     )
     if isinstance(system, ArraySystem):
         loops = looped_terms(system, constrained_steps(system, stages, method), newton=solver == "newton")
+        if loops.products and fixed_point and fixed_point.predictor_matrix:
+            tables = shift_tables(fixed_point.predictor_matrix, fixed_point.points, fixed_point.lanes)
+            loops = replace(loops, shifts=tables)
         check_solver_of_arrays(system, method, solver, splitting or loops.constrained or fixed_point, loops)
         return program(loops=loops, polynomial_curves=bool(fixed_point and (fixed_point.points > 1 or not velocities)))
     check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else fixed_point)

@@ -184,6 +184,7 @@ class ArrayLayout(ArrayDeclarations):
         continued: whether the predictor extrapolates previous steps instead of reusing the forces at their end.
         momentum_formulas, velocity_formulas: L_v in (q, v) and H_p in (q, p) of a Lagrangian that is integrated by its
             Hamiltonian (:class:`~scvi_codegen.formulas.array_statements.ArrayForce`).
+        couplings: terms of the potential energy, which couple the coordinates that occur in them.
         data: values of fields and tables by name for runs that pass none.
         mesh: of the fields of a density (:class:`~scvi_codegen.fields.mesh.Mesh`).
     """
@@ -196,6 +197,7 @@ class ArrayLayout(ArrayDeclarations):
     continued: bool = False
     momentum_formulas: tuple[Any, ...] = ()
     velocity_formulas: tuple[Any, ...] = ()
+    couplings: tuple[Any, ...] = ()
     data: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
     mesh: Any = field(default=None, compare=False, repr=False)
 

@@ -21,12 +21,14 @@ both derived from them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import TypeAlias
 
 from scvi_codegen.ir.equations import FixedPointIteration, PredictorTables
 from scvi_codegen.ir.kernel import Number, NumberTable, lower_matrix, lower_vector
+from scvi_codegen.ir.program import ShiftTables
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -61,6 +63,8 @@ DEGREE_OF_ONE, DEGREE_OF_TWO = 8, 12
 
 Higher degrees are more accurate, but amplify rounding errors, by about 1e6 for these.
 """
+REAL = mp.mpf("1e-30")
+"""Relative imaginary part below which an eigenvalue is real."""
 INTERPOLATED = 5
 """Degree up to which the polynomial of two steps interpolates all points; above, least squares predict better."""
 
@@ -78,6 +82,31 @@ def pad_matrix(entries: Matrix, lanes: int) -> NumberTable:
 def pad_vector(entries: Vector, lanes: int, *, repeat: bool = False) -> tuple[Number, ...]:
     """Return the padded vector; further entries are zero, or repeat the last."""
     return lower_vector(_longer(entries, lanes, repeat=repeat))
+
+
+def shift_tables(matrix: NumberTable, points: int, lanes: int) -> ShiftTables:
+    """Return the eigenvectors of the matrix of a step, whose padded rows repeat the last one."""
+    square = mp.matrix([row[:points] for row in matrix[:points]])
+    values, vectors = mp.eig(square)
+    inverse = mp.inverse(vectors)
+    real = [abs(mp.im(value)) < REAL * abs(value) for value in values]
+    kept = [k for k, value in enumerate(values) if real[k] or mp.im(value) > 0]
+    count = 1 << (len(kept) - 1).bit_length()
+
+    def parts(entries: Sequence[Number], sign: int = 1) -> Vector:
+        padding = [mp.zero] * (count - len(kept))
+        real_parts = [mp.re(entries[k]) for k in kept]
+        return (*real_parts, *padding, *(sign * mp.im(entries[k]) for k in kept), *padding)
+
+    def back(point: int) -> Vector:
+        return parts([(1 if real[k] else 2) * vectors[point, k] for k in range(points)], -1)
+
+    return ShiftTables(
+        count=count,
+        mu=lower_vector(parts(values)),
+        into=lower_vector(tuple(chain(*(parts(inverse[:, j]) for j in range(points))))),
+        back=lower_matrix(transpose(tuple(back(min(n, points - 1)) for n in range(lanes)))),
+    )
 
 
 def predictor_tables_of(

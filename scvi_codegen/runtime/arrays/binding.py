@@ -20,6 +20,7 @@ from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.building import Library
 from scvi_codegen.native.options import FAILURES, NOT_CONVERGED
 from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.arrays.envelope import envelope_of
 from scvi_codegen.runtime.arrays.interface import Numbers, RunSizes
 from scvi_codegen.runtime.arrays.memory import ArrayMemory
 
@@ -78,6 +79,7 @@ class ArrayBinding(Binding):
         first = len(interface.parameters)
         self.field_rows = [(first + start, first + end) for start, end in zip([0, *ends], ends, strict=False)]
         self.parameter_count = first + (int(ends[-1]) if len(ends) else 0)
+        self.envelope = envelope_of(interface.layout, arrays)
 
     def new(self, what: str) -> Any:
         """Return memory of a run, or a report, as :meth:`Binding.new` does."""

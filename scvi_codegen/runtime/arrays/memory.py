@@ -31,7 +31,7 @@ RUN_FIELDS = (
 """Scalar fields of the C struct of a run."""
 REAL_FIELDS = ("t", "t_low", "h", "error", "error_t", "largest_q", "largest_p", "error_before")
 """Those of them that are no whole numbers."""
-COMPUTED = ("inverse_mass", "places", "columns")
+COMPUTED = ("inverse_mass", "places", "columns", "pattern")
 """Arrays computed from the problem and not restored: foreign indices could address memory out of bounds."""
 STATE = ("q", "p", "carry_q", "carry_p")
 """Arrays of the state: positions, momenta and their compensation terms."""
@@ -106,6 +106,9 @@ class ArrayMemory:
         vector |= {"inverse_mass": aligned(n), "work": aligned(n * binding.raw.constant("WORK"))}
         if binding.interface.layout.constraints:
             vector |= constraint_memory(binding.raw, run, problem, n)
+        if (coupled := binding.envelope) is not None:
+            width = 2 * binding.raw.constant("SHIFTS")
+            vector |= {"pattern": coupled.pattern, "factors": aligned(ALIGNMENT + (n + coupled.entries) * width)}
         for name, array in vector.items():
             setattr(run, name, binding.raw.pointer(array))
         run.threads = binding.arrays.threads
@@ -143,6 +146,7 @@ class ArrayMemory:
             problem.field[k] = binding.raw.pointer(self.parameters[first:end])
         if changed:
             self.run.guess *= binding.interface.layout.continued
+            self._forget_factors()
         inverse = self.numbers["inverse_mass"]
         if binding.raw.function("inverse_masses")(problem, self.run.inverse_mass):
             index = int(np.argmin(np.where((inverse > 0) & np.isfinite(inverse), 1.0, -1.0)))
@@ -157,6 +161,12 @@ class ArrayMemory:
         self.run.t, self.run.h, self.iterations, self.adaptive = t, h, 0, h == 0.0
         self.numbers["q"][:], self.numbers["p"][:] = q, p
         self.numbers["carry_q"][:] = self.numbers["carry_p"][:] = 0.0
+        self._forget_factors()
+
+    def _forget_factors(self) -> None:
+        """Let the next step compute the factors of the linear part: their first number is their step size."""
+        if "factors" in self.numbers:
+            self.numbers["factors"][0] = 0.0
 
     def __len__(self) -> int:
         return 8 * (len(RUN_FIELDS) + 2) + sum(array.nbytes for array in self._stored())

@@ -22,6 +22,7 @@ typedef struct {
   double scale, state; /* of coordinates before they are squared, and their scaled size */
   lanes *residual, *correction, *product, *forces, *inverse, *spare, *basis;
   double *roots;
+  int by_factors; /* 1 if the preconditioner is that of envelope.h */
   int by_fourier, tried; /* 1 if the inverses are those of the Fourier modes; number of preconditioners for which one
                         * cycle was not enough */
   double left; /* reduction of the residual by the first of them */

@@ -101,7 +101,7 @@ static double find_correction(linear_system *of, solver_report *report)
     }
     all.rest[0] = sqrt(inner_product(of, left, left));
     if (!(all.rest[0] > enough && all.rest[0] < INFINITY)) {
-      if (enough > LINEAR_TOLERANCE * size && !of->by_fourier) {
+      if (enough > LINEAR_TOLERANCE * size && !of->by_fourier && !of->by_factors) {
         apply_inverses(of, left, of->product, of->own);
         add_multiple(of, of->correction, 1.0, of->product);
       }
@@ -120,6 +120,8 @@ static double find_correction(linear_system *of, solver_report *report)
 
 #define REFRESHED 1e-6 /* squared: the preconditioner is recomputed while points change by more than 1e-3 of the
                         * state */
+#define SLOW 0.1 /* squared: corrections by the factors have to decrease by more, otherwise these are computed again, then
+                  * GMRES solves the linear systems */
 #define UNSOLVED 1e-10 /* relative to the state: a larger residual is not due to rounding */
 
 /* Parts of work behind those of the fixed-point iteration. */
@@ -134,6 +136,7 @@ static linear_system linear_of(const step_points *points)
       .n = points->n,
       .count = count,
       .own = own_part(points->step),
+      .by_factors = points->step->run->pattern != NULL,
       .residual = work,
       .correction = work + count,
       .product = work + 2 * count,
@@ -217,6 +220,14 @@ static double largest_size(const step_points *w)
   return largest_over(&all, 0);
 }
 
+/* Returns 1 if further corrections of the same rate would exceed the tolerance: linear convergence without a final
+ * iteration. */
+static int leaves_more(const progress *now, const solver_options *options)
+{
+  const double rate = smaller(now->last / now->before, SLOWEST_CONVERGENCE);
+  return now->last < now->before && MARGIN * rate * now->last > options->tolerance * options->tolerance;
+}
+
 typedef iteration_data solver_data;
 
 static void prepare(const step_data *step, solver_data *data)
@@ -232,7 +243,7 @@ static int solve(const step_data *step, const solver_data *data, history past, l
   const step_points w = points_in(step, data, past);
   linear_system of = linear_of(&w);
   progress now = before_iterations();
-  int status;
+  int status, slow = 0; /* iterations with the factors that reduced the change too little */
   (void)workspace;
   first_points(&w, past, *guess);
   forces(&w);
@@ -242,15 +253,23 @@ static int solve(const step_data *step, const solver_data *data, history past, l
   for (int k = 0; needs_iteration(&now); k++) {
     double change, size, left;
     find_residual(&of, &w);
-    if (now.last > REFRESHED) /* also before the first iteration */
+    if (!of.by_factors ? now.last > REFRESHED /* also before the first iteration */
+                       : !has_factors(&of) || slow == 1)
       find_inverses(&of);
-    left = find_correction(&of, report);
+    left = 0.0;
+    if (of.by_factors && slow < 2)
+      precondition(&of, of.residual, of.correction);
+    else
+      left = find_correction(&of, report);
     add_multiple(&of, w.X, 1.0, of.correction);
     forces(&w);
     change = inner_product(&of, of.correction, of.correction);
     of.state = sqrt(size_of_state(&of));
     size = options->absolute ? of.scale * of.scale : of.state * of.state;
+    slow += k > 0 && relative_change(change, size) > larger(SLOW * now.last, PROGRESS_LEVEL);
     take_change(&now, relative_change(change, size), options, k, report);
+    if (now.status > 0 && of.by_factors && leaves_more(&now, options))
+      now.status = 0;
     if (now.status > 0 && !(left <= UNSOLVED * of.state)) /* an unsolved linear system does not count as a small
                                                            * correction */
       now.status = -1, now.last = left;

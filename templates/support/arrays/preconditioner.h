@@ -2,8 +2,9 @@
 #define SUPPORT_PRECONDITIONER_H
 
 #include "array_newton.h"
+#include "envelope.h"
 
-/* Preconditioner for Newton-GMRES: by Fourier modes (ON_LATTICES) or from the diagonal of F'. */
+/* Preconditioner for Newton-GMRES: factors of F' (envelope.h), Fourier modes (ON_LATTICES) or the diagonal of F'. */
 #ifdef ON_LATTICES
 /* Mean stencil of h^2 F' / m on a lattice by stencil probing: probes are placed so far apart that their responses do
  * not overlap or reach a boundary, and F' is multiplied by all of them at once. Requires: lattice_transform.h,
@@ -225,6 +226,10 @@ static void apply_modes(const linear_system *of, const lattice *one, complex_lan
 static void precondition(const linear_system *of, const lanes *x, lanes *y)
 {
   lattice all[LATTICES];
+  if (of->by_factors) {
+    apply_factors(of, x, y);
+    return;
+  }
   if (!of->by_fourier) {
     apply_inverses(of, x, y, of->own);
     return;
@@ -243,6 +248,10 @@ static void precondition(const linear_system *of, const lanes *x, lanes *y)
 static void find_inverses(linear_system *of)
 {
   lattice all[LATTICES];
+  if (of->by_factors) {
+    find_factors(of);
+    return;
+  }
   if (of->tried == 0)
     of->by_fourier = find_lattices(of, all);
   if (of->by_fourier) {
@@ -257,6 +266,8 @@ static void find_inverses(linear_system *of)
  * diagonal for one cycle, then keeps the better one. */
 static void choose_preconditioner(linear_system *of, double left)
 {
+  if (of->by_factors)
+    return;
   if (of->tried == 0 && of->by_fourier) {
     of->tried = 1, of->left = left;
     of->by_fourier = 0;
@@ -275,12 +286,18 @@ enum { SPARE_VECTORS = 0 }; /* of work */
 
 static void precondition(const linear_system *of, const lanes *x, lanes *y)
 {
-  apply_inverses(of, x, y, of->own);
+  if (of->by_factors)
+    apply_factors(of, x, y);
+  else
+    apply_inverses(of, x, y, of->own);
 }
 
 static void find_inverses(linear_system *of)
 {
-  find_own_inverses(of);
+  if (of->by_factors)
+    find_factors(of);
+  else
+    find_own_inverses(of);
 }
 
 static void choose_preconditioner(linear_system *of, double left)
