@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from samples import pushed_pendulum
 from scipy.interpolate import CubicSpline
 
-from scvi_codegen import SCVI, SVI, Gauss, LagrangianSystem, StateError, StoermerVerlet, compile_stepper
+from scvi_codegen import SCVI, SVI, Gauss, LagrangianSystem, StateError, StepFailedError, StoermerVerlet, compile_stepper
 
 KNOTS = np.array([0.0, 0.37, 0.9, 1.41, 2.05, 2.6])
 VALUES = np.array([0.0, 1.2, -0.7, 0.4, 1.9, -1.0])
@@ -120,14 +120,16 @@ def test_diverging_trajectory_retains_its_previous_states():
         name="falling", coordinates=["x"], lagrangian="x_dot**2/2 + 1/x", forces={"x": "u"}, inputs=["u"]
     )
     inputs = {"u": ([0.0, 0.5, 3.0], [0.0, 0.1, 0.1])}
-    runs = compile_stepper(singular, SVI(4)).integrate_ensemble(
-        [[1.0], [9.0]], [[0.0], [0.0]], inputs=inputs, t_end=2.5
-    )
+    stepper = compile_stepper(singular, SVI(4))
+    runs = stepper.integrate_ensemble([[1.0], [9.0]], [[0.0], [0.0]], inputs=inputs, t_end=2.5)
     assert runs.status.tolist() == ["step size underflow", "ok"]
     t = next(runs.each())[0]
     assert (t[0], 0.5 in t) == (0.0, True)
     assert 0.9 < t[-1] < 1.3
     assert (np.diff(t) >= 0).all()
+    with pytest.raises(StepFailedError) as failed:
+        stepper.integrate([1.0], [0.0], inputs=inputs, t_end=2.5)
+    assert np.array_equal(failed.value.trajectory.t, t)
 
 
 def test_velocities_use_the_inputs_at_the_start(coupled):

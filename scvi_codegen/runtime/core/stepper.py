@@ -358,9 +358,8 @@ class Stepper(Integrator):
             t=t,
             parameters=parameters,
             options=options,
+            error=error,
         )
-        if error is not None:
-            work.confirm(self, error, threads=threads)
         work.run(progress=progress, threads=threads)
         trajectories = work.result()
         warn_of_unconfirmed(trajectories.confirmations)

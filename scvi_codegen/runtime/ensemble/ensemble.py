@@ -20,7 +20,6 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import SolverOptions, checked_options
-from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, States, columns_of_inputs, parameter_index
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, start_of_ensemble
 from scvi_codegen.runtime.ensemble.lanes import CommonRuns
@@ -30,20 +29,14 @@ from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runtime.inputs.segments import (
     Input,
     breakpoints_until,
-    first_inner_time,
     inputs_of_slice,
     parameters_at,
-    prepared_segments,
 )
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.global_error import GlobalError
-from scvi_codegen.runtime.run.memory import Memory
-from scvi_codegen.runtime.run.observation import Observation
-from scvi_codegen.runtime.run.run_loop import record
 from scvi_codegen.runtime.run.step_plan import StepPlan, checked_plan
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
-from scvi_codegen.runtime.trajectory.joining import joined
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import checked_count
 
@@ -72,6 +65,7 @@ class Ensemble:
         h, steps, t_end: common step size with the number of steps, or with the final time and a shorter step before
             each breakpoint and at the end; without h the final time or times of adaptive steps.
         inputs: validated inputs, with ``t_end``.
+        error: bound of the global error of each trajectory with adaptive steps.
 
     Attributes:
         start: (k, m) initial positions and momenta.
@@ -82,7 +76,7 @@ class Ensemble:
 
     def __init__(
         self,
-        stepper: Integrator,
+        stepper: Any,
         q: States,
         p: States,
         *,
@@ -96,6 +90,7 @@ class Ensemble:
         t_eval: ArrayLike | None = None,
         parameters: EnsembleParameters = None,
         options: SolverOptions | None = None,
+        error: float | None = None,
     ) -> None:
         interface = stepper.interface
         if h is None and interface.energy_parameter:
@@ -117,10 +112,11 @@ class Ensemble:
         self.common: CommonRuns | None = None
         self.plans: list[StepPlan] = []
         self.saved: dict[int, SavedLane] = {}
-        self.confirmations: list[GlobalError | None] = []
+        self.error, self.confirmations = error, list[GlobalError | None]()
         self.t_eval: Array | None = None
         if fixed is None:
             self.plans = self._plans(t_end, tolerance)
+            self.confirmations = [None] * (0 if error is None else len(self))
             self.t_eval = self._output_times(t_eval)
         if self.inputs:
             self.parameters[:, columns_of_inputs(interface)] = 0.0
@@ -186,30 +182,6 @@ class Ensemble:
         if found.times is not None:
             found.times[:, part] = trajectories.times
 
-    def confirm(self, stepper: Any, wanted: float, *, threads: int | None = None) -> None:
-        """Choose the local tolerance of each trajectory for a global error, as ``stepper.integrate(error=)`` does.
-
-        The trajectories are bitwise those of the confirmed runs. One whose runs fail has errors at round-off level.
-        """
-        self.confirmations = [None] * len(self)
-
-        def confirm_one(j: int, check_stop: StopCheck) -> None:
-            arguments: dict[str, Any] = {
-                "t": self.t0,
-                "t_end": self.plans[j].t_end,
-                "save_every": self.save_every,
-                "options": self.options,
-            }
-            arguments |= {"error": wanted, "progress": check_stop, **self._parameters_and_inputs(j)}
-            with without_accuracy_warnings(), suppress(StateError, StepFailedError):
-                self.confirmations[j] = stepper.integrate(self.start[0][j], self.start[1][j], **arguments).confirmation
-
-        run_jobs(len(self), confirm_one, progress=None, threads=threads)
-        self.plans = [
-            plan if confirmation is None else replace(plan, tolerance=confirmation.tolerance)
-            for plan, confirmation in zip(self.plans, self.confirmations, strict=True)
-        ]
-
     def _parameters_and_inputs(self, j: int) -> dict[str, Any]:
         """Return the arguments ``parameters`` and ``inputs`` of a single run of trajectory j."""
         of_inputs = columns_of_inputs(self.stepper.interface) if self.inputs else ()
@@ -268,37 +240,34 @@ class Ensemble:
         run_jobs(len(firsts), advance, progress=report, threads=threads)
 
     def _trajectory(self, j: int, check_stop: StopCheck) -> SavedLane:
-        try:
-            run = Memory.started(
-                self.stepper,
-                self.start[0][j],
-                self.start[1][j],
-                plan=self.plans[j],
-                t=self.t0,
-                parameters=self.values_at(first_inner_time(self.t0, self.plans[j].t_end), slice(j, j + 1))[0],
-                options=self.options,
-            )
-            states, status = self._states(j, run, check_stop)
-        except StateError:  # a sum of finite terms has overflowed
-            return SavedLane(np.array([self.t0]), self.start[0][[j]], self.start[1][[j]], "not finite", 0)
-        return SavedLane(states.t, states.q, states.p, status, run.steps)
+        """Return trajectory j as :meth:`Stepper.integrate` does; with ``error`` its confirmed local tolerance is kept.
 
-    def _states(self, j: int, run: Memory, check_stop: StopCheck) -> tuple[Trajectory, str]:
-        """Return the saved states of trajectory j and its status."""
-        pieces: list[Trajectory] = []
-        try:
-            if self.t_eval is not None:
-                reached = np.abs(self.t_eval - self.t0) <= abs(self.plans[j].t_end - self.t0)
-                return Observation(run, times=self.t_eval[reached]).advance(None, check_stop), OK
-            if not self.inputs:
-                return record(run, None, save_every=self.save_every, progress=check_stop), OK
-            part = slice(j, j + 1)
-            segments = prepared_segments(run, self.inputs, self.plans[j].t_end, lambda t: self.values_at(t, part)[0])
-            pieces.extend(record(run, steps, save_every=self.save_every, progress=check_stop) for steps in segments)
-        except StepFailedError as failure:
-            last = Trajectory.before(failure)
-            return joined([*pieces, last]), failure.status
-        return joined(pieces or [record(run, 0)]), OK
+        One whose confirming runs fail has errors at round-off level.
+        """
+        plan, (q, p), status = self.plans[j], (each[j] for each in self.start), OK
+        arguments: dict[str, Any] = self._parameters_and_inputs(j) | {
+            "t": self.t0,
+            "t_end": plan.t_end,
+            "save_every": self.save_every,
+            "options": self.options,
+            "progress": check_stop,
+        }
+        if self.t_eval is not None:
+            arguments["t_eval"] = self.t_eval[np.abs(self.t_eval - self.t0) <= abs(plan.t_end - self.t0)]
+        integrate: Callable[..., Trajectory] = self.stepper.with_events(()).integrate
+        with without_accuracy_warnings():
+            if self.error is not None:
+                with suppress(StateError, StepFailedError):
+                    states = integrate(q, p, error=self.error, **arguments)
+                    self.confirmations[j], self.plans[j] = states.confirmation, states.plan
+                    return SavedLane(states.t, states.q, states.p, OK, states.steps)
+            try:
+                states = integrate(q, p, tolerance=plan.tolerance or None, **arguments)
+            except StepFailedError as failure:
+                states, status = Trajectory.before(failure), failure.status
+            except StateError:  # a sum of finite terms has overflowed
+                return SavedLane(np.array([self.t0]), q[np.newaxis], p[np.newaxis], "not finite", 0)
+        return SavedLane(states.t, states.q, states.p, status, states.steps)
 
     def result(self) -> EnsembleTrajectory:
         """Return the trajectories; those neither completed nor failed have the status ``"interrupted"``."""

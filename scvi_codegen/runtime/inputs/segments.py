@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from scvi_codegen.errors import StateError
+from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.core.validation import Array, check_left_to_inputs, no_input
@@ -186,7 +186,11 @@ def record_pieces(
     first, run._crossed = run.steps, (0,) * len(run.stepper.events)
     report = None if progress is None else lambda _: progress(run.steps - first)
     for steps in prepared_segments(run, inputs, t_end, values):
-        piece = run.record(steps, save_every=save_every, progress=report)
+        try:
+            piece = run.record(steps, save_every=save_every, progress=report)
+        except StepFailedError as failure:
+            failure.trajectory = joined([*pieces, Trajectory.before(failure)])
+            raise
         run._crossed = tuple(n + len(crossings) for n, crossings in zip(run._crossed, piece.events, strict=True))
         terminal = [int(crossings.event.terminal) for crossings in piece.events]
         ended = any(0 < last <= count for last, count in zip(terminal, run._crossed, strict=True))
