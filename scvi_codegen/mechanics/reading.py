@@ -22,6 +22,7 @@ from scvi_codegen.formulas.symbols import (
 )
 from scvi_codegen.formulas.translation import Translation, sympy_expression
 from scvi_codegen.mechanics.arrays.elements import unrolled_fields
+from scvi_codegen.mechanics.arrays.reading import arrays_from_sympy, arrays_from_text, definition_of
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.definition_checks import warn_of_mistakes
 from scvi_codegen.mechanics.forces import constraints_of, damping_rate, dissipative_forces, forces_by_coordinate
@@ -33,22 +34,6 @@ Read = Callable[[Any], Expr]
 TURNING = ("rotations", "directions", "spins")
 TORQUES = ("torques", "torques_space")
 """Arguments of ``from_text`` of systems with rotations."""
-DEFINING = (
-    *(
-        "coordinates",
-        *TURNING,
-        "momenta",
-        "lagrangian",
-        "hamiltonian",
-        "dissipation",
-        "damping",
-        "constraints",
-        "inputs",
-        "forces",
-    ),
-    *TORQUES,
-)
-"""Arguments that are written to model files as they are."""
 
 
 def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]:
@@ -60,7 +45,7 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
     of_momenta = "momenta" in arguments
     turning = [arguments.get(each) for each in TURNING]
     if are_arrays(ordinary, parameters or (), arguments["tables"], *(each or () for each in turning)):
-        return _of_arrays(cls, ArraySystem.from_text(**arguments)), True
+        return _of_arrays(cls, arrays_from_text(arguments)), True
     names = RotationNames.declared(*turning, momentum=of_momenta)
     coordinates = (*ordinary, *names.coordinates)
     momenta = arguments.get("momenta", ())
@@ -92,7 +77,7 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
         coordinates=variables,
         **conjugate,
         **names.fields(function, read(arguments[function]), forces, constraints, coordinates, constants),
-        definition=_definition(arguments) if names.members else {},
+        definition=definition_of(arguments) if names.members else {},
         time=symbols[TIME],
         parameters=constants,
         defaults=tuple(number(each, value) for each, value in values.items()),
@@ -198,10 +183,8 @@ def _arrays_from_sympy(
             "from_sympy reads the Lagrangian, parameters and tables of a system with arrays: give the rest "
             "as text to from_text"
         )
-    arrays = ArraySystem.from_sympy(
-        name=name, lagrangian=formula, coordinates=coordinates, parameters=parameters, tables=tables
-    )
-    return _of_arrays(cls, arrays)
+    arguments = {"name": name, "coordinates": coordinates, "parameters": parameters, "tables": tables}
+    return _of_arrays(cls, arrays_from_sympy(formula, **arguments))
 
 
 def _components(force: Any, what: str, read: Callable[[Any, str], Expr]) -> Any:
@@ -212,11 +195,6 @@ def _components(force: Any, what: str, read: Callable[[Any, str], Expr]) -> Any:
 def _flat(forces: Iterable[Any]) -> list[Expr]:
     """Return expressions and the entries of tuples."""
     return [each for force in forces for each in (force if isinstance(force, tuple) else (force,))]
-
-
-def _definition(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of a system with rotations that are not empty, for model files."""
-    return {key: arguments[key] for key in DEFINING if arguments.get(key)}
 
 
 def default_momenta(coordinates: Sequence[str]) -> tuple[str, ...]:

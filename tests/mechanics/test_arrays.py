@@ -5,6 +5,7 @@ import pytest
 import sympy
 
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.mechanics.arrays.reading import arrays_from_text
 from scvi_codegen.mechanics.arrays.rolling import unroll_sums
 from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
 from scvi_codegen.mechanics.arrays.system import ArraySystem
@@ -231,7 +232,7 @@ def test_momentum_maps_of_a_hamiltonian() -> None:
 def test_exactly_one_of_lagrangian_and_hamiltonian_is_required(given: dict[str, object], message: str) -> None:
     """One of both, with what belongs to it."""
     with pytest.raises(SystemDefinitionError, match=message):
-        ArraySystem.from_text(name="x", coordinates=["q[N]"], **given)
+        arrays_from_text({"name": "x", "coordinates": ["q[N]"], **given})
 
 
 KINETIC = "sum(i in N, q_dot[i]**2/2)"

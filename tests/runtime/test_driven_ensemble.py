@@ -8,7 +8,16 @@ from numpy.testing import assert_allclose
 from samples import pushed_pendulum
 from scipy.interpolate import CubicSpline
 
-from scvi_codegen import SCVI, SVI, Gauss, LagrangianSystem, StateError, StepFailedError, StoermerVerlet, compile_stepper
+from scvi_codegen import (
+    SCVI,
+    SVI,
+    Gauss,
+    LagrangianSystem,
+    StateError,
+    StepFailedError,
+    StoermerVerlet,
+    compile_stepper,
+)
 
 KNOTS = np.array([0.0, 0.37, 0.9, 1.41, 2.05, 2.6])
 VALUES = np.array([0.0, 1.2, -0.7, 0.4, 1.9, -1.0])

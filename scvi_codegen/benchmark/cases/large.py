@@ -10,6 +10,7 @@ import numpy as np
 
 from scvi_codegen.benchmark.cases.unforced import Array
 from scvi_codegen.mechanics.arrays.system import ArraySystem
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 
 SEED = 20261121
@@ -47,7 +48,7 @@ def ring(count: int, span: float) -> Lattice:
 
     return Lattice(
         name="ring",
-        system=ArraySystem.from_text(
+        system=LagrangianSystem.from_text(
             name="ring",
             coordinates=["q[N]"],
             parameters={"beta": beta},
@@ -76,7 +77,7 @@ def field(side: int, span: float) -> Lattice:
 
     return Lattice(
         name="field",
-        system=ArraySystem.from_text(
+        system=LagrangianSystem.from_text(
             name="field",
             coordinates=["u[NX, NY]"],
             parameters={"w": 1 / dx**2},
@@ -104,7 +105,7 @@ def bodies(count: int, span: float) -> Lattice:
 
     return Lattice(
         name="bodies",
-        system=ArraySystem.from_text(
+        system=LagrangianSystem.from_text(
             name="bodies",
             coordinates=["r[N, 3]"],
             parameters={"m": 1, "e": softening},
@@ -134,7 +135,7 @@ def atoms(cells: int, span: float) -> Lattice:
 
     return Lattice(
         name="atoms",
-        system=ArraySystem.from_text(
+        system=LagrangianSystem.from_text(
             name="atoms",
             coordinates=["r[N, 3]"],
             lagrangian="sum(i in N, sum(a in 3, r_dot[i, a]**2)/2) - sum(i < j in N, "
@@ -153,7 +154,7 @@ def waves(count: int, span: float) -> Lattice:
     phase = 2.0 * np.pi * np.arange(count) / count
     return Lattice(
         name="waves",
-        system=ArraySystem.from_text(
+        system=LagrangianSystem.from_text(
             name="waves",
             coordinates=["q[N]"],
             lagrangian="sum(i in N, q_dot[i]**2/2 - q[i]**2/2 - q[i]**4/4)- sum(i in N periodic, (q[i+1] - q[i])**2/2)",
@@ -173,7 +174,7 @@ def breather(count: int, span: float) -> Lattice:
     x = dx * (np.arange(count) - count // 2)
     return Lattice(
         name="breather",
-        system=ArraySystem.from_text(
+        system=LagrangianSystem.from_text(
             name="breather",
             coordinates=["u[N]"],
             parameters={"w": 1 / dx**2},
@@ -195,7 +196,7 @@ def cloth(side: int, span: float) -> Lattice:
     q = np.stack([1.05 * x, 1.02 * y, 0.1 * np.sin(x) * np.cos(y)], axis=-1).reshape(-1, 3)
     return Lattice(
         name="cloth",
-        system=ArraySystem.from_text(
+        system=LagrangianSystem.from_text(
             name="cloth",
             coordinates=["r[N, 3]"],
             parameters={"k": 100},

@@ -11,42 +11,37 @@ may differ between elements, or quadratic in the velocities of each element
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any, ClassVar
 
-import numpy as np
 from sympy import Expr, S, Symbol
 
 from scvi_codegen.errors import SizesRequiredError, SystemDefinitionError
 from scvi_codegen.files.cache import key_of
-from scvi_codegen.formulas.array_notation import array_text, latex_sum
-from scvi_codegen.formulas.array_statements import ArrayForce, parse_constraint, parse_force
-from scvi_codegen.formulas.arrays import ArrayTerm, parse_array, parse_coordinate, parse_sums
+from scvi_codegen.formulas.array_notation import latex_sum
+from scvi_codegen.formulas.array_statements import ArrayForce
+from scvi_codegen.formulas.arrays import ArrayTerm
 from scvi_codegen.formulas.expressions import unsupported_part
-from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.formulas.rotations.arrays import MemberArray, member_arrays, torque_components
-from scvi_codegen.formulas.symbols import DOT, TIME, check_names, input_formulas, number, symbol, with_inputs
+from scvi_codegen.formulas.rotations.arrays import MemberArray
+from scvi_codegen.formulas.symbols import DOT, check_names, input_formulas, symbol
 from scvi_codegen.indices import SIZES_REQUIRED, Access, Array, Loop
 from scvi_codegen.mechanics.arrays.terms import (
     check_constraint,
     constraint_text,
     force_of,
-    friction,
     friction_of,
     has_constant_mass,
     masses_of,
-    momenta_of,
     substituted,
-    table_of,
     terms_at_rest,
 )
 from scvi_codegen.mechanics.definition_checks import warn_of_negative, warn_of_unused
-from scvi_codegen.mechanics.forces import check_damping, damping_rate
+from scvi_codegen.mechanics.forces import check_damping
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.representation import LONGEST, clipped
-from scvi_codegen.validation import FORMULA, MAPPING, NAMES, TABLES, TEXT, TEXTS, checks_arguments, of
+from scvi_codegen.validation import of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,7 +64,7 @@ class ArraySystem:
         constraints: g = 0 at every element of loops (:mod:`scvi_codegen.mechanics.arrays.terms`).
         damping: damping rate of all momenta, see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
         rotations: rotations, directions and spins, which require known sizes.
-        definition: the arguments of :meth:`from_text` other than name and parameters, for model files.
+        definition: the arguments of ``from_text`` other than name and parameters, for model files.
         data: values of fields and tables by name for runs that pass none.
         mesh: of the fields of a density, their :class:`~scvi_codegen.fields.mesh.Mesh`.
     """
@@ -141,176 +136,6 @@ class ArraySystem:
                     raise SizesRequiredError(f"of the axes of {array} only the last may be a number: name the others")
         except SizesRequiredError as error:
             raise SizesRequiredError(f"{error}. This concerns '{self.name}': {SIZES_REQUIRED}") from error
-
-    @classmethod
-    @checks_arguments(
-        SystemDefinitionError,
-        name=TEXT,
-        coordinates=TEXTS,
-        lagrangian=TEXT,
-        hamiltonian=TEXT,
-        momenta=TEXTS,
-        parameters=MAPPING,
-        tables=TABLES,
-        forces=MAPPING,
-        dissipation=TEXT,
-        damping=FORMULA,
-        inputs=NAMES,
-        constraints=TEXTS,
-    )
-    def from_text(
-        cls,
-        name: str,
-        coordinates: Sequence[str],
-        lagrangian: str | None = None,
-        *,
-        hamiltonian: str | None = None,
-        momenta: Sequence[str] | None = None,
-        parameters: Mapping[str, float] | None = None,
-        tables: Sequence[str] | Mapping[str, Any] = (),
-        forces: Mapping[str, str] | None = None,
-        dissipation: str | None = None,
-        damping: str | float | None = None,
-        inputs: Sequence[str] = (),
-        constraints: Sequence[str] = (),
-        rotations: Mapping[str, str] | None = None,
-        directions: Sequence[str] | None = None,
-        spins: Sequence[str] | None = None,
-        torques: Mapping[str, Sequence[str]] | None = None,
-        torques_space: Mapping[str, Sequence[str]] | None = None,
-    ) -> ArraySystem:
-        """Read L or H from text of the grammar in :mod:`scvi_codegen.formulas.arrays`.
-
-        Args:
-            name: name of the system.
-            coordinates: declarations, as ``["x", "q[N]", "r[N, 3]"]``; sizes are names or whole numbers.
-            lagrangian: the formula; the velocity of ``q[i]`` is written ``q_dot[i]``, time ``t``.
-            hamiltonian: in place of ``lagrangian``, H in coordinates and momenta, of any form.
-            momenta: of H, declarations like those of the coordinates; by default ``["p_q[N]"]``.
-            parameters: default value by name, or by declaration of an array, as ``{"k": 1, "m[N]": 1}``; the values of
-                an array, one per element, are passed to each run, or are default values here, ``{"m[N]": [1, 2, 3]}``.
-            tables: declarations of index tables with their columns, as ``["bonds[B, 2]"]``, or ``["pins[P]"]``; a
-                mapping from them to default values.
-            forces: formula by coordinate, ``{"q[i]": "-c*q_dot[i]"}`` for every index, ``{"q[0]": "cos(t)"}`` for one.
-            dissipation: Rayleigh's function, a sum of sums over velocities, whose forces -dD/dq_dot are added.
-            damping: damping rate of all momenta, a number or a formula of parameters.
-            inputs: names of functions of time whose values are passed to each run
-                (:mod:`scvi_codegen.formulas.symbols`).
-            constraints: formulas in coordinates and time that are 0, or equations, followed by the loops over which
-                they hold, ``"(q[i+1] - q[i])**2 = 1 for i in 0..N-2"``.
-            rotations, directions, spins, torques, torques_space: as of :meth:`LagrangianSystem.from_text`, single or in
-                arrays, ``rotations={"R[N]": "omega"}`` with ``R_33[i]``, ``omega_1[i]`` in formulas and torques on
-                ``"R[i]"``.
-
-        Raises:
-            SystemDefinitionError: for text outside the grammar.
-
-        >>> chain = ArraySystem.from_text(
-        ...     name="chain", coordinates=["q[N]"], parameters={"k": 2},
-        ...     lagrangian="sum(i in N, q_dot[i]**2/2) - k*sum(i in N periodic, (q[i+1] - q[i])**2/2)")
-        >>> print(chain)
-        chain: L(q[N]) = sum(i in N, q_dot[i]**2/2) + sum(i in N periodic, -k*(q[i+1] - q[i])**2/2)
-        """
-        definition = {
-            "coordinates": list(coordinates),
-            "momenta": None if momenta is None else list(momenta),
-            "lagrangian": lagrangian,
-            "hamiltonian": hamiltonian,
-            "tables": list(tables),
-            "forces": dict(forces or {}),
-            "dissipation": dissipation,
-            "damping": damping,
-            "inputs": list(inputs),
-            "constraints": list(constraints),
-            "rotations": dict(rotations or {}),
-            "directions": list(directions or ()),
-            "spins": list(spins or ()),
-            "torques": dict(torques or {}),
-            "torques_space": dict(torques_space or {}),
-        }
-        arrays = tuple(map(parse_coordinate, coordinates))
-        conjugate = momenta_of(arrays, momenta, lagrangian, hamiltonian)
-        index_tables = tuple(map(table_of, tables))
-        data = {key: value for key, value in (parameters or {}).items() if "[" in key and np.ndim(value)}
-        numbers = {key: 1.0 if key in data else number(key, value) for key, value in (parameters or {}).items()}
-        data |= tables if isinstance(tables, Mapping) else {}
-        values = with_inputs(numbers, inputs)
-        fields = {key: parse_array(key) for key in values if "[" in key}
-        scalars = {key: value for key, value in values.items() if key not in fields}
-        velocities = () if conjugate else tuple(Array(array.name + DOT, array.axes) for array in arrays)
-        text = lagrangian if hamiltonian is None else hamiltonian
-        assert text is not None
-        known = {key: symbol(key) for key in (*scalars, *inputs, TIME)}
-        driven = input_formulas(inputs, symbol(TIME))
-        turning = member_arrays(rotations, directions, spins, momentum=hamiltonian is not None)
-        turned = [array for each in turning for array in each.formulas]
-        everything = (*arrays, *conjugate, *velocities, *fields.values(), *turned)
-        targets = [(*pair, arrays) for pair in (forces or {}).items() if isinstance(pair[1], str)]
-        vectors = {target: force for target, force in (forces or {}).items() if not isinstance(force, str)}
-        for by_name, in_space in (({**vectors, **(torques or {})}, False), (torques_space or {}, True)):
-            for target, torque in by_name.items():
-                targets += torque_components(turning, target, torque, in_space=in_space)
-        applied = [
-            parse_force(target, force, on, (*everything, *on), known, index_tables) for target, force, on in targets
-        ]
-        if dissipation is not None:
-            dissipated = parse_sums(dissipation, everything, known, index_tables)
-            moving = dict(zip(velocities, arrays, strict=False))
-            for each in turning:
-                moving |= zip(each.rates, each.torques(), strict=False)
-            applied.append(friction(dissipated, moving))
-        kind = ArrayLagrangian if hamiltonian is None else ArrayHamiltonian
-        system = kind(
-            name=name,
-            coordinates=arrays,
-            momenta=conjugate,
-            time=symbol(TIME),
-            parameters=tuple(known[key] for key in scalars),
-            defaults=tuple(scalars.values()),
-            fields=tuple(fields.values()),
-            field_defaults=tuple(values[key] for key in fields),
-            tables=index_tables,
-            terms=tuple(substituted(term, driven) for term in parse_sums(text, everything, known, index_tables)),
-            forces=tuple(substituted(force, driven) for force in chain(*applied)),
-            inputs=tuple(inputs),
-            constraints=tuple(parse_constraint(each, everything, known, index_tables) for each in constraints),
-            damping=damping_rate(damping, lambda formula: parse_expression(str(formula), known)),
-            rotations=turning,
-            definition={key: value for key, value in definition.items() if value not in (None, [], {})},
-            data={parse_array(key).name: value for key, value in data.items()},
-        )
-        system.warn_of_mistakes()
-        return system
-
-    @classmethod
-    @checks_arguments(SystemDefinitionError, name=TEXT, coordinates=TEXTS, parameters=MAPPING, tables=TABLES)
-    def from_sympy(
-        cls,
-        *,
-        name: str,
-        coordinates: Sequence[str],
-        lagrangian: Expr,
-        parameters: Mapping[str, float] | None = None,
-        tables: Sequence[str] | Mapping[str, Any] = (),
-    ) -> ArraySystem:
-        """Create the system from a SymPy expression of ``Sum`` and ``Indexed``; see also :meth:`from_text`.
-
-        A periodic index is ``Mod(i + 1, N)``, pairs are ``(j, i + 1, N - 1), (i, 0, N - 2)``, a table entry is
-        ``q[bonds[b, 0]]``, the velocity of ``q[i]`` is that of ``IndexedBase("q_dot")``.
-
-        >>> from sympy import IndexedBase, Sum, symbols
-        >>> q, v, (i, N) = IndexedBase("q"), IndexedBase("q_dot"), symbols("i N", integer=True)
-        >>> kinetic, springs = Sum(v[i] ** 2 / 2, (i, 0, N - 1)), Sum((q[i + 1] - q[i]) ** 2 / 2, (i, 0, N - 2))
-        >>> chain = ArraySystem.from_sympy(name="chain", coordinates=["q[N]"], lagrangian=kinetic - springs)
-        >>> print(*sorted(map(str, chain.terms)), sep=chr(10))
-        sum(i in 0..N-2, -(q[i+1] - q[i])**2/2)
-        sum(i in N, q_dot[i]**2/2)
-        """
-        if not isinstance(lagrangian, Expr):
-            what = type(lagrangian).__name__
-            raise SystemDefinitionError(f"the Lagrangian is a {what}, not a SymPy expression (text goes to from_text)")
-        text = array_text(lagrangian)
-        return cls.from_text(name=name, coordinates=coordinates, lagrangian=text, parameters=parameters, tables=tables)
 
     @property
     def sizes(self) -> tuple[str, ...]:
