@@ -28,6 +28,7 @@ from scvi_codegen.derivation.notation import LARGEST_SHOWN, Equation, TableEntry
 from scvi_codegen.display.cards import card, listed, plain
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.expressions import jacobian
+from scvi_codegen.formulas.intermediates import inner_of, written_out
 from scvi_codegen.formulas.translation import format_expression
 from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, symmetries
@@ -191,6 +192,9 @@ def derive(
         return ArrayStepEquations(sites.system if sites else system, as_method(method))
     method = as_method(method, system)
     system = discretised_form(system, method)
+    if inner_of(system.formula):
+        kind = "hamiltonian" if system.auxiliaries else "lagrangian"
+        system = replace(system, **{kind: written_out(system.formula)})
     stages = paper_equations(system, method)
     writer = _Writer(system, stages)
     equations = writer.equations()

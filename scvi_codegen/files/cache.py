@@ -347,14 +347,18 @@ def identity(expression: sympy.Basic) -> str:
     numbers: dict[sympy.Basic, int] = {}
     lines: list[str] = []
 
-    def number_of(part: sympy.Basic) -> int:
+    pending = [expression]
+    while pending:
+        part = pending[-1]
+        missing = [argument for argument in part.args if argument not in numbers]
+        if missing:
+            pending += reversed(missing)
+            continue
+        pending.pop()
         if part not in numbers:
-            inner = ", ".join([str(number_of(argument)) for argument in part.args])
+            inner = ", ".join([str(numbers[argument]) for argument in part.args])
             lines.append(f"{type(part).__name__}({inner})" if part.args else srepr(part))
             numbers[part] = len(lines) - 1
-        return numbers[part]
-
-    number_of(expression)
     return "\n".join(lines)
 
 

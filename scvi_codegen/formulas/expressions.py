@@ -20,6 +20,8 @@ import sympy
 from sympy import Add, Expr, Function, Mul, Pow, Rational, S, Symbol, log
 from sympy.core.function import AppliedUndef
 
+from scvi_codegen.formulas.adjoints import Elimination, Gradient, gradient_by_adjoints
+from scvi_codegen.formulas.intermediates import Intermediate, intermediate, intermediates
 from scvi_codegen.tables.precision import Number, mp
 
 LARGEST = 1.7976931348623157e308
@@ -56,6 +58,11 @@ def parts(*expressions: sympy.Basic) -> dict[sympy.Basic, None]:
     return result
 
 
+def parts_of_type(kind: type, *expressions: sympy.Basic) -> set[Any]:
+    """Return the distinct subexpressions of a class."""
+    return {part for part in parts(*expressions) if isinstance(part, kind)}
+
+
 CONSTANT_VALUES = {sympy.S.Pi: mp.mpf(mp.pi), sympy.S.Exp1: mp.mpf(mp.e)}
 
 
@@ -72,6 +79,8 @@ class Tape:
         self._start: list[Number] = [mp.zero] * len(symbols)
         self._places: dict[sympy.Expr, int] = {symbol: register for register, symbol in enumerate(symbols)}
         self._steps: list[tuple[int, Callable[..., Number], tuple[int, ...]]] = []
+        for each in intermediates(*expressions):
+            self._place(each)
         self._results = [self._place(expression) for expression in expressions]
 
     def __call__(self, numbers: Sequence[Number]) -> list[Number]:
@@ -111,6 +120,8 @@ def _operation(expression: sympy.Expr, operands: tuple[int, ...]) -> tuple[Calla
         return (operator.add if len(operands) == 2 else _sum), operands
     if expression.is_Mul:
         return (operator.mul if len(operands) == 2 else _product), operands
+    if isinstance(expression, Intermediate):
+        return operator.pos, operands
     if not expression.is_Pow:
         return getattr(mp, NAME_OF[expression.func]), operands
     exponent = expression.exp
@@ -169,7 +180,7 @@ def beyond_double(number: Expr) -> bool:
     return p > int(LARGEST) * q or (p > 0 and p << 1075 <= q)
 
 
-NODES = frozenset([Add, Mul, Pow, *NAME_OF])
+NODES = frozenset([Add, Mul, Pow, Intermediate, *NAME_OF])
 
 
 _SMOOTHER = {
@@ -231,11 +242,13 @@ def exponent_problem(exponent: Expr) -> str | None:
 
 def _constant_problem(expression: Expr) -> str | None:
     """Return why a maximal subexpression without symbols is not a finite real number, or ``None``."""
-    pending = [expression]
+    pending, seen = [expression], {expression}
     while pending:
         node = pending.pop()
         if not node.is_number:
-            pending.extend(argument for argument in node.args if argument.args)
+            new = [argument for argument in node.args if argument.args and argument not in seen]
+            seen.update(new)
+            pending += new
         elif node.args:
             try:
                 evaluate(node, {})
@@ -252,6 +265,8 @@ def evaluated(expression: Expr, replacements: Mapping[Expr, Expr] | None = None)
     """
     rules = dict(replacements or {})
     for _ in range(MAX_PASSES):
+        for each in intermediates(expression):
+            _rebuilt(each, rules)
         result = _rebuilt(expression, rules)
         if result == expression:
             break
@@ -271,10 +286,8 @@ def _rebuilt_node(expression: Expr, known: dict[Expr, Expr]) -> Expr:
         return Rational(repr(value) if expression == value else str(expression))
     if not expression.args or isinstance(expression, (sympy.Derivative, AppliedUndef)):
         return expression
-    return expression.func(*(_rebuilt(argument, known) for argument in expression.args))
-
-
-_Gradient = dict[int, Expr]
+    arguments = [_rebuilt(argument, known) for argument in expression.args]
+    return intermediate(arguments[0]) if isinstance(expression, Intermediate) else expression.func(*arguments)
 
 
 def gradient(expression: Expr, variables: Sequence[Symbol]) -> dict[int, Expr]:
@@ -284,26 +297,25 @@ def gradient(expression: Expr, variables: Sequence[Symbol]) -> dict[int, Expr]:
     >>> gradient(x**2 * z + z, [x, y, z])
     {0: 2*x*z, 2: x**2 + 1}
     """
-    return dict(sorted(_accumulation(tuple(variables)).of(expression).items()))
+    return dict(sorted(_accumulation(tuple(variables)).total(expression).items()))
 
 
 def jacobian(
-    expressions: Sequence[Expr] | Mapping[int, Expr], variables: Sequence[Symbol]
+    expressions: Sequence[Expr] | Mapping[int, Expr], variables: Sequence[Symbol], *, symmetric: bool = False
 ) -> dict[tuple[int, int], Expr]:
     """Return the non-zero first derivatives of several expressions, by (row, column), ascending.
 
     Args:
         expressions: the rows, as a sequence or by index (what ``gradient`` returns).
         variables: the columns.
+        symmetric: whether the upper triangle equals the lower one, from which it may be copied.
 
     >>> from sympy.abc import x, y
     >>> jacobian([x * y, y**2], [x, y])
     {(0, 0): y, (0, 1): x, (1, 1): 2*y}
     """
     rows = expressions if isinstance(expressions, Mapping) else dict(enumerate(expressions))
-    accumulation = _accumulation(tuple(variables))
-    entries = {(row, column): entry for row in rows for column, entry in accumulation.of(rows[row]).items()}
-    return dict(sorted(entries.items()))
+    return dict(sorted(_accumulation(tuple(variables)).rows(rows, symmetric=symmetric).items()))
 
 
 def hessian(expression: Expr, variables: Sequence[Symbol]) -> dict[tuple[int, int], Expr]:
@@ -313,7 +325,7 @@ def hessian(expression: Expr, variables: Sequence[Symbol]) -> dict[tuple[int, in
     >>> hessian(x**2 * y, [x, y])
     {(0, 0): 2*y, (0, 1): 2*x, (1, 0): 2*x}
     """
-    entries = jacobian(gradient(expression, variables), variables)
+    entries = jacobian(gradient(expression, variables), variables, symmetric=True)
     upper = {(row, column): entry for (row, column), entry in entries.items() if row <= column}
     lower = {(column, row): entry for (row, column), entry in upper.items()}
     return dict(sorted((upper | lower).items()))
@@ -329,9 +341,26 @@ class _Accumulation:
     """Cache of the non-zero partial derivatives of every visited node, by index of the variable."""
 
     def __init__(self, variables: Sequence[Symbol]) -> None:
-        self.known: dict[Expr, _Gradient] = {variable: {index: S.One} for index, variable in enumerate(variables)}
+        self.variables = frozenset(variables)
+        self.known: dict[Expr, Gradient] = {variable: {index: S.One} for index, variable in enumerate(variables)}
+        self.jacobians: dict[tuple[tuple[Expr, ...], bool], dict[tuple[int, int], Expr]] = {}
 
-    def of(self, node: Expr) -> _Gradient:
+    def total(self, expression: Expr) -> dict[int, Expr]:
+        """Return the derivatives with respect to variables, also by way of intermediate quantities."""
+        return gradient_by_adjoints(self.of(expression), self.of)
+
+    def rows(self, expressions: Mapping[int, Expr], *, symmetric: bool) -> dict[tuple[int, int], Expr]:
+        """Return the derivatives of several expressions, by (row, column)."""
+        if not any(isinstance(key, Intermediate) for each in expressions.values() for key in self.of(each)):
+            return {(i, j): entry for i, each in expressions.items() for j, entry in self.of(each).items()}
+        key = (*expressions.values(),), symmetric
+        if key not in self.jacobians:
+            entries = Elimination(expressions, self.of, lower=symmetric).jacobian()
+            upper = {(j, i): entry for (i, j), entry in entries.items() if i > j} if symmetric else {}
+            self.jacobians[key] = entries | upper
+        return self.jacobians[key]
+
+    def of(self, node: Expr) -> Gradient:
         if not node.args:
             return self.known.get(node, {})
         derivative = self.known.get(node)
@@ -339,7 +368,9 @@ class _Accumulation:
             derivative = self.known[node] = self.derived(node)
         return derivative
 
-    def derived(self, node: Expr) -> _Gradient:
+    def derived(self, node: Expr) -> Gradient:
+        if isinstance(node, Intermediate):
+            return {node: S.One} if self.variables & node.free_symbols else {}
         inner = [self.of(argument) for argument in node.args]
         return _combined(
             [
@@ -350,7 +381,7 @@ class _Accumulation:
         )
 
 
-def _combined(pairs: Sequence[tuple[Expr, _Gradient]]) -> _Gradient:
+def _combined(pairs: Sequence[tuple[Expr, Gradient]]) -> Gradient:
     """Return the sum of factor times gradient: the chain rule."""
     parts: dict[int, list[Expr]] = {}
     for factor, derivatives in pairs:
@@ -385,6 +416,12 @@ def array_value(expression: Expr, known: dict[Expr, Any]) -> Any:
     >>> array_value(x**2 + 1, {x: np.arange(3.0)}).tolist()
     [1.0, 2.0, 5.0]
     """
+    for each in intermediates(expression):
+        _known_value(each, known)
+    return _known_value(expression, known)
+
+
+def _known_value(expression: Expr, known: dict[Expr, Any]) -> Any:
     if expression not in known:
         known[expression] = _node_value(expression, known)
     return known[expression]
@@ -393,7 +430,9 @@ def array_value(expression: Expr, known: dict[Expr, Any]) -> Any:
 def _node_value(expression: Any, known: dict[Expr, Any]) -> Any:
     if not expression.args:
         return float(expression) if not expression.is_Rational or abs(expression) < LARGEST else np.nan
-    arguments = [array_value(argument, known) for argument in expression.args]
+    arguments = [_known_value(argument, known) for argument in expression.args]
+    if isinstance(expression, Intermediate):
+        return arguments[0]
     if expression.is_Add:
         return reduce(np.add, arguments)
     if expression.is_Mul:

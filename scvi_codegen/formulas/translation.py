@@ -14,7 +14,7 @@ from sympy import Expr, Integer, Pow, S, Symbol
 from sympy.core.function import AppliedUndef
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.expressions import NAME_OF, evaluated, unsupported_part
+from scvi_codegen.formulas.expressions import NAME_OF, evaluated, parts_of_type, unsupported_part
 from scvi_codegen.formulas.symbols import DOT, TIME, identifier, symbol
 
 
@@ -86,9 +86,9 @@ class Translation:
 
     def apply(self, expression: Expr, what: str = "Lagrangian") -> Expr:
         """Return the expression in canonical symbols, with exact numbers."""
-        unfolded = {derivative: derivative.doit() for derivative in expression.atoms(sympy.Derivative)}
+        unfolded = {derivative: derivative.doit() for derivative in parts_of_type(sympy.Derivative, expression)}
         result = evaluated(expression.xreplace(unfolded), self.rules)
-        leftover = sorted(result.atoms(sympy.Derivative) or result.atoms(AppliedUndef), key=str)
+        leftover = sorted(parts_of_type(sympy.Derivative, result) or parts_of_type(AppliedUndef, result), key=str)
         if leftover:
             raise SystemDefinitionError(
                 f"'{leftover[0]}' in the {what} is neither a coordinate nor the velocity of one: list it among the "
@@ -144,7 +144,7 @@ class Translation:
 
     def _add_named_functions(self, expressions: Sequence[Expr], names: set[str]) -> None:
         """Add the functions of time that have the name of a parameter or an input."""
-        functions = set().union(*(expression.atoms(AppliedUndef) for expression in expressions)) - self.rules.keys()
+        functions = parts_of_type(AppliedUndef, *expressions) - self.rules.keys()
         for function in sorted(functions, key=str):
             if function.func.__name__ in names and function.args == (self.user_time,):
                 self._add(function, identifier(function.func.__name__))

@@ -23,6 +23,7 @@ from fractions import Fraction
 import sympy
 
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.intermediates import Intermediate, intermediates
 from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation, exact_number
 
 FUNCTIONS = {
@@ -99,6 +100,8 @@ class _Graph:
             return self._sum(expression)
         if isinstance(expression, sympy.Mul):
             return self._product(expression)
+        if isinstance(expression, Intermediate):
+            return self.read(expression.definition)
         if isinstance(expression, sympy.exp):
             return self.node(("exp", (self.read(expression.args[0]),)))
         if isinstance(expression, sympy.Pow):
@@ -219,6 +222,8 @@ def lower_kernel(
     loads |= {symbol: Load("parameters", i) for i, symbol in enumerate(parameters)}
     loads[time] = Load("t", -1)
     graph = _Graph(loads, (*parameters, *arguments[len(arguments) - constants :]))
+    for each in intermediates(*values, *partials):
+        graph.read(each)
     roots = [graph.read(expression) for expression in (*values, *partials)]
     temporaries, results = _linearise(graph, roots)
     return Kernel(

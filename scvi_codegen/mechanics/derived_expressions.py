@@ -78,7 +78,7 @@ class Forms:
     @cached_property
     def mass(self) -> Entries:
         """Mass matrix L_vv."""
-        return jacobian(self.momentum, self.system.velocities)
+        return jacobian(self.momentum, self.system.velocities, symmetric=True)
 
     @cached_property
     def lower_mass(self) -> Entries:

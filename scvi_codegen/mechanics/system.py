@@ -272,10 +272,11 @@ class MechanicalSystem(Deferred, ABC):
 
     def text_of(self, formula: Expr) -> str:
         """Return a formula of the system as text, with its inputs by their names."""
+        from scvi_codegen.formulas.intermediates import written_out
         from scvi_codegen.formulas.symbols import inputs_by_name
         from scvi_codegen.formulas.translation import format_expression
 
-        return format_expression(inputs_by_name(formula, self.inputs))
+        return format_expression(inputs_by_name(written_out(formula), self.inputs))
 
     def with_parameters(self, **values: float) -> Self:
         """Return a copy of the system with other default values for the named parameters."""
@@ -292,10 +293,12 @@ class MechanicalSystem(Deferred, ABC):
         from sympy import Symbol, count_ops
 
         from scvi_codegen.display.mathml import mathml_terms
+        from scvi_codegen.formulas.intermediates import LONGEST_WRITTEN, written_out, written_size
 
         letter = "H" if self.auxiliaries else "L"
-        size = count_ops(self.formula)
-        formula = mathml_terms(self.formula, Symbol(letter)) if size <= MAX_OPERATIONS else ()
+        short = written_size(self.formula) <= LONGEST_WRITTEN
+        size = count_ops(self.formula) if short else written_size(self.formula)
+        formula = mathml_terms(written_out(self.formula), Symbol(letter)) if size <= MAX_OPERATIONS else ()
         written = " ".join(piece for term in formula for piece in term) or plain(f"{letter}: {size} operations")
         parameters = [f"{parameter.name} = {value:g}" for parameter, value in self.constants.items()]
         return card(

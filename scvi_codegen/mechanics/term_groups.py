@@ -16,6 +16,7 @@ from typing import TypeVar
 from sympy import Add, Expr, S, Symbol, factor_terms
 
 from scvi_codegen.formulas.expressions import gradient
+from scvi_codegen.formulas.intermediates import inner_of
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.system import MechanicalSystem
 
@@ -119,9 +120,9 @@ class SimilarTerms:
 
 @lru_cache(maxsize=16)
 def rolled(system: MechanicalSystem) -> SplitSystem | None:
-    """Split a system; ``None`` without large term groups, with constraints, or with a time transformation."""
+    """Split a system; ``None`` without large term groups, or with constraints, a clock, or intermediate quantities."""
     terms = Add.make_args(system.formula)
-    if len(terms) < MIN_GROUP_SIZE or system.constraints or system.clock:
+    if len(terms) < MIN_GROUP_SIZE or system.constraints or system.clock or inner_of(system.formula):
         return None
     moving = {*system.velocities, *system.auxiliaries}
     known = {*system.coordinates}

@@ -25,7 +25,8 @@ FLOORS = """
     errors version representation
     validation indices
     tables files
-    formulas display ir
+    formulas display
+    ir
     mechanics rendering
     methods native pictures
     lowering exact runtime

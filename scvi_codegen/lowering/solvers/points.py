@@ -43,6 +43,7 @@ import sympy
 from sympy import Expr
 
 from scvi_codegen.formulas.expressions import jacobian
+from scvi_codegen.formulas.intermediates import inner_of
 from scvi_codegen.ir.equations import FixedPointIteration, IterationName, IterationTable, StoredValues
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.lowering.solvers.tables import (
@@ -198,9 +199,16 @@ def _coupled(system: LagrangianSystem, tables: VelocityTables) -> FixedPointIter
     if lanes > MOST_LANES or (full and lanes * system.dimension**2 > LARGEST_MASS_MATRICES):
         return None
     of, projected = (*system.coordinates, *system.velocities), bool(tables.velocity)
-    followed = () if tables.projection else _linearised_forces(system)
+    frozen = bool(inner_of(system.lagrangian))
+    followed = () if tables.projection or frozen else _linearised_forces(system)
     evaluated = "L_q, L_v, their derivatives F_q, F_v and L_vq" if followed else "L_q, L_v"
-    force = system_kernel(system, "force_lanes", forms.force, of=of, purpose="L_q at all points.")
+    values = (*forms.force, *forms.momentum)
+    force = (
+        system_kernel(system, "value_lanes", values, of=of, purpose="L_q, L_v at all points.")
+        if frozen
+        else system_kernel(system, "force_lanes", forms.force, of=of, purpose="L_q at all points.")
+    )
+    macros = (("PROJECTED", projected), ("FOLLOWED", followed), ("FROZEN_MASS", frozen))
     integrands, damping = integrand_kernel(system, "integrand_lanes", of), damping_kernel(system)
     return _point_iteration(
         "coupled",
@@ -210,7 +218,7 @@ def _coupled(system: LagrangianSystem, tables: VelocityTables) -> FixedPointIter
             system_kernel(
                 system,
                 "point_lanes",
-                (*forms.force, *forms.momentum, *followed),
+                (*values, *followed),
                 of=of,
                 partials=forms.lower_mass.values(),
                 purpose=f"{evaluated} and the lower triangle of L_vv at all points, u = (q, v).",
@@ -218,13 +226,13 @@ def _coupled(system: LagrangianSystem, tables: VelocityTables) -> FixedPointIter
             None if followed else force,
             integrands,
         ),
-        forces=() if followed else ("point_lanes", "force_lanes"),
+        forces=() if followed else ("point_lanes", force.name),
         stored=2 * lanes,
         parts=(
             *(("damped_points",) if damping else ()),
             *("point_weights", "mass_matrix", "corrections", "coupled_iteration"),
         ),
-        macros=tuple((name, 1) for name, holds in (("PROJECTED", projected), ("FOLLOWED", followed)) if holds),
+        macros=tuple((name, 1) for name, holds in macros if holds),
         mass_entries=tuple(forms.lower_mass),
         damping=damping,
         derivatives_part="" if projected or damping or integrands else "coupled_derivatives",

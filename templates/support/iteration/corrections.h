@@ -103,7 +103,12 @@ static inline void converged_forces(const step_data *step, const iteration_data 
   scale(data->position_weight, z, scaled);
   for (int n = 0; n < GROUPS; n++) {
     place(step, n, scaled, z, u);
+#ifdef FROZEN_MASS
+    value_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, value[n]);
+    memcpy(F[n], value[n], sizeof F[n]);
+#else
     force_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, F[n]);
+#endif
 #ifdef DAMPED
     grow(&data->damping, n, M, F[n]);
 #endif

@@ -10,6 +10,12 @@
  * and an iteration is z_n += L_vv^-1 (P_n - L_v(q_n, z_n)). Requires: points.h or trajectories.h with what they
  * require, point_weights.h, a mass, corrections.h, velocity corrections, the tables, the kernel point_lanes. */
 
+#ifdef FROZEN_MASS
+/* The mass matrices are those of the first of MASS_AGE iterations, which is at extrapolated points: their errors are
+ * small and affect only the convergence rate. Requires: the kernel value_lanes. */
+enum { MASS_AGE = 16 };
+#endif
+
 /* Computes the increments of one step: the velocities z at the points are corrected by mass^-1 (P - L_v) until they
  * converge; the increments follow from the forces at the converged points. The velocities are stored for the predictor.
  * On failure the increments are undefined. */
@@ -31,14 +37,32 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   for (int k = 0; needs_iteration(&now); k++) {
     lanes change = lanes_of(0.0);
     scale(data->position_weight, z, scaled);
+#ifdef FROZEN_MASS
+    if (k % MASS_AGE == 0)
+      memset(mass, 0, sizeof mass);
+#else
     if (!DIAGONAL)
       memset(mass, 0, sizeof mass);
+#endif
     for (int n = 0; n < GROUPS; n++) {
       place(step, n, scaled, z, u);
+#ifdef FROZEN_MASS
+      if (k % MASS_AGE == 0) {
+        point_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, value[n], mass[n]);
+#ifdef DAMPED
+        grow(&data->damping, n, MASS, mass[n]);
+#endif
+        factor_mass(mass[n]);
+      } else
+        value_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, value[n]);
+#else
       point_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, value[n], mass[n]);
+#endif
 #ifdef DAMPED
       grow(&data->damping, n, VALUES, value[n]);
+#ifndef FROZEN_MASS
       grow(&data->damping, n, MASS, mass[n]);
+#endif
 #endif
       for (int i = 0; i < M; i++)
         impulse[n][i] = data->momentum_weight[n] * value[n][i];
@@ -56,7 +80,9 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
       for (int n = 0; n < GROUPS; n++) {
         for (int i = 0; i < M; i++)
           r[n][i] = apply(VELOCITY, n, residual, i);
+#ifndef FROZEN_MASS
         factor_mass(mass[n]);
+#endif
         solve_mass(mass[n], r[n]);
       }
       memcpy(residual, r, sizeof r);
@@ -70,7 +96,9 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
     for (int n = 0; n < GROUPS; n++) {
       for (int i = 0; i < M; i++)
         r[n][i] = step->p0[i] + (step->carry_p[i] + apply(MOMENTUM, n, impulse, i)) - value[n][M + i];
+#ifndef FROZEN_MASS
       factor_mass(mass[n]);
+#endif
     }
     correct(data, value, mass, r);
     for (int n = 0; n < GROUPS; n++)

@@ -11,6 +11,9 @@ velocity omega adds, with the total mass M, the first moment S of the tree in it
 
     T = M |x_dot|^2/2 + R^T x_dot . (S_dot + omega x S) + T(x_dot = 0),    V = -g . (M x + R S).
 
+The components of all these vectors are intermediate quantities (:mod:`scvi_codegen.formulas.intermediates`), so that
+the energies of n bodies have O(n) operations.
+
 R. Featherstone, Rigid Body Dynamics Algorithms, Springer 2008, chapters 3 and 4.
 """
 
@@ -23,6 +26,7 @@ from typing import Any
 from sympy import Add, Expr, Matrix, Rational, S, cos, sin, zeros
 
 from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.formulas.intermediates import intermediate
 from scvi_codegen.formulas.rotations.members import Rotation
 from scvi_codegen.formulas.symbols import DOT, symbol
 from scvi_codegen.mechanics.multibody.trees.tree import (
@@ -59,7 +63,6 @@ class _Tree:
         self.links = links
         self.gravity = _vector(gravity)
         self.joints = {link.joint.name: link.joint for link in links}
-        self.outward = [self.rotation_to_parent(link.joint) for link in links]
         self.moments, self.masses = self.first_moments()
 
     def coordinate(self, joint: Joint) -> tuple[Expr, Expr]:
@@ -76,15 +79,17 @@ class _Tree:
     def displacement(self, joint: Joint) -> Expr:
         return self.coordinate(joint)[0] - _number(joint.zero)
 
-    def rotation_to_parent(self, joint: Joint) -> Matrix:
-        """Return A, from the frame of the link to that of its parent."""
-        constant = _matrix(joint.pose.rotation)
+    def turned(self, joint: Joint, vector: Matrix, *, back: bool = False) -> Matrix:
+        """Return a vector turned by A, from the frame of the link to that of its parent; ``back``: by A^T."""
+        turns = [Matrix(3, 3, rotation_of(joint).entries)] if joint.kind in ("ball", "free") else []
         if joint.kind == "hinge":
             q = self.displacement(joint)
-            return constant * Matrix([[cos(q), -sin(q), 0], [sin(q), cos(q), 0], [0, 0, 1]])
-        if joint.kind == "ball":
-            return constant * Matrix(3, 3, rotation_of(joint).entries)
-        return Matrix(3, 3, rotation_of(joint).entries) if joint.kind == "free" else constant
+            turns = [Matrix([[cos(q), -sin(q), 0], [sin(q), cos(q), 0], [0, 0, 1]])]
+        if joint.kind != "free":
+            turns.insert(0, _matrix(joint.pose.rotation))
+        for turn in turns if back else reversed(turns):
+            vector = as_quantities((turn.T if back else turn) * vector)
+        return vector
 
     def origin(self, joint: Joint) -> Matrix:
         """Return the origin of the link in the frame of its parent."""
@@ -98,7 +103,8 @@ class _Tree:
         for i in reversed(range(len(self.links))):
             parent, joint = self.links[i].parent, self.links[i].joint
             if parent >= 0:
-                moments[parent] += masses[i] * self.origin(joint) + self.outward[i] * moments[i]
+                moments[parent] += masses[i] * self.origin(joint) + self.turned(joint, moments[i])
+                moments[parent] = as_quantities(moments[parent])
                 masses[parent] += masses[i]
         return moments, masses
 
@@ -109,11 +115,11 @@ class _Tree:
         moving: list[Matrix] = []
         along = Matrix([0, 0, 1])
         for i, link in enumerate(self.links):
-            joint, back = link.joint, self.outward[i].T
+            joint = link.joint
             outer = turning[link.parent] if link.parent >= 0 else zeros(3, 1)
             speed = moving[link.parent] if link.parent >= 0 else zeros(3, 1)
-            w = back * outer
-            v = back * (speed + outer.cross(self.origin(joint)))
+            w = self.turned(joint, outer, back=True)
+            v = self.turned(joint, as_quantities(speed + outer.cross(self.origin(joint))), back=True)
             if joint.kind in SINGLE:
                 rate = self.coordinate(joint)[1]
                 if joint.kind == "hinge":
@@ -124,9 +130,9 @@ class _Tree:
                 w += Matrix(rotation_of(joint).rates)
                 if joint.kind == "free":
                     terms.append(self.free_base(i))
-            turning.append(w)
-            moving.append(v)
-            terms.append(_energy(link.inertia, w, v))
+            turning.append(as_quantities(w))
+            moving.append(as_quantities(v))
+            terms.append(_energy(link.inertia, turning[-1], moving[-1]))
             terms.append(self.quadratic(joint, joint.armature))
         return Add(*terms)
 
@@ -162,7 +168,7 @@ class _Tree:
                 position = self.origin(joint)
                 if joint.kind == "free":
                     position = Matrix([symbol(name) for name in position_of(joint)])
-                place = self.masses[i] * position + self.outward[i] * self.moments[i]
+                place = self.masses[i] * position + self.turned(joint, self.moments[i])
                 terms.append(-self.gravity.dot(place))
             if joint.stiffness:
                 terms.append(_number(joint.stiffness) * (self.coordinate(joint)[0] - _number(joint.rest)) ** 2 / 2)
@@ -207,7 +213,7 @@ def position_of(joint: Joint) -> tuple[str, ...]:
 
 
 def _energy(inertia: Inertia, w: Matrix, v: Matrix) -> Expr:
-    velocity = v + w.cross(_vector(inertia.center))
+    velocity = as_quantities(v + w.cross(_vector(inertia.center)))
     return (_number(inertia.mass) * velocity.dot(velocity) + (w.T * _matrix(inertia.matrix) * w)[0]) / 2
 
 
@@ -220,6 +226,11 @@ def _rate_of_matrix(formula: Matrix, rotation: Rotation) -> Matrix:
     for entry, derivative in zip(rotation.entries, rates, strict=True):
         rate += formula.diff(entry) * derivative
     return rate
+
+
+def as_quantities(vector: Matrix) -> Matrix:
+    """Return a vector of intermediate quantities."""
+    return vector.applyfunc(intermediate)
 
 
 def _number(value: float) -> Expr:

@@ -1,0 +1,170 @@
+"""Intermediate quantities: nodes of expressions that are computed once, and never expanded into what contains them.
+
+The velocity of the tenth body of a chain is a sum of ten terms times rotations if it is written in joint coordinates,
+and that of the hundredth of a hundred; as a function of the velocity of the body before it, all have the same length.
+SymPy merges nested sums and products. An :class:`Intermediate` is opaque to it, so that an expression remains a
+straight-line program, whose length is that of its definitions, and whose derivatives are computed by adjoints
+(:func:`~scvi_codegen.formulas.expressions.gradient`).
+
+SymPy traverses expressions as trees, which takes exponential time where quantities share others. Comparisons, free
+symbols and replacements of an intermediate quantity are therefore computed once per definition.
+"""
+
+from __future__ import annotations
+
+from itertools import count
+from typing import Any
+from weakref import WeakValueDictionary
+
+from sympy import Expr, S, Symbol
+
+from scvi_codegen.errors import SystemDefinitionError
+
+LONGEST_WRITTEN = 20_000
+"""Largest number of nodes of a formula that is displayed or stored as text."""
+
+_NUMBERS = count()
+_KNOWN: WeakValueDictionary[Expr, Intermediate] = WeakValueDictionary()
+
+
+class Intermediate(Expr):  # type: ignore[misc]  # SymPy is untyped
+    """Expression with the value of its definition, which SymPy neither expands nor compares term by term.
+
+    Quantities with equal definitions are one object. Numbers ascend: those in a definition precede its own.
+    """
+
+    number: int
+    inner: tuple[Intermediate, ...]
+    is_commutative = True
+    is_real = True
+
+    def __new__(cls, definition: Expr) -> Intermediate:
+        """Return the quantity with this definition."""
+        known = _KNOWN.get(definition)
+        if known is None:
+            known = Expr.__new__(cls, definition)
+            known.number = next(_NUMBERS)
+            known.inner = inner_of(definition)
+            known._free = frozenset(definition.free_symbols)
+            _KNOWN[definition] = known
+        return known
+
+    @property
+    def definition(self) -> Expr:
+        """The expression that it stands for."""
+        return self.args[0]
+
+    @property
+    def free_symbols(self) -> set[Symbol]:
+        """Symbols of its definition and of all quantities in it."""
+        return set(self._free)
+
+    @property
+    def is_number(self) -> bool:
+        """True if its definition is a constant."""
+        return not self._free
+
+    def _hashable_content(self) -> tuple[int]:
+        return (self.number,)
+
+    def _printed(self, printer: Any, *_: Any) -> str:
+        """Return its definition in parentheses, or its number where that is too long to read."""
+        if printer.printmethod == "_sympystr" and written_size(self) > LONGEST_WRITTEN:
+            return f"w{self.number}"
+        return f"({printer._print(self.definition)})"
+
+    _sympystr = _latex = _pythoncode = _numpycode = _scipycode = _mpmathcode = _printed
+
+    def _eval_derivative(self, symbol: Symbol) -> Expr:
+        return self.definition.diff(symbol) if symbol in self._free else S.Zero
+
+    def _xreplace(self, rule: Any) -> tuple[Expr, bool]:
+        replaced = _replacements(rule)
+        for each in intermediates(self):
+            if each in rule:
+                replaced[each] = (rule[each], True)
+            elif each not in replaced:
+                value, changed = each.definition._xreplace(rule)
+                replaced[each] = (intermediate(value), True) if changed else (each, False)
+        return replaced[self]
+
+
+_LAST: list[Any] = [{}, {}]
+"""The last rule of replacements, and the quantities that were replaced by it."""
+
+
+def _replacements(rule: Any) -> dict[Intermediate, tuple[Expr, bool]]:
+    """Return what was replaced by an equal rule immediately before."""
+    if _LAST[0] != rule:
+        _LAST[:] = dict(rule), {}
+    replaced: dict[Intermediate, tuple[Expr, bool]] = _LAST[1]
+    return replaced
+
+
+def intermediate(expression: Expr) -> Expr:
+    """Return an expression as an intermediate quantity; symbols, numbers and multiples of them as they are.
+
+    >>> from sympy.abc import x, y
+    >>> total = intermediate(x + y)
+    >>> (2 * total + x).free_symbols == {x, y}, intermediate(x + y) is total, intermediate(-x)
+    (True, True, -x)
+    """
+    rest = expression.as_coeff_Mul()[1]
+    return expression if rest.is_Atom or isinstance(rest, Intermediate) else Intermediate(expression)
+
+
+def written_out(expression: Expr) -> Expr:
+    """Return an expression without intermediate quantities, for display.
+
+    Raises:
+        SystemDefinitionError: if it is too long.
+    """
+    size = written_size(expression)
+    if size > LONGEST_WRITTEN and inner_of(expression):
+        raise SystemDefinitionError(
+            f"the formula has {size} terms and factors if its intermediate quantities are written out; at most "
+            f"{LONGEST_WRITTEN} can be displayed or stored as text. Use a smaller mechanism, or keep the file from "
+            "which the system was read"
+        )
+    rules: dict[Expr, Expr] = {}
+    for each in intermediates(expression):
+        rules[each] = each.definition.xreplace(dict(rules))
+    return expression.xreplace(rules) if rules else expression
+
+
+def written_size(expression: Expr) -> int:
+    """Return the number of nodes of an expression with all intermediate quantities written out."""
+    sizes: dict[Expr, int] = {}
+
+    def size(node: Expr) -> int:
+        return sizes.get(node) or 1 + sum(map(size, node.args))
+
+    for each in intermediates(expression):
+        sizes[each] = size(each.definition)
+    return size(expression)
+
+
+def inner_of(expression: Expr) -> tuple[Intermediate, ...]:
+    """Return the quantities in an expression, without those in their definitions."""
+    seen, found, pending = {expression}, [], [expression]
+    while pending:
+        node = pending.pop()
+        if isinstance(node, Intermediate):
+            found.append(node)
+            continue
+        new = [argument for argument in node.args if argument.args and argument not in seen]
+        seen.update(new)
+        pending += new
+    return tuple(found)
+
+
+def intermediates(*expressions: Expr) -> list[Intermediate]:
+    """Return all quantities in expressions and in their definitions, each after those that it depends on."""
+    seen: set[Intermediate] = set()
+    pending = [node for each in expressions for node in inner_of(each)]
+    while pending:
+        node = pending.pop()
+        if node not in seen:
+            seen.add(node)
+            pending += node.inner
+    return sorted(seen, key=lambda each: each.number)
