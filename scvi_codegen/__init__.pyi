@@ -13,6 +13,7 @@ from scvi_codegen.errors import BuildError as BuildError
 from scvi_codegen.errors import CacheWarning as CacheWarning
 from scvi_codegen.errors import ControlError as ControlError
 from scvi_codegen.errors import EventError as EventError
+from scvi_codegen.errors import EventWarning as EventWarning
 from scvi_codegen.errors import ExpressionError as ExpressionError
 from scvi_codegen.errors import FitError as FitError
 from scvi_codegen.errors import MethodError as MethodError
@@ -107,6 +108,7 @@ from scvi_codegen.runtime.estimation.fitting import Fit as Fit
 from scvi_codegen.runtime.estimation.fitting import fit as fit
 from scvi_codegen.runtime.events.event import Crossings as Crossings
 from scvi_codegen.runtime.events.event import Event as Event
+from scvi_codegen.runtime.events.event import impact as impact
 from scvi_codegen.runtime.orbits.periodic_orbit import PeriodicOrbit as PeriodicOrbit
 from scvi_codegen.runtime.orbits.solver import periodic_orbit as periodic_orbit
 from scvi_codegen.runtime.run.run import Run as Run

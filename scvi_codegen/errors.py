@@ -104,7 +104,17 @@ class PackageError(ScviCodegenError, ValueError):
 
 
 class EventError(ScviCodegenError, ValueError):
-    """An invalid event: an unknown symbol, a constant function, an unknown direction or a value that is not finite."""
+    """An invalid event: an unknown symbol, a constant function, an unknown direction or a value that is not finite.
+
+    Attributes:
+        trajectory: the :class:`Trajectory` before the failure of an event that changes the state, else ``None``.
+    """
+
+    trajectory: object | None = None
+
+
+class EventWarning(UserWarning):
+    """A run that ended where its events accumulate: infinitely many impacts in finite time."""
 
 
 class PlotError(ScviCodegenError):

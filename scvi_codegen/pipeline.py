@@ -57,7 +57,7 @@ from scvi_codegen.rendering.program_source import (
     workspace_size,
 )
 from scvi_codegen.rendering.source import ArrayLayout, Interface, Source
-from scvi_codegen.runtime.events.event import EventLike, as_events
+from scvi_codegen.runtime.events.event import Event, EventLike, as_events
 from scvi_codegen.validation import SWITCH, TEXT, checks_arguments
 
 LONGEST_PREFIX = 64
@@ -344,21 +344,21 @@ def generate_source(
     """
     method = as_method(method, system)
     system = discretised_form(system, method)
-    functions = tuple(event.function for event in as_events(events)) if events else ()
-    _check_embedded(embedded, solver, functions)
+    searched = as_events(events)
+    _check_embedded(embedded, solver, searched)
     program = program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None)
     g = time_transformation
     control = density_of(system, g) if g is not None else control_of(program) if controlled else None
     source = render_embedded(program, embedded, control) if embedded else render(program, control)
     interface = describe(program, system, method, g=g)
-    complete = with_events(source, interface, functions) if functions else source
+    complete = with_events(source, interface, searched) if searched else source
     return (complete.single_file() if amalgamate else complete), interface
 
 
-def _check_embedded(embedded: Embedded | None, solver: str, functions: Sequence[str]) -> None:
+def _check_embedded(embedded: Embedded | None, solver: str, events: Sequence[Event]) -> None:
     if embedded not in (None, *EMBEDDED):
         raise MethodError(f"embedded must be {' or '.join(EMBEDDED)}, not {embedded!r}")
     if embedded and solver == "fixed-point":
         raise MethodError("solver='fixed-point' is unavailable with embedded: use 'newton' or 'explicit'")
-    if embedded and functions:
+    if embedded and events:
         raise MethodError("source for a microcontroller does not support events: omit events or embedded")

@@ -34,7 +34,8 @@ class Binding:
 
     Attributes:
         reusable: whether memory of runs may be kept for later runs.
-        integers: function that returns a pointer to the first element of a contiguous int32 array that is not empty.
+        integers, whole_numbers: functions that return a pointer to the first element of a contiguous int32 or int64
+            array that is not empty.
     """
 
     reusable = True
@@ -52,6 +53,7 @@ class Binding:
         self._ffi, self._lib, self._prefix, self._workspace = library.ffi, library.lib, prefix, workspace
         self.null, self._doubles = library.ffi.NULL, partial(library.ffi.from_buffer, "double[]")
         self.integers: Callable[[NDArray[np.int32]], Any] = partial(library.ffi.from_buffer, "int[]")
+        self.whole_numbers: Callable[[NDArray[np.int64]], Any] = partial(library.ffi.from_buffer, "long long[]")
         self._fallback = fallback if self.has("set_fallback") else None
         self._fallback_missing = self._fallback is not None
         self._fallback_binding: Self | None = None

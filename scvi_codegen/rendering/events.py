@@ -18,6 +18,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from itertools import accumulate
+from typing import cast
 
 import sympy
 from sympy import Expr, Symbol
@@ -32,6 +34,7 @@ from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Kernel, lower_matrix, lower_vector
 from scvi_codegen.rendering.program_source import EventSearch, render_events
 from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.runtime.events.event import Event, Formula
 from scvi_codegen.tables.nodes import chebyshev_lobatto, to_unit
 from scvi_codegen.tables.precision import mp
 
@@ -39,39 +42,112 @@ DEGREE = 4
 
 
 @lru_cache(maxsize=64)
-def with_events(source: Source, interface: Interface, functions: tuple[str | Expr, ...]) -> Source:
-    """Return the source of an integrator with the search for zeros of functions of its state.
+def with_events(source: Source, interface: Interface, events: tuple[Event, ...]) -> Source:
+    """Return the source of an integrator with the search for its events and their changes of the state.
 
     Args:
         source, interface: of the integrator, without events.
-        functions: formulas as text or SymPy expressions in the names of the interface.
+        events: with formulas as text or SymPy expressions in the names of the interface.
 
     Raises:
         ExpressionError: for text outside the grammar, with its column.
-        EventError: naming the invalid symbol or function.
+        EventError: naming the invalid symbol or function, or what events that change the state do not support.
     """
-    kernel, uses_velocity = _kernel(interface, functions)
-    return replace(source, beside=render_events(_search(interface, kernel, uses_velocity)))
+    formulas = EventFormulas(interface, events)
+    return replace(source, beside=render_events(_search(formulas, controlled="_advance_to(" in source.header)))
 
 
-def _kernel(interface: Interface, functions: Sequence[str | Expr]) -> tuple[Kernel, bool]:
-    """Return the kernel of the functions at u = (q, p, v), and whether any velocity occurs in them."""
-    turning = RotationNames.of_declarations(interface.rotations)
-    names = turning.symbols | _names(interface)
-    input_values = input_formulas(interface.inputs, symbol(TIME))
-    values = [turning.in_coordinates(_expression(function, names)).xreplace(input_values) for function in functions]
-    q = [symbol(name) for name in interface.coordinates]
-    v = [symbol(name + DOT) for name in interface.coordinates]
-    taken = {*q, *v, symbol(TIME), *(symbol(name) for name in interface.parameters)}
-    p = [sympy.Dummy() if symbol(name) in taken else symbol(name) for name in interface.momenta]
-    kernel = lower_kernel(
-        "event_functions",
-        arguments=(*q, *p, *v),
-        time=symbol(TIME),
-        parameters=tuple(symbol(name) for name in interface.parameters),
-        values=values,
-    )
-    return kernel, any(value.free_symbols.intersection(v) for value in values)
+class EventFormulas:
+    """Formulas of events in canonical symbols: functions, conditions, and changes of the state.
+
+    Attributes:
+        q, v, p: symbols of the state, v of its velocities.
+        functions: g of each event.
+        guards: index of its event and formula of each condition, which is satisfied where it is >= 0.
+        changes: for each event the indices of the variables among (q, p, v) that it changes, and their new values; for
+            an impact its gradient g_q, g_t, and the coefficient of restitution.
+    """
+
+    def __init__(self, interface: Interface, events: Sequence[Event]) -> None:
+        self.interface, self.events = interface, events
+        self._turning = RotationNames.of_declarations(interface.rotations)
+        self._known = self._turning.symbols | _names(interface)
+        self.q = [symbol(name) for name in interface.coordinates]
+        self.v = [symbol(name + DOT) for name in interface.coordinates]
+        self.parameters = tuple(symbol(name) for name in interface.parameters)
+        taken = {*self.q, *self.v, symbol(TIME), *self.parameters}
+        self.p = [sympy.Dummy() if symbol(name) in taken else symbol(name) for name in interface.momenta]
+        self.functions = [self._read(event.function, f"event function '{event.function}'") for event in events]
+        for event, function in zip(events, self.functions, strict=True):
+            if not function.free_symbols:
+                raise EventError(
+                    f"the event function '{event.function}' is constant and never crosses zero: use a function of the "
+                    "state or of time"
+                )
+        self.guards = [
+            (number, self._read(condition, f"condition where='{condition}'"))
+            for number, event in enumerate(events)
+            for condition in event.conditions
+        ]
+        self.changes = [self._changes(*each) for each in zip(events, self.functions, strict=True)]
+        _check_changes(interface, events)
+
+    @property
+    def arguments(self) -> tuple[Symbol, ...]:
+        """Arguments (q, p, v) of the kernels."""
+        return (*self.q, *self.p, *self.v)
+
+    def kernel(self, name: str, values: Sequence[Expr]) -> Kernel:
+        """Return the kernel of some of the formulas."""
+        time, parameters = symbol(TIME), self.parameters
+        return lower_kernel(name, arguments=self.arguments, time=time, parameters=parameters, values=values)
+
+    def _read(self, formula: Formula, what: str) -> Expr:
+        expression = self._turning.in_coordinates(_expression(formula, self._known, what))
+        return cast(Expr, expression.xreplace(input_formulas(self.interface.inputs, symbol(TIME))))
+
+    def _changes(self, event: Event, g: Expr) -> tuple[list[int], list[Expr]]:
+        if event.restitution is not None:
+            if moving := sorted(free.name for free in g.free_symbols & {*self.p, *self.v}):
+                raise EventError(
+                    f"the wall '{event.function}' of an impact contains '{moving[0]}': a wall is a function of "
+                    "positions, time and parameters; write the change of the state with then="
+                )
+            gradient = [sympy.diff(g, each) for each in (*self.q, symbol(TIME))]
+            restitution = self._read(event.restitution, f"restitution '{event.restitution}'")
+            return [0] * (len(gradient) + 1), [*gradient, restitution]
+        variables = {each: k for k, each in enumerate(self.arguments)}
+        named = {name: variables[each] for name, each in self._known.items() if each in variables}
+        indices = [named.get(name, -1) for name, _ in event.changes]
+        for index, (name, value) in zip(indices, event.changes, strict=True):
+            if index < 0:
+                raise EventError(
+                    f"then={{'{name}': '{value}'}} of the event '{event.function}': '{name}' is not a coordinate, a "
+                    f"momentum or a velocity{closest(name, named)} An event can set: {', '.join(named)}"
+                )
+        if any(index >= 2 * len(self.q) for index in indices) and any(
+            len(self.q) <= index < 2 * len(self.q) for index in indices
+        ):
+            raise EventError(
+                f"the event '{event.function}' sets momenta and velocities: set one or the other with then="
+            )
+        return indices, [self._read(value, f"value '{value}' of '{name}' in then=") for name, value in event.changes]
+
+
+def _check_changes(interface: Interface, events: Sequence[Event]) -> None:
+    """Raise :class:`EventError` where changes of the state are not supported."""
+    changing = [event for event in events if event.changes_state]
+    unsupported = {
+        "constraints": bool(interface.constraints),
+        "a time transformation": bool(interface.time_transformation or interface.energy_parameter),
+        "rotations, directions and spins": bool(interface.rotations),
+    }
+    for what, present in unsupported.items():
+        if present and changing:
+            raise EventError(
+                f"the event '{changing[0].function}' changes the state, which is not supported with {what}: make the "
+                "event terminal, change the state in Python, and start the next run from it"
+            )
 
 
 def _names(interface: Interface) -> dict[str, Symbol]:
@@ -90,32 +166,27 @@ def _names(interface: Interface) -> dict[str, Symbol]:
     }
 
 
-def _expression(function: str | Expr, names: Mapping[str, Symbol]) -> Expr:
-    """Return one function in canonical symbols."""
-    if isinstance(function, str):
-        found = parse_expression(function, names)
-    elif isinstance(function, Expr):
-        found = _translated(function)
+def _expression(formula: Formula, names: Mapping[str, Symbol], what: str) -> Expr:
+    """Return one formula in canonical symbols."""
+    if isinstance(formula, str | int | float):
+        found = parse_expression(str(formula), names)
+    elif isinstance(formula, Expr):
+        found = _translated(formula, what)
     else:
-        raise EventError(f"the function of an event must be text or a SymPy expression; got {function!r}")
+        raise EventError(f"the {what} must be text or a SymPy expression; got {formula!r}")
     problem = unsupported_part(found)
     if problem:
-        raise EventError(f"in the event function '{function}': {problem}")
+        raise EventError(f"in the {what}: {problem}")
     unknown = sorted(free.name for free in found.free_symbols.difference(names.values()))
     if unknown:
         raise EventError(
-            f"'{unknown[0]}' in the event function '{function}' is neither a coordinate, a velocity, a momentum, time, "
-            f"an input nor a parameter{closest(unknown[0], names)} Known here: {', '.join(names)}"
-        )
-    if not found.free_symbols:
-        raise EventError(
-            f"the event function '{function}' is constant and never crosses zero: use a function of the "
-            "state or of time"
+            f"'{unknown[0]}' in the {what} is neither a coordinate, a velocity, a momentum, time, an input nor a "
+            f"parameter{closest(unknown[0], names)} Known here: {', '.join(names)}"
         )
     return found
 
 
-def _translated(function: Expr) -> Expr:
+def _translated(function: Expr, what: str) -> Expr:
     """Return the expression with functions of time, their derivatives and symbols as canonical symbols."""
     rules: dict[Expr, Expr] = {free: symbol(identifier(free.name)) for free in function.free_symbols}
     for moving in function.atoms(AppliedUndef):
@@ -123,28 +194,38 @@ def _translated(function: Expr) -> Expr:
     for rate in function.atoms(sympy.Derivative):
         if not isinstance(rate.expr, AppliedUndef) or rate.derivative_count != 1:
             raise EventError(
-                f"'{rate}' in the event function '{function}' is not the velocity of a coordinate: use first "
-                "derivatives of coordinates"
+                f"'{rate}' in the {what} is not the velocity of a coordinate: use first derivatives of coordinates"
             )
         rules[rate] = symbol(identifier(rate.expr.func.__name__) + DOT)
     try:
         return evaluated(function, rules)
     except SystemDefinitionError as error:
-        raise EventError(f"in the event function '{function}': {error}") from error
+        raise EventError(f"in the {what}: {error}") from error
 
 
-def _search(interface: Interface, kernel: Kernel, uses_velocity: bool) -> EventSearch:
+def _search(formulas: EventFormulas, *, controlled: bool) -> EventSearch:
     """Return the data of the search: Chebyshev points of the second kind, and the inverse Vandermonde matrix."""
     points = chebyshev_lobatto(DEGREE).points
     inverse = mp.matrix([[x**k for k in range(DEGREE + 1)] for x in points]) ** -1
     coefficients = tuple(tuple(inverse[k, j] for j in range(DEGREE + 1)) for k in range(DEGREE + 1))
+    interface, guards = formulas.interface, [guard for _, guard in formulas.guards]
+    values = [value for _, each in formulas.changes for value in each]
+    counts = [len(each) for _, each in formulas.changes]
+    every = (*formulas.functions, *guards, *values)
     return EventSearch(
         prefix=interface.prefix,
         dimension=interface.dimension,
-        kernel=kernel,
-        uses_velocity=uses_velocity,
+        kernel=formulas.kernel("event_functions", formulas.functions),
+        uses_velocity=any(value.free_symbols.intersection(formulas.v) for value in every),
         transformed=bool(interface.energy_parameter),
         nodes=lower_vector(to_unit(points)),
         coefficients=lower_matrix(coefficients),
         doubts=(0.5 ** (DEGREE - 2), 0.5 ** (DEGREE - 1)),
+        guards=formulas.kernel("event_guards", guards) if guards else None,
+        guarded=tuple(number for number, _ in formulas.guards),
+        changes=formulas.kernel("event_changes", values) if values else None,
+        changed=tuple(index for indices, _ in formulas.changes for index in indices),
+        first_values=(0, *accumulate(counts)),
+        impacts=tuple(int(event.restitution is not None) for event in formulas.events),
+        controlled=controlled,
     )

@@ -117,6 +117,12 @@ class EventSearch:
         nodes: (d + 1,) fractions of a part of a step at which they are evaluated.
         coefficients: (d + 1, d + 1) from values there to coefficients of powers of x in [-1, 1].
         doubts: factors of the last two coefficients in the error estimate.
+        guards, guarded: conditions of crossings, and the index of the function of each.
+        changes: values of variables that crossings change; gradient and restitution of impacts.
+        changed: index among (q, p, v) of the variable of each of these values.
+        first_values: index of the first value of each function, and the number of values.
+        impacts: 1 for each function that is the wall of an impact, else 0.
+        controlled: whether steps are adaptive.
     """
 
     prefix: str
@@ -127,6 +133,18 @@ class EventSearch:
     nodes: tuple[float, ...]
     coefficients: tuple[tuple[float, ...], ...]
     doubts: tuple[float, float]
+    guards: Kernel | None
+    guarded: tuple[int, ...]
+    changes: Kernel | None
+    changed: tuple[int, ...]
+    first_values: tuple[int, ...]
+    impacts: tuple[int, ...]
+    controlled: bool
+
+    @property
+    def further(self) -> tuple[Kernel, ...]:
+        """Kernels of conditions and changes."""
+        return tuple(kernel for kernel in (self.guards, self.changes) if kernel is not None)
 
 
 def render(program: Program, control: Control | None = None, *, fallback: Fallback | None = None) -> Source:
@@ -208,8 +226,8 @@ def render_events(search: EventSearch) -> Source:
         "search": search,
         "prefix": search.prefix,
         "kernel": search.kernel,
-        "cut": is_divided((search.kernel,)),
-        "inverse_roots": inverse_roots((search.kernel,)),
+        "cut": is_divided((search.kernel, *search.further)),
+        "inverse_roots": inverse_roots((search.kernel, *search.further)),
     }
     return _render(f"{search.prefix}_events", context, "events")
 

@@ -390,6 +390,16 @@ class CompiledMethod:
             raise unavailable("dimension", self)
         return self.interface.dimension
 
+    @property
+    def changes_states(self) -> bool:
+        """Return whether events change the states of runs."""
+        return any(event.changes_state for event in self.events)
+
+    def _check_no_changes(self, what: str, *, wanted: bool = True) -> None:
+        """Raise :class:`MethodError` if something is wanted that events that change the states of runs exclude."""
+        if wanted and self.changes_states:
+            raise MethodError(f"{what} does not support events that change the state: use stepper.with_events(())")
+
     def with_events(self, events: EventLike | Sequence[EventLike]) -> Self:
         """Return the integrator with these events in place of its own."""
         wanted = as_events(events)
@@ -414,4 +424,4 @@ class CompiledMethod:
 def _event_variant(source: Source, interface: Interface, events: tuple[Event, ...]) -> Source:
     from scvi_codegen.rendering.events import with_events  # here, because it imports SymPy
 
-    return with_events(source, interface, tuple(event.function for event in events))
+    return with_events(source, interface, events)

@@ -152,6 +152,7 @@ class Stepper(Integrator):
             raise StateError("observe is not supported with inputs or t_eval: omit observe")
         if interface.rotations:
             q, p, velocity = homogeneous_state(interface, q, p, velocity)
+        stepper._check_no_changes("error=" if error else "check_growth=True", wanted=bool(error or check_growth))
         if error is not None:
             alternatives = {"h": h, "steps": steps, "tolerance": tolerance, "observe": observe}
             return confirmed_run(
@@ -340,6 +341,9 @@ class Stepper(Integrator):
         """
         if self.interface.rotations:
             q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
+        unsupported = {"error=": error, "an ensemble with inputs": inputs, "an ensemble with fixed steps (h=)": h}
+        for what, argument in unsupported.items():
+            self._check_no_changes(what, wanted=argument is not None)
         if error is not None:
             others = {"h": h, "steps": steps, "tolerance": tolerance}
             error = checked_error(error, others, has_tau=self._has_tau)

@@ -12,18 +12,18 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.errors import EventError, StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.runtime.core.validation import Array, States, columns_of_inputs, parameter_index
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, start_of_ensemble
 from scvi_codegen.runtime.ensemble.lanes import CommonRuns
-from scvi_codegen.runtime.ensemble.result import INTERRUPTED, OK, EnsembleTrajectory, Span
+from scvi_codegen.runtime.ensemble.result import EVENT_FAILED, INTERRUPTED, OK, EnsembleTrajectory, Span
 from scvi_codegen.runtime.ensemble.schedule import CommonSteps
 from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runtime.inputs.segments import (
@@ -254,7 +254,8 @@ class Ensemble:
         }
         if self.t_eval is not None:
             arguments["t_eval"] = self.t_eval[np.abs(self.t_eval - self.t0) <= abs(plan.t_end - self.t0)]
-        integrate: Callable[..., Trajectory] = self.stepper.with_events(()).integrate
+        stepper = self.stepper if self.stepper.changes_states else self.stepper.with_events(())
+        integrate: Callable[..., Trajectory] = stepper.integrate
         with without_accuracy_warnings():
             if self.error is not None:
                 with suppress(StateError, StepFailedError):
@@ -265,6 +266,10 @@ class Ensemble:
                 states = integrate(q, p, tolerance=plan.tolerance or None, **arguments)
             except StepFailedError as failure:
                 states, status = Trajectory.before(failure), failure.status
+            except EventError as failure:
+                if failure.trajectory is None:
+                    raise
+                states, status = cast(Trajectory, failure.trajectory), EVENT_FAILED
             except StateError:  # a sum of finite terms has overflowed
                 return SavedLane(np.array([self.t0]), q[np.newaxis], p[np.newaxis], "not finite", 0)
         return SavedLane(states.t, states.q, states.p, status, states.steps)

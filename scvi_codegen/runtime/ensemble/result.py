@@ -30,7 +30,7 @@ from scvi_codegen.validation import MAPPING, PATH, checks_arguments
 if TYPE_CHECKING:
     import xarray
 
-OK, INTERRUPTED = "ok", "interrupted"
+OK, INTERRUPTED, EVENT_FAILED = "ok", "interrupted", "event failed"
 
 Span: TypeAlias = tuple[slice, slice, Callable[[slice], Array]]
 """Rows of states, a slice of trajectories, and a function returning the parameters of trajectories in these rows."""

@@ -9,15 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import EventError, StateError
+from scvi_codegen.errors import EventError, EventWarning, StateError, warn
 from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.events.event import ACCUMULATED, Crossings
+from scvi_codegen.runtime.events.event import ACCUMULATED, JAMMED, THROUGH, Crossings
 from scvi_codegen.runtime.trajectory.dense_output import grid_tolerance
 from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
 
 if TYPE_CHECKING:
     from scvi_codegen.runtime.arrays.events import ArraySearch
+    from scvi_codegen.runtime.run.memory import Memory
 
 INITIAL_CAPACITY = 256
 """Initial number of crossings that one call can return; doubled when exceeded."""
@@ -34,14 +35,17 @@ class CrossingSearch:
     Attributes:
         ended: whether a terminal event occurred; ``found[-1]`` then contains its crossing.
         recorded: structured arrays (t, function, q, p), in the order of the run.
+        changes: whether crossings change the state, so that the run must be advanced by :meth:`advance`.
     """
 
     def __init__(self, stepper: Integrator, crossed: Sequence[int] = (), *, terminal: bool = True) -> None:
         self.stepper, self.binding = stepper, stepper.binding
         self.recorded: list[NDArray[Any]] = []
         self.watch = self.binding.new("watch *")
+        self.changes = terminal and stepper.changes_states
         for number, event in enumerate(stepper.events):
             self.watch.direction[number] = event.direction
+            self.watch.acts[number] = terminal and event.changes_state
             if terminal and event.terminal:
                 self.watch.remaining[number] = int(event.terminal) - (crossed[number] if crossed else 0)
         m = stepper.dimension
@@ -98,14 +102,72 @@ class CrossingSearch:
                 return done
             self._capacity *= 2
 
+    def advance(
+        self, run: Memory, size: int
+    ) -> tuple[tuple[Array, Array, Array, NDArray[np.int32]], Array, NDArray[np.int64], Exception | None]:
+        """Advance a run by at most ``size`` steps with events that change its state.
+
+        Returns:
+            The arrays t, q, p and iterations of the present state, of those at the ends of steps and of those after
+            changes; the sizes of the steps that follow them; the numbers of the steps that end there, -1 within a step;
+            and the failure that ended the run, or ``None``.
+        """
+        plan, binding, number = run._plan, self.binding, run.steps
+        most = 2 * size + self._capacity
+        rows = [np.empty((most + 1, *shape)) for shape in ((), run._q.shape, run._p.shape, ())]
+        rows[0][0], rows[1][0], rows[2][0] = run.t, run._q, run._p
+        iterations, numbers = np.zeros(most + 1, np.int32), np.full(most + 1, number, np.int64)
+        crossings, filled = binding.new(f"crossing[{self._capacity}]"), binding.numbers("long long *")
+        status = binding.function("advance_with_changes", run._memory)(
+            self.watch,
+            plan.t_end,
+            plan.tolerance,
+            size,
+            *run._arguments,
+            most,
+            *(binding.pointer(each[1:]) for each in rows),
+            binding.integers(iterations[1:]),
+            binding.whole_numbers(numbers[1:]),
+            self._capacity,
+            crossings,
+            filled,
+            run._report,
+            run._workspace,
+        )
+        self.recorded.append(np.frombuffer(binding.buffer(crossings), self._record, int(filled[0])).copy())
+        report, count = run._report, int(run._report.stored) + 1
+        failure = self._failure(status, report, number + int(report.steps), run.h) if status else None
+        if not (failure or self.ended or report.steps == size or run.arrived):
+            self._capacity *= 2  # too small for the crossings of a step
+        t, q, p, lengths = (each[:count] for each in rows)
+        sizes = np.append(lengths[1:], run.h or np.nan)
+        return (t, q, p, iterations[:count]), sizes, numbers[:count], failure
+
     def _failure(self, status: int, report: Any, step: int, h: float) -> Exception:
         if self.watch.undefined:
             function = self.stepper.events[self.watch.undefined - 1].function
             return EventError(f"the event function '{function}' is not finite in the step from t = {report.t:.17g}")
-        if self.watch.accumulated:
+        if self.watch.accumulated and not self.watch.ended:
             function = self.stepper.events[self.watch.accumulated - 1].function
             return EventError(ACCUMULATED.format(function=function, t=report.t))
+        for number, message in ((self.watch_value("through"), THROUGH), (self.watch_value("jammed"), JAMMED)):
+            if number:
+                return EventError(message.format(function=self.stepper.events[number - 1].function, t=report.t))
         return step_failure(status, report, step=step, h=h)
+
+    def watch_value(self, name: str) -> int:
+        """Return a number of the watch, 0 without changes of the state."""
+        return int(getattr(self.watch, name)) if self.changes else 0
+
+    def warn_of_accumulation(self) -> None:
+        """Issue a :class:`EventWarning` if the run ended where crossings accumulate."""
+        if self.changes and self.watch.accumulated:
+            function, t = self.stepper.events[self.watch.accumulated - 1].function, self.last[0]
+            warn(
+                f"the crossings of '{function}' accumulate at t = {self.watch.end:.17g} (infinitely many impacts in "
+                f"finite time): the run ended at t = {t:.17g}. Continue with a constraint, or ignore this warning",
+                EventWarning,
+            )
 
     @property
     def last(self) -> tuple[float, Array, Array]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,20 +15,34 @@ from scvi_codegen.representation import summary
 from scvi_codegen.validation import checked_count
 
 if TYPE_CHECKING:
-    from sympy import Expr
+    from sympy import Basic, Expr
 
 Array = NDArray[np.float64]
 DIRECTIONS = (-1, 0, 1)
+COMPARISON = re.compile(r"(>=|<=|>|<)")
 ACCUMULATED = (
     "the crossings of the terminal event '{function}' accumulate at t = {t:.17g}: the run starts at its zero and "
     "returns within a rounding error (Zeno behaviour, as of infinitely many bounces). End the run here, or continue "
     "with a constraint"
 )
 
+THROUGH = (
+    "the state passes the wall '{function}' in the step from t = {t:.17g} without an impact: it was at rest on the "
+    "wall, or two impacts are closer than rounding. End the run before that time, or continue with a constraint"
+)
+JAMMED = (
+    "the changes of the state by '{function}' do not end in the step from t = {t:.17g}: a point is jammed in a corner "
+    "that closes, or the new state crosses zero again at once. Check then= and where=, or use a smaller restitution"
+)
+
+
+Formula: TypeAlias = "str | Expr | float"
+"""Formula as text or a SymPy expression, or a number."""
+
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Zero crossings of a function g(q, v, p, t; inputs, parameters).
+    """Zero crossings of a function g(q, v, p, t; inputs, parameters), which may change the state.
 
     Attributes:
         function: g, as a formula or a SymPy expression in the coordinates, their velocities (``q_dot``), their momenta
@@ -35,15 +50,22 @@ class Event:
         direction: 1 for crossings from negative to positive in the direction of the run, -1 for the opposite, 0 both.
         terminal: ``True`` if the first crossing ends the run, or the number of the crossing that ends it. Simultaneous
             crossings of other events (two walls in a corner) are recorded as well.
+        then: new values of coordinates, and of momenta or velocities, by name: ``{"p_y": "-e*p_y"}``, formulas of the
+            state at the crossing, from which the run continues.
+        where: condition of crossings, ``"x > 1"``, or several of them; other crossings are ignored.
+        restitution: of a wall g = 0 (:func:`impact`), its coefficient; instead of ``then``.
 
     Raises:
-        EventError: if the function or the direction is invalid.
+        EventError: if the function, the direction, or a change of the state is invalid.
         StateError: if ``terminal`` is negative.
     """
 
     function: str | Expr
     direction: int = 0
     terminal: bool | int = False
+    then: Mapping[str | Expr, Formula] | tuple[tuple[str, Formula], ...] | None = None
+    where: str | Basic | tuple[str | Basic, ...] | None = None
+    restitution: Formula | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.function, str) and not hasattr(self.function, "free_symbols"):
@@ -51,6 +73,81 @@ class Event:
         if self.direction not in DIRECTIONS:
             raise EventError(f"the direction of an event must be 1, -1 or 0, not {self.direction!r}")
         checked_count(int(self.terminal) if isinstance(self.terminal, bool) else self.terminal, "terminal", least=0)
+        if self.restitution is not None and (self.then is not None or self.direction != -1):
+            raise EventError(
+                f"the wall '{self.function}' must have direction=-1 and no then=: use impact('{self.function}', "
+                f"restitution={self.restitution!r})"
+            )
+        if isinstance(self.restitution, int | float) and not 0.0 <= self.restitution <= 1.0:
+            raise EventError(f"the restitution of the wall '{self.function}' is {self.restitution}: give 0 to 1")
+        if isinstance(self.then, Mapping):
+            object.__setattr__(self, "then", tuple((_name(key), value) for key, value in self.then.items()))
+        if self.then is not None and (not isinstance(self.then, tuple) or not self.then):
+            raise EventError(
+                f"then= of the event '{self.function}' must be new values by name, {{'p_y': '-p_y'}}, not {self.then!r}"
+            )
+        if isinstance(self.where, list):
+            object.__setattr__(self, "where", tuple(self.where))
+        _ = self.conditions
+
+    @property
+    def changes_state(self) -> bool:
+        """Return whether crossings change the state."""
+        return self.then is not None or self.restitution is not None
+
+    @property
+    def changes(self) -> tuple[tuple[str, Formula], ...]:
+        """Names and new values of the variables that crossings set."""
+        return cast("tuple[tuple[str, Formula], ...]", self.then or ())
+
+    @property
+    def conditions(self) -> tuple[Formula, ...]:
+        """Formulas that are >= 0 where the conditions of ``where`` are satisfied."""
+        if self.where is None:
+            return ()
+        return tuple(map(_condition, self.where if isinstance(self.where, tuple) else (self.where,)))
+
+
+def _name(variable: Any) -> str:
+    """Return the name of a variable that an event sets, from text or SymPy."""
+    if isinstance(variable, str):
+        return variable
+    rate = getattr(variable, "expr", None)  # a derivative by time
+    name = getattr(getattr(variable if rate is None else rate, "func", None), "__name__", "")
+    return f"{name}_dot" if rate is not None else str(getattr(variable, "name", name))
+
+
+def _condition(condition: Any) -> Formula:
+    """Return the formula that is >= 0 where a condition is satisfied, ``"x > 1"`` or a SymPy relation."""
+    if isinstance(condition, str):
+        sides = COMPARISON.split(condition)
+        if len(sides) == 3 and sides[0].strip() and sides[2].strip():
+            left, right = (sides[0], sides[2]) if sides[1][0] == ">" else (sides[2], sides[0])
+            return f"({left.strip()}) - ({right.strip()})"
+    elif hasattr(condition, "gts"):
+        return cast(Formula, condition.gts - condition.lts)
+    raise EventError(f"where= must be a comparison such as 'x > 1', or several of them, not {condition!r}")
+
+
+def impact(
+    function: str | Expr,
+    restitution: Formula = 1.0,
+    *,
+    where: str | Basic | tuple[str | Basic, ...] | None = None,
+    terminal: bool | int = False,
+) -> Event:
+    """Return the event of frictionless impacts on the wall g(q, t) = 0 of the region g > 0.
+
+    The impulse is normal, p += lambda g_q. With ``restitution=1`` it conserves energy, H(p + lambda g_q) - H(p) =
+    -lambda g_t; with a coefficient e < 1 it is (1 + e)/2 of that, which is Newton's rule where the kinetic energy is
+    quadratic. A point that touches several walls is reflected by each in turn.
+
+    Args:
+        function: g, in coordinates, time and parameters; a wall that depends on time moves.
+        restitution: coefficient e, a number from 0 to 1 or a formula.
+        where, terminal: as of :class:`Event`.
+    """
+    return Event(function, direction=-1, terminal=terminal, where=where, restitution=restitution)
 
 
 EventLike: TypeAlias = "Event | str | Expr"

@@ -114,7 +114,7 @@ def warn_of_energy_error(trajectory: SavedStates, run: Memory) -> None:
         limits = {"tolerable": GROSS_ERROR, "why": FIXED_STEP_REMEDY}
     elif plan.h or plan.tau:
         return
-    if not stepper.interface.conserves_energy or not _warnings_enabled.get():
+    if not stepper.interface.conserves_energy or stepper.changes_states or not _warnings_enabled.get():
         return
     t, q, p = trajectory.t, trajectory.q, trajectory.p
     ends = run._end_energies(t, q, p)
@@ -127,7 +127,7 @@ def warn_of_energy_error(trajectory: SavedStates, run: Memory) -> None:
 def warn_of_energy_errors(ensemble: EnsembleEnergyData) -> None:
     """Issue the warning of :func:`warn_of_energy_error` for the worst of ``MOST_CHECKED`` trajectories."""
     plans, stepper = ensemble.plans, ensemble.stepper
-    if not plans or not stepper.interface.conserves_energy or not _warnings_enabled.get():
+    if stepper.changes_states or not (plans and stepper.interface.conserves_energy and _warnings_enabled.get()):
         return
     by_trajectory = {}
     for j, (t, q, p, _, _) in islice(enumerate(ensemble.each()), 0, None, -(-len(plans) // MOST_CHECKED)):
@@ -261,6 +261,8 @@ def warn_of_error_growth(
     """
     plan = run.plan
     if plan.h or plan.tau or requested is False or len(states.t) < 2 or not warnings_wanted():
+        return
+    if run.stepper.changes_states:
         return
     if requested or run.steps * DECADES_PER_STEP >= _thresholds(plan.tolerance)[2]:
         _Repetition(run, states, advance_until).warn(requested=bool(requested))

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.errors import EventError, StateError, StepFailedError
 from scvi_codegen.native.arguments import real_array
-from scvi_codegen.runtime.events.detection import search_of
+from scvi_codegen.runtime.events.detection import CrossingSearch, search_of
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.run_loop import record, trajectory_of
@@ -108,12 +108,17 @@ class Observation:
             failure.trajectory = self.trajectory()
             raise
         trajectory = self.trajectory()
+        if isinstance(self.search, CrossingSearch):
+            self.search.warn_of_accumulation()
         if self.times is None and not self.ended:
             run.iterations = self.iterations - int(trajectory.iterations.sum())
         return trajectory
 
     def _advance_chunk(self, size: int) -> None:
         """Advance by one chunk, search it for events and save it; a failure after a terminal event is ignored."""
+        if isinstance(self.search, CrossingSearch) and self.search.changes:
+            self._advance_with_changes(self.search, size)
+            return
         before, failure = self.run.snapshot, None
         try:
             part = record(self.run, size)
@@ -128,6 +133,20 @@ class Observation:
                 self.run.rollback(before)
                 part, failure, self.arrived = self._ended(record(self.run, reached)), None, False
         self._keep(part)
+        if failure is not None:
+            raise failure
+
+    def _advance_with_changes(self, search: CrossingSearch, size: int) -> None:
+        """Advance by one chunk with events that change the state."""
+        run = self.run
+        (t, q, p, iterations), lengths, numbers, failure = search.advance(run, size)
+        self.arrived = self.end is not None and t[-1] == self.end
+        if self.times is None and self.save_every == 1 and len(t) > 1:
+            self.states[-1][3][-1] = lengths[0]  # known only now: an event may have cut this step
+        part = trajectory_of(run, (t, run.stepper.named(q), run.stepper.named(p), iterations), lengths)
+        self._keep(part, numbers=numbers)
+        if isinstance(failure, EventError):
+            failure.trajectory = self.trajectory()
         if failure is not None:
             raise failure
 
@@ -181,15 +200,18 @@ class Observation:
             np.append(part.stepped, t if tau is None else tau),
         )
 
-    def _keep(self, part: Trajectory, *, first: bool = False) -> None:
-        """Save the requested states of a chunk; its first state is already saved unless ``first``."""
+    def _keep(self, part: Trajectory, *, first: bool = False, numbers: NDArray[np.int64] | None = None) -> None:
+        """Save the requested states of a chunk; its first state is already saved unless ``first``.
+
+        ``numbers`` are those of the steps that end at the states, -1 for states within a step.
+        """
         total = self.iterations + np.cumsum(part.iterations, dtype=np.int64)
         self.iterations = int(total[-1])
         if self.times is not None:
             self._keep_times(part, total, first=first)
             return
-        number = self.run.steps - (len(part) - 1 - self.ended) + np.arange(len(part))
-        wanted = number % self.save_every == 0
+        number = self.run.steps - (len(part) - 1 - self.ended) + np.arange(len(part)) if numbers is None else numbers
+        wanted = number % self.save_every == 0  # states within a step only if all are saved
         wanted[0] = first
         wanted[-1] |= self.ended or self.run.arrived
         q, p = part.q[wanted], part.p[wanted]

@@ -9,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from scvi_codegen.errors import StateError
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.constraints.projection import constraint_values, multipliers
 from scvi_codegen.runtime.core.integrator import Integrator
@@ -22,6 +23,7 @@ from scvi_codegen.runtime.run.one_thread import alone
 from scvi_codegen.runtime.run.run_loop import FIRST_STEPS, StateRows, record
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
+from scvi_codegen.validation import LARGEST_COUNT
 
 MOST_KEPT = 2**16
 """Largest number of doubles of workspace of a run that is kept for later calls."""
@@ -80,6 +82,21 @@ class Run(Memory, AttitudeHistory):
             warn_of_large_steps(trajectory, before=before)
         warn_of_energy_error(trajectory, self)
         return trajectory
+
+    def advance(
+        self,
+        steps: int,
+        *,
+        progress: Callable[[int], None] | None = None,
+        stop: Callable[[], bool] | None = None,
+    ) -> None:
+        """Take steps as :meth:`Memory.advance`, with the changes of the state by events."""
+        if not self.stepper.changes_states:
+            super().advance(steps, progress=progress, stop=stop)
+        elif stop is not None:
+            raise StateError("stop is not supported with events that change the state: omit stop")
+        else:
+            self.record(steps, save_every=LARGEST_COUNT, progress=progress)
 
     def _recorded(
         self,

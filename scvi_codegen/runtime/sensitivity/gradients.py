@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +18,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.representation import summary
 from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.events.saltation import Jump, jumps_within
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.sensitivity.step_derivatives import LinearisedMethod, Sensitivity, Starts
@@ -174,9 +176,24 @@ def forward(states: SavedStates, tangents: Array) -> tuple[Array, Array]:
 
 def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], vectors: Array, *, back: bool) -> None:
     """Propagate tangent or adjoint vectors along the steps of a segment and compare its step ends with the run."""
-    ends = states.stepper._propagate(starts, vectors, states.parameters, states.options, transpose=back)
-    known = np.concatenate([starts.q, starts.p], axis=1)
-    check_recomputed(starts.t, np.concatenate(ends, axis=1), known[1:], known[:-1])
+    jumps: dict[int, Jump] = {}
+    if states.stepper.changes_states:
+        more = back or bool(vectors[..., 2 * states.stepper.dimension :].any())
+        jumps = jumps_within(states, starts, numbers, all_inputs=more)
+    parts = list(pairwise(sorted({0, len(starts.h), *jumps})))
+    for first, last in reversed(parts) if back else parts:
+        if back and last in jumps:
+            vectors[last] = vectors[last] @ jumps[last].matrix
+        part = starts.part(first, last) if jumps else starts
+        ends = states.stepper._propagate(
+            part, vectors[first : last + 1], states.parameters, states.options, transpose=back
+        )
+        known = np.concatenate([part.q, part.p], axis=1)
+        if last in jumps:
+            known[-1] = jumps[last].before
+            if not back:
+                vectors[last] = vectors[last] @ jumps[last].matrix.T
+        check_recomputed(part.t, np.concatenate(ends, axis=1), known[1:], known[:-1])
 
 
 def pieces(states: SavedStates) -> Iterator[tuple[int, int]]:

@@ -113,6 +113,7 @@ class LinearisedMethod(StateFunctions):
         if self.interface.time_transformation:
             raise MethodError(f"{what} requires fixed steps h: compile the stepper without time_transformation")
         self._check_physical_time(what)
+        self._check_no_changes(what)
 
     def _check_physical_time(self, what: str) -> None:
         """Raise :class:`MethodError` in transformed time."""

@@ -65,14 +65,23 @@ enum {
 typedef NAME(watch) event_watch;
 typedef NAME(crossing) event_crossing;
 
+#ifndef EVENT_GUARDS
+#define EVENT_GUARDS 0 /* values of the kernel event_guards: conditions of crossings, each of the function GUARDED */
+#endif
+
+/* Arguments (q, p, v) of the kernels of events at a state. */
+static int event_arguments(real t, const real *q, const real *p, const real *parameters, real *u, real *workspace)
+{
+  memcpy(u, q, sizeof(real) * M);
+  memcpy(u + M, p, sizeof(real) * M);
+  memset(u + 2 * M, 0, sizeof(real) * M);
+  return EVENTS_USE_VELOCITIES ? event_velocity(t, q, p, parameters, u + 2 * M, workspace) : OK;
+}
+
 int NAME(event_values)(real t, const real *q, const real *p, const real *parameters, real *value, real *workspace)
 {
   real u[3 * M];
-  int status = OK;
-  memcpy(u, q, sizeof(real) * M);
-  memcpy(u + M, p, sizeof(real) * M);
-  if (EVENTS_USE_VELOCITIES)
-    status = event_velocity(t, q, p, parameters, u + 2 * M, workspace);
+  const int status = event_arguments(t, q, p, parameters, u, workspace);
   if (status != OK)
     return status;
   event_functions(u, t, parameters, value);
@@ -86,7 +95,7 @@ typedef struct {
 
 /* A step that is searched, and the array for its crossings. */
 typedef struct {
-  real t, h;
+  real t, h, whole; /* of a part of a step; of the whole step */
   const real *q, *p, *parameters;
   const solver_options *options;
   event_watch *watch;
@@ -409,7 +418,8 @@ static int leave_zero(const event_step *step, int e, const event_sample *left, r
       return status;
     if (!away && fabs(next.g[e]) <= 8.0 * noise + 4.0 * fabs(left->g[e]))
       continue;
-    if (!away && sign * next.g[e] < 0.0 && step->watch->remaining[e] > 0 && step->watch->direction[e] != sign) {
+    if (!away && sign * next.g[e] < 0.0 && (step->watch->remaining[e] > 0 || step->watch->acts[e]) &&
+        step->watch->direction[e] != sign) {
       step->watch->accumulated = e + 1;
       return NOT_CONVERGED;
     }
@@ -452,12 +462,31 @@ static int search_step(const event_step *step, const event_sample *left, const e
   return OK;
 }
 
-/* Counts a crossing; returns 1 if it ends the search. */
+/* Counts a crossing; returns 1 if it ends the search, or changes the state. */
 static int ends_search(event_watch *watch, const event_crossing *crossing)
 {
   int *remaining = watch->remaining + crossing->function;
   watch->ended |= *remaining > 0 && --*remaining == 0;
-  return watch->ended;
+  return watch->ended || watch->acts[crossing->function];
+}
+
+/* Sets *open to 1 if the conditions of a function are satisfied at a state, all g >= 0, else to 0. */
+static int check_guards(const event_step *step, int e, real t, const real *q, const real *p, int *open)
+{
+  int status = OK;
+  *open = 1;
+#if EVENT_GUARDS > 0
+  real u[3 * M], value[EVENT_GUARDS];
+  status = event_arguments(t, q, p, step->parameters, u, step->workspace);
+  if (status != OK)
+    return status;
+  event_guards(u, t, step->parameters, value);
+  for (int i = 0; i < EVENT_GUARDS; i++)
+    *open &= GUARDED[i] != e || value[i] >= 0.0;
+#else
+  (void)step, (void)e, (void)t, (void)q, (void)p;
+#endif
+  return status;
 }
 
 /* After the crossing that ends the search, keeps those of other functions that have already changed sign at its state:
@@ -485,16 +514,26 @@ static int keep_coincident(const event_step *step, long long last)
   return status;
 }
 
-/* Sorts the crossings of one step by their fractions, as times may coincide, and drops those after the one that ends
- * the search. */
+/* Sorts the crossings of one step by their fractions, as times may coincide, and drops those whose conditions are not
+ * satisfied and those after the one that ends the search or changes the state. */
 static int settle_crossings(const event_step *step, long long first)
 {
+  long long kept = first;
   for (long long i = first + 1; i < *step->filled; i++)
     for (long long k = i; k > first && step->found[k].fraction < step->found[k - 1].fraction; k--) {
       const event_crossing later = step->found[k - 1];
       step->found[k - 1] = step->found[k];
       step->found[k] = later;
     }
+  for (long long i = first; i < *step->filled; i++) {
+    const event_crossing *now = step->found + i;
+    int open, status = check_guards(step, now->function, now->t, now->q, now->p, &open);
+    if (status != OK)
+      return status;
+    if (open)
+      step->found[kept++] = *now;
+  }
+  *step->filled = kept;
   for (long long i = first; i < *step->filled; i++)
     if (ends_search(step->watch, step->found + i))
       return keep_coincident(step, i);
@@ -510,8 +549,8 @@ int NAME(crossings)(event_watch *watch, long long count, const real *h, const re
   *filled = 0;
   for (long long k = 0; k < count && !watch->ended; k++) {
     const long long start = k > 0 ? k - 1 : 0, first = *filled;
-    const event_step step = {t[start], h[start], q + start * M, p + start * M, parameters, options, watch, found, room,
-        filled, report, workspace};
+    const event_step step = {t[start], h[start], h[start], q + start * M, p + start * M, parameters, options, watch,
+        found, room, filled, report, workspace};
     int status;
     report->t = t[start];
     right.fraction = k > 0 ? 1.0 : 0.0;

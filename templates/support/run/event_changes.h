@@ -1,0 +1,466 @@
+#ifndef SUPPORT_EVENT_CHANGES_H
+#define SUPPORT_EVENT_CHANGES_H
+
+#include "events.h"
+
+/* Runs whose events change the state: impacts, impulses, switches.
+ *
+ * A step is searched for crossings, advanced to the first that changes the state by a partial step, changed, and
+ * continued from there: fixed steps to the end of the step, adaptive ones by a new step. Frictionless impacts change p
+ * by lambda n, n = g_q; lambda = (1 + e)/2 lambda_1, where lambda_1 conserves energy:
+ * H(p + lambda_1 n) - H(p) = -lambda_1 g_t. Requires: events.h, the kernel event_changes, CHANGE_VALUES, FIRST_VALUE,
+ * IS_IMPACT, CHANGED, ADAPTIVE. */
+enum {
+  CHANGE_ROUNDS = 20, /* largest number of passes over the walls of a corner */
+  CHANGES_IN_STEP = 100000, /* largest number of changes of the state in a step */
+  CHANGE_ITERATIONS = 50, /* of Newton's method for an impulse */
+  CHANGE_GAPS = 8, /* intervals between hits from which their accumulation is estimated */
+  CHANGE_SAFETY = 64 /* roundings by which a state may be behind a wall */
+};
+
+#define CHANGE_WHOLE 1e-9 /* relative to a step: a difference of its end from t_end that is rounding */
+#define CHANGE_RATIO 1e-3 /* relative spread of the ratios of intervals that accumulate */
+#define CHANGE_END 1e-6 /* relative to a step: remaining time at which an accumulation ends the run */
+
+typedef NAME(run) event_run;
+
+/* Wall of an impact at a state: n = (g_q, g_t, e); the rate of g in the direction of the run, a bound of its terms, and
+ * how far rounding may move the state behind the wall. */
+typedef struct {
+  real value[CHANGE_VALUES], rate, size, slack;
+  const real *n;
+} event_wall;
+
+static void copy_state(real *q, real *p, const real *q0, const real *p0)
+{
+  memcpy(q, q0, sizeof(real) * M);
+  memcpy(p, p0, sizeof(real) * M);
+}
+
+/* Velocities at p + lambda n, and n.v + g_t. */
+static int approach(const event_step *step, const event_sample *at, const real *n, real lambda, real *v, real *rate)
+{
+  real p[M];
+  int status;
+  for (int i = 0; i < M; i++)
+    p[i] = at->p[i] + lambda * n[i];
+  status = NAME(velocity)(at->t, at->q, p, step->parameters, v, step->workspace);
+  *rate = n[M];
+  for (int i = 0; i < M; i++)
+    *rate += n[i] * v[i];
+  return status;
+}
+
+/* Values of the kernel event_changes; the wall of function e if it is one. */
+static int evaluate_changes(const event_step *step, int e, const event_sample *at, event_wall *wall)
+{
+  real u[3 * M], v[M];
+  int status = event_arguments(at->t, at->q, at->p, step->parameters, u, step->workspace);
+  if (status == OK)
+    event_changes(u, at->t, step->parameters, wall->value);
+  if (status != OK || !IS_IMPACT[e])
+    return status;
+  wall->n = wall->value + FIRST_VALUE[e];
+  status = approach(step, at, wall->n, 0.0, v, &wall->rate);
+  wall->size = fabs(wall->n[M]);
+  wall->slack = fabs(wall->n[M] * at->t);
+  for (int i = 0; status == OK && i < M; i++) {
+    wall->size += fabs(wall->n[i] * v[i]);
+    wall->slack += fabs(wall->n[i]) * (fabs(at->q[i]) + fabs(v[i] * step->h));
+  }
+  wall->slack *= CHANGE_SAFETY * DBL_EPSILON;
+  wall->rate *= step->h < 0.0 ? -1.0 : 1.0;
+  return status;
+}
+
+/* Impulse of an impact: p += (1 + e)/2 lambda_1 n. Where the kinetic energy is quadratic, lambda_1 = -2 rate / (n.W n),
+ * W = H_pp, reverses the rate; else Newton's method solves the energy equation, whose derivative by lambda is the rate.
+ * A run backward in time undoes the impact. */
+static int impact(const event_step *step, event_sample *at, const event_wall *wall)
+{
+  const real *n = wall->n, restitution = step->h < 0.0 ? 1.0 / n[M + 1] : n[M + 1];
+  const real rate = step->h < 0.0 ? -wall->rate : wall->rate;
+  event_sample moved = *at;
+  real v[M], lambda, at_rest = 0.0, after = 0.0, energy = 0.0, now = 0.0, correction, before = INFINITY;
+  int status;
+  memset(moved.p, 0, sizeof moved.p);
+  status = approach(step, &moved, n, 0.0, v, &at_rest);
+  if (status == OK)
+    status = approach(step, &moved, n, 1.0, v, &after);
+  lambda = -2.0 * rate / (after - at_rest);
+  if (status == OK)
+    status = approach(step, at, n, lambda, v, &after);
+  if (status == OK && !(fabs(after + rate) <= CHANGE_SAFETY * DBL_EPSILON * wall->size))
+    status = NAME(energy)(at->t, at->q, at->p, step->parameters, &energy, step->workspace);
+  else
+    before = 0.0; /* the kinetic energy is quadratic */
+  for (int k = 0; before > 0.0 && status == OK && k < CHANGE_ITERATIONS && !(after * rate < 0.0); k++) {
+    lambda *= 2.0; /* beyond the minimum of the convex energy: Newton's method does not return to lambda = 0 */
+    status = approach(step, at, n, lambda, v, &after);
+  }
+  for (int k = 0; status == OK && k < CHANGE_ITERATIONS; k++) {
+    for (int i = 0; i < M; i++)
+      moved.p[i] = at->p[i] + lambda * n[i];
+    if (before > 0.0)
+      status = NAME(energy)(at->t, at->q, moved.p, step->parameters, &now, step->workspace);
+    correction = (now - energy + lambda * n[M]) / after;
+    if (status != OK || !(fabs(correction) < before))
+      break; /* the correction is rounding of the energy */
+    before = fabs(correction);
+    lambda -= correction;
+    status = approach(step, at, n, lambda, v, &after);
+  }
+  for (int i = 0; i < M; i++)
+    at->p[i] += 0.5 * (1.0 + restitution) * lambda * n[i];
+  return status;
+}
+
+/* Sets the variables of a map to its values; velocities are set last, by their momenta. */
+static int apply_map(const event_step *step, int e, event_sample *at, const real *value)
+{
+  const event_sample before = *at;
+  real v[M];
+  int by_velocity = 0, status = OK;
+  for (int i = FIRST_VALUE[e]; i < FIRST_VALUE[e + 1]; i++) {
+    by_velocity |= CHANGED[i] >= 2 * M;
+    if (CHANGED[i] < M)
+      at->q[CHANGED[i]] = value[i];
+    else if (CHANGED[i] < 2 * M)
+      at->p[CHANGED[i] - M] = value[i];
+  }
+  if (!by_velocity)
+    return OK;
+  status = NAME(velocity)(before.t, before.q, before.p, step->parameters, v, step->workspace);
+  for (int i = FIRST_VALUE[e]; i < FIRST_VALUE[e + 1]; i++)
+    if (CHANGED[i] >= 2 * M)
+      v[CHANGED[i] - 2 * M] = value[i];
+  return status == OK ? NAME(momentum)(at->t, at->q, v, step->parameters, at->p, step->workspace) : status;
+}
+
+/* Changes the state by function e: by its map, or by an impact if the wall is approached. */
+static int change_state(const event_step *step, int e, event_sample *at)
+{
+  event_wall wall;
+  int status = evaluate_changes(step, e, at, &wall);
+  if (status == OK && IS_IMPACT[e] && wall.rate < 0.0) {
+    step->watch->rounding[e] = wall.slack / -wall.rate;
+    status = impact(step, at, &wall);
+  } else if (status == OK && !IS_IMPACT[e])
+    status = apply_map(step, e, at, wall.value);
+  if (status == OK && !(all_finite(at->q, M) && all_finite(at->p, M))) {
+    step->watch->undefined = e + 1;
+    status = NOT_FINITE;
+  }
+  return status;
+}
+
+/* Records the interval since the last hit. If the last intervals decrease geometrically and the remaining ones are
+ * negligible, crossings accumulate: the search ends and watch->end is the sum of the series. */
+static void note_hit(const event_step *step, int e, real t)
+{
+  event_watch *watch = step->watch;
+  real *gaps = watch->gaps[e], low = INFINITY, high = 0.0, ratio = 0.0, last;
+  memmove(gaps, gaps + 1, sizeof(real) * (CHANGE_GAPS - 1));
+  last = gaps[CHANGE_GAPS - 1] = fabs(watch->since[e]);
+  watch->since[e] = 0.0;
+  watch->hits[e] += watch->hits[e] <= CHANGE_GAPS;
+  for (int k = 1; k < CHANGE_GAPS; k++) {
+    ratio = gaps[k] / gaps[k - 1];
+    low = fmin(low, ratio);
+    high = fmax(high, ratio);
+  }
+  watch->end = t + (step->h < 0.0 ? -1.0 : 1.0) * (ratio < 1.0 ? last * ratio / (1.0 - ratio) : 0.0);
+  if (watch->hits[e] > CHANGE_GAPS && high < 1.0 &&
+      high - low <= CHANGE_RATIO * ratio + 50.0 * DBL_EPSILON * fabs(t) / last + watch->rounding[e] / last &&
+      last * ratio / (1.0 - ratio) < CHANGE_END * fabs(step->whole)) {
+    watch->accumulated = e + 1;
+    watch->ended = 1;
+  }
+}
+
+/* State of the crossings from `first` on. That of an impact is moved back along the flow by g / (dg/dt), at most the
+ * resolution of a fraction of the step, so that large steps do not enter walls by many roundings. */
+static int refine_crossing(const event_step *step, long long first, event_sample *at, real *part)
+{
+  event_crossing *crossing = step->found + first;
+  event_sample moved;
+  event_wall wall;
+  solver_report own;
+  real back = 0.0;
+  int status;
+  at->t = crossing->t;
+  copy_state(at->q, at->p, crossing->q, crossing->p);
+  status = evaluate_functions(step, at);
+  if (status != OK || !IS_IMPACT[crossing->function])
+    return status;
+  status = evaluate_changes(step, crossing->function, at, &wall);
+  back = at->g[crossing->function] / wall.rate; /* in the direction of the run */
+  if (status != OK || !(back > 0.0 && back <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->h)))
+    return status;
+  back = step->h < 0.0 ? -back : back;
+  status = NAME(step)(at->t, -back, at->q, at->p, step->parameters, step->options, moved.q, moved.p, &own,
+      step->workspace);
+  at->t -= back;
+  *part -= back;
+  copy_state(at->q, at->p, moved.q, moved.p);
+  for (long long i = first; i < *step->filled; i++) {
+    step->found[i].t = at->t;
+    copy_state(step->found[i].q, step->found[i].p, at->q, at->p);
+  }
+  return status;
+}
+
+/* Changes the state at the crossings from `first` on, which have one state, then at all walls that it touches within
+ * rounding and approaches, in their order, until there is none; walls that are met there are crossings, too. */
+static int change_at_crossings(const event_step *step, long long first, event_sample *at)
+{
+  int met = 1, status = OK;
+  const long long last = *step->filled;
+  for (long long i = first; status == OK && i < last; i++)
+    if (step->watch->acts[step->found[i].function]) {
+      status = change_state(step, step->found[i].function, at);
+      note_hit(step, step->found[i].function, at->t);
+    }
+  for (int round = 0; status == OK && met; round++) {
+    met = 0;
+    status = evaluate_functions(step, at);
+    for (int e = 0; status == OK && e < EVENTS; e++) {
+      event_wall wall;
+      int open = 0, known = 0;
+      if (!IS_IMPACT[e] || !step->watch->acts[e])
+        continue;
+      status = evaluate_changes(step, e, at, &wall);
+      if (status == OK && fabs(at->g[e]) <= wall.slack && wall.rate < -CHANGE_SAFETY * DBL_EPSILON * wall.size)
+        status = check_guards(step, e, at->t, at->q, at->p, &open);
+      if (status != OK || !open)
+        continue;
+      met = 1;
+      if (round == CHANGE_ROUNDS) {
+        step->watch->jammed = e + 1;
+        return NOT_CONVERGED;
+      }
+      status = change_state(step, e, at);
+      for (long long i = first; i < *step->filled; i++)
+        known |= step->found[i].function == e;
+      if (known)
+        continue;
+      if (*step->filled == step->room)
+        return EVENT_NO_ROOM;
+      step->found[*step->filled] = step->found[first];
+      step->found[*step->filled].function = e;
+      step->found[*step->filled].direction = -1;
+      ends_search(step->watch, step->found + *step->filled);
+      ++*step->filled;
+    }
+  }
+  return status;
+}
+
+/* Fails if a step that began before a wall ends behind it without a crossing: contact that persists. */
+static int check_walls(const event_step *step, const event_sample *left, const event_sample *right)
+{
+  int status = OK;
+  for (int e = 0; status == OK && e < EVENTS; e++) {
+    event_wall wall;
+    int open;
+    if (!IS_IMPACT[e] || !step->watch->acts[e] || right->g[e] >= 0.0)
+      continue;
+    status = evaluate_changes(step, e, left, &wall);
+    if (status == OK)
+      status = check_guards(step, e, right->t, right->q, right->p, &open);
+    if (status == OK && open && left->g[e] >= -wall.slack && right->g[e] < -wall.slack) {
+      step->watch->through = e + 1;
+      status = NOT_CONVERGED;
+    }
+  }
+  return status;
+}
+
+/* Arrays for the states of a call. */
+typedef struct {
+  long long states, *number;
+  real *t, *q, *p, *length;
+  int *iterations;
+} stored_states;
+
+static int store_state(const stored_states *to, const event_sample *at, real length, int iterations, long long number,
+    solver_report *report)
+{
+  const long long k = report->stored;
+  if (k == to->states)
+    return EVENT_NO_ROOM;
+  to->t[k] = at->t;
+  to->length[k] = length;
+  to->iterations[k] = iterations;
+  to->number[k] = number;
+  copy_state(to->q + k * M, to->p + k * M, at->q, at->p);
+  report->stored++;
+  return OK;
+}
+
+/* Sets the state of a run, without predictor and compensation terms. */
+static void set_run(event_run *run, real t, const event_sample *at)
+{
+  run->t = t;
+  copy_state(run->q, run->p, at->q, at->p);
+  memset(run->carry_q, 0, sizeof run->carry_q);
+  memset(run->carry_p, 0, sizeof run->carry_p);
+  run->guess = 0;
+}
+
+/* Searches a step of a run that was at `before`, changes the state at crossings and continues the step. */
+static int change_in_step(const event_run *before, event_run *run, event_step *step, real length, int iterations,
+    const stored_states *to)
+{
+  event_sample left = {.t = before->t}, right = {.fraction = 1.0, .t = run->t};
+  int status;
+  step->whole = length;
+  copy_state(left.q, left.p, before->q, before->p);
+  copy_state(right.q, right.p, run->q, run->p);
+  status = evaluate_functions(step, &left);
+  for (int changes = 0; status == OK; changes++) {
+    const long long first = *step->filled;
+    long long group = first;
+    event_sample at;
+    solver_report own;
+    real part = length;
+    int acts = 0, ends;
+    step->t = left.t;
+    step->h = length;
+    step->q = left.q;
+    step->p = left.p;
+    status = evaluate_functions(step, &right);
+    if (status == OK)
+      status = search_step(step, &left, &right);
+    if (status == OK)
+      status = settle_crossings(step, first);
+    if (status == NOT_CONVERGED && step->watch->accumulated) {
+      step->watch->ended = 1; /* the start of this part is where crossings accumulate */
+      *run = *before;
+      run->t_low = 0.0;
+      set_run(run, left.t, &left);
+      return OK;
+    }
+    if (status != OK)
+      return status;
+    for (long long i = first; i < *step->filled; i++)
+      acts |= step->watch->acts[step->found[i].function];
+    if (acts || step->watch->ended) {
+      while (step->found[group].fraction != step->found[*step->filled - 1].fraction)
+        group++;
+      part *= step->found[group].fraction;
+      status = refine_crossing(step, group, &at, &part);
+    }
+    for (int e = 0; e < EVENTS; e++)
+      step->watch->since[e] += part;
+    if (!acts && !step->watch->ended) {
+      step->watch->started = 1;
+      if (changes > 0)
+        set_run(run, run->t, &right);
+      status = check_walls(step, &left, &right);
+      return status == OK ? store_state(to, &right, length, iterations, run->step, step->report) : status;
+    }
+    if (status == OK)
+      status = change_at_crossings(step, group, &at);
+    length -= part;
+    ends = fabs(length) <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->whole);
+    if (status == OK)
+      status = store_state(to, &at, part, ends ? iterations : 0, ends ? run->step : -1, step->report);
+    if (status == OK && !ends && changes == CHANGES_IN_STEP) {
+      step->watch->jammed = step->found[group].function + 1;
+      status = NOT_CONVERGED;
+    }
+    step->watch->started = 0;
+    if (status == OK && (ends || ADAPTIVE || step->watch->ended)) {
+      if (!ends) {
+        *run = *before;
+        run->step += ADAPTIVE;
+        run->t_low = 0.0;
+      }
+      set_run(run, ends ? run->t : at.t, &at);
+      return OK;
+    }
+    left = at;
+    left.fraction = 0.0;
+    if (status == OK)
+      status = evaluate_functions(step, &left);
+    if (status == OK)
+      status = NAME(step)(left.t, length, left.q, left.p, step->parameters, step->options, right.q, right.p, &own,
+          step->workspace);
+  }
+  return status;
+}
+
+/* One step of a run, shorter if it would pass t_end; returns its size in *length. */
+static int take_step(event_run *run, real t_end, real tolerance, const event_step *step, real *length, int *iterations)
+{
+  real t, q[M], p[M];
+  const real start = run->t, left = (t_end - run->t) - run->t_low;
+  solver_report own;
+  int status;
+#if EVENTS_CONTROLLED
+  status = NAME(advance_to)(run, t_end, tolerance, 1, 1, step->parameters, step->options, &t, q, p, iterations, &own,
+      step->workspace);
+  *length = run->t - start;
+  (void)left;
+#else
+  (void)tolerance, (void)start;
+  *length = run->h;
+  if (fabs(left) >= (1.0 - CHANGE_WHOLE) * fabs(run->h))
+    status = NAME(advance)(run, 1, 1, step->parameters, step->options, &t, q, p, iterations, &own, step->workspace);
+  else {
+    event_sample end;
+    *length = left;
+    status = NAME(step)(run->t, left, run->q, run->p, step->parameters, step->options, end.q, end.p, &own,
+        step->workspace);
+    *iterations = (int)own.iterations;
+    if (status == OK)
+      set_run(run, t_end, &end);
+    run->t_low = 0.0;
+    run->step++;
+  }
+#endif
+  step->report->t = start;
+  step->report->change = own.change;
+  step->report->iterations += own.iterations;
+  return status;
+}
+
+int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, real tolerance, long long steps,
+    const real *parameters, const solver_options *options, long long states, real *t, real *q, real *p, real *length,
+    int *iterations, long long *number, long long room, event_crossing *found, long long *filled, solver_report *report,
+    real *workspace)
+{
+  const event_watch initial = *watch;
+  const stored_states to = {states, number, t, q, p, length, iterations};
+  int status = OK;
+  memset(report, 0, sizeof *report);
+  *filled = 0;
+  while (report->steps < steps && !watch->ended && (t_end - run->t) - run->t_low != 0.0) {
+    const event_run before = *run;
+    const event_watch watched = *watch;
+    const long long kept = report->stored, crossed = *filled;
+    event_step step = {0.0, 0.0, 0.0, NULL, NULL, parameters, options, watch, found, room, filled, report, workspace};
+    real size;
+    int count = 0;
+    status = take_step(run, t_end, tolerance, &step, &size, &count);
+    if (status == OK)
+      status = change_in_step(&before, run, &step, size, count, &to);
+    if (status != OK) {
+      *run = before;
+      report->stored = kept;
+      *filled = crossed;
+      if (status == EVENT_NO_ROOM) {
+        *watch = watched;
+        return OK;
+      }
+      if (status > STATUS(SPURIOUS_SOLUTION))
+        *watch = initial; /* the call is repeated */
+      return status;
+    }
+    report->steps++;
+  }
+  return OK;
+}
+
+#endif

@@ -1,0 +1,419 @@
+"""Events that change the state: impacts, impulses, corners, accumulation, derivatives through them."""
+
+import math
+import pickle
+import warnings
+
+import mpmath as mp
+import numpy as np
+import pytest
+import sympy
+from programs import needs
+
+import scvi_codegen as sc
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import AccuracyWarning, EventError, EventWarning, MethodError, StateError
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.pipeline import generate_source
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.events.event import Event, impact
+
+FLAGS = ("-O1",)
+BALL = LagrangianSystem.from_text(name="ball", coordinates=["y"], lagrangian="y_dot**2/2 - g*y", parameters={"g": 1.0})
+POINT = LagrangianSystem.from_text(name="point", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2")
+FREE = LagrangianSystem.from_text(name="free", coordinates=["y"], lagrangian="y_dot**2/2")
+BOUNCES = {
+    "momentum": Event("y", direction=-1, then={"p_y": "-4*p_y/5"}),
+    "velocity": Event("y", direction=-1, then={"y_dot": "-4*y_dot/5"}),
+    "impact": impact("y", 0.8),
+    "sympy": impact(sympy.Symbol("y"), sympy.Rational(4, 5)),
+}
+STADIUM = [
+    impact("1 - y", where=["x > -1", "x < 1"]),
+    impact("1 + y", where=["x > -1", "x < 1"]),
+    impact("1 - (x - 1)**2 - y**2", where="x > 1"),
+    impact("1 - (x + 1)**2 - y**2", where="x < -1"),
+]
+
+
+@pytest.fixture(scope="module")
+def ball() -> Stepper:
+    return compile_stepper(BALL, "svi:2", flags=FLAGS)
+
+
+@pytest.fixture(scope="module")
+def point() -> Stepper:
+    return compile_stepper(POINT, "svi:1", flags=FLAGS)
+
+
+def folded(start: float, v: float, t: float) -> float:
+    """Position between walls at 0 and 1 of a point that is reflected."""
+    return abs((start + v * t + 1.0) % 2.0 - 1.0)
+
+
+@pytest.mark.parametrize("kind", BOUNCES)
+def test_bounces_of_a_ball_form_a_geometric_series(ball, kind):
+    run = ball.integrate([1.0], [0.0], h=0.1, t_end=12.72, events=BOUNCES[kind])
+    (bounces,) = run.events
+    fall = math.sqrt(2.0)
+    exact = fall + 2.0 * fall * 0.8 * (1.0 - 0.8 ** np.arange(len(bounces))) / 0.2
+    assert len(bounces) > 30
+    assert np.abs(bounces.t - exact).max() < 1e-14
+    assert np.abs(bounces.p[:, 0] / (-fall * 0.8 ** np.arange(len(bounces))) - 1.0).max() < 1e-11
+    assert run.q.min() > -1e-14
+    assert run.t[-1] == 12.72
+
+
+@pytest.mark.parametrize("e", [0.5, 0.8, 0.95])
+def test_accumulation_ends_the_run_and_is_named(ball, e):
+    """The ball does not fall through the floor where infinitely many bounces take a finite time."""
+    exact = math.sqrt(2.0) * (1.0 + e) / (1.0 - e)
+    with pytest.warns(EventWarning, match="accumulate at t = ") as warned:
+        run = ball.integrate([1.0], [0.0], h=0.1, t_end=exact + 10.0, events=impact("y", e))
+    named = float(str(warned[0].message).split("t = ")[1].split(" ")[0])
+    assert abs(named - exact) < 2e-12
+    assert exact - 1e-6 < run.t[-1] < exact
+    assert run.q.min() > -1e-14
+
+
+def test_accumulation_of_a_nonlinear_force_does_not_depend_on_the_step():
+    spring = LagrangianSystem.from_text(name="spring", coordinates=["y"], lagrangian="y_dot**2/2 - y - y**2")
+    stepper, named = compile_stepper(spring, "svi:8", flags=FLAGS), []
+    for h in (0.1, 0.05):
+        with pytest.warns(EventWarning) as warned:
+            stepper.integrate([1.0], [0.0], h=h, t_end=20.0, events=impact("y", 0.7))
+        named.append(float(str(warned[0].message).split("t = ")[1].split(" ")[0]))
+    assert abs(named[0] - named[1]) < 1e-13
+
+
+@pytest.mark.parametrize("t0", [0.0, 7e4])
+@pytest.mark.parametrize("h", [50.0, 5.0, 0.5])
+def test_corners_of_a_square_are_met_exactly(point, h, t0):
+    """Both walls of a corner act, up to 40 bounces occur in a step."""
+    walls = [impact(g) for g in ("x", "y", "1 - x", "1 - y")]
+    run = point.integrate([0.5, 0.5], velocity=[0.5, 0.3], t=t0, h=h, t_end=t0 + 400.0, events=walls)
+    q = np.array([[folded(0.5, v, t - t0) for v in (0.5, 0.3)] for t in run.t])
+    assert sum(map(len, run.events)) == 320
+    assert sum(np.isin(run.events[0].t, np.concatenate([run.events[1].t, run.events[3].t]))) > 5
+    assert np.abs(run.q - q).max() < (1e-13 if t0 == 0.0 else 2e-11)
+    assert np.abs(run.q[-1] - [folded(0.5, v, 400.0) for v in (0.5, 0.3)]).max() < 1e-14
+
+
+def test_moving_wall_accelerates_a_point():
+    """Fermi-Ulam: times of impacts against a map iterated in 60 digits."""
+    amplitude = 0.05
+    walls = [impact("y - sin(t)/20"), impact("1 - y")]
+    run = compile_stepper(FREE, "svi:1", flags=FLAGS).integrate(
+        [0.5], velocity=[0.3], h=0.05, t_end=190.0, events=walls
+    )
+    t = np.sort(np.concatenate([each.t for each in run.events]))
+    with mp.workdps(60):
+        y, v, now, a = mp.mpf("0.5"), mp.mpf(0.3), mp.mpf(0), mp.mpf(1) / 20
+        for k in range(60):
+            high, s = float(now + (1 - y) / v) if v > 0 else math.inf, float(now) + 1e-9
+            while s < high and float(y) + float(v) * (s - float(now)) > amplitude * math.sin(s):
+                s += 1e-3
+            gap = lambda x, y=y, v=v, now=now: y + v * (x - now) - a * mp.sin(x)  # noqa: E731
+            met = mp.findroot(gap, (s - 1e-3, s), solver="anderson", tol=1e-50) if s < high else now + (1 - y) / v
+            y, v, now = y + v * (met - now), (2 * a * mp.cos(met) if s < high else 0) - v, met
+            assert abs(t[k] - float(now)) < 3e-13
+
+
+def test_energy_of_a_double_pendulum_at_a_wall():
+    """The mass matrix depends on the state; impulses conserve energy to round-off, trajectories have order 16."""
+    system = LagrangianSystem.from_text(
+        name="double pendulum",
+        coordinates=["a", "b"],
+        lagrangian="a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)",
+    )
+    stepper = compile_stepper(system, "svi:8")
+    wall = impact("3/10 - sin(a) - sin(b)", terminal=60)
+    run = stepper.integrate([-1.0, -0.5], [0.0, 0.0], h=0.2, t_end=1e4, events=wall)
+    assert len(run.events[0]) == 60
+    assert np.ptp(run.energy()) < 3e-14
+    assert abs(run.events[0].t[20] - 97.0188870109503) < 1e-11
+    adaptive = stepper.integrate([-1.0, -0.5], [0.0, 0.0], t_end=100.0, events=impact("3/10 - sin(a) - sin(b)"))
+    assert abs(adaptive.events[0].t[20] - 97.0188870109503) < 1e-10
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.2])
+def test_impulse_of_a_relativistic_particle_conserves_energy(speed):
+    """Reversing the velocity would change the energy by 3 per cent; the frame of a moving wall exchanges lambda g_t."""
+    system = HamiltonianSystem.from_text(
+        name="relativistic",
+        coordinates=["x", "y"],
+        momenta=["p", "r"],
+        hamiltonian="sqrt(1 + p**2 + 4*r**2) + p*r/(5 + 5*p**2) + y/2",
+        parameters={"b": 0.0},
+    )
+    stepper = compile_stepper(system, "svi:8", flags=FLAGS)
+    wall = impact("y + x/3 + x**2/5 - b*t")
+    run = stepper.integrate([0.3, 1.0], [0.3, -0.2], h=0.1, t_end=12.0, events=wall, parameters={"b": speed})
+    (bounces,) = run.events
+    assert len(bounces)
+    for t, q, p in zip(bounces.t, bounces.q, bounces.p, strict=True):
+        row = int(np.flatnonzero(run.t == t)[0])
+        impulse = (run.p[row] - p)[1]  # g_y = 1
+        values = {"b": speed}
+        energies = [stepper.energy(q, each, t=t, parameters=values) for each in (p, run.p[row])]
+        assert impulse > 0.1
+        assert abs(energies[1] - energies[0] - impulse * speed) < 2e-15
+    if not speed:
+        assert np.ptp(run.energy()) < 5e-14
+
+
+def test_impulses_at_given_times_and_states_within_steps(ball):
+    """A kick at t = 0.35 within a step; dense output and t_eval on both sides of it."""
+    kick = Event("t - 0.35", then={"p_y": "p_y + 2"})
+    run = ball.integrate([0.0], [1.0], h=0.1, steps=10, events=kick)
+    exact = lambda t: t - t * t / 2 + 2 * np.maximum(t - 0.35, 0.0)  # noqa: E731
+    assert run.t.tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.35, *(0.1 * np.arange(4, 11))])
+    assert np.abs(run.q[:, 0] - exact(run.t)).max() < 1e-15
+    times = np.linspace(0.0, 1.0, 41)
+    assert np.abs(run.at(times)[0][:, 0] - exact(times)).max() < 1e-15
+    sparse = ball.integrate([0.0], [1.0], h=0.1, steps=10, events=kick, t_eval=times)
+    assert np.abs(sparse.q[:, 0] - exact(times)).max() < 1e-15
+    every = ball.integrate([0.0], [1.0], h=0.1, steps=10, events=kick, save_every=5)
+    assert np.allclose(every.t, [0.0, 0.5, 1.0])
+    assert np.array_equal(every.q[:, 0], run.q[[0, 6, 11], 0])
+    last = ball.integrate([0.0], [1.0], h=0.1, t_end=0.97, events=kick)
+    assert last.t[-1] == 0.97
+    assert abs(last.q[-1, 0] - exact(0.97)) < 1e-15
+
+
+def test_run_in_parts_equals_a_whole_one(ball):
+    watched = ball.with_events(BOUNCES["impact"])
+    whole = watched.integrate([1.0], [0.0], h=0.1, steps=60)
+    run = watched.start([1.0], [0.0], h=0.1)
+    run.advance(17)
+    first = run.record(20)
+    run = watched.from_checkpoint(run.checkpoint())
+    run.advance(23)
+    assert run.steps == 60
+    assert first.t[0] == pytest.approx(1.7)
+    assert np.array_equal(run.q, whole.q[-1])
+    assert pickle.loads(pickle.dumps(watched)).events == watched.events
+
+
+def test_runs_backward_undo_impacts(ball):
+    forth = ball.integrate([1.0], [0.0], h=0.1, t_end=8.0, events=BOUNCES["impact"])
+    back = ball.integrate(forth.q[-1], forth.p[-1], t=8.0, h=-0.1, t_end=0.0, events=BOUNCES["impact"])
+    assert len(back.events[0]) == len(forth.events[0]) == 4
+    assert abs(back.q[-1, 0] - 1.0) < 1e-13
+
+
+def test_conditions_select_crossings(point):
+    """A plate of finite length: a point that passes beside it is not reflected."""
+    plate = Event("y", then={"p_y": "-p_y"}, where=("x > 0", sympy.Symbol("x") < 1))
+    for x, end in ((0.5, 0.5), (1.5, -0.5), (-0.5, -0.5)):
+        run = point.integrate([x, 0.5], velocity=[0.0, -1.0], h=0.3, t_end=1.0, events=plate)
+        assert run.q[-1, 1] == pytest.approx(end, abs=1e-15)
+        assert len(run.events[0]) == (end > 0)
+
+
+def test_terminal_event_ends_a_run_after_the_change(ball):
+    run = ball.integrate([1.0], [0.0], h=0.1, t_end=9.0, events=impact("y", 0.8, terminal=3))
+    assert run.ended_by == impact("y", 0.8, terminal=3)
+    assert len(run.events[0]) == 3
+    assert run.t[-1] == run.events[0].t[-1]
+    assert run.p[-1, 0] == pytest.approx(-0.8 * run.events[0].p[-1, 0])
+
+
+def test_ensembles_of_bouncing_balls(ball):
+    stepper = compile_stepper(BALL, "svi:4", flags=FLAGS, events=BOUNCES["impact"])
+    heights = np.array([[0.5], [1.0], [2.0]])
+    lanes = stepper.integrate_ensemble(
+        heights, velocity=0.0 * heights, t_end=5.0, t_eval=[1.0, 3.0, 5.0], tolerance=1e-9
+    )
+    for j, q in enumerate(heights):
+        single = stepper.integrate(q, [0.0], t_end=5.0, t_eval=[1.0, 3.0, 5.0], tolerance=1e-9)
+        assert np.array_equal(lanes.q[:, j], single.q)
+    with pytest.raises(MethodError, match="fixed steps"):
+        stepper.integrate_ensemble(heights, velocity=0.0 * heights, h=0.1, steps=5)
+
+
+# Derivatives.
+
+BOX = LagrangianSystem.from_text(
+    name="box",
+    coordinates=["x", "y"],
+    lagrangian="(x_dot**2 + y_dot**2)/2 - k*y - x**2*y**2/4 + 0*(e + b + c + a + w)",
+    parameters={"k": 0.5, "e": 0.8, "b": 1.0, "c": 1.0, "a": 0.1, "w": 2.0},
+)
+ELLIPSE, FLOOR = impact("1 - (x/2)**2 - (y - b)**2/c", "e"), impact("y + 1 - a*sin(w*t) - x**2/5", "e")
+SHIFT = Event("y + b", -1, then={"p_y": "-e*p_y", "p_x": "p_x*(1 + a)", "x": "x + a*k"})
+FORM = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.eye(2), np.zeros((2, 2))]])
+
+
+def differences(run, z, values):
+    """Derivatives of the end of a run by its initial state and parameters, by differences of sixth order."""
+    columns = []
+    for c in range(len(z) + len(values)):
+
+        def end(u, c=c):
+            state, others = z.copy(), dict(values)
+            if c < len(z):
+                state[c] += u
+            else:
+                others[list(others)[c - len(z)]] += u
+            last = run(state, others)
+            return np.concatenate([last.q[-1], last.p[-1]])
+
+        halves = [(end(d) - end(-d)) / (2 * d) for d in (2.5e-5, 5e-5, 1e-4)]
+        columns.append((64 * halves[0] - 20 * halves[1] + halves[2]) / 45)
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize(
+    ("event", "method", "e", "tolerance"),
+    [
+        (ELLIPSE, "svi:2", 1.0, None),
+        (ELLIPSE, "svi:8", 0.8, None),
+        (ELLIPSE, "svi:8", 1.0, 1e-10),
+        (FLOOR, "svi:8", 1.0, None),
+        (SHIFT, "svi:4", 0.9, None),
+    ],
+    ids=["ellipse-2", "restitution", "adaptive", "moving", "map"],
+)
+def test_derivatives_are_those_of_the_computed_run(event, method, e, tolerance):
+    stepper = compile_stepper(BOX, method)
+    values = dict(zip(stepper.parameters, stepper.defaults, strict=True)) | {"e": e}
+    plan = {"h": 0.1 if method != "svi:8" else 0.2} if tolerance is None else {"tolerance": tolerance}
+
+    def run(z, parameters):
+        return stepper.integrate(z[:2], z[2:], t_end=12.0, events=event, parameters=parameters, **plan)
+
+    z = np.array([0.3, 1.2, 0.8, 0.6])
+    motion = run(z, values)
+    assert len(motion.events[0]) >= 2
+    derivatives = motion.sensitivity()
+    found = np.hstack([derivatives.state[-1], derivatives.parameters[-1]])
+    size = np.abs(found).max()
+    assert np.abs(found - differences(run, z, values)).max() < 6e-11 * size
+    cotangents = np.zeros((len(motion), 4))
+    cotangents[-1] = 1.0, 2.0, 3.0, 4.0
+    gradient = motion.pullback(cotangents)
+    adjoint = np.concatenate([gradient.q, gradient.p, gradient.parameters])
+    assert np.abs(adjoint - cotangents[-1] @ found).max() < 1e-13 * size
+    matrix = derivatives.state[-1]
+    if event is not SHIFT:
+        assert np.linalg.det(matrix) == pytest.approx(e ** (2 * len(motion.events[0])), rel=1e-6)
+    if e == 1.0 and method == "svi:8":
+        assert np.abs(matrix.T @ FORM @ matrix - FORM).max() < 1e-10 * size
+
+
+def test_lyapunov_exponent_of_the_stadium_billiard(point):
+    """Benettin & Strelcyn, Phys. Rev. A 17 (1978) 773: 0.43 for a = R = 1."""
+    run = point.integrate([0.1, 0.2], velocity=[0.8, 0.6], h=2.0, steps=4000, events=STADIUM)
+    assert sum(map(len, run.events)) > 3500
+    assert np.abs(np.hypot(*run.p.T) - 1.0).max() < 1e-12
+    exponents = run.lyapunov_exponents()
+    assert abs(exponents[0] - 0.43) < 0.03
+    assert abs(exponents[0] + exponents[3]) < 1e-10
+
+
+def test_derivatives_are_refused_where_they_do_not_exist(point, ball):
+    grazing = point.integrate(
+        [-3.0, 1.0 - 1e-14], velocity=[1.0, 0.0], h=0.37, t_end=6.0, events=impact("x**2 + y**2 - 1")
+    )
+    assert len(grazing.events[0]) == 1
+    with pytest.raises(StateError, match="grazing"):
+        grazing.tangent()
+    corner = point.integrate(
+        [0.5, 0.5], velocity=[1.0, 1.0], h=0.3, t_end=1.0, events=[impact("1 - x"), impact("1 - y")]
+    )
+    with pytest.raises(StateError, match="corner"):
+        corner.tangent()
+    with pytest.raises(StateError, match="save_every=1"):
+        ball.integrate([1.0], [0.0], h=0.1, steps=20, save_every=5, events=BOUNCES["impact"]).tangent()
+    with pytest.raises(StateError, match="momenta instead of velocities"):
+        ball.integrate([1.0], [0.0], h=0.1, steps=20, events=BOUNCES["velocity"]).tangent()
+
+
+@pytest.mark.parametrize("depth", [1e-2, 1e-6, 1e-10])
+def test_grazing_impacts_are_found(point, depth):
+    run = point.integrate([-3.0, 1.0 - depth], velocity=[1.0, 0.0], h=0.37, t_end=6.0, events=impact("x**2 + y**2 - 1"))
+    assert len(run.events[0]) == 1
+    assert abs(math.atan2(run.p[-1, 1], run.p[-1, 0]) - 2 * math.acos(1 - depth)) < 1e-16 / math.sqrt(depth) + 1e-15
+
+
+# Messages.
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Event("y", then={"p_z": "1"}), "'p_z' is not a coordinate.*did you mean 'p_y'"),
+        (lambda: Event("y", then={"g": "2*g"}), "'g' is not a coordinate"),
+        (lambda: Event("y", then={"p_y": "1", "y_dot": "1"}), "sets momenta and velocities"),
+        (lambda: Event("y", then={}), "must be new values by name"),
+        (lambda: Event("y", then={"p_y": sympy.Symbol("z")}), "'z' in the value 'z' of 'p_y'"),
+        (lambda: impact("y - p_y"), "contains 'p_y'"),
+        (lambda: impact("y", 1.2), "restitution of the wall 'y' is 1.2"),
+        (lambda: Event("y", restitution=1.0), "use impact"),
+        (lambda: Event("y", where="y"), "must be a comparison"),
+        (lambda: impact("y", 0.0), "passes the wall 'y'"),
+        (lambda: Event("y", then={"p_y": "p_y"}, where="y > 1 - 1"), None),
+        (lambda: Event("y", -1, then={"p_y": "log(y - 1)"}), "not finite"),
+    ],
+)
+def test_errors_name_the_symbol_and_the_remedy(ball, make, words):
+    if words is None:
+        ball.integrate([1.0], [0.0], h=0.1, steps=30, events=make())
+        return
+    with pytest.raises(EventError, match=words):
+        ball.integrate([1.0], [0.0], h=0.1, steps=30, events=make())
+
+
+def test_unsupported_combinations_are_refused(ball):
+    pendulum = sc.problem("planar-pendulum").system
+    with pytest.raises(EventError, match="time transformation"):
+        compile_stepper(pendulum, "svi:4", time_transformation="1 + q**2", events=Event("q", then={"p_q": "-p_q"}))
+    rod = LagrangianSystem.from_text(
+        name="rod",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + y_dot**2)/2 - y",
+        constraints=["x**2 + y**2 - 1"],
+    )
+    with pytest.raises(EventError, match="constraints"):
+        compile_stepper(rod, "svi:2", events=impact("x"))
+    with pytest.raises(MethodError, match="error="):
+        ball.integrate([1.0], [0.0], t_end=2.0, error=1e-8, events=BOUNCES["impact"])
+
+
+def test_no_accuracy_warnings_of_energies_that_impacts_change(ball):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", AccuracyWarning)
+        compile_stepper(BALL, "svi:4", flags=FLAGS).integrate(
+            [1.0], [0.0], t_end=5.0, events=impact("y", 0.5, terminal=3)
+        )
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_source_compiles_without_warnings(compiler, tmp_path):
+    import subprocess
+
+    needs(compiler)
+    events = [impact("y - sin(t)", where="y > 0"), Event("y", then={"y_dot": "-y_dot"})]
+    for controlled in (False, True):
+        source, _ = generate_source(BALL, "svi:4", prefix="hit", events=events, controlled=controlled)
+        for each in source.amalgamated().sources:
+            (tmp_path / f"{each.prefix}.h").write_text(each.header)
+            (tmp_path / f"{each.prefix}.c").write_text(each.code)
+        strict = [
+            "-std=c99",
+            "-O1",
+            "-Wall",
+            "-Wextra",
+            "-Wpedantic",
+            "-Wshadow",
+            "-Wconversion",
+            "-Wno-psabi",
+            "-Werror",
+            "-c",
+        ]
+        result = subprocess.run(
+            [compiler, *strict, "hit.c", "hit_events.c"], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        assert (result.returncode, result.stderr) == (0, "")
