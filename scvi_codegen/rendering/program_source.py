@@ -122,7 +122,7 @@ class EventSearch:
         changed: index among (q, p, v) of the variable of each of these values.
         first_values: index of the first value of each function, and the number of values.
         impacts: 1 for each function that is the wall of an impact, else 0.
-        controlled: whether steps are adaptive.
+        controlled: whether the integrator has adaptive steps.
     """
 
     prefix: str

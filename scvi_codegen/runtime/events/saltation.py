@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 
 GRAZING = 2.0**-20
-"""Smallest rate of an event function relative to its gradient and that of the flow; rounding of 1/rate is above 1e-4."""
+"""Smallest rate of an event function relative to its gradient and the flow; below it rounding dominates 1/rate."""
 SMALL_STEP = 2.0**-30
 """Fraction of a step from which the rate of the flow at a last state is computed."""
 DIFFERENCE = 2.0**-7

@@ -9,7 +9,7 @@
  * continued from there: fixed steps to the end of the step, adaptive ones by a new step. Frictionless impacts change p
  * by lambda n, n = g_q; lambda = (1 + e)/2 lambda_1, where lambda_1 conserves energy:
  * H(p + lambda_1 n) - H(p) = -lambda_1 g_t. Requires: events.h, the kernel event_changes, CHANGE_VALUES, FIRST_VALUE,
- * IS_IMPACT, CHANGED, ADAPTIVE. */
+ * IS_IMPACT, CHANGED, EVENTS_CONTROLLED. */
 enum {
   CHANGE_ROUNDS = 20, /* largest number of passes over the walls of a corner */
   CHANGES_IN_STEP = 100000, /* largest number of changes of the state in a step */
@@ -371,10 +371,10 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       status = NOT_CONVERGED;
     }
     step->watch->started = 0;
-    if (status == OK && (ends || ADAPTIVE || step->watch->ended)) {
+    if (status == OK && (ends || before->h == 0.0 || step->watch->ended)) {
       if (!ends) {
         *run = *before;
-        run->step += ADAPTIVE;
+        run->step += before->h == 0.0; /* adaptive */
         run->t_low = 0.0;
       }
       set_run(run, ends ? run->t : at.t, &at);
@@ -394,22 +394,22 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
 /* One step of a run, shorter if it would pass t_end; returns its size in *length. */
 static int take_step(event_run *run, real t_end, real tolerance, const event_step *step, real *length, int *iterations)
 {
-  real t, q[M], p[M];
   const real start = run->t, left = (t_end - run->t) - run->t_low;
+  event_sample end;
   solver_report own;
-  int status;
+  int status = NOT_CONVERGED;
+  if (run->h == 0.0) {
 #if EVENTS_CONTROLLED
-  status = NAME(advance_to)(run, t_end, tolerance, 1, 1, step->parameters, step->options, &t, q, p, iterations, &own,
-      step->workspace);
-  *length = run->t - start;
-  (void)left;
-#else
-  (void)tolerance, (void)start;
-  *length = run->h;
-  if (fabs(left) >= (1.0 - CHANGE_WHOLE) * fabs(run->h))
-    status = NAME(advance)(run, 1, 1, step->parameters, step->options, &t, q, p, iterations, &own, step->workspace);
-  else {
-    event_sample end;
+    status = NAME(advance_to)(run, t_end, tolerance, 1, 1, step->parameters, step->options, &end.t, end.q, end.p,
+        iterations, &own, step->workspace);
+#endif
+    (void)tolerance;
+    *length = run->t - start;
+  } else if (fabs(left) >= (1.0 - CHANGE_WHOLE) * fabs(run->h)) {
+    status = NAME(advance)(run, 1, 1, step->parameters, step->options, &end.t, end.q, end.p, iterations, &own,
+        step->workspace);
+    *length = run->h;
+  } else {
     *length = left;
     status = NAME(step)(run->t, left, run->q, run->p, step->parameters, step->options, end.q, end.p, &own,
         step->workspace);
@@ -419,7 +419,6 @@ static int take_step(event_run *run, real t_end, real tolerance, const event_ste
     run->t_low = 0.0;
     run->step++;
   }
-#endif
   step->report->t = start;
   step->report->change = own.change;
   step->report->iterations += own.iterations;
