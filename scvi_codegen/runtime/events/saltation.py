@@ -102,16 +102,16 @@ def _jump(
     def products(state: Array, h: float, time: float, seeds: Array) -> Array:
         return stepper._products(state[:m], state[m:], h, time, parameters, options, seeds)[:, : 2 * m].T
 
-    stretch = np.eye(size)[-1:]
+    size_seed = np.eye(size)[-1:]
     start = np.concatenate([starts.q[k - 1], starts.p[k - 1]])
-    arrival = products(start, float(starts.h[k - 1]), float(starts.t[k - 1]), stretch)[:, 0]
+    arrival = products(start, float(starts.h[k - 1]), float(starts.t[k - 1]), size_seed)[:, 0]
     if row + 1 < len(states):
         h = float(states.t[row + 1] - t)
         step = products(after, h, t, np.eye(size))
         departure = np.linalg.solve(step[:, : 2 * m], step[:, -1] - step[:, -2])
     else:
         h = SMALL_STEP * float(starts.h[k - 1])
-        departure = 0.5 * (products(after, h, t, stretch) + products(after, -h, t, stretch))[:, 0]
+        departure = 0.5 * (products(after, h, t, size_seed) + products(after, -h, t, size_seed))[:, 0]
     values = _derivatives(stepper.interface, event)(before, t, parameters)
     gradient = np.concatenate([values.gradient, np.zeros(1)])
     rate = values.gradient[: 2 * m] @ arrival + values.gradient[-1]
@@ -217,8 +217,8 @@ def _energy_differences(states: SavedStates, q: Array, ends: tuple[Array, Array]
         )
         return np.asarray(last - first)
 
-    slopes = difference(parameters).reshape(m + 1, -1) @ WEIGHTS / steps
-    result[:m], result[-1] = slopes[:m], slopes[m]
+    partials = difference(parameters).reshape(m + 1, -1) @ WEIGHTS / steps
+    result[:m], result[-1] = partials[:m], partials[m]
     shifted = x[np.newaxis]
     for k in range(len(parameters) if all_inputs else 0):
         step = DIFFERENCE * max(1.0, abs(parameters[k]))
