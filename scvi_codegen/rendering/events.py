@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import accumulate
-from typing import cast
+from typing import Protocol, TypeAlias, cast
 
 import sympy
 from sympy import Expr, Symbol
@@ -34,11 +34,26 @@ from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Kernel, lower_matrix, lower_vector
 from scvi_codegen.rendering.program_source import EventSearch, render_events
 from scvi_codegen.rendering.source import Interface, Source
-from scvi_codegen.runtime.events.event import Event, Formula
 from scvi_codegen.tables.nodes import chebyshev_lobatto, to_unit
 from scvi_codegen.tables.precision import mp
 
 DEGREE = 4
+Formula: TypeAlias = "str | Expr | float"
+
+
+class Event(Protocol):
+    """Event of a run; attributes as of :class:`~scvi_codegen.runtime.events.event.Event`."""
+
+    @property
+    def function(self) -> str | Expr: ...  # noqa: D102
+    @property
+    def restitution(self) -> Formula | None: ...  # noqa: D102
+    @property
+    def conditions(self) -> tuple[Formula, ...]: ...  # noqa: D102
+    @property
+    def changes(self) -> tuple[tuple[str, Formula], ...]: ...  # noqa: D102
+    @property
+    def changes_state(self) -> bool: ...  # noqa: D102
 
 
 @lru_cache(maxsize=64)
