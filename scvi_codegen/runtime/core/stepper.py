@@ -341,7 +341,7 @@ class Stepper(Integrator):
         """
         if self.interface.rotations:
             q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
-        unsupported = {"error=": error, "an ensemble with inputs": inputs, "an ensemble with fixed steps (h=)": h}
+        unsupported = {"error=": error, "an ensemble with fixed steps (h=)": h}
         for what, argument in unsupported.items():
             self._check_no_changes(what, wanted=argument is not None)
         if error is not None:
