@@ -1,5 +1,6 @@
-"""Reproduction of the paper: every figure, table, theorem and claim as an experiment with a verdict.
+"""Reproduction of the paper: every numerical figure, table and claim as an experiment with a verdict.
 
-An experiment is a function that returns a :class:`~scvi_codegen.reproduce.laboratory.experiment.Result`: setting, claim
-of the paper, measurements, numbers, a picture. :mod:`~scvi_codegen.reproduce.catalogue` lists all of them.
+Figures are data of a few kinds: runs over time (:mod:`.runs`, :mod:`.figures`), errors of one step
+(:mod:`.refinement`), iterations, tableaux. An experiment returns a :class:`~scvi_codegen.reproduce.experiment.Result`:
+setting, claim of the paper, measurements, numbers, a picture. :mod:`.catalogue` lists all of them.
 """

@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from typing import NamedTuple
 
-from scvi_codegen.reproduce.laboratory.experiment import (
-    Block,
-    Comparison,
-    Paragraph,
-    Result,
-    Verdict,
-    common_verdict,
-    experiment,
-)
+from scvi_codegen.display.page.blocks import Paragraph
+from scvi_codegen.reproduce.experiment import Comparison, Experiment, Result, Verdict, common_verdict
 
 
-@dataclass(frozen=True, slots=True)
-class Claim:
+class Claim(NamedTuple):
     """Sentence of the paper and its section."""
 
     text: str
@@ -86,63 +78,45 @@ CLAIMS: Mapping[str, Claim] = {
 }
 """Claims by the keys that checks name in ``bears_on``."""
 
-EVIDENCE: tuple[str, ...] = (
-    "figure-1",
-    *(f"figure-{number}" for number in range(3, 31)),
-    *(f"table-{number}" for number in range(6, 10)),
-    "correction",
-)
+EVIDENCE = ("figure-1", *(f"figure-{k}" for k in range(3, 31)), *(f"table-{k}" for k in range(6, 10)), "correction")
 """Experiments whose checks are collected."""
 
 
-@experiment("claims", "The claims of the paper, one verdict each", needs=EVIDENCE)
 def claims(results: Mapping[str, Result]) -> Result:
     """Return a row for each claim, with the checks that decide it."""
-    result = {key: tuple(_evidence(key, results)) for key in CLAIMS}
+    checks = [(name, check) for name in EVIDENCE if name in results for check in results[name].checks]
+    evidence = {key: [(name, check) for name, check in checks if key in check.bears_on] for key in CLAIMS}
+    blocks = []
+    for key, claim in CLAIMS.items():
+        verdict = common_verdict(check for _, check in evidence[key])
+        blocks.append(Paragraph(f'"{claim.text}" ({claim.place}): {verdict.value}.'))
+        blocks += [
+            Paragraph(f"{n}, {check.verdict.value}: {check.claim} {check.measured}") for n, check in evidence[key]
+        ]
+    missing = ", ".join(name for name in EVIDENCE if name not in results)
     return Result(
         setting=(
-            "Every check of a figure, table or theorem names the claims that it bears on; here they are collected.",
+            "Every check of a figure or table names the claims that it bears on; here they are collected.",
             "A claim holds if all its checks hold, does not hold if none does, and holds in part otherwise; a claim "
             "without a check is only shown.",
             f"Collected from {len(results)} of {len(EVIDENCE)} experiments"
-            + (f"; without {_listed(results)}." if len(results) < len(EVIDENCE) else "."),
+            + (f"; without {missing}." if missing else "."),
         ),
-        checks=tuple(_check(claim, result[key]) for key, claim in CLAIMS.items()),
-        body=tuple(block for key in CLAIMS for block in _blocks(CLAIMS[key], result[key])),
+        checks=tuple(_check(claim, evidence[key]) for key, claim in CLAIMS.items()),
+        body=tuple(blocks),
     )
 
 
-def _listed(results: Mapping[str, Result]) -> str:
-    return ", ".join(name for name in EVIDENCE if name not in results)
-
-
-def _evidence(key: str, results: Mapping[str, Result]) -> Iterator[tuple[str, Comparison]]:
-    """Yield names of experiments with their checks that concern a claim, in the paper's order."""
-    for name in EVIDENCE:
-        if name in results:
-            yield from ((name, check) for check in results[name].checks if key in check.bears_on)
-
-
-def _check(claim: Claim, evidence: tuple[tuple[str, Comparison], ...]) -> Comparison:
+def _check(claim: Claim, evidence: list[tuple[str, Comparison]]) -> Comparison:
     counted = {verdict: [name for name, check in evidence if check.verdict is verdict] for verdict in Verdict}
-    parts = [f"{_counted(len(names), verdict)} ({_unique(names)})" for verdict, names in counted.items() if names]
+    parts = [f"{len(n)} {verdict.value} ({', '.join(dict.fromkeys(n))})" for verdict, n in counted.items() if n]
     return Comparison(
         claim=f"{claim.text} ({claim.place})",
-        measured=f"Of {len(evidence)} checks {'; '.join(parts)}." if parts else "No check bears on it.",
+        measured=f"Of {len(evidence)} checks: {'; '.join(parts)}." if parts else "No check bears on it.",
         verdict=common_verdict(check for _, check in evidence),
     )
 
 
-def _counted(count: int, verdict: Verdict) -> str:
-    several = {Verdict.HOLDS: "hold", Verdict.PARTLY: "hold in part", Verdict.FAILS: "do not hold"}
-    return f"{count} {several.get(verdict, verdict.value) if count > 1 else verdict.value}"
-
-
-def _unique(names: list[str]) -> str:
-    return ", ".join(dict.fromkeys(names))
-
-
-def _blocks(claim: Claim, evidence: tuple[tuple[str, Comparison], ...]) -> Iterator[Block]:
-    yield Paragraph(f'"{claim.text}" ({claim.place}): {common_verdict(check for _, check in evidence).value}.')
-    for name, check in evidence:
-        yield Paragraph(f"{name}, {check.verdict.value}: {check.claim} {check.measured}")
+EXPERIMENTS = (
+    Experiment(name="claims", title="The claims of the paper, one verdict each", run=claims, needs=EVIDENCE),
+)

@@ -1,4 +1,4 @@
-"""Report of all results as one self-contained HTML page: pictures in the page, MathML, no script, no network.
+"""Files of a result, and the report of all results: one self-contained HTML page with MathML, no script, no network.
 
 It adapts to light and dark mode (pictures keep a light background), to narrow screens and to paper. The page is
 ``templates/report.html.jinja`` with ``templates/report.css`` on the base of all pages; this module converts results
@@ -8,15 +8,21 @@ into text for it.
 from __future__ import annotations
 
 import base64
+import csv
+import io
 import re
+import textwrap
 from collections import Counter
 from collections.abc import Collection, Sequence
+from pathlib import Path
 
 from markupsafe import Markup
 
+from scvi_codegen.display.page.blocks import Block, Formula, Listing, Paragraph, TableBlock
 from scvi_codegen.display.page.environment import SPACE, page_template, style_sheet
-from scvi_codegen.reproduce.laboratory.experiment import Result, TableBlock, Verdict
-from scvi_codegen.reproduce.writing import draw
+from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.reproduce.drawing import draw
+from scvi_codegen.reproduce.experiment import Result, Verdict
 from scvi_codegen.version import __version__
 
 
@@ -89,3 +95,63 @@ def _heading(result: Result) -> str:
 
 def _caption(result: Result, table: TableBlock) -> str:
     return f"Data of {label(result.name)}{table.name and ': '}{table.name.replace('-', ' ')}"
+
+
+# Files of a result: NAME.svg, NAME.png, NAME.csv, and NAME.txt with the statement; each written atomically.
+
+WIDTH = 100
+
+
+def write_result(result: Result, folder: Path) -> list[Path]:
+    """Write the files of a result into an existing folder; return their paths."""
+    written = []
+
+    def write(name: str, content: bytes) -> None:
+        path = folder / name
+        write_atomically(path, lambda file: file.write(content))
+        written.append(path)
+
+    if result.picture is not None:
+        write(f"{result.name}.svg", draw(result.picture, "svg"))
+        write(f"{result.name}.png", draw(result.picture, "png"))
+    for table in result.tables:
+        write(f"{'-'.join(filter(None, (result.name, table.name)))}.csv", csv_text(table).encode())
+    write(f"{result.name}.txt", statement(result).encode())
+    return written
+
+
+def csv_text(table: TableBlock) -> str:
+    """Return CSV with a line of headings; floats in full precision."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(table.columns)
+    writer.writerows(["" if cell is None else cell for cell in row] for row in table.rows)
+    return file.getvalue()
+
+
+def statement(result: Result) -> str:
+    """Return setting, claims and measurements as text."""
+    lines = [f"{result.name}: {result.title}", f"verdict: {result.verdict.value}", ""]
+    lines += [line for sentence in result.setting for line in _wrapped(sentence)]
+    for check in result.checks:
+        lines += ["", *_wrapped(f"paper:    {check.claim}"), *_wrapped(f"measured: {check.measured}")]
+        lines += [f"verdict:  {check.verdict.value}"]
+    for block in result.body:
+        lines += ["", *_block_lines(block)]
+    return "\n".join(lines) + "\n"
+
+
+def _block_lines(block: Block) -> list[str]:
+    match block:
+        case Paragraph():
+            return _wrapped(block.text)
+        case Listing():
+            return [f"    {line}".rstrip() for line in block.text.splitlines()]
+        case Formula():
+            left = "" if block.left is None else f"{block.left} = "
+            number = f"    ({block.number})" if block.number else ""
+            return [f"    {left}{block.right}{number}"]
+
+
+def _wrapped(text: str) -> list[str]:
+    return textwrap.wrap(text, WIDTH, subsequent_indent="  ", break_on_hyphens=False)

@@ -1,7 +1,6 @@
 """Execution of experiments in turn or in parallel processes; one that fails does not stop the others.
 
-The scheduler assigns to a free process an experiment whose dependencies are complete, preferably of the module that
-the process ran last: measurements that experiments of a module share are cached within a process.
+Experiments that judge the results of others run after all others, in this process.
 """
 
 from __future__ import annotations
@@ -12,15 +11,15 @@ import os
 import signal
 import traceback
 import warnings
+from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnProcess
 from typing import TypeAlias
 
 from scvi_codegen.errors import MethodWarning, StateError, closest
-from scvi_codegen.reproduce.laboratory.experiment import Experiment, Result
+from scvi_codegen.reproduce.experiment import Experiment, Result
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 
 CATALOGUE = "scvi_codegen.reproduce.catalogue"
@@ -91,43 +90,30 @@ def run_experiments(
         StateError: for an unknown name.
     """
     experiments = catalogue(module)
-    plan = _Plan(pending={name: experiments[name] for name in with_needs(names, experiments)})
-    count = min(workers or os.cpu_count() or 1, len(plan.pending))
-    return _in_this_process(plan, watch) if count <= 1 else _in_processes(plan, count, module, watch)
+    chosen = [experiments[name] for name in with_needs(names, experiments)]
+    count = min(workers or os.cpu_count() or 1, len(chosen))
+    return _run(chosen, count, module, watch)
 
 
-@dataclass(kw_only=True)
-class _Plan:
-    """Experiments to start, and results so far."""
-
-    pending: dict[str, Experiment]
-    results: dict[str, Result] = field(default_factory=dict)
-
-    def next(self, last_module: str = "") -> Experiment | None:
-        """Remove and return an experiment whose dependencies are complete, of the module last run if possible."""
-        ready = [e for e in self.pending.values() if all(need in self.results for need in e.needs)]
-        ready.sort(key=lambda experiment: _module_of(experiment) != last_module)
-        return self.pending.pop(ready[0].name) if ready else None
-
-    def needs(self, experiment: Experiment) -> dict[str, Result]:
-        return {need: self.results[need] for need in experiment.needs}
-
-    def record_outcome(self, outcome: Outcome) -> Iterator[Outcome]:
-        """Yield the outcome, and the failures of the experiments that depend on it."""
-        yield outcome
+def _run(chosen: Sequence[Experiment], count: int, module: str, watch: Watch) -> Generator[Outcome, None, None]:
+    results, alone = dict[str, Result](), [each for each in chosen if not each.needs]
+    with closing(
+        _in_this_process(alone, watch) if count <= 1 else _in_processes(alone, count, module, watch)
+    ) as others:
+        for outcome in others:
+            yield outcome
+            if isinstance(outcome, Result):
+                results[outcome.name] = outcome
+    for experiment in (each for each in chosen if each.needs):
+        watch([experiment.name])
+        failed = [need for need in experiment.needs if need not in results]
+        if failed:
+            yield Failure(name=experiment.name, message=f"its dependency '{failed[0]}' failed")
+            continue
+        yield (outcome := _outcome(experiment, {need: results[need] for need in experiment.needs}))
         if isinstance(outcome, Result):
-            self.results[outcome.name] = outcome
-            return
-        for experiment in [e for e in self.pending.values() if outcome.name in e.needs]:
-            if self.pending.pop(experiment.name, None):
-                yield from self.record_outcome(
-                    Failure(name=experiment.name, message=f"its dependency '{outcome.name}' failed")
-                )
-
-
-def _module_of(experiment: Experiment) -> str:
-    run = getattr(experiment.run, "func", experiment.run)
-    return getattr(run, "__module__", "")
+            results[outcome.name] = outcome
+    watch([])
 
 
 @without_accuracy_warnings()
@@ -138,41 +124,34 @@ def _outcome(experiment: Experiment, needs: Mapping[str, Result]) -> Outcome:
             warnings.simplefilter("ignore", MethodWarning)  # settings are the paper's
             return experiment.result(needs)
     except Exception as error:  # noqa: BLE001  (others go on)
-        return Failure(name=experiment.name, message=_described(error), details=traceback.format_exc())
+        return _failure(experiment.name, error)
 
 
-def _described(error: BaseException) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())
+def _failure(name: str, error: BaseException) -> Failure:
+    message = " ".join(f"{type(error).__name__}: {error}".split())
+    return Failure(name=name, message=message, details=traceback.format_exc())
 
 
-def _in_this_process(plan: _Plan, watch: Watch) -> Generator[Outcome, None, None]:
-    while (experiment := plan.next()) is not None:
+def _in_this_process(experiments: Sequence[Experiment], watch: Watch) -> Generator[Outcome, None, None]:
+    for experiment in experiments:
         watch([experiment.name])
-        yield from plan.record_outcome(_outcome(experiment, plan.needs(experiment)))
+        yield _outcome(experiment, {})
 
 
-@dataclass(kw_only=True)
 class _Worker:
-    """Process that runs experiments by name, and the experiment that it runs."""
+    """Process that runs experiments by name, and the name of the one that it runs."""
 
-    process: SpawnProcess
-    connection: Connection
-    module: str = ""
-    running: str = ""
-
-    @classmethod
-    def start(cls, module: str) -> _Worker:
+    def __init__(self, module: str) -> None:
         context = multiprocessing.get_context("spawn")
-        here, there = context.Pipe()
-        process = context.Process(target=_work, args=(there, module), daemon=True)
-        process.start()
+        self.connection, there = context.Pipe()
+        self.process, self.running = context.Process(target=_work, args=(there, module), daemon=True), ""
+        self.process.start()
         there.close()
-        return cls(process=process, connection=here)
 
-    def give(self, experiment: Experiment, needs: Mapping[str, Result]) -> None:
-        self.module, self.running = _module_of(experiment), experiment.name
+    def give(self, name: str) -> None:
+        self.running = name
         with suppress(OSError):  # the process died; take reports it
-            self.connection.send((experiment.name, needs))
+            self.connection.send(name)
 
     def take(self) -> Outcome:
         """Return the outcome that the process sent, or the failure that it died."""
@@ -189,46 +168,42 @@ def _work(connection: Connection, module: str) -> None:
     """Serve a process: receive names, send outcomes. Ctrl-C is handled by the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     experiments = catalogue(module)
-    while True:
-        try:
-            name, needs = connection.recv()
-        except (EOFError, OSError):
-            return
-        outcome = _outcome(experiments[name], needs)
-        try:
-            connection.send(outcome)
-        except OSError:  # the parent is gone
-            return
-        except Exception as error:  # noqa: BLE001  (results that cannot be pickled)
-            connection.send(Failure(name=name, message=_described(error), details=traceback.format_exc()))
+    with suppress(EOFError, OSError):  # the parent is gone
+        while True:
+            name = connection.recv()
+            outcome = _outcome(experiments[name], {})
+            try:
+                connection.send(outcome)
+            except OSError:
+                raise
+            except Exception as error:  # noqa: BLE001  (results that cannot be pickled)
+                connection.send(_failure(name, error))
 
 
-def _in_processes(plan: _Plan, count: int, module: str, watch: Watch) -> Generator[Outcome, None, None]:
+def _in_processes(
+    experiments: Sequence[Experiment], count: int, module: str, watch: Watch
+) -> Generator[Outcome, None, None]:
+    pending = deque(each.name for each in experiments)
     with _crew(count, module) as crew:
         while True:
-            _assign(plan, crew, watch)
+            for worker in crew:
+                if pending and not worker.running:
+                    worker.give(pending.popleft())
             busy = {worker.connection: worker for worker in crew if worker.running}
+            watch([worker.running for worker in busy.values()])
             if not busy:
                 return
             for connection in wait(list(busy)):
                 worker = busy[connection]  # type: ignore[index]  # these are the connections waited for
                 outcome = worker.take()
                 if not worker.process.is_alive():
-                    crew[crew.index(worker)] = _Worker.start(module)
-                yield from plan.record_outcome(outcome)
-
-
-def _assign(plan: _Plan, crew: Sequence[_Worker], watch: Watch) -> None:
-    """Start experiments on all idle processes."""
-    for worker in crew:
-        if not worker.running and (experiment := plan.next(worker.module)) is not None:
-            worker.give(experiment, plan.needs(experiment))
-    watch([worker.running for worker in crew if worker.running])
+                    crew[crew.index(worker)] = _Worker(module)
+                yield outcome
 
 
 @contextmanager
 def _crew(count: int, module: str) -> Iterator[list[_Worker]]:
-    crew = [_Worker.start(module) for _ in range(count)]
+    crew = [_Worker(module) for _ in range(count)]
     try:
         yield crew
     finally:

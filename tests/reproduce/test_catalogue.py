@@ -6,7 +6,7 @@ import pytest
 
 from scvi_codegen.reproduce.catalogue import EXPERIMENTS
 from scvi_codegen.reproduce.claims import CLAIMS, EVIDENCE
-from scvi_codegen.reproduce.laboratory.experiment import Verdict
+from scvi_codegen.reproduce.experiment import Verdict
 from scvi_codegen.reproduce.runner import Failure, run_experiments
 
 PAPER = {

@@ -16,7 +16,7 @@ from browsing import (
 )
 from toy_experiments import GOOD
 
-from scvi_codegen.reproduce.laboratory.experiment import Result
+from scvi_codegen.reproduce.experiment import Result
 from scvi_codegen.reproduce.report import report_html
 from scvi_codegen.reproduce.runner import run_experiments
 

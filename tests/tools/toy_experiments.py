@@ -5,45 +5,35 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping
-from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 import sympy
 
 from scvi_codegen.derivation.equations import derive
+from scvi_codegen.display.page.blocks import Formula, Listing, Paragraph, TableBlock
 from scvi_codegen.methods import SVI
 from scvi_codegen.models.problems import problem
-from scvi_codegen.reproduce.laboratory.drawing import draw_error, draw_orbit, draw_powers, panels
-from scvi_codegen.reproduce.laboratory.experiment import (
-    Comparison,
-    Experiment,
-    Formula,
-    Listing,
-    Paragraph,
-    Picture,
-    Result,
-    TableBlock,
-    Verdict,
-    holds,
-)
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from scvi_codegen.reproduce.drawing import Panel, Picture, Series, largest_in_bins
+from scvi_codegen.reproduce.experiment import Comparison, Experiment, Result, Verdict, holds
 
 LONG_LINE = "double energy = 0.5*(v[0]*v[0] + v[1]*v[1]) - mu/sqrt(q[0]*q[0] + q[1]*q[1]);  /* kept on one line */"
 
 
-def draw_curves(t: np.ndarray, svi: np.ndarray, sc: np.ndarray, figure: Figure) -> None:
-    left, middle, right = panels(figure, 1, 3)
-    draw_error(left, t, svi, "SVI")
-    draw_error(left, t, sc, "SC")
-    left.set(xlabel="t", title="energy error")
-    left.legend()
-    draw_orbit(middle, np.cos(t), np.sin(t), "exact")
-    middle.plot([0.0], [0.0], "o", color="k", markerfacecolor="w", label="hollow")
-    middle.set(xlabel="$q_1$", ylabel="$q_2$")
-    draw_powers(right, np.geomspace(0.01, 1.0, 5), [(1.0, 3)])
+def picture(t: np.ndarray, svi: np.ndarray, sc: np.ndarray) -> Picture:
+    errors = [
+        Series(x=largest_in_bins(t, e)[0], y=largest_in_bins(t, e)[1], scheme=s, label=s)
+        for e, s in ((svi, "SVI"), (sc, "SC"))
+    ]
+    circle = Series(x=np.cos(t), y=np.sin(t), scheme="exact")
+    line = Series(x=[0.01, 1.0], y=[1e-6, 1.0], scheme="exact", end="$h^3$", line=":", marker="o")
+    return Picture(
+        panels=(
+            Panel(title="energy error", series=tuple(errors), xlabel="t", log="y", floor=1e-12),
+            Panel(title="orbit", series=(circle,), xlabel="$q_1$", ylabel="$q_2$", equal=True, window=(-2.0, 2.0)),
+            Panel(title="order", series=(line,), log="xy"),
+        ),
+        columns=2,
+    )
 
 
 def figure_4(results: Mapping[str, Result]) -> Result:
@@ -74,7 +64,7 @@ def figure_4(results: Mapping[str, Result]) -> Result:
                 name="series", columns=("t", "SVI"), rows=tuple(zip(t.tolist(), svi.tolist(), strict=True)), shown=False
             ),
         ),
-        picture=Picture(draw=partial(draw_curves, t, svi, sc)),
+        picture=picture(t, svi, sc),
     )
 
 
@@ -123,7 +113,7 @@ def crash(results: Mapping[str, Result]) -> Result:
 
 
 def unportable(results: Mapping[str, Result]) -> Result:
-    return Result(name="unportable", title="", setting=(), picture=Picture(draw=lambda figure: None))
+    return Result(name="unportable", title="", setting=(), body=(Formula(right=lambda: None),))
 
 
 def slow(results: Mapping[str, Result]) -> Result:

@@ -23,10 +23,9 @@ from scvi_codegen.cli.command_group import (
 from scvi_codegen.cli.reports import counted
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.pictures.canvas import check_plot_path
-from scvi_codegen.reproduce.laboratory.experiment import Experiment, Result
-from scvi_codegen.reproduce.report import report_html, tally
+from scvi_codegen.reproduce.experiment import Experiment, Result
+from scvi_codegen.reproduce.report import report_html, tally, write_result
 from scvi_codegen.reproduce.runner import CATALOGUE, Failure, catalogue, run_experiments, with_needs
-from scvi_codegen.reproduce.writing import write_result
 
 EVERYTHING = "all"
 SHOWN_NAMES = 40

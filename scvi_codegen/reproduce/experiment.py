@@ -1,7 +1,6 @@
 """Results of experiments: setting, claims of the paper, measurements, numbers and a picture.
 
-Everything is plain data that can be sent between processes: a picture is a module-level function with its numbers bound
-by ``functools.partial``, a formula is SymPy.
+Everything is plain data that can be sent between processes; a formula is SymPy.
 """
 
 from __future__ import annotations
@@ -11,28 +10,8 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TypeAlias
 
-from scvi_codegen.display.page.blocks import Block, Cell, Formula, Listing, Paragraph, TableBlock
-from scvi_codegen.reproduce.laboratory.drawing import Figure
-
-__all__ = [
-    "REGISTERED",
-    "Block",
-    "Cell",
-    "Comparison",
-    "Experiment",
-    "Formula",
-    "Listing",
-    "Paragraph",
-    "Picture",
-    "Result",
-    "TableBlock",
-    "Verdict",
-    "common_verdict",
-    "experiment",
-    "holds",
-    "judged",
-    "series_table",
-]
+from scvi_codegen.display.page.blocks import Block, TableBlock
+from scvi_codegen.reproduce.drawing import Picture
 
 
 class Verdict(Enum):
@@ -80,15 +59,6 @@ def common_verdict(checks: Iterable[Comparison]) -> Verdict:
     if not result:
         return Verdict.SHOWN
     return result.pop() if len(result) == 1 else Verdict.PARTLY
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Picture:
-    """Picture of ``width`` x ``height`` inches; ``draw`` fills an empty Matplotlib figure."""
-
-    draw: Callable[[Figure], None]
-    width: float = 9.0
-    height: float = 4.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,22 +112,3 @@ class Experiment:
         """Return the result with the name of the experiment, and its title unless it has one."""
         result = self.run(needs)
         return replace(result, name=self.name, title=result.title or self.title)
-
-
-REGISTERED: dict[str, Experiment] = {}
-"""Experiments of all modules imported so far, by name."""
-
-
-def experiment(name: str, title: str, *, needs: tuple[str, ...] = ()) -> Callable[[Run], Run]:
-    """Return a decorator that registers a function as the experiment of a name."""
-
-    def register(run: Run) -> Run:
-        REGISTERED[name] = Experiment(name=name, title=title, run=run, needs=needs)
-        return run
-
-    return register
-
-
-def series_table(columns: Mapping[str, Iterable[Cell]], name: str = "series") -> TableBlock:
-    """Return a table, not shown on the page, of columns by heading."""
-    return TableBlock(name=name, columns=tuple(columns), rows=tuple(zip(*columns.values(), strict=True)), shown=False)

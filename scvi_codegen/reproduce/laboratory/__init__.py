@@ -1,1 +1,0 @@
-"""Components shared by experiments: results, drawings, plain implementations to compare with."""

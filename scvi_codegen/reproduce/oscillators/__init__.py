@@ -1,1 +1,0 @@
-"""Figures of the paper on systems with one degree of freedom: oscillator, pendulum, Duffing."""

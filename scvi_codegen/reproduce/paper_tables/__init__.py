@@ -1,1 +1,0 @@
-"""Tables of the paper: costs, iterations, properties, tableaux."""

@@ -1,0 +1,376 @@
+"""Errors of one step of SVI and SC over the number of points and over the step size, and the paper's lines.
+
+The captions state neither the eccentricity nor, unambiguously, what "N" counts: the number of points, as they say, or
+the degree, as in other figures. Verdicts are based on the cases that are judged; the others show how the result depends
+on what a caption leaves open.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.display.page.blocks import Cell, TableBlock
+from scvi_codegen.errors import StepFailedError
+from scvi_codegen.exact.step import derived_step
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods import SVI, SpectralCollocation
+from scvi_codegen.methods.method import Method
+from scvi_codegen.reproduce.drawing import Array, Panel, Picture, Series
+from scvi_codegen.reproduce.experiment import Comparison, Experiment, Result, Verdict, holds, judged
+from scvi_codegen.reproduce.runs import ROUNDOFF, stepper_of
+from scvi_codegen.tables.precision import Number, mp
+
+SCHEMES = ("SVI", "SC")
+LEGEND = (2, 4, 6)
+"""Values of N over the step size."""
+ROUNDOFF_LEVEL = 1e-13
+WINDOW = ROUNDOFF_LEVEL, 1e-1
+"""Range of errors to which lines are fitted: smaller ones are round-off, larger ones are not resolved."""
+NO_ERROR = 1e-50
+"""Bound on errors in 60 digits that count as 0."""
+ALONG = 30.0
+"""Largest typical factor between errors and a line that counts as agreement."""
+LEAST = 3
+"""Least number of errors for a fit."""
+STRAIGHT = 0.9
+"""Least squared correlation of N and the logarithms of errors that decrease geometrically."""
+MOSTLY = 0.9
+"""Least share of comparisons at which a claim holds in part."""
+
+
+class InitialValue(NamedTuple):
+    """System with unit masses, initial state, errors of (q, p) after h by quantity, and small steps for fits."""
+
+    system: LagrangianSystem
+    q: tuple[Number, ...]
+    p: tuple[Number, ...]
+    errors: Callable[[Sequence[Number], Sequence[Number], Number], Mapping[str, Number]]
+    fitted: tuple[Number, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepCase:
+    """InitialValue, and meaning of N.
+
+    Attributes:
+        title: description, as in sentences and above panels.
+        problem: initial value problem.
+        beyond: N less the degree.
+        more: number of Gauss points of SVI less N.
+        judged: False if the case is only shown.
+    """
+
+    title: str
+    problem: InitialValue
+    beyond: int = 1
+    more: int = 0
+    judged: bool = True
+
+    def method(self, scheme: str, n: int) -> Method:
+        """Return ``"SVI"`` or ``"SC"`` for N."""
+        degree = n - self.beyond
+        return SVI(degree, f"gauss-legendre:{n + self.more}") if scheme == "SVI" else SpectralCollocation(degree)
+
+
+@lru_cache(maxsize=8192)
+def step_errors(case: StepCase, scheme: str, n: int, h: Number, precise: bool = False) -> Mapping[str, float]:
+    """Return the errors of the compiled step, NaN if it has no solution, or of the step in 60 digits."""
+    problem, method = case.problem, case.method(scheme, n)
+    if precise:
+        end = _derived(problem.system, method)(problem.q, problem.p, h)
+        q, p = end.q, end.p
+    else:
+        stepper = stepper_of(problem.system, method, "newton")
+        start = [float(x) for x in problem.q], [float(x) for x in problem.p]
+        try:
+            ends = stepper.step(start[0], start[1], float(h), options=ROUNDOFF)
+        except StepFailedError:
+            return dict.fromkeys(problem.errors(problem.q, problem.p, mp.mpf(h)), math.nan)
+        q, p = (tuple(map(mp.mpf, x)) for x in ends)
+    return {name: float(error) for name, error in problem.errors(q, p, mp.mpf(h)).items()}
+
+
+_derived = lru_cache(maxsize=64)(derived_step)
+
+
+class Law(NamedTuple):
+    """Line constant base^N, or constant h^base."""
+
+    constant: float
+    base: float
+
+
+class ErrorCurve(NamedTuple):
+    """Errors of one scheme over N, or of one scheme and N over h.
+
+    Attributes:
+        case, what, scheme, n: problem, quantity, scheme, and N (0 over N).
+        x, errors: N or h, and errors.
+        law: fitted line, ``None`` if there is no error but round-off.
+    """
+
+    case: StepCase
+    what: str
+    scheme: str
+    n: int
+    x: Array
+    errors: Array
+    law: Law | None
+
+    def row(self, printed: Law | None) -> tuple[Cell, ...]:
+        """Return the row of a table."""
+        law = self.law or (None, None)
+        return (self.case.title, self.scheme, self.n or None, self.what, *law, *(printed or (None, None)))
+
+
+COLUMNS = (
+    "setting",
+    "scheme",
+    "N",
+    "error of",
+    "constant",
+    "base or power",
+    "paper's constant",
+    "paper's base or power",
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Study:
+    """Errors over N or over h.
+
+    Attributes:
+        sentences: setting of the result.
+        cases: problems and meanings of N.
+        quantities: names of the errors.
+        steps: step sizes; over N a single one.
+        degrees: over N, degrees by scheme.
+        lines: over N, the paper's lines by scheme and quantity.
+        powers: over h, constants of the paper's lines by quantity and power of h.
+        resolved: largest error of SC that is compared with that of SVI.
+    """
+
+    sentences: tuple[str, ...]
+    cases: tuple[StepCase, ...]
+    quantities: tuple[str, ...]
+    steps: tuple[float, ...]
+    degrees: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    lines: Mapping[tuple[str, str], Law] = field(default_factory=dict)
+    powers: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
+    resolved: float = math.inf
+
+    @property
+    def judged(self) -> tuple[StepCase, ...]:
+        """Cases on which verdicts are based."""
+        return tuple(case for case in self.cases if case.judged)
+
+    def curves(self) -> list[ErrorCurve]:
+        """Return all curves, those of SVI and SC in turn."""
+        return [
+            each
+            for what in self.quantities
+            for case in self.cases
+            for n in (LEGEND if not self.degrees else (0,))
+            for each in (self._curve(case, what, scheme, n) for scheme in SCHEMES)
+        ]
+
+    def _curve(self, case: StepCase, what: str, scheme: str, n: int) -> ErrorCurve:
+        if n:
+            errors = [step_errors(case, scheme, n, h)[what] for h in self.steps]
+            return ErrorCurve(
+                case, what, scheme, n, np.array(self.steps), np.array(errors), fitted_power(case, scheme, n, what)
+            )
+        counts = np.array(self.degrees[scheme]) + case.beyond
+        over_n = np.array([step_errors(case, scheme, int(n), self.steps[0])[what] for n in counts])
+        return ErrorCurve(case, what, scheme, 0, counts, over_n, fitted_line(counts, over_n))
+
+    def printed(self, curve: ErrorCurve) -> Law | None:
+        """Return the paper's line of a curve; over h that of the same power."""
+        if not curve.n:
+            return self.lines.get((curve.scheme, curve.what))
+        power = round(curve.law.base) if curve.law else 0
+        constant = self.powers.get(curve.what, {}).get(power)
+        return Law(constant, power) if constant else None
+
+
+def within(errors: Array) -> NDArray[np.bool_]:
+    """Return a mask of the errors that count: above round-off and resolved."""
+    return (errors > WINDOW[0]) & (errors < WINDOW[1])
+
+
+def fitted_line(n: Array, errors: Array) -> Law | None:
+    """Return the line through the errors that count; ``None`` with fewer than three of them."""
+    used = within(errors)
+    if np.count_nonzero(used) < LEAST:
+        return None
+    slope, offset = np.polyfit(n[used], np.log(errors[used]), 1)
+    return Law(float(np.exp(offset)), float(np.exp(slope)))
+
+
+@lru_cache(maxsize=512)
+def fitted_power(case: StepCase, scheme: str, n: int, what: str) -> Law | None:
+    """Return the line through the errors of small steps in 60 digits; ``None`` if there is no error."""
+    steps = case.problem.fitted
+    errors = np.array([step_errors(case, scheme, n, h, precise=True)[what] for h in steps])
+    if errors.max() < NO_ERROR:
+        return None
+    power, offset = np.polyfit(np.log([float(h) for h in steps]), np.log(errors), 1)
+    return Law(float(np.exp(offset)), float(power))
+
+
+def is_straight(n: Array, errors: Array) -> bool:
+    """Return True if the errors that count decrease, along a line."""
+    used = within(errors)
+    correlation = np.corrcoef(n[used], np.log(errors[used]))[0, 1]
+    return bool(correlation < 0 and correlation**2 > STRAIGHT)
+
+
+def factors(n: Array, errors: Array, line: Law) -> Array:
+    """Return the factor, at least 1, between each error that counts and a line."""
+    used = within(errors)
+    result: Array = np.exp(np.abs(np.log(errors[used]) - np.log(line.constant) - n[used] * np.log(line.base)))
+    return result
+
+
+def refinement(name: str, title: str, study: Study) -> Experiment:
+    """Return the experiment of a figure of errors over N or over h."""
+
+    def run(_: Mapping[str, Result]) -> Result:
+        curves = study.curves()
+        checks = _point_checks(study, curves) if study.degrees else _step_checks(study, curves)
+        picture = Picture(panels=tuple(_panels(study, curves)), columns=len(study.cases), size=(4.5, 4.0))
+        rows = tuple(curve.row(study.printed(curve)) for curve in curves)
+        formats = dict.fromkeys(COLUMNS[4:], ".2g")
+        return Result(
+            setting=study.sentences,
+            checks=(*checks, _superiority(study, curves)),
+            tables=(TableBlock(columns=COLUMNS, rows=rows, formats=formats), picture.curves()),
+            picture=picture,
+        )
+
+    return Experiment(name=name, title=title, run=run)
+
+
+def _superiority(study: Study, curves: Sequence[ErrorCurve]) -> Comparison:
+    """Return the check of conclusion (ii) where the error of SC is resolved and above round-off."""
+    lost, count = [], 0
+    for svi, sc in zip(curves[::2], curves[1::2], strict=True):
+        theirs = dict(zip(sc.x.tolist(), sc.errors.tolist(), strict=True))
+        for x, error in zip(svi.x.tolist(), svi.errors.tolist(), strict=True):
+            if svi.case.judged and math.isfinite(error) and ROUNDOFF_LEVEL < theirs.get(x, 0.0) < study.resolved:
+                count += 1
+                lost += (
+                    [f"{svi.what}, {svi.case.title}, {'h' if svi.n else 'N'} = {x:.2g}"] if error >= theirs[x] else []
+                )
+    return Comparison(
+        claim="SVI is more accurate than SC with the same number of points and the same step.",
+        measured=f"The error of SVI is the smaller one in {count - len(lost)} of {count} comparisons"
+        + (f"; not {'; '.join(lost[:8])}." if lost else "."),
+        verdict=Verdict.PARTLY if lost and len(lost) <= (1 - MOSTLY) * count else holds(not lost),
+        bears_on=("accuracy",),
+    )
+
+
+def _point_checks(study: Study, curves: Sequence[ErrorCurve]) -> Iterator[Comparison]:
+    """Yield the checks over N: straight lines, their bases, and their constants."""
+    by_case = {case: [c for c in curves if c.case is case] for case in study.cases}
+    straight = {case: [is_straight(c.x, c.errors) for c in by_case[case] if c.law] for case in study.cases}
+    yield Comparison(
+        claim="Under N-refinement the errors fall geometrically.",
+        measured=f"Straight (N and the logarithm of the error correlate with r^2 above {STRAIGHT:g}) are "
+        + ", ".join(f"{sum(each)} of {len(each)} curves ({case.title})" for case, each in straight.items())
+        + ". Curves with fewer than three errors above round-off are left out.",
+        verdict=judged(*(one for case in study.judged for one in straight[case])),
+        bears_on=("geometric",),
+    )
+    drawn = {case: [(c, line) for c in by_case[case] if (line := study.printed(c))] for case in study.cases}
+    bases = {case: [(c.law.base, line.base) for c, line in drawn[case] if c.law] for case in study.cases}
+    lines = ", ".join(f"{scheme} {what} {line.base:g}" for (scheme, what), line in study.lines.items())
+    found = "; ".join(
+        f"{case.title}: " + ", ".join(f"{c.scheme} {c.what} {c.law.base:.2g}" for c, _ in drawn[case] if c.law)
+        for case in study.cases
+    )
+    yield Comparison(
+        claim=f"They fall like b^N with the bases b of the drawn lines: {lines}.",
+        measured=f"{found}. Bases that differ by less than a factor of two count as the same.",
+        verdict=judged(*(all(b / 2 < a < 2 * b for a, b in bases[case]) for case in study.judged)),
+    )
+    off = {k: float(np.median(np.concatenate([factors(c.x, c.errors, line) for c, line in drawn[k]]))) for k in drawn}
+    yield Comparison(
+        claim="The lines c b^N run along the errors.",
+        measured="The typical factor between an error and its line is "
+        + ", ".join(f"{factor:.2g} ({case.title})" for case, factor in off.items())
+        + f". Below {ALONG:g} counts as along.",
+        verdict=judged(*(off[case] < ALONG for case in study.judged)),
+    )
+
+
+def _step_checks(study: Study, curves: Sequence[ErrorCurve]) -> Iterator[Comparison]:
+    """Yield the checks over h: powers and constants of the legend, or that SVI falls faster if there is none."""
+    for what in study.quantities:
+        mine, printed = [c for c in curves if c.what == what], study.powers.get(what)
+        measured = "; ".join(f"{case.title}: {_powers([c for c in mine if c.case is case])}" for case in study.cases)
+        if printed is None:
+            pairs = zip(mine[::2], mine[1::2], strict=True)
+            faster = [not svi.law or bool(sc.law and svi.law.base > sc.law.base) for svi, sc in pairs]
+            claim = f"The error of the {what} falls faster with h for SVI than for SC."
+            yield Comparison(
+                claim=claim, measured=f"Powers: {measured}.", verdict=holds(all(faster)), bears_on=("accuracy",)
+            )
+            continue
+        laws = [c.law for c in mine if c.case.judged and c.law]
+        ours = {round(law.base) for law in laws}
+        missing = ", ".join(f"h^{power}" for power in printed if power not in ours)
+        yield Comparison(
+            claim=f"The errors of {what} follow the lines {', '.join(f'h^{power}' for power in printed)}.",
+            measured=f"Powers: {measured}. Of the lines {missing or 'none'} is missing with {study.judged[0].title}.",
+            verdict=judged(*(power in ours for power in printed)),
+        )
+        both = [(law.constant, printed[round(law.base)]) for law in laws if round(law.base) in printed]
+        off = [max(a / b, b / a) for a, b in both]
+        yield Comparison(
+            claim=f"The lines run along the errors of {what}.",
+            measured=f"The constants of {len(off)} curves whose power is printed are off by factors of {min(off):.1f} "
+            f"to {max(off):.1f} with {study.judged[0].title}. Below {ALONG:g} counts as along.",
+            verdict=holds(max(off) < ALONG),
+        )
+
+
+def _powers(curves: Sequence[ErrorCurve]) -> str:
+    """Return the fitted powers as text."""
+    parts = [[f"{c.law.base:.1f}" for c in curves if c.law and c.scheme == scheme] for scheme in SCHEMES]
+    texts = (f"{scheme} {', '.join(each) or 'no error at all'}" for scheme, each in zip(SCHEMES, parts, strict=True))
+    return " and ".join(texts)
+
+
+def _panels(study: Study, curves: Sequence[ErrorCurve]) -> Iterator[Panel]:
+    """Yield a panel for each quantity and case; the paper's lines are dotted."""
+    looks = {0: ("o", "-"), **dict(zip(LEGEND, (("o", "-"), ("s", "--"), ("D", "-.")), strict=True))}
+    for what, case in product(study.quantities, study.cases):
+        series = []
+        for c in (c for c in curves if c.what == what and c.case is case):
+            marker, line = looks[c.n]
+            label = f"{c.scheme}, N = {c.n}" if c.n else c.scheme
+            series.append(Series(x=c.x, y=c.errors, scheme=c.scheme, label=label, marker=marker, line=line))
+            if not c.n and (law := study.printed(c)):
+                label, y = f"paper: {law.constant:.0e} {law.base:g}$^N$", law.constant * law.base**c.x
+                series.append(Series(x=c.x, y=y, scheme=c.scheme, label=label, line=":"))
+        for power, constant in study.powers.get(what, {}).items() if case.judged else ():
+            y = constant * np.array(study.steps) ** power
+            series.append(Series(x=study.steps, y=y, scheme="exact", end=f"$h^{{{power}}}$", line=":"))
+        yield Panel(
+            title=f"{what}, {case.title}",
+            series=tuple(series),
+            xlabel="Chebyshev points N" if study.degrees else "step h",
+            ylabel="error",
+            log="y" if study.degrees else "xy",
+            floor=1e-15,
+        )
