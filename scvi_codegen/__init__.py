@@ -27,6 +27,9 @@ _HOMES = {
     "frameworks.flow": ("JaxFlow", "jax_flow"),
     "frameworks.torch": ("TorchFlow", "torch_flow"),
     "frameworks.rebound": ("GravitatingBodies", "from_rebound", "to_rebound"),
+    "fields.derivation": ("FieldDerivation",),
+    "fields.laws": ("ConservationLaw",),
+    "fields.local": ("LocalLaw",),
     "fields.mesh": ("MeshSystem",),
     "fields.system": ("FieldSystem",),
     "files.cache": ("CacheInfo", "cache_info", "clear_cache"),
@@ -99,6 +102,7 @@ _HOMES = {
     "pictures.attitudes": ("plot_attitude",),
     "pictures.paths": ("plot_motion", "plot_phase"),
     "pictures.arrays": ("plot_arrays",),
+    "pictures.fields": ("plot_field", "plot_spectrum"),
     "models.problems": ("PROBLEMS", "problem"),
     "tables.quadrature": (
         "Quadrature",

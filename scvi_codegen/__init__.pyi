@@ -33,6 +33,9 @@ from scvi_codegen.errors import SystemDefinitionWarning as SystemDefinitionWarni
 from scvi_codegen.exact.discrete_lagrangian import ExactStep as ExactStep
 from scvi_codegen.exact.discrete_lagrangian import exact_discrete_lagrangian as exact_discrete_lagrangian
 from scvi_codegen.exact.discrete_lagrangian import exact_map as exact_map
+from scvi_codegen.fields.derivation import FieldDerivation as FieldDerivation
+from scvi_codegen.fields.laws import ConservationLaw as ConservationLaw
+from scvi_codegen.fields.local import LocalLaw as LocalLaw
 from scvi_codegen.fields.mesh import MeshSystem as MeshSystem
 from scvi_codegen.fields.system import FieldSystem as FieldSystem
 from scvi_codegen.files.cache import CacheInfo as CacheInfo
@@ -92,6 +95,8 @@ from scvi_codegen.pictures.arrays import plot_arrays as plot_arrays
 from scvi_codegen.pictures.attitudes import plot_attitude as plot_attitude
 from scvi_codegen.pictures.conserved import plot_energy as plot_energy
 from scvi_codegen.pictures.conserved import plot_momentum_maps as plot_momentum_maps
+from scvi_codegen.pictures.fields import plot_field as plot_field
+from scvi_codegen.pictures.fields import plot_spectrum as plot_spectrum
 from scvi_codegen.pictures.overview import plot_section as plot_section
 from scvi_codegen.pictures.overview import plot_trajectory as plot_trajectory
 from scvi_codegen.pictures.paths import plot_motion as plot_motion

@@ -113,20 +113,18 @@ class Axis:
             result /= self.weights
         return np.moveaxis(result, -1, along)
 
-    def spectrum(self, values: Array) -> tuple[Array, Array]:
-        """Return the squared amplitudes of the highest sixth of the modes and of all, (.., E), else (.., 1).
+    def modes(self, values: Array) -> Array:
+        """Return the squared amplitudes of all modes but the constant, (.., E, p), or (.., 1, N//2) of Fourier modes.
 
         Args:
             values: at the points along the last axis.
         """
         if self.table is None:
-            modes = np.abs(np.fft.rfft(values)[..., None, 1:]) ** 2
-        else:
-            points = np.array([float(x) for x in self.reference])
-            to_modes = np.linalg.inv(np.polynomial.legendre.legvander(points, len(points) - 1))
-            modes = np.einsum("ab,...eb->...ea", to_modes, self._in_elements(values))[..., 1:] ** 2
-            modes = modes / (np.arange(1, len(points)) + 0.5)
-        return modes[..., -max(1, modes.shape[-1] // 6) :].sum(-1), modes.sum(-1)
+            return np.asarray(np.abs(np.fft.rfft(values)[..., None, 1:]) ** 2)
+        points = np.array([float(x) for x in self.reference])
+        to_modes = np.linalg.inv(np.polynomial.legendre.legvander(points, len(points) - 1))
+        modes = np.einsum("ab,...eb->...ea", to_modes, self._in_elements(values))[..., 1:] ** 2
+        return np.asarray(modes / (np.arange(1, len(points)) + 0.5))
 
     def _in_elements(self, array: Array) -> Array:
         """Return values at the points of each element, (..., E, p + 1); prescribed ones are 0."""
@@ -155,6 +153,7 @@ def spectral_elements(name: str, breaks: Array, degree: int, fixed: tuple[bool, 
     places %= count
     points, masses = np.zeros(count), np.zeros(count)
     points[places[:, ::-1]] = at[:, ::-1]
+    points[places[0, 0]] = breaks[0]  # not the end of a periodic axis
     np.add.at(masses, places.ravel(), np.outer(half, np.array([float(each) for each in rule.weights])).ravel())
     left, right = fixed or (False, False)
     if count <= left + right:

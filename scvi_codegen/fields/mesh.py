@@ -50,6 +50,22 @@ class Mesh:
 
     __repr__ = summary("field_system")
 
+    def fields_of(self, q: Array, p: Array, velocity: Array | None = None) -> dict[str, Array]:
+        """Return fields at the points, (n, shape of the fields), by name, of states (n, m).
+
+        Momenta of a Hamiltonian density are those of the density; velocities u_t are included if given.
+        """
+        system, shape = self.field_system, self.weights.shape
+
+        def split(states: Array, names: Sequence[str]) -> dict[str, Array]:
+            parts = states[:, : len(names) * self.weights.size].reshape(len(states), len(names), *shape)
+            return {name: parts[:, k] for k, name in enumerate(names)}
+
+        result = split(q, system.fields)
+        if system.momenta:
+            return result | {name: values / self.weights for name, values in split(p, system.momenta).items()}
+        return result if velocity is None else result | split(velocity, [str(each) for each in system.rates])
+
     def integral(self, values: ArrayLike) -> Any:
         """Return the integral over space of values at the points, (.., shape of the fields), by quadrature."""
         return np.sum(self.weights * self._at_points(values), axis=tuple(range(-len(self.axes), 0)))
@@ -76,7 +92,9 @@ class Mesh:
         array = array / np.where(size > 0, size, 1.0)
         for k, each in enumerate(self.axes):
             others = tuple(range(-count, -1))
-            highest, every = (x.sum(others) for x in each.spectrum(np.moveaxis(array, k - count, -1)))
+            modes = each.modes(np.moveaxis(array, k - count, -1))
+            highest = modes[..., -max(1, modes.shape[-1] // 6) :].sum(-1).sum(others)
+            every = modes.sum(-1).sum(others)
             largest = every.max(-1)
             parts.append(highest.max(-1) / np.where(largest > 0, largest, 1.0))
         return np.max(parts, axis=0)[()]

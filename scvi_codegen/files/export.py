@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import StateError
 from scvi_codegen.files.atomic import replaced
 from scvi_codegen.files.labelled_arrays import (
-    AXES,
     CHUNK_BYTES,
     Labelled,
     NamedQuantity,
@@ -79,7 +78,7 @@ class States:
         h: step size.
         about: metadata texts by name: title, system, method, version, ...
         maps: names of the momentum maps.
-        attitudes: quantities of rotations, directions and spins.
+        attitudes: quantities of rotations, directions and spins, and fields on meshes.
         quantities: derived quantities of t (n,), q and p (n, m): velocity (n, m), energy (n,), momentum_map (n, c), and
             the attitudes by name.
         units: of t, q, p and these, as far as known.
@@ -119,8 +118,9 @@ class States:
             whole["symmetry"] = np.array(self.maps)
         attitudes = self.attitudes if self.quantities is not None else ()
         if attitudes:
-            dimensions |= {axis: (axis,) for axis in AXES} | {each.name: ("t", *each.dimensions) for each in attitudes}
-            whole |= AXES
+            axes = {axis: values for each in attitudes for axis, values in each.axes.items()}
+            dimensions |= {axis: (axis,) for axis in axes} | {each.name: ("t", *each.dimensions) for each in attitudes}
+            whole |= axes
         return Labelled(
             dimensions=dimensions,
             pieces=self._labelled_pieces,
@@ -213,7 +213,8 @@ def _columns(states: States) -> Iterator[Iterator[NDArray[Any]]]:
         derived = {} if states.quantities is None else states.quantities(t, q, p)
         more = (*derived["velocity"].T, derived["energy"]) if derived else ()
         if derived:
-            more += tuple(column for each in states.attitudes for column in derived[each.name].reshape(len(t), -1).T)
+            tables = [derived[each.name].reshape(len(t), -1).T for each in states.attitudes if each.columns]
+            more += tuple(column for table in tables for column in table)
         yield iter((t, *q.T, *p.T, iterations, *more))
 
 

@@ -55,19 +55,21 @@ AXES: dict[str, NDArray[np.int_]] = {name: np.arange(1, 4) for name in ("space_a
 
 @dataclass(frozen=True, slots=True)
 class NamedQuantity:
-    """Rotation matrix, angular velocity, angular momentum, direction or spin.
+    """Rotation matrix, angular velocity, angular momentum, direction or spin, or a field on a mesh.
 
     Attributes:
         name: as in formulas, ``R``, ``omega``, ``p_R``, ``n``, ``n_dot``, ``s``.
         dimensions: names of its axes.
-        columns: names of its entries in tables, ``R_11``, ``omega_1``, ``n_1_dot``.
+        columns: names of its entries in tables, ``R_11``, ``omega_1``, ``n_1_dot``; none of fields, whose states are.
         long_name: description.
+        axes: coordinates of its dimensions.
     """
 
     name: str
     dimensions: tuple[str, ...]
     columns: tuple[str, ...]
     long_name: str
+    axes: Mapping[str, NDArray[Any]] = field(default_factory=lambda: AXES)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,7 +104,7 @@ class Labelled:
     def about(self, name: str) -> dict[str, str]:
         """Return the attributes of an array."""
         units = {"units": self.units[name]} if name in self.units else {}
-        return {"long_name": self.long_names.get(name) or LONG_NAMES[name], **units}
+        return {"long_name": self.long_names.get(name) or LONG_NAMES.get(name, f"coordinate {name}"), **units}
 
     def size(self) -> int:
         """Return the bytes of the arrays along t."""

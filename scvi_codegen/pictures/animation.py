@@ -20,7 +20,8 @@ from scvi_codegen.errors import PlotError, StateError
 from scvi_codegen.files.atomic import replaced
 from scvi_codegen.mechanics.symmetry.sampling import bodies
 from scvi_codegen.pictures.attitudes import solids
-from scvi_codegen.pictures.canvas import MOTION, Array, DrawnMotion, check_plot_path, color, plain, style
+from scvi_codegen.pictures.canvas import COLORS, MOTION, Array, DrawnMotion, check_plot_path, color, plain, style
+from scvi_codegen.pictures.fields import field_values, mesh_of
 from scvi_codegen.representation import summary
 from scvi_codegen.validation import FUNCTION, PATH, REAL, checks_arguments
 
@@ -81,6 +82,8 @@ def shape_of(motion: DrawnMotion, positions: Callable[[Array], Array] | None = N
         return MovingPoints(
             points=lambda q, p: q[:, columns], labels=labels, trails=tuple(range(len(result))), names=names
         )
+    if (mesh := mesh_of(motion)) is not None and len(mesh.axes) < 3:
+        return _graph(motion)
     if (sign := _hanging(motion)) is not None:
         return _pendulum(_lengths(motion), sign)
     if m == 1:
@@ -115,6 +118,20 @@ def _solids(motion: DrawnMotion) -> MovingPoints:
     centres = motion.q[:, columns] if len(columns) == 3 else np.zeros((len(motion.q), 3))
     points, parts, trails = solids(motion, centres)
     return MovingPoints(points=lambda q, p: points, labels=tuple("xyz"), solids=parts, trails=trails)
+
+
+def _graph(motion: DrawnMotion) -> MovingPoints:
+    """Return the graph of the first field of a mesh, a line over x or the lines of a surface over x and y."""
+    mesh, name, values = field_values(motion, None)
+    points = np.stack([*(np.broadcast_to(grid, values.shape) for grid in mesh.points.values()), values], axis=-1)
+    count = values.shape[-1]
+    lines = tuple(slice(k, k + count) for k in range(0, values[0].size, count))
+    return MovingPoints(
+        points=lambda q, p: points.reshape(len(points), -1, points.shape[-1]),
+        labels=(*(axis.name for axis in mesh.axes), name),
+        solids=lines,
+        equal=False,
+    )
 
 
 def _pendulum(lengths: Array, sign: float) -> MovingPoints:
@@ -196,7 +213,7 @@ def animate(
     seconds: float = 8.0,
     positions: Callable[[Array], Array] | None = None,
 ) -> Film:
-    """Animate a trajectory: bodies, pendulums, chains, or a point in the plane of its coordinates.
+    """Animate a trajectory: bodies, pendulums, chains, fields on meshes, or a point in the plane of its coordinates.
 
     Bodies are recognised by coordinate names (x, y or sun_x, sun_y, ..), pendulums by their potential energy, with rod
     lengths from parameters named l, or l1, l2, .., for example. Other numbered coordinates are a chain.
@@ -296,9 +313,10 @@ class _Scene:
         alone: list[Any] = [slice(None)] if shape.joined else list(range(self.drawn_points.shape[1]))
         marks = list(shape.solids) or alone
         names = shape.names or ("",) * len(marks)
+        few = len(marks) <= len(COLORS)  # a surface has one colour
         line = "-" if shape.solids else "o-" if shape.joined else "o"
         self.marks = [
-            (which, self.axes.plot(*nothing, line, color=color(k), markersize=5, linewidth=1.2, label=name)[0])
+            (which, self.axes.plot(*nothing, line, color=color(k * few), markersize=5, linewidth=1.2, label=name)[0])
             for k, (which, name) in enumerate(zip(marks, names, strict=True))
         ]
         if shape.names:

@@ -31,6 +31,7 @@ from scvi_codegen.pictures.canvas import (
     style,
 )
 from scvi_codegen.pictures.conserved import draw_energy_error, plot_energy, plot_momentum_maps
+from scvi_codegen.pictures.fields import plot_field, plot_spectrum
 from scvi_codegen.pictures.paths import draw_paths, path_panels, plot_motion, plot_phase
 from scvi_codegen.validation import CANVAS, NAMES, PATH, checks_arguments
 
@@ -160,6 +161,14 @@ class Plots:
     def momentum_maps(self, path: Path = None, *, ax: Axes | None = None) -> Axes:
         """Draw the errors of momentum maps, as :func:`scvi_codegen.plot_momentum_maps`."""
         return plot_momentum_maps(self.trajectory, path, ax=ax)
+
+    def field(self, path: Path = None, *, field: str | None = None, state: int = -1, ax: Axes | None = None) -> Axes:
+        """Draw a field of a mesh, as :func:`scvi_codegen.plot_field`."""
+        return plot_field(self.trajectory, path, field=field, state=state, ax=ax)
+
+    def spectrum(self, path: Path = None, *, field: str | None = None, ax: Axes | None = None) -> Axes:
+        """Draw the spectrum of a field of a mesh, as :func:`scvi_codegen.plot_spectrum`."""
+        return plot_spectrum(self.trajectory, path, field=field, ax=ax)
 
     def section(self, path: Path = None, *, axes: tuple[str, str], event: int = 0, ax: Axes | None = None) -> Axes:
         """Draw a Poincare section, as :func:`scvi_codegen.plot_section`."""

@@ -1,6 +1,8 @@
-"""Named quantities of rotations, directions and spins, for tables and files."""
+"""Named quantities of rotations, directions, spins and fields on meshes, for tables and files."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +20,29 @@ SPACE, BODY = (("space_axis",), ("body_axis",))
 
 def named_quantities(interface: Interface) -> tuple[NamedQuantity, ...]:
     """Return the quantities of :func:`values_by_name`, in order."""
+    if (mesh := _mesh(interface)) is not None:
+        axes = {axis.name: axis.points for axis in mesh.axes}
+        nothing = np.zeros((1, interface.dimension))
+        return tuple(
+            NamedQuantity(_free_name(name), tuple(axes), (), f"{name} at the points of the mesh", axes)
+            for name in mesh.fields_of(nothing, nothing, nothing)
+        )
     return tuple(each for member in members_of(interface.dimension, interface.rotations) for each in _names(member))
+
+
+def _mesh(interface: Interface) -> Any:
+    """Return the mesh of fields discretised from a density, or ``None``."""
+    return None if interface.layout is None else interface.layout.mesh
+
+
+def _free_name(name: str) -> str:
+    return name if name not in LONG_NAMES else f"{name}_"
 
 
 def values_by_name(interface: Interface, q: Array, p: Array, velocity: Array) -> dict[str, Array]:
     """Return (.., 3) vectors and (.., 3, 3) matrices by name, of (.., m) states."""
+    if (mesh := _mesh(interface)) is not None:
+        return {_free_name(name): values for name, values in mesh.fields_of(q, p, velocity).items()}
     result: dict[str, Array] = {}
     for member in members_of(interface.dimension, interface.rotations):
         own, momenta, rates = (each[..., member.columns] for each in (q, p, velocity))
@@ -80,7 +100,7 @@ def _observables(member: Member) -> tuple[str, ...]:
 
 def _names(member: Member) -> tuple[NamedQuantity, ...]:
     """Return the quantities of a member; names that files use otherwise have a trailing underscore."""
-    name = member.name if member.name not in LONG_NAMES else f"{member.name}_"
+    name = _free_name(member.name)
     if member.kind == "spin":
         return (NamedQuantity(name, SPACE, _columns(name), f"spin {name}"),)
     if member.kind == "direction":

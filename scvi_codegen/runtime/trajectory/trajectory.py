@@ -365,7 +365,8 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
     def plot(self) -> Plots:
         """Plots: ``run.plot()`` gives an overview, ``run.plot.energy("energy.png")`` a single plot in a file.
 
-        There are ``motion``, ``phase``, ``energy``, ``momentum_maps`` and ``section``; each returns Matplotlib axes.
+        There are ``motion``, ``phase``, ``energy``, ``momentum_maps`` and ``section``, and of fields on a mesh
+        ``field`` and ``spectrum``; each returns Matplotlib axes.
         """
         from scvi_codegen.pictures.overview import Plots
 
