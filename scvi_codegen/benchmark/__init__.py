@@ -1,20 +1,17 @@
 """Benchmark: this package and other integrators, compared at equal error.
 
-    cases/              problems, eight initial states each, accelerations derived by hand (unforced, adaptive, rods
-                        with forces or constraints, rotations, large array systems, texts of systems), and their final
-                        states in extended precision, independent of the package's steppers (references)
-    contenders/         steppers of this package, at the step sizes that advise() recommends; its peers: REBOUND, CyRK,
-                        JiTCODE, SciPy, heyoka and MuJoCo (engines) at several tolerances
-    comparison          timing of all of them in turn, in one process, for one case, or an ensemble of 64 trajectories
-    report              time at equal error, by interpolation; tables and JSON of results; plots: their pictures
-    energies            energy drift over ten million steps, and of array systems over a hundred thousand
-    hand_written        generated C and hand-written C; cost of a control step, and of the bare C function
-    first_step          time from text to the first step, also for larger systems and SymPy's bodies and loads
-    constrained_bodies  energies and lengths at equal time; MuJoCo
-    lattices            SVI and compositions at equal error; hand-written C (lattices.c), SciPy, REBOUND, OpenMM
-    array_systems       scaling with size; several threads
-    machine             description and limits of the machine; the same source with several compilers
-    settings            settings of a benchmark; processor times of functions and outputs of fresh processes
+    cases/       systems with their initial states and spans: unforced, adaptive, rods with forces or constraints,
+                 rotations, robots, fields, large array systems; accelerations derived by hand, and final states in
+                 extended precision, independent of the package's steppers (references)
+    contenders/  functions from a case and a step size or tolerance to its final state: steppers of this package; peers:
+                 heyoka (taylor), REBOUND, CyRK, JiTCODE, SciPy (peers), MuJoCo, Pinocchio (engines), OpenMM (arrays),
+                 PyDy (mechanisms), py-pde and spectral methods by hand (pdes)
+    comparison   timing of all contenders of a case in turn, in one process
+    sections     which contenders and which reference belong to a case
+    report       time at equal error, by interpolation; tables and JSON of results; plots: their pictures
+    tables       energy drift, time from text to the first step, steps with several threads
+    machine      description of the machine
+    settings     settings of a benchmark; processor times of functions
 
 The rules: medians of alternating rounds; stepping time only, compile time apart; every peer with the best options and
 the best formulation known to us, which are named; whole work-precision curves, no step or tolerance tuned afterwards.
@@ -29,30 +26,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from scvi_codegen.benchmark.array_systems import run_growth, run_threads
-from scvi_codegen.benchmark.cases.adaptive import ADAPTIVE_CASES
-from scvi_codegen.benchmark.cases.rods import CONSTRAINED_CASES, FORCED_CASES
-from scvi_codegen.benchmark.cases.rotations import ROTATIONS
 from scvi_codegen.benchmark.cases.unforced import CASES
-from scvi_codegen.benchmark.comparison import (
-    ENSEMBLES,
-    run_adaptive,
-    run_bodies,
-    run_case,
-    run_constrained,
-    run_ensemble,
-    run_forced,
-    run_rotations,
-)
-from scvi_codegen.benchmark.constrained_bodies import run_constrained_bodies
+from scvi_codegen.benchmark.comparison import run_race
 from scvi_codegen.benchmark.contenders.peers import PEERS
-from scvi_codegen.benchmark.energies import run_drift, run_energies
-from scvi_codegen.benchmark.first_step import run_cold_start, run_compile_times, run_mechanisms
-from scvi_codegen.benchmark.hand_written import run_control_loop, run_hand_written
-from scvi_codegen.benchmark.lattices import run_compositions, run_lattices
-from scvi_codegen.benchmark.machine import machine, run_compilers
+from scvi_codegen.benchmark.machine import machine
 from scvi_codegen.benchmark.report import LEGEND, CaseResult, ResultTable, header_lines
+from scvi_codegen.benchmark.sections import BUILDERS
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
+from scvi_codegen.benchmark.tables import run_drift, run_first_steps, run_threads
 from scvi_codegen.errors import ScviCodegenError, StateError, closest
 from scvi_codegen.files.atomic import write_atomically
 
@@ -62,26 +43,10 @@ SCHEMA = 2
 """Version of the JSON document."""
 
 SECTIONS: Mapping[str, Callable[[Plan, ReportActivity], CaseResult | ResultTable]] = {
-    **{name: partial(run_case, name) for name in CASES},
-    **{f"ensemble:{name}": partial(run_ensemble, name) for name in ENSEMBLES},
-    **{f"forced:{name}": partial(run_forced, name) for name in FORCED_CASES},
-    **{f"constrained:{name}": partial(run_constrained, name) for name in CONSTRAINED_CASES},
-    **{f"adaptive:{name}": partial(run_adaptive, name) for name in ADAPTIVE_CASES},
-    **{f"rotations:{name}": partial(run_rotations, name) for name in ROTATIONS},
-    "rotations:bodies": run_bodies,
+    **{name: partial(run_race, build) for name, build in BUILDERS.items()},
     "drift": run_drift,
-    "compositions": run_compositions,
-    "hand-written": run_hand_written,
-    "cold-start": run_cold_start,
-    "compile": run_compile_times,
-    "mechanisms": run_mechanisms,
-    "constrained-bodies": run_constrained_bodies,
-    "control-loop": run_control_loop,
-    "lattices": run_lattices,
-    "growth": run_growth,
+    "first-step": run_first_steps,
     "threads": run_threads,
-    "energies": run_energies,
-    "c-compilers": run_compilers,
 }
 """Sections of the benchmark: name on the command line -> function that measures it."""
 

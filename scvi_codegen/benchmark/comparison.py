@@ -1,6 +1,4 @@
-"""Comparison of all contenders on one case: compile all, then time them in turn.
-
-Timing of contenders in turn, in one process: all of them once, then all of them again.
+"""Comparison of all contenders on one case: compile all, then time them in turn, in one process, round after round.
 
 Times are processor times of the process. Every contender steps in one thread and does nothing but compute, so that this
 equals the wall time of an idle machine; on a busy one it excludes the time of other programs.
@@ -11,160 +9,81 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from scvi_codegen.benchmark.cases.adaptive import adaptive_case
-from scvi_codegen.benchmark.cases.references import Reference, adaptive_reference, reference, rms_error
-from scvi_codegen.benchmark.cases.rods import CONSTRAINED_CASES, FORCED_CASES, constrained_contenders
-from scvi_codegen.benchmark.cases.rotations import BODIES, FEW_BODIES, ROTATIONS, bodies
-from scvi_codegen.benchmark.cases.unforced import STATES, Array, Case, case
-from scvi_codegen.benchmark.contenders.ours import adaptive_contenders, our_contenders, our_ensembles
-from scvi_codegen.benchmark.contenders.peers import PEERS, missing_module, peer_contenders
-from scvi_codegen.benchmark.contenders.taylor import heyoka_ensembles
+from scvi_codegen.benchmark.cases.references import Reference, reference, rms_error
+from scvi_codegen.benchmark.cases.unforced import STATES, Array, Case
+from scvi_codegen.benchmark.contenders.peers import PEERS, missing_module
 from scvi_codegen.benchmark.report import CaseResult, Contender, Measurement
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.errors import ScviCodegenError
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 
-ENSEMBLES = ("planar-pendulum", "kepler:0.2", "outer-solar-system")
-"""Names of the cases that are run as ensembles."""
-
-TRAJECTORIES = 64
-Makers = dict[str, Callable[[], Iterable[Contender]]]
-"""Functions that return contenders, by name of the peer."""
-
-ReferenceOf = Callable[[Case, Array | None], Reference]
-"""Function that returns the final states of a case, from its velocities or from momenta."""
+Make = Callable[[], Iterable[Contender]]
+"""Function that returns contenders."""
 
 
-@without_accuracy_warnings()
-def run_case(name: str, plan: Plan, report_activity: ReportActivity) -> CaseResult:
-    """Compare single trajectories of this package and all peers."""
-    return _race_alone(case(name), plan, report_activity)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Race:
+    """Contenders on a case.
 
-
-@without_accuracy_warnings()
-def run_forced(name: str, plan: Plan, report_activity: ReportActivity) -> CaseResult:
-    """Compare single trajectories with friction and driving forces."""
-    return _race_alone(FORCED_CASES[name](), plan, report_activity)
-
-
-def _race_alone(chosen: Case, plan: Plan, report_activity: ReportActivity) -> CaseResult:
-    chosen = replace(chosen, span=chosen.span * plan.share)
-    ours = partial(our_contenders, chosen, methods=plan.methods, quick=plan.quick)
-    return race(chosen, ours, _makers(chosen, plan), plan, report_activity)
-
-
-def _makers(chosen: Case, plan: Plan) -> Makers:
-    return {peer: partial(peer_contenders, peer, chosen, quick=plan.quick) for peer in plan.peers}
-
-
-@without_accuracy_warnings()
-def run_constrained(name: str, plan: Plan, report_activity: ReportActivity) -> CaseResult:
-    """Compare rods as constraints in this package with peers, and this package, in the angles of the rods."""
-    both = CONSTRAINED_CASES[name]().shortened(plan.share)
-    ours = partial(constrained_contenders, both, quick=plan.quick)
-    return race(both.angles, ours, _makers(both.angles, plan), plan, report_activity)
-
-
-@without_accuracy_warnings()
-def run_ensemble(name: str, plan: Plan, report_activity: ReportActivity) -> CaseResult:
-    """Compare ensembles of 64 trajectories in one thread; heyoka in its batch mode.
-
-    They start from the eight states of the case repeatedly, so that eight references suffice.
+    Attributes:
+        case: case to integrate, already with the span of the plan.
+        ours: function that returns the contenders of this package.
+        peers: function of a peer's name and whether the run is quick that returns the contenders of a peer, by default
+            those of :data:`~scvi_codegen.benchmark.contenders.peers.PEERS`.
+        ends: function that returns the final states of a case, from its velocities or from momenta.
     """
-    few = case(name)
-    few = replace(few, name=f"ensemble:{name}", span=few.span * plan.share)
-    copies = 2 if plan.quick else TRAJECTORIES // STATES
-    many = replace(few, q=np.tile(few.q, (copies, 1)), velocity=np.tile(few.velocity, (copies, 1)))
-    makers: Makers = {"heyoka": partial(heyoka_ensembles, many, plan.quick)} if "heyoka" in plan.peers else {}
-    return race(few, partial(our_ensembles, many, quick=plan.quick), makers, plan, report_activity)
+
+    case: Case
+    ours: Make
+    peers: Callable[[str, bool], Iterable[Contender] | None] | None = None
+    ends: Callable[[Case, Array | None], Reference] = reference
 
 
 @without_accuracy_warnings()
-def run_adaptive(name: str, plan: Plan, report_activity: ReportActivity) -> CaseResult:
-    """Compare problems with close encounters in all modes of this package with peers of adaptive step size."""
-    chosen = adaptive_case(name)
-    peers = ("heyoka", "rebound")
-    makers: Makers = {peer: partial(peer_contenders, peer, chosen, quick=True) for peer in peers if peer in plan.peers}
-    ours = partial(adaptive_contenders, chosen, quick=plan.quick)
-    return race(chosen, ours, makers, plan, report_activity, adaptive_reference)
-
-
-@without_accuracy_warnings()
-def run_rotations(name: str, plan: Plan, report_activity: ReportActivity) -> CaseResult:
-    """Compare a rigid body in this package with peers that integrate quaternion and angular velocity."""
-    chosen = ROTATIONS[name]()
-    chosen = replace(chosen, span=chosen.span * plan.share)
-
-    def ours() -> list[Contender]:
-        both = (our_contenders, adaptive_contenders)
-        return [contender for make in both for contender in make(chosen, quick=plan.quick)]
-
-    return race(chosen, ours, _makers(chosen, plan), plan, report_activity)
-
-
-@without_accuracy_warnings()
-def run_bodies(plan: Plan, report_activity: ReportActivity) -> CaseResult:
-    """Compare many free bodies in this package, in heyoka's batch mode and in one model of MuJoCo."""
-    chosen = bodies(FEW_BODIES if plan.quick else BODIES)
-    chosen = replace(chosen, span=chosen.span * plan.share)
-    makers: Makers = {
-        "heyoka": partial(heyoka_ensembles, chosen, plan.quick),
-        "mujoco": partial(peer_contenders, "mujoco", chosen, quick=plan.quick),
-    }
-    makers = {name: make for name, make in makers.items() if name in plan.peers}
-    return race(chosen, partial(our_ensembles, chosen, quick=plan.quick), makers, plan, report_activity)
-
-
-def race(
-    chosen: Case,
-    ours: Callable[[], list[Contender]],
-    makers: Makers,
-    plan: Plan,
-    report_activity: ReportActivity,
-    ends: ReferenceOf = reference,
-) -> CaseResult:
+def run_race(build: Callable[[Plan], Race], plan: Plan, report_activity: ReportActivity) -> CaseResult:
     """Time the contenders of this package and of peers in turn, and compare them with the reference."""
-    report_activity(f"{chosen.name}: reference")
-    exact = ends(chosen, None)
-    report_activity(f"{chosen.name}: step sizes")
+    chosen = build(plan)
+    name = chosen.case.name
+    report_activity(f"{name}: reference")
+    exact = chosen.ends(chosen.case, None)
+    report_activity(f"{name}: step sizes")
     skipped: dict[str, str] = {}
-    contenders = [*ours(), *_peer_contenders(chosen, makers, skipped, report_activity)]
-    report_activity(f"{chosen.name}: {len(contenders)} settings")
+    contenders = [*chosen.ours(), *_peer_contenders(chosen, plan, skipped, report_activity)]
+    report_activity(f"{name}: {len(contenders)} settings")
 
     def reference_of(contender: Contender) -> Reference:
-        return exact if contender.momenta is None else ends(chosen, contender.momenta[:STATES])
+        return exact if contender.momenta is None else chosen.ends(chosen.case, contender.momenta[:STATES])
 
-    result = measure(contenders, reference_of, repeats=plan.rounds)
     return CaseResult(
-        name=chosen.name,
-        span=chosen.span,
-        dimension=chosen.dimension,
+        name=name,
+        span=chosen.case.span,
+        dimension=chosen.case.dimension,
         accuracy=exact.accuracy,
-        measurements=tuple(result),
+        measurements=tuple(measure(contenders, reference_of, repeats=plan.rounds)),
         skipped=skipped,
     )
 
 
 def _peer_contenders(
-    chosen: Case, makers: Makers, skipped: dict[str, str], report_activity: ReportActivity
+    chosen: Race, plan: Plan, skipped: dict[str, str], report_activity: ReportActivity
 ) -> Iterator[Contender]:
-    for name, make in makers.items():
+    for name in plan.peers:
+        if not PEERS[name].suits(chosen.case):
+            continue
         missing = missing_module(PEERS[name])
         if missing is not None:
             skipped[name] = f"{missing} is not installed (pip install 'scvi-codegen[bench]')"
-        elif not PEERS[name].suits(chosen):
-            skipped[name] = "not applicable to this problem"
-        else:
-            report_activity(f"{chosen.name}: compiling {name}")
-            try:
-                yield from make()
-            except PEER_ERRORS as error:
-                skipped[name] = f"{type(error).__name__}: {error}"
+            continue
+        report_activity(f"{chosen.case.name}: compiling {name}")
+        try:
+            own = None if chosen.peers is None else chosen.peers(name, plan.quick)
+            yield from PEERS[name].contenders(chosen.case, plan.quick) if own is None else own
+        except PEER_ERRORS as error:
+            skipped[name] = f"{type(error).__name__}: {error}"
 
 
 PEER_ERRORS = (ArithmeticError, AttributeError, ImportError, OSError, RuntimeError, TypeError, ValueError)
@@ -190,7 +109,7 @@ class _Record:
             began = time.process_time()
             q = integrate()
             taken.append((time.process_time() - began) / size)
-            final.append(q)
+            final.append(q() if callable(q) else q)
         self.seconds.append(taken)
         self.final = final
 
@@ -203,7 +122,6 @@ def measure(
     reference_of: Callable[[Contender], Reference],
     *,
     repeats: int,
-    progress: Callable[[], None] = lambda: None,
 ) -> list[Measurement]:
     """Time all contenders alternately; a contender that fails is reported with the reason.
 
@@ -211,7 +129,6 @@ def measure(
         contenders: contenders to time.
         reference_of: function that returns the exact final states for a contender.
         repeats: number of rounds, after one that is not timed.
-        progress: called after each round of all.
     """
     records = [_Record(contender) for contender in contenders]
     for number in range(repeats + 1):
@@ -220,8 +137,7 @@ def measure(
                 _attempt(record)
             if number == 0 and record.wants_more():
                 record.seconds.clear()  # caches were cold
-        progress()
-    return [_summary(record, reference_of(record.contender)) for record in records]
+    return [_summary(record, reference_of) for record in records]
 
 
 def _attempt(record: _Record) -> None:
@@ -231,10 +147,12 @@ def _attempt(record: _Record) -> None:
         record.failure = f"{type(error).__name__}: {error}"
 
 
-def _summary(record: _Record, reference: Reference) -> Measurement:
-    contender, failed = record.contender, bool(record.failure)
+def _summary(record: _Record, reference_of: Callable[[Contender], Reference]) -> Measurement:
+    contender, failed, error = record.contender, bool(record.failure), float("nan")
     columns = [] if failed else list(zip(*record.seconds, strict=True))
-    error = float("nan") if failed else _error(record.final, reference)
+    if not failed:
+        own = contender.error
+        error = _error(record.final, reference_of(contender)) if own is None else own(record.final[0])
     return Measurement(
         method=contender.method,
         setting=contender.setting,

@@ -1,9 +1,4 @@
-"""Results that are one plain table.
-
-Work-precision curves: time at equal error, interpolated between measured settings.
-
-Work-precision curves of a case as a table for the terminal and as JSON.
-"""
+"""Contenders of a case, their measurements and work-precision curves, and tables of them for the terminal and JSON."""
 
 from __future__ import annotations
 
@@ -127,23 +122,6 @@ def time_at(points: Iterable[Point], error: float) -> float | None:
     return loose.seconds * math.pow(tight.seconds / loose.seconds, share)
 
 
-def error_at(points: Iterable[Point], seconds: float) -> float | None:
-    """Return the error reached in a time, as :func:`time_at`; ``None`` below the time of the fastest setting.
-
-    >>> round(error_at([Point(seconds=1.0, error=1e-4), Point(seconds=4.0, error=1e-8)], 2.0), 12)
-    1e-06
-    """
-    curve = frontier(points)
-    if not curve or seconds < curve[0].seconds:
-        return None
-    if seconds >= curve[-1].seconds:
-        return curve[-1].error
-    after = next(n for n, point in enumerate(curve) if point.seconds > seconds)
-    loose, tight = curve[after - 1], curve[after]
-    share = math.log(seconds / loose.seconds) / math.log(tight.seconds / loose.seconds)
-    return loose.error * math.pow(max(tight.error, LEAST) / loose.error, share)
-
-
 def common_error(one: Sequence[Point], other: Sequence[Point]) -> float | None:
     """Return the smallest error that both methods reach safely: twice the larger of their smallest, or the floor."""
     curves = frontier(one), frontier(other)
@@ -151,6 +129,9 @@ def common_error(one: Sequence[Point], other: Sequence[Point]) -> float | None:
         return None
     return max(FLOOR, *(MARGIN * curve[-1].error if curve[-1].error > FLOOR else FLOOR for curve in curves))
 
+
+ERRORS = (1e-3, 1e-6, 1e-9, 1e-12)
+"""Errors at which all methods are compared, where they reach them."""
 
 BASELINE, FAST, DEFAULT = "heyoka", "fast_math", "tol=default"
 
@@ -168,20 +149,22 @@ class Contender:
         options: formulation and options, for the reader.
         compile_seconds: time from the equations to a function that can be called.
         prepare: function from the number of a run, which is that of its initial state, to a function that integrates
-            from it and returns the final q.
+            from it and returns the final q, or a function for it that is not timed.
         momenta: (k, m) initial momenta, if they are its state; ``None`` if it starts from velocities.
         trajectories: number of trajectories of one run; the final q of an ensemble is (trajectories, m).
         starts: number of initial states, each of which is a run unless one run has all.
+        error: error of the final q, if it is not to be compared with the reference of the case (on other meshes).
     """
 
     method: str
     setting: str
     options: str
     compile_seconds: float
-    prepare: Callable[[int], Callable[[], NDArray[np.float64]]]
+    prepare: Callable[[int], Callable[[], Any]]
     momenta: NDArray[np.float64] | None = None
     trajectories: int = 1
     starts: int = STATES
+    error: Callable[[NDArray[np.float64]], float] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -243,13 +226,17 @@ class CaseResult:
     def text(self) -> str:
         """Return the table for the terminal."""
         failures = [f"{each.method} {each.setting}: {each.failure}" for each in self.measurements if each.failure]
-        good = {row.method: _shown(row) for row in rows(self)}
+        good = {row["method"]: finite(row) for row in rows(self)}
         return ResultTable(
             name=self.name,
             title=f"T = {self.span:g}, m = {self.dimension} (reference accurate to {self.accuracy:.0e})",
             columns=COLUMNS,
             rows=tuple(good.get(method, {"method": method, "setting": "failed"}) for method in self.methods()),
-            remarks=(*failures, *(f"skipped {name}: {why}" for name, why in self.skipped.items())),
+            remarks=(
+                *filter(None, (_line_at(self, error) for error in ERRORS)),
+                *failures,
+                *(f"skipped {name}: {why}" for name, why in self.skipped.items()),
+            ),
         ).text()
 
     @classmethod
@@ -276,62 +263,67 @@ class CaseResult:
             "reference_accuracy": self.accuracy,
             "skipped": dict(self.skipped),
             "measurements": [finite(asdict(each)) for each in self.measurements],
-            "rows": [_row_data(row) for row in rows(self)],
+            "rows": [finite(row) for row in rows(self)],
         }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReportRow:
-    """Line of the table; ratios are times of others over that of this method at equal error: above 1 it is faster.
+def rows(result: CaseResult) -> list[dict[str, Any]]:
+    """Return one row per method without failures, with the entries of :data:`COLUMNS` and, for JSON, more.
 
-    Attributes:
-        measurement: the fastest setting that reaches the common error, else the most accurate one.
-        at_error: error at which times are compared: the smallest that this method and heyoka both reach.
-        seconds: time of this method at that error, interpolated on its curve.
-        default: ratio for heyoka at its default tolerance, without ``fast_math``.
-        best: ratio for heyoka, the best of all its curves and tolerances.
-        peer: ratio for the best of all peers.
-        best_by_minima: like best, from the shortest times instead of the medians.
+    ``setting``: the fastest that reaches ``at_error``, else the most accurate one; ``at_error``: the smallest error
+    that this method and heyoka (else the best peer) both reach; ``seconds``: time of this method there, interpolated;
+    ``best_by_minima``: like best, from the shortest times instead of the medians.
     """
-
-    method: str
-    measurement: Measurement
-    at_error: float
-    seconds: float
-    default: float | None
-    best: float | None
-    peer: float | None
-    best_by_minima: float | None
-
-
-def rows(result: CaseResult) -> list[ReportRow]:
-    """Return one row per method."""
     made = [_row(result, method) for method in result.methods()]
-    return [row for row in made if row is not None]
+    return [row for row in made if row]
 
 
-def _row(result: CaseResult, method: str) -> ReportRow | None:
+def _row(result: CaseResult, method: str) -> dict[str, Any]:
     good = [each for each in result.measurements if not each.failure]
-    ours = [each for each in good if each.method == method]
-    if not ours:
-        return None
+    own = [each for each in good if each.method == method]
+    if not own:
+        return {}
     peers = [each for each in good if not each.method.startswith(OURS)]
     best = [each for each in peers if each.method.startswith(BASELINE)]
     default = [each for each in best if FAST not in each.method and each.setting == DEFAULT]
-    points = [each.point for each in ours]
-    error = common_error(points, [each.point for each in best or ours]) or math.inf
-    reaching = [each for each in ours if max(each.error, FLOOR) <= error]
-    shown = min(reaching, key=lambda each: each.seconds) if reaching else min(ours, key=lambda each: each.error)
-    return ReportRow(
-        method=method,
-        measurement=shown,
-        at_error=error,
-        seconds=time_at(points, error) or math.nan,
-        default=_ratio(_points(default), points),
-        best=_ratio(_points(best), points),
-        peer=_ratio(_points(peers), points),
-        best_by_minima=_ratio([each.fastest_point for each in best], [each.fastest_point for each in ours]),
-    )
+    points = _points(own)
+    error = common_error(points, _points(best or own)) or math.inf
+    reaching = [each for each in own if max(each.error, FLOOR) <= error]
+    shown = min(reaching, key=lambda each: each.seconds) if reaching else min(own, key=lambda each: each.error)
+    return {
+        "method": method,
+        "setting": shown.setting,
+        "time_ms": 1e3 * shown.seconds,
+        "error": shown.error,
+        "compile_s": shown.compile_seconds,
+        "default": _ratio(_points(default), points),
+        "best": _ratio(_points(best), points),
+        "peer": _ratio(_points(peers), points),
+        "at_error": error,
+        "options": "" if method.startswith(OURS) else shown.options,
+        "seconds": time_at(points, error) or math.nan,
+        "best_by_minima": _ratio([each.fastest_point for each in best], [each.fastest_point for each in own]),
+    }
+
+
+def ratios_at(result: CaseResult, error: float) -> tuple[str, dict[str, float]]:
+    """Return the fastest method of this package at an error, and the times of all methods that reach it, in seconds."""
+    good = [each for each in result.measurements if not each.failure]
+    curves = {method: [each.fastest_point for each in good if each.method == method] for method in result.methods()}
+    times = {method: time_at(points, error) for method, points in curves.items()}
+    reached = {method: seconds for method, seconds in times.items() if seconds is not None}
+    return min((each for each in reached if each.startswith(OURS)), key=reached.__getitem__, default=""), reached
+
+
+def _line_at(result: CaseResult, error: float) -> str:
+    """Return a line with the time of the fastest method of this package at an error, and ratios of all others."""
+    ours, times = ratios_at(result, error)
+    if not ours:
+        return ""
+    others = [f"{name} {seconds / times[ours]:.3g}" for name, seconds in times.items() if name != ours]
+    missing = [name for name in result.methods() if name not in times]
+    never = f"; not reached: {', '.join(missing)}" if missing else ""
+    return f"at {error:.0e}: {1e3 * times[ours]:.3g} ms by {ours}; others over it: {', '.join(others)}{never}"
 
 
 def _points(measurements: Sequence[Measurement]) -> list[Point]:
@@ -353,7 +345,8 @@ number of trajectories. Errors are those of q at the end, relative, in root mean
 setting shown is the fastest that reaches the error named. Ratios are times of others over that of the method, at equal
 error (errors below 1e-13 count as equal), interpolated on the measured curves: above 1 the method is faster.
 default: against heyoka with its default options; best: against heyoka with fast_math or without, at any tolerance,
-whichever is fastest; peer: against the fastest of all peers."""
+whichever is fastest; peer: against the fastest of all peers. Lines "at ..." compare the shortest times of all methods
+with that of the fastest of this package."""
 
 
 def header_lines(description: Mapping[str, Any]) -> str:
@@ -361,17 +354,3 @@ def header_lines(description: Mapping[str, Any]) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in description["versions"].items())
     first = f"{description['processor']}, {description['cores']} cores, load {description['load']}"
     return f"{first}\n{description['compiler']}, {description['flags']}\n{versions}"
-
-
-def _shown(row: ReportRow) -> dict[str, Any]:
-    """Return the entries of the table."""
-    shown = row.measurement
-    times = {"time_ms": 1e3 * shown.seconds, "error": shown.error, "compile_s": shown.compile_seconds}
-    options = "" if row.method.startswith(OURS) else shown.options
-    return finite(asdict(row)) | times | {"setting": shown.setting, "options": options}
-
-
-def _row_data(row: ReportRow) -> dict[str, Any]:
-    numbers = asdict(row) | {"setting": row.measurement.setting}
-    del numbers["measurement"]
-    return finite(numbers)

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from scvi_codegen.benchmark.contenders.peers import PEERS
 from scvi_codegen.errors import StateError
 from scvi_codegen.methods.method import Method
-from scvi_codegen.native import building
 
 Result = TypeVar("Result")
 
@@ -67,15 +63,6 @@ def timed(work: Callable[[], Result]) -> tuple[float, Result]:
     return time.process_time() - began, result
 
 
-def seconds_in_turn(works: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
-    """Return the processor seconds of each function in each round; all functions are called in turn."""
-    result: dict[str, list[float]] = {name: [] for name in works}
-    for _ in range(rounds):
-        for name, work in works.items():
-            result[name].append(timed(work)[0])
-    return result
-
-
 @contextmanager
 def set_variable(name: str, value: str) -> Iterator[None]:
     """Set an environment variable, and restore it afterwards."""
@@ -87,24 +74,3 @@ def set_variable(name: str, value: str) -> Iterator[None]:
         del os.environ[name]
         if before is not None:
             os.environ[name] = before
-
-
-def output_of_process(
-    arguments: Sequence[str], *, text: str = "", cache: str = "", longest: float | None = None
-) -> str:
-    """Return what a fresh Python process prints, which reads ``text`` and has an empty cache.
-
-    Args:
-        arguments: arguments of Python.
-        text: standard input.
-        cache: folder of a cache to use instead of an empty one.
-        longest: seconds after which the process is ended.
-
-    Raises:
-        subprocess.CalledProcessError, subprocess.TimeoutExpired: as ``subprocess.run``.
-    """
-    with tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder:
-        environment = os.environ | {building.CACHE_VARIABLE: cache or folder}
-        command = [sys.executable, *arguments]
-        how: dict[str, Any] = {"capture_output": True, "text": True, "check": True, "timeout": longest}
-        return str(subprocess.run(command, input=text, env=environment, **how).stdout)

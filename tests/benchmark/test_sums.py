@@ -1,97 +1,180 @@
-"""The benchmark of array systems: all contenders compute the same motion, and measurements are reported."""
+"""Array systems, multibody systems and fields of the benchmark: all contenders compute the same motion."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from scvi_codegen import benchmark as bench
-from scvi_codegen.benchmark import array_systems, energies, lattices
+from scvi_codegen.benchmark import sections, tables
+from scvi_codegen.benchmark.cases.fields import FIELDS, our_fields
 from scvi_codegen.benchmark.cases.large import atoms, bodies, field, ring
-from scvi_codegen.benchmark.lattices import PLATFORMS
+from scvi_codegen.benchmark.cases.robots import chain, four_bar, quadruped
+from scvi_codegen.benchmark.contenders import arrays, engines, pdes
+from scvi_codegen.benchmark.contenders.ours import fixed_contenders
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import Composition
 
-QUICK = bench.Plan(quick=True, peers=())
+QUICK = bench.Plan(quick=True, peers=(), repeats=1)
 
 
 def quiet(text):
     """Says nothing."""
 
 
-@pytest.mark.parametrize("lattice", [ring(8, 1.0), field(6, 0.2)], ids=lambda lattice: lattice.name)
-def test_lattices_by_hand_move_as_generated_ones(lattice):
-    steps = 10
-    by_hand, ours = (
-        prepare(0)()
-        for prepare in (lattices._by_hand(lattice, 8, steps), lattices._ours(lattice, Composition(8), steps))
-    )
-    assert np.abs(by_hand - ours).max() < 1e-14
-    assert np.abs(ours - lattice.q).max() > 0.01
+def end(contender):
+    """Return the final positions of a contender."""
+    found = contender.prepare(0)()
+    return found() if callable(found) else found
+
+
+def ours(case, method, steps):
+    """Return the final positions of this package."""
+    (contender,) = fixed_contenders(case, {method: [steps]})
+    return end(contender)
+
+
+@pytest.mark.parametrize("case", [ring(8, 1.0), field(6, 0.2)], ids=lambda case: case.name)
+def test_lattices_by_hand_move_as_generated_ones(case):
+    by_hand, generated = end(arrays.by_hand(case, "", 8, 10)), ours(case, Composition(8), 10)
+    assert np.abs(by_hand - generated).max() < 1e-14
+    assert np.abs(generated - case.q[0]).max() > 0.01
 
 
 @pytest.mark.parametrize(
-    "each",
-    [ring(8, 1.0), field(5, 1.0), atoms(1, 1.0), bodies(4, 1.0)],
-    ids=lambda each: each.name,
+    "each", [ring(8, 1.0), field(5, 1.0), atoms(1, 1.0), bodies(4, 1.0)], ids=lambda each: each.name
 )
 def test_accelerations_by_numpy_are_those_of_the_formula(each):
     """Compare with one step of leapfrog."""
-    h, given = 1e-3, {"parameters": each.parameters, "tables": each.tables}
-    run = compile_stepper(each.system, "stoermer-verlet").integrate(each.q, velocity=each.v, h=h, steps=1, **given)
+    h, shape = 1e-3, each.arrays.shape
+    start, v = (part[0].reshape(shape) for part in each.states)
+    run = compile_stepper(each.system, "stoermer-verlet").integrate(start, velocity=v, h=h, steps=1)
     ((_, q),) = run.q.values()
     ((_, velocity),) = run.velocity.values()
-    kick = h / 2 * (each.accelerations(each.q) + each.accelerations(q))
-    np.testing.assert_allclose(velocity - each.v, kick, rtol=0, atol=1e-12 * np.abs(kick).max() + 1e-15)
+    kick = h / 2 * (each.arrays.accelerations(start) + each.arrays.accelerations(q))
+    np.testing.assert_allclose(velocity - v, kick, rtol=0, atol=1e-12 * np.abs(kick).max() + 1e-15)
 
 
-@pytest.mark.parametrize("name", sorted(PLATFORMS))
+@pytest.mark.parametrize("name", sorted(arrays.PLATFORMS))
 def test_openmm_makes_the_steps_of_leapfrog(name):
     pytest.importorskip("openmm", reason="needs the extra 'bench'")
     crystal, steps = atoms(1, 0.5), 50
-    theirs = lattices.openmm_run(name, crystal, steps)(0)()
-    ours = lattices._ours(crystal, "stoermer-verlet", steps)(0)()
-    rounding = {"OpenMM_CPU": 1e-5, "OpenMM_double": 1e-13}[name]
-    assert np.abs(theirs - ours).max() < rounding
-    assert np.abs(ours - crystal.q).max() > 0.1
+    found = ours(crystal, "stoermer-verlet", steps)
+    rounding = {"OpenMM CPU": 1e-5, "OpenMM Reference": 1e-13}[name]
+    assert np.abs(end(arrays.openmm_contender(crystal, name, steps)) - found).max() < rounding
+    assert np.abs(found - crystal.q[0]).max() > 0.1
 
 
 @pytest.mark.full
 def test_rebound_converges_to_the_same_state():
     pytest.importorskip("rebound", reason="needs the extra 'bench'")
     each = bodies(10, 0.5)
-    ours, theirs = lattices._ours(each, "svi:8", 32)(0)(), lattices._rebound(each, "ias15", None)(0)()
-    assert np.abs(ours - theirs).max() < 1e-14
+    theirs = end(next(arrays.rebound_contenders(each, quick=True)))
+    assert np.abs(ours(each, "svi:8", 32) - theirs).max() < 1e-14
 
 
 @pytest.mark.full
 def test_array_systems_are_measured_at_equal_error(monkeypatch):
-    monkeypatch.setattr(lattices, "lattices", lambda plan: (ring(32, 2.0), bodies(4, 0.5)))
-    rows = lattices.run_lattices(QUICK, quiet).rows
-    assert [row["error"] for row in rows] == [*lattices.ERRORS, *lattices.ERRORS]
-    assert all(row["doubt"] < 1e-13 and row["DOP853"] > 0.0 and row["composition_8"] > 0.0 for row in rows)
-    assert "leapfrog_by_hand" in rows[0]
-    assert "leapfrog_by_hand" not in rows[-1]
-
-
-@pytest.mark.full
-def test_growth_is_measured(monkeypatch):
-    monkeypatch.setattr(array_systems, "GROWTH", (100, 100_000))
-    rows = array_systems.run_growth(QUICK, quiet).rows
-    assert [row["coordinates"] for row in rows] == [100, 100_000, 256] * 3
-    assert all(row["memory_mb"] > before["memory_mb"] for before, row in zip(rows[::3], rows[1::3], strict=True))
-    assert all(row["gigabytes_s"] > 0.0 for row in rows)
+    monkeypatch.setitem(sections.LATTICES, "ring:1000", lambda: ring(32, 2.0))
+    plan = bench.Plan(quick=True, repeats=1, peers=("scipy", "hand"))
+    result = bench.run_race(
+        lambda plan: sections._halved(lambda: ring(32, 40.0), sections.EXPLICIT, sections.EXACT, plan), plan, quiet
+    )
+    assert result.accuracy < 1e-13
+    assert {"SciPy DOP853", "leapfrog by hand", "scvi-codegen svi:8"} <= set(result.methods())
+    assert min(each.error for each in result.measurements) < 1e-12
 
 
 @pytest.mark.full
 def test_threads_are_measured():
-    rows = array_systems.run_threads(QUICK, quiet).rows
+    rows = tables.run_threads(QUICK, quiet).rows
     assert [row["problem"] for row in rows] == ["ring"] * 2 + ["atoms"] * 2
     assert all(row["one_us"] > 0.0 and row["threads_2"] > 0.0 for row in rows)
 
 
+@pytest.mark.parametrize("make", [lambda: chain(2), four_bar], ids=["chain", "four-bar"])
+def test_multibody_systems_are_measured_without_peers(make):
+    plan = bench.Plan(quick=True, peers=(), repeats=1)
+    result = bench.run_race(
+        lambda plan: sections._halved(make, {"svi:2": range(2)}, {"svi:3": 2, "svi:2": 3}, plan), plan, quiet
+    )
+    assert result.methods() == ["scvi-codegen svi:2"]
+    assert 0.0 < min(each.error for each in result.measurements) < 1e-6
+
+
+def test_chains_move_in_mujoco_and_pinocchio_as_here():
+    robot = chain(3)
+    exact = ours(robot, "svi:4", 200)
+    for name, peer, setting in (
+        ("mujoco", engines.mujoco_contenders, "h=0.01"),
+        ("pinocchio", engines.pinocchio_contenders, "h=0.01"),
+    ):
+        pytest.importorskip(name, reason="extra bench")
+        contender = next(each for each in peer(robot, quick=True) if each.setting == setting)
+        assert np.abs(end(contender) - exact).max() < 1e-6
+
+
+def test_closed_loops_in_mujoco_are_soft_unless_stiff():
+    pytest.importorskip("mujoco", reason="extra bench")
+    linkage = four_bar()
+    exact = ours(linkage, "svi:4", 400)
+    soft, stiff = (
+        np.abs(end(each) - exact).max()
+        for each in engines.mujoco_contenders(linkage, quick=True)
+        if each.setting == "h=0.01" and "RK4" in each.method
+    )
+    assert stiff < 0.1 * soft < 0.1
+
+
+def test_instability_of_mujoco_is_reported_and_leaves_no_file(monkeypatch, tmp_path):
+    """MuJoCo would write its warnings into the working folder."""
+    pytest.importorskip("mujoco", reason="extra bench")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(engines, "LARGEST_STEP", 2.0)
+    robot = replace(chain(5), span=400.0)
+    with pytest.raises(ArithmeticError, match="unstable"):
+        end(next(engines.mujoco_contenders(robot, quick=True)))
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.full
-def test_energies_stay_at_rounding():
-    rows = energies.run_energies(QUICK, quiet).rows
-    assert rows
-    for row in rows:
-        exact = row["by"].endswith("svi:8")
-        assert row["largest"] < 1e-13 if exact else 1e-8 < row["largest"] < 1e-2
+def test_coordinates_of_a_free_base_are_those_of_mujoco():
+    mujoco = pytest.importorskip("mujoco", reason="extra bench")
+    animal = quadruped()
+    places = engines.coordinate_places(mujoco.MjModel.from_xml_string(animal.mjcf), animal)
+    assert sorted(places[0]) == list(range(animal.dimension))
+    assert sorted(places[1]) == list(range(animal.dimension - 1))
+    assert animal.q[0][places[0]][3] == 1.0
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_exact_solutions_of_fields_solve_their_equations(name):
+    """Differences of order 8 in space, of order 2 in time."""
+    case, t, dt = FIELDS[name](), 0.7, 1e-4
+    axes = pdes._axes(case, 128 if name == "wave-2d" else 512)
+    points, dx = pdes._points(axes), axes[0][1] - axes[0][0]
+    before, now, after = (case.exact(points, t + k * dt) for k in (-1, 0, 1))
+
+    def laplacian(u):
+        total = len(axes) * pdes.STENCIL[0] * u
+        for k, weight in enumerate(pdes.STENCIL[1:], 1):
+            total = total + weight * sum(np.roll(u, sign * k, axis) for axis in range(len(axes)) for sign in (1, -1))
+        return total / dx**2
+
+    if case.complex:
+        psi, rate = now[0] + 1j * now[1], (after[0] - before[0] + 1j * (after[1] - before[1])) / (2 * dt)
+        rest = 1j * rate + laplacian(psi) / 2 + abs(psi) ** 2 * psi
+    else:
+        nonlinear = np.sin(now[0]) if name == "breather" else 0.0
+        rest = (after[0] - 2 * now[0] + before[0]) / dt**2 - laplacian(now[0]) + nonlinear
+        assert np.abs((after[0] - before[0]) / (2 * dt) - now[1]).max() < 1e-6 * np.abs(now[1]).max()
+    assert np.abs(rest).max() < 1e-4 * max(1.0, np.abs(now[0]).max())
+
+
+def test_fields_are_measured_without_peers_and_by_split_steps():
+    case = FIELDS["breather"]()
+    here = [each.error(end(each)) for each in our_fields(case, quick=True)]
+    assert min(here) < 0.03
+    contenders = [each for each in pdes.fft_contenders(case.plain(), quick=False) if each.method.endswith("8")]
+    split = next(each for each in contenders if each.setting == "256 points, 200 steps")
+    assert split.error(end(split)) < 1e-8

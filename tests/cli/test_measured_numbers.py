@@ -170,15 +170,6 @@ def test_energy_errors_of_the_paper_follow_from_methods_written_out():
             assert int(rows[name]["steps"]) == steps
 
 
-def test_ratio_of_hand_written_code_follows_from_its_times():
-    text = output_of("bench", "hand-written", "--quick", "--peers", "", "-o", "report.json")
-    (by_hand,) = json.loads(Path("report.json").read_text())["tables"]
-    assert by_hand["rows"]
-    for row in by_hand["rows"]:
-        assert row["ratio"] == pytest.approx(row["generated_ns"] / row["by_hand_ns"])
-        assert f"{row['generated_ns']:.0f} " in text
-
-
 def kepler(x: Array) -> Array:
     return np.concatenate([x[2:], -x[:2] / np.hypot(*x[:2]) ** 3])
 

@@ -76,15 +76,15 @@ def reference(case: Case, momenta: Array | None = None) -> Reference:
     Args:
         case: case to compute.
         momenta: (k, m) doubles to start from instead of the case's velocities, for steppers whose state is (q, p);
-            relevant only for cases with masses.
+            relevant only if momenta are rounded velocities.
     """
     return remembered(case, _velocity(case, momenta), _compute)
 
 
 def _velocity(case: Case, momenta: Array | None) -> Extended:
-    velocity = case.velocity.astype(np.longdouble)
-    if momenta is not None and case.masses is not None:
-        velocity = momenta.astype(np.longdouble) / np.array(case.masses, dtype=np.longdouble)
+    if momenta is None or case.velocity_of is None:
+        return case.velocity.astype(np.longdouble)
+    velocity: Extended = case.velocity_of(momenta.astype(np.longdouble))
     return velocity
 
 

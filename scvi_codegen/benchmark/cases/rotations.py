@@ -52,6 +52,14 @@ def matrix(q: Vector) -> list[list[Any]]:
     ]
 
 
+def _velocities(q: Any, inertia: Sequence[float], momenta: Any) -> Any:
+    """Return velocities, (I w) = E(q)^T p / 2 of the momenta p of quaternions q, after unit masses' momenta."""
+    (w, x, y, z), (a, b, c, d) = (np.moveaxis(part[..., -4:].astype(np.longdouble), -1, 0) for part in (q, momenta))
+    turning = [w * b - x * a + z * c - y * d, w * c - y * a + x * d - z * b, w * d - z * a + y * b - x * c]
+    body = np.stack([each / (2 * np.longdouble(moment)) for each, moment in zip(turning, inertia, strict=True)], -1)
+    return np.concatenate([momenta[..., :-4], body], axis=-1)
+
+
 def free_top(x: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
     """Return the rates of a body without torque."""
     return attitude_rates(x[:4], x[4:], of)
@@ -99,15 +107,17 @@ def _case(
         parameters=parameters,
         lagrangian=lagrangian,
     )
+    positions = np.tile(np.asarray(q, dtype=float), (STATES, 1))
     return Case(
         name=f"rotations:{name}",
         system=system,
         formulations=(Formulation(name="quaternion and angular velocity", rates=rates),),
-        q=np.tile(np.asarray(q, dtype=float), (STATES, 1)),
+        q=positions,
         velocity=scaled(velocity, 0.05),
         span=span,
         step=fine,
         fine=fine,
+        velocity_of=partial(_velocities, positions, [parameters[name] for name in "ABC"]),
     )
 
 
@@ -123,25 +133,25 @@ def _dumbbell() -> Case:
         "dumbbell",
         " + ".join([kinetic, *(f"1/(2*{distance})" for distance in distances)]),
         dumbbell,
-        {"A": 0.02, "B": 0.026, "C": 0.03, "l": 0.1},
+        {"A": 0.02, "B": 0.026, "C": 0.03, "l": 0.03},
         (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
-        (0.0, 1.1, 0.1, 0.3, 0.5, 1.2),
+        (0.0, 1.1, 0.1, 0.3, 0.5, 2.0),
         span=628.0,
         fine=0.125,
     )
 
 
-def bodies(count: int) -> Case:
-    """Return free bodies of one shape, the trajectories of one system, which MuJoCo integrates together."""
+def tumbling(count: int) -> Case:
+    """Return free bodies of one shape: the trajectories of one system, which MuJoCo integrates as one model."""
     parameters = {"A": 1.0, "B": 2.0, "C": 2.5}
-    plain = _case("bodies", KINETIC, free_top, parameters, TILT, (0.0, 0.0, 1.0), span=20.0, fine=0.0625)
+    plain = _case("bodies", KINETIC, free_top, parameters, TILT, (0.0, 0.0, 1.0), span=10.0, fine=0.0625)
     numbers = np.random.default_rng(SEED)
     q, velocity = numbers.normal(size=(count, 4)), numbers.normal(size=(count, 3))
     inertia = " ".join(map(repr, parameters.values()))
     body = f'<body><joint type="ball"/><inertial pos="0 0 0" mass="1" diaginertia="{inertia}"/></body>'
     mjcf = f'<mujoco><option gravity="0 0 0"/><worldbody>{body * count}</worldbody></mujoco>'
     q /= np.linalg.norm(q, axis=1, keepdims=True)
-    return replace(plain, q=q, velocity=velocity, mjcf=mjcf)
+    return replace(plain, q=q, velocity=velocity, mjcf=mjcf, velocity_of=None)
 
 
 ROTATIONS: Mapping[str, Callable[[], Case]] = {

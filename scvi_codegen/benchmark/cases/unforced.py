@@ -60,9 +60,11 @@ class Case:
         fine: step size with which a Gauss method of 16 stages reaches 1e-18, for the reference.
         bodies: masses and constant of gravity if coordinates are Cartesian positions of gravitating bodies.
         loops: source of ``rates(out, t, x, unused)`` in Python with loops, for Numba, if faster than unrolled code.
-        masses: (m,) constant masses of the coordinates if momenta differ from velocities by a rounding; ``None`` if
-            p = dL/dv is exact at the initial states (unit masses, or rest).
+        velocity_of: function from (k, m) momenta in extended precision to velocities if a rounding of momenta matters;
+            ``None`` if p = dL/dv is exact at the initial states (unit masses, or rest).
         mjcf: the same system as a model of MuJoCo, if there is one.
+        arrays: of an array system of one array, which has one initial state, what peers of arrays need.
+        field: of a partial differential equation, its density and exact solution.
     """
 
     name: str
@@ -75,8 +77,10 @@ class Case:
     fine: float
     bodies: Bodies | None = None
     loops: str | None = None
-    masses: tuple[float, ...] | None = None
+    velocity_of: Callable[[Any], Any] | None = None
     mjcf: str | None = None
+    arrays: Arrays | None = None
+    field: Any = None
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -100,6 +104,21 @@ class Case:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Arrays:
+    """Array system for peers.
+
+    Attributes:
+        shape: shape of its array.
+        accelerations: by NumPy, for SciPy's DOP853.
+        by_hand: (is a field, length of an axis, strength) for the hand-written C.
+    """
+
+    shape: tuple[int, ...]
+    accelerations: Callable[[Array], Array]
+    by_hand: tuple[int, int, float] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Bodies:
     """Point masses that attract each other.
 
@@ -114,6 +133,11 @@ class Bodies:
     gravity: float
     fixed_centre: bool
     axes: int
+
+
+def divided(masses: Sequence[float], momenta: Any) -> Any:
+    """Return velocities of bodies in space from their momenta in extended precision."""
+    return momenta / np.repeat(np.array(masses, dtype=np.longdouble), 3)
 
 
 def second_order(accelerations: Callable[[Vector, Vector, Mapping[str, Any], Any], list[Any]]) -> Rates:
@@ -273,7 +297,7 @@ def _outer_solar_system() -> Case:
         step=500.0,
         fine=256.0,
         bodies=Bodies(masses=masses, gravity=values["G"], fixed_centre=False, axes=3),
-        masses=tuple(mass for mass in masses for _ in range(3)),
+        velocity_of=partial(divided, masses),
     )
 
 

@@ -1,10 +1,13 @@
-"""Contenders of multibody programs: MuJoCo's integrators at several step sizes, for cases that have its model."""
+"""Contenders of multibody programs for cases that have a model of MuJoCo: MuJoCo's integrators, and Pinocchio."""
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +17,9 @@ from scvi_codegen.benchmark.report import Contender
 
 LARGEST_STEP, HALVINGS = 0.02, 6
 """Largest step size, ten times MuJoCo's default, and number of step sizes, each half of the one before."""
+STIFF = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+"""Impedance of stiff equality constraints."""
+TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 INTEGRATORS = ("RK4", "implicitfast", "Euler")
 
 
@@ -23,7 +29,11 @@ def step_counts(span: float, *, quick: bool) -> list[int]:
 
 
 def mujoco_contenders(case: Case, quick: bool) -> Iterator[Contender]:
-    """Yield MuJoCo's integrators; a model whose coordinates are those of all states integrates them together."""
+    """Yield MuJoCo's integrators; a model whose coordinates are those of all states integrates them together.
+
+    A closed loop (``<equality>``) is integrated with MuJoCo's default softness and with the stiffest that a step size
+    allows; the final coordinates are then the positions of its sites in the plane of x and z.
+    """
     import mujoco
 
     assert case.mjcf is not None
@@ -32,37 +42,142 @@ def mujoco_contenders(case: Case, quick: bool) -> Iterator[Contender]:
     seconds, data = time.perf_counter() - began, mujoco.MjData(model)
     together = len(case.q) > 1 and model.nq == case.q.size
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-
-    def preparation(integrator: str, steps: int) -> Callable[[int], Callable[[], Array]]:
-        def prepare(index: int) -> Callable[[], Array]:
-            chosen = slice(None) if together else index
-            mujoco.mj_resetData(model, data)
-            model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
-            model.opt.timestep = case.span / steps
-            data.qpos[:], data.qvel[:] = (np.ravel(part[chosen]) for part in case.states)
-
-            def integrate() -> Array:
-                with _warnings() as warnings_seen:
-                    mujoco.mj_step(model, data, nstep=steps)
-                if warnings_seen:
-                    raise ArithmeticError(warnings_seen[0])
-                return np.array(data.qpos).reshape(-1, case.dimension)
-
-            return integrate
-
-        return prepare
-
+    prepare = _mujoco_preparation(case, model, data, together=together)
     for integrator in INTEGRATORS:
-        for steps in step_counts(case.span, quick=quick):
-            yield Contender(
-                method=f"MuJoCo {integrator}",
-                setting=f"h={case.span / steps:.4g}",
-                options="without contacts",
-                compile_seconds=seconds,
-                prepare=preparation(integrator, steps),
-                trajectories=len(case.q) if together else 1,
-                starts=len(case.q),
-            )
+        for stiff in (False, True)[: 2 if model.neq else 1]:
+            for steps in step_counts(case.span, quick=quick):
+                yield Contender(
+                    method=f"MuJoCo {integrator}{', stiff' * stiff}",
+                    setting=f"h={case.span / steps:.4g}",
+                    options="without contacts",
+                    compile_seconds=seconds,
+                    prepare=partial(prepare, integrator, steps, stiff),
+                    trajectories=len(case.q) if together else 1,
+                    starts=len(case.q),
+                )
+
+
+def _mujoco_preparation(case: Case, model: Any, data: Any, *, together: bool) -> Callable[..., Callable[[], Any]]:
+    """Return a function of (integrator, steps, stiff, number of the state) that prepares a run."""
+    import mujoco
+
+    softness = model.eq_solref.copy(), model.eq_solimp.copy()
+    places = None if together or model.neq else coordinate_places(model, case)
+
+    def prepare(integrator: str, steps: int, stiff: bool, index: int) -> Callable[[], Any]:
+        h = case.span / steps
+        mujoco.mj_resetData(model, data)
+        model.opt.integrator, model.opt.timestep = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}"), h
+        model.eq_solref[:], model.eq_solimp[:] = ((2 * h, 1.0), STIFF) if stiff else softness
+        if places is not None:
+            data.qpos[:], data.qvel[:] = case.q[index][places[0]], case.velocity[index][places[1]]
+        elif together:
+            data.qpos[:], data.qvel[:] = (np.ravel(part) for part in case.states)
+        return partial(integrate, steps)
+
+    def integrate(steps: int) -> Callable[[], Array]:
+        with _warnings() as warnings_seen:
+            mujoco.mj_step(model, data, nstep=steps)
+        if warnings_seen:
+            raise ArithmeticError(warnings_seen[0])
+        return final
+
+    def final() -> Array:
+        if model.neq:
+            mujoco.mj_forward(model, data)
+            return np.ravel(data.site_xpos[: case.dimension // 2, [0, 2]])
+        q = np.array(data.qpos)
+        return q.reshape(-1, case.dimension) if places is None else q[np.argsort(places[0])]
+
+    return prepare
+
+
+def mujoco_states(case: Case, integrator: str, h: float, every: int, count: int) -> tuple[float, Array]:
+    """Return the seconds and ``count`` states (q, v) of a case, every so many steps, of a model without loops."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string(case.mjcf)
+    data, (positions, velocities) = mujoco.MjData(model), coordinate_places(model, case)
+    model.opt.integrator, model.opt.timestep = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}"), h
+    data.qpos[:], data.qvel[:] = case.q[0][positions], case.velocity[0][velocities]
+    states, seconds = np.empty((count, case.size)), 0.0
+    for state in states:
+        state[positions] = data.qpos
+        state[[case.dimension + k for k in velocities]] = data.qvel
+        began = time.process_time()
+        mujoco.mj_step(model, data, nstep=every)
+        seconds += time.process_time() - began
+    return seconds, states
+
+
+def coordinate_places(model: Any, case: Case) -> tuple[list[int], list[int]]:
+    """Return the indices in coordinates and velocities of a case of those of MuJoCo's hinges and free joints."""
+    names = [str(symbol) for symbol in case.system.coordinates]
+    positions: list[int] = []
+    velocities: list[int] = []
+    for name, free in ((model.joint(k).name, model.jnt_type[k] == 0) for k in range(model.njnt)):
+        own = [names.index(f"{axis}_{name}") for axis in "xyz"] if free else [names.index(name)]
+        positions += own
+        velocities += own
+        if free:
+            positions += [names.index(f"R_{name}_{part}") for part in "wxyz"]
+            velocities += range(len(names) - 4, len(names) - 1)  # the one rotation is the last
+    return positions, velocities
+
+
+def pinocchio_contenders(case: Case, quick: bool) -> Iterator[Contender]:
+    """Yield the classical Runge-Kutta method with Pinocchio's ``aba``, and SciPy's DOP853 with it.
+
+    Pinocchio has no integrator. The time of the first is that of the four calls of ``aba`` a step alone, made by C++
+    (``abaInParallel`` with one thread): a lower bound for any program of C++. The second is run from Python as it is.
+    """
+    import pinocchio
+    from scipy.integrate import solve_ivp
+
+    assert case.mjcf is not None
+    began = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.xml"
+        path.write_text(case.mjcf, encoding="utf-8")
+        made = pinocchio.buildModelFromMJCF(str(path))
+    model = made[0] if isinstance(made, tuple) else made
+    data, pool, m = model.createData(), pinocchio.ModelPool(model, 1), case.dimension
+    seconds, zero = time.perf_counter() - began, np.zeros(m)
+
+    def rates(t: float, x: Array) -> Array:
+        return np.concatenate([x[m:], pinocchio.aba(model, data, x[:m], x[m:], zero)])
+
+    def runge_kutta(index: int, steps: int) -> Array:
+        x, h = np.concatenate([part[index] for part in case.states]), case.span / steps
+        for _ in range(steps):
+            a = rates(0.0, x)
+            b = rates(0.0, x + h / 2 * a)
+            c = rates(0.0, x + h / 2 * b)
+            x = x + h / 6 * (a + 2 * b + 2 * c + rates(0.0, x + h * c))
+        return x[:m]
+
+    def timed(steps: int, index: int) -> Callable[[], Callable[[], Array]]:
+        q, v = (np.tile(part[index][:, np.newaxis], 4 * steps) for part in case.states)
+        torques, accelerations = np.zeros_like(q), np.empty_like(q)
+
+        def evaluate() -> Callable[[], Array]:
+            pinocchio.abaInParallel(1, pool, q, v, torques, accelerations)
+            return partial(ends, index, steps)
+
+        return evaluate
+
+    def solved(tolerance: float, index: int) -> Callable[[], Array]:
+        start = np.concatenate([part[index] for part in case.states])
+        how = {"method": "DOP853", "rtol": tolerance, "atol": tolerance}
+        return lambda: np.asarray(solve_ivp(rates, (0.0, case.span), start, **how).y[:m, -1])
+
+    ends, starts = lru_cache(maxsize=None)(runge_kutta), len(case.q)
+    for steps in step_counts(case.span, quick=quick):
+        name, setting = "Pinocchio aba, RK4 (bound)", f"h={case.span / steps:.4g}"
+        yield Contender(name, setting, "4 aba a step in C++", seconds, partial(timed, steps), starts=starts)
+    for tolerance in TOLERANCES[: 2 if quick else None]:
+        name, setting = "Pinocchio DOP853", f"tol={tolerance:.0e}"
+        yield Contender(name, setting, "aba from Python", seconds, partial(solved, tolerance), starts=starts)
 
 
 @contextmanager

@@ -8,9 +8,12 @@ from __future__ import annotations
 import itertools
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any, cast
+
+import numpy as np
 
 from scvi_codegen.advice.advice import advise
 from scvi_codegen.benchmark.cases.unforced import Array, Case
@@ -61,6 +64,44 @@ def our_contenders(case: Case, *, methods: Iterable[Method] = (), quick: bool = 
     return result
 
 
+def fixed_contenders(case: Case, counts: Mapping[str | Method, Iterable[int]]) -> list[Contender]:
+    """Return contenders by several methods with numbers of steps, from the velocities of a case."""
+    result = []
+    for method, numbers in counts.items():
+        stepper, seconds = compiled(case, method)
+        momenta = None if case.size == 2 * case.dimension else momenta_of(stepper, case)
+        for steps in numbers:
+            prepare, name = partial(_fixed, stepper, case, momenta, steps), getattr(method, "name", method)
+            setting = f"h={case.span / steps:.4g}"
+            result.append(Contender(f"{OURS} {name}", setting, "", seconds, prepare, starts=len(case.q)))
+    return result
+
+
+def _fixed(stepper: Any, case: Case, momenta: Array | None, steps: int, index: int) -> Callable[[], Array]:
+    shape = (-1,) if case.arrays is None else case.arrays.shape
+    q, velocity = (part[index].reshape(shape) for part in case.states)
+    how = {"velocity": velocity} if momenta is None else {"p": momenta[index]}
+    run = stepper.start(q, **how, h=case.span / steps)
+
+    def integrate() -> Array:
+        run.advance(steps)
+        return np.array(run.q, dtype=float).ravel()
+
+    return integrate
+
+
+def run_contenders(case: Case, counts: Mapping[str | Method, Iterable[int]]) -> list[Contender]:
+    """Return contenders that advance one run for each state of a case in turn, started beforehand."""
+
+    def prepare(contender: Contender, _: int) -> Callable[[], Array]:
+        integrations = [contender.prepare(k) for k in range(len(case.q))]
+        return lambda: np.array([integrate() for integrate in integrations])
+
+    made = fixed_contenders(case, counts)
+    changes = {"starts": 1, "trajectories": len(case.q)}
+    return [replace(each, method=f"{OURS} runs", prepare=partial(prepare, each), **changes) for each in made]
+
+
 def our_ensembles(case: Case, *, quick: bool = False) -> list[Contender]:
     """Return contenders by SVI(8) with all states of the case as one ensemble, in one thread."""
     stepper, seconds = compiled(case, SVI(8))
@@ -95,14 +136,19 @@ def advised_counts(case: Case, method: Method, momentum: Array, *, quick: bool) 
     return counts
 
 
-def compiled(case: Case, method: Method) -> tuple[Stepper, float]:
+def compiled(case: Case, method: str | Method) -> tuple[Stepper, float]:
+    """Return the stepper of a case, and the seconds to compile it."""
+    return compiled_system(case.system, method)
+
+
+def compiled_system(system: Any, method: str | Method) -> tuple[Any, float]:
     """Return the stepper, and the seconds to compile it with an empty cache and a new name."""
     with (
         tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder,
         set_variable(building.CACHE_VARIABLE, folder),
     ):
         began = time.perf_counter()
-        stepper = compile_stepper(case.system, method, prefix=f"bench_{next(_builds)}")
+        stepper = compile_stepper(system, method, prefix=f"bench_{next(_builds)}")
         return stepper, time.perf_counter() - began
 
 

@@ -2,7 +2,7 @@
 
 heyoka      adaptive Taylor series, compiled by LLVM: see :mod:`.taylor`.
 rebound     IAS15, for gravitating bodies, with its default step control.
-mujoco      its integrators, for multibody systems: see :mod:`.engines`.
+mujoco      its integrators, and Pinocchio, for multibody systems: see :mod:`.engines`.
 cyrk        DOP853 in C++ (CyRK), right-hand side compiled by Numba.
 jitcode     SciPy's Fortran DOP853, right-hand side compiled by C with JiTCODE's default flags (-Ofast -march=native).
 scipy       ``solve_ivp`` with DOP853, right-hand side compiled by Numba if it is there, else plain Python.
@@ -24,7 +24,9 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.benchmark.cases.unforced import Array, Case
-from scvi_codegen.benchmark.contenders.engines import mujoco_contenders
+from scvi_codegen.benchmark.contenders import arrays, pdes
+from scvi_codegen.benchmark.contenders.engines import mujoco_contenders, pinocchio_contenders
+from scvi_codegen.benchmark.contenders.mechanisms import lambdify_contenders, pydy_contenders
 from scvi_codegen.benchmark.contenders.taylor import heyoka_contenders
 from scvi_codegen.benchmark.contenders.tracing import rates_text
 from scvi_codegen.benchmark.report import Contender
@@ -46,17 +48,12 @@ class Peer:
 
     modules: tuple[str, ...]
     contenders: Callable[[Case, bool], Iterator[Contender]]
-    suits: Callable[[Case], bool] = lambda case: True
+    suits: Callable[[Case], bool]
 
 
 def missing_module(peer: Peer) -> str | None:
     """Return the first module that is not installed."""
     return next((name for name in peer.modules if importlib.util.find_spec(name) is None), None)
-
-
-def peer_contenders(name: str, case: Case, *, quick: bool = False) -> Iterator[Contender]:
-    """Yield the contenders of a peer for a case."""
-    return PEERS[name].contenders(case, quick)
 
 
 # ---- REBOUND
@@ -143,7 +140,7 @@ def _dop853(
 
 def _absolute(tolerance: float, start: Array) -> float:
     """Return the absolute tolerance: a tenth of the relative one times the smaller typical size of q and v."""
-    sizes = [float(np.sqrt(np.mean(half**2))) for half in np.split(start, 2)]
+    sizes = [float(np.sqrt(np.mean(half**2))) for half in np.array_split(start, 2)]
     return 0.1 * tolerance * min(size for size in sizes if size > 0.0)
 
 
@@ -245,13 +242,49 @@ def _scipy(case: Case, quick: bool) -> Iterator[Contender]:
     yield from _dop853("SciPy DOP853", options, seconds, case, quick, solve)
 
 
+def _solvable(case: Case) -> bool:
+    return bool(case.formulations)
+
+
+def _field(case: Case) -> bool:
+    return case.field is not None
+
+
+def _sympy_mechanism(case: Case) -> bool:
+    return case.name.startswith("mechanisms")
+
+
+def _by_hand(case: Case) -> bool:
+    return case.arrays is not None and case.arrays.by_hand is not None
+
+
 PEERS = {
-    "heyoka": Peer(modules=("heyoka",), contenders=heyoka_contenders),
-    "rebound": Peer(modules=("rebound",), contenders=_rebound, suits=lambda case: case.bodies is not None),
+    "heyoka": Peer(modules=("heyoka",), contenders=heyoka_contenders, suits=_solvable),
+    "rebound": Peer(
+        modules=("rebound",),
+        contenders=lambda case, quick: (arrays.rebound_contenders if case.arrays else _rebound)(case, quick),
+        suits=lambda case: case.bodies is not None or ("bodies" in case.name and case.arrays is not None),
+    ),
     "mujoco": Peer(modules=("mujoco",), contenders=mujoco_contenders, suits=lambda case: case.mjcf is not None),
-    "cyrk": Peer(modules=("CyRK", "numba"), contenders=_cyrk),
-    "jitcode": Peer(modules=("jitcode",), contenders=_jitcode),
-    "scipy": Peer(modules=("scipy",), contenders=_scipy),
-    "openmm": Peer(modules=("openmm",), contenders=lambda case, quick: iter(()), suits=lambda case: False),
+    "pinocchio": Peer(
+        modules=("pinocchio",),
+        contenders=pinocchio_contenders,
+        suits=lambda case: case.mjcf is not None and case.size == 2 * case.dimension and not case.system.constraints,
+    ),
+    "cyrk": Peer(modules=("CyRK", "numba"), contenders=_cyrk, suits=_solvable),
+    "jitcode": Peer(modules=("jitcode",), contenders=_jitcode, suits=_solvable),
+    "scipy": Peer(
+        modules=("scipy",),
+        contenders=lambda case, quick: (arrays.numpy_contenders if case.arrays else _scipy)(case, quick),
+        suits=lambda case: bool(case.formulations) or case.arrays is not None,
+    ),
+    "py-pde": Peer(modules=("pde", "numba"), contenders=pdes.pde_contenders, suits=_field),
+    "fft": Peer(modules=("scipy",), contenders=pdes.fft_contenders, suits=_field),
+    "numba": Peer(modules=("numba",), contenders=pdes.numba_contenders, suits=_field),
+    "hand": Peer(modules=(), contenders=arrays.by_hand_contenders, suits=_by_hand),
+    "lambdify": Peer(modules=(), contenders=lambdify_contenders, suits=_sympy_mechanism),
+    "pydy": Peer(modules=("pydy",), contenders=pydy_contenders, suits=_sympy_mechanism),
+    "openmm": Peer(modules=("openmm",), contenders=arrays.openmm_contenders, suits=lambda case: "atoms" in case.name),
 }
-"""Peers by the name on the command line, the fastest first; the last is for array systems only."""
+"""Peers by the name on the command line, the fastest first; "hand", "fft" and "numba" are programs
+written by hand: C for lattices, split steps with FFT and loops in Numba for fields."""

@@ -2,83 +2,59 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from scvi_codegen.benchmark.cases.unforced import Rates
 
 
-class _Lines:
-    """Assignments with common subexpressions shared; also replaces the module of functions."""
-
-    def __init__(self) -> None:
-        self.names: dict[str, str] = {}
-
-    @property
-    def time(self) -> _Traced:
-        return _Traced(self, "t")
-
-    def add(self, text: str) -> _Traced:
-        return _Traced(self, self.names.setdefault(text, f"w{len(self.names)}"))
-
-    def sin(self, x: _Traced) -> _Traced:
-        return self.add(f"sin({x.text})")
-
-    def cos(self, x: _Traced) -> _Traced:
-        return self.add(f"cos({x.text})")
-
-    def sqrt(self, x: _Traced) -> _Traced:
-        return self.add(f"sqrt({x.text})")
-
-
 class _Traced:
-    """Number that records the operations on it."""
+    """Number that records the operations on it; common subexpressions are shared."""
 
-    def __init__(self, lines: _Lines, text: str) -> None:
-        self.lines, self.text = lines, text
+    def __init__(self, names: dict[str, str], text: str) -> None:
+        self.names, self.text = names, text
 
-    def _binary(self, left: object, operator: str, right: object) -> _Traced:
-        return self.lines.add(f"{_text(left)} {operator} {_text(right)}")
-
-    def __add__(self, other: object) -> _Traced:
-        return self._binary(self, "+", other)
-
-    def __radd__(self, other: object) -> _Traced:
-        return self._binary(other, "+", self)
-
-    def __sub__(self, other: object) -> _Traced:
-        return self._binary(self, "-", other)
-
-    def __rsub__(self, other: object) -> _Traced:
-        return self._binary(other, "-", self)
-
-    def __mul__(self, other: object) -> _Traced:
-        return self._binary(self, "*", other)
-
-    def __rmul__(self, other: object) -> _Traced:
-        return self._binary(other, "*", self)
-
-    def __truediv__(self, other: object) -> _Traced:
-        return self._binary(self, "/", other)
+    def record(self, text: str) -> _Traced:
+        return _Traced(self.names, self.names.setdefault(text, f"w{len(self.names)}"))
 
     def __neg__(self) -> _Traced:
-        return self.lines.add(f"-{self.text}")
+        return self.record(f"-{self.text}")
 
     def __pow__(self, exponent: float) -> _Traced:
         """Return half-integer powers by a square root, which is several times faster than ``pow``."""
-        root = self.lines.sqrt(self)
-        power = {0.5: root, 1.5: self * root}[abs(exponent)]
-        return self.lines.add(f"1.0 / {power.text}") if exponent < 0 else power
+        root: Any = self.record(f"sqrt({self.text})")
+        power = {0.5: root, 1.5: self * root}[abs(exponent)]  # type: ignore[operator]
+        return self.record(f"1.0 / {power.text}") if exponent < 0 else power
 
 
-def _text(value: object) -> str:
-    return value.text if isinstance(value, _Traced) else f"({float(value)!r})"  # type: ignore[arg-type]
+def _binary(form: str) -> Callable[[_Traced, Any], _Traced]:
+    return lambda self, other: self.record(form.format(self.text, _text(other)))
+
+
+for _name, _operator in {"add": "+", "sub": "-", "mul": "*", "truediv": "/"}.items():
+    setattr(_Traced, f"__{_name}__", _binary(f"{{0}} {_operator} {{1}}"))
+    setattr(_Traced, f"__r{_name}__", _binary(f"{{1}} {_operator} {{0}}"))
+
+
+class _Functions:
+    """Replacement of the module of functions."""
+
+    def __init__(self, time: _Traced) -> None:
+        self.time = time
+
+    def __getattr__(self, name: str) -> Callable[[_Traced], _Traced]:
+        return lambda x: x.record(f"{name}({x.text})")
+
+
+def _text(value: Any) -> str:
+    return value.text if isinstance(value, _Traced) else f"({float(value)!r})"
 
 
 def rates_text(rates: Rates, parameters: Mapping[str, float], size: int) -> str:
     """Return the source of ``def rates(out, t, x, unused)``, which fills ``out`` with the derivative of ``x``."""
-    lines = _Lines()
-    results: list[Any] = rates([_Traced(lines, f"x[{n}]") for n in range(size)], parameters, lines)
-    body = [f"{name} = {operation}" for operation, name in lines.names.items()]
+    names: dict[str, str] = {}
+    x = [_Traced(names, f"x[{n}]") for n in range(size)]
+    results: list[Any] = rates(x, parameters, _Functions(_Traced(names, "t")))
+    body = [f"{name} = {operation}" for operation, name in names.items()]
     body += [f"out[{n}] = {_text(result)}" for n, result in enumerate(results)]
     return "def rates(out, t, x, unused):\n    " + "\n    ".join(body) + "\n"

@@ -40,17 +40,13 @@ def bench(
       ensemble:planar-pendulum, :kepler:0.2, :outer-solar-system            64 trajectories at once
       adaptive:kepler:0.9, ..   adaptive and fixed step size, time transformation; heyoka and IAS15
       rotations:free-top, :heavy-top, :dumbbell, :bodies                    rigid bodies; heyoka, MuJoCo
+      robots:chain:2, :5, :10, :30, :quadruped, :four-bar                   multibody systems; MuJoCo, Pinocchio
+      mechanisms:2, :5, :10, :20                                            SymPy mechanisms; lambdify and PyDy
+      fields:breather, :wave-2d, :schroedinger                              partial differential equations; py-pde
+      lattices:ring:1000, ..    array systems; C by hand, NumPy, REBOUND, OpenMM
       drift                     energy over ten million steps
-      compositions              explicit composition methods, at equal error
-      hand-written              hand-written C
-      cold-start, compile       time from text to the first step; for larger systems
-      mechanisms                SymPy mechanisms; lambdify and PyDy
-      constrained-bodies        constrained bodies; MuJoCo
-      control-loop              cost of a control step
-      lattices, growth          array systems (lattices, fields, bodies); scaling with size
+      first-step                time from text to the first step
       threads                   steps with several threads
-      energies                  energy of array systems over 100,000 steps
-      c-compilers               compilers and processors
 
     Install the peers with 'scvi-codegen[bench]'. Each section is printed, and written to the JSON file, when it is
     complete; after Ctrl-C, --resume continues.
@@ -58,7 +54,7 @@ def bench(
     \b
     Examples:
       scvi-codegen bench kepler:0.5 --peers heyoka --plot kepler.svg
-      scvi-codegen bench drift hand-written -o measured.json
+      scvi-codegen bench drift robots -o measured.json
     """
     if resume and output is None:
         raise click.UsageError("--resume requires -o FILE, the report to continue")

@@ -1,0 +1,159 @@
+"""Peers for array systems: leapfrog and a composition in hand-written C, DOP853 with NumPy, REBOUND and OpenMM."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.benchmark.cases.unforced import Array, Case
+from scvi_codegen.benchmark.report import Contender
+from scvi_codegen.methods.composition import Composition
+from scvi_codegen.methods.leapfrog_stages import kicks_and_drifts
+from scvi_codegen.native import building
+from scvi_codegen.rendering.source import Source
+
+TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
+DECLARATIONS = (
+    "void leapfrog(int is_field, double *q, double *v, double *work, long n, double strength, double h, long steps, "
+    "const double *kicks, const double *drifts, int leaps);"
+)
+PLATFORMS = {"OpenMM CPU": ("CPU", {"Threads": "1"}), "OpenMM Reference": ("Reference", {})}
+"""OpenMM's platforms: single precision with vectors in one thread; double precision with loops."""
+
+Integrate = Callable[[], Array]
+
+
+def _contender(case: Case, method: str, setting: str, prepare: Callable[[], Integrate]) -> Contender:
+    return Contender(method, setting, "", 0.0, lambda _: prepare(), starts=1)
+
+
+def step_counts(case: Case, halvings: range) -> list[int]:
+    """Return numbers of steps in the span of a case: its own step size, halved repeatedly."""
+    return [max(1, round(case.span / case.step * 2**k)) for k in halvings]
+
+
+def by_hand_contenders(case: Case, quick: bool) -> Iterator[Contender]:
+    """Yield leapfrog and the composition of order 8 in C, written for one lattice."""
+    for method, order, halvings in (("leapfrog by hand", 2, range(1, 13)), ("composition 8 by hand", 8, range(6))):
+        for steps in step_counts(case, halvings[: 2 if quick else None]):
+            yield by_hand(case, method, order, steps)
+
+
+def by_hand(case: Case, method: str, order: int, steps: int) -> Contender:
+    """Return one setting of the hand-written C."""
+    assert case.arrays is not None
+    assert case.arrays.by_hand is not None
+    code = files("scvi_codegen.benchmark").joinpath("lattices.c").read_text(encoding="utf-8")
+    source = Source(prefix="lattices", header=f"{DECLARATIONS}\n", code=code, declarations=DECLARATIONS)
+    library = building.load(source, flags=(*building.TUNED_FLAGS, "-ffast-math"))
+    kicks, drifts = (np.array([float(x) for x in row]) for row in kicks_and_drifts(Composition(order)))
+    is_field, count, strength = case.arrays.by_hand
+
+    def prepare() -> Integrate:
+        q, v = case.q[0].copy(), case.velocity[0].copy()
+        arrays = [library.ffi.from_buffer("double[]", array) for array in (q, v, np.empty(q.size), kicks, drifts)]
+        state, tables = arrays[:3], arrays[3:]
+
+        def integrate() -> Array:
+            library.lib.leapfrog(is_field, *state, count, strength, case.span / steps, steps, *tables, len(kicks))
+            return q
+
+        return integrate
+
+    return _contender(case, method, f"{steps} steps", prepare)
+
+
+def numpy_contenders(case: Case, quick: bool) -> Iterator[Contender]:
+    """Yield SciPy's DOP853 with accelerations by NumPy."""
+    from scipy.integrate import solve_ivp
+
+    arrays, size = case.arrays, case.dimension
+    assert arrays is not None
+
+    def derivative(t: float, y: Array) -> Array:
+        return np.concatenate([y[size:], arrays.accelerations(y[:size].reshape(arrays.shape)).reshape(-1)])
+
+    def solved(tolerance: float) -> Integrate:
+        start = np.concatenate([case.q[0], case.velocity[0]])
+
+        def integrate() -> Array:
+            end = solve_ivp(derivative, (0.0, case.span), start, method="DOP853", rtol=tolerance, atol=tolerance)
+            final: Array = end.y[:size, -1]
+            return final
+
+        return integrate
+
+    for tolerance in TOLERANCES[: 2 if quick else None]:
+        yield _contender(case, "SciPy DOP853", f"tol={tolerance:.0e}", lambda tolerance=tolerance: solved(tolerance))
+
+
+def rebound_contenders(case: Case, quick: bool) -> Iterator[Contender]:
+    """Yield REBOUND's leapfrog and IAS15 for the softened cluster."""
+    import rebound
+
+    assert case.arrays is not None
+    shape = case.arrays.shape
+
+    def prepare(integrator: str, steps: int) -> Integrate:
+        simulation = rebound.Simulation()
+        simulation.softening = float(case.system.defaults[1])
+        for q, v in zip(case.q[0].reshape(shape), case.velocity[0].reshape(shape), strict=True):
+            simulation.add(m=1 / shape[0], x=q[0], y=q[1], z=q[2], vx=v[0], vy=v[1], vz=v[2])
+        simulation.integrator = integrator
+        simulation.dt = case.span / steps
+
+        def integrate() -> Array:
+            simulation.integrate(case.span)
+            return np.array([particle.xyz for particle in simulation.particles]).ravel()
+
+        return integrate
+
+    yield _contender(case, "REBOUND IAS15", "default", lambda: prepare("ias15", 100))
+    for n in step_counts(case, range(2, 4 if quick else 12)):
+        yield _contender(case, "REBOUND leapfrog", f"{n} steps", lambda n=n: prepare("leapfrog", n))
+
+
+def openmm_contenders(case: Case, quick: bool) -> Iterator[Contender]:
+    """Yield OpenMM's Verlet integrator for the crystal."""
+    for name in PLATFORMS:
+        for steps in step_counts(case, range(1, 3 if quick else 10)):
+            yield openmm_contender(case, name, steps)
+
+
+def openmm_contender(case: Case, name: str, steps: int) -> Contender:
+    """Return ``steps`` steps of OpenMM on a platform.
+
+    Atoms have unit mass, depth and diameter. OpenMM's velocities are those half a step before the positions, so that
+    the start is shifted by half a kick; the method is then Stoermer-Verlet. Units are consistent: dalton, nm, ps,
+    kJ/mol.
+    """
+    import openmm
+
+    arrays = case.arrays
+    assert arrays is not None
+    q, v = (part[0].reshape(arrays.shape) for part in case.states)
+    platform, properties = PLATFORMS[name]
+    system, force = openmm.System(), openmm.NonbondedForce()
+    force.setNonbondedMethod(openmm.NonbondedForce.NoCutoff)
+    for _ in q:
+        system.addParticle(1.0)
+        force.addParticle(0.0, 1.0, 1.0)
+    system.addForce(force)
+    h = case.span / steps
+    integrator = openmm.VerletIntegrator(h)
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform), properties)
+
+    def prepare() -> Integrate:
+        context.setPositions(q)
+        context.setVelocities(v - h / 2 * arrays.accelerations(q))
+        return integrate
+
+    def integrate() -> Array:
+        integrator.step(steps)
+        end: Any = context.getState(positions=True).getPositions(asNumpy=True)._value
+        return np.ravel(end)
+
+    return _contender(case, name, f"{steps} steps", prepare)

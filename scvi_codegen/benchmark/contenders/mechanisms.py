@@ -1,0 +1,109 @@
+"""Peers for SymPy's description of mechanisms: ``lambdify`` and PyDy with SciPy's DOP853.
+
+The mechanism is SymPy's own pendulum of n links on a cart; this package reads the same ``KanesMethod``.
+
+lambdify    mass matrix and forcing by ``lambdify(..., cse=True)``, NumPy's solve
+pydy        the same equations by its Cython generator
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import sympy
+from sympy.physics.mechanics import KanesMethod
+from sympy.physics.mechanics.models import n_link_pendulum_on_cart
+
+from scvi_codegen.benchmark.cases.unforced import Array, Case
+from scvi_codegen.benchmark.report import Contender
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+
+LINKS = (2, 5, 10, 20)
+TOLERANCES = (1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
+ANGLE = 0.3
+"""Initial angle of every link, at rest; no force acts on the cart."""
+
+Rates = Callable[[float, Array], Array]
+
+
+def _pendulum(n: int) -> tuple[KanesMethod, dict[sympy.Symbol, float]]:
+    method = n_link_pendulum_on_cart(n, cart_force=False)
+    values = {f"m{i}": 1.0 / (n + 1) for i in range(n + 1)} | {f"l{i}": 1.0 / n for i in range(n)} | {"g": 9.81}
+    return method, {sympy.Symbol(name): value for name, value in values.items()}
+
+
+def links(n: int) -> Case:
+    """Return the case of n links."""
+    method, values = _pendulum(n)
+    parameters = {str(symbol): value for symbol, value in values.items()}
+    q = np.array([[0.0, *[ANGLE] * n]])
+    return Case(
+        name=f"mechanisms:{n}",
+        system=LagrangianSystem.from_kanes_method(method, name=f"{n} links", parameters=parameters),
+        formulations=(),
+        q=q,
+        velocity=0.0 * q,
+        span=1.0,
+        step=0.0625,
+        fine=0.0625,
+    )
+
+
+def lambdify_contenders(case: Case, quick: bool) -> Iterator[Contender]:
+    """Yield DOP853 with SymPy's equations by ``lambdify``."""
+    return _contenders("lambdify DOP853", case, _by_lambdify, quick)
+
+
+def pydy_contenders(case: Case, quick: bool) -> Iterator[Contender]:
+    """Yield DOP853 with SymPy's equations by PyDy's Cython function."""
+    return _contenders("PyDy DOP853", case, _by_pydy, quick)
+
+
+def _by_lambdify(method: KanesMethod, values: dict[sympy.Symbol, float]) -> Rates:
+    state = {function: sympy.Dummy() for function in (*method.q, *method.u)}
+    both = [part.xreplace(values).xreplace(state) for part in (method.mass_matrix, method.forcing)]
+    equations = sympy.lambdify([list(state.values())], both, cse=True)
+    m = len(method.q)
+
+    def rates(t: float, x: Array) -> Array:
+        mass, forcing = equations(x)
+        return np.concatenate([x[m:], np.linalg.solve(mass, forcing[:, 0])])
+
+    return rates
+
+
+def _by_pydy(method: KanesMethod, values: dict[sympy.Symbol, float]) -> Rates:
+    from pydy.codegen.ode_function_generators import generate_ode_function
+
+    used = method.mass_matrix.free_symbols | method.forcing.free_symbols
+    constants = sorted((symbol for symbol in values if symbol in used), key=str)
+    generated = generate_ode_function(
+        method.forcing,
+        list(method.q),
+        list(method.u),
+        constants,
+        mass_matrix=method.mass_matrix,
+        coordinate_derivatives=sympy.Matrix(list(method.u)),
+        generator="cython",
+    )
+    numbers = np.array([values[symbol] for symbol in constants])
+    return lambda t, x: np.array(generated(x, t, numbers))  # the function reuses its array
+
+
+def _contenders(name: str, case: Case, make: Callable[..., Rates], quick: bool) -> Iterator[Contender]:
+    from scipy.integrate import solve_ivp
+
+    began, m = time.perf_counter(), case.dimension
+    rates, start = make(*_pendulum(m - 1)), np.concatenate([case.q[0], case.velocity[0]])
+    rates(0.0, start)
+    seconds = time.perf_counter() - began
+
+    def prepare(tolerance: float) -> Callable[[int], Callable[[], Any]]:
+        how = {"method": "DOP853", "rtol": tolerance, "atol": tolerance}
+        return lambda _: lambda: solve_ivp(rates, (0.0, case.span), start, **how).y[:m, -1]
+
+    for tolerance in TOLERANCES[: 2 if quick else None]:
+        yield Contender(name, f"tol={tolerance:.0e}", "", seconds, prepare(tolerance), starts=1)

@@ -1,0 +1,253 @@
+"""Tables without contenders at equal error: energy drift, time to the first step, steps with several threads."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.benchmark.cases.large import atoms, bodies, ring
+from scvi_codegen.benchmark.cases.robots import chain
+from scvi_codegen.benchmark.cases.unforced import Array, Case, case
+from scvi_codegen.benchmark.contenders.engines import mujoco_states
+from scvi_codegen.benchmark.contenders.ours import momenta_of
+from scvi_codegen.benchmark.contenders.taylor import heyoka_states
+from scvi_codegen.benchmark.report import OURS, ResultTable
+from scvi_codegen.benchmark.settings import Plan, ReportActivity, timed
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.native import building
+from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
+from scvi_codegen.runtime.run.run import Run
+
+DRIFTS = {"kepler:0.2": (0.5, 0.35, 0.2), "kepler:0.5": (0.2, 0.15, 0.1)}
+"""Three step sizes for each case, from the largest without a visible truncation error down."""
+STEPS, ROBOT_STEPS, QUICK_STEPS = 10_000_000, 200_000, 20_000
+ROBOT_METHODS = {"svi:2": 0.01, "svi:4": 0.02, "MuJoCo RK4": 0.002, "MuJoCo implicitfast": 0.002}
+"""Step sizes for a chain of five hinges; 0.002 is MuJoCo's default."""
+SAMPLES, BLOCKS, PARTS = 2000, 20, 10
+"""Numbers of samples of the energy, of blocks of them, and of parts of a run; the first part is reported by itself."""
+
+
+@without_accuracy_warnings()
+def run_drift(plan: Plan, report_activity: ReportActivity) -> ResultTable:
+    """Measure the energy error of long runs of this package, heyoka at its default tolerance, and MuJoCo."""
+    rows = []
+    for name, sizes in DRIFTS.items():
+        for h in sizes:
+            report_activity(f"drift: {name}, h = {h:g}")
+            methods, steps = ("svi:8", *_installed("heyoka", plan)), QUICK_STEPS if plan.quick else STEPS
+            rows += [drift_row(case(name), by, h, steps) for by in methods]
+    if not plan.quick:
+        robot = chain(5)
+        for by, h in ROBOT_METHODS.items():
+            if "MuJoCo" not in by or _installed("mujoco", plan):
+                report_activity(f"drift: {robot.name} by {by}")
+                rows.append(drift_row(robot, by, h, ROBOT_STEPS))
+    columns = {"problem": "", "by": "", "h": "g", "steps": "d", "seconds": ".2f"}
+    errors = dict.fromkeys(("first_tenth", "largest", "at_the_end", "drift", "uncertainty"), ".1e")
+    return ResultTable(
+        name="drift",
+        title="energy error of long runs, relative to the energy",
+        columns=columns | errors,
+        rows=tuple(rows),
+        remarks=(
+            "first tenth, largest: largest error in the first tenth of the run, and in all of it; a random walk grows",
+            "by a factor of about 3. drift: slope of the fitted line times the length of the run. uncertainty: its",
+            f"standard error, from the variance of the gains over {BLOCKS} blocks. h of heyoka: of the run it repeats.",
+        ),
+    )
+
+
+def _installed(name: str, plan: Plan) -> tuple[str, ...]:
+    return (name,) if name in plan.peers and importlib.util.find_spec(name) is not None else ()
+
+
+def drift_row(chosen: Case, by: str, h: float, steps: int) -> dict[str, Any]:
+    """Return the energy errors of a run from the first state of a case by one method."""
+    stepper = compile_stepper(chosen.system, by if by.startswith("svi") else "svi:8")
+    every, q, p = max(1, steps // SAMPLES), chosen.q[0], momenta_of(stepper, chosen)[0]
+    if by.startswith("svi"):
+        seconds, run = timed(lambda: stepper.integrate(q, p, h=h, steps=steps, save_every=every, check_growth=False))
+        energy = run.energy()
+    else:
+        times, half = h * every * np.arange(steps // every + 1), chosen.dimension
+        if by == "heyoka":
+            seconds, states = timed(lambda: heyoka_states(chosen, times))
+        else:
+            seconds, states = mujoco_states(chosen, by.split()[1], h, every, len(times))
+        energy = stepper.energy(states[:, :half], stepper.momentum(states[:, :half], states[:, half:]))
+    error = (energy - energy[0]) / abs(energy[0])
+    drift, uncertainty = fitted_rate(error)
+    return {
+        "problem": chosen.name,
+        "by": f"{OURS} {by}" if by.startswith("svi") else by,
+        "h": h,
+        "steps": steps,
+        "seconds": seconds,
+        "first_tenth": float(np.abs(error[: len(error) // PARTS + 1]).max()),
+        "largest": float(np.abs(error).max()),
+        "at_the_end": float(error[-1]),
+        "drift": drift,
+        "uncertainty": uncertainty,
+    }
+
+
+def fitted_rate(error: Array) -> tuple[float, float]:
+    """Return the slope of a line fitted to equidistant samples, times their length, and its standard error.
+
+    Round-off makes the energy a random walk, so the residuals of the fit are correlated and the usual error is too
+    small. The increments of the walk are independent: the error is estimated from the variance of its gains over twenty
+    blocks, with the variance 6/5 of the slope of a walk of unit variance.
+    """
+    t = np.linspace(-0.5, 0.5, len(error))
+    derivative = float(t @ error / (t @ t))
+    gains = np.diff(error[np.linspace(0, len(error) - 1, BLOCKS + 1).astype(int)])
+    return derivative, float(np.sqrt(1.2 * BLOCKS * np.var(gains, ddof=1)))
+
+
+FIRST_STEPS = ("kepler:0.2", "double-pendulum", "outer-solar-system", "fput-chain:64", "fput-chain:256")
+"""Cases whose time from text to the first step is measured."""
+LONGEST = 1800
+FIRST_STEP = """
+import json, os, sys, time
+began = time.perf_counter()
+import scvi_codegen as sc
+by_import = "sympy" in sys.modules
+sc.LagrangianSystem, sc.compile_stepper, sc.SVI
+given, start = json.load(sys.stdin)
+marks = [time.perf_counter()]
+system = sc.LagrangianSystem.from_text(**given)
+marks.append(time.perf_counter())
+stepper = sc.compile_stepper(system, sc.SVI(8))
+stepper.step(start, [0.0] * len(start), 1e-3)
+done = time.perf_counter()
+used = os.times()
+seconds = [marks[0] - began, marks[1] - marks[0], done - marks[0]]
+cpu = [used.user + used.system, used.children_user + used.children_system]
+by_step = "sympy" in sys.modules
+print(json.dumps([stepper.source.code.count("\\n"), *seconds, *cpu, str(by_import), str(by_step)]))
+"""
+MEASURED = {"lines_of_C": "d", "import_s": ".3f", "read_s": ".3f", "first_step_s": ".3f"}
+MEASURED |= {"python_cpu_s": ".2f", "compiler_cpu_s": ".2f", "sympy_by_import": "", "sympy_by_step": ""}
+"""Numbers that this prints, with their formats."""
+
+
+def run_first_steps(plan: Plan, report_activity: ReportActivity) -> ResultTable:
+    """Measure fresh processes, with an empty cache and again with the cache filled, in turn; medians of the rounds."""
+    rows = []
+    for name in FIRST_STEPS[: 1 if plan.quick else None]:
+        rounds: dict[str, list[dict[str, Any]]] = {"empty": [], "filled": []}
+        for number in range(plan.rounds):
+            report_activity(f"first step: {name}, round {number + 1}")
+            with tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder:
+                for kind, measured in rounds.items():
+                    measured.append({"system": name, "cache": kind} | _first_step(case(name), folder))
+        rows += [_medians(measured) for measured in rounds.values()]
+    return ResultTable(
+        name="first-step",
+        title="from the text of a Lagrangian to the first step of SVI(8), in a fresh process",
+        columns={"system": "", "cache": "", "coordinates": "d", **MEASURED},
+        rows=tuple(rows),
+        remarks=(
+            "import: wall time of scvi_codegen and the names used; first step: from the text on, including reading it;",
+            "cpu: processor seconds of Python and of the C compiler, less sensitive to other processes; sympy: whether",
+            "it was imported by 'import scvi_codegen', and by the step.",
+        ),
+    )
+
+
+def _first_step(chosen: Case, cache: str) -> dict[str, Any]:
+    """Return what a fresh process measures that reads the system as text."""
+    system: Any = chosen.system
+    names = [str(symbol) for symbol in system.coordinates]
+    given = {"name": system.name, "coordinates": names, "lagrangian": str(system.lagrangian)}
+    text = json.dumps([given | {"parameters": chosen.parameters}, chosen.q[0].tolist()])
+    environment = os.environ | {building.CACHE_VARIABLE: cache}
+    how: dict[str, Any] = {"capture_output": True, "text": True, "check": True, "timeout": LONGEST}
+    output = subprocess.run([sys.executable, "-c", FIRST_STEP], input=text, env=environment, **how).stdout
+    return {"coordinates": chosen.dimension} | dict(zip(MEASURED, json.loads(output), strict=True))
+
+
+def _medians(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    return {
+        key: statistics.median(row[key] for row in rows) if isinstance(value, float) else value
+        for key, value in rows[0].items()
+    }
+
+
+TURN = 0.003
+"""Duration of a turn in seconds: short, so that other programs seldom interrupt it."""
+PROBLEM_SECONDS = 0.5
+"""Seconds for a problem, a method and a number of threads."""
+
+
+@without_accuracy_warnings()
+def run_threads(plan: Plan, report_activity: ReportActivity) -> ResultTable:
+    """Measure the time of a step of array systems, its growth with their size, and the speed-up by several threads."""
+    cores = os.cpu_count() or 1
+    numbers = [number for number in (2, 4, 8, 16, 32) if number <= max(cores, 2)]
+    rows = []
+    for each, h in _threaded(plan):
+        for method in ("svi:8", "stoermer-verlet"):
+            report_activity(f"threads: {each.name} by {method}")
+            rows.append({"problem": each.name.split(":")[1]} | _thread_row(each, method, h, numbers, plan))
+    columns = {"problem": "", "coordinates": "d", "by": "", "one_us": ".4g", "ns_a_coordinate": ".1f"}
+    return ResultTable(
+        name="threads",
+        title="time of a step with one thread, and speed-up with several",
+        columns=columns | {f"threads_{number}": ".2f" for number in numbers},
+        rows=tuple(rows),
+        remarks=(
+            "time of the clock, the best of many turns of 3 ms, threads begun in each, numbers of threads in turn. On",
+            "a machine with other work threads that wait for each other may be slower than one.",
+        ),
+    )
+
+
+def _threaded(plan: Plan) -> Iterator[tuple[Case, float]]:
+    """Yield each problem with a step size."""
+    if plan.quick:
+        yield from ((ring(5000, 1.0), 0.1), (atoms(2, 1.0), 0.002))
+        return
+    for count in (10**3, 10**4, 10**5, 10**6):
+        yield ring(count, 1.0), 0.1
+    for cells in (2, 3, 4, 6):
+        yield atoms(cells, 1.0), 0.002
+    for number in (256, 1000):
+        yield bodies(number, 1.0), 0.02
+
+
+def _thread_row(each: Case, method: str, h: float, numbers: list[int], plan: Plan) -> dict[str, Any]:
+    stepper: Any = compile_stepper(each.system, method)
+    assert each.arrays is not None
+    q, v = (part[0].reshape(each.arrays.shape) for part in each.states)
+    runs = {threads: stepper.start(q, velocity=v, threads=threads, h=h) for threads in (1, *numbers)}
+    for run in runs.values():
+        run.advance(3)
+    steps = max(1, int(TURN / _seconds(runs[1], 1)))
+    best, until = dict.fromkeys(runs, float("inf")), time.perf_counter() + plan.share * PROBLEM_SECONDS * len(runs)
+    while time.perf_counter() < until:
+        for threads, run in runs.items():
+            best[threads] = min(best[threads], _seconds(run, steps))
+    gained = {f"threads_{threads}": best[1] / best[threads] for threads in numbers}
+    row = {"coordinates": each.dimension, "by": f"{OURS} {method}", "one_us": 1e6 * best[1]}
+    return row | {"ns_a_coordinate": 1e9 * best[1] / each.dimension} | gained
+
+
+def _seconds(run: Run, steps: int) -> float:
+    """Return the seconds per step of a call with ``steps`` steps."""
+    memory: Any = run._memory
+    binding = memory.binding.raw
+    report = binding.new("report *")
+    began = time.perf_counter()
+    binding.function("advance")(memory.run, memory.problem, steps, binding.null, report)
+    return (time.perf_counter() - began) / steps
