@@ -35,6 +35,8 @@ from scvi_codegen.methods.method import Method
 ENSEMBLES = ("planar-pendulum", "kepler:0.2", "outer-solar-system")
 """Names of the cases that are run as ensembles."""
 TRAJECTORIES = 64
+Counts = Mapping[str | Method, Sequence[int]]
+"""Numbers of steps by method."""
 
 
 def _shortened(chosen: Case, plan: Plan) -> Case:
@@ -74,7 +76,7 @@ def _copies(name: str, plan: Plan) -> Race:
 def _tumbling(plan: Plan) -> Race:
     """Return many free bodies, which MuJoCo integrates as one model."""
     chosen = _shortened(tumbling(FEW_BODIES if plan.quick else BODIES), plan)
-    counts = {"svi:8": step_counts(replace(chosen, step=1.0), range(2 if plan.quick else 5))}
+    counts: Counts = {"svi:8": step_counts(replace(chosen, step=1.0), range(2 if plan.quick else 5))}
     return replace(
         _ensemble(chosen, chosen, plan),
         ours=lambda: [*run_contenders(chosen, counts), *our_ensembles(chosen, quick=True)],
@@ -101,9 +103,6 @@ def _rotation(name: str, plan: Plan) -> Race:
         return [contender for make in both for contender in make(chosen, quick=plan.quick)]
 
     return Race(case=chosen, ours=ours)
-
-
-Counts = Mapping[str | Method, Sequence[int]]
 
 
 def _halved(

@@ -79,7 +79,7 @@ def drift_row(chosen: Case, by: str, h: float, steps: int) -> dict[str, Any]:
         seconds, run = timed(lambda: stepper.integrate(q, p, h=h, steps=steps, save_every=every, check_growth=False))
         energy = run.energy()
     else:
-        times, half = h * every * np.arange(steps // every + 1), chosen.dimension
+        times, half = np.linspace(0.0, h * steps, steps // every + 1), chosen.dimension
         if by == "heyoka":
             seconds, states = timed(lambda: heyoka_states(chosen, times))
         else:

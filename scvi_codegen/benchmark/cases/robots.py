@@ -54,7 +54,9 @@ def chain(n: int) -> Case:
     bodies = (
         f'<body name="b{i}" pos="0 0 {-1 if i else 0}"><joint name="q{i}" axis="{AXES[i % 2]}"/>{ROD}' for i in range(n)
     )
-    return _case(f"chain:{n}", _model("".join(bodies) + "</body>" * n), np.linspace(0.4, 0.6, n), [0.0] * n, span=2.0)
+    return _case(
+        f"chain:{n}", _model("".join(bodies) + "</body>" * n), np.linspace(0.4, 0.6, n).tolist(), [0.0] * n, span=2.0
+    )
 
 
 def quadruped() -> Case:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from importlib.resources import files
 from typing import Any
 
@@ -59,7 +60,8 @@ def by_hand(case: Case, method: str, order: int, steps: int) -> Contender:
 
         def integrate() -> Array:
             library.lib.leapfrog(is_field, *state, count, strength, case.span / steps, steps, *tables, len(kicks))
-            return q
+            end: Array = q
+            return end
 
         return integrate
 
@@ -87,7 +89,7 @@ def numpy_contenders(case: Case, quick: bool) -> Iterator[Contender]:
         return integrate
 
     for tolerance in TOLERANCES[: 2 if quick else None]:
-        yield _contender(case, "SciPy DOP853", f"tol={tolerance:.0e}", lambda tolerance=tolerance: solved(tolerance))
+        yield _contender(case, "SciPy DOP853", f"tol={tolerance:.0e}", partial(solved, tolerance))
 
 
 def rebound_contenders(case: Case, quick: bool) -> Iterator[Contender]:
@@ -111,9 +113,9 @@ def rebound_contenders(case: Case, quick: bool) -> Iterator[Contender]:
 
         return integrate
 
-    yield _contender(case, "REBOUND IAS15", "default", lambda: prepare("ias15", 100))
+    yield _contender(case, "REBOUND IAS15", "default", partial(prepare, "ias15", 100))
     for n in step_counts(case, range(2, 4 if quick else 12)):
-        yield _contender(case, "REBOUND leapfrog", f"{n} steps", lambda n=n: prepare("leapfrog", n))
+        yield _contender(case, "REBOUND leapfrog", f"{n} steps", partial(prepare, "leapfrog", n))
 
 
 def openmm_contenders(case: Case, quick: bool) -> Iterator[Contender]:

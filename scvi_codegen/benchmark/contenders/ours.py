@@ -98,8 +98,10 @@ def run_contenders(case: Case, counts: Mapping[str | Method, Iterable[int]]) -> 
         return lambda: np.array([integrate() for integrate in integrations])
 
     made = fixed_contenders(case, counts)
-    changes = {"starts": 1, "trajectories": len(case.q)}
-    return [replace(each, method=f"{OURS} runs", prepare=partial(prepare, each), **changes) for each in made]
+    return [
+        replace(each, method=f"{OURS} runs", prepare=partial(prepare, each), starts=1, trajectories=len(case.q))
+        for each in made
+    ]
 
 
 def our_ensembles(case: Case, *, quick: bool = False) -> list[Contender]:

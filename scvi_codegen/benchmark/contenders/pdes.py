@@ -130,6 +130,8 @@ def _split_steps(field: Any, axes: list[Array], composition: Any, steps: int) ->
                 u, v = fft.irfft([cosine * one + sine * other, cosine * other - lower * one], len(k))
         return u, v
 
+    step: Any
+    start: Any
     step, start = (schroedinger_step, first + 1j * second) if field.complex else (wave_step, (first, second))
 
     def integrate() -> Callable[[], Array]:

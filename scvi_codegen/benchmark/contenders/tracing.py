@@ -23,7 +23,7 @@ class _Traced:
     def __pow__(self, exponent: float) -> _Traced:
         """Return half-integer powers by a square root, which is several times faster than ``pow``."""
         root: Any = self.record(f"sqrt({self.text})")
-        power = {0.5: root, 1.5: self * root}[abs(exponent)]  # type: ignore[operator]
+        power = {0.5: root, 1.5: self * root}[abs(exponent)]
         return self.record(f"1.0 / {power.text}") if exponent < 0 else power
 
 
