@@ -6,6 +6,7 @@ have the arguments of the functions of known sizes, so that steppers, runs and t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -23,6 +24,7 @@ from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.envelope import envelope_of
 from scvi_codegen.runtime.arrays.interface import Numbers, RunSizes
 from scvi_codegen.runtime.arrays.memory import ArrayMemory
+from scvi_codegen.runtime.core.validation import by_name
 
 FAILURES_BY_SOLVER = {
     "fixed-point": FAILURES
@@ -74,11 +76,12 @@ class ArrayBinding(Binding):
         super().__init__(library, interface.prefix)
         self.raw = Binding(library, interface.prefix)
         self.interface, self.arrays, self._unused = interface, arrays, list[ArrayMemory]()
-        self.count = sum(int(np.prod(array.shape(arrays.sizes))) for array in interface.layout.coordinates)
-        ends = np.cumsum([int(np.prod(field.shape(arrays.sizes))) for field in interface.layout.fields], dtype=int)
-        first = len(interface.parameters)
-        self.field_rows = [(first + start, first + end) for start, end in zip([0, *ends], ends, strict=False)]
-        self.parameter_count = first + (int(ends[-1]) if len(ends) else 0)
+        self.shapes, self.fields = (
+            [(array.name, array.shape(arrays.sizes)) for array in each]
+            for each in (interface.layout.coordinates, interface.layout.fields)
+        )
+        self.count = sum(math.prod(shape) for _, shape in self.shapes)
+        self.parameter_count = len(interface.parameters) + sum(math.prod(shape) for _, shape in self.fields)
         self.envelope = envelope_of(interface.layout, arrays)
 
     def new(self, what: str) -> Any:
@@ -202,18 +205,14 @@ class ArrayBinding(Binding):
         from scvi_codegen.formulas.numpy_values import Elements  # here, because it imports SymPy
         from scvi_codegen.formulas.symbols import TIME, symbol
 
-        values, sizes = self._vector(parameters, self.parameter_count), self.arrays.sizes
+        values, scalars = self._vector(parameters, self.parameter_count), len(self.interface.parameters)
         numbers: dict[Any, float] = {symbol(TIME): t}
         numbers |= {symbol(name): x for name, x in zip(self.interface.parameters, values.tolist(), strict=False)}
-        arrays = self.by_name(self._vector(q))
-        arrays |= {names[0].format(name): each for name, each in self.by_name(self._vector(moving)).items()}
-        arrays |= {
-            field.name: values[first:end].reshape(field.shape(sizes))
-            for field, (first, end) in zip(self.interface.layout.fields, self.field_rows, strict=True)
-        }
-        targets = {names[1].format(name): each for name, each in self.by_name(self._vector(result)).items()}
+        arrays = by_name(self._vector(q), self.shapes) | by_name(values[scalars:], self.fields)
+        arrays |= {names[0].format(name): each for name, each in by_name(self._vector(moving), self.shapes).items()}
+        targets = {names[1].format(name): each for name, each in by_name(self._vector(result), self.shapes).items()}
         for force in formulas:
-            elements = Elements(force.loops, sizes, self.arrays.places)
+            elements = Elements(force.loops, self.arrays.sizes, self.arrays.places)
             for access, formula in force.targets:
                 value = elements.values(formula, force.slots, arrays, numbers)
                 targets[access.array.name][elements.of(access)] = value
@@ -222,7 +221,7 @@ class ArrayBinding(Binding):
     def _momentum_maps(self, count: int, t: Any, q: Any, p: Any, parameters: Any, values: Any, sizes: Any) -> int:
         maps, n = self.interface.layout.maps, self.count
         for k in range(count):
-            states = [self.by_name(self._vector(each + k * n)) for each in (q, p)]
+            states = [by_name(self._vector(each + k * n), self.shapes) for each in (q, p)]
             absolute = [{name: np.abs(each) for name, each in state.items()} for state in states]
             for j, each in enumerate(maps):
                 values[k * len(maps) + j] = momentum_of(states[0][each.array], states[1][each.array], each)
@@ -257,16 +256,6 @@ class ArrayBinding(Binding):
             size = float(max(np.abs(before).max(initial=0.0), np.abs(after).max(initial=0.0)))
             result[k] = float(np.abs(after - before).max(initial=0.0)) / (size or 1.0)
         return 0
-
-    def by_name(self, values: Numbers) -> dict[str, Numbers]:
-        """Return a vector of coordinates as arrays by name."""
-        arrays, first = {}, 0
-        for array in self.interface.layout.coordinates:
-            shape = array.shape(self.arrays.sizes)
-            size = int(np.prod(shape))
-            arrays[array.name] = values[first : first + size].reshape(shape)
-            first += size
-        return arrays
 
     def _states(self, count: int, t: Any, q: Any, p: Any, parameters: Any) -> Iterator[tuple[int, ArrayMemory]]:
         for k in range(count):

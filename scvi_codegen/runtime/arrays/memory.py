@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.runtime.arrays.interface import Numbers
+from scvi_codegen.runtime.core.validation import by_name
 from scvi_codegen.validation import LARGEST_COUNT
 
 STEP_CONTROL_FIELDS = (
@@ -142,8 +143,8 @@ class ArrayMemory:
         self.parameters[:], self.ready = values, True
         scalars = len(binding.interface.parameters)
         problem.parameters[0:scalars] = self.parameters[:scalars].tolist()
-        for k, (first, end) in enumerate(binding.field_rows):
-            problem.field[k] = binding.raw.pointer(self.parameters[first:end])
+        for k, field in enumerate(by_name(self.parameters[scalars:], binding.fields).values()):
+            problem.field[k] = binding.raw.pointer(field)
         if changed:
             self.run.guess *= binding.interface.layout.continued
             self._forget_factors()

@@ -5,7 +5,6 @@ All C calls release the GIL and share no state, so one integrator may be used fr
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -21,13 +20,14 @@ from scvi_codegen.runtime.core.validation import (
     Array,
     Parameters,
     States,
+    by_name,
     checked_parameters,
     checked_states,
     checked_vector,
+    coordinate_shapes,
     flat_state,
     is_one_state,
     parameter_index,
-    state_by_name,
 )
 
 REPORTED = 1e-3
@@ -221,7 +221,7 @@ class StateFunctions(CompiledMethod):
 
         States are accepted in the same form, ``{"x": 0.0, "q": [..]}`` of ``coordinates=["x", "q[8]"]``.
         """
-        return state_by_name(self.interface, values)
+        return by_name(np.asarray(values), coordinate_shapes(self.interface))
 
     def _vector(self, value: States, name: str) -> Array:
         return checked_vector(self.interface, value, name)
@@ -235,11 +235,8 @@ class StateFunctions(CompiledMethod):
         interface = self.interface if self.problem is None or self.origin is None else self.origin.interface
         result: dict[str, Any] = dict(zip(interface.parameters, values.tolist(), strict=self.problem is None))
         if self.problem is not None:
-            fields, first = np.asarray(values), len(interface.parameters)
-            for field in interface.layout.fields:
-                shape = field.shape(self.problem.sizes)
-                result[field.name] = fields[first : first + math.prod(shape)].reshape(shape)
-                first += math.prod(shape)
+            fields = [(field.name, field.shape(self.problem.sizes)) for field in interface.layout.fields]
+            result |= by_name(np.asarray(values)[len(interface.parameters) :], fields)
         return result
 
     def constraint_arrays(self, values: Array) -> Any:
@@ -247,5 +244,4 @@ class StateFunctions(CompiledMethod):
         if self.problem is None:
             return values
         shapes = constraint_shapes(self.interface.layout, self.problem.sizes)
-        ends = np.cumsum([math.prod(shape) for shape in shapes], dtype=int)
-        return tuple(part.reshape(shape) for part, shape in zip(np.split(values, ends), shapes, strict=False))
+        return tuple(by_name(values, enumerate(map(tuple, shapes))).values())

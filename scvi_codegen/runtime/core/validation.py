@@ -5,8 +5,8 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Collection, Iterator, KeysView, Mapping, Sequence
-from typing import Any
+from collections.abc import Collection, Hashable, Iterable, Iterator, KeysView, Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +17,7 @@ from scvi_codegen.rendering.source import Interface
 
 Array = NDArray[np.float64]
 Shapes = Sequence[tuple[str, tuple[int, ...]]]
+Key = TypeVar("Key", bound=Hashable)
 
 
 class NamedState(np.ndarray[Any, Any]):
@@ -37,13 +38,10 @@ class NamedState(np.ndarray[Any, Any]):
     def __getitem__(self, key: Any) -> Any:
         if not isinstance(key, str):
             return super().__getitem__(key)
-        values, first = np.asarray(self), 0
-        for name, shape in self.shapes or ():
-            size = math.prod(shape)
-            if name == key:
-                return values[..., first : first + size].reshape((*values.shape[:-1], *shape))
-            first += size
-        raise KeyError(f"there is no array '{key}' among {', '.join(self.keys()) or 'no names'}")
+        arrays = by_name(np.asarray(self), self.shapes or ())
+        if key not in arrays:
+            raise KeyError(f"there is no array '{key}' among {', '.join(arrays) or 'no names'}")
+        return arrays[key]
 
     def keys(self) -> KeysView[str]:
         """Return the names of the arrays."""
@@ -51,11 +49,11 @@ class NamedState(np.ndarray[Any, Any]):
 
     def values(self) -> list[Array]:
         """Return the arrays in order."""
-        return [self[name] for name in self.keys()]
+        return list(by_name(np.asarray(self), self.shapes or ()).values())
 
     def items(self) -> list[tuple[str, Array]]:
         """Return the names and the arrays in order."""
-        return [(name, self[name]) for name in self.keys()]
+        return list(by_name(np.asarray(self), self.shapes or ()).items())
 
     def __reduce__(self) -> tuple[Any, ...]:
         return named, (np.asarray(self), self.shapes)
@@ -112,7 +110,7 @@ def flat_state(interface: Interface, value: Any, name: str) -> Any:
     """
     if not interface.arrays and not isinstance(value, Mapping):
         return value
-    arrays = _coordinates(interface)
+    arrays = coordinate_shapes(interface)
     if isinstance(value, Mapping):
         return _joined(arrays, value, name)
     (_, shape), *others = arrays
@@ -123,19 +121,18 @@ def flat_state(interface: Interface, value: Any, name: str) -> Any:
     return array.reshape(*array.shape[: -len(shape)], -1) if whole and array.ndim != 1 else value
 
 
-def state_by_name(interface: Interface, values: Array) -> dict[str, Array]:
-    """Return (.., m) numbers, such as states of a trajectory, by the names of their arrays."""
-    state, first, values = {}, 0, np.asarray(values)
-    for name, shape in _coordinates(interface):
-        size = math.prod(shape)
-        state[name] = values[..., first : first + size].reshape((*values.shape[:-1], *shape))
-        first += size
-    return state
+def by_name(values: Array, shapes: Iterable[tuple[Key, tuple[int, ...]]]) -> dict[Key, Array]:
+    """Return (.., m) numbers as arrays of these names and shapes; shares memory."""
+    arrays, first = {}, 0
+    for name, shape in shapes:
+        end = first + math.prod(shape)
+        arrays[name], first = values[..., first:end].reshape((*values.shape[:-1], *shape)), end
+    return arrays
 
 
 def shapes_of(interface: Interface) -> Shapes | None:
     """Return the names and shapes of the arrays of coordinates; ``None`` without arrays."""
-    return _coordinates(interface) if interface.arrays else None
+    return coordinate_shapes(interface) if interface.arrays else None
 
 
 def _joined(arrays: Sequence[tuple[str, tuple[int, ...]]], by_name: Mapping[str, Any], what: str) -> Array:
@@ -156,7 +153,7 @@ def _joined(arrays: Sequence[tuple[str, tuple[int, ...]]], by_name: Mapping[str,
     return np.concatenate(parts, axis=-1)
 
 
-def _coordinates(interface: Interface) -> list[tuple[str, tuple[int, ...]]]:
+def coordinate_shapes(interface: Interface) -> list[tuple[str, tuple[int, ...]]]:
     """Return the name and shape of each array of coordinates; without arrays, each coordinate is one."""
     coordinates, total = [], 0
     for name, shape in declared(interface.arrays or interface.coordinates):

@@ -219,6 +219,7 @@ class Memory(OneThread):
         if plan is not None:
             self.plan = plan
 
+    @alone
     def set_inputs(self, **inputs: float) -> None:
         """Set inputs to constant values for the following steps (zero-order hold).
 
@@ -229,12 +230,7 @@ class Memory(OneThread):
             if name not in self._inputs:
                 raise no_input(name, self._inputs)
             values[self._inputs[name]] = checked_number(value, f"the input {name}"), 0.0, 0.0, 0.0, 0.0
-        if not self._lock.acquire(False):
-            raise in_use()
-        try:
-            self._set_parameters(values)
-        finally:
-            self._lock.release()
+        self._set_parameters(values)
         if self._unset_inputs:
             self._unset_inputs = tuple(name for name in self._unset_inputs if name not in inputs)
 
