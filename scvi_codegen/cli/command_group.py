@@ -109,12 +109,6 @@ class Commands(click.Group):
         try:
             with _warnings_as_lines():
                 return super().invoke(ctx)
-        except click.NoSuchOption as error:
-            if error.option_name not in ("--event", "--events"):
-                raise
-            from scvi_codegen.models.model_files.sections import EVENTS  # here, because it imports NumPy
-
-            raise click.UsageError(f"there is no option '{error.option_name}': {EVENTS}", error.ctx) from error
         except (StepFailedError, BuildError, RecordingError) as error:
             raise CommandFailure(str(error), FAILURE) from error
         except ScviCodegenError as error:

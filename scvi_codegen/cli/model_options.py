@@ -18,6 +18,7 @@ from scvi_codegen.mechanics.time_transformation import CONTROLLERS
 from scvi_codegen.methods import ARGUMENTS, METHODS, size_of, specification_of
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.model_file import catalogue_model, load_model
+from scvi_codegen.models.model_files.sections import event_entry
 from scvi_codegen.models.problems import PROBLEMS, problem
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -59,6 +60,7 @@ class ModelOptions:
     controller: str | None = None
     inputs: tuple[tuple[str, dict[str, str]], ...] | None = None
     size: tuple[tuple[str, int], ...] | None = None
+    event: tuple[str, ...] = ()
     solver: str = "auto"
 
     def sections(self) -> dict[str, dict[str, Any]]:
@@ -78,7 +80,8 @@ class ModelOptions:
         arguments = {
             name: {key: _plain(x) for key, x in section.items() if x is not None} for name, section in named.items()
         }
-        return {name: section for name, section in arguments.items() if section}
+        events: dict[str, Any] = {"events": [event_entry(text) for text in self.event]}
+        return {name: section for name, section in (arguments | events).items() if section}
 
 
 def _plain(value: Any) -> Any:
@@ -220,6 +223,13 @@ STATE_OPTIONS = (
         metavar="NAME=N",
         callback=_sizes,
         help="Array size of an array model, as N=1000; may be repeated.",
+    ),
+    _option(
+        "--event",
+        multiple=True,
+        metavar="G[; NAME=VALUE]..",
+        help="Zero crossing of G that changes the state, as 'y; direction=-1; p_y=-0.8*p_y', or of a wall, as "
+        "'y; restitution=0.8; where=x > 0'; terminal=N ends the run at the N-th; may be repeated.",
     ),
     _option("--q", metavar="Q1,Q2,..", callback=_numbers, help="Initial coordinates."),
     _option("--p", metavar="P1,P2,..", callback=_numbers, help="Initial momenta."),

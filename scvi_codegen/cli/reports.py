@@ -88,7 +88,8 @@ def energy_report(system: MechanicalSystem, trajectory: Trajectory, balance: Bal
     scale = abs(float(energy[0]))
     error = (energy - energy[0]) / (scale or 1.0)
     what = "relative energy error" if scale else "energy error"
-    if why := system.changes_energy:
+    why = "events change the state" if trajectory.stepper.changes_states else system.changes_energy
+    if why:
         changed = f"energy: {why}, it changed by {np.abs(energy - energy[0]).max():.3g} at most"
         return changed if balance is None else f"{changed}; energy balance |E - E0 - W| {balance.error:.1e} at most"
     largest = np.abs(error).max()
@@ -118,6 +119,8 @@ def _drift(t: Array, error: Array) -> float:
 def momentum_report(result: Trajectory | EnsembleTrajectory) -> Iterator[str]:
     """Yield a line for each momentum map: its largest change, relative to the largest size of its terms."""
     described = result.stepper.interface
+    if result.stepper.changes_states:
+        return
     try:
         changes = np.abs(result.momentum_errors())
     except StateError as failure:

@@ -91,7 +91,7 @@ def integrate_model(model: Model, *, options: SolverOptions | None = None, threa
         try:
             for steps in model.segments(run):
                 recorder.record(steps, look, stop)
-                if stopped:
+                if stopped or recorder.ended:
                     break
         except StepFailedError as error:
             failure = error
@@ -124,8 +124,10 @@ class _FileRecorder:
 
     def record(self, steps: int | None, look: Callable[[int], None], stop: Callable[[], bool]) -> None:
         try:
+            if self.model.events:
+                self.observed = Observation(self.run, save_every=self.model.save_every)
             if self.observed is not None:
-                piece = self.observed.advance(None, look, stop)
+                piece = self.observed.advance(steps, look, stop)
             else:
                 piece = record(self.run, steps, save_every=self.model.save_every, progress=look, stop=stop)
         except StepFailedError as error:
@@ -181,6 +183,7 @@ def summary(model: Model, outcome: RunOutcome, known: Known | None, balance: Bal
         with np.errstate(all="ignore"):
             lines += conserved(model, trajectory, balance)
         lines += worst_step(trajectory)
+    lines += [f"event {each.event.function}: {counted(len(each), 'crossing')}" for each in trajectory.events]
     return "\n".join([*lines, *final_state(run.stepper.coordinates, *outcome.end[1:], known)])
 
 
@@ -196,6 +199,7 @@ def known_at_end(model: Model, outcome: RunOutcome) -> Known | None:
     run, trajectory = outcome.run, outcome.trajectory
     if (
         model.array_system is not None
+        or model.events
         or not run.steps
         or outcome.failure is not None
         or outcome.interrupted

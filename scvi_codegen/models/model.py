@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from scvi_codegen.native.options import SolverOptions
     from scvi_codegen.runtime.core.stepper import Stepper
     from scvi_codegen.runtime.core.validation import Array
+    from scvi_codegen.runtime.events.event import Event
     from scvi_codegen.runtime.inputs.segments import Input
     from scvi_codegen.runtime.run.global_error import GlobalError
     from scvi_codegen.runtime.run.run import Run
@@ -58,6 +59,7 @@ class Model(TimeSpan):
             it; a run requires all inputs of the system.
         fields: arrays of parameters by name, for array sizes known at run time; others keep their default value.
         tables: index tables of shape (rows, columns) by name, for array sizes known at run time.
+        events: zero crossings that runs record, which may change the state.
 
     Raises:
         ModelFileError: naming the field, unless exactly one of p and velocity, at most one of h, tolerance and error,
@@ -74,6 +76,7 @@ class Model(TimeSpan):
     inputs: Mapping[str, InputTable] = field(default_factory=dict)
     fields: Mapping[str, Any] = field(default_factory=dict)
     tables: Mapping[str, Any] = field(default_factory=dict)
+    events: tuple[Event, ...] = ()
 
     __repr__ = summary("system", "method", "h", "span", "steps")
 
@@ -209,9 +212,10 @@ class Model(TimeSpan):
         """Compile a stepper for runs of this model; raises as :func:`~scvi_codegen.compile_stepper`."""
         from scvi_codegen.compiler import compile_stepper  # imported here: not needed for reading a model
 
-        return compile_stepper(
+        stepper = compile_stepper(
             self.system, self.method, solver=self.solver, time_transformation=self.time_transformation
         )
+        return stepper.with_events(self.events) if self.events else stepper
 
     def momenta(self, stepper: Stepper) -> Array:
         """Return the (m,) initial momenta: ``p``, or the Legendre transform of the velocities."""

@@ -233,7 +233,9 @@ class TestChoices:
             ("kepler --method gauss:", "the colon must be followed by a number, its stages, as in gauss:8"),
             ("kepler --method collocation:2", "collocation does not take a number; its arguments are abscissae, form"),
             ("kepler --method gaus:2", "did you mean 'gauss'?"),
-            ("kepler --event q1", "events are supported in Python only, as stepper.integrate(..., events=[...])"),
+            ("kepler --event q3", "unknown name 'q3'. Known here: q1, q2"),
+            ("kepler --event q1;z=3", "'z' is not a coordinate, a momentum or a velocity"),
+            ("kepler --event q1;p_q1", "'p_q1' in the event 'q1;p_q1' is not of the form NAME=VALUE"),
             (
                 "kepler --stages 3",
                 "unknown key 'stages' in [method] for svi; did you mean 'degree'? Known: method, degree, quadrature",

@@ -8,13 +8,25 @@ import mpmath as mp
 import numpy as np
 import pytest
 import sympy
+from click.testing import CliRunner
 from programs import needs
 
 import scvi_codegen as sc
+from scvi_codegen.cli import main
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import AccuracyWarning, EventError, EventWarning, MethodError, StateError
+from scvi_codegen.errors import (
+    AccuracyWarning,
+    EventError,
+    EventWarning,
+    MethodError,
+    ModelFileError,
+    PackageError,
+    StateError,
+)
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.models.model_files.model_file import dump_model, parse_model
+from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.pipeline import generate_source
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.events.event import Event, impact
@@ -417,3 +429,57 @@ def test_source_compiles_without_warnings(compiler, tmp_path):
             [compiler, *strict, "hit.c", "hit_events.c"], cwd=tmp_path, capture_output=True, text=True, check=False
         )
         assert (result.returncode, result.stderr) == (0, "")
+
+
+# Model files and the command line.
+
+MODEL = """
+[system]
+name = "ball"
+coordinates = ["x", "y"]
+lagrangian = "(x_dot**2 + y_dot**2)/2 - g*y"
+[parameters]
+g = 1.0
+e = 0.8
+[initial]
+q = [0.0, 1.0]
+q_dot = [1.0, 0.0]
+[[events]]
+function = "y"
+restitution = "e"
+[[events]]
+function = "x - 3"
+direction = 1
+then = { p_x = "-p_x" }
+where = "y >= 0"
+[method]
+method = "svi:2"
+[run]
+step = 0.1
+span = 8.03
+"""
+
+
+def test_model_files_contain_events(tmp_path):
+    model = parse_model(MODEL)
+    assert parse_model(dump_model(model)) == model
+    assert model.events == (impact("y", "e"), Event("x - 3", 1, then={"p_x": "-p_x"}, where="y >= 0"))
+    run = model.integrate()
+    assert [len(each) for each in run.events] == [4, 1]
+    assert run.q[-1, 0] == pytest.approx(3.0 - 5.03, abs=1e-14)
+    with pytest.raises(PackageError, match="has no events"):
+        generate_package(model, tmp_path / "ball")
+    with pytest.raises(ModelFileError, match=r"'were'.*did you mean 'where'"):
+        parse_model(MODEL.replace("where", "were"))
+
+
+def test_events_of_the_command_line_add_to_those_of_the_file(tmp_path):
+    path = tmp_path / "ball.toml"
+    path.write_text(MODEL)
+    command = ["run", str(path), "--event", "t - 6; terminal=1", "--event", "y - 1/2; direction=1; p_y=p_y/2"]
+    result = CliRunner().invoke(main, command)
+    assert result.exit_code == 0, result.output
+    assert "event y: 3 crossings" in result.output
+    assert "to t = 6;" in result.output
+    assert "event y - 1/2:" in result.output
+    assert "NOT conserved" not in result.output

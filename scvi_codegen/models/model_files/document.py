@@ -12,6 +12,8 @@ from scvi_codegen.errors import ModelFileError
 from scvi_codegen.indices import Array
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_files.sections import EVENT_KEYS
+from scvi_codegen.runtime.events.event import Event
 
 if TYPE_CHECKING:
     from scvi_codegen.models.model_files.input_tables import InputTable
@@ -42,6 +44,8 @@ def document_of(model: Model, *, as_arrays: bool = True) -> dict[str, Any]:
         document["system"]["time_transformation"] = g
     if model.inputs:
         document["inputs"] = {name: _as_lists(table) for name, table in model.inputs.items()}
+    if model.events:
+        document["events"] = [_event_entry(event) for event in model.events]
     if sizes := {name: size for name, size in model.sizes.items() if size}:
         document["sizes"] = sizes
     if parameters:
@@ -50,6 +54,21 @@ def document_of(model: Model, *, as_arrays: bool = True) -> dict[str, Any]:
         declared = {each.partition("[")[0]: each for each in system.definition.get("tables", ())}
         document["tables"] = {declared[name]: np.asarray(rows).tolist() for name, rows in model.tables.items()}
     return {**document, **motion}
+
+
+def _event_entry(event: Event) -> dict[str, Any]:
+    """Return the table of an event."""
+    entry = {name: getattr(event, name) for name in EVENT_KEYS if getattr(event, name) not in (None, 0, False)}
+    if event.restitution is not None:
+        entry |= {"restitution": event.restitution}
+    texts: dict[str, Any] = {
+        key: value if isinstance(value, int | float | str) else str(value) for key, value in entry.items()
+    }
+    if event.then is not None:
+        texts["then"] = {name: value if isinstance(value, int | float) else str(value) for name, value in event.changes}
+    if isinstance(event.where, tuple):
+        texts["where"] = list(map(str, event.where))
+    return texts
 
 
 def _definition(system: MechanicalSystem) -> dict[str, Any]:

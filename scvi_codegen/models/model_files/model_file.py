@@ -36,6 +36,12 @@
     q_dot = [0.0]                                       # velocities, or p = [...] for momenta, not both
     t = 0.0                                             # default: 0
 
+    # [[events]]                                        # zero crossings, which may change the state; any number
+    # function = "q - 1"
+    # direction = 1                                     # from negative to positive; default: both; terminal = 3
+    # then = { p_q = "-0.8*p_q" }                       # or restitution = 0.8, of the wall of an impact
+    # where = "q_dot > 0"                               # condition
+
     [method]                                            # default: SVI(8); with constraints SVI(6)
     method = "svi"                                      # then its arguments: degree, quadrature, nodes, ...
     degree = 8
@@ -63,6 +69,7 @@ Further sections, such as command-line options, can be merged over those of a fi
 from __future__ import annotations
 
 import os
+import re
 import warnings
 from collections.abc import Mapping
 from contextlib import suppress
@@ -73,6 +80,7 @@ from typing import TYPE_CHECKING, Any
 from scvi_codegen.errors import ModelFileError, SystemDefinitionWarning
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.toml_text import read_toml
+from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.lowering.arrays import one_coordinate
 from scvi_codegen.mechanics.definition_checks import warn_of_mistakes
 from scvi_codegen.mechanics.time_transformation import time_rescaling_function, with_time_transformation
@@ -93,6 +101,7 @@ from scvi_codegen.models.model_files.sections import (
     in_section,
     merged_sections,
     read_catalogue,
+    read_events,
     read_method,
     read_run,
     read_system,
@@ -107,7 +116,19 @@ if TYPE_CHECKING:
 SYSTEM_KEYS = ("name", "coordinates", *TURNING, "momenta", *FORMULAS, "inputs", "catalogue", "time_transformation")
 RUN_KEYS = ("step", "tolerance", "error", "controller", "span", "steps", "save_every")
 KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
-SECTIONS = ("system", "forces", *TORQUES, "inputs", "sizes", "parameters", "tables", "initial", "method", "run")
+SECTIONS = (
+    "system",
+    "forces",
+    *TORQUES,
+    "inputs",
+    "sizes",
+    "parameters",
+    "tables",
+    "initial",
+    "events",
+    "method",
+    "run",
+)
 ARRAY_SECTIONS = ("sizes", "tables")
 """Sections of systems with arrays."""
 
@@ -167,7 +188,7 @@ def parse_model(text: str, changes: Document | None = None, *, folder: str | os.
     document = read_toml(text)
     check_keys(document, SECTIONS, "section")
     for name, content in document.items():
-        if not isinstance(content, dict):
+        if not isinstance(content, dict) and name != "events":
             raise ModelFileError(f"'{name}' must be a section, [{name}], not {content!r}")
     for name, known in KEYS.items():
         check_keys(document.get(name, {}), known, "key", f"[{name}]")
@@ -219,8 +240,9 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
         system, values = read_values(document, read_system(document, entry), folder)
     arrays = Model.arrays_of(system)
     method = read_method(fitted(specification, one_coordinate(arrays) if arrays else system))
-    inputs = _read_inputs(document.get("inputs", {}), folder)
-    model = Model(system=system, method=method, solver=solver, inputs=inputs, **values, **read_run(document["run"]))
+    values |= {"inputs": _read_inputs(document.get("inputs", {}), folder), "solver": solver}
+    events = read_events(document.get("events", []))
+    model = Model(system=system, method=method, events=events, **values, **read_run(document["run"]))
     return _with_time_transformation(model, document, specification)
 
 
@@ -257,7 +279,9 @@ def _with_time_transformation(model: Model, document: Document, specification: S
     if model.array_system is not None:
         model.array_system.warn_of_mistakes()
         return model
-    warn_of_mistakes(model.system, () if g is None else (time_rescaling_function(model.system, g, in_time=True),))
+    others = [symbol(word) for word in re.findall(r"[A-Za-z_]\w*", str(document.get("events", "")))]
+    rescaling = [] if g is None else [time_rescaling_function(model.system, g, in_time=True)]
+    warn_of_mistakes(model.system, (*others, *rescaling))
     return model
 
 

@@ -15,6 +15,7 @@ from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification, s
 from scvi_codegen.models.model import DEFAULT_METHOD
 from scvi_codegen.models.problems import Problem, problem
 from scvi_codegen.models.time_span import real
+from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.validation import FORMULA, checked_count, likely_names, synonym_hint
 
 KEYS: Final = {
@@ -23,7 +24,7 @@ KEYS: Final = {
     "method": "method degree quadrature",
     "system": "lagrangian hamiltonian damping dissipation constraints time_transformation inputs",
 }
-EVENTS: Final = "events are supported in Python only, as stepper.integrate(..., events=[...])"
+EVENT_KEYS: Final = ("function", "direction", "terminal", "then", "where", "restitution")
 LOCATIONS: Final = {
     **{key: f"'{key}' belongs in [{section}]" for section, keys in KEYS.items() for key in keys.split()},
     **{section: f"there is a section [{section}]" for section in ("parameters", "forces", "initial", "run")},
@@ -39,8 +40,6 @@ def key_hint(key: str, names: Iterable[str]) -> str:
         names: known keys of its section.
     """
     known = list(names)
-    if key in ("event", "events"):
-        return f"; {EVENTS}."
     if here := synonym_hint(key, known):
         return here
     if (hint := closest(key, known)) != ".":
@@ -70,8 +69,11 @@ def chosen_method(document: Document, changes: Document) -> Section:
 
 def merged_sections(below: Document, above: Document) -> dict[str, Section]:
     """Return all sections merged; keys in ``above`` replace those in ``below`` and their alternatives."""
-    document = dict(below)
+    document: dict[str, Any] = dict(below)
     for name, section in above.items():
+        if name == "events":
+            document[name] = [*below.get(name, ()), *section]
+            continue
         replaced = {key for keys in ALTERNATIVES if not keys.isdisjoint(section) for key in keys}
         base_section = {} if name == "method" else below.get(name, {})
         document[name] = {key: value for key, value in base_section.items() if key not in replaced} | dict(section)
@@ -236,10 +238,40 @@ def check_used(document: Document, parameters: Section) -> None:
     section = document["system"]
     formulas = [section.get(key, "") for key in (*FORMULAS, "time_transformation")]
     acting = [formula for name in ("forces", *TORQUES) for formula in document.get(name, {}).values()]
-    formula = " ".join(map(str, (*formulas, *acting)))
+    formula = " ".join(map(str, (*formulas, *acting, *document.get("events", ()))))
     for name in parameters:
         if name not in re.findall(r"\w+", formula):
             raise ModelFileError(f"the system has no parameter '{name}'")
+
+
+def read_events(entries: Any) -> tuple[Event, ...]:
+    """Return the events of the tables ``[[events]]``."""
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise ModelFileError(f"events must be tables, [[events]], not {entries!r}")
+    events = []
+    for entry in entries:
+        check_keys(entry, EVENT_KEYS, "key", "[[events]]")
+        direction = {"direction": -1} if "restitution" in entry else {}
+        where = f"[[events]] function = {required(entry, 'function', '[[events]]')!r}"
+        events.append(in_section(where, lambda entry=entry, direction=direction: Event(**direction | entry)))  # type: ignore[misc]
+    return tuple(events)
+
+
+def event_entry(text: str) -> dict[str, Any]:
+    """Return the table of an event on one line, ``"y; direction=-1; where=x > 1; p_y=-e*p_y"``."""
+    function, *settings = map(str.strip, text.split(";"))
+    entry: dict[str, Any] = {"function": function}
+    for setting in settings:
+        name, equals, value = map(str.strip, setting.partition("="))
+        if not equals or not value:
+            raise ModelFileError(f"'{setting}' in the event '{text}' is not of the form NAME=VALUE, as in p_y=-p_y")
+        if name in ("direction", "terminal"):
+            entry[name] = checked_count(int(value) if value.lstrip("-").isdigit() else value, name, least=-1)
+        elif name in EVENT_KEYS:
+            entry[name] = value
+        else:
+            entry.setdefault("then", {})[name] = value
+    return entry
 
 
 def read_catalogue(section: Section) -> Problem | None:

@@ -80,6 +80,8 @@ def generate_package(
         MethodError: for a solver that does not support the method, and for a number beyond single precision.
         StateError: if the initial velocities have no momenta.
     """
+    if model.events:
+        raise PackageError("a generated package has no events: omit them, or use generate_source(.., events=..)")
     target = Path(folder)
     prefix = prefix_of(target)
     model = model if solver == "auto" else replace(model, solver=solver)

@@ -99,6 +99,7 @@ def record_run(
     if run.steps:
         raise StateError(f"record_run requires a run at its start, but this run has {run.steps} steps: start a new one")
     _check_inputs(run)
+    run.stepper._check_no_changes("record_run")
     run = _of_known_sizes(run)
     check_flags(run.stepper.flags, StateError)
     manifest = Manifest(
