@@ -58,8 +58,8 @@ DEEPEST_EXPRESSION = 24
 class _Graph:
     """Hash-consed arithmetic: ``nodes[k]`` is a leaf or (operator, operand ids)."""
 
-    def __init__(self, loads: Mapping[sympy.Symbol, Load], given: Sequence[sympy.Symbol]) -> None:
-        self.loads, self.given = loads, set(given)
+    def __init__(self, loads: Mapping[sympy.Symbol, Load], given: Sequence[sympy.Symbol], *, paired: bool) -> None:
+        self.loads, self.given, self.paired = loads, set(given), paired
         self.nodes: list[Constant | Load | tuple[str, tuple[int, ...]]] = []
         self._ids: dict[Constant | Load | tuple[str, tuple[int, ...]], int] = {}
         self._read: dict[sympy.Expr, int] = {}
@@ -118,13 +118,25 @@ class _Graph:
         content, primitive = expression.primitive()
         terms = [term.as_coeff_Mul() for term in primitive.args]
         terms.sort(key=lambda term: self._rank(term[1]))
+        if self.paired and any(isinstance(factor, sympy.Add) for _, rest in terms for factor in rest.args):
+            content, terms = sympy.S.One, [(content * coefficient, rest) for coefficient, rest in terms]
         if terms[0][0] < 0:
             content, terms = -content, [(-coefficient, rest) for coefficient, rest in terms]
+        if self.paired:
+            return self._times(content, self._in_pairs([(c < 0, self._scaled(abs(c), rest)) for c, rest in terms])[1])
         total = self._scaled(*terms[0])
         for coefficient, rest in terms[1:]:
             operator = "-" if coefficient < 0 else "+"
             total = self.node((operator, (total, self._scaled(abs(coefficient), rest))))
         return self._times(content, total)
+
+    def _in_pairs(self, terms: Sequence[tuple[bool, int]]) -> tuple[bool, int]:
+        """Return sign and node of the sum of terms with signs, those of two halves added, which are independent."""
+        if len(terms) == 1:
+            return terms[0]
+        half = (len(terms) + 1) // 4 * 2 or 1
+        (negative, first), (other, second) = self._in_pairs(terms[:half]), self._in_pairs(terms[half:])
+        return negative, self.node(("-" if other != negative else "+", (first, second)))
 
     def _scaled(self, coefficient: sympy.Rational, rest: sympy.Expr) -> int:
         if rest == 1:
@@ -213,15 +225,17 @@ def lower_kernel(
     values: Sequence[sympy.Expr],
     partials: Sequence[sympy.Expr] = (),
     constants: int = 0,
+    paired: bool = False,
 ) -> Kernel:
     """Return the kernel of ``values`` and ``partials`` with common subexpressions shared.
 
-    The last ``constants`` arguments are constant.
+    The last ``constants`` arguments are constant. With ``paired`` the terms of sums are added in pairs, and their
+    common rational factor is not separated if they have sums as factors: a few more operations, with less latency.
     """
     loads = {symbol: Load("u", i) for i, symbol in enumerate(arguments)}
     loads |= {symbol: Load("parameters", i) for i, symbol in enumerate(parameters)}
     loads[time] = Load("t", -1)
-    graph = _Graph(loads, (*parameters, *arguments[len(arguments) - constants :]))
+    graph = _Graph(loads, (*parameters, *arguments[len(arguments) - constants :]), paired=paired)
     for each in intermediates(*values, *partials):
         graph.read(each)
     roots = [graph.read(expression) for expression in (*values, *partials)]

@@ -229,6 +229,7 @@ class FixedPointIteration:
         serves_many: whether lanes may be trajectories.
         final_iterations: number of iterations after the one that converges.
         in_groups: whether its C supports several vectors for the points of a step, besides one.
+        exchanges: whether sums over the points exchange lanes (``templates/support/core/exchange.h``).
     """
 
     name: IterationName
@@ -250,6 +251,7 @@ class FixedPointIteration:
     serves_many: bool = False
     final_iterations: int = 0
     in_groups: bool = True
+    exchanges: bool = False
 
     @property
     def tables(self) -> Iterator[IterationTable]:
@@ -295,8 +297,9 @@ class FixedPointIteration:
 
     @property
     def facts(self) -> Mapping[str, int]:
-        """Macros that its support headers require, DIAGONAL_MASS among them if the mass matrix is diagonal."""
-        return {**dict(self.macros), **({"DIAGONAL_MASS": 1} if self.mass_entries and self.diagonal else {})}
+        """Macros that its support headers require: those of its own, of exchanges and of a diagonal mass matrix."""
+        found = {"EXCHANGES": self.exchanges, "DIAGONAL_MASS": self.mass_entries and self.diagonal}
+        return {**dict(self.macros), **{name: 1 for name, holds in found.items() if holds}}
 
 
 def transposed(table: NumberTable, points: int) -> NumberTable:

@@ -56,6 +56,7 @@ def system_kernel(
     of: Iterable[Symbol],
     partials: Iterable[Expr] = (),
     purpose: str = "",
+    paired: bool = False,
 ) -> Kernel:
     """Return the kernel ``name`` as a function of the time and parameters of a system.
 
@@ -65,6 +66,7 @@ def system_kernel(
         of: the arguments u.
         partials: expressions of derivatives, stored after the values.
         purpose: one sentence on what it computes, for the comment above it.
+        paired: whether its sums have short chains of operations instead of few operations.
     """
     kernel = lower_kernel(
         name,
@@ -73,6 +75,7 @@ def system_kernel(
         parameters=system.parameters,
         values=tuple(values),
         partials=tuple(partials),
+        paired=paired,
     )
     return replace(kernel, purpose=purpose)
 

@@ -197,7 +197,8 @@ def _control_context(program: Program, control: Control | None) -> dict[str, obj
     name = f"support/{program.prefix}_predictor.h"
     if not (control and control.predictor and program.fixed_point):
         return {"control": control, "own_headers": {}}
-    return {"control": control, "own_headers": {name: predictor_text(control.predictor)}}
+    text = predictor_text(control.predictor, exchanges=program.fixed_point.exchanges)
+    return {"control": control, "own_headers": {name: text}}
 
 
 def render_ensemble(program: Program) -> Source | None:

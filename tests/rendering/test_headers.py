@@ -13,7 +13,7 @@ import golden_cells
 import pytest
 from programs import needs
 
-from scvi_codegen import SVI, SpectralCollocation, compile_stepper, impact, problem
+from scvi_codegen import SVI, LagrangianSystem, SpectralCollocation, compile_stepper, impact, problem
 from scvi_codegen.files.cache import template_folder
 from scvi_codegen.rendering.flow import with_casadi_flow, with_flow_of_rows
 from scvi_codegen.rendering.source import Source
@@ -67,6 +67,8 @@ def sources() -> tuple[Source, ...]:
     kepler = compile_stepper(problem("kepler").system, SVI(2))
     oscillator = compile_stepper(problem("harmonic-oscillator").system, SVI(1), events=[impact("q", where="t > 0")])
     made.append(compile_stepper(problem("double-pendulum").system, SpectralCollocation(3)).source)
+    body = LagrangianSystem.from_text("body", rotations={"R": "w"}, lagrangian="w_1**2 + w_2**2 + 2*w_3**2")
+    made.append(compile_stepper(body, SVI(3)).source)
     made.append(with_casadi_flow(kepler.second_derivatives, 10, 5, second=True))
     made.append(with_flow_of_rows(kepler.derivatives))
     return (*made, *oscillator.source.sources)

@@ -75,3 +75,21 @@ def test_points_use_the_vectors_that_registers_allow(name, method):
         run = stepper.integrate(given.q, p, h=given.step, steps=20)
         ends.append(np.concatenate([run.q[-1], run.p[-1]]))
     assert np.abs(ends[0] - ends[1]).max() < 1e-13 * np.abs(ends[1]).max()
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the lengths of vectors of other processors are not chosen")
+@pytest.mark.parametrize("points", [2, 3, 8, 10])
+def test_sums_by_exchanged_lanes_are_the_same_in_vectors_of_any_length(points):
+    top = sc.LagrangianSystem.from_text(
+        "top", rotations={"R": "w"}, lagrangian="(w_1**2 + 2*w_2**2 + 3*w_3**2)/2 - R_33 - R_12"
+    )
+    ends = []
+    for flags in (SHORT, LONG):
+        stepper = sc.compile_stepper(top, sc.SVI(points), flags=flags)
+        run = stepper.integrate({"R": [0.9, 0.3, -0.2, 0.1]}, velocity={"w": [0.7, -0.4, 1.5]}, h=0.1, steps=20)
+        assert run.iterations.max() < 20  # by fixed-point iteration
+        ends.append(np.concatenate([run.q[-1], run.p[-1]]))
+    adaptive = stepper.integrate({"R": [0.9, 0.3, -0.2, 0.1]}, velocity={"w": [0.7, -0.4, 1.5]}, t_end=2.0)
+    assert np.abs(ends[0] - ends[1]).max() < 1e-13
+    if points > 7:
+        assert np.abs(adaptive.rotation()[-1] - run.rotation()[-1]).max() < 1e-12

@@ -19,7 +19,9 @@ they matter: in the last evaluation of the points and in the increments.
 
 **Hamiltonians.** No mass matrix, no Legendre transform: with positions and momenta at the points, one iteration
 computes forces, momenta, velocities and positions in turn, each from the latest of the others (Gauss-Seidel). Its
-convergence rate is h^2 if H = T(p) + V(q), and h at worst. H need not be regular.
+convergence rate is h^2 if H = T(p) + V(q), and h at worst. H need not be regular. Rotations share most operations of
+forces and velocities and have the rate h either way: both are evaluated at once (Jacobi), in a fifth more iterations
+with half the latency. Sums over the points then exchange lanes, and kernels add terms in pairs.
 
 **Any regular Lagrangian.** Velocities are corrected by the mass matrix at each point: the equations are L_v(q_n, V_n) =
 P_n. If the points are not those of the velocities (an SVI with another quadrature), the s velocities z_b give V_n =
@@ -37,6 +39,7 @@ rounded map still has a generating function: its energy error does not drift.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 from typing import Any
 
 import sympy
@@ -162,19 +165,26 @@ def hamiltonian_iteration(problem: StepProblem) -> FixedPointIteration | None:
     lanes, forms = lane_count(len(tables.abscissae)), forms_of(system)
     if lanes > MOST_LANES:
         return None
-    of = forms.legendre_arguments
+    of, turning = forms.legendre_arguments, bool(system.rotations)
+    joint = turning and lanes > 2 and sum(len(each.coordinates) for each in system.rotations) == system.dimension
+    kernel = partial(system_kernel, system, of=of, paired=turning)
     return _point_iteration(
         "Hamiltonian",
         tables,
         lanes,
         (
-            system_kernel(system, "velocity_lanes", forms.legendre, of=of, purpose="H_p at all points, u = (q, p)."),
-            system_kernel(system, "force_lanes", forms.force, of=of, purpose="-H_q at all points, u = (q, p)."),
+            kernel("velocity_lanes", forms.legendre, purpose="H_p at all points, u = (q, p)."),
+            kernel("force_lanes", forms.force, purpose="-H_q at all points, u = (q, p)."),
+            kernel("rate_lanes", (*forms.legendre, *forms.force), purpose="(H_p, -H_q) at all points, u = (q, p).")
+            if joint
+            else None,
             integrand_kernel(system, "integrand_lanes", of),
         ),
-        forces=("force_lanes",),
+        forces=() if joint else ("force_lanes",),
         stored=4 * lanes,
         parts=("point_weights", "hamiltonian_iteration"),
+        macros=(("JOINT_RATES", 1),) if joint else (),
+        exchanges=turning,
     )
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import sympy
-from sympy import Expr, Matrix, S, Symbol
+from sympy import Add, Expr, Matrix, S, Symbol
 
 from scvi_codegen.formulas.expressions import gradient, hessian
 from scvi_codegen.formulas.rotations.names import RotationNames
@@ -47,7 +47,8 @@ def hamiltonian_of_rotations(system: LagrangianSystem) -> HamiltonianSystem | No
         mu += each.body_momentum(tuple(momenta[symbol(name)] for name in each.coordinates))
     rest = Matrix([m - linear.get(i, S.Zero).xreplace(at_rest) for i, m in enumerate(mu)])
     velocity = dict(zip(u, inverse * rest, strict=True))
-    energy = (rest.T * inverse * rest)[0] / 2 - reduced.lagrangian.xreplace(at_rest)
+    products = [rest[i] * rest[j] * inverse[i, j] / 2 for i in range(len(u)) for j in range(len(u))]
+    energy = Add(*products) - reduced.lagrangian.xreplace(at_rest)
 
     def in_phase_space(formula: Expr) -> Expr:
         return names.in_coordinates(formula.xreplace(velocity))
