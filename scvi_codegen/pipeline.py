@@ -36,6 +36,7 @@ from scvi_codegen.lowering.program import lower
 from scvi_codegen.mechanics.arrays.legendre import SiteHamiltonian, site_hamiltonian
 from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
 from scvi_codegen.mechanics.arrays.system import ArraySystem
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.derived_systems import with_tangent_vectors
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
@@ -139,6 +140,7 @@ def describe(
         rotations=tuple(each.declaration for each in system.rotations),
         energy_parameter=system.clock.energy.name if system.clock else "",
         solver=_solver_of(program),
+        variables=tuple(each.name for each in getattr(system, "variables", ())),
     )
 
 
@@ -285,6 +287,8 @@ class Sources:
         """
         if second and (self.system.integrands or self.system.damping):
             return None
+        if forms_of(self.system).one_form:
+            raise MethodError(f"derivatives of steps are not available for the first-order system '{self.system.name}'")
         program = self.program(fallback=True)
         if not program.newton:  # explicit steps
             program = self._derived(solver="newton")

@@ -91,9 +91,7 @@ class RecordedOutcome:
         if steps:
             since = f" since step {self.first}" if self.first else ""
             lines.append(f"{self.seconds:.3g} s{since}, {duration(self.seconds / steps)} per step, including writing")
-        return "\n".join(
-            [*lines, *self._conserved(), *final_state(self.run.stepper.coordinates, self.run.q, self.run.p)]
-        )
+        return "\n".join([*lines, *self._conserved(), *final_state(self.run.stepper.interface, self.run.q, self.run.p)])
 
     def _conserved(self) -> list[str]:
         """Return lines on conserved quantities if the folder names a model that determines them."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, wa
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.inputs.segments import with_final_state
 from scvi_codegen.runtime.run.accuracy import TOLERABLE_ERROR, without_accuracy_warnings
@@ -184,7 +185,7 @@ def summary(model: Model, outcome: RunOutcome, known: Known | None, balance: Bal
             lines += conserved(model, trajectory, balance)
         lines += worst_step(trajectory)
     lines += [f"event {each.event.function}: {counted(len(each), 'crossing')}" for each in trajectory.events]
-    return "\n".join([*lines, *final_state(run.stepper.coordinates, *outcome.end[1:], known)])
+    return "\n".join([*lines, *final_state(run.stepper.interface, *outcome.end[1:], known)])
 
 
 def _geometry(model: Model, run: Run) -> str:
@@ -257,14 +258,15 @@ def worst_step(trajectory: Trajectory) -> Iterator[str]:
             )
 
 
-def final_state(names: Sequence[str], positions: Array, momenta: Array, known: Known | None = None) -> Iterator[str]:
+def final_state(interface: Interface, positions: Array, momenta: Array, known: Known | None = None) -> Iterator[str]:
     """Yield lines with the final coordinates and momenta, in the digits that are known to be right."""
-    shown = names[:SHOWN_COORDINATES]
+    names, columns = interface.coordinates, interface.momentum_columns
+    shown, column = names[:SHOWN_COORDINATES], max(map(len, columns[:SHOWN_COORDINATES]))
     width = max(map(len, shown))
     yield f"final state ({_how_known(known)})"
-    for i, (name, q, p) in enumerate(zip(shown, positions, momenta, strict=False)):
+    for i, (name, other, q, p) in enumerate(zip(shown, columns, positions, momenta, strict=False)):
         known_q, known_p = (known.q[i], known.p[i]) if known else (0.0, 0.0)
-        yield f"  {name:{width}} = {in_known_digits(q, known_q):24} p_{name:{width}} = {in_known_digits(p, known_p)}"
+        yield f"  {name:{width}} = {in_known_digits(q, known_q):24} {other:{column}} = {in_known_digits(p, known_p)}"
     if len(names) > SHOWN_COORDINATES:
         yield f"  and {len(names) - SHOWN_COORDINATES} more coordinates"
 

@@ -31,6 +31,7 @@ from scvi_codegen.formulas.expressions import jacobian
 from scvi_codegen.formulas.intermediates import inner_of, written_out
 from scvi_codegen.formulas.translation import format_expression
 from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
+from scvi_codegen.mechanics.first_order import FirstOrderSystem
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, symmetries
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import as_method
@@ -137,6 +138,10 @@ class StepEquations:
         yield f"{'H' if self.system.auxiliaries else 'L'} = {format_expression(self.system.formula)}"
         for g in self.system.constraints:
             yield f"0 = {format_expression(g)}"
+        if isinstance(self.system, FirstOrderSystem):
+            yield f"subtracted from L: d/dt of {format_expression(self.system.integrated)}"
+            for momentum, theta in zip(p, self.system.one_form, strict=True):
+                yield f"{momentum.name.removesuffix('_k')} = {format_expression(theta)}"
         yield f"known: {', '.join(s.name for s in (*q, *p, self.time, self.step))}"
         yield f"unknown: {', '.join(s.name for s in self.unknowns)}"
 

@@ -20,6 +20,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.exact.newton import Array as Numbers
 from scvi_codegen.exact.newton import Floats, NotConvergedError, Solve, newton, solver
 from scvi_codegen.formulas.expressions import Tape, jacobian
+from scvi_codegen.mechanics.first_order import FirstOrderSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Number, mp
 
@@ -133,6 +134,18 @@ class ExactMotion:
         """Return the (m,) momenta dL/dv of a Lagrangian."""
         return self._values(self._by_second, q, v, t)
 
+    def momenta(self, q: Numbers, p: Numbers, t: Number) -> Numbers:
+        """Return the (m,) canonical momenta of a state (q, p): p, or theta(q, y, t) of a first-order system."""
+        return p
+
+    def variables(self, q: Numbers, theta: Numbers, t: Number, guess: Numbers) -> Numbers:
+        """Return the p of the state with these canonical momenta: themselves, or y with theta(q, y, t) = theta."""
+        return theta
+
+    def two_form(self, q: Numbers, p: Numbers, t: Number) -> Floats:
+        """Return the (2m, 2m) symplectic form dq ^ d theta in the variables of a state (q, p)."""
+        return np.asarray(np.kron([[0, 1], [-1, 0]], np.eye(len(q))), dtype=np.float64)
+
     def velocity(self, q: Numbers, p: Numbers, t: Number, digits: int = DIGITS) -> Numbers:
         """Return the (m,) velocities: dH/dp, or the v with dL/dv = p, by Newton's iteration from v = 0.
 
@@ -172,7 +185,7 @@ class ExactMotion:
         mass, applied = self._mass_and_applied(q, second, t)
         if self.system.constraints:
             return np.concatenate([second, self._constrained_accelerations(mass, applied, q, second, t)[:m]])
-        return np.concatenate([second, _solved(mass, applied)])
+        return np.concatenate([second, solved(mass, applied)])
 
     def _mass_and_applied(self, q: Numbers, v: Numbers, t: Number) -> tuple[Numbers, Numbers]:
         """Return L_vv and the applied force (L_vv times unconstrained accelerations) at (q, v) of a Lagrangian."""
@@ -183,7 +196,7 @@ class ExactMotion:
     def _constrained_accelerations(self, mass: Numbers, applied: Numbers, q: Numbers, v: Numbers, t: Number) -> Numbers:
         """Return (m + c,) accelerations, and multipliers with which constraints have zero second derivatives."""
         derivatives, (growth, _, _) = self._constraint_terms(q, v, t)
-        return _solved(_saddle(mass, derivatives), np.concatenate([applied, -growth]))
+        return solved(_saddle(mass, derivatives), np.concatenate([applied, -growth]))
 
     def _constraint_terms(self, q: Numbers, v: Numbers, t: Number) -> tuple[Numbers, Numbers]:
         """Return the (c, m) constraint Jacobian; (3, c) d/dt of the rates at constant v, constraints, rates."""
@@ -199,9 +212,9 @@ class ExactMotion:
         v = self.velocity(q, p, t)
         for _ in range(MAX_PROJECTIONS):
             mass, (derivatives, (_, g, _)) = self._mass_and_applied(q, v, t)[0], self._constraint_terms(q, v, t)
-            q = q + _solved(_saddle(mass, derivatives), np.concatenate([still, -g]))[:m]
+            q = q + solved(_saddle(mass, derivatives), np.concatenate([still, -g]))[:m]
         mass, (derivatives, (_, _, rate)) = self._mass_and_applied(q, v, t)[0], self._constraint_terms(q, v, t)
-        v = v + _solved(_saddle(mass, derivatives), np.concatenate([still, -rate]))[:m]
+        v = v + solved(_saddle(mass, derivatives), np.concatenate([still, -rate]))[:m]
         return q, self.momentum(q, v, t)
 
     def multipliers(self, q: Numbers, v: Numbers, t: Number) -> Numbers:
@@ -298,7 +311,8 @@ def _saddle(mass: Numbers, derivatives: Numbers) -> Numbers:
     return matrix
 
 
-def _solved(matrix: Numbers, right: Numbers) -> Numbers:
+def solved(matrix: Numbers, right: Numbers) -> Numbers:
+    """Return the solution of a linear system."""
     if len(right) == 1:
         return np.array([right[0] / matrix[0, 0]], dtype=object)
     return np.array(list(mp.lu_solve(mp.matrix(matrix.tolist()), mp.matrix(right.tolist()))), dtype=object)
@@ -307,4 +321,8 @@ def _solved(matrix: Numbers, right: Numbers) -> Numbers:
 @lru_cache(maxsize=64)
 def exact_motion(system: MechanicalSystem) -> ExactMotion:
     """Return the exact motion of a system; cached, since its formula is differentiated."""
+    if isinstance(system, FirstOrderSystem) and not system.is_canonical:
+        from scvi_codegen.exact.first_order import FirstOrderMotion
+
+        return FirstOrderMotion(system)
     return ExactMotion(system)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import accumulate
 from typing import Any
@@ -40,11 +40,15 @@ STEADY = 0.1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolvedStep:
-    """Unknowns of a step, in the order of the derivation, and the final state."""
+    """Unknowns of a step, in the order of the derivation, and the final state.
+
+    ``momenta`` are p, or theta(q, y) of a first-order system, whose p stands for y.
+    """
 
     unknowns: tuple[Number, ...]
     q: tuple[Number, ...]
     p: tuple[Number, ...]
+    momenta: tuple[Number, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +57,7 @@ class _Known:
     p: Numbers
     h: Number
     t: Number
+    momenta: Numbers
 
 
 class DerivedStep:
@@ -87,6 +92,11 @@ class DerivedStep:
         result.motion = self.motion.with_parameters(parameters)
         return result
 
+    def _known(self, q: Any, p: Any, h: Any, t: Any) -> _Known:
+        """Return the initial state of a step, with doubles converted exactly."""
+        q, p, h, t = numbers(q), numbers(p), mp.mpf(h), mp.mpf(t)
+        return _Known(q, p, h, t, self.motion.momenta(q, p, t))
+
     @property
     def unknowns(self) -> int:
         """Number of unknowns of a step."""
@@ -94,7 +104,7 @@ class DerivedStep:
 
     def seconds(self, q: Any, p: Any, h: Any, t: Any = 0) -> float:
         """Estimate the time of solving a step: that of evaluating its equations as many times as it has unknowns."""
-        known, began = _Known(numbers(q), numbers(p), mp.mpf(h), mp.mpf(t)), time.perf_counter()
+        known, began = self._known(q, p, h, t), time.perf_counter()
         self._rows(self._straight(known), known)
         return self.unknowns * (time.perf_counter() - began)
 
@@ -104,7 +114,7 @@ class DerivedStep:
         Raises:
             StateError: if Newton's iteration does not converge.
         """
-        known = _Known(numbers(q), numbers(p), mp.mpf(h), mp.mpf(t))
+        known = self._known(q, p, h, t)
 
         def linearised(z: Numbers) -> Solve:
             inverse = self._inverse(self._exact_matrix(z, known), known)
@@ -124,7 +134,7 @@ class DerivedStep:
 
     def first_update(self, q: Any, p: Any, h: Any, t: Any = 0) -> SolvedStep:
         """Return the result of one Newton update from the straight line, with the matrix from finite differences."""
-        known = _Known(numbers(q), numbers(p), mp.mpf(h), mp.mpf(t))
+        known = self._known(q, p, h, t)
         z = self._straight(known)
         matrix, rows = self._exact_matrix(z, known), self._rows(z, known)[: self.unknowns]
         inverse = self._inverse(matrix, known)
@@ -143,7 +153,7 @@ class DerivedStep:
         shape = self.stages.shape
         if self.rate is None or not isinstance(shape, Velocities):
             raise StateError(f"'{self.system.name}' has no time transformation")
-        known = _Known(numbers(q), numbers(p), mp.mpf(h), mp.zero)
+        known = self._known(q, p, h, 0)
         group, z = self.stages.stage_groups[0], np.array(solved.unknowns, dtype=object)
         rates = [
             self.rate(self._point(group, n, arguments, known))[0]
@@ -158,11 +168,11 @@ class DerivedStep:
         """
         if None in self.scalars:
             return None
-        known = _Known(numbers(q), numbers(p), mp.mpf(h), mp.mpf(t))
+        known = self._known(q, p, h, t)
         joined, m = np.array([*known.q, *solved.unknowns], dtype=object), self.system.dimension
 
         def action(values: Numbers) -> Number:
-            return self._action(values[m:], _Known(values[:m], known.p, known.h, known.t))
+            return self._action(values[m:], replace(known, q=values[:m]))
 
         derivatives = np.empty_like(joined)
         for k in range(len(joined)):
@@ -239,7 +249,7 @@ class DerivedStep:
         """Return the residuals of the equations, followed by p1."""
         m = self.system.dimension
         starts = [
-            known.p * x if row.stop - row.start == m else numbers([0] * (row.stop - row.start))
+            known.momenta * x if row.stop - row.start == m else numbers([0] * (row.stop - row.start))
             for row, x in zip(self.rows, self.momenta, strict=True)
         ]
         rows = np.concatenate(starts)
@@ -294,9 +304,9 @@ class DerivedStep:
 
     def _end(self, z: Numbers, rows: Numbers, known: _Known) -> SolvedStep:
         q = self._gathered(numbers(self.stages.end_position.entries[0]), self.system.dimension, z, known)
-        return SolvedStep(
-            unknowns=tuple(z), q=tuple(q), p=tuple(rows[self.rows[-1]] / self._damping_factor(mp.one, known))
-        )
+        momenta = rows[self.rows[-1]] / self._damping_factor(mp.one, known)
+        p = self.motion.variables(q, momenta, known.t + known.h, known.p)
+        return SolvedStep(unknowns=tuple(z), q=tuple(q), p=tuple(p), momenta=tuple(momenta))
 
 
 def _slices(sizes: Sequence[int]) -> tuple[slice, ...]:

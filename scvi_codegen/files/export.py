@@ -73,7 +73,7 @@ class States:
     Attributes:
         count: number n of states.
         pieces: returns an iterator over chunks in order; may be called repeatedly.
-        coordinates: the m names.
+        coordinates, momenta: the m names of the columns of q and of p.
         parameters: value by name.
         h: step size.
         about: metadata texts by name: title, system, method, version, ...
@@ -87,6 +87,7 @@ class States:
     count: int
     pieces: Callable[[], Iterator[Piece]]
     coordinates: tuple[str, ...]
+    momenta: tuple[str, ...]
     parameters: Mapping[str, float]
     h: float
     about: Mapping[str, str]
@@ -200,7 +201,7 @@ def to_dataframe(states: States) -> pandas.DataFrame:
 
 def _names(states: States) -> list[str]:
     """Return column names: t, coordinates x, momenta p_x, iterations; velocities, energy and attitudes, if known."""
-    names = ["t", *states.coordinates, *(f"p_{name}" for name in states.coordinates), "iterations"]
+    names = ["t", *states.coordinates, *states.momenta, "iterations"]
     if states.quantities is not None:
         names += [*(f"{name}_dot" for name in states.coordinates), "energy"]
         names += [name for each in states.attitudes for name in each.columns]

@@ -151,6 +151,7 @@ class Quantities:
         momentum_kernel: their values at (q, p), then the sums of the squares of their terms; ``None`` if there are
             none.
         integrals: functions integrated along a run, or ``None``; the first one gives the time.
+        first_order_rates: velocities at (q, y) of a first-order system, whose ``legendre`` is theta(q, y), or ``None``.
         work_and_impulses: names of work and impulses of forces: of the energy, and momentum maps; none without forces.
     """
 
@@ -161,6 +162,7 @@ class Quantities:
     momentum_maps: tuple[MomentumMap, ...] = ()
     momentum_kernel: Kernel | None = None
     integrals: Integrals | None = None
+    first_order_rates: Kernel | None = None
     work_and_impulses: tuple[str, ...] = ()
 
 
@@ -275,6 +277,7 @@ class Program:
         kernels = (
             *(kernel for group in stage_groups for kernel in (group.value, group.derivative)),
             *(found.legendre, found.energy, *(group.integrand for group in stage_groups), found.momentum_kernel),
+            found.first_order_rates,
             *(integrals.kernel if integrals else None, constraints and constraints.kernel),
             *(constraints and constraints.motion, self.damping, rattle and rattle.force, rattle and rattle.mass),
         )

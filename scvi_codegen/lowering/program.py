@@ -47,6 +47,7 @@ from scvi_codegen.lowering.stage_groups import (
 )
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.derived_expressions import forms_of
+from scvi_codegen.mechanics.first_order import FirstOrderSystem, velocities_of_form
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, work_rates
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -77,7 +78,7 @@ def iteration_of(
 
     With ``velocities`` it has a table of those at the points, on which forces depend.
     """
-    if system.constraints:
+    if system.constraints or forms_of(system).one_form:
         return None
     problem = StepProblem(system, stages.shape)
     if velocities:
@@ -230,7 +231,10 @@ def _equations(
         extrapolation=lower_matrix(
             tuple(line for columns in sites.columns.values() for line in _required_extrapolation(stages, columns))
         ),
-        acts=sites.count == m and has_action(system) and any(group.in_action for group in stages.stage_groups),
+        acts=sites.count == m
+        and not forms_of(system).one_form
+        and has_action(system)
+        and any(group.in_action for group in stages.stage_groups),
         stage_curve=_stage_curve(stages) if curve else None,
         numbers=_numbers(system, method, len(rows)) if len(blocks) * sites.count <= FEW_UNKNOWNS else ("", "", ""),
     )
@@ -247,6 +251,7 @@ def _quantities(
         hamiltonian=bool(system.auxiliaries),
         momentum_maps=tuple(_momentum_map(each, method) for each in symmetries),
         momentum_kernel=_momentum_kernel(system, symmetries),
+        first_order_rates=_rates_of_first_order(system),
         integrals=_integrals(system, method, stages),
         work_and_impulses=_work_and_impulse_names(system, stages),
     )
@@ -346,10 +351,20 @@ def _legendre_kernel(system: MechanicalSystem) -> Kernel:
         forms.regular_legendre,
         of=forms.legendre_arguments,
         partials=forms.legendre_jacobian.values(),
-        purpose="H_p and H_pp at u = (q, p)."
+        purpose="Momenta theta and their derivatives by y at u = (q, y)."
+        if forms.one_form
+        else "H_p and H_pp at u = (q, p)."
         if system.auxiliaries
         else "Momenta L_v and mass matrix L_vv at u = (q, v).",
     )
+
+
+def _rates_of_first_order(system: MechanicalSystem) -> Kernel | None:
+    """Return the kernel of the velocities of a first-order system, ``None`` for other systems."""
+    if not isinstance(system, FirstOrderSystem) or system.is_canonical:
+        return None
+    of, rates = forms_of(system).legendre_arguments, velocities_of_form(system)
+    return system_kernel(system, "first_order_rates", rates, of=of, purpose="Velocities q' at u = (q, y).")
 
 
 def _energy_kernel(system: MechanicalSystem) -> Kernel:

@@ -42,7 +42,7 @@ def warn_of_mistakes(system: MechanicalSystem, others: Iterable[Expr] = ()) -> b
     used = set[Symbol](energy).union(*(formula.free_symbols for formula in formulas))
     unused = warn_of_unused(system.name, function, system.parameters, system.inputs, used)
     plain = system.clock.plain.formula if system.clock and system.clock.plain else system.formula
-    entries = hessian(plain, variables)
+    entries = {} if hasattr(system, "one_form") else hessian(plain, variables)
     masses = {f"d2{function[0]}/d{v}2": entries[i, i] for i, v in enumerate(variables) if (i, i) in entries}
     return warn_of_negative(system.name, masses, system.constants) or unused
 
@@ -209,14 +209,9 @@ def _degenerate_message(system: MechanicalSystem, velocities: Sequence[Symbol], 
     names = [velocity.name[: -len(DOT)] for velocity in velocities]
     if not hessian(system.lagrangian, system.velocities):
         every = " and ".join(velocity.name for velocity in system.velocities)
-        pairs = (
-            "If coordinates are conjugate to each other (a guiding centre, point vortices), write it as a "
-            "HamiltonianSystem in canonical coordinates and momenta; otherwise add "
-        )
         return (
-            f"the Lagrangian of '{system.name}' is degenerate: it is at most linear in {every} (no kinetic energy), so "
-            f"its equations of motion are of first order. {REQUIRED} {pairs if system.dimension > 1 else 'Add '}"
-            f"the missing kinetic energy, such as m*{velocities[0]}**2/2"
+            f"the Lagrangian of '{system.name}' is degenerate: it is at most linear in {every} (no kinetic energy). "
+            f"{REQUIRED} Add the missing kinetic energy, such as m*{velocities[0]}**2/2"
         )
     derivative = sympy.expand(system.lagrangian.diff(symbol(names[0])))
     multiplies = derivative.has(*system.coordinates) and not derivative.has(symbol(names[0]), *system.velocities)

@@ -96,9 +96,20 @@ class Forms:
         return (*self.system.coordinates, *(self.system.auxiliaries or self.system.velocities))
 
     @cached_property
+    def one_form(self) -> tuple[Expr, ...]:
+        """Momenta theta(q, y, t) of a first-order system, functions of its auxiliary variables y; else empty.
+
+        Empty also if theta = y: such a system is Hamiltonian in the usual sense.
+        """
+        return () if getattr(self.system, "is_canonical", True) else self.momentum
+
+    @cached_property
     def legendre(self) -> tuple[Expr, ...]:
-        """Legendre transform in closed form, m expressions: p = L_v at (q, v), or v = H_p at (q, p)."""
-        if not self.system.auxiliaries:
+        """Legendre transform in closed form, m expressions: p = L_v at (q, v), or v = H_p at (q, p).
+
+        Of a first-order system the momenta theta(q, y, t).
+        """
+        if not self.system.auxiliaries or self.one_form:
             return self.momentum
         return self._gradient_tuple(self.system.formula, self.system.auxiliaries)
 
@@ -206,6 +217,7 @@ class Forms:
         system = self.system
         if (
             not system.auxiliaries
+            or self.one_form
             or system.damping != 0
             or system.time in set().union(*(v.free_symbols for v in self.legendre))
         ):

@@ -16,7 +16,7 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.expressions import evaluate, gradient, hessian, unsupported_part
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import input_formulas, symbol
-from scvi_codegen.mechanics.derived_expressions import coupled_blocks, sample_points
+from scvi_codegen.mechanics.derived_expressions import coupled_blocks, forms_of, sample_points
 from scvi_codegen.mechanics.forces import constraints_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -234,7 +234,8 @@ def equivalent_lagrangian(system: MechanicalSystem) -> LagrangianSystem | None:
     """Return an equivalent Lagrangian system, possibly ``system`` itself; ``None`` if none is found."""
     if isinstance(system, LagrangianSystem):
         return system
-    return _equivalent_lagrangian(system) if isinstance(system, HamiltonianSystem) else None
+    plain = isinstance(system, HamiltonianSystem) and not forms_of(system).one_form
+    return _equivalent_lagrangian(system) if plain else None
 
 
 @lru_cache(maxsize=64)

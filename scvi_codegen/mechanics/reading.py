@@ -25,6 +25,7 @@ from scvi_codegen.mechanics.arrays.elements import unrolled_fields
 from scvi_codegen.mechanics.arrays.reading import arrays_from_sympy, arrays_from_text, definition_of
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.definition_checks import warn_of_mistakes
+from scvi_codegen.mechanics.first_order import system_of
 from scvi_codegen.mechanics.forces import constraints_of, damping_rate, dissipative_forces, forces_by_coordinate
 from scvi_codegen.mechanics.rotations.frames import rotations_of_frames
 from scvi_codegen.mechanics.system import are_arrays
@@ -72,7 +73,7 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
     else:
         forces = _forces(variables, applied, friction, read)
     constraints = constraints_of(arguments["constraints"], read)
-    system = cls(
+    defined = dict(
         name=arguments["name"],
         coordinates=variables,
         **conjugate,
@@ -84,7 +85,13 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
         damping=damping_rate(arguments["damping"], lambda formula: read(str(formula))),
         inputs=tuple(inputs),
     )
-    return system, warn_of_mistakes(system)
+    system = system_of(cls, defined)
+    return system, _warned(system) or type(system) is not cls
+
+
+def _warned(system: Any) -> bool:
+    """Warn of what is probably a mistake; true if any warning was issued."""
+    return warn_of_mistakes(system, getattr(system, "one_form", ()))
 
 
 def system_from_sympy(
@@ -159,7 +166,7 @@ def system_from_sympy(
         acting = _forces(variables, by_symbol, friction, reader("forces"))
     expression, conditions = reader(function)(formula), constraints_of(conditions, reader("constraints"))
     parts = function.lower(), expression, acting, conditions, [q.name for q in variables]
-    system = cls(
+    defined = dict(
         name=name,
         coordinates=variables,
         **({} if momenta is None else {"momenta": conjugate}),
@@ -170,7 +177,8 @@ def system_from_sympy(
         damping=reader("damping")(rate),
         inputs=input_names,
     )
-    warn_of_mistakes(system)
+    system = system_of(cls, defined)
+    _warned(system)
     return system
 
 
@@ -204,7 +212,7 @@ def default_momenta(coordinates: Sequence[str]) -> tuple[str, ...]:
 
 def _of_arrays(cls: Any, system: ArraySystem) -> Any:
     """Return the system of named coordinates of arrays of known sizes, others as they are."""
-    return system if system.sizes else cls(**unrolled_fields(system, {}))
+    return system if system.sizes else system_of(cls, unrolled_fields(system, {}))
 
 
 def _named_parameters(parameters: Mapping[Any, float] | None) -> dict[str, float]:

@@ -182,6 +182,11 @@ def time_rescaling_function(system: MechanicalSystem, g: str | Expr, *, in_time:
     Raises:
         SystemDefinitionError: for a formula in other symbols, and a name that is not applicable to the system.
     """
+    if in_time and forms_of(system).one_form:
+        raise SystemDefinitionError(
+            f"the reversible controller is not available for the first-order system '{system.name}': use "
+            "reparametrise(system, g), or adaptive steps (t_end without h)"
+        )
     if isinstance(g, str) and g in TIME_RESCALINGS:
         return TIME_RESCALINGS[g](system)
     driven = input_formulas(system.inputs, system.time) if in_time else {}

@@ -15,6 +15,7 @@ from scvi_codegen.formulas.symbols import input_parameters
 from scvi_codegen.lowering.arrays import check_solver, one_coordinate
 from scvi_codegen.mechanics.arrays.rolling import unroll_sums
 from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
+from scvi_codegen.mechanics.first_order import FirstOrderSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import Method, as_method
 from scvi_codegen.methods.galerkin import SVI
@@ -50,7 +51,7 @@ class Model(TimeSpan):
         system: the mechanical system, with the parameter values of the run as its defaults.
         method: its discretisation; a name, ``"svi:8"``, is converted to the method.
         solver: of the stage equations, as of :func:`~scvi_codegen.compile_stepper`.
-        q: (m,) initial coordinates.
+        q: (m,) initial coordinates, or all variables of a first-order system, by name or in order, without p.
         p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
         velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
         h, tolerance, error, span, steps, save_every, t, time_transformation: as of
@@ -84,6 +85,9 @@ class Model(TimeSpan):
         check_kind(SYSTEM_OR_ARRAYS, self.system, "system", ModelFileError)
         arrays = self.array_system
         object.__setattr__(self, "method", as_method(self.method, one_coordinate(arrays) if arrays else self.system))
+        if isinstance(self.system, FirstOrderSystem) and self.p is self.velocity is None:
+            for name, half in zip(("q", "p"), self.system.halves(self.q), strict=True):
+                object.__setattr__(self, name, half)
         if arrays is None:
             check_one_of("p", self.p, "velocity (q_dot)", self.velocity)
             for name in STATE:

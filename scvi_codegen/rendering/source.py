@@ -233,6 +233,8 @@ class Interface:
         rotations: declarations of rotations, directions and spins, ``"rotation R omega"``, ``"direction n"``, ``"spin
             s"``, in the order of their coordinates, which follow the ordinary ones.
         layout: of arrays whose sizes are known at run time; the coordinates are their names.
+        variables: of a first-order system all coordinates in the order of the user, half of which are ``coordinates``
+            and half of which take the place of momenta; else none.
     """
 
     prefix: str
@@ -261,6 +263,7 @@ class Interface:
     arrays: tuple[str, ...] = ()
     rotations: tuple[str, ...] = ()
     layout: ArrayLayout = ArrayLayout()
+    variables: tuple[str, ...] = ()
 
     @property
     def dimension(self) -> int:
@@ -275,6 +278,11 @@ class Interface:
     def momenta(self) -> tuple[str, ...]:
         """Names of the momenta: those of a Hamiltonian, else ``p_`` and the coordinate's name."""
         return self.momentum_names or tuple(f"p_{name}" for name in self.coordinates)
+
+    @property
+    def momentum_columns(self) -> tuple[str, ...]:
+        """Names of columns with p: ``p_`` and the coordinate's name, or the variables in its place."""
+        return self.momentum_names if self.variables else tuple(f"p_{name}" for name in self.coordinates)
 
     def to_record(self) -> dict[str, Any]:
         """Return the fields for :meth:`from_record`, which supports named coordinates only."""

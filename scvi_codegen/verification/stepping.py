@@ -196,7 +196,8 @@ def _action(tested: SystemUnderTest) -> Finding | None:
     partials = equations.action_gradient(solved, state.q, state.p, state.h, state.t)
     if partials is None:
         return None
-    p0, p1 = numbers(state.p), np.array(solved.p, dtype=object)
+    p0 = tested.motion.momenta(numbers(state.q), numbers(state.p), mp.mpf(state.t))
+    p1 = np.array(solved.momenta, dtype=object)
     row = numbers(equations.stages.end_position.entries[0])
     powers = [mp.mpf(state.h) ** block.power for block in equations.stages.blocks]
     expected = np.array([p1 * (row[b + 1] * power) for b, power in enumerate(powers)], dtype=object)

@@ -61,11 +61,12 @@ def _symplecticity(tested: SystemUnderTest) -> Finding:
             raise StateError("steps from neighbouring states fail")
         m, shrunk = len(state.q), math.exp(-tested.damping * state.h)
         areas = around.scales[:m] * around.scales[m:]
+        forms = (tested.two_form(state), tested.two_form(tested.after(state)))
         if tested.system.constraints:
-            defect, noise = _defect(around, tested.tangents(state), float(np.median(areas)), shrunk)
+            defect, noise = _defect(around, tested.tangents(state), float(np.median(areas)), shrunk, forms)
         else:
             units = np.sqrt(np.outer(np.tile(areas, 2), np.tile(areas, 2)))
-            defect, noise = _defect(around, np.eye(2 * m), units, shrunk)
+            defect, noise = _defect(around, np.eye(2 * m), units, shrunk, forms)
         if noise.max() > TOO_ROUGH:
             raise StateError(f"finite differences have noise {noise.max():.1g}: use a smaller step size")
         index = np.unravel_index(np.argmax(defect / noise), defect.shape)
@@ -74,18 +75,19 @@ def _symplecticity(tested: SystemUnderTest) -> Finding:
     return worst
 
 
-def _defect(around: Jacobian, tangents: Array, units: Array | float, shrunk: float) -> tuple[Array, Array]:
+def _defect(
+    around: Jacobian, tangents: Array, units: Array | float, shrunk: float, forms: tuple[Array, Array]
+) -> tuple[Array, Array]:
     """Return absolute values of J^T Omega J - Omega on pairs of tangents, and their noise, in units of areas.
 
-    ``shrunk`` is the factor exp(-gamma h) of Omega for a damped system.
+    ``shrunk`` is the factor exp(-gamma h) of Omega for a damped system, ``forms`` are Omega before and after the step.
     """
-    m, scales = len(around.scales) // 2, around.scales
-    omega = np.kron([[0, 1], [-1, 0]], np.eye(m)) * np.outer(scales, scales)
+    before, omega = (form * np.outer(around.scales, around.scales) for form in forms)
     error = np.full_like(around.matrix, SPREAD * (around.uncertainty + EPSILON * ROUNDINGS))
     ends = around.matrix @ tangents
     # First-order bound |dJ^T Omega J + J^T Omega dJ| for an error |dJ| <= error of the differences.
     half = np.abs(tangents.T) @ error.T @ np.abs(omega) @ np.abs(ends)
-    return np.abs(ends.T @ omega @ ends - shrunk * tangents.T @ omega @ tangents) / units, (half + half.T) / units
+    return np.abs(ends.T @ omega @ ends - shrunk * tangents.T @ before @ tangents) / units, (half + half.T) / units
 
 
 def _constraints(tested: SystemUnderTest) -> Finding:

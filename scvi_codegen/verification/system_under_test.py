@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.exact.solution import ExactMotion, exact_motion
+from scvi_codegen.exact.solution import ExactMotion, exact_motion, numbers
 from scvi_codegen.exact.step import DerivedStep, SolvedStep, derived_step
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.announcements import tell
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.tables.precision import mp
 
 Array = NDArray[np.float64]
 Map = Callable[[Array], Array]
@@ -244,6 +245,14 @@ class SystemUnderTest:
     def ends(self, state: State, stepper: Stepper | None = None, options: SolverOptions | None = None) -> Array:
         """Return the end of a step as one vector (2m,)."""
         return np.concatenate(self.step(state, stepper, options))
+
+    def after(self, state: State) -> State:
+        """Return the state after the compiled step."""
+        return State(*self.step(state), state.t + state.h, state.h)
+
+    def two_form(self, state: State) -> Array:
+        """Return the (2m, 2m) symplectic form at a state."""
+        return exact_motion(self.moved).two_form(numbers(state.q), numbers(state.p), mp.mpf(state.t))
 
     def scales(self, state: State) -> Array:
         """Return (2m,) the size of q and of p: of the state or, if larger, of its change in a step.

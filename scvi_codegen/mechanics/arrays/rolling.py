@@ -24,6 +24,7 @@ from scvi_codegen.formulas.symbols import DOT, input_formulas, symbol, with_inpu
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
 from scvi_codegen.mechanics.arrays.elements import unrolled_fields
 from scvi_codegen.mechanics.arrays.system import ARRAYS, ArrayHamiltonian, ArrayLagrangian, ArraySystem
+from scvi_codegen.mechanics.first_order import system_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
@@ -234,4 +235,5 @@ def unroll_sums(
     """
     assert isinstance(system, ArraySystem)
     kind = HamiltonianSystem if system.function == "Hamiltonian" else LagrangianSystem
-    return kind(**unrolled_fields(system, sizes, tables, parameters))
+    result: MechanicalSystem = system_of(kind, unrolled_fields(system, sizes, tables, parameters))
+    return result

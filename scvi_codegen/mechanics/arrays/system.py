@@ -23,7 +23,7 @@ from scvi_codegen.files.cache import key_of
 from scvi_codegen.formulas.array_notation import latex_sum
 from scvi_codegen.formulas.array_statements import ArrayForce
 from scvi_codegen.formulas.arrays import ArrayTerm
-from scvi_codegen.formulas.expressions import unsupported_part
+from scvi_codegen.formulas.expressions import hessian, unsupported_part
 from scvi_codegen.formulas.rotations.arrays import MemberArray
 from scvi_codegen.formulas.symbols import DOT, check_names, input_formulas, symbol
 from scvi_codegen.indices import SIZES_REQUIRED, Access, Array, Loop
@@ -108,7 +108,7 @@ class ArraySystem:
                 "system by its Lagrangian"
             )
         used = {access.array.name for term in self.terms for _, access in term.slots}
-        for array in () if self.momenta else self.coordinates:
+        for array in () if self.momenta or self.is_first_order else self.coordinates:
             if array.name + DOT not in used:
                 entry = f"sum(i in {array.axes[0]}, {array.name}{DOT}[i]**2/2)" if array.axes else f"{array}{DOT}**2/2"
                 raise SystemDefinitionError(
@@ -121,6 +121,10 @@ class ArraySystem:
         try:
             if self.rotations:
                 raise SizesRequiredError("rotations, directions and spins are not available for arrays of any size")
+            if self.is_first_order:
+                raise SizesRequiredError(
+                    "Lagrangians linear in the velocities are not available for arrays of any size"
+                )
             for term in self.coupled_terms:
                 raise SizesRequiredError(
                     f"'{term}' contains velocities in another form: arrays of any size have velocities as m*v**2/2 "
@@ -182,6 +186,12 @@ class ArraySystem:
         if any(self.time in term.formula.free_symbols for term in self.constraints):
             return "constraints depend on time"
         return f"the {self.function} depends on time" if self.depends_on_time else ""
+
+    @property
+    def is_first_order(self) -> bool:
+        """True if L contains velocities, all of them linearly (:mod:`scvi_codegen.mechanics.first_order`)."""
+        slots = [[slot for slot, access in term.slots if access.array.name in self._velocities] for term in self.terms]
+        return any(slots) and not any(hessian(term.formula, v) for term, v in zip(self.terms, slots, strict=True))
 
     @property
     def coupled_terms(self) -> tuple[ArrayTerm, ...]:

@@ -49,6 +49,7 @@ from scvi_codegen.indices import ArrayMap
 from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
 from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
 from scvi_codegen.mechanics.derived_expressions import forms_of
+from scvi_codegen.mechanics.first_order import FirstOrderSystem, translations
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.symmetry.ansatz import (
     Terms,
@@ -127,6 +128,8 @@ class Symmetry:
 
     def degrees(self) -> set[tuple[int, int, int]] | None:
         """Return the degrees in (t, q, p) of the terms of the momentum map, ``None`` if it is not a polynomial."""
+        if self.gauge == 0 and all(xi.is_number for xi in self.direction):
+            return {(0, 0, 1)}
         terms, m = self._terms(), len(self.coordinates)
         if terms is None:
             return None
@@ -168,6 +171,8 @@ def symmetries(system: MechanicalSystem | ArraySystem) -> tuple[Symmetry, ...] |
     """
     if isinstance(system, ArraySystem):
         return momentum_maps(system)
+    if isinstance(system, FirstOrderSystem) and not system.is_canonical:
+        return _of_first_order(system)
     return _distinct([_symmetry(system, terms) for terms in _found(system)])
 
 
@@ -189,6 +194,22 @@ def all_symmetries(system: MechanicalSystem, additional: Sequence[Symmetry]) -> 
         if names.count(name) > 1:
             raise SystemDefinitionError(f"two symmetries are called '{name}': choose another name for yours")
     return result
+
+
+def _of_first_order(system: FirstOrderSystem) -> tuple[Symmetry, ...]:
+    """Return the translations of coordinates that leave L unchanged; they conserve sums of theta(q, y)."""
+    return tuple(
+        Symmetry(
+            name=f"momentum of {', '.join(system.coordinates[i].name for i in moved)}",
+            coordinates=system.coordinates,
+            momenta=system.momenta,
+            time=system.time,
+            direction=tuple(sympy.Integer(i in moved) for i in range(system.dimension)),
+            gauge=sympy.S.Zero,
+            momentum_map=sympy.Add(*(system.one_form[i] for i in moved)),
+        )
+        for moved in translations(system)
+    )
 
 
 def _found(system: MechanicalSystem) -> list[Terms]:

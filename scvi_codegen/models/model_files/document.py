@@ -10,6 +10,7 @@ import numpy as np
 
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.indices import Array
+from scvi_codegen.mechanics.first_order import FirstOrderSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.sections import EVENT_KEYS
@@ -33,7 +34,10 @@ def document_of(model: Model, *, as_arrays: bool = True) -> dict[str, Any]:
     names = [] if model.array_system else [coordinate.name for coordinate in system.coordinates]
     if model.array_system and not system.definition:
         raise ModelFileError(f"'{system.name}' was not read from text: give its formula to from_text to write a file")
-    if system.definition and not model.array_system and system.rotations:
+    if isinstance(system, FirstOrderSystem):
+        document, parameters, motion = _definition(system), model.parameters, motion_of(model, names)
+        motion["initial"] = {"t": model.t, "q": system.joined(model.q, model.p)}
+    elif system.definition and not model.array_system and system.rotations:
         document, parameters, motion = _of_rotations(system), model.parameters, motion_of(model, names)
     elif as_arrays and system.definition:
         document, parameters = _definition(system), _declared_parameters(model)

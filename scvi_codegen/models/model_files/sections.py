@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final, TypeVar
 
 from scvi_codegen.errors import ModelFileError, ScviCodegenError, closest
+from scvi_codegen.mechanics.first_order import FirstOrderSystem
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import lagrangian_of
@@ -219,6 +220,8 @@ def check_complete(document: Document) -> None:
             choice = next((choice for choice in ALTERNATIVES if key in choice), {key})
             if choice.isdisjoint(document.get(name, {})) and not _is_optional(document, key):
                 missing.append(f"{' or '.join(sorted(choice))} in [{name}]")
+    if missing == ["p or q_dot in [initial]"] and isinstance(read_system(document, None), FirstOrderSystem):
+        return
     if missing:
         at_rest = "p or q_dot in [initial]" in missing
         rest = "; for a start from rest write q_dot = [0.0, ..], or --velocity 0,.." if at_rest else ""

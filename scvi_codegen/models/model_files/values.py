@@ -54,6 +54,7 @@ from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.indices import Array
 from scvi_codegen.mechanics.arrays.system import ArraySystem
+from scvi_codegen.mechanics.first_order import FirstOrderSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.model_files.input_tables import parse_table
 from scvi_codegen.models.model_files.sections import (
@@ -125,10 +126,16 @@ def read_values(
 
 
 def _by_coordinate(section: Section, system: MechanicalSystem) -> Section:
-    """Return the initial state with rotations, directions and spins as homogeneous coordinates."""
+    """Return the initial state with rotations, directions and spins as homogeneous coordinates.
+
+    That of a first-order system is divided into coordinates and the variables in the place of momenta.
+    """
     from scvi_codegen.runtime.rotations.states import members_of, state_of  # not needed for other systems
 
     q = section.get("q")
+    if isinstance(system, FirstOrderSystem) and q is not None and section.keys().isdisjoint(("p", "q_dot")):
+        halves = in_section("[initial]", lambda: system.halves(q))
+        return {**section, **{key: list(half) for key, half in zip(("q", "p"), halves, strict=True)}}
     members = members_of(system.dimension, [each.declaration for each in system.rotations])
     shapes = [(array.name, array.shape({})) for array in system.arrays if array.axes]
     turning = {*(member.name for member in members), *(array.name for array in system.arrays if array.letters)}

@@ -133,11 +133,16 @@ class _Statements:
                         text = f"step->q0[{i}] + (step->carry_q[{i}] + {text})"
                     yield f"u[{n * group.value.arguments + loop.offset + i}] = {text};"
 
+    @property
+    def _momenta(self) -> str:
+        """Name of the momenta of the initial state."""
+        return "step->theta0" if self.program.quantities.first_order_rates else "step->p0"
+
     def _row(self, site: int, row: int) -> list[Term]:
         """Return the terms of row ``row`` of a site, the last row that of p1."""
         program = self.program
         begins = row < program.equations.blocks and site < program.dimension
-        terms = [(program.equations.momentum_rows[row], f"step->p0[{site}]")] if begins else []
+        terms = [(program.equations.momentum_rows[row], f"{self._momenta}[{site}]")] if begins else []
         for k, group in enumerate(program.equations.stage_groups):
             for loop in group.scatters:
                 if loop.first <= site < loop.first + loop.sites:
@@ -150,7 +155,7 @@ class _Statements:
         """Yield the statements of the magnitudes of p1, then of q1: sums of absolute values."""
         program = self.program
         for s in range(program.equations.sites):
-            own = [f"step->p0[{s}]"] if s < program.dimension else []
+            own = [f"{self._momenta}[{s}]"] if s < program.dimension else []
             terms = [*own, *(self._sum([term]) for term in self._row(s, program.equations.blocks) if term[0])]
             yield f"size_p[{s}] = {_magnitude(terms)};"
         for i in range(program.dimension):

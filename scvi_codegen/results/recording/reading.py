@@ -205,6 +205,7 @@ class RecordedRun:
             count=len(self),
             pieces=self._pieces,
             coordinates=manifest.interface.coordinates,
+            momenta=manifest.interface.momentum_columns,
             parameters=dict(zip(manifest.interface.parameters, manifest.parameters, strict=True)),
             h=self.h,
             about=manifest.about(),

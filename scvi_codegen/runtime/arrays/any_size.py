@@ -74,7 +74,8 @@ def _call(
     if name in AT_REST and not arguments and others.get("p") is None and others.get("velocity") is None:
         layout = stepper.interface.layout
         general = layout.momentum_formulas or (stepper._reason and not layout.momenta)
-        if not any(each.startswith("spin") for each in bound.interface.rotations):  # spins have momenta of their own
+        spins = any(each.startswith("spin") for each in bound.interface.rotations)
+        if not (spins or bound.interface.variables):  # their state has momenta of its own
             others["velocity" if general else "p"] = np.zeros(bound.dimension)
     return getattr(bound, name)(state, *arguments, parameters=parameters, **others)
 

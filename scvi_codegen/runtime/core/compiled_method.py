@@ -162,7 +162,9 @@ class CompiledMethod:
         if self._reason and problem.threads > 1:
             raise MethodError(f"omit threads: this system is compiled with the sizes of each call. {self._reason}")
         bound = self.with_sizes(problem.sizes, tables=problem.places) if self._reason else self._bound_to(problem)
-        return bound, q if bound.interface.rotations else flat_state(bound.interface, q, "q")
+        return bound, q if bound.interface.rotations or bound.interface.variables else flat_state(
+            bound.interface, q, "q"
+        )
 
     def _check_not_of_run(self, tables: object, threads: object) -> None:
         """Raise :class:`StateError` for arguments of arrays of run-time sizes."""

@@ -150,7 +150,7 @@ class Stepper(Integrator):
             raise StateError("t_eval is not supported with inputs: omit t_eval")
         if observe is not None and (data is not None or t_eval is not None):
             raise StateError("observe is not supported with inputs or t_eval: omit observe")
-        if interface.rotations:
+        if interface.rotations or interface.variables:
             q, p, velocity = homogeneous_state(interface, q, p, velocity)
         stepper._check_no_changes("error=" if error else "check_growth=True", wanted=bool(error or check_growth))
         if error is not None:
@@ -218,7 +218,7 @@ class Stepper(Integrator):
         Tables and threads are those of :meth:`integrate`.
         """
         self._check_not_of_run(tables, threads)
-        if self.interface.rotations:
+        if self.interface.rotations or self.interface.variables:
             q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
         return self._started(q, p, velocity, self._plan(h, t_end, tolerance), t, parameters, options)
 
@@ -339,7 +339,7 @@ class Stepper(Integrator):
         Raises:
             StateError: if a shape, name or number is invalid.
         """
-        if self.interface.rotations:
+        if self.interface.rotations or self.interface.variables:
             q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
         unsupported = {"error=": error, "an ensemble with fixed steps (h=)": h}
         for what, argument in unsupported.items():
@@ -410,7 +410,7 @@ class Stepper(Integrator):
             MethodError: if time is transformed.
             StateError: if a shape, name or number is invalid.
         """
-        if self.interface.rotations:
+        if self.interface.rotations or self.interface.variables:
             q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
         p = momenta_of_each(self, q, p, velocity, t, parameters)
         work = ChaosIndicatorsEnsemble(

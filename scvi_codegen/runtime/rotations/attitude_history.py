@@ -45,6 +45,20 @@ class AttitudeHistory:
         pieces: Any
         velocity: Any
 
+    @property
+    def variables(self) -> Array:
+        """(n, d) values of all variables of a first-order system (:class:`~scvi_codegen.FirstOrderSystem`), in order.
+
+        Raises:
+            StateError: for other systems, whose states are q and p.
+        """
+        interface = self.stepper.interface
+        if not interface.variables:
+            raise StateError(f"'{interface.system}' is not a first-order system: its states are q and p")
+        names = (*interface.coordinates, *interface.momenta)
+        states = np.concatenate([self.q, self.p], axis=-1)
+        return np.asarray(states[..., [names.index(name) for name in interface.variables]])
+
     def rotation(self, name: str | None = None, *, t: ArrayLike | None = None) -> Array:
         """Return (n, 3, 3) rotation matrices, from components in the body frame to components in space."""
         return matrices(self._states(t)[0][..., self._member("rotation", name).columns])

@@ -27,7 +27,11 @@ def named_quantities(interface: Interface) -> tuple[NamedQuantity, ...]:
             NamedQuantity(_free_name(name), tuple(axes), (), f"{name} at the points of the mesh", axes)
             for name in mesh.fields_of(nothing, nothing, nothing)
         )
-    return tuple(each for member in members_of(interface.dimension, interface.rotations) for each in _names(member))
+    variables = [name for name in interface.momenta if name in interface.variables]
+    named = tuple(NamedQuantity(name, (), (), f"variable {name} of the state") for name in variables)
+    return named + tuple(
+        each for member in members_of(interface.dimension, interface.rotations) for each in _names(member)
+    )
 
 
 def _mesh(interface: Interface) -> Any:
@@ -44,6 +48,8 @@ def values_by_name(interface: Interface, q: Array, p: Array, velocity: Array) ->
     if (mesh := _mesh(interface)) is not None:
         return {_free_name(name): values for name, values in mesh.fields_of(q, p, velocity).items()}
     result: dict[str, Array] = {}
+    if interface.variables:
+        result |= {name: p[..., k] for k, name in enumerate(interface.momenta)}
     for member in members_of(interface.dimension, interface.rotations):
         own, momenta, rates = (each[..., member.columns] for each in (q, p, velocity))
         values: tuple[Array, ...]

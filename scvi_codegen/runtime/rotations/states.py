@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -64,10 +66,49 @@ def members_of(dimension: int, declarations: Sequence[str]) -> tuple[Member, ...
 
 def homogeneous_state(interface: Interface, q: Any, p: Any, velocity: Any) -> tuple[Any, Any, Any]:
     """Return (q, p, velocity) with states by name as (.., m) numbers, and numbers as they are; see :func:`state_of`."""
+    if interface.variables:
+        return _first_order_state(interface, q, p, velocity)
     if not isinstance(q, Mapping) or not interface.rotations:
         return q, p, velocity
     members = members_of(interface.dimension, interface.rotations)
     return state_of(interface.coordinates, members, q, p, velocity, shapes_of(interface) or ())
+
+
+def _first_order_state(interface: Interface, z: Any, p: Any, velocity: Any) -> tuple[Any, Any, None]:
+    """Return the halves of the values z of all variables of a first-order system, or (q, p) as they are."""
+    if velocity is not None:
+        raise StateError(
+            f"'{interface.system}' is a first-order system, whose velocities follow from the state: omit velocity"
+        )
+    names = interface.variables
+    if p is not None:
+        return z, p, None
+    if isinstance(z, Mapping):
+        z = dict(chain.from_iterable(_entries(names, name, value) for name, value in z.items()))
+        _check(z, names, "the state")
+        values = _joined([_column(z, name, "the state") for name in names])
+    else:
+        values = real_array(z, "the state")
+        if not values.ndim or values.shape[-1] != len(names):
+            raise StateError(
+                f"the state of '{interface.system}' must have {len(names)} values, {', '.join(names)}, not the shape "
+                f"{values.shape}"
+            )
+    halves = interface.coordinates, interface.momenta
+    q, rest = (values[..., [names.index(name) for name in half]] for half in halves)
+    return q, rest, None
+
+
+def _entries(names: Sequence[str], name: str, value: Any) -> list[tuple[str, Any]]:
+    """Return the names and values of the entries ``x_0``, ``x_1`` of an array ``x`` of variables."""
+    own = [each for each in names if name not in names and re.fullmatch(rf"{re.escape(name)}(_\d+)+", each)]
+    if not own:
+        return [(name, value)]
+    array, axes = real_array(value, name), own[0].removeprefix(name).count("_")
+    outer = array.shape[: max(0, array.ndim - axes)]
+    if array.size != len(own) * int(np.prod(outer, dtype=int)):
+        raise StateError(f"'{name}' must have {len(own)} values, not the shape {array.shape}")
+    return list(zip(own, np.moveaxis(array.reshape(*outer, len(own)), -1, 0), strict=True))
 
 
 def _by_entry(shapes: Shapes, members: Sequence[Member], values: Any) -> Any:

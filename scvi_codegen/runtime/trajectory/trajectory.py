@@ -245,6 +245,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
             count=len(self),
             pieces=lambda: iter([piece]),
             coordinates=interface.coordinates,
+            momenta=interface.momentum_columns,
             parameters=known,
             h=self.h,
             about=interface.about(),

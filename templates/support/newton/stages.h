@@ -90,9 +90,9 @@ static inline void begin_rows(const step_data *step, const real *z, real *rows, 
 {
   for (int i = 0; i < M; i++) {
     for (int r = 0; r < B; r++)
-      rows[i * (B + 1) + r] = MOMENTUM_ROW[r] * step->p0[i];
+      rows[i * (B + 1) + r] = MOMENTUM_ROW[r] * MOMENTA_OF(step)[i];
     rows[i * (B + 1) + B] = 0;
-    size_p[i] = MATH(fabs)(step->p0[i]);
+    size_p[i] = MATH(fabs)(MOMENTA_OF(step)[i]);
     size_q[i] = MATH(fabs)(step->q0[i]);
     for (int b = 0; b < B; b++)
       size_q[i] += MATH(fabs)(step->h * END_POSITION[b] * z[i * B + b]);

@@ -1,0 +1,321 @@
+"""First-order systems: degenerate Lagrangians L = theta(z, t) . z' - H(z, t), linear in all velocities.
+
+Guiding centres, point vortices, massless charged particles and Lotka-Volterra equations have such Lagrangians. Their
+equations of motion, omega z' = H_z + theta_t with omega = d theta, are of first order: positions are the whole state.
+A Galerkin method applied to L itself has parasitic modes, or loses half of its order. If half of the coordinates, y,
+satisfy omega(y_i, y_j) = 0, then theta_y is a gradient in y, and subtracting dF/dt with F_y = theta_y from L gives
+
+    L = theta_x(x, y, t) . x' - H(x, y, t),
+
+Hamilton's principle in phase space with the momenta theta_x(x, y, t) as functions of y (C. L. Ellison et al.,
+*Degenerate variational integrators for magnetic field line flow and guiding center trajectories*, Phys. Plasmas 25
+(2018), call these systems properly degenerate). Variational integrators take y as auxiliary variables at the points of
+a step, have their full order, and preserve the two-form omega.
+
+:func:`first_order_form` finds such coordinates and integrates theta_y. Whether an expression is zero is decided by its
+values at random points in 60 digits.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import sympy
+from sympy import Expr, Matrix, Symbol
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.expressions import Tape, hessian
+from scvi_codegen.formulas.symbols import DOT, symbol
+from scvi_codegen.formulas.translation import format_expression
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.representation import summary
+from scvi_codegen.tables.precision import Number, mp
+
+SAMPLES = 4
+NEGLIGIBLE = mp.mpf(10) ** -30
+"""Largest value of an expression that is zero, relative to the largest of its terms."""
+RANK_TOLERANCE = 1e-10
+MOST_CHOICES = 8
+"""Largest number of choices of y whose gauge is integrated; the shortest result is used."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FirstOrderSystem(HamiltonianSystem):
+    """System of a Lagrangian that is linear in all velocities, whose coordinates are its whole state.
+
+    :meth:`LagrangianSystem.from_text` and :meth:`LagrangianSystem.from_sympy` return it for such a Lagrangian. Initial
+    states are values of all coordinates, without velocities, by name or in the order of ``variables``;
+    ``Trajectory.variables`` has the states in this order.
+
+    Attributes:
+        coordinates: the half x of the coordinates whose velocities remain in L.
+        momenta: the other half y, auxiliary variables of the action.
+        hamiltonian: H(x, y, t).
+        variables: all coordinates in the order of the user.
+        one_form: theta_x(x, y, t), the momenta conjugate to x.
+        integrated: F, whose time derivative was subtracted from the Lagrangian of the user.
+    """
+
+    variables: tuple[Symbol, ...]
+    one_form: tuple[Expr, ...]
+    integrated: Expr = field(default=sympy.S.Zero, compare=False)
+
+    __repr__ = summary("name", "variables")
+
+    @property
+    def lagrangian(self) -> Expr:
+        """Integrand theta_x . v - H of Hamilton's principle."""
+        products = [theta * v for theta, v in zip(self.one_form, self.velocities, strict=True)]
+        return sympy.Add(*products, -self.hamiltonian)
+
+    def halves(self, values: Mapping[str, float] | Sequence[float]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return the values of ``coordinates`` and of ``momenta``, from values by name or in the order of the user.
+
+        Raises:
+            SystemDefinitionError: if a variable is missing or unknown.
+        """
+        names = [each.name for each in self.variables]
+        given = dict(values) if isinstance(values, Mapping) else dict(enumerate(values))
+        if set(given) != set(names) and list(given) != list(range(len(names))):
+            raise SystemDefinitionError(
+                f"the state of '{self.name}' must have the values of {', '.join(names)}, by name or in this order, not "
+                f"{given}"
+            )
+        known = given if isinstance(values, Mapping) else dict(zip(names, given.values(), strict=True))
+        q, y = ([known[each.name] for each in half] for half in (self.coordinates, self.momenta))
+        return tuple(q), tuple(y)
+
+    def joined(self, q: Sequence[float], y: Sequence[float]) -> dict[str, float]:
+        """Return the values of all variables by name, in the order of the user."""
+        values = dict(zip((*self.coordinates, *self.momenta), (*q, *y), strict=True))
+        return {each.name: values[each] for each in self.variables}
+
+    @property
+    def is_canonical(self) -> bool:
+        """True if theta_x = y, so that the system is an ordinary Hamiltonian one."""
+        return self.one_form == self.momenta
+
+    @property
+    def is_regular(self) -> bool:
+        """False unless the system is canonical with regular H."""
+        return self.is_canonical and HamiltonianSystem.is_regular.fget(self)  # type: ignore[attr-defined]
+
+
+def is_first_order(lagrangian: Expr, velocities: Sequence[Symbol]) -> bool:
+    """Return whether L is linear in the velocities, contains some of them, and has several coordinates."""
+    occurring = lagrangian.free_symbols & set(velocities)
+    return len(velocities) > 1 and bool(occurring) and not hessian(lagrangian, velocities)
+
+
+@dataclass(frozen=True)
+class OneForm:
+    """One-form theta and function H of a Lagrangian that is linear in its velocities.
+
+    Attributes:
+        name: of the system, for messages.
+        lagrangian: theta . v - H.
+        coordinates, velocities, time: its symbols; all others are parameters.
+    """
+
+    name: str
+    lagrangian: Expr
+    coordinates: tuple[Symbol, ...]
+    velocities: tuple[Symbol, ...]
+    time: Symbol
+
+    @cached_property
+    def theta(self) -> tuple[Expr, ...]:
+        """Coefficients of the velocities."""
+        return tuple(self.lagrangian.diff(v) for v in self.velocities)
+
+    @cached_property
+    def hamiltonian(self) -> Expr:
+        """H, minus the terms without velocities."""
+        return -self.lagrangian.xreplace(dict.fromkeys(self.velocities, sympy.S.Zero))
+
+    def omega(self, i: int, j: int) -> Expr:
+        """Return the entry d theta_j / d z_i - d theta_i / d z_j of the two-form d theta."""
+        return self.theta[j].diff(self.coordinates[i]) - self.theta[i].diff(self.coordinates[j])
+
+    def points(self) -> Iterator[dict[Symbol, Number]]:
+        """Yield reproducible random points with positive values of order 1, where logarithms and roots are defined."""
+        symbols = sorted(self.lagrangian.free_symbols - set(self.velocities) | {*self.coordinates, self.time}, key=str)
+        generator = random.Random(20250101)
+        for _ in range(4 * SAMPLES):
+            yield {each: mp.mpf(generator.uniform(0.3, 1.3)) for each in symbols}
+
+    def values(self, expressions: Sequence[Expr]) -> Iterator[list[Number]]:
+        """Yield the values of expressions at up to ``SAMPLES`` points where they are defined."""
+        tape, found = None, 0
+        for point in self.points():
+            tape = tape or Tape(expressions, list(point))
+            try:
+                values = tape(list(point.values()))
+            except ArithmeticError:
+                continue
+            yield values
+            found += 1
+            if found == SAMPLES:
+                return
+
+    def is_zero(self, expression: Expr) -> bool:
+        """Return whether an expression is zero at all points, up to the rounding of its terms."""
+        terms = sympy.Add.make_args(expression)
+        return expression == 0 or all(
+            abs(mp.fsum(values)) <= NEGLIGIBLE * max(map(abs, values)) for values in self.values(list(terms))
+        )
+
+    @cached_property
+    def vanishing(self) -> frozenset[tuple[int, int]]:
+        """The pairs i < j with omega_ij = 0."""
+        n = len(self.coordinates)
+        return frozenset((i, j) for i in range(n) for j in range(i + 1, n) if self.is_zero(self.omega(i, j)))
+
+    def rank(self) -> int:
+        """Return the largest rank of omega at the points."""
+        n = len(self.coordinates)
+        entries = [self.omega(i, j) for i in range(n) for j in range(n)]
+        matrices = [np.array(values, dtype=float).reshape(n, n) for values in self.values(entries)]
+        return max((int(np.linalg.matrix_rank(m, tol=RANK_TOLERANCE * np.abs(m).max())) for m in matrices), default=0)
+
+    def choices(self, chosen: tuple[int, ...] = (), first: int = 0) -> Iterator[tuple[int, ...]]:
+        """Yield the choices of half of the coordinates between which omega vanishes."""
+        n = len(self.coordinates)
+        if 2 * len(chosen) == n:
+            yield chosen
+            return
+        for j in range(first, n):
+            if all((i, j) in self.vanishing for i in chosen):
+                yield from self.choices((*chosen, j), j + 1)
+
+    def integral(self, chosen: Sequence[int]) -> Expr | None:
+        """Return F with F_y = theta_y, or ``None`` if no closed form is found."""
+        total: Expr = sympy.S.Zero
+        for j in chosen:
+            rest = sympy.expand(self.theta[j] - total.diff(self.coordinates[j]))
+            if rest == 0:
+                continue
+            part = sympy.integrate(rest, self.coordinates[j], manual=True)
+            if part.has(sympy.Integral, sympy.Piecewise):
+                return None
+            total += part
+        remaining = [self.theta[j] - total.diff(self.coordinates[j]) for j in chosen]
+        return total if all(map(self.is_zero, remaining)) else None
+
+    def check(self) -> None:
+        """Raise :class:`SystemDefinitionError` unless omega is regular."""
+        n, rank = len(self.coordinates), self.rank()
+        if rank < n:
+            raise SystemDefinitionError(
+                f"the Lagrangian of '{self.name}' is linear in the velocities, and its two-form d theta has rank "
+                f"{rank} in {n} coordinates: {n - rank} combination{'s' * (n - rank > 1)} of the coordinates "
+                f"ha{'ve' if n - rank > 1 else 's'} no equation of motion. A regular two-form is required. Eliminate "
+                "conserved combinations (Casimirs), or add the missing kinetic energy, such as "
+                f"m*{self.velocities[0]}**2/2"
+            )
+
+
+def system_of(kind: Any, fields: Mapping[str, Any]) -> Any:
+    """Return a system of these fields: of a Lagrangian that is linear in velocities a :class:`FirstOrderSystem`."""
+    return (first_order_system(fields) if "lagrangian" in fields else None) or kind(**fields)
+
+
+def first_order_system(fields: Mapping[str, Any]) -> FirstOrderSystem | None:
+    """Return the first-order system of the fields of a :class:`LagrangianSystem`; ``None`` if L is not linear in v."""
+    coordinates, lagrangian = fields["coordinates"], fields["lagrangian"]
+    velocities = tuple(symbol(q.name + DOT) for q in coordinates)
+    if fields.get("rotations") or not is_first_order(lagrangian, velocities):
+        return None
+    name = fields["name"]
+    for key in ("constraints", "forces", "damping", "inputs"):
+        if fields.get(key):
+            raise SystemDefinitionError(
+                f"the Lagrangian of '{name}' is linear in the velocities (a first-order system), for which {key} are "
+                f"not supported: leave them out, or add the missing kinetic energy, such as m*{velocities[0]}**2/2"
+            )
+    form = OneForm(name, lagrangian, coordinates, velocities, fields["time"])
+    kept = {key: fields[key] for key in ("name", "time", "parameters", "defaults")}
+    text = {"coordinates": [q.name for q in coordinates], "lagrangian": format_expression(lagrangian)}
+    return FirstOrderSystem(**kept, **first_order_form(form), definition=fields.get("definition") or text)
+
+
+def first_order_form(form: OneForm) -> dict[str, Any]:
+    """Return the fields of a :class:`FirstOrderSystem` that its one-form determines.
+
+    Raises:
+        SystemDefinitionError: if omega is singular, does not vanish between any half of the coordinates, or theta_y has
+            no integral in closed form.
+    """
+    form.check()
+    found: list[tuple[int, tuple[int, ...], Expr, tuple[Expr, ...]]] = []
+    refused: list[tuple[int, ...]] = []
+    z, n = form.coordinates, len(form.coordinates)
+    for chosen, _ in zip(form.choices(), range(MOST_CHOICES), strict=False):
+        integral = form.integral(chosen)
+        if integral is None:
+            refused.append(chosen)
+            continue
+        rest = [i for i in range(n) if i not in chosen]
+        theta = tuple(sympy.expand(form.theta[i] - integral.diff(z[i])) for i in rest)
+        found.append((int(sympy.count_ops(theta)), chosen, integral, theta))
+        if integral == 0:
+            break
+    if not found:
+        raise SystemDefinitionError(_refusal(form, refused))
+    _, chosen, integral, theta = min(found, key=lambda each: each[:2])
+    rest = [i for i in range(n) if i not in chosen]
+    y = tuple(z[i] for i in chosen)
+    order = sorted(range(len(y)), key=lambda k: theta.index(y[k])) if set(theta) == set(y) else range(len(y))
+    return {
+        "coordinates": tuple(z[i] for i in rest),
+        "momenta": tuple(y[k] for k in order),
+        "hamiltonian": form.hamiltonian + integral.diff(form.time),
+        "variables": z,
+        "one_form": theta,
+        "integrated": integral,
+    }
+
+
+def _refusal(form: OneForm, refused: Sequence[Sequence[int]]) -> str:
+    z, half = form.coordinates, len(form.coordinates) // 2
+    start = f"the Lagrangian of '{form.name}' is linear in the velocities, theta . v - H. "
+    if refused:
+        sets = " or ".join("(" + ", ".join(z[j].name for j in chosen) + ")" for chosen in refused)
+        return (
+            f"{start}The two-form d theta vanishes between {sets}, but no integral of these components of theta was "
+            "found in closed form. Subtract a time derivative from L by hand, so that the velocities of these "
+            "coordinates no longer occur in it"
+        )
+    pairs = ", ".join(f"({z[i]}, {z[j]})" for i, j in sorted(form.vanishing))
+    return (
+        f"{start}{half} coordinates are required between which the two-form d theta vanishes; it vanishes "
+        f"{'only between ' + pairs if pairs else 'between no two coordinates'}. Use other coordinates, such as flux "
+        "coordinates of a magnetic field, or canonical ones"
+    )
+
+
+def velocities_of_form(system: FirstOrderSystem) -> tuple[Expr, ...]:
+    """Return x' = (d theta_x / d y)^-T H_y, the Euler-Lagrange equations of y."""
+    derivatives = Matrix([[theta.diff(y) for theta in system.one_form] for y in system.momenta])
+    right = Matrix([system.hamiltonian.diff(y) for y in system.momenta])
+    return tuple(derivatives.LUsolve(right))
+
+
+def translations(system: FirstOrderSystem) -> list[tuple[int, ...]]:
+    """Return sets of coordinates whose common translation leaves L unchanged: single ones, and ``x1, x2, ..``."""
+    force = [system.lagrangian.diff(q) for q in system.coordinates]
+    form = OneForm(system.name, system.lagrangian, (*system.coordinates, *system.momenta), (), system.time)
+    cyclic = [i for i, each in enumerate(force) if each == 0]
+    groups: dict[str, list[int]] = {}
+    for i, q in enumerate(system.coordinates):
+        if i not in cyclic:
+            groups.setdefault(q.name.rstrip("0123456789_"), []).append(i)
+    common = [
+        moved for moved in groups.values() if len(moved) > 1 and form.is_zero(sympy.Add(*(force[i] for i in moved)))
+    ]
+    return [*((i,) for i in cyclic), *map(tuple, common)]

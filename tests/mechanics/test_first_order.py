@@ -1,0 +1,234 @@
+"""Lagrangians that are linear in all velocities: gauges, runs, files, certificates."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import sympy
+from scipy.integrate import solve_ivp
+
+import scvi_codegen as sc
+from scvi_codegen.mechanics.first_order import FirstOrderSystem
+
+PARTICLE = (
+    "-(y + x**2*y + y**3/6 + x*y**2/6)/2*x_dot + (x + x**3/3 + x*y**2/2 + x**2*y/6)/2*y_dot"
+    " - (1 + cos(x)/2 + y**2 + x**4/4)"
+)
+SLAB = (
+    "-(y + y**3/6 + x**2*y/2)*x_dot/2 + (x + x*y**2/2 + x**3/6)/2*y_dot + u*z_dot - u**2/2"
+    " - mu*(1 + x**2/2 + y**2/2)*(1 + z**2/3)"
+)
+PREY = "log(y)/x/2*x_dot - log(x)/y/2*y_dot - (x + y - log(x) - 2*log(y))"
+CASES = {
+    "Lotka-Volterra": (["x", "y"], PREY, {}, [2.0, 1.0]),
+    "massless particle": (["x", "y"], PARTICLE, {}, [1.0, 0.2]),
+    "guiding centre": (["x", "y", "z", "u"], SLAB, {"mu": 0.1}, [0.5, 0.3, 0.2, 0.4]),
+}
+
+
+def system(name: str) -> FirstOrderSystem:
+    coordinates, lagrangian, parameters, _ = CASES[name]
+    return sc.LagrangianSystem.from_text(name, coordinates, lagrangian, parameters=parameters)
+
+
+def rates(name: str):
+    """Right-hand side omega^-1 dH from the text alone, without a choice of gauge."""
+    names, text, parameters, _ = CASES[name]
+    z, v = sympy.symbols(names, real=True), sympy.symbols([f"{each}_dot" for each in names], real=True)
+    lagrangian = sympy.sympify(text, locals={str(each): each for each in (*z, *v)}).subs(parameters)
+    theta = [lagrangian.diff(each) for each in v]
+    hamiltonian = -lagrangian.subs(dict.fromkeys(v, 0))
+    omega = [[theta[j].diff(z[i]) - theta[i].diff(z[j]) for j in range(len(z))] for i in range(len(z))]
+    evaluate = sympy.lambdify(z, [omega, [hamiltonian.diff(each) for each in z]])
+
+    def right(_: float, state: np.ndarray) -> np.ndarray:
+        form, gradient = evaluate(*state)
+        return np.linalg.solve(np.array(form, float), np.array(gradient, float))
+
+    return right
+
+
+METHODS = (
+    ("svi:1", 2, 40),
+    ("stoermer-verlet", 2, 40),
+    ("radau-iia:2", 3, 20),
+    ("svi:2", 4, 20),
+    ("lobatto-iiia:3", 4, 20),
+    ("svi:3", 6, 10),
+)
+"""Methods with their order and the smaller number of steps."""
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_order_2s_against_the_equations_without_gauge(name: str) -> None:
+    start = CASES[name][3]
+    expected = solve_ivp(rates(name), (0.0, 3.0), start, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
+    for method, order, steps in METHODS:
+        stepper = sc.compile_stepper(system(name), method)
+        errors = [
+            np.abs(stepper.integrate(start, h=3.0 / n, steps=n).variables[-1] - expected).max()
+            for n in (steps, 2 * steps)
+        ]
+        assert math.log2(errors[0] / errors[1]) > order - 0.3 or errors[1] < 1e-11
+    adaptive = stepper.integrate(start, t_end=3.0)
+    assert np.abs(adaptive.variables[-1] - expected).max() < 1e-12
+
+
+def test_energy_does_not_drift() -> None:
+    stepper = sc.compile_stepper(system("massless particle"), "svi:2")
+    run = stepper.integrate([1.0, 0.2], h=0.1, steps=100_000, save_every=7)
+    errors = np.abs(run.energy() - run.energy()[0])
+    assert errors[-2000:].max() < 1.01 * errors[:2000].max() < 1e-6
+
+
+def test_vortices_on_a_curved_surface_agree_with_the_published_reference() -> None:
+    """GeometricProblems.jl, ``point_vortices``: ``reference_solution`` at t = 10."""
+    places = [f"(1 + x{i}**2 + y{i}**2)" for i in (1, 2)]
+    theta = " + ".join(f"g*S/2*(x{i}*y{i}_dot - y{i}*x{i}_dot)".replace("S", s) for i, s in enumerate(places, 1))
+    energy = f"g**2*{places[0]}*{places[1]}*log((x1 - x2)**2 + (y1 - y2)**2)/(2*pi)"
+    vortices = sc.LagrangianSystem.from_text(
+        "vortices", ["x1", "y1", "x2", "y2"], f"{theta} - {energy}", parameters={"g": 0.5}
+    )
+    run = sc.compile_stepper(vortices, "svi:8").integrate([0.5, 0.1, 0.5, -0.1], h=0.1, steps=100)
+    published = [0.18722529318641928, 0.38967432450068706, 0.38125332930294187, 0.4258020604293123]
+    assert np.abs(run.variables[-1] - published).max() < 1e-11
+    assert run.energy_error() < 1e-14
+
+
+def test_translations_of_vortices_conserve_their_centre() -> None:
+    strengths, pairs = {1: 1.0, 2: 2.0, 3: 0.5}, ((1, 2), (1, 3), (2, 3))
+    theta = " + ".join(f"{g}*x{i}*y{i}_dot" for i, g in strengths.items())
+    energy = " + ".join(
+        f"{strengths[i] * strengths[j]}*log((x{i} - x{j})**2 + (y{i} - y{j})**2)/(4*pi)" for i, j in pairs
+    )
+    three = sc.LagrangianSystem.from_text(
+        "vortices", [f"{c}{i}" for i in strengths for c in "xy"], f"{theta} + {energy}"
+    )
+    stepper = sc.compile_stepper(three, "svi:3")
+    assert stepper.momentum_map_names == ("momentum of y1, y2, y3",)
+    assert stepper.interface.map_exact == (True,)
+    run = stepper.integrate([0.0, 0.0, 1.0, 0.2, 0.3, 1.2], h=0.2, steps=500)
+    centre = run.variables[:, ::2] @ list(strengths.values())
+    assert np.abs(centre - centre[0]).max() < 1e-13
+    assert run.momentum_errors().max() < 1e-13
+
+
+@pytest.mark.parametrize("size", ["3", "N"])
+def test_arrays_of_vortices(size: str) -> None:
+    pairs = f"sum(i in {size}, j in {size}, G[i]*G[j]*log((x[i] - x[j])**2 + (y[i] - y[j])**2 + 0.1))/(8*pi)"
+    cloud = sc.LagrangianSystem.from_text(
+        "vortices",
+        [f"x[{size}]", f"y[{size}]"],
+        f"sum(i in {size}, G[i]*x[i]*y_dot[i]) + {pairs}",
+        parameters={f"G[{size}]": 1.0},
+    )
+    start = {"x": [0.0, 1.0, 0.3], "y": [0.0, 0.2, 1.2]}
+    run = sc.compile_stepper(cloud, "svi:2").integrate(start, h=0.1, steps=10)
+    one = "+".join(f"x{i}*y{i}_dot" for i in range(3))
+    potential = "+".join(f"log((x{i} - x{j})**2 + (y{i} - y{j})**2 + 0.1)/(4*pi)" for i, j in ((0, 1), (0, 2), (1, 2)))
+    named = sc.LagrangianSystem.from_text("vortices", ["x0", "x1", "x2", "y0", "y1", "y2"], f"{one} + {potential}")
+    expected = sc.compile_stepper(named, "svi:2").integrate([*start["x"], *start["y"]], h=0.1, steps=10)
+    assert np.abs(run.variables - expected.variables).max() < 1e-14
+
+
+def test_canonical_one_forms_use_the_fixed_point_iteration() -> None:
+    oscillator = sc.LagrangianSystem.from_text("oscillator", ["x", "y"], "x*y_dot - x**2/2 - y**2/2")
+    assert oscillator.is_canonical
+    stepper = sc.compile_stepper(oscillator, "svi:4")
+    assert stepper.interface.solver == "fixed-point"
+    run = stepper.integrate({"x": 1.0, "y": 0.0}, h=0.1, steps=10)
+    assert run.variables[-1] == pytest.approx([math.cos(1.0), math.sin(1.0)], abs=1e-13)
+
+
+def test_certificate_measures_the_two_form_and_the_order() -> None:
+    certificate = sc.verify(system("guiding centre"), "svi:2")
+    assert certificate.passed, str(certificate)
+    names = {check.name for check in certificate.checks}
+    assert {"stage equations", "symplecticity", "order", "reversal", "Newton's matrix"} <= names
+
+
+def test_states_by_name_and_in_order() -> None:
+    stepper = sc.compile_stepper(system("guiding centre"), "svi:2")
+    start = dict(zip("xyzu", CASES["guiding centre"][3], strict=True))
+    run = stepper.integrate(start, h=0.1, steps=5)
+    assert np.array_equal(run.variables, stepper.integrate(list(start.values()), h=0.1, steps=5).variables)
+    assert np.array_equal(run.variables[0], list(start.values()))
+    assert run.to_dataframe()["u"].iloc[-1] == run.variables[-1, 3]
+    many = stepper.integrate_ensemble({**start, "x": [0.5, 0.6]}, h=0.1, steps=5)
+    assert many.variables.shape == (6, 2, 4)
+    assert np.abs(many.variables[-1, 0] - run.variables[-1]).max() < 1e-14
+    restarted = stepper.integrate(run.q[-1], run.p[-1], h=-0.1, steps=5)
+    assert np.abs(restarted.variables[-1] - run.variables[0]).max() < 1e-13
+
+
+@pytest.mark.parametrize(
+    ("start", "message"),
+    [
+        ({"x": 1.0, "y": 1.0}, "'z' is missing"),
+        ([1.0, 2.0], r"must have 4 values, x, y, z, u"),
+    ],
+)
+def test_malformed_states(start: object, message: str) -> None:
+    with pytest.raises(sc.StateError, match=message):
+        sc.compile_stepper(system("guiding centre"), "svi:2").integrate(start, h=0.1, steps=1)
+
+
+def test_velocities_are_refused_and_available() -> None:
+    stepper = sc.compile_stepper(system("guiding centre"), "svi:2")
+    start = CASES["guiding centre"][3]
+    with pytest.raises(sc.StateError, match="velocities follow from the state: omit velocity"):
+        stepper.integrate(start, velocity=[1.0, 1.0], h=0.1, steps=1)
+    run = stepper.integrate(start, h=0.1, steps=1)
+    expected = rates("guiding centre")(0.0, np.array(start))
+    names = [*"xyzu"]
+    assert run.velocity[0] == pytest.approx([expected[names.index(name)] for name in stepper.coordinates], abs=1e-15)
+
+
+def test_model_files(tmp_path) -> None:
+    model = sc.Model(system=system("guiding centre"), method="svi:2", q=CASES["guiding centre"][3], h=0.1, span=1.0)
+    sc.save_model(model, tmp_path / "model.toml")
+    again = sc.load_model(tmp_path / "model.toml")
+    assert np.array_equal(again.integrate().variables, model.integrate().variables)
+    sc.generate_package(model, tmp_path / "generated")
+    package = sc.load_package(tmp_path / "generated")
+    assert np.array_equal(package.integrate(model.q, model.p, h=0.1, steps=10).variables, model.integrate().variables)
+
+
+@pytest.mark.parametrize(
+    ("coordinates", "lagrangian", "message"),
+    [
+        ("x y z", "y*x_dot + z*y_dot - x**2", "has rank 2 in 3 coordinates: 1 combination of the coordinates has no"),
+        (
+            "q1 q2 q3 q4",
+            "(q2 + q3 + q4)*q1_dot + (2*q3 + 3*q4)*q2_dot + 5*q4*q3_dot - q1**2",
+            "vanishes between no two coordinates",
+        ),
+        ("x y", "exp(-x**2*y**2)*(x*y_dot - y*x_dot) - x**2", "no integral of these components of theta was found"),
+    ],
+)
+def test_lagrangians_without_a_gauge(coordinates: str, lagrangian: str, message: str) -> None:
+    with pytest.raises(sc.SystemDefinitionError, match=message):
+        sc.LagrangianSystem.from_text("system", coordinates.split(), lagrangian)
+
+
+def test_unsupported_uses_are_named() -> None:
+    with pytest.raises(sc.SystemDefinitionError, match="forces are not supported"):
+        sc.LagrangianSystem.from_text("system", ["x", "y"], "x*y_dot - x**2 - y**2", forces={"x": "-x_dot"})
+    particle = system("massless particle")
+    for method in ("scvi:3", "composition"):
+        with pytest.raises(sc.MethodError):
+            sc.compile_stepper(particle, method).integrate([1.0, 0.2], h=0.1, steps=1)
+    with pytest.raises(sc.MethodError, match="derivatives of steps are not available for the first-order system"):
+        sc.compile_stepper(particle, "svi:2").jacobian([0.2], [1.0], 0.1)
+    with pytest.raises(sc.SystemDefinitionError, match="use reparametrise"):
+        sc.compile_stepper(particle, "svi:2", time_transformation="1 + x**2").integrate([1.0, 0.2], h=0.1, t_end=1.0)
+
+
+def test_transformed_time() -> None:
+    particle = system("massless particle")
+    slow = sc.compile_stepper(sc.reparametrise(particle, "1 + x**2"), "svi:6").integrate([1.0, 0.2], h=0.05, t_end=2.0)
+    plain = sc.compile_stepper(particle, "svi:6").integrate([1.0, 0.2], h=0.05, steps=40)
+    assert slow.t[-1] == pytest.approx(2.0)
+    assert slow.variables[-1] == pytest.approx(plain.variables[-1], abs=1e-11)
