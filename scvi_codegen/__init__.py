@@ -42,6 +42,7 @@ _HOMES = {
     "runtime.estimation.fitting": ("Fit", "fit"),
     "runtime.sensitivity.gradients": ("Gradient",),
     "runtime.sensitivity.step_derivatives": ("Sensitivity",),
+    "mechanics.first_order": ("FirstOrderSystem",),
     "mechanics.hamiltonian": ("HamiltonianSystem",),
     "mechanics.legendre": ("hamiltonian_of", "lagrangian_of"),
     "mechanics.time_transformation": ("reparametrise",),

@@ -220,7 +220,7 @@ class OneForm:
             )
 
 
-def system_of(kind: Any, fields: Mapping[str, Any]) -> Any:
+def system_of(kind: Any, **fields: Any) -> Any:
     """Return a system of these fields: of a Lagrangian that is linear in velocities a :class:`FirstOrderSystem`."""
     return (first_order_system(fields) if "lagrangian" in fields else None) or kind(**fields)
 
@@ -261,7 +261,7 @@ def first_order_form(form: OneForm) -> dict[str, Any]:
             refused.append(chosen)
             continue
         rest = [i for i in range(n) if i not in chosen]
-        theta = tuple(sympy.expand(form.theta[i] - integral.diff(z[i])) for i in rest)
+        theta = tuple(sympy.expand(form.theta[i] - integral.diff(z[i])) if integral else form.theta[i] for i in rest)
         found.append((int(sympy.count_ops(theta)), chosen, integral, theta))
         if integral == 0:
             break

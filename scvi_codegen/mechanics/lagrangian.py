@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.errors import SystemDefinitionError
@@ -231,10 +232,11 @@ class LagrangianSystem(MechanicalSystem):
         >>> LagrangianSystem.from_sympy(name="chain", coordinates=["q[N]"], lagrangian=kinetic - springs)
         LagrangianSystem(name='chain', coordinates=(q[N]))
         """
+        from scvi_codegen.mechanics.first_order import system_of
         from scvi_codegen.mechanics.reading import system_from_sympy
 
         system: LagrangianSystem = system_from_sympy(
-            cls,
+            partial(system_of, cls),
             "Lagrangian",
             lagrangian,
             name=name,
@@ -411,9 +413,11 @@ class LagrangianSystem(MechanicalSystem):
 
     @classmethod
     def _read(cls, arguments: Mapping[str, Any]) -> tuple[Any, bool]:
+        from scvi_codegen.mechanics.first_order import system_of
         from scvi_codegen.mechanics.reading import system_from_text
 
-        return system_from_text(cls, arguments)
+        system, warned = system_from_text(partial(system_of, cls), arguments)
+        return system, warned or type(system) is not cls
 
     def _repr_latex_(self) -> str:
         from sympy import latex

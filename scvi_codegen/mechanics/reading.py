@@ -25,7 +25,6 @@ from scvi_codegen.mechanics.arrays.elements import unrolled_fields
 from scvi_codegen.mechanics.arrays.reading import arrays_from_sympy, arrays_from_text, definition_of
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.definition_checks import warn_of_mistakes
-from scvi_codegen.mechanics.first_order import system_of
 from scvi_codegen.mechanics.forces import constraints_of, damping_rate, dissipative_forces, forces_by_coordinate
 from scvi_codegen.mechanics.rotations.frames import rotations_of_frames
 from scvi_codegen.mechanics.system import are_arrays
@@ -38,7 +37,7 @@ TORQUES = ("torques", "torques_space")
 
 
 def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]:
-    """Return the system of the arguments of ``cls.from_text``, and whether warnings were issued.
+    """Return the system of the arguments of ``from_text``, made by ``cls``, and whether warnings were issued.
 
     Systems of arrays of run-time sizes are returned as they are, others with their entries as coordinates.
     """
@@ -85,8 +84,8 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
         damping=damping_rate(arguments["damping"], lambda formula: read(str(formula))),
         inputs=tuple(inputs),
     )
-    system = system_of(cls, defined)
-    return system, _warned(system) or type(system) is not cls
+    system = cls(**defined)
+    return system, _warned(system)
 
 
 def _warned(system: Any) -> bool:
@@ -177,7 +176,7 @@ def system_from_sympy(
         damping=reader("damping")(rate),
         inputs=input_names,
     )
-    system = system_of(cls, defined)
+    system = cls(**defined)
     _warned(system)
     return system
 
@@ -212,7 +211,7 @@ def default_momenta(coordinates: Sequence[str]) -> tuple[str, ...]:
 
 def _of_arrays(cls: Any, system: ArraySystem) -> Any:
     """Return the system of named coordinates of arrays of known sizes, others as they are."""
-    return system if system.sizes else system_of(cls, unrolled_fields(system, {}))
+    return system if system.sizes else cls(**unrolled_fields(system, {}))
 
 
 def _named_parameters(parameters: Mapping[Any, float] | None) -> dict[str, float]:

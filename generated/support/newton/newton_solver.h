@@ -37,6 +37,25 @@ static void guess_from(const real *memory, newton_data *data)
   gather(EXTRAPOLATION[SITES > M ? B : 0], B, 1, memory + M * B, SITES - M, data->z + M * B, 1, B);
 }
 
+#ifdef FIRST_ORDER_SYSTEM
+/* Replaces the increments of the momenta theta(q, y) by those of y: solves theta(q1, y1) = theta0 + dtheta by Newton
+ * iteration from y at the last point of the step. */
+static int variables_of_momenta(const step_data *step, const real *z, const real *dq, real *increment)
+{
+  real u[2 * M], theta[M];
+  int status;
+  for (int i = 0; i < M; i++) {
+    u[i] = step->q0[i] + (step->carry_q[i] + dq[i]);
+    u[M + i] = z[i * B + B - 1];
+    theta[i] = step->theta0[i] + increment[i];
+  }
+  status = invert_from(step->t + step->h, u, theta, step->parameters, step->scratch);
+  for (int i = 0; i < M; i++)
+    increment[i] = (u[M + i] - step->p0[i]) - step->carry_p[i];
+  return status;
+}
+#endif
+
 /* Computes the increments by RATTLE if applicable, else by Newton's method from the extrapolated stages of the previous
  * step, and from the straight line if there are none or the iteration fails. memory contains the stages and, if factors
  * are reused, the point of the factors; guess is 1 if the stages are valid, 2 if both are. On failure the increments
@@ -46,6 +65,14 @@ static int solve(const step_data *step, const solver_data *unused, real *memory,
 {
   newton_data *data = newton_in(workspace);
   int status = NOT_CONVERGED, keep = 0;
+#ifdef FIRST_ORDER_SYSTEM
+  real theta[M];
+  step_data with_momenta = *step;
+  if (transform(step->t, step->q0, step->p0, step->parameters, theta, step->scratch) != OK)
+    return NOT_FINITE;
+  with_momenta.theta0 = theta;
+  step = &with_momenta;
+#endif
   (void)unused;
   if (POINT > 0 && *guess == 2)
     keep = step->first ? remake_factors(step, memory + N, data) : 1;
@@ -65,6 +92,11 @@ static int solve(const step_data *step, const solver_data *unused, real *memory,
   if (status != OK)
     return status;
   gather(END_POSITION, 1, step->h, data->z, M, dq, 0, 1);
+#ifdef FIRST_ORDER_SYSTEM
+  status = variables_of_momenta(step, data->z, dq, dp);
+  if (status != OK)
+    return status;
+#endif
   if (!reaches(step, dq, dp))
     return NOT_FINITE;
   memcpy(memory, data->z, sizeof(real) * N);

@@ -235,5 +235,5 @@ def unroll_sums(
     """
     assert isinstance(system, ArraySystem)
     kind = HamiltonianSystem if system.function == "Hamiltonian" else LagrangianSystem
-    result: MechanicalSystem = system_of(kind, unrolled_fields(system, sizes, tables, parameters))
+    result: MechanicalSystem = system_of(kind, **unrolled_fields(system, sizes, tables, parameters))
     return result

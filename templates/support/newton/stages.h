@@ -88,11 +88,16 @@ static inline void scatter_derivatives(const real *row, const real *column, int 
 static inline void begin_rows(const step_data *step, const real *z, real *rows, real *size_p, real *size_q,
     real *jacobian, const band *shape)
 {
+#ifdef FIRST_ORDER_SYSTEM
+  const real *p0 = step->theta0;
+#else
+  const real *p0 = step->p0;
+#endif
   for (int i = 0; i < M; i++) {
     for (int r = 0; r < B; r++)
-      rows[i * (B + 1) + r] = MOMENTUM_ROW[r] * MOMENTA_OF(step)[i];
+      rows[i * (B + 1) + r] = MOMENTUM_ROW[r] * p0[i];
     rows[i * (B + 1) + B] = 0;
-    size_p[i] = MATH(fabs)(MOMENTA_OF(step)[i]);
+    size_p[i] = MATH(fabs)(p0[i]);
     size_q[i] = MATH(fabs)(step->q0[i]);
     for (int b = 0; b < B; b++)
       size_q[i] += MATH(fabs)(step->h * END_POSITION[b] * z[i * B + b]);
