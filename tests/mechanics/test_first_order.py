@@ -20,10 +20,12 @@ SLAB = (
     "-(y + y**3/6 + x**2*y/2)*x_dot/2 + (x + x*y**2/2 + x**3/6)/2*y_dot + u*z_dot - u**2/2"
     " - mu*(1 + x**2/2 + y**2/2)*(1 + z**2/3)"
 )
+COUPLED = "(a + b*y/3)*x_dot + (b + b**3/5)*y_dot - (a**2 + b**2 + x**2 + 2*y**2 + x*b/2)/2"
 PREY = "log(y)/x/2*x_dot - log(x)/y/2*y_dot - (x + y - log(x) - 2*log(y))"
 CASES = {
     "Lotka-Volterra": (["x", "y"], PREY, {}, [2.0, 1.0]),
     "massless particle": (["x", "y"], PARTICLE, {}, [1.0, 0.2]),
+    "coupled": (["x", "y", "a", "b"], COUPLED, {}, [0.5, 0.3, 0.2, 0.4]),
     "guiding centre": (["x", "y", "z", "u"], SLAB, {"mu": 0.1}, [0.5, 0.3, 0.2, 0.4]),
 }
 
@@ -74,6 +76,23 @@ def test_order_2s_against_the_equations_without_gauge(name: str) -> None:
         assert math.log2(errors[0] / errors[1]) > order - 0.3 or errors[1] < 1e-11
     adaptive = stepper.integrate(start, t_end=3.0)
     assert np.abs(adaptive.variables[-1] - expected).max() < 1e-12
+
+
+def test_a_gauge_that_depends_on_time() -> None:
+    """theta_x = y (1 + sin(t)/2)/2 and theta_y = -x (1 + sin(t)/2)/2 require the term F_t in H."""
+    swept = sc.LagrangianSystem.from_text(
+        "swept", ["x", "y"], "(1 + sin(t)/2)*(y + y**3/3)*x_dot/2 - (1 + sin(t)/2)*x*y_dot/2 - x**2/2 - y**2/2"
+    )
+
+    def right(t: float, state: np.ndarray) -> list[float]:
+        x, y = state
+        s, rate = 1 + math.sin(t) / 2, math.cos(t) / 2
+        omega = s * (2 + y**2) / 2  # d theta_x / dy - d theta_y / dx
+        return [(y - rate * x / 2) / omega, -(x + rate * (y + y**3 / 3) / 2) / omega]
+
+    expected = solve_ivp(right, (0.0, 3.0), [1.0, 0.2], method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
+    run = sc.compile_stepper(swept, "svi:4").integrate([1.0, 0.2], h=0.1, steps=30)
+    assert np.abs(run.variables[-1] - expected).max() < 1e-11
 
 
 def test_energy_does_not_drift() -> None:
@@ -176,13 +195,13 @@ def test_malformed_states(start: object, message: str) -> None:
 
 
 def test_velocities_are_refused_and_available() -> None:
-    stepper = sc.compile_stepper(system("guiding centre"), "svi:2")
-    start = CASES["guiding centre"][3]
+    stepper = sc.compile_stepper(system("coupled"), "svi:2")
+    start = CASES["coupled"][3]
     with pytest.raises(sc.StateError, match="velocities follow from the state: omit velocity"):
         stepper.integrate(start, velocity=[1.0, 1.0], h=0.1, steps=1)
     run = stepper.integrate(start, h=0.1, steps=1)
-    expected = rates("guiding centre")(0.0, np.array(start))
-    names = [*"xyzu"]
+    expected = rates("coupled")(0.0, np.array(start))
+    names = [*"xyab"]
     assert run.velocity[0] == pytest.approx([expected[names.index(name)] for name in stepper.coordinates], abs=1e-15)
 
 
