@@ -23,6 +23,7 @@ def definitions() -> Iterator[Any]:
     yield from (sc.gauss_legendre(8), sc.clenshaw_curtis(6), sc.chebyshev_lobatto(8), sc.Polynomials())
     yield from (sc.Splines(3), sc.Trigonometric(0.5), sc.SolverOptions(), sc.Event("q - 1", terminal=True))
     yield sc.HamiltonianSystem.from_text(NAME, ["q"], "p**2/2 - cos(q)", momenta=["p"])
+    yield sc.LagrangianSystem.from_text(NAME, ["x", "y"], "x*y_dot - x**2/2 - y**2/2")
     waves = sc.FieldSystem.from_text(NAME, ["u"], {"x": (0, 1)}, "u_t**2/2 - u_x**2/2")
     yield from (waves, waves.discretise("spectral-elements", degree=2, elements=2))
     kepler = sc.problem("kepler")

@@ -80,8 +80,8 @@ def test_order_2s_against_the_equations_without_gauge(name: str) -> None:
 
 def test_a_gauge_that_depends_on_time() -> None:
     """theta_x = y (1 + sin(t)/2)/2 and theta_y = -x (1 + sin(t)/2)/2 require the term F_t in H."""
-    swept = sc.LagrangianSystem.from_text(
-        "swept", ["x", "y"], "(1 + sin(t)/2)*(y + y**3/3)*x_dot/2 - (1 + sin(t)/2)*x*y_dot/2 - x**2/2 - y**2/2"
+    driven = sc.LagrangianSystem.from_text(
+        "driven", ["x", "y"], "(1 + sin(t)/2)*(y + y**3/3)*x_dot/2 - (1 + sin(t)/2)*x*y_dot/2 - x**2/2 - y**2/2"
     )
 
     def right(t: float, state: np.ndarray) -> list[float]:
@@ -91,7 +91,7 @@ def test_a_gauge_that_depends_on_time() -> None:
         return [(y - rate * x / 2) / omega, -(x + rate * (y + y**3 / 3) / 2) / omega]
 
     expected = solve_ivp(right, (0.0, 3.0), [1.0, 0.2], method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
-    run = sc.compile_stepper(swept, "svi:4").integrate([1.0, 0.2], h=0.1, steps=30)
+    run = sc.compile_stepper(driven, "svi:4").integrate([1.0, 0.2], h=0.1, steps=30)
     assert np.abs(run.variables[-1] - expected).max() < 1e-11
 
 
