@@ -31,19 +31,7 @@ def document_of(model: Model, *, as_arrays: bool = True) -> dict[str, Any]:
     """Return all sections, in the order of a file; ``as_arrays``: with the arrays that the system was read with."""
     clock = None if model.array_system else model.system.clock
     system = clock.plain if clock and clock.plain else model.system
-    names = [] if model.array_system else [coordinate.name for coordinate in system.coordinates]
-    if model.array_system and not system.definition:
-        raise ModelFileError(f"'{system.name}' was not read from text: give its formula to from_text to write a file")
-    if isinstance(system, FirstOrderSystem):
-        document, parameters, motion = _definition(system), model.parameters, motion_of(model, names)
-        motion["initial"] = {"t": model.t, "q": system.joined(model.q, model.p)}
-    elif system.definition and not model.array_system and system.rotations:
-        document, parameters, motion = _of_rotations(system), model.parameters, motion_of(model, names)
-    elif as_arrays and system.definition:
-        document, parameters = _definition(system), _declared_parameters(model)
-        motion = motion_of(model, names) | {"initial": {"t": model.t, **_state_by_array(model, names)}}
-    else:
-        document, parameters, motion = _formulas(system, names), model.parameters, motion_of(model, names)
+    document, parameters, motion = _system_and_state(model, system, as_arrays=as_arrays)
     if g := clock.time_transformation if clock else model.time_transformation:
         document["system"]["time_transformation"] = g
     if model.inputs:
@@ -58,6 +46,25 @@ def document_of(model: Model, *, as_arrays: bool = True) -> dict[str, Any]:
         declared = {each.partition("[")[0]: each for each in system.definition.get("tables", ())}
         document["tables"] = {declared[name]: np.asarray(rows).tolist() for name, rows in model.tables.items()}
     return {**document, **motion}
+
+
+def _system_and_state(
+    model: Model, system: MechanicalSystem, *, as_arrays: bool
+) -> tuple[dict[str, Any], Mapping[str, Any], dict[str, Any]]:
+    """Return the sections of the system, its parameters, and the sections of :func:`motion_of`."""
+    names = [] if model.array_system else [coordinate.name for coordinate in system.coordinates]
+    if model.array_system and not system.definition:
+        raise ModelFileError(f"'{system.name}' was not read from text: give its formula to from_text to write a file")
+    motion = motion_of(model, names)
+    if isinstance(system, FirstOrderSystem):
+        state = {"t": model.t, "q": system.joined(model.q, model.p)}
+        return _definition(system), model.parameters, motion | {"initial": state}
+    if system.definition and not model.array_system and system.rotations:
+        return _of_rotations(system), model.parameters, motion
+    if as_arrays and system.definition:
+        state = {"t": model.t, **_state_by_array(model, names)}
+        return _definition(system), _declared_parameters(model), motion | {"initial": state}
+    return _formulas(system, names), model.parameters, motion
 
 
 def _event_entry(event: Event) -> dict[str, Any]:
