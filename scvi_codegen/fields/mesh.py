@@ -11,7 +11,7 @@ import sympy
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError, closest
-from scvi_codegen.fields.axes import Axis
+from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis
 from scvi_codegen.fields.density import Density
 from scvi_codegen.fields.derivation import FieldDerivation, derivation_of
 from scvi_codegen.fields.laws import Variations
@@ -93,6 +93,9 @@ class Mesh:
         for k, each in enumerate(self.axes):
             others = tuple(range(-count, -1))
             modes = each.modes(np.moveaxis(array, k - count, -1))
+            ends = self.field_system.boundary[each.name]
+            if ends != PERIODIC and any(value != 0 for end in ends if end != NATURAL for value in end.values()):
+                modes[..., ~each.inside.all(axis=1), :] = 0  # prescribed values are not known here
             highest = modes[..., -max(1, modes.shape[-1] // 6) :].sum(-1).sum(others)
             every = modes.sum(-1).sum(others)
             largest = every.max(-1)
