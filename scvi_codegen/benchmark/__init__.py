@@ -9,7 +9,7 @@
     comparison   timing of all contenders of a case in turn, in one process
     sections     which contenders and which reference belong to a case
     report       time at equal error, by interpolation; tables and JSON of results; plots: their pictures
-    tables       energy drift, time from text to the first step, steps with several threads
+    tables       energy drift, time from text to the first step
     machine      description of the machine
     settings     settings of a benchmark; processor times of functions
 
@@ -33,7 +33,7 @@ from scvi_codegen.benchmark.machine import machine
 from scvi_codegen.benchmark.report import LEGEND, CaseResult, ResultTable, header_lines
 from scvi_codegen.benchmark.sections import BUILDERS
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
-from scvi_codegen.benchmark.tables import run_drift, run_first_steps, run_threads
+from scvi_codegen.benchmark.tables import run_drift, run_first_steps
 from scvi_codegen.errors import ScviCodegenError, StateError, closest
 from scvi_codegen.files.atomic import write_atomically
 
@@ -46,7 +46,6 @@ SECTIONS: Mapping[str, Callable[[Plan, ReportActivity], CaseResult | ResultTable
     **{name: partial(run_race, build) for name, build in BUILDERS.items()},
     "drift": run_drift,
     "first-step": run_first_steps,
-    "threads": run_threads,
 }
 """Sections of the benchmark: name on the command line -> function that measures it."""
 

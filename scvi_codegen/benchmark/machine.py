@@ -19,7 +19,7 @@ from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.native.compilers import find_compiler
 from scvi_codegen.version import __version__
 
-PACKAGES = ("numpy", "scipy", "sympy", "heyoka", "rebound", "CyRK", "numba", "jitcode", "symengine", "pydy")
+PACKAGES = ("numpy", "scipy", "sympy", "heyoka", "rebound", "CyRK", "numba", "pydy", "mujoco", "pin", "py-pde")
 
 
 def machine() -> dict[str, str | dict[str, str]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
@@ -13,7 +13,13 @@ from scvi_codegen.benchmark.cases.fields import FIELDS, FieldCase, our_fields
 from scvi_codegen.benchmark.cases.large import atoms, bodies, field, ring
 from scvi_codegen.benchmark.cases.references import Reference, adaptive_reference, rms_error
 from scvi_codegen.benchmark.cases.robots import ROBOTS
-from scvi_codegen.benchmark.cases.rods import CONSTRAINED_CASES, FORCED_CASES, constrained_contenders
+from scvi_codegen.benchmark.cases.rods import (
+    CONSTRAINED_CASES,
+    FORCED_CASES,
+    angles_of,
+    positions_of,
+    rods_in_positions,
+)
 from scvi_codegen.benchmark.cases.rotations import BODIES, FEW_BODIES, ROTATIONS, tumbling
 from scvi_codegen.benchmark.cases.unforced import CASES, STATES, Array, Case, case
 from scvi_codegen.benchmark.comparison import Race
@@ -29,6 +35,7 @@ from scvi_codegen.benchmark.contenders.ours import (
 from scvi_codegen.benchmark.contenders.taylor import heyoka_contenders, heyoka_ensembles
 from scvi_codegen.benchmark.report import Contender
 from scvi_codegen.benchmark.settings import Plan
+from scvi_codegen.methods import as_method
 from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.method import Method
 
@@ -49,10 +56,24 @@ def _single(make: Callable[[], Case], plan: Plan) -> Race:
     return Race(case=chosen, ours=partial(our_contenders, chosen, methods=plan.methods, quick=plan.quick))
 
 
-def _constrained(name: str, plan: Plan) -> Race:
+def _constrained(make: Callable[[], Case], plan: Plan) -> Race:
     """Return rods as constraints in this package, and everybody in the angles of the rods."""
-    both = CONSTRAINED_CASES[name]().shortened(plan.share)
-    return Race(case=both.angles, ours=partial(constrained_contenders, both, quick=plan.quick))
+    angles = _shortened(make(), plan)
+    q = positions_of(angles.q)
+    positions = replace(angles, system=rods_in_positions(angles.dimension), q=q, velocity=0.0 * q)
+    methods = [as_method(f"svi:{degree}", positions.system) for degree in ((6,) if plan.quick else (6, 8))]
+
+    def in_angles(prepare: Callable[[int], Callable[[], Array]], index: int) -> Callable[[], Callable[[], Array]]:
+        integrate = prepare(index)
+        return lambda: partial(angles_of, integrate())
+
+    def ours() -> Iterable[Contender]:
+        for each in our_contenders(positions, methods=methods, quick=plan.quick):
+            yield replace(each, prepare=partial(in_angles, each.prepare), momenta=None)
+        for each in our_contenders(angles, quick=plan.quick):
+            yield replace(each, method=f"{each.method}, angles", momenta=None)
+
+    return Race(case=angles, ours=ours)
 
 
 def _ensemble(few: Case, many: Case, plan: Plan) -> Race:
@@ -115,14 +136,15 @@ def _halved(
     """
     chosen = _shortened(make(), plan)
 
-    def ends(_: Case, __: Array | None) -> Reference:
+    @cache
+    def exact_end() -> Reference:
         counts: Counts = {method: step_counts(chosen, range(k, k + 1)) for method, k in exact.items()}
         result, other = (each.prepare(0)() for each in fixed_contenders(chosen, counts))
         reference = Reference(high=result.reshape(1, -1), low=np.zeros((1, result.size)), accuracy=0.0)
         return replace(reference, accuracy=rms_error(other.reshape(1, -1), reference))
 
     some = {method: step_counts(chosen, k[: 2 if plan.quick else None]) for method, k in methods.items()}
-    return Race(case=chosen, ours=partial(fixed_contenders, chosen, some), ends=ends)
+    return Race(case=chosen, ours=partial(fixed_contenders, chosen, some), ends=lambda _, __: exact_end())
 
 
 def _field(make: Callable[[], FieldCase], plan: Plan) -> Race:
@@ -149,8 +171,8 @@ MECHANISM_METHODS: dict[str | Method, range] = {"svi:4": range(6)}
 BUILDERS: dict[str, Callable[[Plan], Race]] = {
     **{name: partial(_single, make) for name, make in CASES.items()},
     **{f"ensemble:{name}": partial(_copies, name) for name in ENSEMBLES},
-    **{f"forced:{name}": partial(_single, make) for name, make in FORCED_CASES.items()},
-    **{f"constrained:{name}": partial(_constrained, name) for name in CONSTRAINED_CASES},
+    **{name: partial(_single, make) for name, make in FORCED_CASES.items()},
+    **{name: partial(_constrained, make) for name, make in CONSTRAINED_CASES.items()},
     **{f"adaptive:{name}": partial(_adaptive, name) for name in ADAPTIVE_CASES},
     **{f"rotations:{name}": partial(_rotation, name) for name in ROTATIONS},
     "rotations:bodies": _tumbling,

@@ -1,4 +1,4 @@
-"""Tables without contenders at equal error: energy drift, time to the first step, steps with several threads."""
+"""Tables without contenders at equal error: energy drift, and time to the first step."""
 
 from __future__ import annotations
 
@@ -9,13 +9,10 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from scvi_codegen.benchmark.cases.large import atoms, bodies, ring
 from scvi_codegen.benchmark.cases.robots import chain
 from scvi_codegen.benchmark.cases.unforced import Array, Case, case
 from scvi_codegen.benchmark.contenders.engines import mujoco_states
@@ -26,7 +23,6 @@ from scvi_codegen.benchmark.settings import Plan, ReportActivity, timed
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.native import building
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
-from scvi_codegen.runtime.run.run import Run
 
 DRIFTS = {"kepler:0.2": (0.5, 0.35, 0.2), "kepler:0.5": (0.2, 0.15, 0.1)}
 """Three step sizes for each case, from the largest without a visible truncation error down."""
@@ -182,72 +178,3 @@ def _medians(rows: list[dict[str, Any]]) -> dict[str, Any]:
         key: statistics.median(row[key] for row in rows) if isinstance(value, float) else value
         for key, value in rows[0].items()
     }
-
-
-TURN = 0.003
-"""Duration of a turn in seconds: short, so that other programs seldom interrupt it."""
-PROBLEM_SECONDS = 0.5
-"""Seconds for a problem, a method and a number of threads."""
-
-
-@without_accuracy_warnings()
-def run_threads(plan: Plan, report_activity: ReportActivity) -> ResultTable:
-    """Measure the time of a step of array systems, its growth with their size, and the speed-up by several threads."""
-    cores = os.cpu_count() or 1
-    numbers = [number for number in (2, 4, 8, 16, 32) if number <= max(cores, 2)]
-    rows = []
-    for each, h in _threaded(plan):
-        for method in ("svi:8", "stoermer-verlet"):
-            report_activity(f"threads: {each.name} by {method}")
-            rows.append({"problem": each.name.split(":")[1]} | _thread_row(each, method, h, numbers, plan))
-    columns = {"problem": "", "coordinates": "d", "by": "", "one_us": ".4g", "ns_a_coordinate": ".1f"}
-    return ResultTable(
-        name="threads",
-        title="time of a step with one thread, and speed-up with several",
-        columns=columns | {f"threads_{number}": ".2f" for number in numbers},
-        rows=tuple(rows),
-        remarks=(
-            "time of the clock, the best of many turns of 3 ms, threads begun in each, numbers of threads in turn. On",
-            "a machine with other work threads that wait for each other may be slower than one.",
-        ),
-    )
-
-
-def _threaded(plan: Plan) -> Iterator[tuple[Case, float]]:
-    """Yield each problem with a step size."""
-    if plan.quick:
-        yield from ((ring(5000, 1.0), 0.1), (atoms(2, 1.0), 0.002))
-        return
-    for count in (10**3, 10**4, 10**5, 10**6):
-        yield ring(count, 1.0), 0.1
-    for cells in (2, 3, 4, 6):
-        yield atoms(cells, 1.0), 0.002
-    for number in (256, 1000):
-        yield bodies(number, 1.0), 0.02
-
-
-def _thread_row(each: Case, method: str, h: float, numbers: list[int], plan: Plan) -> dict[str, Any]:
-    stepper: Any = compile_stepper(each.system, method)
-    assert each.arrays is not None
-    q, v = (part[0].reshape(each.arrays.shape) for part in each.states)
-    runs = {threads: stepper.start(q, velocity=v, threads=threads, h=h) for threads in (1, *numbers)}
-    for run in runs.values():
-        run.advance(3)
-    steps = max(1, int(TURN / _seconds(runs[1], 1)))
-    best, until = dict.fromkeys(runs, float("inf")), time.perf_counter() + plan.share * PROBLEM_SECONDS * len(runs)
-    while time.perf_counter() < until:
-        for threads, run in runs.items():
-            best[threads] = min(best[threads], _seconds(run, steps))
-    gained = {f"threads_{threads}": best[1] / best[threads] for threads in numbers}
-    row = {"coordinates": each.dimension, "by": f"{OURS} {method}", "one_us": 1e6 * best[1]}
-    return row | {"ns_a_coordinate": 1e9 * best[1] / each.dimension} | gained
-
-
-def _seconds(run: Run, steps: int) -> float:
-    """Return the seconds per step of a call with ``steps`` steps."""
-    memory: Any = run._memory
-    binding = memory.binding.raw
-    report = binding.new("report *")
-    began = time.perf_counter()
-    binding.function("advance")(memory.run, memory.problem, steps, binding.null, report)
-    return (time.perf_counter() - began) / steps

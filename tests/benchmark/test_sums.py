@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 
 from scvi_codegen import benchmark as bench
-from scvi_codegen.benchmark import sections, tables
+from scvi_codegen.benchmark import sections
 from scvi_codegen.benchmark.cases.fields import FIELDS, our_fields
 from scvi_codegen.benchmark.cases.large import atoms, bodies, field, ring
 from scvi_codegen.benchmark.cases.robots import chain, four_bar, quadruped
-from scvi_codegen.benchmark.contenders import arrays, engines, pdes
+from scvi_codegen.benchmark.contenders import arrays, engines, pdes, peers
 from scvi_codegen.benchmark.contenders.ours import fixed_contenders
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import Composition
-
-QUICK = bench.Plan(quick=True, peers=(), repeats=1)
 
 
 def quiet(text):
@@ -69,13 +67,12 @@ def test_openmm_makes_the_steps_of_leapfrog(name):
 def test_rebound_converges_to_the_same_state():
     pytest.importorskip("rebound", reason="needs the extra 'bench'")
     each = bodies(10, 0.5)
-    theirs = end(next(arrays.rebound_contenders(each, quick=True)))
+    theirs = end(next(peers.PEERS["rebound"].contenders(each, True)))
     assert np.abs(ours(each, "svi:8", 32) - theirs).max() < 1e-14
 
 
 @pytest.mark.full
-def test_array_systems_are_measured_at_equal_error(monkeypatch):
-    monkeypatch.setitem(sections.LATTICES, "ring:1000", lambda: ring(32, 2.0))
+def test_array_systems_are_measured_at_equal_error():
     plan = bench.Plan(quick=True, repeats=1, peers=("scipy", "hand"))
     result = bench.run_race(
         lambda plan: sections._halved(lambda: ring(32, 40.0), sections.EXPLICIT, sections.EXACT, plan), plan, quiet
@@ -83,13 +80,6 @@ def test_array_systems_are_measured_at_equal_error(monkeypatch):
     assert result.accuracy < 1e-13
     assert {"SciPy DOP853", "leapfrog by hand", "scvi-codegen svi:8"} <= set(result.methods())
     assert min(each.error for each in result.measurements) < 1e-12
-
-
-@pytest.mark.full
-def test_threads_are_measured():
-    rows = tables.run_threads(QUICK, quiet).rows
-    assert [row["problem"] for row in rows] == ["ring"] * 2 + ["atoms"] * 2
-    assert all(row["one_us"] > 0.0 and row["threads_2"] > 0.0 for row in rows)
 
 
 @pytest.mark.parametrize("make", [lambda: chain(2), four_bar], ids=["chain", "four-bar"])

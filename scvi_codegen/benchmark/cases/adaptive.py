@@ -14,7 +14,6 @@ import numpy as np
 from scvi_codegen.benchmark.cases.unforced import (
     Bodies,
     Case,
-    Vector,
     case,
     divided,
     gravitation,
@@ -52,32 +51,6 @@ def _kepler_case(eccentricity: float) -> Case:
     q, velocity = rotated((1.0 + eccentricity, 0.0), 2), rotated((0.0, speed), 2)
     plain = kepler_case(eccentricity, step=0.1, fine=0.1)
     return replace(plain, name="kepler", q=q, velocity=velocity, span=KEPLER_SPAN)
-
-
-def atwood(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
-    """Return r'' = (m r th'^2 - g (M - m cos th)) / (M + m), th'' = -(2 r' th' + g sin th) / r."""
-    heavy, light, g = of["M"], of["m"], of["g"]
-    pull = light * q[0] * (v[1] * v[1]) - g * (heavy - light * functions.cos(q[1]))
-    return [pull / (heavy + light), -(2.0 * v[0] * v[1] + g * functions.sin(q[1])) / q[0]]
-
-
-def _atwood_case() -> Case:
-    system = LagrangianSystem.from_text(
-        name="swinging Atwood machine",
-        coordinates=["r", "th"],
-        lagrangian="(M + m)*r_dot**2/2 + m*r**2*th_dot**2/2 - g*r*(M - m*cos(th))",
-        parameters={"M": 1.7, "m": 1.0, "g": 1.0},
-    )
-    return Case(
-        name="atwood",
-        system=system,
-        formulations=hand_solved(atwood),
-        q=scaled((1.1, 0.8), 0.01),
-        velocity=scaled((0.0, 0.2), 0.01),
-        span=100.0,
-        step=0.05,
-        fine=0.05,
-    )
 
 
 def _double_pendulum_case() -> Case:
@@ -150,7 +123,6 @@ def _solar_case(name: str, body: Mapping[str, float], span: float, *, part: floa
 
 ADAPTIVE_CASES: Mapping[str, Callable[[], Case]] = {
     **{f"kepler:{e}": partial(_kepler_case, e) for e in ECCENTRICITIES},
-    "atwood": _atwood_case,
     "double-pendulum": _double_pendulum_case,
     "pythagorean": _pythagorean_case,
     "mercury": partial(_solar_case, "mercury", MERCURY, ORBITS[0], part=1.0),

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.benchmark.cases.unforced import Array, Arrays, Case
+from scvi_codegen.benchmark.cases.unforced import Array, Arrays, Bodies, Case
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 
 SEED = 20261121
@@ -23,6 +23,7 @@ def _case(
     longest: float,
     accelerations: Callable[[Array], Array],
     by_hand: tuple[int, int, float] | None = None,
+    bodies: Bodies | None = None,
     **definition: Any,
 ) -> Case:
     return Case(
@@ -34,6 +35,7 @@ def _case(
         span=span,
         step=longest,
         fine=longest,
+        bodies=bodies,
         arrays=Arrays(shape=q.shape, accelerations=accelerations, by_hand=by_hand),
     )
 
@@ -108,6 +110,7 @@ def bodies(count: int, span: float) -> Case:
         span=span,
         longest=0.25,
         accelerations=accelerations,
+        bodies=Bodies(masses=(1 / count,) * count, gravity=1.0, fixed_centre=False, axes=3, softening=softening),
     )
 
 

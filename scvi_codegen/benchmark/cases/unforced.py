@@ -127,12 +127,14 @@ class Bodies:
         gravity: constant of gravity in the units of the case.
         fixed_centre: True if a unit mass at rest in the origin precedes the bodies of the coordinates.
         axes: coordinates of each body, 2 or 3.
+        softening: distance that is added in quadrature to all others.
     """
 
     masses: tuple[float, ...]
     gravity: float
     fixed_centre: bool
     axes: int
+    softening: float = 0.0
 
 
 def divided(masses: Sequence[float], momenta: Any) -> Any:

@@ -1,9 +1,8 @@
-"""Peers for array systems: leapfrog and a composition in hand-written C, DOP853 with NumPy, REBOUND and OpenMM."""
+"""Peers for array systems: leapfrog and a composition in hand-written C, and OpenMM."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
 from importlib.resources import files
 from typing import Any
 
@@ -16,7 +15,6 @@ from scvi_codegen.methods.leapfrog_stages import kicks_and_drifts
 from scvi_codegen.native import building
 from scvi_codegen.rendering.source import Source
 
-TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 DECLARATIONS = (
     "void leapfrog(int is_field, double *q, double *v, double *work, long n, double strength, double h, long steps, "
     "const double *kicks, const double *drifts, int leaps);"
@@ -68,54 +66,11 @@ def by_hand(case: Case, method: str, order: int, steps: int) -> Contender:
     return _contender(case, method, f"{steps} steps", prepare)
 
 
-def numpy_contenders(case: Case, quick: bool) -> Iterator[Contender]:
-    """Yield SciPy's DOP853 with accelerations by NumPy."""
-    from scipy.integrate import solve_ivp
-
+def rates_of(case: Case) -> Callable[[float, Array], Array]:
+    """Return the right-hand side with accelerations by NumPy, of (q, v) as one array."""
     arrays, size = case.arrays, case.dimension
     assert arrays is not None
-
-    def derivative(t: float, y: Array) -> Array:
-        return np.concatenate([y[size:], arrays.accelerations(y[:size].reshape(arrays.shape)).reshape(-1)])
-
-    def solved(tolerance: float) -> Integrate:
-        start = np.concatenate([case.q[0], case.velocity[0]])
-
-        def integrate() -> Array:
-            end = solve_ivp(derivative, (0.0, case.span), start, method="DOP853", rtol=tolerance, atol=tolerance)
-            final: Array = end.y[:size, -1]
-            return final
-
-        return integrate
-
-    for tolerance in TOLERANCES[: 2 if quick else None]:
-        yield _contender(case, "SciPy DOP853", f"tol={tolerance:.0e}", partial(solved, tolerance))
-
-
-def rebound_contenders(case: Case, quick: bool) -> Iterator[Contender]:
-    """Yield REBOUND's leapfrog and IAS15 for the softened cluster."""
-    import rebound
-
-    assert case.arrays is not None
-    shape = case.arrays.shape
-
-    def prepare(integrator: str, steps: int) -> Integrate:
-        simulation = rebound.Simulation()
-        simulation.softening = float(case.system.defaults[1])
-        for q, v in zip(case.q[0].reshape(shape), case.velocity[0].reshape(shape), strict=True):
-            simulation.add(m=1 / shape[0], x=q[0], y=q[1], z=q[2], vx=v[0], vy=v[1], vz=v[2])
-        simulation.integrator = integrator
-        simulation.dt = case.span / steps
-
-        def integrate() -> Array:
-            simulation.integrate(case.span)
-            return np.array([particle.xyz for particle in simulation.particles]).ravel()
-
-        return integrate
-
-    yield _contender(case, "REBOUND IAS15", "default", partial(prepare, "ias15", 100))
-    for n in step_counts(case, range(2, 4 if quick else 12)):
-        yield _contender(case, "REBOUND leapfrog", f"{n} steps", partial(prepare, "leapfrog", n))
+    return lambda t, y: np.concatenate([y[size:], arrays.accelerations(y[:size].reshape(arrays.shape)).reshape(-1)])
 
 
 def openmm_contenders(case: Case, quick: bool) -> Iterator[Contender]:

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.benchmark.cases.unforced import Array, Case
+from scvi_codegen.benchmark.contenders.dop853 import LOOSE, dop853, start_of
 from scvi_codegen.benchmark.report import Contender
 
 LARGEST_STEP, HALVINGS = 0.02, 6
 """Largest step size, ten times MuJoCo's default, and number of step sizes, each half of the one before."""
 STIFF = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Impedance of stiff equality constraints."""
-TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 INTEGRATORS = ("RK4", "implicitfast", "Euler")
 
 
@@ -132,7 +132,6 @@ def pinocchio_contenders(case: Case, quick: bool) -> Iterator[Contender]:
     (``abaInParallel`` with one thread): a lower bound for any program of C++. The second is run from Python as it is.
     """
     import pinocchio
-    from scipy.integrate import solve_ivp
 
     assert case.mjcf is not None
     began = time.perf_counter()
@@ -148,7 +147,7 @@ def pinocchio_contenders(case: Case, quick: bool) -> Iterator[Contender]:
         return np.concatenate([x[m:], pinocchio.aba(model, data, x[:m], x[m:], zero)])
 
     def runge_kutta(index: int, steps: int) -> Array:
-        x, h = np.concatenate([part[index] for part in case.states]), case.span / steps
+        x, h = start_of(case, index), case.span / steps
         for _ in range(steps):
             a = rates(0.0, x)
             b = rates(0.0, x + h / 2 * a)
@@ -166,18 +165,11 @@ def pinocchio_contenders(case: Case, quick: bool) -> Iterator[Contender]:
 
         return evaluate
 
-    def solved(tolerance: float, index: int) -> Callable[[], Array]:
-        start = np.concatenate([part[index] for part in case.states])
-        how = {"method": "DOP853", "rtol": tolerance, "atol": tolerance}
-        return lambda: np.asarray(solve_ivp(rates, (0.0, case.span), start, **how).y[:m, -1])
-
     ends, starts = lru_cache(maxsize=None)(runge_kutta), len(case.q)
     for steps in step_counts(case.span, quick=quick):
         name, setting = "Pinocchio aba, RK4 (bound)", f"h={case.span / steps:.4g}"
         yield Contender(name, setting, "4 aba a step in C++", seconds, partial(timed, steps), starts=starts)
-    for tolerance in TOLERANCES[: 2 if quick else None]:
-        name, setting = "Pinocchio DOP853", f"tol={tolerance:.0e}"
-        yield Contender(name, setting, "aba from Python", seconds, partial(solved, tolerance), starts=starts)
+    yield from dop853("aba from Python", seconds, case, quick, rates, LOOSE, "Pinocchio DOP853")
 
 
 @contextmanager

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import numpy as np
 import sympy
@@ -18,11 +17,11 @@ from sympy.physics.mechanics import KanesMethod
 from sympy.physics.mechanics.models import n_link_pendulum_on_cart
 
 from scvi_codegen.benchmark.cases.unforced import Array, Case
+from scvi_codegen.benchmark.contenders.dop853 import LOOSE, dop853, start_of
 from scvi_codegen.benchmark.report import Contender
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 
 LINKS = (2, 5, 10, 20)
-TOLERANCES = (1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 ANGLE = 0.3
 """Initial angle of every link, at rest; no force acts on the cart."""
 
@@ -94,16 +93,7 @@ def _by_pydy(method: KanesMethod, values: dict[sympy.Symbol, float]) -> Rates:
 
 
 def _contenders(name: str, case: Case, make: Callable[..., Rates], quick: bool) -> Iterator[Contender]:
-    from scipy.integrate import solve_ivp
-
-    began, m = time.perf_counter(), case.dimension
-    rates, start = make(*_pendulum(m - 1)), np.concatenate([case.q[0], case.velocity[0]])
-    rates(0.0, start)
-    seconds = time.perf_counter() - began
-
-    def prepare(tolerance: float) -> Callable[[int], Callable[[], Any]]:
-        how = {"method": "DOP853", "rtol": tolerance, "atol": tolerance}
-        return lambda _: lambda: solve_ivp(rates, (0.0, case.span), start, **how).y[:m, -1]
-
-    for tolerance in TOLERANCES[: 2 if quick else None]:
-        yield Contender(name, f"tol={tolerance:.0e}", "", seconds, prepare(tolerance), starts=1)
+    began = time.perf_counter()
+    rates = make(*_pendulum(case.dimension - 1))
+    rates(0.0, start_of(case, 0))
+    return dop853("", time.perf_counter() - began, case, quick, rates, LOOSE, name)

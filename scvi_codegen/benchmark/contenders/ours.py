@@ -21,7 +21,6 @@ from scvi_codegen.benchmark.report import OURS, Contender
 from scvi_codegen.benchmark.settings import set_variable
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError
-from scvi_codegen.mechanics.time_transformation import reparametrise
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native import building
@@ -35,9 +34,6 @@ QUICK_TOLERANCES = (1e-8, 1e-10, 1e-12)
 ADAPTIVE_TOLERANCES = (None, 1e-15, 1e-14, 1e-13, 1e-12, 1e-10, 1e-8)
 FIXED = tuple(2.0 ** (k / 2) for k in range(-2, 9))
 """Fixed steps, as multiples of the number of adaptive steps."""
-TRANSFORMED = (0.4, 0.3, 0.2, 0.15, 0.1)
-"""Step sizes of tau for dt = g dtau with the time-rescaling function "frequency"."""
-LAST = 10**15
 LARGEST_NEWTON = 18
 """Largest number of degrees of freedom for which Newton's method is used; beyond, its larger steps take seconds
 each."""
@@ -65,15 +61,15 @@ def our_contenders(case: Case, *, methods: Iterable[Method] = (), quick: bool = 
 
 
 def fixed_contenders(case: Case, counts: Mapping[str | Method, Iterable[int]]) -> list[Contender]:
-    """Return contenders by several methods with numbers of steps, from the velocities of a case."""
+    """Return contenders by several methods with numbers of steps."""
     result = []
     for method, numbers in counts.items():
         stepper, seconds = compiled(case, method)
-        momenta = None if case.size == 2 * case.dimension else momenta_of(stepper, case)
+        momenta = momenta_of(stepper, case) if case.arrays is None and not case.system.constraints else None
         for steps in numbers:
             prepare, name = partial(_fixed, stepper, case, momenta, steps), getattr(method, "name", method)
-            setting = f"h={case.span / steps:.4g}"
-            result.append(Contender(f"{OURS} {name}", setting, "", seconds, prepare, starts=len(case.q)))
+            setting, starts = f"h={case.span / steps:.4g}", len(case.q)
+            result.append(Contender(f"{OURS} {name}", setting, "", seconds, prepare, momenta, starts=starts))
     return result
 
 
@@ -176,57 +172,33 @@ def _prepared_ensemble(stepper: Stepper, case: Case, momenta: Array, count: int,
     return lambda: cast("Array", stepper.integrate_ensemble(case.q, momenta, **arguments).q[-1])
 
 
-def adaptive_contenders(chosen: Case, *, quick: bool) -> list[Contender]:
-    """Return contenders by SVI(8) with adaptive and fixed step size and, for ellipses, with time transformation."""
-    stepper, seconds = compiled(chosen, SVI(8))
-    momenta, span = momenta_of(stepper, chosen), chosen.span
-    adaptive = stepper.integrate(chosen.q[0], momenta[0], t_end=span, check_growth=False).steps
+def adaptive_contenders(case: Case, *, quick: bool) -> list[Contender]:
+    """Return contenders by SVI(8) with adaptive step size at several tolerances, and with fixed steps beside them."""
+    stepper, seconds = compiled(case, SVI(8))
+    momenta = momenta_of(stepper, case)
+    adaptive = stepper.integrate(case.q[0], momenta[0], t_end=case.span, check_growth=False).steps
     counts = [max(1, round(adaptive * factor)) for factor in FIXED[: 1 if quick else None]]
-    settings: list[tuple[str, str, Stepper, Callable[..., Callable[[], Array]], dict[str, Any]]] = [
-        ("controlled", f"tol={each:.0e}" if each else "tol=default", stepper, _to_its_end, {"tolerance": each})
-        for each in ADAPTIVE_TOLERANCES[: 2 if quick else None]
-    ]
-    settings += [("fixed", f"{n} steps", stepper, _by_so_many, {"steps": n}) for n in counts]
-    if "kepler" in chosen.name and not quick:
-        transformed = compile_stepper(reparametrise(chosen.system, "frequency"), SVI(8))
-        settings += [("transformed", f"h={h:g}", transformed, _transformed, {"h": h}) for h in TRANSFORMED]
 
-    def prepare(used: Stepper, start: Callable[..., Callable[[], Array]], how: dict[str, Any], k: int) -> Any:
-        return start(used, chosen.q[k], momenta[k], span, **how)
+    def prepare(tolerance: float | None, index: int) -> Callable[[], Array]:
+        run = stepper.start(case.q[index], momenta[index], t_end=case.span, tolerance=tolerance)
 
-    return [
+        def integrate() -> Array:
+            """Integrate and return the final state alone, as heyoka's propagate_until."""
+            run._run_to_target()
+            return run.q
+
+        return integrate
+
+    controlled = [
         Contender(
-            method=f"{OURS} {mode}",
-            setting=setting,
-            options=f"{used.title}, {' '.join(used.flags)}",
+            method=f"{OURS} adaptive",
+            setting=f"tol={tolerance:.0e}" if tolerance else "tol=default",
+            options=f"{stepper.title}, {' '.join(stepper.flags)}",
             compile_seconds=seconds,
-            prepare=partial(prepare, used, start, how),
+            prepare=partial(prepare, tolerance),
             momenta=momenta,
         )
-        for mode, setting, used, start, how in settings
+        for tolerance in ADAPTIVE_TOLERANCES[: 2 if quick else None]
     ]
-
-
-def _to_its_end(stepper: Stepper, q: Array, p: Array, t_end: float, tolerance: float | None) -> Callable[[], Array]:
-    run = stepper.start(q, p, t_end=t_end, tolerance=tolerance)
-
-    def integrate() -> Array:
-        """Integrate and return the final state alone, as heyoka's propagate_until."""
-        run._run_to_target()
-        return run.q
-
-    return integrate
-
-
-def _by_so_many(stepper: Stepper, q: Array, p: Array, t_end: float, steps: int) -> Callable[[], Array]:
-    run = stepper.start(q, p, h=t_end / steps)
-
-    def integrate() -> Array:
-        run.advance(steps)
-        return run.q
-
-    return integrate
-
-
-def _transformed(stepper: Stepper, q: Array, p: Array, t_end: float, h: float) -> Callable[[], Array]:
-    return lambda: stepper.integrate(q, p, h=h, t_end=t_end, save_every=LAST, check_growth=False).q[-1]
+    fixed = (replace(each, method=f"{OURS} fixed") for each in fixed_contenders(case, {SVI(8): counts}))
+    return [*controlled, *fixed]
