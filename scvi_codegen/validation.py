@@ -185,6 +185,7 @@ MAPPING = ArgumentType(
     "a mapping from names, as {'k': 2.0}",
     lambda value: isinstance(value, Mapping) and all(isinstance(name, str) for name in value),
 )
+MAPPINGS = several("a list of mappings", Mapping)
 NUMBERS = ArgumentType("a list of numbers", lambda value: _is_sequence(value) or isinstance(value, np.ndarray))
 MAPPED = of("a mapping, as {x: 2.0}", Mapping)
 FORMULAS = ArgumentType("a list of formulas", lambda value: _is_sequence(value) or hasattr(value, "shape"))

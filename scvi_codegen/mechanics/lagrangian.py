@@ -15,6 +15,7 @@ from scvi_codegen.validation import (
     FORMULAS,
     MAPPED,
     MAPPING,
+    MAPPINGS,
     NAMES,
     NUMBERS,
     PATH,
@@ -91,6 +92,7 @@ class LagrangianSystem(MechanicalSystem):
         directions=NAMES,
         torques=MAPPING,
         torques_space=MAPPING,
+        point_forces=MAPPINGS,
         parameters=MAPPING,
         forces=MAPPING,
         dissipation=TEXT,
@@ -111,6 +113,7 @@ class LagrangianSystem(MechanicalSystem):
         forces: Mapping[str, Any] | None = None,
         torques: Mapping[str, Sequence[str]] | None = None,
         torques_space: Mapping[str, Sequence[str]] | None = None,
+        point_forces: Sequence[Mapping[str, Any]] = (),
         dissipation: str | None = None,
         damping: str | float | None = None,
         constraints: Sequence[str] = (),
@@ -138,6 +141,9 @@ class LagrangianSystem(MechanicalSystem):
             parameters: default value by name, or of all entries by declaration of an array, ``{"k": 1, "m[N]": 1}``.
             forces: formula by coordinate, in coordinates, velocities and time (:mod:`scvi_codegen.mechanics.forces`).
             torques, torques_space: three formulas by rotation, components in the body frame and in the space frame.
+            point_forces: forces at points, which act on coordinates and rotations by virtual work: ``{"point": [..],
+                "force": [..]}``, three formulas each in space, or of a point of a body, ``{"body": "R", "point": [0, 0,
+                "l"], "origin": ["x", "y", "z"], "force": [..], "frame": "body"}``.
             dissipation: Rayleigh's function D(q, q_dot, t), whose forces -dD/dq_dot are added to them.
             damping: damping rate of all momenta, a number or a formula of parameters
                 (:mod:`scvi_codegen.mechanics.forces`).
@@ -161,7 +167,7 @@ class LagrangianSystem(MechanicalSystem):
         arguments = {"name": name, "coordinates": coordinates, "lagrangian": lagrangian, "parameters": parameters}
         acting = {"forces": forces, "dissipation": dissipation, "damping": damping, "constraints": constraints}
         acting |= {"torques": torques, "torques_space": torques_space}
-        turning = {"rotations": rotations, "directions": directions}
+        turning: dict[str, Any] = {"rotations": rotations, "directions": directions, "point_forces": point_forces}
         return cls._of_text(arguments | acting | {"inputs": inputs, "tables": tables} | turning)
 
     @classmethod

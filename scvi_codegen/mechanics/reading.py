@@ -27,6 +27,7 @@ from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.definition_checks import warn_of_mistakes
 from scvi_codegen.mechanics.forces import constraints_of, damping_rate, dissipative_forces, forces_by_coordinate
 from scvi_codegen.mechanics.rotations.frames import rotations_of_frames
+from scvi_codegen.mechanics.rotations.points import forces_at_points
 from scvi_codegen.mechanics.system import are_arrays
 
 Read = Callable[[Any], Expr]
@@ -45,6 +46,8 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
     of_momenta = "momenta" in arguments
     turning = [arguments.get(each) for each in TURNING]
     if are_arrays(ordinary, parameters or (), arguments["tables"], *(each or () for each in turning)):
+        if arguments.get("point_forces"):
+            raise SystemDefinitionError("point_forces of arrays are not supported: give torques and forces by index")
         return _of_arrays(cls, arrays_from_text(arguments)), True
     names = RotationNames.declared(*turning, momentum=of_momenta)
     coordinates = (*ordinary, *names.coordinates)
@@ -66,9 +69,12 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
     function = "hamiltonian" if of_momenta else "lagrangian"
     constants = tuple(symbols[each] for each in values)
     applied, friction = arguments["forces"], arguments.get("dissipation")
-    if names.members:
+    at_points = arguments.get("point_forces") or ()
+    if names.members or at_points:
         torques, torques_space = (arguments.get(each) for each in TORQUES)
-        forces: Any = names.forces_by_name(ordinary, read, applied, torques, torques_space, friction)
+        others = forces_at_points(at_points, ordinary, names.members, read)
+        forces: Any = names.forces_by_name(ordinary, read, applied, torques, torques_space, friction, others)
+        forces = forces if names.members else names.forces(forces, coordinates)
     else:
         forces = _forces(variables, applied, friction, read)
     constraints = constraints_of(arguments["constraints"], read)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from scvi_codegen.errors import ModelFileError
+from scvi_codegen.errors import ModelFileError, StateError
 from scvi_codegen.formulas.symbols import input_parameters
 from scvi_codegen.lowering.arrays import check_solver, one_coordinate
 from scvi_codegen.mechanics.arrays.rolling import unroll_sums
@@ -51,7 +51,9 @@ class Model(TimeSpan):
         system: the mechanical system, with the parameter values of the run as its defaults.
         method: its discretisation; a name, ``"svi:8"``, is converted to the method.
         solver: of the stage equations, as of :func:`~scvi_codegen.compile_stepper`.
-        q: (m,) initial coordinates, or all variables of a first-order system, by name or in order, without p.
+        q: (m,) initial coordinates, or all variables of a first-order system, by name or in order, without p; with
+            rotations also by name, as of :meth:`Stepper.integrate`: attitudes as quaternions, matrices, Euler angles,
+            or axis and angle.
         p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
         velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
         h, tolerance, error, span, steps, save_every, t, time_transformation: as of
@@ -89,6 +91,7 @@ class Model(TimeSpan):
             for name, half in zip(("q", "p"), self.system.halves(self.q), strict=True):
                 object.__setattr__(self, name, half)
         if arrays is None:
+            self._take_attitudes()
             check_one_of("p", self.p, "velocity (q_dot)", self.velocity)
             for name in STATE:
                 if (vector := getattr(self, name)) is not None:
@@ -108,6 +111,19 @@ class Model(TimeSpan):
             from scvi_codegen.models.model_files.input_tables import checked_tables  # not needed for reading a model
 
             object.__setattr__(self, "inputs", checked_tables(self.system, self.inputs))
+
+    def _take_attitudes(self) -> None:
+        """Replace a state by name of rotations, directions and spins by that of all coordinates."""
+        if not (self.system.rotations and isinstance(self.q, Mapping)):
+            return
+        from scvi_codegen.runtime.rotations.states import state_by_name  # not needed for other systems
+
+        try:
+            state = state_by_name(self.system, self.q, self.p, self.velocity)
+        except StateError as error:
+            raise ModelFileError(str(error)) from error
+        for name, vector in zip(STATE, state, strict=True):
+            object.__setattr__(self, name, vector)
 
     def _check_arrays(self) -> None:
         if self.solver != "auto":

@@ -106,3 +106,33 @@ def test_declarations_in_data_are_checked(wrong):
     with pytest.raises(ValueError, match="it must declare some of the coordinates"):
         Interface.from_record(record)
     assert Interface.from_record(interface.to_record()) == interface
+
+
+ANGLES = [0.3, 0.5, -0.2]
+c, s = np.cos(ANGLES), np.sin(ANGLES)
+MATRIX = (
+    np.array([[c[0], -s[0], 0], [s[0], c[0], 0], [0, 0, 1]])
+    @ np.array([[1, 0, 0], [0, c[1], -s[1]], [0, s[1], c[1]]])
+    @ np.array([[c[2], -s[2], 0], [s[2], c[2], 0], [0, 0, 1]])
+)
+
+
+@pytest.mark.parametrize("attitude", [MATRIX, {"euler": "ZXZ", "angles": ANGLES}])
+def test_models_in_python_take_attitudes(attitude):
+    system = parse_model(TOP).system
+    model = sc.Model(
+        system=system,
+        method="svi:3",
+        q={"x": 0.1, "R": attitude},
+        velocity={"x": 0.0, "omega": [0.1, 0.0, 2.0]},
+        h=0.05,
+        steps=20,
+    )
+    run = model.integrate()
+    assert np.abs(run.rotation()[0] - MATRIX).max() < 1e-15
+    np.testing.assert_allclose(run.angular_velocity()[0], [0.1, 0.0, 2.0], atol=1e-15)
+    assert np.array_equal(parse_model(dump_model(model)).integrate().q, run.q)
+    with pytest.raises(ModelFileError, match="the matrix of 'R' is not a rotation"):
+        sc.Model(
+            system=system, method="svi:3", q={"x": 0, "R": np.ones((3, 3))}, velocity=None, p=[0] * 5, h=1, steps=1
+        )

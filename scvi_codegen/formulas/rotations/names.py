@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -135,8 +135,9 @@ class RotationNames:
         torques: Mapping[str, Sequence[Any]] | None,
         torques_space: Mapping[str, Sequence[Any]] | None,
         dissipation: Any,
+        others: Iterable[tuple[str, Matrix]] = (),
     ) -> Forces:
-        """Return the forces by name of a coordinate (one), rotation or direction (three components)."""
+        """Return the forces by name of a coordinate (one), rotation or direction (three components), and ``others``."""
         rotating = {member.name: member for member in self.rotations}
         pointing = [member.name for member in self.members if isinstance(member, Direction)]
         total: dict[str, Matrix] = {}
@@ -161,12 +162,16 @@ class RotationNames:
                 if by_name is torques_space:
                     force = Matrix(3, 3, rotating[name].entries).T * force
                 add(name, force)
-        if dissipation is not None:
-            for name, rates in self._rates(coordinates).items():
-                friction = gradient(read(dissipation), rates)
-                if friction:
-                    add(name, -Matrix([friction.get(i, S.Zero) for i in range(len(rates))]))
+        friction = () if dissipation is None else self._friction(read(dissipation), coordinates)
+        for name, force in (*others, *friction):
+            add(name, force)
         return tuple((name, tuple(force)) for name, force in total.items())
+
+    def _friction(self, dissipation: Expr, coordinates: Sequence[str]) -> Iterator[tuple[str, Matrix]]:
+        """Yield the forces of Rayleigh's function."""
+        for name, rates in self._rates(coordinates).items():
+            if friction := gradient(dissipation, rates):
+                yield name, -Matrix([friction.get(i, S.Zero) for i in range(len(rates))])
 
     def fields(
         self,

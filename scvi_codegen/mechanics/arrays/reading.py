@@ -21,11 +21,11 @@ from scvi_codegen.mechanics.arrays.system import ArrayHamiltonian, ArrayLagrangi
 from scvi_codegen.mechanics.arrays.terms import friction, momenta_of, substituted, table_of
 from scvi_codegen.mechanics.forces import damping_rate
 
-LISTED = ("coordinates", "directions", "spins", "momenta", "constraints", "inputs", "tables")
+LISTED = ("coordinates", "directions", "spins", "momenta", "constraints", "inputs", "tables", "point_forces")
 """Arguments that are lists."""
 DEFINING = (
     *("coordinates", "rotations", "directions", "spins", "momenta", "lagrangian", "hamiltonian", "dissipation"),
-    *("damping", "constraints", "inputs", "tables", "forces", "torques", "torques_space"),
+    *("damping", "constraints", "inputs", "tables", "forces", "torques", "torques_space", "point_forces"),
 )
 """Arguments that define a system, in the order of model files."""
 

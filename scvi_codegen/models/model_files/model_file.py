@@ -12,6 +12,7 @@
     # constraints = ["x**2 + y**2 = l**2"]              # g(q, t) = 0, or equations
     # inputs = ["u"]                                    # functions of time given as data
     # rotations = { R = "omega" }                       # rigid bodies: R_11, .., omega_1, ..; directions, spins: names
+    # point_forces = [{ body = "R", point = ["0", "0", "l"], force = ["F", "0", "0"] }]
 
     [forces]                                            # on coordinates; default: 0
     q = "F*cos(w*t)"
@@ -113,7 +114,10 @@ from scvi_codegen.validation import PATH, checks_arguments, of
 if TYPE_CHECKING:
     from scvi_codegen.models.model_files.input_tables import InputTable
 
-SYSTEM_KEYS = ("name", "coordinates", *TURNING, "momenta", *FORMULAS, "inputs", "catalogue", "time_transformation")
+SYSTEM_KEYS = (
+    *("name", "coordinates", *TURNING, "momenta", *FORMULAS, "inputs", "catalogue", "time_transformation"),
+    "point_forces",
+)
 RUN_KEYS = ("step", "tolerance", "error", "controller", "span", "steps", "save_every")
 KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
 SECTIONS = (

@@ -239,7 +239,7 @@ def _is_optional(document: Document, key: str) -> bool:
 def check_used(document: Document, parameters: Section) -> None:
     """Raise an error for an added parameter that no formula contains."""
     section = document["system"]
-    formulas = [section.get(key, "") for key in (*FORMULAS, "time_transformation")]
+    formulas = [section.get(key, "") for key in (*FORMULAS, "time_transformation", "point_forces")]
     acting = [formula for name in ("forces", *TORQUES) for formula in document.get(name, {}).values()]
     formula = " ".join(map(str, (*formulas, *acting, *document.get("events", ()))))
     for name in parameters:
@@ -315,6 +315,7 @@ def read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
             "[system] has momenta and a lagrangian: momenta are names for a hamiltonian; leave them out"
         )
     arguments["lagrangian"] = text_of(section, "lagrangian", "[system]")
+    arguments["point_forces"] = section.get("point_forces", ())
     arguments["dissipation"] = text_of(section, "dissipation", "[system]") if "dissipation" in section else None
     return in_section("[system]", lambda: LagrangianSystem.from_text(**arguments, constraints=constraints))
 

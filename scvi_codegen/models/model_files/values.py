@@ -130,21 +130,21 @@ def _by_coordinate(section: Section, system: MechanicalSystem) -> Section:
 
     That of a first-order system is divided into coordinates and the variables in the place of momenta.
     """
-    from scvi_codegen.runtime.rotations.states import members_of, state_of  # not needed for other systems
+    from scvi_codegen.runtime.rotations.states import state_by_name  # not needed for other systems
 
     q = section.get("q")
     if isinstance(system, FirstOrderSystem) and q is not None and section.keys().isdisjoint(("p", "q_dot")):
         halves = in_section("[initial]", lambda: system.halves(q))
         return {**section, **{key: list(half) for key, half in zip(("q", "p"), halves, strict=True)}}
-    members = members_of(system.dimension, [each.declaration for each in system.rotations])
-    shapes = [(array.name, array.shape({})) for array in system.arrays if array.axes]
-    turning = {*(member.name for member in members), *(array.name for array in system.arrays if array.letters)}
-    if not isinstance(q, dict) or turning.isdisjoint(q):
+    if not system.rotations:
         return section
-    names = [coordinate.name for coordinate in system.coordinates]
-    state = in_section("[initial]", lambda: state_of(names, members, q, section.get("p"), section.get("q_dot"), shapes))
-    vectors = {key: value for key, value in zip(("q", "p", "q_dot"), state, strict=True) if value is not None}
-    return {**section, **{key: np.asarray(value, dtype=float).tolist() for key, value in vectors.items()}}
+    given = [section.get(key) for key in STATE]
+    state = in_section("[initial]", lambda: state_by_name(system, *given))
+    vectors = {key: value for key, value in zip(STATE, state, strict=True) if value is not None}
+    return {
+        **section,
+        **{key: value if value is section.get(key) else value.tolist() for key, value in vectors.items()},
+    }
 
 
 def _values_of_arrays(

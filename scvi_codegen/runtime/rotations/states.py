@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,9 @@ from scvi_codegen.runtime.rotations.attitudes import (
     quaternions,
     velocities_of_body,
 )
+
+if TYPE_CHECKING:
+    from scvi_codegen.mechanics.system import MechanicalSystem
 
 Array = NDArray[np.float64]
 
@@ -180,6 +183,18 @@ def state_of(
     if isinstance(p, Mapping):
         state, p = np.broadcast_arrays(state, _joined(_moving(ordinary, members, p, own, "p")))
     return state, p, velocity
+
+
+def state_by_name(system: MechanicalSystem, q: Any, p: Any, velocity: Any) -> tuple[Any, Any, Any]:
+    """Return the state of a system as of :func:`state_of`; as it is if q names no rotation, direction or spin."""
+    members = members_of(system.dimension, [each.declaration for each in system.rotations])
+    shapes = [(array.name, array.shape({})) for array in system.arrays if array.axes]
+    turning = {*(member.name for member in members), *(array.name for array in system.arrays if array.letters)}
+    if not isinstance(q, Mapping) or turning.isdisjoint(q):
+        return q, p, velocity
+    names = [coordinate.name for coordinate in system.coordinates]
+    q, p, velocity = state_of(names, members, q, p, velocity, shapes)
+    return q, *(None if each is None else np.asarray(each, dtype=float) for each in (p, velocity))
 
 
 def _coordinates(member: Member, q: Mapping[str, Any]) -> tuple[Array, Array]:
