@@ -135,7 +135,7 @@ def interface_of_sizes(interface: Interface, sizes: Mapping[str, int]) -> Interf
     count = len(layout.coordinates)
     momenta = [(array.name, array.shape(sizes)) for array in layout.momenta]
     of_fields = [
-        np.broadcast_to(layout.data.get(name, default), shape).ravel()
+        np.broadcast_to(data if np.shape(data := layout.data.get(name)) == shape else default, shape).ravel()
         for (name, shape), default in zip(shapes[count:], layout.field_defaults, strict=True)
     ]
     names: dict[str, Any] = {

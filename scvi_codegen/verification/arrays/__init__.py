@@ -58,6 +58,8 @@ def verify_arrays(
     Properties are measured on a few indices of the arrays first, then at full size; adaptive steps, constraints, and
     systems without an integrator for arrays of any size with known sizes only.
     """
+    if q is None and p is None and system.mesh is not None:
+        q, p, h = _state_of_fields(system.mesh, method, h)
     if q is None or h is None:
         raise StateError(f"verify requires q and h for arrays of '{system.name}': their shapes determine the sizes")
     if stepper is not None and not stepper.any_size:
@@ -99,6 +101,13 @@ def verify_arrays(
         checks=checks,
         seconds=time.perf_counter() - began,
     )
+
+
+def _state_of_fields(mesh: Any, method: Method | str, h: float | None) -> tuple[Any, Any, float]:
+    """Return random fields at the points of a mesh, their momenta, and a step size at which iterations converge."""
+    random = np.random.default_rng(0)
+    q, p = ({each: random.uniform(-0.5, 0.5, mesh.weights.shape) for each in mesh.field_system.fields} for _ in "qp")
+    return q, {each: mesh.weights * values for each, values in p.items()}, h or min(mesh.largest_step(method) / 4, 0.05)
 
 
 def _subject(start: WholeStart) -> SystemUnderTest:
