@@ -90,8 +90,8 @@ def verify(
         tolerance: also measure runs with adaptive step size and this relative local error; 0: round-off.
         solver, flags: as for ``compile_stepper``.
         velocity, parameters, tables: only for arrays of run-time sizes, which also need q and h (fields on a mesh do
-            not), as of :meth:`Stepper.integrate`: properties are measured on a few indices of the arrays first, then at full
-            size; the state of the certificate is that of the few indices.
+            not), as of :meth:`Stepper.integrate`: properties are measured on a few indices of the arrays first, then at
+            full size; the state of the certificate is that of the few indices.
 
     Returns:
         The certificate. The properties follow from the method (order, symmetry, symplecticity) and the system (momentum

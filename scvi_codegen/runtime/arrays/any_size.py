@@ -134,10 +134,10 @@ def interface_of_sizes(interface: Interface, sizes: Mapping[str, int]) -> Interf
     shapes = [(array.name, array.shape(sizes)) for array in (*layout.coordinates, *layout.fields)]
     count = len(layout.coordinates)
     momenta = [(array.name, array.shape(sizes)) for array in layout.momenta]
-    of_fields = [
-        np.broadcast_to(data if np.shape(data := layout.data.get(name)) == shape else default, shape).ravel()
-        for (name, shape), default in zip(shapes[count:], layout.field_defaults, strict=True)
-    ]
+    of_fields = []
+    for (name, shape), default in zip(shapes[count:], layout.field_defaults, strict=True):
+        values = np.asarray(layout.data.get(name, default))
+        of_fields.append(np.broadcast_to(values if values.shape in ((), shape) else default, shape).ravel())
     names: dict[str, Any] = {
         "coordinates": EntryNames(shapes[:count]),
         "parameters": EntryNames([*((name, ()) for name in interface.parameters), *shapes[count:]]),
