@@ -13,15 +13,9 @@ from scvi_codegen.benchmark.cases.fields import FIELDS, FieldCase, our_fields
 from scvi_codegen.benchmark.cases.large import atoms, bodies, field, ring
 from scvi_codegen.benchmark.cases.references import Reference, adaptive_reference, rms_error
 from scvi_codegen.benchmark.cases.robots import ROBOTS
-from scvi_codegen.benchmark.cases.rods import (
-    CONSTRAINED_CASES,
-    FORCED_CASES,
-    angles_of,
-    positions_of,
-    rods_in_positions,
-)
+from scvi_codegen.benchmark.cases.rods import FORCED_CASES
 from scvi_codegen.benchmark.cases.rotations import BODIES, FEW_BODIES, ROTATIONS, tumbling
-from scvi_codegen.benchmark.cases.unforced import CASES, STATES, Array, Case, case
+from scvi_codegen.benchmark.cases.unforced import CASES, STATES, Case, case
 from scvi_codegen.benchmark.comparison import Race
 from scvi_codegen.benchmark.contenders.arrays import step_counts
 from scvi_codegen.benchmark.contenders.mechanisms import LINKS, links
@@ -35,7 +29,6 @@ from scvi_codegen.benchmark.contenders.ours import (
 from scvi_codegen.benchmark.contenders.taylor import heyoka_contenders, heyoka_ensembles
 from scvi_codegen.benchmark.report import Contender
 from scvi_codegen.benchmark.settings import Plan
-from scvi_codegen.methods import as_method
 from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.method import Method
 
@@ -54,26 +47,6 @@ def _single(make: Callable[[], Case], plan: Plan) -> Race:
     """Return single trajectories at advised step sizes."""
     chosen = _shortened(make(), plan)
     return Race(case=chosen, ours=partial(our_contenders, chosen, methods=plan.methods, quick=plan.quick))
-
-
-def _constrained(make: Callable[[], Case], plan: Plan) -> Race:
-    """Return rods as constraints in this package, and everybody in the angles of the rods."""
-    angles = _shortened(make(), plan)
-    q = positions_of(angles.q)
-    positions = replace(angles, system=rods_in_positions(angles.dimension), q=q, velocity=0.0 * q)
-    methods = [as_method(f"svi:{degree}", positions.system) for degree in ((6,) if plan.quick else (6, 8))]
-
-    def in_angles(prepare: Callable[[int], Callable[[], Array]], index: int) -> Callable[[], Callable[[], Array]]:
-        integrate = prepare(index)
-        return lambda: partial(angles_of, integrate())
-
-    def ours() -> Iterable[Contender]:
-        for each in our_contenders(positions, methods=methods, quick=plan.quick):
-            yield replace(each, prepare=partial(in_angles, each.prepare), momenta=None)
-        for each in our_contenders(angles, quick=plan.quick):
-            yield replace(each, method=f"{each.method}, angles", momenta=None)
-
-    return Race(case=angles, ours=ours)
 
 
 def _ensemble(few: Case, many: Case, plan: Plan) -> Race:
@@ -172,7 +145,6 @@ BUILDERS: dict[str, Callable[[Plan], Race]] = {
     **{name: partial(_single, make) for name, make in CASES.items()},
     **{f"ensemble:{name}": partial(_copies, name) for name in ENSEMBLES},
     **{name: partial(_single, make) for name, make in FORCED_CASES.items()},
-    **{name: partial(_constrained, make) for name, make in CONSTRAINED_CASES.items()},
     **{f"adaptive:{name}": partial(_adaptive, name) for name in ADAPTIVE_CASES},
     **{f"rotations:{name}": partial(_rotation, name) for name in ROTATIONS},
     "rotations:bodies": _tumbling,

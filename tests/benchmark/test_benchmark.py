@@ -10,27 +10,18 @@ import numpy as np
 import pytest
 import sympy
 from mpmath import mp
-from scipy.integrate import solve_ivp
 
 from scvi_codegen import benchmark as bench
 from scvi_codegen.benchmark import comparison, report, tables
 from scvi_codegen.benchmark.cases import unforced
 from scvi_codegen.benchmark.cases.adaptive import adaptive_case
 from scvi_codegen.benchmark.cases.references import Reference, final_states, gauss_tables, reference, rms_error
-from scvi_codegen.benchmark.cases.rods import (
-    CONSTRAINED_CASES,
-    FORCED_CASES,
-    angles_of,
-    positions_of,
-    rod_accelerations,
-    rods_in_positions,
-)
+from scvi_codegen.benchmark.cases.rods import FORCED_CASES
 from scvi_codegen.benchmark.contenders import ours, peers
 from scvi_codegen.benchmark.contenders.ours import our_ensembles
 from scvi_codegen.benchmark.contenders.tracing import rates_text
 from scvi_codegen.benchmark.report import FLOOR, Contender, Point, ResultTable, common_error, frontier, time_at
 from scvi_codegen.benchmark.tables import drift_row, fitted_rate
-from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, SystemDefinitionError
 from scvi_codegen.methods import SVI
 from scvi_codegen.native import building
@@ -83,25 +74,6 @@ class TestCases:
         masses, others, forces = terms(*x, t, *system.defaults)
         assert mp.norm(masses * mp.matrix(accelerations) + others - forces) < 1e-12 * (1 + mp.norm(forces))
         assert name not in FORCED_CASES or any(force != 0 for force in system.forces)
-
-    @pytest.mark.parametrize("name", ["pendulum", "double-pendulum", "chain:5"])
-    def test_rods_in_angles_obey_their_lagrangian_and_move_as_the_constraints_do(self, name):
-        angles = CONSTRAINED_CASES[f"constrained:{name}"]()
-        q = positions_of(angles.q)
-        assert np.abs(angles_of(q) - angles.q).max() < 1e-15
-        stepper = compile_stepper(rods_in_positions(angles.dimension), "svi:4")
-        end = stepper.integrate(*stepper.project(q[0]), h=0.02, steps=50).q[-1]
-        accelerations = partial(rod_accelerations, of=angles.parameters, functions=np)
-        start = np.concatenate([angles.q[0], angles.velocity[0]])
-        exact = solve_ivp(
-            lambda t, x: [*x[len(x) // 2 :], *accelerations(x[: len(x) // 2], x[len(x) // 2 :])],
-            (0.0, 1.0),
-            start,
-            method="DOP853",
-            rtol=1e-12,
-            atol=1e-14,
-        ).y[: len(start) // 2, -1]
-        assert np.abs(angles_of(end) - exact).max() < 1e-10
 
     def test_the_formulation_in_momenta_agrees_with_the_one_in_velocities(self):
         chosen = unforced.case("relativistic-particle")
@@ -467,9 +439,9 @@ class TestDrift:
 class TestTables:
     @pytest.mark.full
     @needs_extended
-    def test_forced_and_constrained_problems_are_measured_at_their_errors(self, monkeypatch):
+    def test_forced_problems_are_measured_at_their_errors(self, monkeypatch):
         monkeypatch.setattr(ours, "QUICK_TOLERANCES", (1e-6,))
-        for name, count in (("forced:chain:5", 1), ("constrained:pendulum", 2)):
+        for name, count in (("forced:chain:5", 1),):
             plan = bench.Plan(peers=("scipy",), repeats=1, quick=True)
             found = [each for each in bench.SECTIONS[name](plan, lambda text: None).measurements if not each.failure]
             own = [each for each in found if each.method.startswith("scvi-codegen")]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ def _case(
     velocity: Array,
     span: float,
     longest: float,
-    accelerations: Callable[[Array], Array],
     by_hand: tuple[int, int, float] | None = None,
     bodies: Bodies | None = None,
     **definition: Any,
@@ -36,18 +34,13 @@ def _case(
         step=longest,
         fine=longest,
         bodies=bodies,
-        arrays=Arrays(shape=q.shape, accelerations=accelerations, by_hand=by_hand),
+        arrays=Arrays(shape=q.shape, by_hand=by_hand),
     )
 
 
 def ring(count: int, span: float) -> Case:
     """Return a Fermi-Pasta-Ulam-Tsingou ring with random velocities."""
     beta, numbers = 0.25, np.random.default_rng(SEED)
-
-    def accelerations(q: Array) -> Array:
-        d = np.roll(q, -1) - q
-        pull = d + beta * d**3
-        return pull - np.roll(pull, 1)
 
     return _case(
         "ring",
@@ -58,7 +51,6 @@ def ring(count: int, span: float) -> Case:
         velocity=numbers.normal(size=count),
         span=span,
         longest=0.4,
-        accelerations=accelerations,
         by_hand=(0, count, beta),
     )
 
@@ -68,11 +60,6 @@ def field(side: int, span: float) -> Case:
     dx = 0.1
     x = dx * (np.arange(side) - side // 2)
     bump = 2.0 * np.exp(-(x[:, np.newaxis] ** 2 + x**2) / 4.0)
-
-    def accelerations(u: Array) -> Array:
-        around = sum(np.roll(u, shift, axis) for shift in (1, -1) for axis in (0, 1))
-        result: Array = (around - 4.0 * u) / dx**2 - np.sin(u)
-        return result
 
     return _case(
         "field",
@@ -84,7 +71,6 @@ def field(side: int, span: float) -> Case:
         velocity=np.zeros((side, side)),
         span=span,
         longest=0.06,
-        accelerations=accelerations,
         by_hand=(1, side, 1 / dx**2),
     )
 
@@ -92,12 +78,6 @@ def field(side: int, span: float) -> Case:
 def bodies(count: int, span: float) -> Case:
     """Return a cluster with softened gravity."""
     softening, numbers = 0.1, np.random.default_rng(SEED)
-
-    def accelerations(r: Array) -> Array:
-        d = r[np.newaxis] - r[:, np.newaxis]
-        cube = (np.sum(d**2, axis=-1) + softening**2) ** -1.5
-        result: Array = np.einsum("ij,ijk->ik", cube, d) / count
-        return result
 
     return _case(
         "bodies",
@@ -109,7 +89,6 @@ def bodies(count: int, span: float) -> Case:
         velocity=0.4 * numbers.normal(size=(count, 3)),
         span=span,
         longest=0.25,
-        accelerations=accelerations,
         bodies=Bodies(masses=(1 / count,) * count, gravity=1.0, fixed_centre=False, axes=3, softening=softening),
     )
 
@@ -118,13 +97,6 @@ def atoms(cells: int, span: float) -> Case:
     """Return a crystal of argon (face-centred cubic, free surfaces), slightly compressed, with random velocities."""
     corner = np.array([[0.0, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0.5]])
     q = SPACING * np.concatenate([corner + np.array(cell) for cell in np.ndindex(cells, cells, cells)])
-
-    def accelerations(r: Array) -> Array:
-        d = r[np.newaxis] - r[:, np.newaxis]
-        square = np.sum(d**2, axis=-1)
-        np.fill_diagonal(square, np.inf)
-        result: Array = -np.einsum("ij,ijk->ik", 24.0 * (2.0 * square**-7 - square**-4), d)
-        return result
 
     return _case(
         "atoms",
@@ -135,5 +107,4 @@ def atoms(cells: int, span: float) -> Case:
         velocity=0.5 * np.random.default_rng(SEED).normal(size=q.shape),
         span=span,
         longest=0.05,
-        accelerations=accelerations,
     )

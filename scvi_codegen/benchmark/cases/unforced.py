@@ -109,12 +109,10 @@ class Arrays:
 
     Attributes:
         shape: shape of its array.
-        accelerations: by NumPy, for SciPy's DOP853.
         by_hand: (is a field, length of an axis, strength) for the hand-written C.
     """
 
     shape: tuple[int, ...]
-    accelerations: Callable[[Array], Array]
     by_hand: tuple[int, int, float] | None = None
 
 

@@ -66,13 +66,6 @@ def by_hand(case: Case, method: str, order: int, steps: int) -> Contender:
     return _contender(case, method, f"{steps} steps", prepare)
 
 
-def rates_of(case: Case) -> Callable[[float, Array], Array]:
-    """Return the right-hand side with accelerations by NumPy, of (q, v) as one array."""
-    arrays, size = case.arrays, case.dimension
-    assert arrays is not None
-    return lambda t, y: np.concatenate([y[size:], arrays.accelerations(y[:size].reshape(arrays.shape)).reshape(-1)])
-
-
 def openmm_contenders(case: Case, quick: bool) -> Iterator[Contender]:
     """Yield OpenMM's Verlet integrator for the crystal."""
     for name in PLATFORMS:
@@ -105,7 +98,8 @@ def openmm_contender(case: Case, name: str, steps: int) -> Contender:
 
     def prepare() -> Integrate:
         context.setPositions(q)
-        context.setVelocities(v - h / 2 * arrays.accelerations(q))
+        forces: Any = context.getState(forces=True).getForces(asNumpy=True)._value
+        context.setVelocities(v - h / 2 * forces)
         return integrate
 
     def integrate() -> Array:

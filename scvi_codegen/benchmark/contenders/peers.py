@@ -21,7 +21,7 @@ import numpy as np
 
 from scvi_codegen.benchmark.cases.unforced import Array, Case
 from scvi_codegen.benchmark.contenders import arrays, pdes
-from scvi_codegen.benchmark.contenders.dop853 import LOOSE, absolute_tolerance, by_tolerance, dop853, start_of
+from scvi_codegen.benchmark.contenders.dop853 import absolute_tolerance, by_tolerance, dop853, start_of
 from scvi_codegen.benchmark.contenders.engines import mujoco_contenders, pinocchio_contenders
 from scvi_codegen.benchmark.contenders.mechanisms import lambdify_contenders, pydy_contenders
 from scvi_codegen.benchmark.contenders.taylor import heyoka_contenders
@@ -138,9 +138,6 @@ def _cyrk(case: Case, quick: bool) -> Iterator[Contender]:
 
 
 def _scipy(case: Case, quick: bool) -> Iterator[Contender]:
-    if case.arrays is not None:
-        yield from dop853("accelerations by NumPy", 0.0, case, quick, arrays.rates_of(case), LOOSE)
-        return
     began = time.perf_counter()
     plain, size = _right_hand_side(case), case.size
     fast, options = plain, "right-hand side in Python"
@@ -184,11 +181,7 @@ PEERS = {
         suits=lambda case: case.mjcf is not None and case.size == 2 * case.dimension and not case.system.constraints,
     ),
     "cyrk": Peer(modules=("CyRK", "numba"), contenders=_cyrk, suits=_solvable),
-    "scipy": Peer(
-        modules=("scipy",),
-        contenders=_scipy,
-        suits=lambda case: bool(case.formulations) or case.arrays is not None,
-    ),
+    "scipy": Peer(modules=("scipy",), contenders=_scipy, suits=_solvable),
     "py-pde": Peer(modules=("pde", "numba"), contenders=pdes.pde_contenders, suits=_field),
     "fft": Peer(modules=("scipy",), contenders=pdes.fft_contenders, suits=_field),
     "numba": Peer(modules=("numba",), contenders=pdes.numba_contenders, suits=_field),

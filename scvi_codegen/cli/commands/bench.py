@@ -36,14 +36,13 @@ def bench(
       planar-pendulum, duffing, kepler:0.2, kepler:0.5, henon-heiles, outer-solar-system, double-pendulum,
       relativistic-particle, fput-chain:8, fput-chain:64, fput-chain:256    single trajectories
       forced:double-pendulum, :chain:5                                      friction and driving forces
-      constrained:pendulum, :double-pendulum, :chain:5                      constraints; peers in angles
       ensemble:planar-pendulum, :kepler:0.2, :outer-solar-system            64 trajectories at once
       adaptive:kepler:0.9, ..   adaptive and fixed step size; heyoka and IAS15
       rotations:free-top, :heavy-top, :dumbbell, :bodies                    rigid bodies; heyoka, MuJoCo
       robots:chain:2, :5, :10, :30, :quadruped, :four-bar                   multibody systems; MuJoCo, Pinocchio
       mechanisms:2, :5, :10, :20                                            SymPy mechanisms; lambdify and PyDy
       fields:breather, :wave-2d, :schroedinger                              partial differential equations; py-pde
-      lattices:ring:1000, ..    array systems; C by hand, NumPy, REBOUND, OpenMM
+      lattices:ring:1000, ..    array systems; C by hand, REBOUND, OpenMM
       drift                     energy over ten million steps
       first-step                time from text to the first step
 
