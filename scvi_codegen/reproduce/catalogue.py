@@ -9,18 +9,17 @@ from scvi_codegen.reproduce import (
     kepler_figures,
     oscillator_figures,
     refinement_figures,
-    tableaux,
 )
 from scvi_codegen.reproduce.experiment import Experiment
 
 ORDER = """
-    table-1 table-2 table-3 figure-1 figure-3 figure-4 figure-5 figure-6 figure-7 figure-8
-    figure-9 figure-10 table-6 figure-11 figure-12 table-7
+    figure-1 figure-3 figure-4 figure-5 figure-6 figure-7 figure-8
+    figure-9 figure-10 figure-11 figure-12
     figure-13 figure-14 figure-15 figure-16 figure-17 figure-18 figure-19 figure-20 table-8 table-9
     figure-21 figure-22 figure-23 figure-24 figure-25 figure-26 figure-27 figure-28 figure-29 figure-30
     correction claims
 """
-MODULES = (tableaux, kepler_figures, oscillator_figures, refinement_figures, iterations, correction, claims)
+MODULES = (kepler_figures, oscillator_figures, refinement_figures, iterations, correction, claims)
 
 
 def _catalogue() -> dict[str, Experiment]:

@@ -36,8 +36,6 @@ COLORS = {
 """Colours by scheme, the same in every picture."""
 MOST_POINTS = 1500
 BINS = 400
-HIGHEST = 10.0
-"""Upper limit of the errors that a panel with a floor shows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,7 +152,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         axes.ticklabel_format(useOffset=False)
     if panel.floor:
         bottom, top = axes.get_ylim()
-        axes.set_ylim(max(bottom, panel.floor / 100), min(top, HIGHEST))
+        axes.set_ylim(max(bottom, panel.floor / 100), min(top, 10.0))
         axes.axhspan(panel.floor / 1e9, panel.floor, color=COLORS["exact"], alpha=0.15, linewidth=0)
     if panel.equal:
         axes.set_aspect("equal", adjustable="box" if panel.window else "datalim")

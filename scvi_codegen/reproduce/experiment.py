@@ -24,11 +24,6 @@ class Verdict(Enum):
     """No claim, or none that can be decided."""
 
 
-def holds(condition: bool) -> Verdict:
-    """Return ``HOLDS`` or ``FAILS``."""
-    return Verdict.HOLDS if condition else Verdict.FAILS
-
-
 def judged(*conditions: bool) -> Verdict:
     """Return ``HOLDS`` if all conditions do, ``FAILS`` if none does, else ``PARTLY``."""
     if all(conditions):
@@ -51,6 +46,12 @@ class Comparison:
     measured: str
     verdict: Verdict
     bears_on: tuple[str, ...] = ()
+
+
+def comparison(claim: str, measured: str, *conditions: object, bears_on: str = "") -> Comparison:
+    """Return a comparison whose verdict follows from conditions; without any it is only shown."""
+    verdict = judged(*map(bool, conditions)) if conditions else Verdict.SHOWN
+    return Comparison(claim=claim, measured=measured, verdict=verdict, bears_on=tuple(bears_on.split()))
 
 
 def common_verdict(checks: Iterable[Comparison]) -> Verdict:

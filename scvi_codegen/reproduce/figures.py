@@ -2,88 +2,93 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from types import SimpleNamespace
-from typing import NamedTuple, TypeAlias
+from inspect import cleandoc
+from itertools import pairwise
+from typing import TypeAlias
 
 from numpy.typing import ArrayLike
 
 from scvi_codegen.display.page.blocks import TableBlock
 from scvi_codegen.reproduce.drawing import Panel, Picture, Series, largest_in_bins, thinned
-from scvi_codegen.reproduce.experiment import Comparison, Experiment, Result, Verdict, judged
+from scvi_codegen.reproduce.experiment import Comparison, Experiment, Result, comparison
 from scvi_codegen.reproduce.runs import MEASURES, PERIOD, MeasuredRun, RunSetting
 
 Runs: TypeAlias = Mapping[str, MeasuredRun]
 View: TypeAlias = Callable[[Runs], Iterable[Panel]]
 
 
-class RunCheck(NamedTuple):
-    """Test of a statement of the paper on runs.
+def compared(claim: str, check: str, runs: Runs) -> Comparison:
+    """Return the comparison of a claim with measurements.
 
-    Attributes:
-        measures: attributes of the runs and, after a colon, keys of runs (default: all): ``"energy drift: svi sc"``.
-        judge: function of the runs, as attributes by key, that returns the conditions under which the statement holds;
-            the statement is only shown if there are none.
-        bears_on: keys of claims (:mod:`scvi_codegen.reproduce.claims`), separated by spaces.
-        note: sentences after the measurement.
+    Args:
+        claim: statement of the paper.
+        check: ``"ATTRIBUTE: CONDITION, ..; ATTRIBUTE: ..|CLAIMS|NOTE"``. A condition is a chain such as
+            ``svi < 1e-6 < sc`` or ``100*svi < sc`` of numbers and absolute values of the attribute for runs by key; a
+            key alone is only listed. CLAIMS are keys of :mod:`scvi_codegen.reproduce.claims`; NOTE is appended.
+        runs: runs by key.
     """
-
-    measures: str
-    judge: Callable[[SimpleNamespace], Iterable[object]] = lambda runs: ()
-    bears_on: str = ""
-    note: str = ""
-
-    def compared(self, claim: str, runs: Runs) -> Comparison:
-        """Return the comparison of a claim with the measurement."""
-        conditions = [bool(each) for each in self.judge(SimpleNamespace(**runs))]
-        attributes, _, keys = self.measures.partition(":")
-        chosen = [runs[key] for key in keys.split() or runs]
-        parts = [f"{MEASURES[each].heading}: {_values(each, chosen)}" for each in attributes.split()]
-        measured = "; ".join(parts)
-        return Comparison(
-            claim=claim,
-            measured=" ".join(filter(None, (f"{measured[:1].upper()}{measured[1:]}." if parts else "", self.note))),
-            verdict=judged(*conditions) if conditions else Verdict.SHOWN,
-            bears_on=tuple(self.bears_on.split()),
-        )
+    conditions, claims, note = (part.strip() for part in f"{check}||".split("|")[:3])
+    measured, outcomes = [], []
+    for part in conditions.split(";"):
+        attribute, _, chains = (text.strip() for text in part.partition(":"))
+        terms = [[term.strip() for term in chain.split("<")] for chain in chains.split(",")]
+        keys = dict.fromkeys(term.split("*")[-1] for chain in terms for term in chain)
+        measure, named = MEASURES[attribute], [runs[key] for key in keys if key in runs]
+        texts = ((getattr(run, attribute), run.label) for run in named)
+        listed = ", ".join(f"{'none' if x is None else format(x, measure.form)} ({label})" for x, label in texts)
+        measured.append(f"{measure.heading}: {listed}")
+        for chain in terms:
+            values = [_value(term, attribute, runs) for term in chain]
+            outcomes += [all(x < y for x, y in pairwise(values))] if len(values) > 1 else []
+    sentence = "; ".join(measured)
+    text = f"{sentence[:1].upper()}{sentence[1:]}. {note}".strip()
+    return comparison(claim, text, *outcomes, bears_on=claims)
 
 
-def _values(attribute: str, runs: Iterable[MeasuredRun]) -> str:
-    form, values = MEASURES[attribute].form, [(run.label, getattr(run, attribute)) for run in runs]
-    return ", ".join(f"{'none' if value is None else format(value, form)} ({label})" for label, value in values)
+def _value(term: str, attribute: str, runs: Runs) -> float:
+    """Return a number, or the absolute value of the attribute of a run, times a factor; NaN if it has none."""
+    factor, _, key = term.rpartition("*")
+    if key not in runs:
+        return float(term)
+    value = getattr(runs[key], attribute)
+    return math.nan if value is None else float(factor or 1.0) * abs(value)
 
 
 def figure(
-    name: str,
     title: str,
     setting: RunSetting,
     views: Sequence[View],
-    checks: Mapping[str, RunCheck],
+    checks: str,
 ) -> Experiment:
     """Return the experiment that runs the schemes of a setting, draws views of them and tests statements.
 
     Args:
-        name, title: of the experiment.
+        title: name and title of the experiment, ``"figure-1: Title"``.
         setting: problem and schemes.
         views: functions that return the panels; without them there is no picture.
-        checks: tests by the statement of the paper; their measures are the columns of the table.
+        checks: statements of the paper, a line each, followed by indented lines as in :func:`compared`.
     """
+    tests = re.findall(r"^(\S.*)\n((?:[ ]+.*(?:\n|$))+)", cleandoc(checks), re.MULTILINE)
+    measures = dict.fromkeys(re.findall(r"(\w+):", " ".join(test.split("|")[0] for _, test in tests)))
 
     def run(_: Mapping[str, Result]) -> Result:
         runs = {key: setting.run(key) for key in setting.schemes}
         panels = tuple(panel for view in views for panel in view(runs))
         size, columns = ((7.0, 4.2), 1) if len(panels) == 1 else ((4.0, 3.8), 2 if len(panels) in (2, 4) else 3)
         picture = Picture(panels=panels, columns=columns, size=size) if panels else None
-        measures = dict.fromkeys(each for check in checks.values() for each in check.measures.partition(":")[0].split())
         return Result(
             setting=setting.sentences,
-            checks=tuple(check.compared(claim, runs) for claim, check in checks.items()),
+            checks=tuple(compared(claim, " ".join(test.split()), runs) for claim, test in tests),
             tables=(measured_table(runs, list(measures)), *([picture.curves()] if picture else [])),
             picture=picture,
         )
 
-    return Experiment(name=name, title=title, run=run)
+    name, _, rest = title.partition(": ")
+    return Experiment(name=name, title=rest, run=run)
 
 
 def measured_table(runs: Runs, measures: Sequence[str]) -> TableBlock:

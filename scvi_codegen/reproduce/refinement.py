@@ -24,7 +24,7 @@ from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SVI, SpectralCollocation
 from scvi_codegen.methods.method import Method
 from scvi_codegen.reproduce.drawing import Array, Panel, Picture, Series
-from scvi_codegen.reproduce.experiment import Comparison, Experiment, Result, Verdict, holds, judged
+from scvi_codegen.reproduce.experiment import Comparison, Experiment, Result, comparison
 from scvi_codegen.reproduce.runs import ROUNDOFF, stepper_of
 from scvi_codegen.tables.precision import Number, mp
 
@@ -131,16 +131,7 @@ class ErrorCurve(NamedTuple):
         return (self.case.title, self.scheme, self.n or None, self.what, *law, *(printed or (None, None)))
 
 
-COLUMNS = (
-    "setting",
-    "scheme",
-    "N",
-    "error of",
-    "constant",
-    "base or power",
-    "paper's constant",
-    "paper's base or power",
-)
+COLUMNS = ("setting", "scheme", "N", "error of", "constant", "base or power", "paper's constant", "paper's base")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -183,14 +174,11 @@ class Study:
         ]
 
     def _curve(self, case: StepCase, what: str, scheme: str, n: int) -> ErrorCurve:
-        if n:
-            errors = [step_errors(case, scheme, n, h)[what] for h in self.steps]
-            return ErrorCurve(
-                case, what, scheme, n, np.array(self.steps), np.array(errors), fitted_power(case, scheme, n, what)
-            )
-        counts = np.array(self.degrees[scheme]) + case.beyond
-        over_n = np.array([step_errors(case, scheme, int(n), self.steps[0])[what] for n in counts])
-        return ErrorCurve(case, what, scheme, 0, counts, over_n, fitted_line(counts, over_n))
+        counts = [n] if n else [degree + case.beyond for degree in self.degrees[scheme]]
+        errors = np.array([step_errors(case, scheme, k, h)[what] for k in counts for h in self.steps])
+        x = np.array(self.steps if n else counts, dtype=float)
+        law = fitted_power(case, scheme, n, what) if n else fitted_line(x, errors)
+        return ErrorCurve(case, what, scheme, n, x, errors, law)
 
     def printed(self, curve: ErrorCurve) -> Law | None:
         """Return the paper's line of a curve; over h that of the same power."""
@@ -263,53 +251,43 @@ def _superiority(study: Study, curves: Sequence[ErrorCurve]) -> Comparison:
     """Return the check of conclusion (ii) where the error of SC is resolved and above round-off."""
     lost, count = [], 0
     for svi, sc in zip(curves[::2], curves[1::2], strict=True):
-        theirs = dict(zip(sc.x.tolist(), sc.errors.tolist(), strict=True))
+        theirs, name = dict(zip(sc.x.tolist(), sc.errors.tolist(), strict=True)), "h" if svi.n else "N"
         for x, error in zip(svi.x.tolist(), svi.errors.tolist(), strict=True):
             if svi.case.judged and math.isfinite(error) and ROUNDOFF_LEVEL < theirs.get(x, 0.0) < study.resolved:
                 count += 1
-                lost += (
-                    [f"{svi.what}, {svi.case.title}, {'h' if svi.n else 'N'} = {x:.2g}"] if error >= theirs[x] else []
-                )
-    return Comparison(
-        claim="SVI is more accurate than SC with the same number of points and the same step.",
-        measured=f"The error of SVI is the smaller one in {count - len(lost)} of {count} comparisons"
-        + (f"; not {'; '.join(lost[:8])}." if lost else "."),
-        verdict=Verdict.PARTLY if lost and len(lost) <= (1 - MOSTLY) * count else holds(not lost),
-        bears_on=("accuracy",),
+                lost += [f"{svi.what}, {svi.case.title}, {name} = {x:.2g}"] * (error >= theirs[x])
+    return comparison(
+        "SVI is more accurate than SC with the same number of points and the same step.",
+        f"The error of SVI is the smaller one in {count - len(lost)} of {count} comparisons; not: "
+        f"{'; '.join(lost[:8]) or 'none'}.",
+        not lost,
+        len(lost) <= (1 - MOSTLY) * count,
+        bears_on="accuracy",
     )
 
 
 def _point_checks(study: Study, curves: Sequence[ErrorCurve]) -> Iterator[Comparison]:
     """Yield the checks over N: straight lines, their bases, and their constants."""
-    by_case = {case: [c for c in curves if c.case is case] for case in study.cases}
-    straight = {case: [is_straight(c.x, c.errors) for c in by_case[case] if c.law] for case in study.cases}
-    yield Comparison(
-        claim="Under N-refinement the errors fall geometrically.",
-        measured=f"Straight (N and the logarithm of the error correlate with r^2 above {STRAIGHT:g}) are "
-        + ", ".join(f"{sum(each)} of {len(each)} curves ({case.title})" for case, each in straight.items())
-        + ". Curves with fewer than three errors above round-off are left out.",
-        verdict=judged(*(one for case in study.judged for one in straight[case])),
-        bears_on=("geometric",),
+    straight = [is_straight(c.x, c.errors) for c in curves if c.law and c.case.judged]
+    yield comparison(
+        "Under N-refinement the errors fall geometrically.",
+        f"{sum(straight)} of {len(straight)} curves above round-off are straight: N and the logarithm of the error "
+        f"correlate with r^2 above {STRAIGHT:g}.",
+        *straight,
+        bears_on="geometric",
     )
-    drawn = {case: [(c, line) for c in by_case[case] if (line := study.printed(c))] for case in study.cases}
-    bases = {case: [(c.law.base, line.base) for c, line in drawn[case] if c.law] for case in study.cases}
-    lines = ", ".join(f"{scheme} {what} {line.base:g}" for (scheme, what), line in study.lines.items())
-    found = "; ".join(
-        f"{case.title}: " + ", ".join(f"{c.scheme} {c.what} {c.law.base:.2g}" for c, _ in drawn[case] if c.law)
+    drawn = [(c, line) for c in curves if (line := study.printed(c))]
+    off = {
+        case: float(np.median(np.concatenate([factors(c.x, c.errors, line) for c, line in drawn if c.case is case])))
         for case in study.cases
-    )
-    yield Comparison(
-        claim=f"They fall like b^N with the bases b of the drawn lines: {lines}.",
-        measured=f"{found}. Bases that differ by less than a factor of two count as the same.",
-        verdict=judged(*(all(b / 2 < a < 2 * b for a, b in bases[case]) for case in study.judged)),
-    )
-    off = {k: float(np.median(np.concatenate([factors(c.x, c.errors, line) for c, line in drawn[k]]))) for k in drawn}
-    yield Comparison(
-        claim="The lines c b^N run along the errors.",
-        measured="The typical factor between an error and its line is "
+    }
+    bases = [f"{c.law.base:.2g} for {line.base:g} ({c.scheme} {c.what}, {c.case.title})" for c, line in drawn if c.law]
+    yield comparison(
+        "The lines c b^N run along the errors.",
+        "The typical factor between an error and its line is "
         + ", ".join(f"{factor:.2g} ({case.title})" for case, factor in off.items())
-        + f". Below {ALONG:g} counts as along.",
-        verdict=judged(*(off[case] < ALONG for case in study.judged)),
+        + f". Below {ALONG:g} counts as along. Fitted bases: {', '.join(bases)}.",
+        *(off[case] < ALONG for case in study.judged),
     )
 
 
@@ -317,38 +295,31 @@ def _step_checks(study: Study, curves: Sequence[ErrorCurve]) -> Iterator[Compari
     """Yield the checks over h: powers and constants of the legend, or that SVI falls faster if there is none."""
     for what in study.quantities:
         mine, printed = [c for c in curves if c.what == what], study.powers.get(what)
-        measured = "; ".join(f"{case.title}: {_powers([c for c in mine if c.case is case])}" for case in study.cases)
+        powers = [f"{c.law.base:.1f}" if c.law else "none" for c in mine]
+        measured = ", ".join(
+            f"{power} ({c.scheme}, N = {c.n}, {c.case.title})" for power, c in zip(powers, mine, strict=True)
+        )
         if printed is None:
             pairs = zip(mine[::2], mine[1::2], strict=True)
             faster = [not svi.law or bool(sc.law and svi.law.base > sc.law.base) for svi, sc in pairs]
             claim = f"The error of the {what} falls faster with h for SVI than for SC."
-            yield Comparison(
-                claim=claim, measured=f"Powers: {measured}.", verdict=holds(all(faster)), bears_on=("accuracy",)
-            )
+            yield comparison(claim, f"Powers: {measured}.", all(faster), bears_on="accuracy")
             continue
         laws = [c.law for c in mine if c.case.judged and c.law]
-        ours = {round(law.base) for law in laws}
-        missing = ", ".join(f"h^{power}" for power in printed if power not in ours)
-        yield Comparison(
-            claim=f"The errors of {what} follow the lines {', '.join(f'h^{power}' for power in printed)}.",
-            measured=f"Powers: {measured}. Of the lines {missing or 'none'} is missing with {study.judged[0].title}.",
-            verdict=judged(*(power in ours for power in printed)),
+        missing = [power for power in printed if power not in {round(law.base) for law in laws}]
+        yield comparison(
+            f"The errors of {what} follow the lines {', '.join(f'h^{power}' for power in printed)}.",
+            f"Powers: {measured}. Missing: {', '.join(f'h^{power}' for power in missing) or 'none'}.",
+            *(power not in missing for power in printed),
         )
         both = [(law.constant, printed[round(law.base)]) for law in laws if round(law.base) in printed]
         off = [max(a / b, b / a) for a, b in both]
-        yield Comparison(
-            claim=f"The lines run along the errors of {what}.",
-            measured=f"The constants of {len(off)} curves whose power is printed are off by factors of {min(off):.1f} "
-            f"to {max(off):.1f} with {study.judged[0].title}. Below {ALONG:g} counts as along.",
-            verdict=holds(max(off) < ALONG),
+        yield comparison(
+            f"The lines run along the errors of {what}.",
+            f"The constants of {len(off)} curves whose power is printed are off by factors of {min(off):.1f} to "
+            f"{max(off):.1f} with {study.judged[0].title}. Below {ALONG:g} counts as along.",
+            max(off) < ALONG,
         )
-
-
-def _powers(curves: Sequence[ErrorCurve]) -> str:
-    """Return the fitted powers as text."""
-    parts = [[f"{c.law.base:.1f}" for c in curves if c.law and c.scheme == scheme] for scheme in SCHEMES]
-    texts = (f"{scheme} {', '.join(each) or 'no error at all'}" for scheme, each in zip(SCHEMES, parts, strict=True))
-    return " and ".join(texts)
 
 
 def _panels(study: Study, curves: Sequence[ErrorCurve]) -> Iterator[Panel]:

@@ -97,23 +97,13 @@ def run_experiments(
 
 def _run(chosen: Sequence[Experiment], count: int, module: str, watch: Watch) -> Generator[Outcome, None, None]:
     results, alone = dict[str, Result](), [each for each in chosen if not each.needs]
-    with closing(
-        _in_this_process(alone, watch) if count <= 1 else _in_processes(alone, count, module, watch)
-    ) as others:
-        for outcome in others:
-            yield outcome
-            if isinstance(outcome, Result):
-                results[outcome.name] = outcome
-    for experiment in (each for each in chosen if each.needs):
-        watch([experiment.name])
-        failed = [need for need in experiment.needs if need not in results]
-        if failed:
-            yield Failure(name=experiment.name, message=f"its dependency '{failed[0]}' failed")
-            continue
-        yield (outcome := _outcome(experiment, {need: results[need] for need in experiment.needs}))
-        if isinstance(outcome, Result):
-            results[outcome.name] = outcome
-    watch([])
+    first = _in_processes(alone, count, module, watch) if count > 1 else _in_this_process(alone, {}, watch)
+    for outcomes in (first, _in_this_process([each for each in chosen if each.needs], results, watch)):
+        with closing(outcomes):
+            for outcome in outcomes:
+                if isinstance(outcome, Result):
+                    results[outcome.name] = outcome
+                yield outcome
 
 
 @without_accuracy_warnings()
@@ -132,10 +122,17 @@ def _failure(name: str, error: BaseException) -> Failure:
     return Failure(name=name, message=message, details=traceback.format_exc())
 
 
-def _in_this_process(experiments: Sequence[Experiment], watch: Watch) -> Generator[Outcome, None, None]:
+def _in_this_process(
+    experiments: Sequence[Experiment], results: Mapping[str, Result], watch: Watch
+) -> Generator[Outcome, None, None]:
     for experiment in experiments:
         watch([experiment.name])
-        yield _outcome(experiment, {})
+        failed = [need for need in experiment.needs if need not in results]
+        if failed:
+            yield Failure(name=experiment.name, message=f"its dependency '{failed[0]}' failed")
+        else:
+            yield _outcome(experiment, {need: results[need] for need in experiment.needs})
+    watch([])
 
 
 class _Worker:

@@ -1,4 +1,4 @@
-"""The tables of the paper and the claims: numbers against those measured by independent programs."""
+"""Tables 8 and 9 and the claims: numbers against those measured by independent programs."""
 
 import pickle
 
@@ -6,36 +6,11 @@ import numpy as np
 import pytest
 
 from scvi_codegen.methods import SVI, SpectralCollocation
-from scvi_codegen.reproduce import claims, iterations, tableaux
+from scvi_codegen.reproduce import claims, iterations
 from scvi_codegen.reproduce.catalogue import EXPERIMENTS
 from scvi_codegen.reproduce.experiment import Comparison, Result, Verdict
 from scvi_codegen.reproduce.report import statement
 from scvi_codegen.reproduce.runs import KEPLER, perihelion, stepper_of
-from scvi_codegen.tables.tableau import gauss
-
-GAUSS = [EXPERIMENTS[f"table-{n}"] for n in (1, 2, 3)]
-
-
-@pytest.mark.parametrize("experiment", GAUSS, ids=lambda experiment: experiment.name)
-def test_experiments_can_be_pickled_and_written(experiment):
-    result = experiment.result({})
-    again = pickle.loads(pickle.dumps(result))
-    assert again.name == experiment.name
-    assert statement(again) == statement(result)
-    assert all(len(row) == len(table.columns) for table in result.tables for row in table.rows)
-
-
-def test_tables_1_to_3_are_as_printed_but_for_one_entry(monkeypatch):
-    found = [experiment.result({}) for experiment in GAUSS]
-    assert [result.verdict for result in found] == [Verdict.HOLDS, Verdict.HOLDS, Verdict.PARTLY]
-    wrong = [row for result in found for row in result.tables[0].rows if row[-1] > 1e-50]
-    assert [(row[0], row[1]) for row in wrong] == [("a_34", "w1 - w'3 - w4")]
-    assert wrong[0][3] == pytest.approx(float(gauss(4).A[2][3]), abs=1e-15)
-    first, *others = tableaux.PRINTED[4]
-    second, third, *rest = others
-    right = {**tableaux.PRINTED, 4: (first, second, third.replace("w1 - v3 - w4", "w1 + v3 - w4"), *rest)}
-    monkeypatch.setattr(tableaux, "PRINTED", right)
-    assert EXPERIMENTS["table-3"].result({}).verdict is Verdict.HOLDS
 
 
 def test_the_printed_iterations_are_those_of_the_paper():
@@ -45,13 +20,6 @@ def test_the_printed_iterations_are_those_of_the_paper():
     assert table[0.5, 2, "SC"].total is None
     assert sum(count.total is not None for count in table.values()) == 33
     assert sum(count.total is not None for count in iterations.printed_counts(9).values()) == 24
-
-
-def test_iterations_of_the_compiled_solvers():
-    fixed, newton = (iterations.compiled_count(0.2, (0.5, 5, "SVI"), solver) for solver in iterations.SOLVERS)
-    assert fixed.total == pytest.approx(1354, rel=0.05)
-    assert newton.total == pytest.approx(735, rel=0.05)
-    assert iterations.compiled_count(0.2, (1.0, 3, "SC"), "fixed-point").total is None
 
 
 @pytest.mark.parametrize(
@@ -80,8 +48,17 @@ def test_picard_iteration_converges_to_the_compiled_step(degree):
 
 def test_diverging_picard_iteration_is_reported():
     q, v = map(np.array, perihelion(0.2))
-    with pytest.raises(iterations.NotSolvedError):
-        iterations.picard_step(iterations.equations_of("SVI", 1, 2), q, v, 5.0, 1e-14)
+    assert iterations.picard_step(iterations.equations_of("SVI", 1, 2), q, v, 5.0, 1e-14)[2] == 0
+
+
+@pytest.mark.full
+def test_tables_8_and_9_hold_in_part():
+    for name in ("table-8", "table-9"):
+        result = EXPERIMENTS[name].result({})
+        assert [check.verdict for check in result.checks] == [Verdict.HOLDS, Verdict.PARTLY, Verdict.PARTLY]
+        again = pickle.loads(pickle.dumps(result))
+        assert statement(again) == statement(result)
+        assert all(len(row) == len(table.columns) for table in result.tables for row in table.rows)
 
 
 def result_with(name: str, *checks: tuple[str, Verdict]) -> Result:

@@ -1,5 +1,6 @@
 """Tableaux: the paper's tables 1 to 4, orders by two independent paths, stability against eigenvalues, closed forms."""
 
+import re
 from collections.abc import Callable
 from fractions import Fraction
 
@@ -365,3 +366,33 @@ def test_floats_are_read_as_the_numbers_they_round(floats, meant, order, symmetr
     if meant is not None:
         assert max(abs(c - other) for c, other in zip(tableau.c, collocation_tableau(meant).c, strict=True)) < 1e-50
     assert max(abs(c - given) for c, given in zip(tableau.c, floats, strict=True)) < 3e-16
+
+
+PRINTED = """
+    2*w1 + 2*v1 - 2*w3 - w5 : w1, v1 - w3 + v4, v1 - w3 - v4, w1 - w5
+    2*w1 + 2*v1 - 2*v3 - v5 : w1 - v3 + w4, v1, v1 - v5, w1 - v3 - w4
+    2*w1 + 2*v1 + 2*v3 + v5 : w1 + v3 + w4, v1 + v5, v1, w1 - v3 - w4
+    2*w1 + 2*v1 + 2*w3 + w5 : w1 + w5, v1 + w3 + v4, v1 + w3 - v4, w1
+"""
+LETTERS = """
+    w1 = 1/8 - sqrt(30)/144;  w2 = sqrt((15 + 2*sqrt(30))/35)/2;  v2 = sqrt((15 - 2*sqrt(30))/35)/2
+    v1 = 1/8 + sqrt(30)/144;  w3 = w2*(1/6 + sqrt(30)/24);        v3 = v2*(1/6 - sqrt(30)/24)
+    w5 = w2 - 2*w3;           w4 = w2*(1/21 + 5*sqrt(30)/168);    v4 = v2*(1/21 - 5*sqrt(30)/168)
+    v5 = v2 - 2*v3
+"""
+
+
+def test_table_3_of_the_paper_has_one_wrong_entry():
+    """Li, Wu, Leok print w1 - w3' - w4 for a_34 of Gauss's method with four stages, where v is w'."""
+    values = {"sqrt": mp.sqrt}
+    for line in re.split(r"[;\n]", LETTERS.strip()):
+        name, _, formula = line.partition("=")
+        values[name.strip()] = eval(formula.strip(), values)
+    wrong, exact = [], gauss(4)
+    for i, line in enumerate(PRINTED.strip().splitlines()):
+        c, row = line.split(" : ")
+        assert abs(eval(c.strip(), values) - exact.c[i]) < 1e-15
+        printed = [eval(entry, values) for entry in row.split(", ")]
+        wrong += [(i + 1, j + 1) for j, a in enumerate(exact.A[i]) if abs(printed[j] - a) > 1e-15]
+    assert wrong == [(3, 4)]
+    assert abs(eval("w1 + v3 - w4", values) - exact.A[2][3]) < 1e-15

@@ -14,7 +14,7 @@ from scvi_codegen.display.page.blocks import Formula, Listing, Paragraph, TableB
 from scvi_codegen.methods import SVI
 from scvi_codegen.models.problems import problem
 from scvi_codegen.reproduce.drawing import Panel, Picture, Series, largest_in_bins
-from scvi_codegen.reproduce.experiment import Comparison, Experiment, Result, Verdict, holds
+from scvi_codegen.reproduce.experiment import Comparison, Experiment, Result, Verdict, judged
 
 LONG_LINE = "double energy = 0.5*(v[0]*v[0] + v[1]*v[1]) - mu/sqrt(q[0]*q[0] + q[1]*q[1]);  /* kept on one line */"
 
@@ -51,7 +51,7 @@ def figure_4(results: Mapping[str, Result]) -> Result:
             Comparison(
                 claim="SVI keeps the energy better than SC.",
                 measured=f"The largest errors are {largest[0]:.2e} and {largest[1]:.2e}, that is h^2 < 1 & -1 > -2.",
-                verdict=holds(largest[0] < largest[1]),
+                verdict=judged(largest[0] < largest[1]),
                 bears_on=("accuracy",),
             ),
             Comparison(claim="SC is stable.", measured="It is not.", verdict=Verdict.FAILS),
