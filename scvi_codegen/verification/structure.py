@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.exact.solution import numbers
 from scvi_codegen.methods.discretise import is_conformally_symplectic, is_symplectic
+from scvi_codegen.runtime.rotations.reduction import Reduction
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, checked, information
@@ -28,6 +29,9 @@ STEPS, SAMPLED_STATES = 1000, 20
 MULTIPLIER_BOUND = 1e-10
 DOUBLINGS, BISECTIONS = 24, 10
 CONSECUTIVE_STEPS = 3
+SPACES = {"rotation": "T*SO(3)", "direction": "T*S^2", "spin": "S^2"}
+LENGTH, PHASE = 1.7, complex(np.exp(0.7j))
+"""Factors of quaternions and directions, and of spins, to which steps must be invariant."""
 
 
 def structure_checks(tested: SystemUnderTest) -> Iterator[Check]:
@@ -38,6 +42,13 @@ def structure_checks(tested: SystemUnderTest) -> Iterator[Check]:
     elif is_conformally_symplectic(tested.method, tested.system):
         statement = "J^T Omega J = exp(-gamma h) Omega, gamma the damping, J by finite differences of the compiled step"
         yield from checked("conformal symplecticity", statement, partial(_symplecticity, tested))
+    if rotations := tested.stepper.interface.rotations:
+        statement = "a step commutes with changes of the lengths of quaternions and directions, and of phases of spins"
+        yield from checked("gauge invariance", statement, partial(_gauge_invariance, tested))
+        if is_symplectic(tested.method, tested.system) and not tested.system.constraints:
+            kinds = " and ".join(dict.fromkeys(SPACES[declaration.split()[0]] for declaration in rotations))
+            statement = f"A^T Omega A = Omega of the derivative A of the step on the reduced space ({kinds})"
+            yield from checked("reduced symplecticity", statement, partial(_reduced_symplecticity, tested))
     if tested.system.constraints:
         statement = f"they and their rates are 0 up to round-off at {SAMPLED_STATES} states of {STEPS} steps"
         yield from checked("constraints", statement, partial(_constraints, tested))
@@ -73,6 +84,34 @@ def _symplecticity(tested: SystemUnderTest) -> Finding:
         result = Finding(float(defect[index]), float(noise[index]), "the bound is the noise of the differences")
         worst = max(worst, result, key=lambda finding: finding.measured / finding.bound)
     return worst
+
+
+def _reduced_symplecticity(tested: SystemUnderTest) -> Finding:
+    """Return the largest defect of the symplectic form in canonical coordinates of the reduced space."""
+    reduction, worst = Reduction(tested.stepper.interface), 0.0
+    half = reduction.size // 2
+    form = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(half))
+    for each in tested.states:
+        state = State(*reduction.normalised(each.q, each.p), each.t, each.h)
+        derivative = tested.stepper.jacobian(state.q, state.p, state.h, state.t, tested.parameters)
+        step = reduction.outward(*tested.step(state)) @ derivative @ reduction.inward(state.q, state.p)
+        units = EPSILON * (np.abs(step.T) @ np.abs(form) @ np.abs(step)).max()
+        worst = max(worst, float(np.abs(step.T @ form @ step - form).max() / units))
+    return Finding(worst, ROUNDINGS, "in units of rounding, exact derivatives of 2 steps")
+
+
+def _gauge_invariance(tested: SystemUnderTest) -> Finding:
+    """Return the difference of steps from states of other gauge."""
+    reduction, worst = Reduction(tested.stepper.interface), 0.0
+    for each in tested.states:
+        state = State(*reduction.normalised(each.q, each.p), each.t, each.h)
+        z = state.q + 1j * state.p
+        for member in reduction.members:
+            part = z[member.columns]
+            z[member.columns] = part * PHASE if member.kind == "spin" else part.real * LENGTH + 1j * part.imag / LENGTH
+        other, end = tested.ends(State(z.real, z.imag, state.t, state.h)), tested.ends(state)
+        worst = max(worst, float(np.max(np.abs(reduction.aligned(other, end) - end) / tested.rounding(state))))
+    return Finding(worst, ROUNDINGS, "in units of rounding, 2 states")
 
 
 def _defect(

@@ -3,6 +3,8 @@
 Expected values: linearised Euler equations about steady rotations, periods of pendulums by elliptic integrals.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from samples import QUICK_FLAGS
@@ -11,6 +13,8 @@ from scipy.special import ellipk
 import scvi_codegen as sc
 from scvi_codegen.errors import StateError
 from scvi_codegen.runtime.rotations.reduction import Reduction
+from scvi_codegen.verification.structure import structure_checks
+from scvi_codegen.verification.system_under_test import State, SystemUnderTest
 
 BODY = sc.LagrangianSystem.from_text(
     "free body", rotations={"R": "omega"}, lagrangian="(omega_1**2 + 2*omega_2**2 + 2.5*omega_3**2)/2"
@@ -145,3 +149,50 @@ def test_orbits_of_a_rotation_a_direction_and_a_spin_have_the_periods_of_formula
     orbit = sc.periodic_orbit(compiled(spin, "svi:4"), {"a": [0.6, 0, 0.8]}, period=4.0, steps=40)
     assert orbit.period == pytest.approx(2 * np.pi / (1 + 2 / 3 * orbit.run().spin()[0, 2]), rel=1e-6)
     assert orbit.monodromy.shape == (2, 2)
+
+
+def checks_of(system, start, method="svi:2", step=None):
+    stepper = compiled(system, method)
+    run = stepper.integrate(start[0], velocity=start[1], h=0.1, steps=1)
+    tested = SystemUnderTest(system, sc.as_method(method, system), stepper, None, State(run.q[0], run.p[0], 0.0, 0.1))
+    if step:
+        tested = replace(tested, stepper=step(stepper))
+    return {check.name: check for check in structure_checks(tested) if check.name in REDUCED}
+
+
+REDUCED = ("gauge invariance", "reduced symplecticity")
+
+
+class Gauged:
+    """A stepper whose momenta depend on the lengths of quaternions."""
+
+    def __init__(self, stepper):
+        self.stepper = stepper
+
+    def __getattr__(self, name):
+        return getattr(self.stepper, name)
+
+    def step(self, q, p, *arguments, **options):
+        q1, p1 = self.stepper.step(q, p, *arguments, **options)
+        return q1, p1 + 1e-11 * q * (q @ q)
+
+
+class Contracting(Gauged):
+    """A stepper that loses momentum."""
+
+    def jacobian(self, *arguments, **options):
+        jacobian = self.stepper.jacobian(*arguments, **options)
+        jacobian[len(jacobian) // 2 :] *= 1 - 1e-13
+        return jacobian
+
+
+@pytest.mark.parametrize(("system", "start"), [(MIXED, (START, MOVING)), (SPINS, (DIRECTIONS, None))])
+def test_certificates_contain_gauge_invariance_and_reduced_symplecticity(system, start):
+    checks = checks_of(system, start)
+    assert [checks[name].outcome.name for name in REDUCED] == ["SATISFIED"] * 2
+    assert ("T*SO(3) and T*S^2" if system is MIXED else "(S^2)") in checks["reduced symplecticity"].statement
+
+
+def test_violations_of_the_reduced_map_are_found():
+    checks = checks_of(BODY, ({"R": [1, 0, 0, 0]}, {"omega": [0.7, -0.4, 2.5]}), step=Contracting)
+    assert [checks[name].outcome.name for name in REDUCED] == ["VIOLATED"] * 2
