@@ -88,8 +88,9 @@ def energy_report(system: MechanicalSystem, trajectory: Trajectory, balance: Bal
     scale = abs(float(energy[0]))
     error = (energy - energy[0]) / (scale or 1.0)
     what = "relative energy error" if scale else "energy error"
-    why = "events change the state" if trajectory.stepper.changes_states else system.changes_energy
-    if why:
+    if trajectory.stepper.changes_states:
+        return f"energy: events change the state, it changed by {np.abs(energy - energy[0]).max():.3g} at most"
+    if why := system.changes_energy:
         changed = f"energy: {why}, it changed by {np.abs(energy - energy[0]).max():.3g} at most"
         return changed if balance is None else f"{changed}; energy balance |E - E0 - W| {balance.error:.1e} at most"
     largest = np.abs(error).max()

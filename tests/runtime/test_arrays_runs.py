@@ -53,7 +53,7 @@ def test_slices_have_the_states_of_the_run(steppers):
         part = run[rows]
         assert len(part) == len(run.t[rows])
         for name in ("t", "energies"):
-            assert np.array_equal(getattr(part, name), getattr(run, name)[rows])
+            assert np.array_equal(getattr(part, name), getattr(run, name)[rows], equal_nan=True)
         assert np.array_equal(part.q["q"], run.q["q"][rows])
         assert np.array_equal(part.p["q"], run.p["q"][rows])
         between = (part.t[0] + part.t[-1]) / 2

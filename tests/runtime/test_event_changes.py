@@ -245,6 +245,22 @@ def test_ensembles_of_bouncing_balls(ball):
         stepper.integrate_ensemble(heights, velocity=0.0 * heights, h=0.1, steps=5)
 
 
+def test_particles_in_a_box_are_arrays():
+    """Index notation: the sizes are those of the call."""
+    gas = LagrangianSystem.from_text(
+        name="gas", coordinates=["r[N, 2]"], lagrangian="sum(i in N, (r_dot[i, 0]**2 + r_dot[i, 1]**2)/2)"
+    )
+    stepper = compile_stepper(gas, "svi:1", flags=FLAGS)
+    r, v = np.array([[0.5, 0.5], [0.2, 0.7], [0.9, 0.1]]), np.array([[0.5, 0.3], [-1.0, 0.2], [0.4, -0.7]])
+    entries = [f"r[{i}, {k}]" for i in range(3) for k in range(2)]
+    walls = [impact(g) for each in entries for g in (each, f"1 - {each}")]
+    run = stepper.integrate({"r": r}, velocity={"r": v}, h=0.7, t_end=20.0, events=walls)
+    assert np.abs(run.q["r"][-1] - np.abs((r + 20.0 * v + 1.0) % 2.0 - 1.0)).max() < 1e-13
+    kick = Event("sum(i in N, r[i, 0]) - 1", then={"p_r[N-1, 1]": "2*p_r[0, 1]"}, where="r[0, 0] > 0")
+    kicked = stepper.integrate({"r": r}, velocity={"r": v}, h=0.5, steps=20, events=kick)
+    assert kicked.p["r"][-1, 2, 1] == pytest.approx(0.6)
+
+
 # Derivatives.
 
 BOX = LagrangianSystem.from_text(

@@ -144,6 +144,12 @@ def events(of: Kind, _: Path) -> Any:
     return of.run(events="x - 0.25")
 
 
+def changing_events(of: Kind, _: Path) -> Any:
+    run = of.run(events=sc.Event("x - 0.25", then={"p_x": "-p_x"}))
+    assert len(run.events[0])
+    return run
+
+
 def ensembles(of: Kind, _: Path) -> Any:
     starts = {name: np.stack([value, value]) for name, value in of.q.items()}
     return of.stepper().integrate_ensemble(starts, np.zeros((2, 3)), h=0.1, steps=3)
@@ -295,6 +301,7 @@ FEATURES: dict[str, Callable[[Kind, Path], Any]] = {
     "output times `t_eval`": t_eval,
     "dense output `at`": dense_output,
     "events": events,
+    "events that change the state": changing_events,
     "ensembles": ensembles,
     "threads within a step": threads,
     "sizes chosen by each run": other_sizes,

@@ -68,6 +68,8 @@ def _call(
 ) -> Any:
     """Call a method of the stepper that is bound to the arrays of the call."""
     threads = others.pop("threads", None) if name in AT_REST else None
+    if others.get("events") is not None:
+        stepper = stepper.with_events(others.pop("events"))
     bound, state = stepper.bind(q, parameters, tables, threads)
     if len(arguments) == 1 and arguments[0] is None:  # p=None by position
         arguments = ()

@@ -25,6 +25,7 @@ from scvi_codegen.runtime.arrays.any_size import (
 from scvi_codegen.runtime.arrays.binding import ArrayBinding
 from scvi_codegen.runtime.arrays.interface import RunSizes
 from scvi_codegen.runtime.core.validation import Array, flat_state, named, shapes_of
+from scvi_codegen.runtime.events.array_events import events_of_entries
 from scvi_codegen.runtime.events.event import Event, EventLike, as_events
 
 MOST_EVENT_SETS = 16
@@ -159,9 +160,13 @@ class CompiledMethod:
             self._check_not_of_run(tables, threads)
             return self, q
         problem = sizes_of_run(self.interface, q, parameters, tables, threads)
-        if self._reason and problem.threads > 1:
-            raise MethodError(f"omit threads: this system is compiled with the sizes of each call. {self._reason}")
-        bound = self.with_sizes(problem.sizes, tables=problem.places) if self._reason else self._bound_to(problem)
+        if (self._reason or self.events) and problem.threads > 1:
+            why = self._reason or "Runs with events are compiled with the sizes of each call"
+            raise MethodError(f"omit threads: this system is compiled with the sizes of each call. {why}")
+        compiled = self._reason or self.events
+        bound = self.with_sizes(problem.sizes, tables=problem.places) if compiled else self._bound_to(problem)
+        if self.events:
+            bound = bound.with_events(events_of_entries(self.interface, problem, self.events))
         return bound, q if bound.interface.rotations or bound.interface.variables else flat_state(
             bound.interface, q, "q"
         )
@@ -189,7 +194,6 @@ class CompiledMethod:
                 interface_of_sizes(self.interface, problem.sizes),
                 variants=Variants(make=make),
                 flags=self.flags,
-                events=self.events,
                 origin=self,
                 problem=problem,
             )
@@ -407,6 +411,8 @@ class CompiledMethod:
         wanted = as_events(events)
         if wanted == self.events:
             return self
+        if self.problem is not None and self.origin is not None and wanted:
+            return self.known.with_events(events_of_entries(self.origin.interface, self.problem, wanted))
         if wanted not in self._event_variants:
             while len(self._event_variants) >= MOST_EVENT_SETS:
                 self._event_variants.pop(next(iter(self._event_variants)), None)

@@ -17,7 +17,6 @@ from scvi_codegen.runtime.trajectory.dense_output import grid_tolerance
 from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
 
 if TYPE_CHECKING:
-    from scvi_codegen.runtime.arrays.events import ArraySearch
     from scvi_codegen.runtime.run.memory import Memory
 
 INITIAL_CAPACITY = 256
@@ -185,15 +184,6 @@ class CrossingSearch:
         )
 
 
-def search_of(stepper: Any, crossed: Sequence[int] = (), *, terminal: bool = True) -> CrossingSearch | ArraySearch:
-    """Return the search for the events of a stepper; arguments as of :class:`CrossingSearch`."""
-    if stepper.interface.layout.coordinates:
-        from scvi_codegen.runtime.arrays.events import ArraySearch  # here: not needed for known sizes
-
-        return ArraySearch(stepper, crossed, terminal=terminal)
-    return CrossingSearch(stepper, crossed, terminal=terminal)
-
-
 def crossings_of(stepper: Integrator, states: SavedStates) -> tuple[Crossings, ...]:
     """Return the crossings of the stepper's events along a trajectory with all states saved; no event is terminal.
 
@@ -208,6 +198,6 @@ def crossings_of(stepper: Integrator, states: SavedStates) -> tuple[Crossings, .
             "events require all states, but this trajectory has save_every > 1 or t_eval: integrate with save_every=1"
         )
     lengths[:-1][short] = spans[short]  # an event ended the last step
-    search = search_of(stepper, terminal=False)
+    search = CrossingSearch(stepper, terminal=False)
     search.search(replace(states, step_sizes=lengths))
     return search.crossings()

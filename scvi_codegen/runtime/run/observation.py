@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import EventError, StateError, StepFailedError
 from scvi_codegen.native.arguments import real_array
-from scvi_codegen.runtime.events.detection import CrossingSearch, search_of
+from scvi_codegen.runtime.events.detection import CrossingSearch
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.run_loop import record, trajectory_of
@@ -52,7 +52,7 @@ class Observation:
         observe: Callable[[Any], ArrayLike] | None = None,
     ) -> None:
         self.run, self.save_every, self.times = run, checked_count(save_every, "save_every", least=1), times
-        self.search = search_of(run.stepper, run._crossed) if run.stepper.events else None
+        self.search = CrossingSearch(run.stepper, run._crossed) if run.stepper.events else None
         plan = run.plan
         self.end = plan.t_end if plan.fixed and math.isfinite(plan.t_end) else None
         self.arrived, self.partial_steps = False, 0
@@ -108,7 +108,7 @@ class Observation:
             failure.trajectory = self.trajectory()
             raise
         trajectory = self.trajectory()
-        if isinstance(self.search, CrossingSearch):
+        if self.search is not None:
             self.search.warn_of_accumulation()
         if self.times is None and not self.ended:
             run.iterations = self.iterations - int(trajectory.iterations.sum())
@@ -116,7 +116,7 @@ class Observation:
 
     def _advance_chunk(self, size: int) -> None:
         """Advance by one chunk, search it for events and save it; a failure after a terminal event is ignored."""
-        if isinstance(self.search, CrossingSearch) and self.search.changes:
+        if self.search is not None and self.search.changes:
             self._advance_with_changes(self.search, size)
             return
         before, failure = self.run.snapshot, None
