@@ -188,8 +188,16 @@ _SMOOTHER = {
     "sign": "the sign is not differentiable",
     "Piecewise": "piecewise functions are not differentiable where pieces meet",
     "Heaviside": "step functions are not differentiable",
+    "Max": "the maximum is not differentiable",
+    "Min": "the minimum is not differentiable",
     "ImaginaryUnit": "a Lagrangian must be real",
 }
+SWITCHES = frozenset(("abs", "sign", "max", "min", "heaviside", "piecewise"))
+BY_EVENTS = (
+    ". A force or velocity that switches, an impact or a stop is an event: events=sc.impact(..), or "
+    "sc.Event(.., then={..}); see docs/events.md. For dry friction and contact that persists use Siconos or Drake"
+)
+"""Advice for functions that are not smooth."""
 
 
 def unsupported_part(expression: Expr) -> str | None:
@@ -226,7 +234,8 @@ def _node_problem(node: Any) -> str | None:
     kind = type(node).__name__
     reason = f": {_SMOOTHER[kind]}" if kind in _SMOOTHER else ""
     known = ", ".join([*FUNCTIONS, *CONSTANTS])
-    return f"{kind} ('{shortened(node)}') is not supported{reason}. Use + - * / ** and {known}"
+    advice = BY_EVENTS if kind.lower() in SWITCHES else ""
+    return f"{kind} ('{shortened(node)}') is not supported{reason}. Use + - * / ** and {known}{advice}"
 
 
 def exponent_problem(exponent: Expr) -> str | None:

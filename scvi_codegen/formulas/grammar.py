@@ -22,11 +22,13 @@ from sympy import Add, Expr, Mul, Pow, Rational, S, Symbol
 
 from scvi_codegen.errors import ExpressionError, SystemDefinitionError, closest
 from scvi_codegen.formulas.expressions import (
+    BY_EVENTS,
     CONSTANTS,
     FUNCTIONS,
     MAX_BITS,
     MAX_DIGITS,
     NODES,
+    SWITCHES,
     beyond_double,
     bits,
     evaluated,
@@ -319,6 +321,7 @@ class Parser:
             return self.call(name, column)
         if self.tokens[self.position][:2] == ("operator", "("):
             known = ", ".join(FUNCTIONS)
+            known += BY_EVENTS if name.lower() in SWITCHES else ""
             self.refuse(f"'{name}' is not a function of the grammar{closest(name, FUNCTIONS)} Known: {known}", column)
         value = self.symbols.get(name, CONSTANTS.get(name))
         if value is None:

@@ -22,6 +22,7 @@ from scvi_codegen.errors import (
     ModelFileError,
     PackageError,
     StateError,
+    SystemDefinitionError,
 )
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -408,6 +409,12 @@ def test_unsupported_combinations_are_refused(ball):
         compile_stepper(rod, "svi:2", events=impact("x"))
     with pytest.raises(MethodError, match="error="):
         ball.integrate([1.0], [0.0], t_end=2.0, error=1e-8, events=BOUNCES["impact"])
+
+
+@pytest.mark.parametrize("formula", ["abs(y)", "sign(y)", "max(y, 0)", "Heaviside(y)"])
+def test_formulas_that_switch_point_to_events(formula):
+    with pytest.raises(SystemDefinitionError, match=r"sc\.impact\(\.\.\), or sc\.Event"):
+        LagrangianSystem.from_text(name="stop", coordinates=["y"], lagrangian=f"y_dot**2/2 - {formula}")
 
 
 def test_no_accuracy_warnings_of_energies_that_impacts_change(ball):
