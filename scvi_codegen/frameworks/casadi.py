@@ -22,6 +22,7 @@ from sympy import Expr, Symbol
 from scvi_codegen.errors import ArgumentError, MethodError, StateError
 from scvi_codegen.formulas.expressions import CONSTANTS, FUNCTIONS
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.intermediates import written_out
 from scvi_codegen.formulas.symbols import PARTS, input_parameters, symbol
 from scvi_codegen.frameworks.flow import Flow, imported
 from scvi_codegen.mechanics.derived_expressions import forms_of
@@ -175,7 +176,8 @@ def numeric(ca: Any, expressions: Sequence[Expr], symbols: Sequence[Symbol]) -> 
         "cse": True,
         "dummify": True,
     }  # a symbol may be called e
-    function: Callable[..., list[Any]] = sympy.lambdify(symbols, list(expressions), **arguments)
+    plain = list(map(written_out, expressions))
+    function: Callable[..., list[Any]] = sympy.lambdify(symbols, plain, **arguments)
     return function
 
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.expressions import evaluate
 from scvi_codegen.mechanics.multibody.trees.shapes import SHAPES, volume_and_inertia
 
 ROBOTS = Path(__file__).parent / "robots"
@@ -128,8 +129,7 @@ def value(system: Any, state: dict[str, Any], velocity: dict[str, Any]) -> float
                 values |= {f"{name}_{letter}": a, f"{name}_{letter}_dot": b}
         else:
             values |= {name: q, name + "_dot": velocity[name]}
-    symbols = sorted(system.lagrangian.free_symbols, key=str)
-    return float(sympy.lambdify(symbols, system.lagrangian, cse=True)(*(values[each.name] for each in symbols)))
+    return float(evaluate(system.lagrangian, {each: values[each.name] for each in system.lagrangian.free_symbols}))
 
 
 def turning(start: Any, rates: Any) -> Callable[[float], Any]:

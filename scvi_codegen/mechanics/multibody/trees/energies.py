@@ -6,10 +6,12 @@ velocity and velocity of the origin, in the frame of the link, follow from the p
     w_i = A_i^T w_p + a q_dot (hinge),    v_i = A_i^T (v_p + w_p x r_i) + a q_dot (slide),
 
 the kinetic energy is the sum of m |v_i + w_i x c_i|^2/2 + w_i . I_i w_i/2, and the first moments of the subtrees are
-S_i = m_i c_i + sum over children (m_subtree r_k + A_k S_k). A free base with position x, rotation R and angular
-velocity omega adds, with the total mass M, the first moment S of the tree in its frame and S_dot = dS/dq q_dot,
+S_i = m_i c_i + sum over children (m_subtree r_k + A_k S_k). A free base with position x and rotation R adds, with the
+total mass M, and the first moment S of the tree and its momentum P for x_dot = 0 in the frame of the base,
 
-    T = M |x_dot|^2/2 + R^T x_dot . (S_dot + omega x S) + T(x_dot = 0),    V = -g . (M x + R S).
+    T = M |x_dot|^2/2 + x_dot . R P + T(x_dot = 0),    V = -g . (M x + R S),
+
+where P_i = m_i (v_i + w_i x c_i) + sum over children A_k P_k.
 
 The components of all these vectors are intermediate quantities (:mod:`scvi_codegen.formulas.intermediates`), so that
 the energies of n bodies have O(n) operations.
@@ -19,7 +21,7 @@ R. Featherstone, Rigid Body Dynamics Algorithms, Springer 2008, chapters 3 and 4
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from itertools import chain
 from typing import Any
 
@@ -31,7 +33,6 @@ from scvi_codegen.formulas.rotations.members import Rotation
 from scvi_codegen.formulas.symbols import DOT, symbol
 from scvi_codegen.mechanics.multibody.trees.tree import (
     SINGLE,
-    Inertia,
     Joint,
     Link,
     Vector,
@@ -113,8 +114,9 @@ class _Tree:
         terms: list[Expr] = []
         turning: list[Matrix] = []
         moving: list[Matrix] = []
+        momenta: list[Matrix] = []
         along = Matrix([0, 0, 1])
-        for i, link in enumerate(self.links):
+        for link in self.links:
             joint = link.joint
             outer = turning[link.parent] if link.parent >= 0 else zeros(3, 1)
             speed = moving[link.parent] if link.parent >= 0 else zeros(3, 1)
@@ -128,13 +130,28 @@ class _Tree:
                     v += along * rate
             else:
                 w += Matrix(rotation_of(joint).rates)
-                if joint.kind == "free":
-                    terms.append(self.free_base(i))
             turning.append(as_quantities(w))
             moving.append(as_quantities(v))
-            terms.append(_energy(link.inertia, turning[-1], moving[-1]))
+            velocity = as_quantities(moving[-1] + turning[-1].cross(_vector(link.inertia.center)))
+            momenta.append(_number(link.inertia.mass) * velocity)
+            terms.append(velocity.dot(momenta[-1]) / 2)
+            terms.append((turning[-1].T * _matrix(link.inertia.matrix) * turning[-1])[0] / 2)
             terms.append(self.quadratic(joint, joint.armature))
-        return Add(*terms)
+        return Add(*terms, *self.free_bases(momenta))
+
+    def free_bases(self, momenta: list[Matrix]) -> Iterator[Expr]:
+        """Yield the kinetic energies of the velocities of free bases.
+
+        Args:
+            momenta: of the links, in their frames, where the bases do not move but turn.
+        """
+        for i in reversed(range(len(self.links))):
+            parent, joint = self.links[i].parent, self.links[i].joint
+            if joint.kind == "free":
+                velocity = Matrix([symbol(name + DOT) for name in position_of(joint)])
+                yield self.masses[i] * velocity.dot(velocity) / 2 + velocity.dot(self.turned(joint, momenta[i]))
+            elif parent >= 0:
+                momenta[parent] = as_quantities(momenta[parent] + self.turned(joint, momenta[i]))
 
     def quadratic(self, joint: Joint, factor: float) -> Expr:
         """Return factor/2 times the sum of the squared rates of a joint."""
@@ -144,20 +161,6 @@ class _Tree:
             rates = [*rotation_of(joint).rates]
             rates += [symbol(name + DOT) for name in position_of(joint)] if joint.kind == "free" else []
         return _number(factor) * Add(*(rate**2 for rate in rates)) / 2
-
-    def free_base(self, i: int) -> Expr:
-        """Return the kinetic energy of the velocity of a free base."""
-        joint = self.links[i].joint
-        velocity = Matrix([symbol(name + DOT) for name in position_of(joint)])
-        moment = self.moments[i]
-        rate = Matrix(rotation_of(joint).rates).cross(moment)
-        for name in self.single_coordinates():
-            rate += moment.diff(symbol(name)) * symbol(name + DOT)
-        for each in self.links:
-            if each.joint.kind == "ball":
-                rate += _rate_of_matrix(moment, rotation_of(each.joint))
-        turned = Matrix(3, 3, rotation_of(joint).entries) * rate
-        return self.masses[i] * velocity.dot(velocity) / 2 + velocity.dot(turned)
 
     def potential_energy(self) -> Expr:
         """Return V of gravity and springs."""
@@ -210,22 +213,6 @@ def rotation_of(joint: Joint) -> Rotation:
 def position_of(joint: Joint) -> tuple[str, ...]:
     """Return the names of the position of a free body: ``x_NAME``, ``y_NAME``, ``z_NAME``."""
     return tuple(f"{axis}_{joint.name}" for axis in "xyz")
-
-
-def _energy(inertia: Inertia, w: Matrix, v: Matrix) -> Expr:
-    velocity = as_quantities(v + w.cross(_vector(inertia.center)))
-    return (_number(inertia.mass) * velocity.dot(velocity) + (w.T * _matrix(inertia.matrix) * w)[0]) / 2
-
-
-def _rate_of_matrix(formula: Matrix, rotation: Rotation) -> Matrix:
-    """Return the time derivative of a formula by the entries of a rotation, R_dot = R hat(omega)."""
-    one, two, three = rotation.rates
-    hat = Matrix([[0, -three, two], [three, 0, -one], [-two, one, 0]])
-    rates = Matrix(3, 3, rotation.entries) * hat
-    rate = zeros(3, 1)
-    for entry, derivative in zip(rotation.entries, rates, strict=True):
-        rate += formula.diff(entry) * derivative
-    return rate
 
 
 def as_quantities(vector: Matrix) -> Matrix:
