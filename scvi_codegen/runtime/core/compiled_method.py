@@ -76,6 +76,7 @@ class CompiledMethod:
         source: the C source it was compiled from; ``None`` of arrays that are compiled with the sizes of each call.
         fallback: source with Newton's iteration, if the main source contains only the fixed-point iteration.
         events: events that every run records.
+        changes_states: whether one of them changes the states of runs.
         any_size: whether the sizes of its arrays are those of each call; the stepper is bound to them, or
             compiled with them if an integrator of any size is impossible.
         origin, problem: of a bound stepper, the stepper of any size, and the sizes and tables; else ``None``.
@@ -95,6 +96,7 @@ class CompiledMethod:
         problem: RunSizes | None = None,
     ) -> None:
         self.interface, self.flags, self.events = interface, flags, events
+        self.changes_states = any(event.changes_state for event in events)
         self.origin, self.problem, self._of_sizes, self._reason = origin, problem, of_sizes, reason
         self.any_size = problem is None and bool(interface.layout.coordinates)
         self._variants = Variants() if variants is None else variants
@@ -395,11 +397,6 @@ class CompiledMethod:
         if self.any_size:
             raise unavailable("dimension", self)
         return self.interface.dimension
-
-    @property
-    def changes_states(self) -> bool:
-        """Return whether events change the states of runs."""
-        return any(event.changes_state for event in self.events)
 
     def _check_no_changes(self, what: str, *, wanted: bool = True) -> None:
         """Raise :class:`MethodError` if something is wanted that events that change the states of runs exclude."""

@@ -149,6 +149,8 @@ def unresolved_parts(states: SavedStates, rows: slice = slice(None)) -> Array | 
 
 def warn_of_unresolved_fields(trajectory: SavedStates) -> None:
     """Issue an :class:`AccuracyWarning` if the highest modes of a mesh contain too much in one of some saved states."""
+    if trajectory.stepper.interface.layout.mesh is None:
+        return
     count = max(4, min(MOST_SPECTRA, MOST_VALUES // max(1, trajectory.q.shape[-1])))
     stride = -(-max(len(trajectory.t) - 1, 1) // count)
     rows = slice((len(trajectory.t) - 1) % stride, None, stride)
