@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.method import Method, Specification, degree_count, resolve_nodes
-from scvi_codegen.methods.runge_kutta import RungeKutta, check_form
+from scvi_codegen.methods.method import Specification, degree_count, resolve_nodes
+from scvi_codegen.methods.runge_kutta import RungeKutta, TableauMethod, check_form
 from scvi_codegen.representation import summary
 from scvi_codegen.tables import tableau as tableaux
 from scvi_codegen.tables.nodes import Nodes
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class SpectralCollocation(Method):
+class SpectralCollocation(TableauMethod):
     """Spectral collocation (SC): (18) in position form, (21) in phase space. Neither symplectic nor reversible.
 
     Args:
@@ -50,7 +50,7 @@ class SpectralCollocation(Method):
         return self.nodes
 
     @property
-    def tableau(self) -> Tableau:
+    def tableau(self) -> Tableau:  # type: ignore[override]  # a property in place of a field
         """Equivalent collocation Runge-Kutta tableau (23), on the nodes 1 .. s."""
         return tableaux.collocation_tableau(self.node_set.abscissae[1:])
 
@@ -63,26 +63,6 @@ class SpectralCollocation(Method):
     def title(self) -> str:
         """Display title."""
         return f"Spectral collocation, degree {self.degree}, {self.node_set.name} nodes, {self.form} form"
-
-    @property
-    def order(self) -> int | None:
-        """Order of the equivalent tableau."""
-        return self.tableau.order
-
-    @property
-    def symmetric(self) -> bool:
-        """True if the equivalent tableau is symmetric."""
-        return self.tableau.is_symmetric
-
-    @property
-    def symplectic(self) -> bool:
-        """True if the form is phase space and the equivalent tableau symplectic."""
-        return self.form == "phase-space" and self.tableau.is_symplectic
-
-    @property
-    def needs_regular(self) -> bool:
-        """True if the form is position, which requires a regular Lagrangian."""
-        return self.form == "position"
 
     @property
     def parts(self) -> tuple[Part, ...]:

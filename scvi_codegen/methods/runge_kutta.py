@@ -35,8 +35,36 @@ if TYPE_CHECKING:
 FORMS = ("phase-space", "position")
 
 
+class TableauMethod(Method):
+    """Method whose properties are those of a Runge-Kutta tableau, in one of two forms."""
+
+    __slots__ = ()
+    tableau: Tableau
+    form: str
+
+    @property
+    def order(self) -> int | None:
+        """Order by the simplifying conditions of the tableau."""
+        return self.tableau.order
+
+    @property
+    def symmetric(self) -> bool:
+        """True if the tableau is symmetric."""
+        return self.tableau.is_symmetric
+
+    @property
+    def symplectic(self) -> bool:
+        """True if the tableau is symplectic and the form phase space; in position form p is not an unknown."""
+        return self.form == "phase-space" and self.tableau.is_symplectic
+
+    @property
+    def needs_regular(self) -> bool:
+        """True if the form is position, which requires a regular Lagrangian."""
+        return self.form == "position"
+
+
 @dataclass(frozen=True, slots=True)
-class RungeKutta(Method):
+class RungeKutta(TableauMethod):
     """Runge-Kutta method on Hamilton's equations (``form="phase-space"``) or on (q, v) (``form="position"``).
 
     Args:
@@ -65,26 +93,6 @@ class RungeKutta(Method):
         """Display title."""
         stages = len(self.tableau.b)
         return f"Runge-Kutta {self.tableau.name}, {stages} stage{'s' * (stages > 1)}, {self.form} form"
-
-    @property
-    def order(self) -> int | None:
-        """Order by the simplifying conditions of the tableau."""
-        return self.tableau.order
-
-    @property
-    def symmetric(self) -> bool:
-        """True if the tableau is symmetric."""
-        return self.tableau.is_symmetric
-
-    @property
-    def symplectic(self) -> bool:
-        """True if the tableau is symplectic and the form phase space; in position form p is not an unknown."""
-        return self.form == "phase-space" and self.tableau.is_symplectic
-
-    @property
-    def needs_regular(self) -> bool:
-        """True if the form is position, which requires a regular Lagrangian."""
-        return self.form == "position"
 
     @property
     def exactness(self) -> Exactness:
