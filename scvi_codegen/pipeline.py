@@ -124,7 +124,7 @@ def describe(
         parameters=program.layout.parameters,
         defaults=program.layout.defaults,
         unknowns=program.equations.unknowns,
-        workspace=workspace_size(program),
+        workspace=workspace_size(program) + uses_fallback_library,
         has_action=program.action or (uses_fallback_library and program.equations.acts),
         map_names=tuple(each.name for each in program.quantities.momentum_maps),
         map_formulas=tuple(each.formula for each in program.quantities.momentum_maps),

@@ -55,8 +55,8 @@ class Binding:
         self.integers: Callable[[NDArray[np.int32]], Any] = partial(library.ffi.from_buffer, "int[]")
         self.whole_numbers: Callable[[NDArray[np.int64]], Any] = partial(library.ffi.from_buffer, "long long[]")
         self._fallback = fallback if self.has("set_fallback") else None
-        self._fallback_missing = self._fallback is not None
         self._fallback_binding: Self | None = None
+        self._shared_fallback = self.null
 
     def __reduce__(self) -> tuple[Any, ...]:
         if self._origin is None:
@@ -68,7 +68,7 @@ class Binding:
         function: Callable[..., Any] = getattr(self._lib, f"{self._prefix}_{name}")
         leading = () if memory is None else (memory,)
         called = partial(function, *leading) if leading else function
-        if self._fallback_missing and name not in WITHOUT_STEPS:
+        if self._fallback is not None and name not in WITHOUT_STEPS:
             return self._with_fallback(called, *leading)
         return called
 
@@ -93,18 +93,19 @@ class Binding:
         return self
 
     def set_fallback(self) -> None:
-        """Compile the library with Newton's method if it is used and was not required yet."""
-        if self._fallback_missing:
-            lender = self.with_function("provided_fallback")
-            getattr(self._lib, f"{self._prefix}_set_fallback")(lender.function("provided_fallback")())
-            self._fallback_missing = False
+        """Compile the library with Newton's method if it is used; the workspaces allocated from now on refer to it."""
+        if self._fallback is not None:
+            self._shared_fallback = self.with_function("provided_fallback").function("provided_fallback")()
 
     def has(self, name: str) -> bool:
         """Return whether the library has the function ``<prefix>_<name>``."""
         return hasattr(self._lib, f"{self._prefix}_{name}")
 
     def _with_fallback(self, function: Callable[..., Any], *changed: Any) -> Callable[..., Any]:
-        """Return the function; a call that requests the fallback is repeated with it, on the initial memory."""
+        """Return the function; a call that requests the fallback is repeated with it, on the initial memory.
+
+        Its last argument is the workspace.
+        """
         memory = self._ffi.buffer(*changed) if changed else bytearray()
 
         def call(*arguments: Any) -> Any:
@@ -113,6 +114,7 @@ class Binding:
             if status != FALLBACK_REQUIRED:
                 return status
             self.set_fallback()
+            self._refer_to_fallback(arguments[-1])
             memory[:] = before
             return function(*arguments)
 
@@ -158,7 +160,13 @@ class Binding:
 
     def workspace(self) -> Any:
         """Return memory for one call."""
-        return self.pointer(np.empty(self._workspace))
+        workspace = self.pointer(np.empty(self._workspace))
+        if self._fallback is not None:
+            self._refer_to_fallback(workspace)
+        return workspace
+
+    def _refer_to_fallback(self, workspace: Any) -> None:
+        getattr(self._lib, f"{self._prefix}_set_fallback")(self._shared_fallback, workspace)
 
     def options(self, options: SolverOptions | None) -> Any:
         """Return the C struct, NULL for the defaults."""

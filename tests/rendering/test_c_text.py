@@ -174,6 +174,8 @@ def test_sources_for_this_machine_compile_without_warnings(name, solver, compile
         folder = tmp_path / str(number)
         folder.mkdir()
         run([needs(compiler), *C99, "-c", *write([text], folder)], folder)
+        variables = re.findall(r"^(\w+) [BbCc]", run([needs("nm"), "-P", f"{text.prefix}.o"], folder), re.MULTILINE)
+        assert variables == []
         check_style(text.amalgamated().code)
         check_style(text.header)
 

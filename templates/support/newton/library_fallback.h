@@ -4,6 +4,8 @@
 #include "../core/status_codes.h"
 #include "../core/step.h"
 
+#include <string.h>
+
 /* Newton solver that one library provides to another, which has only the fixed-point iteration. Requires: step.h. */
 
 /* Computes the increments of a step with their low words, and the relative error of its end if the stages determine it,
@@ -14,23 +16,24 @@ typedef struct {
 } fallback;
 
 #ifdef LIBRARY_FALLBACK
-/* Fallback to the Newton solver of another library, which is loaded on demand. Until it is set, a step whose
- * fixed-point iteration fails returns FALLBACK_REQUIRED, is not performed, and has to be repeated. */
-static const fallback *library_fallback; /* set once, before the calls that need it are repeated */
-
-void NAME(set_fallback)(const void *shared_fallback)
+/* Fallback to the Newton solver of another library, which is loaded on demand; the last number of the scratch contains
+ * the pointer to it. While that is NULL, a step whose fixed-point iteration fails returns FALLBACK_REQUIRED, is not
+ * performed, and has to be repeated. */
+void NAME(set_fallback)(const void *shared_fallback, double *workspace)
 {
-  library_fallback = shared_fallback;
+  memcpy(workspace + SCRATCH - 1, &shared_fallback, sizeof shared_fallback);
 }
 
 /* Solves the step by the fallback library, which leaves its error estimate in the workspace. */
 static SELDOM int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
     solver_report *report, double *workspace)
 {
+  const fallback *library;
   (void)status;
-  if (!library_fallback)
+  memcpy(&library, step->scratch + SCRATCH - 1, sizeof library);
+  if (!library)
     return STATUS(FALLBACK_REQUIRED);
-  return library_fallback->step(step, dq, dp, options, report, workspace);
+  return library->step(step, dq, dp, options, report, workspace);
 }
 #else
 /* Newton solver for a library without it. Requires: fallback.h, FALLBACK_WORKSPACE. */
