@@ -48,7 +48,15 @@ class _Assembly:
         system = self.system
         sizes = ", ".join(f"N{axis}" for axis in self.axes)
         terms = [*self.kinetic(), *self.in_space()]
+        dissipation = None
+        if system.dissipation != 0:
+            here = {axis: f"i{axis}" for axis in self.axes}
+            rates = {rate.name: self.at(f"{rate.name[:-2]}_dot", here) for rate in system.rates}
+            dissipation = self.over_points(
+                f"({self.written(system.dissipation, rates | self.at_points([*self.axes]))})"
+            )
         tables = {f"nodes_{name}": axis.table for name, axis in self.axes.items() if axis.table is not None}
+        tables |= {f"edges_{name}": axis.edges.table for name, axis in self.axes.items() if axis.edges is not None}
         text = "\n+ ".join(terms)
         tables = {name: table for name, table in tables.items() if f"{name}[" in text}
         conjugate = [f"{each}[{sizes}]" for each in system.momenta]
@@ -60,13 +68,14 @@ class _Assembly:
                 **{f"{name}[{size}]": values for name, (size, values) in self.used.items()},
             },
             "tables": {
-                f"{name}[E{name.removeprefix('nodes_')}, {table.shape[1]}]": table for name, table in tables.items()
+                f"{name}[{'F' if name.startswith('edges') else 'E'}{name[6:]}, {table.shape[1]}]": table
+                for name, table in tables.items()
             },
         }
         if conjugate:
             assembled: Any = HamiltonianSystem.from_text(**arguments, momenta=conjugate, hamiltonian=text)
         else:
-            assembled = LagrangianSystem.from_text(**arguments, lagrangian=text)
+            assembled = LagrangianSystem.from_text(**arguments, lagrangian=text, dissipation=dissipation)
         grids = np.meshgrid(*(axis.points for axis in self.axes.values()), indexing="ij")
         masses = np.meshgrid(*(axis.weights for axis in self.axes.values()), indexing="ij")
         parts: dict[str, Any] = {
@@ -179,16 +188,28 @@ class _Assembly:
     def over_cells(self, key: tuple[str, ...], term: Expr) -> Iterator[str]:
         """Yield the sums over cells of the axes of the derivatives, and over the points of the other axes."""
         others = [axis for axis in self.axes if axis not in key]
-        for cells in itertools.product(*(self.axes[axis].cells for axis in key)):
+        for cells in itertools.product(*(self.kinds(axis, term) for axis in key)):
             chosen = dict(zip(key, cells, strict=True))
             loops = [each.loop for each in cells if each.loop] + [f"i{axis} in N{axis}" for axis in others]
-            factors = [
-                self.array(f"jacobian_{axis}", self.extent(axis), self.axes[axis].jacobians, each.index)
-                for axis, each in chosen.items()
-            ]
+            factors = [self.size(axis, each) for axis, each in chosen.items()]
             factors += map(self.weight, others)
             body = f"{'*'.join(factors)}*({self.quadrature(chosen, others, term)})"
             yield f"sum({', '.join(loops)}, {body})" if loops else f"({body})"
+
+    def kinds(self, axis: str, term: Expr) -> list[Cells]:
+        """Return the cells of an axis, of elements with their edges if a term has second derivatives along it."""
+        discretised, derivatives = self.axes[axis], self.system.derivatives
+        second = [name for name, (_, orders) in derivatives.items() if orders.get(axis) == 2]
+        if discretised.edges is None or not any(symbol(name) in term.free_symbols for name in second):
+            return [*discretised.cells]
+        return [*(replace(each, interior=True) for each in discretised.cells), *discretised.edges.cells]
+
+    def size(self, axis: str, cells: Cells) -> str:
+        """Return the text of the Jacobian of a cell, or of the weight of an edge."""
+        discretised = self.axes[axis]
+        if cells.edge and discretised.edges:
+            return self.array(f"edge_weight_{axis}", f"F{axis}", discretised.edges.weights, cells.index)
+        return self.array(f"jacobian_{axis}", self.extent(axis), discretised.jacobians, cells.index)
 
     def extent(self, axis: str) -> str:
         """Return the size that counts the cells of an axis."""
@@ -203,7 +224,7 @@ class _Assembly:
         nodes: list[list[str]] = []
         sums: list[str] = []
         for name, cells in chosen.items():
-            count = len(self.axes[name].quadrature)
+            count = 1 if cells.edge else len(self.axes[name].quadrature)
             alike = cells.rule is not None
             nodes.append([f"a{name}"] if alike else [str(k) for k in range(count)])
             sums += [f"a{name} in {count}"] * alike
@@ -211,12 +232,14 @@ class _Assembly:
         for node in itertools.product(*nodes):
             at = dict(zip(chosen, node, strict=True))
             texts = self.at_points(others)
-            texts |= {name: f"{name}_in_cells[{chosen[name].index}, {k}]" for name, k in at.items()}
+            for name, k in at.items():
+                edge, index = chosen[name].edge, chosen[name].index
+                texts[name] = f"{name}_at_edges[{index}]" if edge else f"{name}_in_cells[{index}, {k}]"
             texts |= {each: self.combined(each, {}, chosen, at) for each in self.system.variables}
             for name, (each, orders) in self.system.derivatives.items():
                 if set(orders) <= set(chosen) and symbol(name) in term.free_symbols:
                     texts[name] = self.derivative(each, orders, chosen, at)
-            weights = [self.coefficient(None, name, (k,)) for name, k in at.items()]
+            weights = ["1" if chosen[name].edge else self.quadrature_weight(name, chosen, k) for name, k in at.items()]
             parts.append("*".join([*(each for each in weights if each != "1"), f"({self.written(term, texts)})"]))
         body = " + ".join(parts)
         for each in reversed(sums):
@@ -230,10 +253,29 @@ class _Assembly:
             for k in index:
                 entries = entries[int(k)]
             return digits(entries)
-        name = f"weights_{axis}" if order is None else f"D_{axis}"
+        name = f"weights_{axis}" if order is None else f"D{order if order > 1 else ''}_{axis}"
         values = np.array([list(map(float, row)) for row in entries] if order else list(map(float, entries)))
         self.used[name] = (", ".join(map(str, values.shape)), values)
         return f"{name}[{', '.join(index)}]"
+
+    def quadrature_weight(self, axis: str, chosen: Mapping[str, Cells], k: str) -> str:
+        """Return the text of a quadrature weight, 0 at the ends of elements if these are edges."""
+        if not chosen[axis].interior:
+            return self.coefficient(None, axis, (k,))
+        values = np.array([0.0, *map(float, self.axes[axis].quadrature[1:-1]), 0.0])
+        self.used[f"interior_weights_{axis}"] = (str(len(values)), values)
+        return f"interior_weights_{axis}[{k}]"
+
+    def at_edge(self, axis: str, order: int, cells: Cells, values: Sequence[str]) -> str:
+        """Return the text of a derivative at an edge from the values to the left and to the right."""
+        edges, half, sides = self.axes[axis].edges, len(values) // 2, []
+        assert edges is not None
+        name, factor = f"edge_rows{order}_{axis}", f"edge_factors{order}_{axis}"
+        self.used |= {name: (f"2, {half}", edges.rows[order]), factor: (f"F{axis}, 2", edges.scales[order])}
+        for side, part in enumerate((values[:half], values[half:])):
+            terms = [f"{name}[{side}, {b}]*{value}" for b, value in enumerate(part) if value != "0"]
+            sides.append(f"{factor}[{cells.index}, {side}]*({' + '.join(terms) or '0'})")
+        return f"({' + '.join(sides)})"
 
     def derivative(
         self, each: str, orders: Mapping[str, int], chosen: Mapping[str, Cells], at: Mapping[str, str]
@@ -242,14 +284,11 @@ class _Assembly:
         factors = []
         for axis, order in orders.items():
             discretised = self.axes[axis]
-            if order >= len(discretised.operators):
-                raise SystemDefinitionError(
-                    f'the density contains the second derivative {each}_{axis * order}, which "spectral-elements" '
-                    'of continuous functions do not have: use "finite-differences" or "fourier"'
-                )
+            if chosen[axis].edge:
+                continue
             by = self.array(f"inverse_{axis}", self.extent(axis), 1 / discretised.jacobians, chosen[axis].index)
             factors += [by] * order
-        return f"{'*'.join(factors)}*({self.combined(each, orders, chosen, at)})"
+        return "*".join([*factors, f"({self.combined(each, orders, chosen, at)})"])
 
     def combined(
         self,
@@ -273,6 +312,12 @@ class _Assembly:
             return self.entry(each, chosen, slots)
         axis = left[0]
         cells, order = chosen[axis], orders.get(axis, 0)
+        if cells.edge:
+            count = len(cells.places)
+            if order == 0:
+                return self.combined(each, orders, chosen, at, {**slots, axis: str(count // 2 - 1)})
+            known = (self.combined(each, orders, chosen, at, {**slots, axis: str(b)}) for b in range(count))
+            return self.at_edge(axis, order, cells, [*known])
         if order == 0 and self.axes[axis].table is not None:
             return self.combined(each, orders, chosen, at, {**slots, axis: at[axis]})
         if cells.rule is not None:
@@ -312,6 +357,9 @@ class _Assembly:
                 return name
             if name in self.axes:
                 axis = self.axes[name]
+                if texts[name].startswith(f"{name}_at_edges") and axis.edges:
+                    self.used[f"{name}_at_edges"] = (f"F{name}", axis.edges.points)
+                    return f"({texts[name]})"
                 self.used |= (
                     {f"{name}_points": (f"N{name}", axis.points)}
                     if texts[name].startswith(f"{name}_points")

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.tables.basis import differentiation_matrix, identity_matrix
+from scvi_codegen.tables.basis import differentiation_matrix, identity_matrix, matrix_product
 from scvi_codegen.tables.nodes import point_count
 from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
 from scvi_codegen.tables.quadrature import gauss_lobatto
@@ -53,12 +53,40 @@ class Cells:
         index: index of the cell.
         places: of the points that a cell uses.
         rule: beginning of the text of the index of point b, ``nodes_x[ex``, if a table has all of them.
+        interior: whether the ends of elements have no weight, because they are edges.
+        edge: whether it is an end of two elements, whose points follow each other.
     """
 
     loop: str
     index: str
     places: tuple[CellPoint, ...]
     rule: str | None = None
+    interior: bool = False
+    edge: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Edges:
+    """Ends of elements with derivatives from both sides, for densities of the second derivative.
+
+    The second derivative is k = -M^-1 K u with the mass and stiffness matrices: within elements that of the
+    polynomials, at their ends a mean of both sides and the jump of the first derivative. Ends of the axis belong to
+    them only if they are clamped; at others k vanishes.
+
+    Attributes:
+        cells: kinds of edges.
+        table: (F, 2 p + 2) positions of the points of the elements to the left and to the right.
+        weights, points: (F,) quadrature weights and coordinates.
+        rows: by order of the derivative, (2, p + 1) coefficients to the left and to the right.
+        scales: by order, (F, 2) factors of both sides.
+    """
+
+    cells: tuple[Cells, ...]
+    table: NDArray[np.int64]
+    weights: Array
+    points: Array
+    rows: dict[int, Array]
+    scales: dict[int, Array]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,6 +104,7 @@ class Axis:
         table: (E, b) positions of the points, or ``None`` if cells name their points without a table.
         inside: (E, b) whether a point is unknown; the value at the others is prescribed.
         reference: of elements, the points on [-1, 1].
+        edges: of elements, their ends.
         pairs: (N, N) matrices K of the quadratic forms sum_(i<j) K_ij (u_i - u_j)^2/2 of int u_x^2/2 dx and int
             u_xx^2/2 dx (Fourier).
         stiffness: upper bounds of int u_x^2 dx and int u_xx^2 dx by sum_i weights_i u_i^2.
@@ -93,6 +122,7 @@ class Axis:
     table: NDArray[np.int64] | None = None
     inside: NDArray[np.bool_] = field(default_factory=lambda: np.ones((0, 0), bool))
     reference: Vector = ()
+    edges: Edges | None = None
     pairs: tuple[Array, ...] = ()
     stiffness: tuple[float, ...] = ()
 
@@ -132,7 +162,9 @@ class Axis:
         return np.where(self.inside, array[..., self.table], 0.0)
 
 
-def spectral_elements(name: str, breaks: Array, degree: int, fixed: tuple[bool, bool] | None) -> Axis:
+def spectral_elements(
+    name: str, breaks: Array, degree: int, fixed: tuple[bool, bool] | None, clamped: tuple[bool, bool]
+) -> Axis:
     """Return an axis of elements of degree p on Gauss-Lobatto-Legendre points.
 
     Args:
@@ -140,6 +172,7 @@ def spectral_elements(name: str, breaks: Array, degree: int, fixed: tuple[bool, 
         breaks: (E + 1,) ascending ends of the elements.
         degree: p.
         fixed: whether the values at the left and right ends are prescribed; ``None`` for a periodic axis.
+        clamped: whether the first derivatives vanish there.
     """
     p = point_count(degree, "the degree of the elements", least=1)
     rule = gauss_lobatto(p + 1)
@@ -175,20 +208,64 @@ def spectral_elements(name: str, breaks: Array, degree: int, fixed: tuple[bool, 
         if right:
             last = tuple(CellPoint(f"N{name}-{p - b}") for b in range(p))
             kinds.append(Cells("", f"{size}-1", (*last, CellPoint(None, 1))))
+    largest = _largest_quotient(rule.weights, derivative) / float(half.min()) ** 2
     return Axis(
         name=name,
         points=points[inside],
         weights=masses[inside],
         length=float(breaks[-1] - breaks[0]),
         quadrature=rule.weights,
-        operators=(identity_matrix(p + 1), derivative),
-        stiffness=(_largest_quotient(rule.weights, derivative) / float(half.min()) ** 2,),
+        operators=(identity_matrix(p + 1), derivative, matrix_product(derivative, derivative)),
+        stiffness=(largest, largest**2),
+        edges=_edges(name, places, at, (rule.weights, derivative), fixed, clamped),
         cells=tuple(kinds),
         jacobians=half,
         cell_points=at,
         table=np.clip(places - int(left), 0, count - int(left) - int(right) - 1),
         inside=(places >= int(left)) & (places < count - int(right)),
         reference=rule.points,
+    )
+
+
+def _edges(
+    name: str,
+    places: NDArray[np.int64],
+    at: Array,
+    rule: tuple[Vector, Matrix],
+    fixed: tuple[bool, bool] | None,
+    clamped: tuple[bool, bool],
+) -> Edges:
+    """Return the ends of elements whose points have the positions ``places`` and the coordinates ``at``, (E, p + 1)."""
+    weights = np.array([float(each) for each in rule[0]])
+    derivative = np.array([[float(x) for x in row] for row in rule[1]])
+    elements, size, half = len(places), places.shape[1], np.ptp(at, axis=1) / 2
+    last, (left, right) = int(places.max()), fixed or (False, False)
+    ends = np.arange(1 - clamped[0], elements + (fixed is None or clamped[1]))
+    sides = np.stack([ends - 1, ends], axis=1)
+    present = (sides >= 0) & ((sides < elements) | (fixed is None))
+    sides = np.where(present, sides % elements, (sides % elements)[:, ::-1])
+    table = places[sides]
+    table[~present[:, 0], 0] = table[~present[:, 0], 0, ::-1]  # so that entry p is the edge in all rows
+    table = table.reshape(-1, 2 * size)
+    shares = np.where(present, half[sides] * weights[0], 0.0)
+    whole = shares.sum(1, keepdims=True)
+    by_end = ((table == 0) & left, (table == last) & right)
+    prescribed, (lower, upper) = by_end[0] | by_end[1], (int(each.any(1).sum()) for each in by_end)
+    loop = f"f{name} in {lower}..F{name}-{upper + 1}" if lower or upper else f"f{name} in F{name}"
+    slots = tuple(CellPoint(f"edges_{name}[f{name}, {b}]") for b in range(2 * size))
+    kinds = [] if prescribed.any(1).all() else [Cells(loop, f"f{name}", slots, edge=True)]
+    for f in np.flatnonzero(prescribed.any(1)):
+        single = zip(table[f].tolist(), prescribed[f].tolist(), strict=True)
+        given = tuple(CellPoint(None, int(n > 0)) if end else CellPoint(str(n - left)) for n, end in single)
+        kinds.append(Cells("", str(f), given, edge=True))
+    stiffness = derivative.T @ (weights[:, None] * derivative)
+    return Edges(
+        cells=tuple(kinds),
+        table=np.clip(table - left, 0, last - left - right),
+        weights=whole[:, 0],
+        points=np.where(present[:, 1], at[sides[:, 1], 0], at[sides[:, 0], -1]),
+        rows={order: matrix[[-1, 0]] for order, matrix in ((1, derivative), (2, stiffness))},
+        scales={1: shares / half[sides] / whole, 2: np.where(present, -1, 0) / half[sides] / whole},
     )
 
 

@@ -33,6 +33,7 @@ class Density:
         boundary: by axis ``"periodic"`` or, for the lower and upper end, ``"natural"`` or the prescribed value as a
             formula in t by field.
         parameters, defaults: adjustable numbers and their default values.
+        dissipation: Rayleigh density D of velocities, whose forces are -dD/du_t.
         density: L or H; ``u_t``, ``u_x``, ``u_xx``, ``u_xy`` are the derivatives of ``u``.
     """
 
@@ -44,6 +45,7 @@ class Density:
     parameters: tuple[Symbol, ...]
     defaults: tuple[float, ...]
     density: Expr
+    dissipation: Expr = S.Zero
 
     __repr__ = summary("name", "fields", "space")
 

@@ -81,10 +81,13 @@ def derivation_of(system: Density, mesh: Any = None) -> FieldDerivation:
         each: Eq(variations.functions[each].diff(symbol(TIME), order), formula)
         for each, formula in variations.equations.items()
     }
+    for each, rate in zip(system.fields, system.rates, strict=True) if system.dissipation != 0 else ():
+        force = variations.along(system.dissipation.diff(rate) / system.density.diff(rate, 2))
+        equations[each] = Eq(equations[each].lhs, sympy.expand(equations[each].rhs - force))
     return FieldDerivation(
         field_system=system,
         equations=equations,
-        laws=variations.laws(),
+        laws=variations.laws() if system.dissipation == 0 else (),
         semidiscrete={} if mesh is None else _semidiscrete(mesh),
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from math import isfinite
 from typing import Any
@@ -25,9 +25,11 @@ from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import TIME, check_names, number, symbol
 from scvi_codegen.validation import MAPPING, NAMES, TEXT, checks_arguments
 
+CLAMPED = "clamped"
 MOST_AXES = 3
 DISCRETISATIONS = {
     "spectral-elements": ("degree", "elements"),
+    "legendre": ("degree",),
     "finite-differences": ("order", "points"),
     "fourier": ("points",),
 }
@@ -55,6 +57,7 @@ class FieldSystem(Density):
         momenta=NAMES,
         boundary=MAPPING,
         parameters=MAPPING,
+        dissipation=TEXT,
     )
     def from_text(
         cls,
@@ -67,6 +70,7 @@ class FieldSystem(Density):
         momenta: Sequence[str] = (),
         boundary: Mapping[str, Any] | None = None,
         parameters: Mapping[str, float] | None = None,
+        dissipation: str | None = None,
     ) -> FieldSystem:
         """Read a density from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 
@@ -80,8 +84,11 @@ class FieldSystem(Density):
             momenta: names of the conjugate fields of H.
             boundary: ``"periodic"`` by axis, or two ends. An end is ``"natural"`` (dL/du_x = 0; Neumann), or the
                 prescribed value: a number or a formula in t and parameters (Dirichlet), or these by field,
-                ``{"u": "sin(t)", "v": 0}``. By default natural ends.
+                ``{"u": "sin(t)", "v": 0}``. Beams are also clamped, ``"clamped"`` or ``{"u": "sin(t)", "u_x": 0}``;
+                at other ends dL/du_xx = 0. By default natural ends.
             parameters: default value by name.
+            dissipation: Rayleigh density of velocities, axes and parameters, whose forces -dD/du_t are added to those
+                of L; ``"100*x**4*u_t**2/2"`` absorbs waves at an end.
 
         Raises:
             SystemDefinitionError: naming the symbol, if the density is outside the grammar, not regular in the
@@ -98,7 +105,13 @@ class FieldSystem(Density):
         for match in re.finditer(rf"\b({'|'.join((*fields, *momenta))})_((?:{'|'.join((*space, TIME))})+)\b", text):
             _check_derivative(match[0], match[1], [*space], parameters or {})
         read = partial(parse_expression, text)
-        return cls._of(name, fields, momenta, space, boundary, parameters, first_order, read)
+        system = cls._of(name, fields, momenta, space, boundary, parameters, first_order, read)
+        if dissipation is None:
+            return system
+        if first_order:
+            raise SystemDefinitionError(f"'{name}' has a Hamiltonian density, which has no dissipation=: omit it")
+        known = {each.name: each for each in (*system.rates, *map(symbol, space), *system.parameters)}
+        return replace(system, dissipation=parse_expression(dissipation, known))
 
     @classmethod
     @checks_arguments(SystemDefinitionError, name=TEXT, space=MAPPING, boundary=MAPPING, parameters=MAPPING)
@@ -228,8 +241,9 @@ class FieldSystem(Density):
 
         Args:
             method: ``"spectral-elements"`` with ``degree=`` and ``elements=``, the number of equal elements or their
-                ends; ``"finite-differences"`` (periodic) with ``order=`` 2, 4, 6 or 8 and ``points=``; ``"fourier"``
-                (periodic; at most 64 points unless the density is quadratic in the derivatives) with ``points=``.
+                ends; ``"legendre"``, one element of ``degree=``; ``"finite-differences"`` (periodic) with ``order=`` 2,
+                4, 6 or 8 and ``points=``; ``"fourier"`` (periodic; at most 64 points unless the density is quadratic in
+                the derivatives) with ``points=``.
             options: as above; a mapping gives each axis its own value, ``points={"x": 64, "y": 32}``.
 
         Raises:
@@ -258,9 +272,12 @@ class FieldSystem(Density):
     def _axis(self, axis: str, method: str, options: Mapping[str, Any]) -> Axis:
         start, end = self.space[axis]
         boundary = self.boundary[axis]
-        if method == "spectral-elements":
+        if "degree" in options:
             fixed = None if boundary == PERIODIC else tuple(each != NATURAL for each in boundary)
-            return spectral_elements(axis, _breaks(axis, start, end, options["elements"]), options["degree"], fixed)
+            slope = f"{self.fields[0]}_{axis}"
+            clamped = [fixed is not None and fixed[k] and slope in boundary[k] for k in range(2)]
+            breaks = _breaks(axis, start, end, options.get("elements", 1))
+            return spectral_elements(axis, breaks, options["degree"], fixed, (clamped[0], clamped[1]))
         if boundary != PERIODIC:
             raise SystemDefinitionError(
                 f"'{method}' needs a periodic axis, and '{axis}' has ends: use \"spectral-elements\""
@@ -316,8 +333,10 @@ def _boundary(axis: str, boundary: Any, fields: Sequence[str], known: Mapping[st
         if end == NATURAL:
             ends.append(NATURAL)
             continue
+        gradients = [f"{each}_{axis}" for each in fields]
         values = dict(end) if isinstance(end, Mapping) else dict.fromkeys(fields, end)
-        if set(values) != set(fields):
+        values = dict.fromkeys((*fields, *gradients), 0) if end == CLAMPED else values
+        if set(values) not in ({*fields}, {*fields, *gradients}) or any(values.get(each, 0) != 0 for each in gradients):
             raise SystemDefinitionError(f"an end of '{axis}' has values of {sorted(values)}, not of {sorted(fields)}")
         ends.append({each: parse_expression(str(value), known) for each, value in values.items()})
     return tuple(ends)
