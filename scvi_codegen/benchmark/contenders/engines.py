@@ -93,20 +93,23 @@ def _mujoco_preparation(case: Case, model: Any, data: Any, *, together: bool) ->
 
 
 def mujoco_states(case: Case, integrator: str, h: float, every: int, count: int) -> tuple[float, Array]:
-    """Return the seconds and ``count`` states (q, v) of a case, every so many steps, of a model without loops."""
+    """Return the seconds and ``count`` states (q, v), every so many steps; NaN once the simulation is unstable."""
     import mujoco
 
     model = mujoco.MjModel.from_xml_string(case.mjcf)
     data, (positions, velocities) = mujoco.MjData(model), coordinate_places(model, case)
     model.opt.integrator, model.opt.timestep = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}"), h
     data.qpos[:], data.qvel[:] = case.q[0][positions], case.velocity[0][velocities]
-    states, seconds = np.empty((count, case.size)), 0.0
-    for state in states:
-        state[positions] = data.qpos
-        state[[case.dimension + k for k in velocities]] = data.qvel
-        began = time.process_time()
-        mujoco.mj_step(model, data, nstep=every)
-        seconds += time.process_time() - began
+    states, seconds = np.full((count, case.size), np.nan), 0.0
+    with _warnings() as warnings_seen:
+        for state in states:
+            state[positions] = data.qpos
+            state[[case.dimension + k for k in velocities]] = data.qvel
+            began = time.process_time()
+            mujoco.mj_step(model, data, nstep=every)
+            seconds += time.process_time() - began
+            if warnings_seen:
+                break
     return seconds, states
 
 
