@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.benchmark.cases.unforced import Array, Case
-from scvi_codegen.benchmark.contenders.ours import compiled_system
+from scvi_codegen.benchmark.contenders.ours import compiled
 from scvi_codegen.benchmark.report import OURS, Contender
 from scvi_codegen.fields.system import FieldSystem
 
@@ -79,7 +79,7 @@ def our_fields(case: FieldCase, quick: bool) -> Iterator[Contender]:
     for kind, options, methods, counts in case.settings[: 1 if quick else None]:
         mesh = case.field.discretise(kind, **options)
         for method in methods:
-            stepper, seconds = compiled_system(mesh.system, method)
+            stepper, seconds = compiled(mesh.system, method)
             for steps in counts[: 2 if quick else None]:
                 size = ", ".join(f"{key} {value}" for key, value in options.items())
                 yield Contender(

@@ -121,7 +121,7 @@ def _case(
     )
 
 
-_top = partial(_case, q=TILT, span=1000.0)
+_top = partial(_case, q=TILT)
 
 
 def _dumbbell() -> Case:
@@ -136,7 +136,7 @@ def _dumbbell() -> Case:
         {"A": 0.02, "B": 0.026, "C": 0.03, "l": 0.03},
         (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
         (0.0, 1.1, 0.1, 0.3, 0.5, 2.0),
-        span=628.0,
+        span=314.0,
         fine=0.125,
     )
 
@@ -156,7 +156,14 @@ def tumbling(count: int) -> Case:
 
 ROTATIONS: Mapping[str, Callable[[], Case]] = {
     "free-top": partial(
-        _top, "free-top", KINETIC, free_top, {"A": 1.0, "B": 2.0, "C": 2.5}, velocity=(0.3, -0.5, 2.0), fine=0.25
+        _top,
+        "free-top",
+        KINETIC,
+        free_top,
+        {"A": 1.0, "B": 2.0, "C": 2.5},
+        velocity=(0.3, -0.5, 2.0),
+        span=1000.0,
+        fine=0.25,
     ),
     "heavy-top": partial(
         _top,
@@ -165,6 +172,7 @@ ROTATIONS: Mapping[str, Callable[[], Case]] = {
         heavy_top,
         {"A": 1.0, "B": 1.0, "C": 0.5, "w": 1.0},
         velocity=(0.1, 0.0, 10.0),
+        span=300.0,
         fine=0.125,
     ),
     "dumbbell": _dumbbell,

@@ -51,11 +51,11 @@ def our_contenders(case: Case, *, methods: Iterable[Method] = (), quick: bool = 
     """
     result = []
     for method in methods or (SVI(8),):
-        stepper, seconds = compiled(case, method)
+        stepper, seconds = compiled(case.system, method)
         momenta = momenta_of(stepper, case)
         options = f"{stepper.title}, solver auto, {' '.join(stepper.flags)}"
         for count, setting in _settings(case, method, momenta, quick).items():
-            prepare = partial(_prepared, stepper, case, momenta, count)
+            prepare = partial(_fixed, stepper, case, momenta, count)
             result.append(Contender(f"{OURS} {method.name}", setting, options, seconds, prepare, momenta))
     return result
 
@@ -64,7 +64,7 @@ def fixed_contenders(case: Case, counts: Mapping[str | Method, Iterable[int]]) -
     """Return contenders by several methods with numbers of steps."""
     result = []
     for method, numbers in counts.items():
-        stepper, seconds = compiled(case, method)
+        stepper, seconds = compiled(case.system, method)
         momenta = momenta_of(stepper, case) if case.arrays is None and not case.system.constraints else None
         for steps in numbers:
             prepare, name = partial(_fixed, stepper, case, momenta, steps), getattr(method, "name", method)
@@ -102,7 +102,7 @@ def run_contenders(case: Case, counts: Mapping[str | Method, Iterable[int]]) -> 
 
 def our_ensembles(case: Case, *, quick: bool = False) -> list[Contender]:
     """Return contenders by SVI(8) with all states of the case as one ensemble, in one thread."""
-    stepper, seconds = compiled(case, SVI(8))
+    stepper, seconds = compiled(case.system, SVI(8))
     momenta = momenta_of(stepper, case)
     began = time.perf_counter()
     stepper.integrate_ensemble(case.q, momenta, h=case.step, steps=1, threads=1)  # compiled on first use
@@ -134,12 +134,7 @@ def advised_counts(case: Case, method: Method, momentum: Array, *, quick: bool) 
     return counts
 
 
-def compiled(case: Case, method: str | Method) -> tuple[Stepper, float]:
-    """Return the stepper of a case, and the seconds to compile it."""
-    return compiled_system(case.system, method)
-
-
-def compiled_system(system: Any, method: str | Method) -> tuple[Any, float]:
+def compiled(system: Any, method: str | Method) -> tuple[Any, float]:
     """Return the stepper, and the seconds to compile it with an empty cache and a new name."""
     with (
         tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder,
@@ -162,11 +157,6 @@ def momenta_of(stepper: Stepper, case: Case) -> Array:
     return stepper.momentum(positions, velocities) if members else stepper.momentum(*case.states)
 
 
-def _prepared(stepper: Stepper, case: Case, momenta: Array, count: int, index: int) -> Callable[[], Array]:
-    run = stepper.start(case.q[index], momenta[index], h=case.span / count)
-    return lambda: cast("Array", run.record(count, save_every=count).q[-1])
-
-
 def _prepared_ensemble(stepper: Stepper, case: Case, momenta: Array, count: int, _: int) -> Callable[[], Array]:
     arguments: dict[str, Any] = {"h": case.span / count, "steps": count, "save_every": count, "threads": 1}
     return lambda: cast("Array", stepper.integrate_ensemble(case.q, momenta, **arguments).q[-1])
@@ -174,7 +164,7 @@ def _prepared_ensemble(stepper: Stepper, case: Case, momenta: Array, count: int,
 
 def adaptive_contenders(case: Case, *, quick: bool) -> list[Contender]:
     """Return contenders by SVI(8) with adaptive step size at several tolerances, and with fixed steps beside them."""
-    stepper, seconds = compiled(case, SVI(8))
+    stepper, seconds = compiled(case.system, SVI(8))
     momenta = momenta_of(stepper, case)
     adaptive = stepper.integrate(case.q[0], momenta[0], t_end=case.span, check_growth=False).steps
     counts = [max(1, round(adaptive * factor)) for factor in FIXED[: 1 if quick else None]]
@@ -185,7 +175,8 @@ def adaptive_contenders(case: Case, *, quick: bool) -> list[Contender]:
         def integrate() -> Array:
             """Integrate and return the final state alone, as heyoka's propagate_until."""
             run._run_to_target()
-            return run.q
+            end: Array = run.q
+            return end
 
         return integrate
 
