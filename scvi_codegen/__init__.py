@@ -102,8 +102,7 @@ _HOMES = {
     "pictures.overview": ("plot_section", "plot_trajectory"),
     "pictures.attitudes": ("plot_attitude",),
     "pictures.paths": ("plot_motion", "plot_phase"),
-    "pictures.arrays": ("plot_arrays",),
-    "pictures.fields": ("plot_field", "plot_spectrum"),
+    "pictures.arrays": ("plot_arrays", "plot_spectrum"),
     "models.problems": ("PROBLEMS", "problem"),
     "tables.quadrature": (
         "Quadrature",

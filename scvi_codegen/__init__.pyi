@@ -93,11 +93,10 @@ from scvi_codegen.native.options import SolverOptions as SolverOptions
 from scvi_codegen.pictures.animation import Film as Film
 from scvi_codegen.pictures.animation import animate as animate
 from scvi_codegen.pictures.arrays import plot_arrays as plot_arrays
+from scvi_codegen.pictures.arrays import plot_spectrum as plot_spectrum
 from scvi_codegen.pictures.attitudes import plot_attitude as plot_attitude
 from scvi_codegen.pictures.conserved import plot_energy as plot_energy
 from scvi_codegen.pictures.conserved import plot_momentum_maps as plot_momentum_maps
-from scvi_codegen.pictures.fields import plot_field as plot_field
-from scvi_codegen.pictures.fields import plot_spectrum as plot_spectrum
 from scvi_codegen.pictures.overview import plot_section as plot_section
 from scvi_codegen.pictures.overview import plot_trajectory as plot_trajectory
 from scvi_codegen.pictures.paths import plot_motion as plot_motion

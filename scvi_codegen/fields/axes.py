@@ -128,20 +128,53 @@ class Axis:
 
     def differentiated(self, values: Array, along: int) -> Array:
         """Return the derivative at the points of values along one of their axes; see :meth:`MeshSystem.derivative`."""
+        return self.from_elements(self.derivative(self.in_elements(values, along), along), along)
+
+    @property
+    def element_points(self) -> Array:
+        """Coordinates of the points of all elements, (E (p + 1),), or of the points."""
+        return self.points if self.table is None else self.cell_points.ravel()
+
+    @property
+    def element_weights(self) -> Array:
+        """Quadrature weights at ``element_points``."""
+        if self.table is None:
+            return self.weights
+        return np.outer(self.jacobians, [float(w) for w in self.quadrature]).ravel()
+
+    def in_elements(self, values: Array, along: int, ends: Sequence[Array | None] = (None, None)) -> Array:
+        """Return values at ``element_points``, those at ends are ``ends`` if prescribed, or 0."""
+        if self.table is None:
+            return values
+        local = self._in_elements(np.moveaxis(values, along, -1))
+        for end, prescribed in enumerate(ends):
+            if prescribed is not None:
+                local[..., -end, -end] = prescribed
+        return np.moveaxis(local.reshape(*local.shape[:-2], -1), -1, along)
+
+    def derivative(self, values: Array, along: int) -> Array:
+        """Return the derivative at ``element_points`` of values there."""
         array = np.moveaxis(values, along, -1)
         if self.table is None:
             k = 2j * np.pi * np.fft.rfftfreq(len(self.points), self.length / len(self.points))
             result = np.fft.irfft(k * np.fft.rfft(array), len(self.points))
         else:
-            derivative = np.array([[float(x) for x in row] for row in self.operators[1]])
-            weights = np.array([float(x) for x in self.quadrature])
-            local = np.einsum("ab,...eb->...ea", derivative, self._in_elements(array)) * weights
-            result = np.zeros(array.shape)
-            for entry in range(self.table.shape[1]):  # a point occurs once in each column of the table
-                elements = self.inside[:, entry]
-                result[..., self.table[elements, entry]] += local[..., elements, entry]
-            result /= self.weights
+            matrix = np.array([[float(x) for x in row] for row in self.operators[1]])
+            local = array.reshape(*array.shape[:-1], *self.table.shape) @ matrix.T
+            result = (local / self.jacobians[:, None]).reshape(array.shape)
         return np.moveaxis(result, -1, along)
+
+    def from_elements(self, values: Array, along: int) -> Array:
+        """Return values at the points, of values at ``element_points``: at shared points means weighted by length."""
+        if self.table is None:
+            return values
+        array = np.moveaxis(values, along, -1) * self.element_weights
+        local = array.reshape(*array.shape[:-1], *self.table.shape)
+        result = np.zeros((*array.shape[:-1], len(self.points)))
+        for entry in range(self.table.shape[1]):  # a point occurs once in each column of the table
+            elements = self.inside[:, entry]
+            result[..., self.table[elements, entry]] += local[..., elements, entry]
+        return np.moveaxis(result / self.weights, -1, along)
 
     def modes(self, values: Array) -> Array:
         """Return the squared amplitudes of all modes but the constant, (.., E, p), or (.., 1, N//2) of Fourier modes.

@@ -1,4 +1,4 @@
-"""Derivation of a density: equations, semi-discrete system and conservation laws, as text and LaTeX."""
+"""Derivation of a density: equations, semi-discrete system and conservation laws, as text."""
 
 from __future__ import annotations
 
@@ -38,34 +38,17 @@ class FieldDerivation:
         """Return plain text: density, equations, semi-discrete system, and conservation laws."""
         return "".join(f"{line}\n" for line in self._lines())
 
-    def to_latex(self) -> str:
-        """Return LaTeX: an ``align*`` environment of the density, the equations and the conservation laws."""
-        rows = [(f"\\mathcal{{{self._letter}}}", _latex(self.field_system.density), "")]
-        rows += [(_latex(each.lhs), _latex(each.rhs), "") for each in self.equations.values()]
-        for law in self.laws:
-            rows.append(("J^t", _latex(law.density), f"\\text{{{law.name.replace('_', ' ')}: {law.symmetry}}}"))
-            rows += [(f"J^{{{axis}}}", _latex(part), "") for axis, part in law.flux.items()]
-        body = " \\\\\n".join(f"{left} &= {right}{f' && {note}' if note else ''}" for left, right, note in rows)
-        return f"\\begin{{align*}}\n{body}\n\\end{{align*}}\n"
-
-    def _repr_latex_(self) -> str:
-        return self.to_latex()
-
-    @property
-    def _letter(self) -> str:
-        return "H" if self.field_system.momenta else "L"
-
     def _lines(self) -> Iterator[str]:
-        yield f"{self.field_system.name}: {self._letter} = {format_expression(self.field_system.density)}"
+        letter, title = ("H", "Hamilton") if self.field_system.momenta else ("L", "Euler-Lagrange")
+        yield f"{self.field_system.name}: {letter} = {format_expression(self.field_system.density)}"
         yield ""
-        yield f"{'Hamilton' if self.field_system.momenta else 'Euler-Lagrange'} equations"
+        yield f"{title} equations"
         for each in self.equations.values():
             yield f"  {_written(each.lhs)} = {_written(each.rhs)}"
         for name, text in self.semidiscrete.items():
             yield f"\n{name}"
             yield from (f"  {line}" for line in text.split("\n"))
-        axes = [*self.field_system.space]
-        divergence = " + ".join(f"d/d{axis} J{axis}" for axis in axes)
+        divergence = " + ".join(f"d/d{axis} J{axis}" for axis in self.field_system.space)
         yield f"\nconservation laws, d/d{TIME} J{TIME} + {divergence} = 0"
         for law in self.laws:
             yield f"  {law.name}: {law.symmetry}"
@@ -104,16 +87,5 @@ def _semidiscrete(mesh: Any) -> dict[str, str]:
     return {"semi-discrete Lagrangian": text, "semi-discrete energy": energy}
 
 
-def _named(formula: Expr) -> Expr:
-    return formula.xreplace(names_of(formula))
-
-
 def _written(formula: Expr) -> str:
-    return format_expression(_named(formula))
-
-
-def _latex(formula: Expr) -> str:
-    named = _named(formula)
-    marks = {each: each.name.split("_", 1) for each in named.free_symbols if "_" in each.name}
-    names = {each: f"{field}_{{{along}}}" for each, (field, along) in marks.items()}
-    return str(sympy.latex(named, symbol_names=names))
+    return format_expression(formula.xreplace(names_of(formula)))

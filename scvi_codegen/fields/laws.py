@@ -12,8 +12,8 @@ has L = sum p u_t - H. Candidates for Q and K are tested: ``dL - D_t K^t - sum D
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 from random import Random
@@ -22,6 +22,7 @@ import sympy
 from sympy import Add, Derivative, Expr, Function, S, Symbol
 from sympy.core.function import AppliedUndef
 
+from scvi_codegen.errors import StateError, closest
 from scvi_codegen.fields.density import Density
 from scvi_codegen.formulas.symbols import TIME, symbol
 from scvi_codegen.representation import summary
@@ -37,8 +38,8 @@ class ConservationLaw:
     """Local conservation law d/dt density + sum over axes of d/dx flux = 0 of the solutions of a field system.
 
     Attributes:
-        name: ``"energy"``, ``"momentum_x"``, ``"charge"``, ``"shift"``, ``"boost_x"`` or ``"angular_momentum_xy"``; of
-            several fields with that of the fields, ``"shift_u"``.
+        name: ``"energy"``, ``"momentum_x"``, ``"charge"``, ``"shift"`` or ``"boost_x"``; of several fields with
+            that of the fields, ``"shift_u"``.
         symmetry: transformation that the law follows from.
         density: conserved density in the fields, functions of the axes and of the time, and their derivatives.
         flux: flux by axis.
@@ -52,42 +53,23 @@ class ConservationLaw:
     __repr__ = summary("name", "symmetry")
 
 
-@dataclass(frozen=True)
 class Variations:
     """Fields of a density as functions of space and time, their equations and conservation laws."""
 
-    system: Density
-    functions: dict[str, Expr] = field(init=False)
-    values: dict[Expr, Expr] = field(init=False)
-
-    def __post_init__(self) -> None:
-        places = [symbol(axis) for axis in (*self.system.space, TIME)]
-        functions = {each: Function(each)(*places) for each in self.system.variables}
-        values = {symbol(each): function for each, function in functions.items()}
-        for name, (each, orders) in self.derivatives.items():
-            values[symbol(name)] = functions[each].diff(*((symbol(axis), order) for axis, order in orders.items()))
-        object.__setattr__(self, "functions", functions)
-        object.__setattr__(self, "values", values)
-
-    @cached_property
-    def derivatives(self) -> dict[str, tuple[str, dict[str, int]]]:
-        """Field, and order by axis and time, of the derivatives that L may contain."""
-        rates = {f"{each}_{TIME}": (each, {TIME: 1}) for each in self.system.variables}
-        return rates | self.system.derivatives
-
-    @cached_property
-    def formula(self) -> Expr:
-        """L in symbols; of a Hamiltonian density sum p u_t - H."""
-        system = self.system
-        if not system.momenta:
-            return system.density
-        pairs = zip(system.fields, system.momenta, strict=True)
-        return Add(*(symbol(p) * symbol(f"{u}_{TIME}") for u, p in pairs)) - system.density
-
-    @cached_property
-    def lagrangian(self) -> Expr:
-        """L along the fields."""
-        return self.along(self.formula)
+    def __init__(self, system: Density) -> None:
+        places = [symbol(axis) for axis in (*system.space, TIME)]
+        rates = {f"{each}_{TIME}": (each, {TIME: 1}) for each in system.variables}
+        derivatives = {**rates, **system.derivatives}
+        self.system = system
+        self.functions: dict[str, Expr] = {each: Function(each)(*places) for each in system.variables}
+        self.values = {symbol(each): function for each, function in self.functions.items()}
+        for name, (each, orders) in derivatives.items():
+            self.values[symbol(name)] = derivative(self.functions[each], orders)
+        pairs = zip(system.fields, system.momenta, strict=False)
+        products = Add(*(symbol(p) * symbol(f"{u}_{TIME}") for u, p in pairs))
+        self.formula: Expr = products - system.density if system.momenta else system.density
+        self.lagrangian = self.along(self.formula)
+        self.used = {name: each for name, each in derivatives.items() if symbol(name) in self.formula.free_symbols}
 
     def along(self, formula: Expr) -> Expr:
         """Return a formula in symbols ``u``, ``u_x`` as one in functions of space and time."""
@@ -98,11 +80,6 @@ class Variations:
         return self.along(self.formula.diff(symbol(name)))
 
     @cached_property
-    def used(self) -> dict[str, tuple[str, dict[str, int]]]:
-        """Field and order of the derivatives that L contains."""
-        return {name: each for name, each in self.derivatives.items() if symbol(name) in self.formula.free_symbols}
-
-    @cached_property
     def equations(self) -> dict[str, Expr]:
         """Highest derivative in time of each field, u_tt or of a Hamiltonian density u_t, in derivatives in space."""
         system, forces = self.system, {}
@@ -111,7 +88,7 @@ class Variations:
             for name, (of, orders) in self.used.items():
                 if of == each and TIME not in orders:
                     sign = (-1) ** sum(orders.values())
-                    terms.append(sign * self.partial(name).diff(*((symbol(a), n) for a, n in orders.items())))
+                    terms.append(sign * derivative(self.partial(name), orders))
             forces[each] = Add(*terms).doit()
         if not system.momenta:
             masses = {each: self.along(system.density.diff(symbol(f"{each}_{TIME}"), 2)) for each in system.fields}
@@ -131,8 +108,7 @@ class Variations:
     def _is_symmetry(self, variation: Variation, divergence: Mapping[str, Expr]) -> bool:
         terms = [self.partial(each) * change for each, change in variation.items()]
         for name, (each, orders) in self.used.items():
-            change = variation[each].diff(*((symbol(axis), order) for axis, order in orders.items()))
-            terms.append(self.partial(name) * change)
+            terms.append(self.partial(name) * derivative(variation[each], orders))
         terms += [-part.diff(symbol(axis)) for axis, part in divergence.items()]
         return vanishes(Add(*terms).doit())
 
@@ -157,34 +133,20 @@ class Variations:
         for axis in self.system.space:
             backward = {each: -rate for each, rate in self._rates(axis).items()}
             yield f"momentum_{axis}", f"translation in {axis}", backward, {axis: -self.lagrangian}
-        variables, pairs = self.system.variables, [*self._pairs()]
+        variables, fields, momenta = self.system.variables, self.system.fields, self.system.momenta
+        pairs = [*zip(fields, momenta, strict=True)] if momenta else [*combinations(fields, 2)]
         for pair in pairs:
             suffix = f"_{pair[0]}_{pair[1]}" if len(variables) > 2 else ""
             yield f"charge{suffix}", f"rotation of ({pair[0]}, {pair[1]})", *self._rotated([pair], S.One)
-        if self.system.momenta and len(pairs) > 1:
+        if momenta and len(pairs) > 1:
             yield "charge", "rotation of all pairs", *self._rotated(pairs, S.One)
-        for each in variables:
+        for each in fields:
             shifted: Variation = {other: S.One if other == each else S.Zero for other in variables}
-            divergence = {TIME: self._conjugate_part(each)}
-            yield f"shift_{each}" if len(variables) > 1 else "shift", f"shift of {each}", shifted, divergence
+            yield f"shift_{each}" if len(variables) > 1 else "shift", f"shift of {each}", shifted, {}
         yield from self._boosts(pairs)
-        yield from self._rotations_of_space()
 
     def _rates(self, axis: str) -> Variation:
         return {each: function.diff(symbol(axis)) for each, function in self.functions.items()}
-
-    def _pairs(self) -> Iterator[tuple[str, str]]:
-        """Yield pairs of real and imaginary parts."""
-        if self.system.momenta:
-            yield from zip(self.system.fields, self.system.momenta, strict=True)
-        else:
-            yield from combinations(self.system.fields, 2)
-
-    def _conjugate_part(self, each: str) -> Expr:
-        """Return K^t of a shift of a field: that of a momentum p adds u_t to L."""
-        if each not in self.system.momenta:
-            return S.Zero
-        return self.functions[self.system.fields[self.system.momenta.index(each)]]
 
     def _rotated(self, pairs: list[tuple[str, str]], angle: Expr) -> tuple[Variation, dict[str, Expr]]:
         """Return the rotation of pairs (a, b) by an angle that may depend on space, and its K."""
@@ -217,21 +179,19 @@ class Variations:
                 divergence = {TIME: x * self.lagrangian, axis: squared * time * self.lagrangian}
                 yield f"boost_{axis}", f"Lorentz transformation along {axis}", moved, divergence
 
-    def _rotations_of_space(self) -> Iterator[tuple[str, str, Variation, dict[str, Expr]]]:
-        """Yield rotations in the planes of two axes: of scalars, and of the components of a vector field."""
-        axes, fields = [*self.system.space], self.system.fields
-        for one, two in combinations(range(len(axes)), 2):
-            x, y = symbol(axes[one]), symbol(axes[two])
-            along_x, along_y = self._rates(axes[one]), self._rates(axes[two])
-            turned = {each: y * along_x[each] - x * along_y[each] for each in self.functions}
-            divergence = {axes[one]: y * self.lagrangian, axes[two]: -x * self.lagrangian}
-            name, plane = f"angular_momentum_{axes[one]}{axes[two]}", f"({axes[one]}, {axes[two]})"
-            yield name, f"rotation of {plane}", turned, divergence
-            if len(fields) == len(axes) and not self.system.momenta:
-                vector = dict(turned)
-                vector[fields[one]] -= self.functions[fields[two]]
-                vector[fields[two]] += self.functions[fields[one]]
-                yield name, f"rotation of {plane} and of the vector field", vector, divergence
+
+def chosen_laws(system: Density, names: Collection[str]) -> list[ConservationLaw]:
+    """Return the conservation laws of these names, all without names."""
+    known = {law.name: law for law in Variations(system).laws()}
+    for name in names:
+        if name not in known:
+            raise StateError(f"there is no conservation law '{name}'{closest(name, known)} Known: {', '.join(known)}")
+    return [known[name] for name in names or known]
+
+
+def derivative(formula: Expr, orders: Mapping[str, int]) -> Expr:
+    """Return the derivative of a formula in functions, with orders by axis and time."""
+    return formula.diff(*((symbol(axis), order) for axis, order in orders.items()))
 
 
 def vanishes(formula: Expr) -> bool:

@@ -14,8 +14,8 @@ from scvi_codegen.errors import StateError, closest
 from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis
 from scvi_codegen.fields.density import Density
 from scvi_codegen.fields.derivation import FieldDerivation, derivation_of
-from scvi_codegen.fields.laws import Variations
-from scvi_codegen.fields.local import FieldHistory, LocalLaw, chosen_laws, local_laws
+from scvi_codegen.fields.laws import chosen_laws
+from scvi_codegen.fields.local import FieldHistory, LocalLaw, local_law
 from scvi_codegen.formulas.symbols import TIME, symbol
 from scvi_codegen.lowering.arrays import one_coordinate
 from scvi_codegen.methods import as_method
@@ -116,16 +116,16 @@ class Mesh:
         Raises:
             StateError: for an unknown name, and for a run with ``observe``.
         """
-        return local_laws(self, chosen_laws(Variations(self.field_system).laws(), names), run)
+        history = FieldHistory(self, run)
+        return {law.name: local_law(history, law) for law in chosen_laws(self.field_system, names)}
 
     def conserved(self, run: Any, *names: str) -> dict[str, Array]:
         """Return (n,) integrals over space of the conserved densities along a run, by name; see :meth:`local_laws`.
 
-        They are constant in the solution if the fluxes at the ends vanish or the axes are periodic (boosts and angular
-        momenta depend on position and are not constant on periodic axes).
+        They are constant in the solution if the fluxes at the ends vanish or the axes are periodic (boosts depend on
+        position and are not constant on periodic axes).
         """
-        history = FieldHistory(self, run)
-        laws = chosen_laws(Variations(self.field_system).laws(), names)
+        history, laws = FieldHistory(self, run), chosen_laws(self.field_system, names)
         return {law.name: history.integral(history.values(law.density)) for law in laws}
 
     def highest_frequency(self, **parameters: float) -> float:

@@ -214,7 +214,7 @@ class FieldSystem(Density):
         """Return the equations of motion and the local conservation laws of the symmetries of the density.
 
         The symmetries tested are translations in time and space, shifts and rotations of fields, Lorentz and Galilei
-        transformations, and rotations of space.
+        transformations.
 
         >>> waves = FieldSystem.from_text("waves", ["u"], {"x": (0, 1)}, "u_t**2/2 - u_x**2/2 - u**4/4")
         >>> print(waves.derive().to_text(), end="")

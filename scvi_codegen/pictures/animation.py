@@ -19,9 +19,9 @@ import numpy as np
 from scvi_codegen.errors import PlotError, StateError
 from scvi_codegen.files.atomic import replaced
 from scvi_codegen.mechanics.symmetry.sampling import bodies
+from scvi_codegen.pictures.arrays import array_values, mesh_of
 from scvi_codegen.pictures.attitudes import solids
 from scvi_codegen.pictures.canvas import COLORS, MOTION, Array, DrawnMotion, check_plot_path, color, plain, style
-from scvi_codegen.pictures.fields import field_values, mesh_of
 from scvi_codegen.representation import summary
 from scvi_codegen.validation import FUNCTION, PATH, REAL, checks_arguments
 
@@ -122,7 +122,7 @@ def _solids(motion: DrawnMotion) -> MovingPoints:
 
 def _graph(motion: DrawnMotion) -> MovingPoints:
     """Return the graph of the first field of a mesh, a line over x or the lines of a surface over x and y."""
-    mesh, name, values = field_values(motion, None)
+    mesh, (name, values) = mesh_of(motion), array_values(motion, None)
     points = np.stack([*(np.broadcast_to(grid, values.shape) for grid in mesh.points.values()), values], axis=-1)
     count = values.shape[-1]
     lines = tuple(slice(k, k + count) for k in range(0, values[0].size, count))

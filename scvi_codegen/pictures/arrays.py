@@ -1,9 +1,9 @@
-"""Plots of arrays of array systems: an image over index and time, a final image, or bodies in space."""
+"""Plots of arrays and fields: an image over index and time, an image of a state, bodies in space, spectra."""
 
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,81 +19,86 @@ IN_SPACE = (2, 3)
 """Lengths of the last axis of arrays of positions in space."""
 
 
-class ArrayMotion(Protocol):
-    """Trajectory to draw, of a system with arrays."""
-
-    @property
-    def t(self) -> NDArray[np.float64]: ...
-
-    @property
-    def q(self) -> NDArray[np.float64]: ...
-
-    @property
-    def stepper(self) -> Any: ...
-
-    @property
-    def observed(self) -> NDArray[np.float64] | None: ...
+ARRAYS = ArgumentType("a trajectory of arrays", lambda value: hasattr(getattr(value, "q", None), "shapes"))
 
 
-@checks_arguments(
-    trajectory=ArgumentType("a trajectory of arrays", lambda value: hasattr(getattr(value, "q", None), "shapes")),
-    array=TEXT,
-    path=PATH,
-    ax=CANVAS,
-)
+def mesh_of(motion: Any) -> Any:
+    """Return the mesh of the fields of a trajectory, or ``None`` if they are not discretised from a density."""
+    layout = motion.stepper.interface.layout
+    return None if layout is None else layout.mesh
+
+
+def array_values(motion: Any, name: str | None) -> tuple[str, NDArray[np.float64]]:
+    """Return name and values (n, ..) of an array or of a field on a mesh, by default the first.
+
+    Raises:
+        StateError: for an unknown name.
+    """
+    mesh = mesh_of(motion)
+    arrays = mesh.fields_of(np.asarray(motion.q), np.asarray(motion.p)) if mesh else motion.stepper.arrays(motion.q)
+    chosen = next(iter(arrays)) if name is None else name
+    if chosen not in arrays:
+        raise StateError(f"there is no array '{chosen}'{closest(chosen, arrays)} Known: {', '.join(arrays)}")
+    return chosen, arrays[chosen]
+
+
+@checks_arguments(trajectory=ARRAYS, array=TEXT, path=PATH, ax=CANVAS)
 def plot_arrays(
-    trajectory: ArrayMotion,
+    trajectory: Any,
     path: str | os.PathLike[str] | None = None,
     *,
     array: str | None = None,
+    state: int = -1,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw an array of a trajectory of an array system.
+    """Draw an array of a trajectory of an array system, or a field on a mesh.
 
     An array with one index, ``q[N]``, is an image over index and time; ``r[N, 2]`` or ``r[N, 3]`` are the first and
     last positions in space, in their first two components; any other array with two indices, ``u[NX, NY]``, is an image
-    of the final state.
+    of one state. Fields on a mesh are drawn over the coordinates of its points.
 
     Args:
         trajectory: result of :meth:`Stepper.integrate`.
         path, ax: as of :func:`~scvi_codegen.pictures.paths.plot_motion`.
-        array: name of the array; by default the first.
+        array: name of the array or field; by default the first.
+        state: index of the state drawn of two indices.
 
     Raises:
-        StateError: for an unknown array or one with more indices, and for a run with ``observe``.
+        StateError: for an unknown array or one with more indices, an unknown state, and for a run with ``observe``.
         PlotError: without matplotlib.
     """
-    arrays = trajectory.stepper.arrays(trajectory.q)
-    name = next(iter(arrays)) if array is None else array
-    if name not in arrays:
-        raise StateError(f"there is no array '{name}'{closest(name, arrays)} Known: {', '.join(arrays)}")
-    values = arrays[name]
+    name, values = array_values(trajectory, array)
+    mesh = mesh_of(trajectory)
     if trajectory.observed is not None and values.ndim == 2:
         raise StateError(
             "a run with observe saves only its first and last state: run it without observe to draw this array"
         )
     if values.ndim > 3:
         raise StateError(f"'{name}' has {values.ndim - 1} indices: only arrays with one or two can be drawn")
+    if not -len(values) <= state < len(values):
+        raise StateError(f"there is no state {state} in a trajectory with {len(values)}")
+    labels = ["index"] if values.ndim == 2 else ["first index", "second index"]
+    points = [np.arange(size) for size in values.shape[1:]]
+    if mesh:
+        labels, points = [axis.name for axis in mesh.axes], [axis.points for axis in mesh.axes]
     with panel(path, ax) as drawn:
         drawn.grid(visible=False)
-        if values.ndim == 3 and values.shape[2] in IN_SPACE:
+        if values.ndim == 3 and values.shape[2] in IN_SPACE and not mesh:
             _draw_positions(drawn, values, name)
         elif values.ndim == 3:
-            _draw_picture(drawn, values[-1].T, name, None)
-            drawn.set(xlabel="first index", ylabel="second index", title=f"t = {trajectory.t[-1]:g}")
+            _draw_picture(drawn, points, values[state].T, name)
+            drawn.set(xlabel=labels[0], ylabel=labels[1], title=f"t = {trajectory.t[state]:g}")
         else:
-            span = (-0.5, values.shape[1] - 0.5, float(trajectory.t[0]), float(trajectory.t[-1]))
-            _draw_picture(drawn, values, name, span if span[2] != span[3] else None)
-            drawn.set(xlabel="index", ylabel="t")
+            _draw_picture(drawn, [points[0], trajectory.t], values, name)
+            drawn.set(xlabel=labels[0], ylabel="t")
     return drawn
 
 
-def _draw_picture(drawn: Axes, values: NDArray[np.float64], name: str, extent: Any) -> None:
+def _draw_picture(drawn: Axes, points: Any, values: NDArray[np.float64], name: str) -> None:
     """Draw an image with a colour scale that is symmetric about 0."""
     largest = float(np.abs(values).max()) or 1.0
-    image = drawn.imshow(
-        values, origin="lower", aspect="auto", extent=extent, cmap="RdBu_r", vmin=-largest, vmax=largest
-    )
+    limits: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -largest, "vmax": largest}
+    image = drawn.pcolormesh(*points, values, shading="nearest", rasterized=True, **limits)
     drawn.figure.colorbar(image, ax=drawn, label=plain(name))
 
 
@@ -103,3 +108,31 @@ def _draw_positions(drawn: Axes, values: NDArray[np.float64], name: str) -> None
     drawn.set_aspect("equal", adjustable="datalim")
     drawn.set(xlabel=plain(f"{name}[.., 0]"), ylabel=plain(f"{name}[.., 1]"))
     drawn.legend()
+
+
+@checks_arguments(trajectory=ARRAYS, field=TEXT, path=PATH, ax=CANVAS)
+def plot_spectrum(
+    trajectory: Any,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    field: str | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the spectrum of a field on a mesh in the first and last state: squared amplitudes of the modes of each axis.
+
+    The modes are Fourier modes, or on elements Legendre polynomials (the largest of all elements); they must decay for
+    the mesh to resolve the field. Arguments and errors as of :func:`plot_arrays`; StateError without a mesh.
+    """
+    if (mesh := mesh_of(trajectory)) is None:
+        raise StateError("the system is not discretised from a density: a spectrum needs a mesh")
+    name, values = array_values(trajectory, field)
+    with panel(path, ax) as drawn:
+        for k, axis in enumerate(mesh.axes):
+            modes = axis.modes(np.moveaxis(values[[0, -1]], k + 1, -1)).max(axis=-2)
+            for row, line in ((0, ":"), (-1, "-")):
+                spectrum = modes[row].reshape(-1, modes.shape[-1]).max(axis=0)
+                label = f"{axis.name}, t = {trajectory.t[row]:g}"
+                drawn.semilogy(np.arange(1, len(spectrum) + 1), spectrum, line, color=color(k), label=label)
+        drawn.set(xlabel="number of the mode", ylabel=plain(f"squared amplitude of {name}"))
+        drawn.legend()
+    return drawn

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.mechanics.symmetry.sampling import bodies
+from scvi_codegen.pictures.arrays import plot_arrays, plot_spectrum
 from scvi_codegen.pictures.attitudes import plot_attitude
 from scvi_codegen.pictures.canvas import (
     COLORS,
@@ -31,7 +32,6 @@ from scvi_codegen.pictures.canvas import (
     style,
 )
 from scvi_codegen.pictures.conserved import draw_energy_error, plot_energy, plot_momentum_maps
-from scvi_codegen.pictures.fields import plot_field, plot_spectrum
 from scvi_codegen.pictures.paths import draw_paths, path_panels, plot_motion, plot_phase
 from scvi_codegen.validation import CANVAS, NAMES, PATH, checks_arguments
 
@@ -163,8 +163,8 @@ class Plots:
         return plot_momentum_maps(self.trajectory, path, ax=ax)
 
     def field(self, path: Path = None, *, field: str | None = None, state: int = -1, ax: Axes | None = None) -> Axes:
-        """Draw a field of a mesh, as :func:`scvi_codegen.plot_field`."""
-        return plot_field(self.trajectory, path, field=field, state=state, ax=ax)
+        """Draw a field of a mesh, or an array, as :func:`scvi_codegen.plot_arrays`."""
+        return plot_arrays(self.trajectory, path, array=field, state=state, ax=ax)
 
     def spectrum(self, path: Path = None, *, field: str | None = None, ax: Axes | None = None) -> Axes:
         """Draw the spectrum of a field of a mesh, as :func:`scvi_codegen.plot_spectrum`."""

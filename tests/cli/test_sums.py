@@ -273,4 +273,4 @@ def test_pictures_of_an_array_system(axes: str, tmp_path: Path) -> None:
         assert ax.get_lines()[1].get_xdata().tolist() == values[-1, :, 0].tolist()
     else:
         drawn = values if axes == "q[N]" else values[-1].T
-        assert np.array_equal(ax.get_images()[0].get_array(), drawn)
+        assert np.array_equal(ax.collections[0].get_array(), drawn)
