@@ -160,8 +160,8 @@ def test_a_catalogue_reference_may_be_changed():
         ("[run]", "[rum]", "unknown section 'rum' in the file; did you mean 'run'?"),
         (
             "[system]",
-            "[[events]]\nfunction = 'q'\n[system]",
-            "section 'events' in the file; events are supported in Python only",
+            "[[events]]\nfunctio = 'q'\n[system]",
+            "unknown key 'functio' in [[events]]; did you mean 'function'?",
         ),
         ("[method]", "[zzz]", "Known: system, forces, torques, torques_space, inputs, sizes, "),
         ("lagrangian", "lagrangain", "unknown key 'lagrangain' in [system]; did you mean 'lagrangian'?"),
