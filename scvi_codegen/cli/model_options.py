@@ -60,7 +60,7 @@ class ModelOptions:
     controller: str | None = None
     inputs: tuple[tuple[str, dict[str, str]], ...] | None = None
     size: tuple[tuple[str, int], ...] | None = None
-    event: tuple[str, ...] = ()
+    event: tuple[str, ...] | None = None
     solver: str = "auto"
 
     def sections(self) -> dict[str, dict[str, Any]]:
@@ -80,7 +80,7 @@ class ModelOptions:
         arguments = {
             name: {key: _plain(x) for key, x in section.items() if x is not None} for name, section in named.items()
         }
-        events: dict[str, Any] = {"events": [event_entry(text) for text in self.event]}
+        events: dict[str, Any] = {"events": [event_entry(text) for text in self.event or ()]}
         return {name: section for name, section in (arguments | events).items() if section}
 
 
