@@ -71,3 +71,19 @@ def test_angular_velocity_in_the_body_frame_moves_the_matrix():
 def test_values_that_are_no_rotation_are_rejected_by_name(value, message):
     with pytest.raises(StateError, match=message):
         quaternions(value, "R")
+
+
+def test_orders_of_quaternions_and_rotation_vectors_are_named():
+    turned = Rotation.from_rotvec([[0.3, -0.5, 0.8], [1.2, 0.1, 0.0]])
+    last, wanted = turned.as_quat(), quaternions(turned, "R")
+    for given in (
+        {"quaternion": last, "order": "xyzw"},
+        {"quaternion": 3 * np.roll(last, 1, axis=-1), "order": "wxyz"},
+        {"rotation_vector": turned.as_rotvec()},
+    ):
+        found = quaternions(given, "R")
+        np.testing.assert_allclose(found * np.sign((found * wanted).sum(axis=1))[:, None], wanted, atol=1e-15)
+    with pytest.raises(StateError, match="must be 'wxyz' or 'xyzw', not 'xwyz'"):
+        quaternions({"quaternion": last, "order": "xwyz"}, "R")
+    with pytest.raises(StateError, match="the rotation vector of 'R' must have three components"):
+        quaternions({"rotation_vector": [1.0, 2.0]}, "R")

@@ -20,8 +20,10 @@ Array = NDArray[np.float64]
 
 ACCEPTED = (
     "a quaternion (w, x, y, z), a rotation matrix (3, 3), {'euler': 'zxz', 'angles': [..]}, {'axis': [..], 'angle': "
-    "..}, or a scipy Rotation"
+    "..}, {'rotation_vector': [..]}, {'quaternion': [..], 'order': 'xyzw'}, or a scipy Rotation"
 )
+ORDERS = {"wxyz": 0, "xyzw": 1}
+"""Shift of the components of a quaternion to (w, x, y, z), by their order."""
 ORTHOGONAL = 1e-8
 """Largest deviation of R^T R from the identity of an initial matrix, which is then projected."""
 
@@ -31,7 +33,9 @@ def quaternions(value: Any, name: str) -> Array:
 
     Args:
         value: (.., 4) quaternions; (.., 3, 3) matrices; a mapping with ``euler`` (axes) and ``angles`` in radians, or
-            with ``axis`` and ``angle``; or a ``scipy.spatial.transform.Rotation``.
+            with ``axis`` and ``angle``; with ``rotation_vector`` (angle times unit axis); with ``quaternion`` and
+            ``order``, ``"wxyz"`` or ``"xyzw"`` (scalar part first or last, as in ROS, SciPy and most files); or a
+            ``scipy.spatial.transform.Rotation``.
         name: of the rotation, for messages.
 
     Raises:
@@ -53,6 +57,13 @@ def quaternions(value: Any, name: str) -> Array:
 
 
 def _of_angles(value: Mapping[str, Any], name: str) -> Array:
+    if set(value) == {"quaternion", "order"}:
+        if value["order"] not in ORDERS:
+            raise StateError(
+                f"the order of the quaternion of '{name}' must be 'wxyz' or 'xyzw', not {value['order']!r}"
+            )
+        components = real_array(value["quaternion"], name)
+        return quaternions(np.roll(components, ORDERS[value["order"]], axis=-1), name)
     from scipy.spatial.transform import Rotation  # imported on use: the core does without SciPy
 
     if set(value) == {"euler", "angles"}:
@@ -66,6 +77,13 @@ def _of_angles(value: Mapping[str, Any], name: str) -> Array:
         if axis.shape != (3,) or angle.ndim or not length > 0:
             raise StateError(f"the axis of '{name}' must be three numbers, not all zero, and the angle one number")
         rotation = Rotation.from_rotvec(axis / length * angle)
+    elif set(value) == {"rotation_vector"}:
+        vector = real_array(value["rotation_vector"], name)
+        if not vector.ndim or vector.shape[-1] != 3:
+            raise StateError(
+                f"the rotation vector of '{name}' must have three components, not the shape {vector.shape}"
+            )
+        rotation = Rotation.from_rotvec(vector)
     else:
         raise StateError(f"the rotation '{name}' must be {ACCEPTED}; the mapping has the keys {', '.join(value)}")
     return np.roll(np.asarray(rotation.as_quat(), dtype=float), 1, axis=-1)
