@@ -10,7 +10,6 @@ from scvi_codegen.reproduce import (
     oscillator_figures,
     refinement_figures,
 )
-from scvi_codegen.reproduce.experiment import Experiment
 
 ORDER = """
     figure-1 figure-3 figure-4 figure-5 figure-6 figure-7 figure-8
@@ -20,11 +19,5 @@ ORDER = """
     correction claims
 """
 MODULES = (kepler_figures, oscillator_figures, refinement_figures, iterations, correction, claims)
-
-
-def _catalogue() -> dict[str, Experiment]:
-    experiments = {experiment.name: experiment for module in MODULES for experiment in module.EXPERIMENTS}
-    return {name: experiments[name] for name in ORDER.split()}
-
-
-EXPERIMENTS = _catalogue()
+_BY_NAME = {experiment.name: experiment for module in MODULES for experiment in module.EXPERIMENTS}
+EXPERIMENTS = {name: _BY_NAME[name] for name in ORDER.split()}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from scvi_codegen.display.page.blocks import Paragraph
 from scvi_codegen.reproduce.experiment import Comparison, Experiment, Result, Verdict, common_verdict
 
 CLAIMS: Mapping[str, str] = {
@@ -43,36 +42,22 @@ EVIDENCE = ("figure-1", *(f"figure-{k}" for k in range(3, 31)), "table-8", "tabl
 
 def claims(results: Mapping[str, Result]) -> Result:
     """Return a row for each claim, with the checks that decide it."""
-    checks = [(name, check) for name in EVIDENCE if name in results for check in results[name].checks]
-    evidence = {key: [(name, check) for name, check in checks if key in check.bears_on] for key in CLAIMS}
-    blocks = []
+    checks, rows = [(name, check) for name in EVIDENCE if name in results for check in results[name].checks], []
     for key, claim in CLAIMS.items():
-        verdict = common_verdict(check for _, check in evidence[key])
-        blocks.append(Paragraph(f"{claim} Verdict: {verdict.value}."))
-        blocks += [
-            Paragraph(f"{n}, {check.verdict.value}: {check.claim} {check.measured}") for n, check in evidence[key]
-        ]
+        evidence = [(name, check) for name, check in checks if key in check.bears_on]
+        counted = {verdict: [name for name, check in evidence if check.verdict is verdict] for verdict in Verdict}
+        parts = [f"{len(n)} {verdict.value} ({', '.join(dict.fromkeys(n))})" for verdict, n in counted.items() if n]
+        measured = f"Of {len(evidence)} checks: {'; '.join(parts)}." if parts else "No check bears on it."
+        rows.append(Comparison(claim=claim, measured=measured, verdict=common_verdict(check for _, check in evidence)))
     missing = ", ".join(name for name in EVIDENCE if name not in results)
     return Result(
         setting=(
             "Every check of a figure or table names the claims that it bears on; here they are collected.",
             "A claim holds if all its checks hold, does not hold if none does, and holds in part otherwise; a claim "
             "without a check is only shown.",
-            f"Collected from {len(results)} of {len(EVIDENCE)} experiments"
-            + (f"; without {missing}." if missing else "."),
+            f"Collected from {len(results)} of {len(EVIDENCE)} experiments{'; without ' if missing else ''}{missing}.",
         ),
-        checks=tuple(_check(claim, evidence[key]) for key, claim in CLAIMS.items()),
-        body=tuple(blocks),
-    )
-
-
-def _check(claim: str, evidence: list[tuple[str, Comparison]]) -> Comparison:
-    counted = {verdict: [name for name, check in evidence if check.verdict is verdict] for verdict in Verdict}
-    parts = [f"{len(n)} {verdict.value} ({', '.join(dict.fromkeys(n))})" for verdict, n in counted.items() if n]
-    return Comparison(
-        claim=claim,
-        measured=f"Of {len(evidence)} checks: {'; '.join(parts)}." if parts else "No check bears on it.",
-        verdict=common_verdict(check for _, check in evidence),
+        checks=tuple(rows),
     )
 
 

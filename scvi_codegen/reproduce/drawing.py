@@ -167,7 +167,7 @@ def _draw_series(axes: Axes, series: Series, *, positive: bool) -> None:
     if positive:
         x, y = x[y > 0.0], y[y > 0.0]
     style: dict[str, Any] = {"color": COLORS[series.scheme], "marker": series.marker, "linestyle": series.line}
-    size = 1.5 if series.marker == "." else 3.0
-    axes.plot(x, y, label=series.label or None, markersize=size, linewidth=0.9, **style)
+    style |= {"linewidth": 0.9, "markersize": 1.5 if series.marker == "." else 3.0, "label": series.label or None}
+    axes.plot(x, y, **style)
     if series.end and len(x):
         axes.annotate(series.end, (x[-1], y[-1]), fontsize=7, color=COLORS[series.scheme])

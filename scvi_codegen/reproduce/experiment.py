@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TypeAlias
 
-from scvi_codegen.display.page.blocks import Block, TableBlock
+from scvi_codegen.display.page.blocks import TableBlock
 from scvi_codegen.reproduce.drawing import Picture
 
 
@@ -73,7 +73,6 @@ class Result:
         checks: claims and measurements.
         tables: numbers; the first has no name.
         picture: picture, or ``None``.
-        body: text and formulas, in order, for experiments with a derivation.
     """
 
     name: str = ""
@@ -82,7 +81,6 @@ class Result:
     checks: tuple[Comparison, ...] = ()
     tables: tuple[TableBlock, ...] = ()
     picture: Picture | None = None
-    body: tuple[Block, ...] = ()
 
     @property
     def verdict(self) -> Verdict:

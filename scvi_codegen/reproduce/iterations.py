@@ -8,7 +8,6 @@ written in NumPy and starts anew in each step, as the counts of the paper do.
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -113,12 +112,12 @@ class Count(NamedTuple):
 
     largest: int | None
     total: int | None
-    energy: float = math.nan
+    energy: float | None = None
 
     @property
     def sound(self) -> bool:
         """True if every step converged and the body did not escape."""
-        return self.total is not None and self.energy < 1.0
+        return self.energy is not None and self.energy < 1.0
 
 
 Key: TypeAlias = tuple[float, int, str]
@@ -153,17 +152,14 @@ def _picard_count(e: float, key: Key, beyond: int, tolerance: float) -> Count:
     return Count(max(counts), sum(counts), energy)
 
 
-def alike(result: Counts, printed: Counts) -> int:
-    """Return the number of cells that converge or fail as printed."""
-    return sum((result[key].total is None) == (count.total is None) for key, count in printed.items())
+def differing(result: Counts, printed: Counts) -> list[Key]:
+    """Return the cells that converge where the printed ones fail, or fail where they converge."""
+    return [key for key, count in printed.items() if (result[key].total is None) != (count.total is None)]
 
 
 def _table(number: int, _: Mapping[str, Result]) -> Result:
     printed, result = printed_counts(number), picard_counts(number)
-    rows = []
-    for key, count in printed.items():
-        energy = None if math.isnan(result[key].energy) else result[key].energy
-        rows.append((*key, count.largest, count.total, result[key].largest, result[key].total, energy))
+    rows = [(*key, *count[:2], *result[key][:2], result[key].energy) for key, count in printed.items()]
     columns = ("h", "N", "scheme", "paper max", "paper total", "max", "total", "energy error")
     return Result(
         setting=(
@@ -180,20 +176,16 @@ def _table(number: int, _: Mapping[str, Result]) -> Result:
 
 def _dashes(number: int, printed: Counts) -> Comparison:
     """Return the check of convergence: where the iteration fails, and where the table has a dash."""
-    ours = picard_counts(number)
-    differing = [
-        f"{scheme} N = {n}, h = {h:g}"
-        for (h, n, scheme), count in ours.items()
-        if (count.total is None) != (printed[h, n, scheme].total is None)
-    ]
+    ours, by_degree = picard_counts(number), picard_counts(number, 0)
+    wrong, cells = differing(ours, printed), len(printed)
     ratio = statistics.median(a.total / b.total for key, b in printed.items() if (a := ours[key]).total and b.total)
     return comparison(
         "The iteration converges where the table has numbers, and nowhere else.",
-        f"Picard iteration agrees in {alike(ours, printed)} of {len(printed)} cells with N points and in "
-        f"{alike(picard_counts(number, 0), printed)} with N the degree; with N points not at "
-        f"{'; '.join(differing) or 'none'}. Its iterations are {ratio:.2f} of the printed ones (median): the paper's "
-        "iteration is another, or ended earlier.",
-        alike(ours, printed) >= AS_PRINTED * len(printed),
+        f"Picard iteration agrees in {cells - len(wrong)} of {cells} cells with N points and in "
+        f"{cells - len(differing(by_degree, printed))} with N the degree; with N points not at (h, N, scheme) "
+        f"{', '.join(map(str, wrong)) or 'none'}. Its iterations are {ratio:.2f} of the printed ones (median): the "
+        "paper's iteration is another, or ended earlier.",
+        cells - len(wrong) >= AS_PRINTED * cells,
     )
 
 

@@ -38,8 +38,6 @@ NO_ERROR = 1e-50
 """Bound on errors in 60 digits that count as 0."""
 ALONG = 30.0
 """Largest typical factor between errors and a line that counts as agreement."""
-LEAST = 3
-"""Least number of errors for a fit."""
 STRAIGHT = 0.9
 """Least squared correlation of N and the logarithms of errors that decrease geometrically."""
 MOSTLY = 0.9
@@ -125,11 +123,6 @@ class ErrorCurve(NamedTuple):
     errors: Array
     law: Law | None
 
-    def row(self, printed: Law | None) -> tuple[Cell, ...]:
-        """Return the row of a table."""
-        law = self.law or (None, None)
-        return (self.case.title, self.scheme, self.n or None, self.what, *law, *(printed or (None, None)))
-
 
 COLUMNS = ("setting", "scheme", "N", "error of", "constant", "base or power", "paper's constant", "paper's base")
 
@@ -197,7 +190,7 @@ def within(errors: Array) -> NDArray[np.bool_]:
 def fitted_line(n: Array, errors: Array) -> Law | None:
     """Return the line through the errors that count; ``None`` with fewer than three of them."""
     used = within(errors)
-    if np.count_nonzero(used) < LEAST:
+    if np.count_nonzero(used) < 3:
         return None
     slope, offset = np.polyfit(n[used], np.log(errors[used]), 1)
     return Law(float(np.exp(offset)), float(np.exp(slope)))
@@ -228,23 +221,26 @@ def factors(n: Array, errors: Array, line: Law) -> Array:
     return result
 
 
-def refinement(name: str, title: str, study: Study) -> Experiment:
+def refinement(title: str, study: Study) -> Experiment:
     """Return the experiment of a figure of errors over N or over h."""
 
     def run(_: Mapping[str, Result]) -> Result:
         curves = study.curves()
         checks = _point_checks(study, curves) if study.degrees else _step_checks(study, curves)
         picture = Picture(panels=tuple(_panels(study, curves)), columns=len(study.cases), size=(4.5, 4.0))
-        rows = tuple(curve.row(study.printed(curve)) for curve in curves)
-        formats = dict.fromkeys(COLUMNS[4:], ".2g")
+        none, rows = (None, None), list[tuple[Cell, ...]]()
+        for c in curves:
+            rows.append((c.case.title, c.scheme, c.n or None, c.what, *(c.law or none), *(study.printed(c) or none)))
+        table = TableBlock(columns=COLUMNS, rows=tuple(rows), formats=dict.fromkeys(COLUMNS[4:], ".2g"))
         return Result(
             setting=study.sentences,
             checks=(*checks, _superiority(study, curves)),
-            tables=(TableBlock(columns=COLUMNS, rows=rows, formats=formats), picture.curves()),
+            tables=(table, picture.curves()),
             picture=picture,
         )
 
-    return Experiment(name=name, title=title, run=run)
+    name, _, rest = title.partition(": ")
+    return Experiment(name=name, title=rest, run=run)
 
 
 def _superiority(study: Study, curves: Sequence[ErrorCurve]) -> Comparison:

@@ -106,20 +106,16 @@ INVARIANT_LINES = {
     ("SC", "energy"): Law(1e6, 0.1),
     ("SVI", "energy"): Law(1e13, 0.004),
 }
-STUDIES = {
-    6: ("Harmonic oscillator: error over one step h = 20 with more and more points", OVER_N),
-    7: ("Harmonic oscillator: error of q over one step of size h", OVER_H),
-    8: (
-        "Harmonic oscillator: error of the energy over one step of size h",
-        replace(OVER_H, quantities=("energy",), cases=(BY_POINTS, BY_DEGREE, BEYOND)),
-    ),
-    16: ("Kepler: error of q1 and q2 in one step h = 5 over the number of points", KEPLER_OVER_N),
-    17: (
-        "Kepler: error of momentum and energy in one step h = 5 over the number of points",
-        replace(KEPLER_OVER_N, quantities=("momentum", "energy"), lines=INVARIANT_LINES),
-    ),
-    18: ("Kepler: error of q1 and q2 in one step over the step", KEPLER_OVER_H),
-    19: ("Kepler: error of the momentum in one step over the step", replace(KEPLER_OVER_H, quantities=("momentum",))),
-    20: ("Kepler: error of the energy in one step over the step", replace(KEPLER_OVER_H, quantities=("energy",))),
-}
-EXPERIMENTS = tuple(refinement(f"figure-{number}", title, study) for number, (title, study) in STUDIES.items())
+BOTH = replace(KEPLER_OVER_N, quantities=("momentum", "energy"), lines=INVARIANT_LINES)
+ENERGY = replace(OVER_H, quantities=("energy",), cases=(BY_POINTS, BY_DEGREE, BEYOND))
+KEPLER_MOMENTUM, KEPLER_ENERGY = (replace(KEPLER_OVER_H, quantities=(what,)) for what in ("momentum", "energy"))
+EXPERIMENTS = (
+    refinement("figure-6: Harmonic oscillator: error over one step h = 20 with more and more points", OVER_N),
+    refinement("figure-7: Harmonic oscillator: error of q over one step of size h", OVER_H),
+    refinement("figure-8: Harmonic oscillator: error of the energy over one step of size h", ENERGY),
+    refinement("figure-16: Kepler: error of q1 and q2 in one step h = 5 over the number of points", KEPLER_OVER_N),
+    refinement("figure-17: Kepler: error of momentum and energy in one step h = 5 over the number of points", BOTH),
+    refinement("figure-18: Kepler: error of q1 and q2 in one step over the step", KEPLER_OVER_H),
+    refinement("figure-19: Kepler: error of the momentum in one step over the step", KEPLER_MOMENTUM),
+    refinement("figure-20: Kepler: error of the energy in one step over the step", KEPLER_ENERGY),
+)

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from scvi_codegen.display.page.blocks import Block, Formula, Listing, Paragraph, TableBlock
+from scvi_codegen.display.page.blocks import TableBlock
 from scvi_codegen.display.page.environment import SPACE, page_template, style_sheet
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.reproduce.drawing import draw
@@ -52,9 +52,9 @@ def report_html(results: Sequence[Result]) -> str:
     """
     pictures = {result.name: _picture(result) for result in results}
     alone = len(results) == 1
-    page = page_template("report.html.jinja", label=label, heading=_heading, caption=_caption, linked=linked)
+    page = page_template("report.html.jinja", label=label, caption=_caption, linked=linked)
     return page.render(
-        title=_heading(results[0]) if alone else TITLE,
+        title=results[0].title if alone else TITLE,
         alone=alone,
         body_class="alone" if alone else "",
         results=results,
@@ -83,14 +83,7 @@ def _picture(result: Result) -> Markup:
         return Markup()
     document = base64.b64encode(draw(result.picture, "svg")).decode()
     image = Markup('<img src="data:image/svg+xml;base64,{}" alt="{}" style="--width:{:g}in">')
-    return image.format(document, f"{label(result.name)}. {_heading(result)}", result.picture.width)
-
-
-def _heading(result: Result) -> str:
-    """Return the title, without the name if it begins with it."""
-    name = label(result.name)
-    shorter = result.title.removeprefix(name).lstrip(" .:,")
-    return shorter[:1].upper() + shorter[1:] if shorter else result.title
+    return image.format(document, f"{label(result.name)}. {result.title}", result.picture.width)
 
 
 def _caption(result: Result, table: TableBlock) -> str:
@@ -136,21 +129,7 @@ def statement(result: Result) -> str:
     for check in result.checks:
         lines += ["", *_wrapped(f"paper:    {check.claim}"), *_wrapped(f"measured: {check.measured}")]
         lines += [f"verdict:  {check.verdict.value}"]
-    for block in result.body:
-        lines += ["", *_block_lines(block)]
     return "\n".join(lines) + "\n"
-
-
-def _block_lines(block: Block) -> list[str]:
-    match block:
-        case Paragraph():
-            return _wrapped(block.text)
-        case Listing():
-            return [f"    {line}".rstrip() for line in block.text.splitlines()]
-        case Formula():
-            left = "" if block.left is None else f"{block.left} = "
-            number = f"    ({block.number})" if block.number else ""
-            return [f"    {left}{block.right}{number}"]
 
 
 def _wrapped(text: str) -> list[str]:

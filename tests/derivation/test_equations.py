@@ -60,6 +60,29 @@ def test_two_point_svi_equals_equations_28_to_30():
     assert derived.end_momentum[0].number == "27c"
 
 
+def test_three_point_scvi_is_the_derivative_of_its_generating_function():
+    """G = L_d + lambda . E on the nodes -1, 0, 1, formed here from the parabola through three values."""
+    symbols = sympy.symbols("h q_k p_k Q_1 Q_2 v_0 lambda_1 lambda_2", real=True)
+    h, q, p, middle, end, v, first, second = symbols
+    tau = sympy.Symbol("tau", real=True)
+
+    def differentiated(start, centre, last):
+        return (last - start) / h, (start - 4 * centre + 3 * last) / h
+
+    curve = tau * (tau - 1) / 2 * q + (1 - tau**2) * middle + tau * (tau + 1) / 2 * end
+    lagrangian = (2 / h * curve.diff(tau)) ** 2 / 2 + cos(curve)
+    action = h / 2 * sum(lagrangian.subs(tau, point) for point in (-1 / sqrt(3), 1 / sqrt(3)))
+    accelerations = differentiated(v, *differentiated(q, middle, end))
+    G = action + first * (accelerations[0] + sin(middle)) + second * (accelerations[1] + sin(end))
+    expected = {"34d": p + G.diff(q), "dG/dQ": G.diff(middle), "dG/dv0": G.diff(v), "34e": G.diff(end)}
+    derived = derive(planar_pendulum(), SCVI(2, "gauss-legendre:2"), radicals=True)
+    rows = {e.number: unit_pendulum(e.residual) for e in (*derived.equations, *derived.end_momentum)}
+    assert set(expected) <= set(rows)
+    for k in (2, 3, 5):
+        state = {symbol: sympy.Float((i * k + 3) % 7 - 2.5) / 2 for i, symbol in enumerate(symbols)}
+        assert max(abs(float((rows[number] - value).xreplace(state))) for number, value in expected.items()) < 1e-12
+
+
 SYSTEMS = [planar_pendulum(), kepler(), double_pendulum(), duffing().with_parameters(gamma=0.3, omega=1.3)]
 METHODS = [
     SVI(1),

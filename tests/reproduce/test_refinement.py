@@ -110,7 +110,7 @@ COARSE = {
 
 
 def test_figures_have_the_papers_lines_and_verdicts_can_fail():
-    found = {number: refinement(f"figure-{number}", "title", study).result({}) for number, study in COARSE.items()}
+    found = {number: refinement(f"figure-{number}: title", study).result({}) for number, study in COARSE.items()}
     assert {number: result.verdict for number, result in found.items()} == {
         6: Verdict.HOLDS,
         7: Verdict.PARTLY,
@@ -121,7 +121,7 @@ def test_figures_have_the_papers_lines_and_verdicts_can_fail():
     assert bases["N points", "SC", None, "q"] == pytest.approx(0.221, abs=0.002)
     assert all(len(row) == len(table.columns) for each in found.values() for table in each.tables for row in table.rows)
     wrong = replace(COARSE[7], powers={"q": {4: 1.0, 5: 1e3}})
-    powers, constants, _ = refinement("figure-7", "title", wrong).result({}).checks
+    powers, constants, _ = refinement("figure-7: title", wrong).result({}).checks
     assert (powers.verdict, constants.verdict) == (Verdict.PARTLY, Verdict.FAILS)
 
 

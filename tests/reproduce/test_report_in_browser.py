@@ -6,8 +6,6 @@ from typing import Any
 import pytest
 import toy_experiments
 from browsing import (
-    FORMULAS,
-    FRACTIONS,
     UNREADABLE,
     VIEWS,
     assert_it_asks_for_nothing,
@@ -55,14 +53,6 @@ class TestInABrowser:
         for own, inside, outside, hint in found:
             assert hint.count("linear-gradient") == 4
             assert own > 640 or inside <= outside
-
-    def test_formulas_are_set_by_the_browser(self, view):
-        boxes = view.evaluate(FORMULAS)
-        assert len(boxes) > 10
-        assert all(width > 5.0 and height > 8.0 for width, height in boxes)
-        fractions = view.evaluate(FRACTIONS)
-        assert len(fractions) > 50
-        assert all(height > 12.0 and above <= below + 0.5 for height, above, below in fractions)
 
     def test_all_text_has_sufficient_contrast(self, view):
         assert view.evaluate(UNREADABLE) == []

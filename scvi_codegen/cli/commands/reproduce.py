@@ -45,8 +45,7 @@ def reproduce(names: tuple[str, ...], output: str, html: str | None, jobs: int |
     """Reproduce figures, tables and claims of the paper, with verdicts from measurements (needs matplotlib).
 
     WHAT is 'all' or names of experiments ('--list' prints them); their dependencies are run, too. Each result is
-    written when it is complete: NAME.txt with the verdicts, NAME.svg and NAME.png, NAME.csv with all numbers, and
-    NAME.html if there are formulas.
+    written when it is complete: NAME.txt with the verdicts, NAME.svg and NAME.png, NAME.csv with all numbers.
 
     Exit status: 0 if all experiments ran, whatever their verdicts; 1 if an experiment failed to run; 130 after Ctrl-C
     (files written before remain).
@@ -177,8 +176,6 @@ def _add(done: Reproduction, outcome: Result | Failure, folder: Path) -> str:
         done.failures.append(outcome)
         return f"failed: {outcome.message}"
     done.files += write_result(outcome, folder)
-    if outcome.body:
-        done.files.append(_write_page([outcome], folder / f"{outcome.name}.html"))
     done.results.append(outcome)
     return f"{outcome.verdict.value:13}  {outcome.title}"
 
