@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from itertools import combinations
-from typing import Any
 
 import numpy as np
 
 from scvi_codegen.benchmark.cases.unforced import (
-    Bodies,
     Case,
     case,
-    divided,
-    gravitation,
-    hand_solved,
+    gravitating,
     kepler_case,
     rotated,
     scaled,
 )
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.models.problems import problem
 
 ECCENTRICITIES = (0.0, 0.2, 0.5, 0.9, 0.99, 0.999)
@@ -57,34 +51,6 @@ def _double_pendulum_case() -> Case:
     """Return a tumbling double pendulum: both rods rotate over the top."""
     plain = case("double-pendulum")
     return replace(plain, q=scaled((2.2, 2.8), 0.01), velocity=scaled((0.5, 0.5), 0.01), span=20.0)
-
-
-def gravitating(masses: Sequence[float], q: Sequence[float], velocity: Sequence[float], **others: Any) -> Case:
-    """Return a case of bodies in space that attract each other."""
-    gravity = others.pop("gravity", 1.0)
-    names = [[f"{axis}{n}" for axis in "xyz"] for n in range(len(masses))]
-    kinetic = [f"m_{n}*({' + '.join(f'{x}_dot**2' for x in body)})/2" for n, body in enumerate(names)]
-    potential = [
-        f"G*m_{i}*m_{j}/sqrt({' + '.join(f'({a} - {b})**2' for a, b in zip(names[i], names[j], strict=True))})"
-        for i, j in combinations(range(len(masses)), 2)
-    ]
-    system = LagrangianSystem.from_text(
-        name=others["name"],
-        coordinates=[x for body in names for x in body],
-        lagrangian=" + ".join([*kinetic, *potential]),
-        parameters={f"m_{n}": mass for n, mass in enumerate(masses)} | {"G": gravity},
-    )
-    return Case(
-        system=system,
-        formulations=hand_solved(gravitation),
-        q=rotated(q, 3),
-        velocity=rotated(velocity, 3),
-        bodies=Bodies(masses=tuple(masses), gravity=gravity, fixed_centre=False, axes=3),
-        velocity_of=partial(divided, masses),
-        step=0.1,
-        fine=0.1,
-        **others,
-    )
 
 
 def _pythagorean_case() -> Case:

@@ -10,13 +10,14 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.problems import problem
 
@@ -282,23 +283,39 @@ def kepler_case(eccentricity: float, *, step: float, fine: float) -> Case:
     )
 
 
+def gravitating(masses: Sequence[float], q: Sequence[float], velocity: Sequence[float], **others: Any) -> Case:
+    """Return a case of bodies in space that attract each other."""
+    gravity = others.pop("gravity", 1.0)
+    names = [[f"{axis}{n}" for axis in "xyz"] for n in range(len(masses))]
+    kinetic = [f"m_{n}*({' + '.join(f'{x}_dot**2' for x in body)})/2" for n, body in enumerate(names)]
+    potential = [
+        f"G*m_{i}*m_{j}/sqrt({' + '.join(f'({a} - {b})**2' for a, b in zip(names[i], names[j], strict=True))})"
+        for i, j in combinations(range(len(masses)), 2)
+    ]
+    system = LagrangianSystem.from_text(
+        name=others["name"],
+        coordinates=[x for body in names for x in body],
+        lagrangian=" + ".join([*kinetic, *potential]),
+        parameters={f"m_{n}": mass for n, mass in enumerate(masses)} | {"G": gravity},
+    )
+    return Case(
+        system=system,
+        formulations=hand_solved(gravitation),
+        q=rotated(q, 3),
+        velocity=rotated(velocity, 3),
+        bodies=Bodies(masses=tuple(masses), gravity=gravity, fixed_centre=False, axes=3),
+        velocity_of=partial(divided, masses),
+        **{"step": 0.1, "fine": 0.1} | others,
+    )
+
+
 def _outer_solar_system() -> Case:
     entry = problem("outer-solar-system")
     assert entry.velocity is not None
     values = dict(zip((str(symbol) for symbol in entry.system.parameters), entry.system.defaults, strict=True))
-    masses = tuple(value for name, value in values.items() if name.startswith("m_"))
-    return Case(
-        name="outer-solar-system",
-        system=entry.system,
-        formulations=hand_solved(gravitation),
-        q=rotated(entry.q, 3),
-        velocity=rotated(entry.velocity, 3),
-        span=entry.span,
-        step=500.0,
-        fine=256.0,
-        bodies=Bodies(masses=masses, gravity=values["G"], fixed_centre=False, axes=3),
-        velocity_of=partial(divided, masses),
-    )
+    masses = [value for name, value in values.items() if name.startswith("m_")]
+    how: dict[str, Any] = {"name": entry.name, "gravity": values["G"], "span": entry.span, "step": 500.0, "fine": 256.0}
+    return gravitating(masses, entry.q, entry.velocity, **how)
 
 
 def _chain_case(n: int, *, step: float, fine: float) -> Case:
