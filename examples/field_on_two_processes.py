@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.shared_memory import SharedMemory
@@ -97,18 +98,18 @@ def run(part: Part, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, int]:
     return q, iterations
 
 
-def work(part: Part, q: np.ndarray, v: np.ndarray, end: np.ndarray, numbers: np.ndarray) -> None:
-    """Run a process."""
+def work(steps: Callable, part: Part, q: np.ndarray, v: np.ndarray, end: np.ndarray, numbers: np.ndarray) -> None:
+    """Run the steps of a process."""
     os.setsid()
     places = slice(part.rank * len(q) // part.count, (part.rank + 1) * len(q) // part.count)
     part.meet()
     began, busy = time.perf_counter(), time.process_time()
-    end[places], iterations = run(part, q[places], v[places])
+    end[places], iterations = steps(part, q[places], v[places])
     took = time.perf_counter() - began
     numbers[part.rank] = took, iterations, took - (time.process_time() - busy)
 
 
-def on_processes(count: int, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, float, float]:
+def on_processes(count: int, q: np.ndarray, v: np.ndarray, steps: Callable = run) -> tuple[np.ndarray, float, float]:
     """Return positions after all steps on ``count`` processes, seconds per iteration, and the share without a core."""
     sizes = {"edges": (2, count, EDGES, STAGES), "sums": (2, BLOCKS), "end": q.shape, "numbers": (count, 3)}
     shared = {name: SharedMemory(create=True, size=8 * int(np.prod(shape))) for name, shape in sizes.items()}
@@ -118,7 +119,7 @@ def on_processes(count: int, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, 
     arrived[:] = 0
 
     parts = [Part(rank, count, arrays["edges"], arrays["sums"], arrived) for rank in range(count)]
-    given = [(part, q, v, arrays["end"], arrays["numbers"]) for part in parts]
+    given = [(steps, part, q, v, arrays["end"], arrays["numbers"]) for part in parts]
     processes = [get_context("fork").Process(target=work, args=each) for each in given]
     for process in processes:
         process.start()

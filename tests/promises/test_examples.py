@@ -32,6 +32,7 @@ SCRIPTS = (
     "curves_and_quadratures",
     "duffing_fit",
     "eccentric_comet",
+    "elements_on_processes",
     "field_on_two_processes",
     "halo_orbits",
     "hanging_chain",
@@ -76,6 +77,7 @@ def output_of(tmp_path, monkeypatch, capfd) -> Callable[..., str]:
         monkeypatch.chdir(tmp_path)
         monkeypatch.setenv("MPLBACKEND", "agg")
         monkeypatch.setattr(sys, "argv", [script, *arguments])
+        monkeypatch.syspath_prepend(str(EXAMPLES))  # as Python does for a script
         with warnings.catch_warnings(action="error"):
             runpy.run_path(script, run_name="__main__")
         if "matplotlib.pyplot" in sys.modules:
@@ -162,6 +164,13 @@ def test_field_in_two_parts_is_bitwise_equal(output_of):
     assert bits == "two processes have the bits of one: True"
     assert states == "and the states of the compiled integrator: True"
     assert len(times) in (4, 5)  # the last where others had the cores
+
+
+def test_elements_on_processes_are_bitwise_equal(output_of):
+    bits, states, sent = output_of("elements_on_processes").splitlines()
+    assert bits == "two and four processes have the bits of one: True"
+    assert states == "and the states of the compiled integrator: True"
+    assert sent.endswith("in an iteration: 8")
 
 
 def test_every_step_size_selection_has_its_documented_accuracy(output_of):
