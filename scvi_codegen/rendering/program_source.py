@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Literal, NamedTuple, TypeAlias, cast, get_args
+from typing import Literal, TypeAlias, cast, get_args
 
 from scvi_codegen.ir.derivatives import Derivatives
 from scvi_codegen.ir.equations import Control, FixedPointIteration, StoredValues
@@ -21,7 +21,7 @@ from scvi_codegen.rendering.kernels.functions import unrolled_equations
 from scvi_codegen.rendering.kernels.loops import loop_context
 from scvi_codegen.rendering.kernels.printer import DOUBLE, SINGLE, Target, constants, inverse_roots
 from scvi_codegen.rendering.kernels.simd import POINTS, TRAJECTORIES, Fallback, iteration_source, predictor_text
-from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.rendering.source import ExampleInput, Interface, Source
 from scvi_codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, MAX_ITERATIONS, ROUNDING_UNITS, included
 
 Embedded: TypeAlias = Literal["double", "single"]
@@ -45,14 +45,6 @@ LARGEST_INLINED = 150
 
 Larger ones are slower inlined: six bodies by 3 per cent, a chain of 64 masses by 20.
 """
-
-
-class ExampleInput(NamedTuple):
-    """Input as a function of time: (n + 1,) breakpoints, and (n, 4) coefficients of powers of the time since."""
-
-    name: str
-    breakpoints: tuple[float, ...]
-    coefficients: tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from scvi_codegen.indices import Access, ArrayDeclarations, ArrayMap, Loop
 from scvi_codegen.rendering.text import preprocessed, specialised, with_own_names
@@ -169,6 +169,14 @@ def _compare(name: str, size: int, found: re.Match[str] | None) -> None:
     wanted = int(found[1]) if found else 0
     if size != wanted:
         raise ValueError(f"{name} is {size} in the interface and {wanted} in the C source: they must be equal")
+
+
+class ExampleInput(NamedTuple):
+    """Input as a function of time: (n + 1,) breakpoints, and (n, 4) coefficients of powers of the time since."""
+
+    name: str
+    breakpoints: tuple[float, ...]
+    coefficients: tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -29,7 +29,7 @@ from scvi_codegen.files.export import loaded
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.time_span import real
 from scvi_codegen.native.arguments import real_array
-from scvi_codegen.rendering.program_source import ExampleInput
+from scvi_codegen.rendering.source import ExampleInput
 from scvi_codegen.runtime.inputs.segments import POWERS, first_inner_time, input_of, parameters_at
 
 NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)", re.ASCII | re.IGNORECASE)
