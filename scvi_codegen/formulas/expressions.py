@@ -27,15 +27,66 @@ from scvi_codegen.tables.precision import Number, mp
 LARGEST = 1.7976931348623157e308
 """Largest finite C double."""
 
+
+class rint(Function):  # type: ignore[misc]  # noqa: N801  (a function of formulas, like sympy.sin)
+    """Nearest whole number, of two the even one; its derivative is 0."""
+
+    is_real = True
+
+    @classmethod
+    def eval(cls, x: Expr) -> Expr | None:
+        """Return the value at a rational number."""
+        return sympy.Integer(round(x)) if x.is_Rational else None
+
+    def fdiff(self, argindex: int = 1) -> Expr:
+        """Return 0."""
+        return S.Zero
+
+
+class unit_step(Function):  # type: ignore[misc]  # noqa: N801
+    """1 where the argument is positive, 0 where it is negative; its derivative is 0."""
+
+    is_real = True
+
+    @classmethod
+    def eval(cls, x: Expr) -> Expr | None:
+        """Return the value at a rational number, 1 at 0."""
+        return sympy.Integer(x >= 0) if x.is_Rational else None
+
+    def _eval_power(self, exponent: Expr) -> Expr | None:
+        return self if exponent.is_positive else None
+
+    def fdiff(self, argindex: int = 1) -> Expr:
+        """Return 0."""
+        return S.Zero
+
+
+def wrap(x: Expr, length: Expr) -> Expr:
+    """Return x - L rint(x / L), the number of smallest size that differs from x by a multiple of L."""
+    return x - length * rint(x / length)
+
+
+def positive_part(x: Expr) -> Expr:
+    """Return x where it is positive, else 0."""
+    return x * unit_step(x)
+
+
 FUNCTIONS: Mapping[str, Callable[..., Expr]] = {
     function.__name__: function
     for function in (
         *(sympy.sin, sympy.cos, sympy.tan, sympy.asin, sympy.acos, sympy.atan, sympy.atan2),
         *(sympy.sinh, sympy.cosh, sympy.tanh, sympy.asinh, sympy.acosh, sympy.atanh),
         *(sympy.exp, sympy.log, sympy.sqrt),
+        *(rint, unit_step, wrap, positive_part),
     )
 }
-"""Functions of the grammar by name; all take one argument, ``atan2`` two."""
+"""Functions of the grammar by name; all take one argument, those of ``OF_TWO`` two."""
+OF_TWO = ("atan2", "wrap")
+PIECEWISE_CONSTANT: Mapping[str, tuple[Callable[[Number], Number], Callable[..., Any]]] = {
+    "rint": (mp.nint, np.rint),
+    "unit_step": (lambda x: mp.mpf(x >= 0), lambda x: np.heaviside(x, 1.0)),
+}
+"""Piecewise constant functions of mpmath and NumPy."""
 
 NAME_OF = {function: name for name, function in FUNCTIONS.items() if isinstance(function, type)}
 CONSTANTS = {"pi": S.Pi}
@@ -123,7 +174,8 @@ def _operation(expression: sympy.Expr, operands: tuple[int, ...]) -> tuple[Calla
     if isinstance(expression, Intermediate):
         return operator.pos, operands
     if not expression.is_Pow:
-        return getattr(mp, NAME_OF[expression.func]), operands
+        name = NAME_OF[expression.func]
+        return PIECEWISE_CONSTANT[name][0] if name in PIECEWISE_CONSTANT else getattr(mp, name), operands
     exponent = expression.exp
     if exponent.is_Integer:
         power = int(exponent)
@@ -449,4 +501,6 @@ def _node_value(expression: Any, known: dict[Expr, Any]) -> Any:
     if expression.is_Pow:
         return np.power(arguments[0], float(arguments[1]) if expression.exp.is_Number else arguments[1])
     name = type(expression).__name__
+    if name in PIECEWISE_CONSTANT:
+        return PIECEWISE_CONSTANT[name][1](*arguments)
     return getattr(np, f"arc{name[1:]}" if name.startswith("a") else name)(*arguments)

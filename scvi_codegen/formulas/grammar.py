@@ -28,6 +28,7 @@ from scvi_codegen.formulas.expressions import (
     MAX_BITS,
     MAX_DIGITS,
     NODES,
+    OF_TWO,
     SWITCHES,
     beyond_double,
     bits,
@@ -344,7 +345,7 @@ class Parser:
         while self.accept(","):
             arguments.append(self.sum())
         self.close()
-        expected = 2 if name == "atan2" else 1
+        expected = 2 if name in OF_TWO else 1
         if len(arguments) != expected:
             self.refuse(f"{name} takes {expected} argument{'s'[: expected - 1]}, not {len(arguments)}", column)
         return self.supported(FUNCTIONS[name](*arguments), column)

@@ -169,7 +169,8 @@ def read(texts: Sequence[str], symbols: Sequence[Symbol]) -> list[Expr]:
 
 def numeric(ca: Any, expressions: Sequence[Expr], symbols: Sequence[Symbol]) -> Callable[..., list[Any]]:
     """Return expressions as a function of CasADi's symbols, with common subexpressions shared."""
-    names = {name: getattr(ca, name) for name in FUNCTIONS}
+    names = {name: getattr(ca, name) for name in FUNCTIONS if hasattr(ca, name)}
+    names |= {"rint": lambda x: ca.floor(x + 0.5), "unit_step": lambda x: x >= 0}
     constants = {name: float(value) for name, value in CONSTANTS.items()} | {"e": float(sympy.E)}
     arguments: dict[str, Any] = {
         "modules": [names | constants],

@@ -23,6 +23,7 @@ from fractions import Fraction
 import sympy
 
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.expressions import rint, unit_step
 from scvi_codegen.formulas.intermediates import Intermediate, intermediates
 from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation, exact_number
 
@@ -42,6 +43,7 @@ FUNCTIONS = {
     sympy.atanh: "atanh",
     sympy.exp: "exp",
     sympy.log: "log",
+    rint: "rint",
 }
 
 
@@ -106,6 +108,9 @@ class _Graph:
             return self.node(("exp", (self.read(expression.args[0]),)))
         if isinstance(expression, sympy.Pow):
             return self._power(*expression.as_base_exp())
+        if isinstance(expression, unit_step):  # (1 + copysign(1, x)) / 2
+            sign = self.node(("copysign", (self.read(sympy.S.One), self.read(expression.args[0]))))
+            return self.node(("*", (self.read(sympy.S.Half), self.node(("+", (self.read(sympy.S.One), sign))))))
         name = FUNCTIONS.get(expression.func)
         if name is None:
             raise SystemDefinitionError(

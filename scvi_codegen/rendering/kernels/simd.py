@@ -28,7 +28,7 @@ Fallback: TypeAlias = Literal["own", "external", "provided", "none"]
 LIBRARY = ("sin", "cos", "exp", "log", "pow")
 """Functions that glibc's libmvec has for every x86-64 vector width since 2.22."""
 
-OF_TWO = ("pow", "atan2")
+OF_TWO = ("pow", "atan2", "copysign")
 
 
 @dataclass(frozen=True, slots=True)
