@@ -35,8 +35,8 @@ class rint(Function):  # type: ignore[misc]  # noqa: N801  (a function of formul
 
     @classmethod
     def eval(cls, x: Expr) -> Expr | None:
-        """Return the value at a rational number."""
-        return sympy.Integer(round(x)) if x.is_Rational else None
+        """Return the value at a number."""
+        return sympy.Integer(round(x.evalf(50))) if x.is_number and x.is_finite and x.is_real else None
 
     def fdiff(self, argindex: int = 1) -> Expr:
         """Return 0."""
@@ -50,8 +50,8 @@ class unit_step(Function):  # type: ignore[misc]  # noqa: N801
 
     @classmethod
     def eval(cls, x: Expr) -> Expr | None:
-        """Return the value at a rational number, 1 at 0."""
-        return sympy.Integer(x >= 0) if x.is_Rational else None
+        """Return the value at a number, 1 at 0."""
+        return sympy.Integer(int(bool(x.evalf(50) >= 0))) if x.is_number and x.is_finite and x.is_real else None
 
     def _eval_power(self, exponent: Expr) -> Expr | None:
         return self if exponent.is_positive else None
