@@ -1,4 +1,4 @@
-"""Event functions in C: formulas to a kernel, and a search for its zeros besides the source of an integrator.
+"""SearchedEvent functions in C: formulas to a kernel, and a search for its zeros besides the source of an integrator.
 
 The search uses only the public functions of an integrator, so that it is available for every method and solver, and the
 source without events does not change. On a step (``templates/support/run/events.h``):
@@ -41,8 +41,8 @@ DEGREE = 4
 Formula: TypeAlias = "str | Expr | float"
 
 
-class Event(Protocol):
-    """Event of a run; attributes as of :class:`~scvi_codegen.runtime.events.event.Event`."""
+class SearchedEvent(Protocol):
+    """SearchedEvent of a run; attributes as of :class:`~scvi_codegen.runtime.events.event.Event`."""
 
     @property
     def function(self) -> str | Expr: ...  # noqa: D102
@@ -57,7 +57,7 @@ class Event(Protocol):
 
 
 @lru_cache(maxsize=64)
-def with_events(source: Source, interface: Interface, events: tuple[Event, ...]) -> Source:
+def with_events(source: Source, interface: Interface, events: tuple[SearchedEvent, ...]) -> Source:
     """Return the source of an integrator with the search for its events and their changes of the state.
 
     Args:
@@ -83,7 +83,7 @@ class EventFormulas:
             an impact its gradient g_q, g_t, and the coefficient of restitution.
     """
 
-    def __init__(self, interface: Interface, events: Sequence[Event]) -> None:
+    def __init__(self, interface: Interface, events: Sequence[SearchedEvent]) -> None:
         self.interface, self.events = interface, events
         self._turning = RotationNames.of_declarations(interface.rotations)
         self._known = self._turning.symbols | _names(interface)
@@ -121,7 +121,7 @@ class EventFormulas:
         expression = self._turning.in_coordinates(_expression(formula, self._known, what))
         return cast(Expr, expression.xreplace(input_formulas(self.interface.inputs, symbol(TIME))))
 
-    def _changes(self, event: Event, g: Expr) -> tuple[list[int], list[Expr]]:
+    def _changes(self, event: SearchedEvent, g: Expr) -> tuple[list[int], list[Expr]]:
         if event.restitution is not None:
             if moving := sorted(free.name for free in g.free_symbols & {*self.p, *self.v}):
                 raise EventError(
@@ -149,7 +149,7 @@ class EventFormulas:
         return indices, [self._read(value, f"value '{value}' of '{name}' in then=") for name, value in event.changes]
 
 
-def _check_changes(interface: Interface, events: Sequence[Event]) -> None:
+def _check_changes(interface: Interface, events: Sequence[SearchedEvent]) -> None:
     """Raise :class:`EventError` where changes of the state are not supported."""
     changing = [event for event in events if event.changes_state]
     unsupported = {

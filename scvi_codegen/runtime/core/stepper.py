@@ -114,8 +114,9 @@ class Stepper(Integrator):
                 :meth:`Trajectory.at`. Not with inputs.
             observe: function of the run that returns the data to save instead of the states, a number or an array of
                 constant shape, in ``observed`` of the trajectory. Not with inputs.
-            events: zero crossings to record in ``events`` of the trajectory; a terminal one ends the run. One or
-                several :class:`~scvi_codegen.runtime.events.event.Event` or functions of (q, v, p, t) as text or SymPy
+            events: zero crossings to record in ``events`` of the trajectory; a terminal one ends the run, others may
+                change the state (:func:`~scvi_codegen.impact`), which is saved as a further state. One or several
+                :class:`~scvi_codegen.runtime.events.event.Event` or functions of (q, v, p, t) as text or SymPy
                 expression, compiled once with the integrator. By default those of :func:`compile_stepper`.
             error: instead of a tolerance, bound of the relative global error of all saved states up to t_end. Local
                 tolerances are reduced until a second run, with other steps and a perturbed initial state, confirms

@@ -159,7 +159,7 @@ class Crossings:
     """Crossings of one event, in the order of the run.
 
     At each of them g has its new sign or is 0; one rounding error earlier it has the old sign. A run started from such
-    a state does not detect the same crossing again.
+    a state does not detect the same crossing again. States are those before a change by the event.
 
     Attributes:
         event: the event.
