@@ -1,4 +1,4 @@
-"""SearchedEvent functions in C: formulas to a kernel, and a search for its zeros besides the source of an integrator.
+"""Event functions in C: formulas to a kernel, and a search for its zeros besides the source of an integrator.
 
 The search uses only the public functions of an integrator, so that it is available for every method and solver, and the
 source without events does not change. On a step (``templates/support/run/events.h``):
@@ -42,7 +42,7 @@ Formula: TypeAlias = "str | Expr | float"
 
 
 class SearchedEvent(Protocol):
-    """SearchedEvent of a run; attributes as of :class:`~scvi_codegen.runtime.events.event.Event`."""
+    """Event of a run; attributes as of :class:`~scvi_codegen.runtime.events.event.Event`."""
 
     @property
     def function(self) -> str | Expr: ...  # noqa: D102
