@@ -27,7 +27,7 @@ Examples:
   scvi-codegen derive planar-pendulum --method svi:2 --quadrature gauss-legendre:2
   scvi-codegen derive kepler --html kepler.html        the derivation from L to the C code on one page
   scvi-codegen generate mine.toml -o mine_svi          C, a Makefile and a Python package in the folder mine_svi
-  scvi-codegen reproduce all --html paper.html         every figure, table and claim of the paper, with a verdict
+  scvi-codegen reproduce all --html paper.html         figures, tables and claims of the paper, with verdicts
   scvi-codegen verify mine_svi                         measure its guaranteed properties
   scvi-codegen run ring.toml --size N=10000            an array model (lattice), of any size
 

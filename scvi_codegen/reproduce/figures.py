@@ -58,18 +58,13 @@ def _value(term: str, attribute: str, runs: Runs) -> float:
     return math.nan if value is None else float(factor or 1.0) * abs(value)
 
 
-def figure(
-    title: str,
-    setting: RunSetting,
-    views: Sequence[View],
-    checks: str,
-) -> Experiment:
+def figure(title: str, setting: RunSetting, views: Sequence[View], checks: str) -> Experiment:
     """Return the experiment that runs the schemes of a setting, draws views of them and tests statements.
 
     Args:
         title: name and title of the experiment, ``"figure-1: Title"``.
         setting: problem and schemes.
-        views: functions that return the panels; without them there is no picture.
+        views: functions that return the panels.
         checks: statements of the paper, a line each, followed by indented lines as in :func:`compared`.
     """
     tests = re.findall(r"^(\S.*)\n((?:[ ]+.*(?:\n|$))+)", cleandoc(checks), re.MULTILINE)
@@ -79,11 +74,11 @@ def figure(
         runs = {key: setting.run(key) for key in setting.schemes}
         panels = tuple(panel for view in views for panel in view(runs))
         size, columns = ((7.0, 4.2), 1) if len(panels) == 1 else ((4.0, 3.8), 2 if len(panels) in (2, 4) else 3)
-        picture = Picture(panels=panels, columns=columns, size=size) if panels else None
+        picture = Picture(panels=panels, columns=columns, size=size)
         return Result(
             setting=setting.sentences,
             checks=tuple(compared(claim, " ".join(test.split()), runs) for claim, test in tests),
-            tables=(measured_table(runs, list(measures)), *([picture.curves()] if picture else [])),
+            tables=(measured_table(runs, list(measures)), picture.curves()),
             picture=picture,
         )
 
