@@ -25,7 +25,8 @@ def definitions() -> Iterator[Any]:
     yield sc.HamiltonianSystem.from_text(NAME, ["q"], "p**2/2 - cos(q)", momenta=["p"])
     yield sc.LagrangianSystem.from_text(NAME, ["x", "y"], "x*y_dot - x**2/2 - y**2/2")
     waves = sc.FieldSystem.from_text(NAME, ["u"], {"x": (0, 1)}, "u_t**2/2 - u_x**2/2")
-    yield from (waves, waves.discretise("spectral-elements", degree=2, elements=2))
+    yield from (waves, waves.discretise("spectral-elements", degree=2, elements=2), waves.derive())
+    yield from waves.derive().laws
     kepler = sc.problem("kepler")
     yield from (kepler, kepler.system, sc.Model.from_problem(kepler), sc.cache_info())
     yield from sc.symmetries(kepler.system)
@@ -55,6 +56,11 @@ def runs(folder: Path) -> Iterator[Any]:
     many = sc.compile_stepper(ring, "svi:2", flags=QUICK_FLAGS)
     yield from (ring, many, many.start(np.ones(5), h=0.1), many.integrate(np.ones(5), h=0.1, steps=3))
     yield sc.Model(system=ring, method=sc.SVI(2), q={"q": np.ones(5)}, h=0.1, steps=3)
+    mesh = sc.FieldSystem.from_text(NAME, ["u"], {"x": (0, 1)}, "u_t**2/2").discretise(
+        "spectral-elements", degree=2, elements=2
+    )
+    flat = sc.compile_stepper(mesh.system, "svi:2", flags=QUICK_FLAGS).integrate({"u": np.ones(5)}, h=0.1, steps=3)
+    yield mesh.local_laws(flat, "energy")["energy"]
 
 
 @pytest.mark.filterwarnings("ignore")
