@@ -11,7 +11,7 @@ RANDOM = np.random.default_rng(2)
 LINEAR = "u_t**2/2 - u_x**2/2 - u**2/2"
 GRADED = [0, 0.02, 0.1, 0.3, 1.0, 2.0, 2.5]
 MESHES = {
-    "ring": ("periodic", "spectral-elements", {"degree": 5, "elements": 9}),
+    "ring": ("periodic", "spectral-elements", {"degree": 5, "elements": 8}),
     "natural": (("natural", "natural"), "spectral-elements", {"degree": 8, "elements": GRADED}),
     "prescribed": ((0, "sin(t)"), "spectral-elements", {"degree": 12, "elements": 3}),
     "differences": ("periodic", "finite-differences", {"order": 6, "points": 70}),
@@ -71,7 +71,7 @@ def test_steps_equal_those_of_fixed_point_iteration_and_of_other_threads():
 
 def test_restored_runs_and_other_parameters_have_the_right_factors():
     field = FieldSystem.from_text(
-        "string", ["u"], {"x": (0, 1)}, "u_t**2/2 - c*u_x**2/2 - u**4", boundary={"x": (0, 0)}, parameters={"c": 1}
+        "string", ["u"], {"x": (0, 1)}, "u_t**2/2 - c*u_x**2/2 - u**2", boundary={"x": (0, 0)}, parameters={"c": 1}
     )
     mesh = field.discretise("spectral-elements", degree=9, elements=5)
     stepper = sc.compile_stepper(mesh.system, "svi:4", solver="newton", flags=QUICK_FLAGS)
@@ -84,4 +84,4 @@ def test_restored_runs_and_other_parameters_have_the_right_factors():
     before = run.iterations
     run.update(parameters={"c": 25.0})
     run.advance(3)
-    assert run.iterations - before <= 18
+    assert run.iterations - before <= 6
