@@ -236,6 +236,8 @@ def _of_rotations(system: MechanicalSystem) -> list[Terms]:
         return []
     m, turning = system.dimension, {name for each in system.rotations for name in each.coordinates}
     ordinary = [i for i, q in enumerate(system.coordinates) if q.name not in turning]
+    if len(ordinary) > MAX_SEARCHED_COORDINATES:  # the position of a base; joints have other forces
+        ordinary = [i for i in ordinary if motion.forces[i].free_symbols.isdisjoint(motion.arguments)]
     state = [*ordinary, *(m + i for i in ordinary)]
     columns: list[Polynomial] = [
         {Monomial(a.power, tuple(state[i] for i in a.factors)): x for a, x in column.items()}
