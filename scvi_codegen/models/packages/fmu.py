@@ -246,6 +246,8 @@ def _texts(model: Model, prefix: str) -> tuple[Source, dict[str, bytes]]:
 
 def _start(model: Model) -> ExampleRun:
     """Return the initial state, with velocities or momenta as in the model, and the step size."""
+    if model.events:
+        raise ModelFileError("an FMU has no events: omit them")
     if model.h is None or model.has_time_transformation:
         raise ModelFileError(
             "an FMU requires a fixed step size in time: give a step h (--step, [run] step), without a time "
