@@ -113,7 +113,7 @@ def _energy_checks(better: str, factor: float) -> str:
         SVI is more accurate in energy than SC with the same points and step.
             energy: svi < sc, finer_svi < finer_sc | accuracy
         SVI achieves {better}.
-            energy: {factor}*svi < srk | efficiency
+            energy: {factor}*svi < srk
         """
 
 
