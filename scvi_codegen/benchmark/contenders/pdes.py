@@ -16,7 +16,7 @@ from scvi_codegen.methods.leapfrog_stages import kicks_and_drifts
 
 MESHES = ((128, 1e-4), (512, 1e-6), (2048, 1e-8))
 """Points of an axis and tolerance of py-pde, whose differences are of order 2."""
-MODES = (96, 128, 192)
+MODES = (96, 128, 192, 256, 384)
 STEPS = tuple(25 * 2**k for k in range(7))
 STENCIL = (-205 / 72, 8 / 5, -1 / 5, 8 / 315, -1 / 560)
 """Second difference of order 8."""
