@@ -1,10 +1,10 @@
 """Benchmark: this package and other integrators, compared at equal error.
 
-    cases/       systems with their initial states and spans: unforced, adaptive, rods with forces or constraints,
+    cases/       systems with their initial states and spans: unforced, adaptive, rods with friction and motor,
                  rotations, robots, fields, large array systems; accelerations derived by hand, and final states in
                  extended precision, independent of the package's steppers (references)
     contenders/  functions from a case and a step size or tolerance to its final state: steppers of this package; peers:
-                 heyoka (taylor), REBOUND, CyRK, JiTCODE, SciPy (peers), MuJoCo, Pinocchio (engines), OpenMM (arrays),
+                 heyoka (taylor), REBOUND, CyRK, SciPy (peers), MuJoCo, Pinocchio (engines), OpenMM (arrays),
                  PyDy (mechanisms), py-pde and spectral methods by hand (pdes)
     comparison   timing of all contenders of a case in turn, in one process
     sections     which contenders and which reference belong to a case

@@ -151,5 +151,5 @@ def test_fields_are_measured_without_peers_and_by_split_steps():
     here = [each.error(end(each)) for each in our_fields(case, quick=True)]
     assert min(here) < 0.03
     contenders = [each for each in pdes.fft_contenders(case.plain(), quick=False) if each.method.endswith("8")]
-    split = next(each for each in contenders if each.setting == "192 points, 200 steps")
+    split = next(each for each in contenders if each.setting == "256 points, 200 steps")
     assert split.error(end(split)) < 1e-8
