@@ -32,7 +32,7 @@ RUN_FIELDS = (
 """Scalar fields of the C struct of a run."""
 REAL_FIELDS = ("t", "t_low", "h", "error", "error_t", "largest_q", "largest_p", "error_before")
 """Those of them that are no whole numbers."""
-COMPUTED = ("inverse_mass", "places", "columns", "pattern")
+COMPUTED = ("inverse_mass", "places", "columns", "pattern", "compared_factors")
 """Arrays computed from the problem and not restored: foreign indices could address memory out of bounds."""
 STATE = ("q", "p", "carry_q", "carry_p")
 """Arrays of the state: positions, momenta and their compensation terms."""
@@ -109,7 +109,8 @@ class ArrayMemory:
             vector |= constraint_memory(binding.raw, run, problem, n)
         if (coupled := binding.envelope) is not None:
             width = 2 * binding.raw.constant("SHIFTS")
-            vector |= {"pattern": coupled.pattern, "factors": aligned(ALIGNMENT + (n + coupled.entries) * width)}
+            size = ALIGNMENT + (n + coupled.entries) * width
+            vector |= {"pattern": coupled.pattern, "factors": aligned(size), "compared_factors": aligned(size)}
         for name, array in vector.items():
             setattr(run, name, binding.raw.pointer(array))
         run.threads = binding.arrays.threads

@@ -28,7 +28,7 @@ typedef struct {
 static envelope envelope_of(const linear_system *of)
 {
   const int *pattern = of->run->pattern;
-  double *memory = of->run->factors;
+  double *memory = of->step->first == COMPARISON ? of->run->compared_factors : of->run->factors;
   envelope all = {.n = of->n, .width = pattern[0], .apart = pattern[1], .order = pattern + 2};
   all.first = all.order + all.n;
   all.start = all.first + all.n;

@@ -254,7 +254,7 @@ static int solve(const step_data *step, const solver_data *data, history past, l
     double change, size, left;
     find_residual(&of, &w);
     if (!of.by_factors ? now.last > REFRESHED /* also before the first iteration */
-                       : !has_factors(&of) || slow == 1)
+                       : !has_factors(&of) || slow == 1 || (k == 0 && step->first == COMPARISON))
       find_inverses(&of);
     left = 0.0;
     if (of.by_factors && slow < 2)
