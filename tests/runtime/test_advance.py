@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+import scvi_codegen as sc
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -111,3 +112,14 @@ def test_runs_of_one_stepper_are_independent(pushed):
     assert together == [with_force(force) for force in forces]
     assert len({each[1][0] for each in together}) == 8
     assert given[pushed.parameters.index("u_0")] == 0.2
+
+
+@pytest.mark.parametrize("save_every", [3, 4001, 10**9])
+def test_the_end_is_saved_if_whole_steps_reach_it(save_every):
+    problem = sc.problem("kepler")
+    stepper = sc.compile_stepper(problem.system, "svi:4")
+    every = stepper.integrate(problem.q, velocity=problem.velocity, h=0.25, t_end=1000.0)
+    few = stepper.integrate(problem.q, velocity=problem.velocity, h=0.25, t_end=1000.0, save_every=save_every)
+    assert few.t[-1] == 1000.0
+    assert np.array_equal(few.q[-1], every.q[-1])
+    assert few.steps == every.steps

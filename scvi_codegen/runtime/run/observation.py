@@ -171,7 +171,7 @@ class Observation:
         lengths = part.step_sizes.copy()
         lengths[-1] = self.run.left_to(self.end) if tau is None else tau - part.stepped[-1]
         self.partial_steps = int(abs(lengths[-1]) > WHOLE * abs(self.run.h))
-        if tau is None:
+        if tau is None and lengths[-1] != 0.0:
             run = self.run
             q, p = run.stepper.step(q, p, lengths[-1], run.t, run.parameters, options=run.options)
         return self._with_state(part, lengths, self.end, q, p, tau)
