@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.representation import summary
@@ -213,25 +213,13 @@ def gauss_radau(n: int, side: Literal["left", "right"] = "left") -> Quadrature:
     return gauss_type(f"gauss-radau-{side}", points, 2 * n - 1, lambda x, P2: (1 + sign * x) / (n * n * P2))
 
 
-def cosine_sum(angle: Any, cosine: Callable[[Any], Any], count: int, last: int) -> Any:
+def cosine_sum(angle: Number, count: int, last: int) -> Number:
     """Return 1 - sum_{k=1}^{count//2} b_k cos(2 k angle) / (4k^2 - 1), where b_k is 1 for 2 k = ``last``, else 2.
 
-    Exact or numerical, as ``angle`` and ``cosine`` are: both Chebyshev rules, and both their forms, are this sum.
+    Both Chebyshev rules are this sum.
     """
-    terms = ((1 if 2 * k == last else 2) * cosine(2 * k * angle) / (4 * k * k - 1) for k in range(1, count // 2 + 1))
-    return cosine(0) - sum(terms)
-
-
-def clenshaw_curtis_weights(n: int, pi: Any, cosine: Callable[[Any], Any]) -> tuple[Any, ...]:
-    """Return the Clenshaw-Curtis weights in the arithmetic of ``pi`` and ``cosine``."""
-    N = n - 1
-    sums = [cosine_sum(j * pi / N, cosine, N, N) for j in range(n)]
-    return tuple((1 if j in (0, N) else 2) * value / N for j, value in enumerate(sums))
-
-
-def fejer_weights(n: int, pi: Any, cosine: Callable[[Any], Any]) -> tuple[Any, ...]:
-    """Return the weights of Fejer's first rule in the arithmetic of ``pi`` and ``cosine``."""
-    return tuple(2 * cosine_sum((2 * j + 1) * pi / (2 * n), cosine, n, 0) / n for j in range(n))
+    terms = ((1 if 2 * k == last else 2) * mp.cos(2 * k * angle) / (4 * k * k - 1) for k in range(1, count // 2 + 1))
+    return 1 - sum(terms)
 
 
 @checks_arguments(MethodError, n=WHOLE)
@@ -243,8 +231,10 @@ def clenshaw_curtis(n: int) -> Quadrature:
     b_k = 1 for 2k = N, else 2 (Waldvogel 2006; Trefethen 2008).
     """
     n = point_count(n, "the number of Clenshaw-Curtis points", least=2)
+    N = n - 1
     with mp.workdps(DIGITS + GUARD):
-        weights = symmetrised(clenshaw_curtis_weights(n, +mp.pi, mp.cos))
+        sums = [cosine_sum(j * mp.pi / N, N, N) for j in range(n)]
+        weights = symmetrised(tuple((1 if j in (0, N) else 2) * value / N for j, value in enumerate(sums)))
     points = chebyshev_lobatto_points(n)
     return Quadrature(name=f"clenshaw-curtis:{n}", points=points, weights=weights, order=n + n % 2)
 
@@ -258,7 +248,7 @@ def fejer(n: int) -> Quadrature:
     """
     n = point_count(n, "the number of Fejer points", least=1)
     with mp.workdps(DIGITS + GUARD):
-        weights = symmetrised(fejer_weights(n, +mp.pi, mp.cos))
+        weights = symmetrised(tuple(2 * cosine_sum((2 * j + 1) * mp.pi / (2 * n), n, 0) / n for j in range(n)))
     return Quadrature(name=f"fejer:{n}", points=chebyshev_gauss_points(n), weights=weights, order=n + n % 2)
 
 
@@ -316,14 +306,6 @@ def split_name(name: str, families: Mapping[str, Item], what: str) -> tuple[Item
     if not (count.isascii() and count.isdigit() and len(count) <= MOST_DIGITS):
         raise MethodError(f"{what} {name!r} lacks its number of points; write '{family}:3', for example")
     return resolved, int(count)
-
-
-def is_built_in(by_name: Callable[[str], Item], name: str, item: Item) -> bool:
-    """Return whether ``item`` equals the built-in object of that name, rather than a user's object of the same name."""
-    try:
-        return by_name(name) == item
-    except MethodError:
-        return False
 
 
 def quadrature_by_name(name: str) -> Quadrature:

@@ -197,14 +197,9 @@ def symplectic_partner(tableau: Tableau, name: str) -> Tableau:
     The pair is GNI, theorem VI.4.6. On the c and b of a collocation method the result satisfies D(s), since then
     b_i a^_ij is b_j times the integral of l_i from c_j to 1.
     """
-    b, A = tableau.b, tableau.A
-    return Tableau(name=name, A=partner_matrix(A, b), b=b, c=tableau.c)
-
-
-def partner_matrix(A: Sequence[Sequence[Any]], b: Sequence[Any]) -> tuple[tuple[Any, ...], ...]:
-    """Return b_j - b_j a_ji / b_i in the arithmetic of the entries, numerical or exact."""
-    span = range(len(b))
-    return tuple(tuple(b[j] - b[j] * A[j][i] / b[i] for j in span) for i in span)
+    b, A, span = tableau.b, tableau.A, range(tableau.stages)
+    partner = tuple(tuple(b[j] - b[j] * A[j][i] / b[i] for j in span) for i in span)
+    return Tableau(name=name, A=partner, b=b, c=tableau.c)
 
 
 def _stages(s: Any) -> int:

@@ -97,8 +97,8 @@ def test_lobatto_and_gauss_points_have_published_digits() -> None:
 @pytest.mark.parametrize(
     ("name", "degrees"),
     [
-        ("chebyshev-lobatto", [1, 2, 3, 4, 5, 6, 8]),
-        ("legendre-lobatto", [1, 2, 3, 4, 5]),
+        ("chebyshev-lobatto", [1, 2, 3, 4, 5, 6, 8, 10, 12]),
+        ("legendre-lobatto", [1, 2, 3, 4, 5, 6]),
         ("equispaced", [1, 2, 7, 30]),
         ("legendre-gauss", [1, 2, 3, 4]),
         ("chebyshev-gauss", [1, 2, 3, 4, 5]),
@@ -117,13 +117,20 @@ def test_closed_forms_are_radicals_of_the_same_value(name: str, degrees: list[in
             assert abs(mp.mpf(str(sp.N(expression, 60))) - point) < FIFTY_DIGITS
 
 
-def test_long_and_user_defined_nodes_have_no_closed_form() -> None:
+def test_nodes_of_higher_degree_and_rounded_nodes_have_no_closed_form() -> None:
     assert exact_points(chebyshev_lobatto(7)) is None
-    assert exact_points(legendre_lobatto(6)) is None
+    assert exact_points(legendre_lobatto(7)) is None
     assert exact_points(legendre_gauss(5)) is None
     assert exact_points(radau_left(3)) is None
-    assert exact_points(Nodes(name="equispaced", degree=2, points=(-1, 0.25, 1))) is None
-    assert exact_points(Nodes(name="mine", degree=1, points=(-1, 1))) is None
+    assert exact_points(Nodes(name="legendre-gauss", degree=1, points=(-(1 / 3**0.5), 1 / 3**0.5))) is None
+    assert exact_points(Nodes(name="mine", degree=1, points=(mp.mpf("1e-30"), mp.pi / 4))) is None
+
+
+def test_user_defined_nodes_are_recognised() -> None:
+    assert exact_points(Nodes(name="equispaced", degree=2, points=(-1, 0.25, 1))) == (-1, sp.Rational(1, 4), 1)
+    silver, half = sp.sqrt(2) - 1, sp.Rational(1, 2)
+    for points in [(-silver, half), (-sp.sqrt(half - sp.sqrt(2) / 4), silver), (sp.Rational(-12345, 678901), silver)]:
+        assert exact_points(Nodes(name="mine", degree=1, points=points)) == points
 
 
 def test_numbers_of_many_kinds_are_converted() -> None:

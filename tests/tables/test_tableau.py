@@ -206,10 +206,11 @@ def test_closed_forms_have_the_value_of_the_tableau(tableau: Tableau) -> None:
                 assert abs(mp.mpf(str(sp.N(expression, 60))) - number) < FIFTY_DIGITS
 
 
-def test_user_defined_tableau_has_no_closed_form() -> None:
-    assert exact_tableau(Tableau(name="gauss:1", A=((1,),), b=(1,), c=(1,))) is None
-    assert exact_tableau(Tableau(name="lobatto-iiia:1", A=((1,),), b=(1,), c=(1,))) is None
-    assert exact_tableau(collocation_tableau((0, HALF))) is None
+def test_user_defined_tableau_is_recognised_by_its_numbers() -> None:
+    assert exact_tableau(Tableau(name="gauss:1", A=((1,),), b=(1,), c=(1,))) == (((1,),), (1,), (1,))
+    quarter = sp.Rational(1, 4)
+    assert exact_tableau(collocation_tableau((0, HALF))) == (((0, 0), (quarter, quarter)), (0, 1), (0, 2 * quarter))
+    assert exact_tableau(Tableau(name="gauss:1", A=((mp.pi,),), b=(1,), c=(1,))) is None
 
 
 @settings(max_examples=40, deadline=None)
