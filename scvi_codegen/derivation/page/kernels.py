@@ -172,7 +172,7 @@ def _formulas(name: str, system: MechanicalSystem, stages: StageSystem, program:
         yield from _compiled(system, stages)
     elif name == "newton":
         yield from _newton()
-    elif name == "fixed_point" and program.fixed_point is not None:
+    elif name in ("fixed_point", "iterate") and program.fixed_point is not None:
         yield from ITERATIONS[program.fixed_point.name]
     elif name == "gather":
         yield Formula(sympy.Sum(Symbol("table_j_n") * Symbol("z_j"), (j, 1, Symbol("B"))), Symbol("u_n"))
