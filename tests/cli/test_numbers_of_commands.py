@@ -14,6 +14,7 @@ import scvi_codegen as sc
 from scvi_codegen.advice.tolerance_check import Known
 from scvi_codegen.cli import main
 from scvi_codegen.cli.running import final_state
+from scvi_codegen.rendering.source import Interface
 
 
 def document(*words: str) -> dict[str, Any]:
@@ -83,6 +84,9 @@ def test_checks_of_verify_compare_what_they_measured_with_their_bounds():
 
 def test_positions_and_momenta_are_printed_with_their_correct_digits():
     known = Known(q=np.array([1e-3, 1e-9]), p=np.array([1e-9, 1e-3]), tenfold=np.inf)
-    lines = list(final_state(["x", "y"], np.array([1 / 3, 2 / 3]), np.array([1 / 7, 1 / 9]), known))
+    interface = Interface(
+        prefix="two", title="", system="", method="", coordinates=("x", "y"), parameters=(), defaults=()
+    )
+    lines = list(final_state(interface, np.array([1 / 3, 2 / 3]), np.array([1 / 7, 1 / 9]), known))
     digits = [[len(text) for text in re.findall(r"0\.(\d*[1-9])", line)] for line in lines[1:]]
     assert digits[0][0] == digits[1][1] < digits[0][1] == digits[1][0]

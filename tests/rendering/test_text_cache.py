@@ -58,9 +58,9 @@ def test_ensemble_source_is_generated_on_demand_and_cached(made, tmp_path, monke
     stepper = sc.compile_stepper(spring(), sc.SVI(2))
     stepper.integrate([1.0], [0.0], h=0.1, steps=3)
     assert (len(written), len(list((tmp_path / "texts").iterdir()))) == (0, 2)
-    saved = pickle.loads(pickle.dumps(stepper))  # makes also those of controlled steps, fallback and derivatives
+    saved = pickle.loads(pickle.dumps(stepper))  # makes also those of fallback and derivatives
     assert saved.ensemble == stepper.ensemble == sc.compile_stepper(spring(), sc.SVI(2)).ensemble
-    assert (len(written), len(list((tmp_path / "texts").iterdir()))) == (1, 6)
+    assert (len(written), len(list((tmp_path / "texts").iterdir()))) == (1, 5)
     assert len(made) == 2  # with the fallback and without
 
 
@@ -154,6 +154,7 @@ ARGUMENTS = {
     "forces": [{"r": "-a*q_dot"}, {"q": "-b*q_dot"}, {}],
     "torques": [{"R": ["0", "0", "1"]}],
     "torques_space": [{"R": ["0", "0", "1"]}],
+    "point_forces": [[{"body": "R", "point": ["1", "0", "0"], "force": ["0", "0", "1"]}]],
     "dissipation": ["q_dot**2", "r_dot**2"],
     "damping": ["a", "1", 1.5],
     "constraints": [["q - r"], ["q_dot - r"], ["q", "r"]],
@@ -170,6 +171,7 @@ TEXT = {
     "forces": {"q": "-a*q_dot"},
     "torques": None,
     "torques_space": None,
+    "point_forces": [],
     "dissipation": None,
     "damping": None,
     "constraints": [],

@@ -17,7 +17,7 @@ from scvi_codegen.runtime.core.stepper import Stepper
 
 pytestmark = pytest.mark.usefixtures("as_users_compile")
 
-GENERATED = Path(__file__).parents[2] / "generated" / "two_point_pendulum" / "two_point_pendulum.c"
+GENERATED = Path(__file__).parents[2] / "generated" / "two_point_pendulum.c"
 TWO_POINTS = SCVI(1, "gauss-legendre:2")
 HAMILTONIAN = HamiltonianSystem.from_text(
     name="pendulum", coordinates=["x"], momenta=["y"], hamiltonian="y**2*(1 + x**2/5)/2 - cos(x)"

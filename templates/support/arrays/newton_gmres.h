@@ -120,8 +120,8 @@ static double find_correction(linear_system *of, solver_report *report)
 
 #define REFRESHED 1e-6 /* squared: the preconditioner is recomputed while points change by more than 1e-3 of the
                         * state */
-#define SLOW 0.1 /* squared: corrections by the factors have to decrease by more, otherwise these are computed again, then
-                  * GMRES solves the linear systems */
+#define SLOW 0.1 /* squared: corrections by the factors have to decrease by more, otherwise these are computed again,
+                  * then GMRES solves the linear systems */
 #define UNSOLVED 1e-10 /* relative to the state: a larger residual is not due to rounding */
 
 /* Parts of work behind those of the fixed-point iteration. */

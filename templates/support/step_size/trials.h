@@ -51,7 +51,8 @@ static real attempt(run_memory *run, step_data *step, const solver_data *data, i
 /* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
  * failed. afresh: without the predictor. Out of line, one copy compiles faster than two. */
 static __attribute__((noinline)) double attempt(run_memory *run, step_data *step, const solver_data *data, int afresh,
-    long long *guess, double *dq, double *dp, double decay, double least, const solver_options *options, solver_report *report)
+    long long *guess, double *dq, double *dp, double decay, double least, const solver_options *options,
+    solver_report *report)
 {
   struct predictor_tables_of tables = {NULL, NULL, NULL};
   int status;
