@@ -41,7 +41,7 @@ class TestInABrowser:
     def test_no_element_overflows_the_page(self, view):
         assert_nothing_sticks_out(view)
         boxes = "[...document.querySelectorAll('.scroll')].map(e => [e.scrollWidth, e.clientWidth])"
-        assert view.width > 390 or sum(inside > outside for inside, outside in view.evaluate(boxes)) > 3
+        assert view.width > 190 or sum(inside > outside for inside, outside in view.evaluate(boxes)) > 3
 
     def test_single_panel_fits_a_phone_and_wider_pictures_scroll(self, view):
         figures = """[...document.querySelectorAll('figure .scroll')].map(e => {
