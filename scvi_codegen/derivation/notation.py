@@ -153,8 +153,7 @@ def html(equation: Equation) -> Html:
     size = sympy.count_ops(equation.residual)
     if size > LARGEST_SHOWN:
         return Html(f"<div>{plain(f'({equation.number}) {size} operations')}</div>")
-    pieces = [piece for term in mathml_terms(equation.residual, sympy.S.Zero) for piece in term]
-    return Html(f"<div>{plain(f'({equation.number})')} {' '.join(pieces)}</div>")
+    return Html(f"<div>{plain(f'({equation.number})')} {' '.join(mathml_terms(equation.residual, sympy.S.Zero))}</div>")
 
 
 def _names_of_maps(symmetry: Symmetry) -> dict[sympy.Symbol, str]:

@@ -299,7 +299,7 @@ class MechanicalSystem(Deferred, ABC):
         short = written_size(self.formula) <= LONGEST_WRITTEN
         size = count_ops(self.formula) if short else written_size(self.formula)
         formula = mathml_terms(written_out(self.formula), Symbol(letter)) if size <= MAX_OPERATIONS else ()
-        written = " ".join(piece for term in formula for piece in term) or plain(f"{letter}: {size} operations")
+        written = " ".join(formula) or plain(f"{letter}: {size} operations")
         parameters = [f"{parameter.name} = {value:g}" for parameter, value in self.constants.items()]
         return card(
             self.name,

@@ -56,7 +56,7 @@ def _tokens(element: ElementTree.Element) -> Iterator[Any]:  # noqa: C901
             for child in children:
                 yield from _tokens(child)
         case "mn":
-            yield ("number", text)
+            yield ("number", text.replace("−", "-"))
         case "mi" if text in FUNCTIONS:
             yield ("function", text, None)
         case "mi":

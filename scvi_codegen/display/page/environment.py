@@ -153,9 +153,7 @@ def _is_a(kind: type) -> Callable[[object], bool]:
 
 
 def _equation(formula: blocks.Formula) -> Markup:
-    """Return terms that are not broken if they fit a line."""
-    terms = mathml_terms(formula.right, formula.left)
-    return Markup(" ".join(f'<span class="term">{" ".join(pieces)}</span>' for pieces in terms))
+    return Markup(" ".join(mathml_terms(formula.right, formula.left)))
 
 
 def _c_text(text: str) -> Markup:
