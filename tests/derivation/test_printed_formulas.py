@@ -652,7 +652,7 @@ def of_functions(name: str, entry: Entry, index: int) -> bool:
     if entry.pair == "gather":
         known = {"B": mp.mpf(2), "table_1,n": mp.mpf(3), "table_2,n": mp.mpf(5), "z_1": mp.mpf(7), "z_2": mp.mpf(11)}
         return close(value(entry.tree[2], known.__getitem__), mp.mpf(21 + 55))
-    return entry.pair == "fixed_point" and of_iteration(name, entry)
+    return entry.pair in ("fixed_point", "iterate") and of_iteration(name, entry)
 
 
 @cache
