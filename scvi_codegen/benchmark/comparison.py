@@ -168,5 +168,5 @@ def _summary(record: _Record, reference_of: Callable[[Contender], Reference]) ->
 
 def _error(final: list[Array], reference: Reference) -> float:
     """Return the error of one array for each state, or of one for an ensemble that contains all states repeatedly."""
-    copies = np.concatenate([np.atleast_2d(q) for q in final]).reshape(-1, *reference.high.shape)
+    copies = np.concatenate([np.atleast_2d(q) for q in final]).reshape(-1, *reference.positions.shape)
     return float(np.sqrt(np.mean([rms_error(q, reference) ** 2 for q in copies])))

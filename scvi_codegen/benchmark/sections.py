@@ -10,10 +10,10 @@ import numpy as np
 
 from scvi_codegen.benchmark.cases.adaptive import ADAPTIVE_CASES, adaptive_case
 from scvi_codegen.benchmark.cases.fields import FIELDS, FieldCase, our_fields
+from scvi_codegen.benchmark.cases.forced import driven_pendulum
 from scvi_codegen.benchmark.cases.large import atoms, bodies, field, ring
-from scvi_codegen.benchmark.cases.references import Reference, adaptive_reference, rms_error
+from scvi_codegen.benchmark.cases.references import Reference, rms_error
 from scvi_codegen.benchmark.cases.robots import ROBOTS
-from scvi_codegen.benchmark.cases.rods import FORCED_CASES
 from scvi_codegen.benchmark.cases.rotations import BODIES, FEW_BODIES, ROTATIONS, tumbling
 from scvi_codegen.benchmark.cases.unforced import CASES, STATES, Case, case
 from scvi_codegen.benchmark.comparison import Race
@@ -79,13 +79,12 @@ def _tumbling(plan: Plan) -> Race:
 
 def _adaptive(name: str, plan: Plan) -> Race:
     """Return problems with close encounters, in all modes of this package."""
-    chosen = adaptive_case(name)
+    chosen = _shortened(adaptive_case(name), plan)
 
     def peers(peer: str, quick: bool) -> Iterable[Contender] | None:
         return heyoka_contenders(chosen, True) if peer == "heyoka" else None if peer == "rebound" else ()
 
-    ours = partial(adaptive_contenders, chosen, quick=plan.quick)
-    return Race(case=chosen, ours=ours, peers=peers, ends=adaptive_reference)
+    return Race(case=chosen, ours=partial(adaptive_contenders, chosen, quick=plan.quick), peers=peers)
 
 
 def _rotation(name: str, plan: Plan) -> Race:
@@ -113,7 +112,7 @@ def _halved(
     def exact_end() -> Reference:
         counts: Counts = {method: step_counts(chosen, range(k, k + 1)) for method, k in exact.items()}
         result, other = (each.prepare(0)() for each in fixed_contenders(chosen, counts))
-        reference = Reference(high=result.reshape(1, -1), low=np.zeros((1, result.size)), accuracy=0.0)
+        reference = Reference(positions=result.reshape(1, -1), accuracy=0.0)
         return replace(reference, accuracy=rms_error(other.reshape(1, -1), reference))
 
     some = {method: step_counts(chosen, k[: 2 if plan.quick else None]) for method, k in methods.items()}
@@ -122,7 +121,7 @@ def _halved(
 
 def _field(make: Callable[[], FieldCase], plan: Plan) -> Race:
     """Return a partial differential equation; every contender knows the exact solution on its own mesh."""
-    chosen, exact = make(), Reference(high=np.ones((1, 1)), low=np.zeros((1, 1)), accuracy=0.0)
+    chosen, exact = make(), Reference(positions=np.ones((1, 1)), accuracy=0.0)
     return Race(case=chosen.plain(), ours=lambda: our_fields(chosen, plan.quick), ends=lambda _, __: exact)
 
 
@@ -144,7 +143,7 @@ MECHANISM_METHODS: dict[str | Method, range] = {"svi:4": range(6)}
 BUILDERS: dict[str, Callable[[Plan], Race]] = {
     **{name: partial(_single, make) for name, make in CASES.items()},
     **{f"ensemble:{name}": partial(_copies, name) for name in ENSEMBLES},
-    **{name: partial(_single, make) for name, make in FORCED_CASES.items()},
+    "forced:double-pendulum": partial(_single, driven_pendulum),
     **{f"adaptive:{name}": partial(_adaptive, name) for name in ADAPTIVE_CASES},
     **{f"rotations:{name}": partial(_rotation, name) for name in ROTATIONS},
     "rotations:bodies": _tumbling,

@@ -36,7 +36,7 @@ of the central one."""
 
 def adaptive_case(name: str) -> Case:
     """Return one of :data:`ADAPTIVE_CASES`."""
-    return replace(ADAPTIVE_CASES[name](), name=f"adaptive:{name}")
+    return replace(ADAPTIVE_CASES[name](), name=f"adaptive:{name}", fine=None)
 
 
 def _kepler_case(eccentricity: float) -> Case:

@@ -59,12 +59,10 @@ class FieldCase:
         return Case(
             name=f"fields:{self.name}",
             system=system,
-            formulations=(),
             q=zero,
             velocity=zero,
             span=self.span,
             step=1.0,
-            fine=1.0,
             field=self,
         )
 

@@ -27,12 +27,10 @@ def _case(
     return Case(
         name=f"lattices:{name}:{len(q)}",
         system=LagrangianSystem.from_text(name=name, **definition),
-        formulations=(),
         q=q.reshape(1, -1),
         velocity=velocity.reshape(1, -1),
         span=span,
         step=longest,
-        fine=longest,
         bodies=bodies,
         arrays=Arrays(shape=q.shape, by_hand=by_hand),
     )

@@ -39,12 +39,10 @@ def _case(name: str, mjcf: str, q: Sequence[float], velocity: Sequence[float], s
     return Case(
         name=f"robots:{name}",
         system=system,
-        formulations=(),
         q=np.array([q], dtype=float),
         velocity=np.array([velocity], dtype=float),
         span=span,
         step=0.04,
-        fine=0.04,
         mjcf=mjcf,
     )
 

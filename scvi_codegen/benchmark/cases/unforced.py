@@ -58,7 +58,8 @@ class Case:
             coordinates, and angular velocities in the body frame.
         span: duration.
         step: step size that gives about ten digits; the catalogue's own for its problems.
-        fine: step size with which a Gauss method of 16 stages reaches 1e-18, for the reference.
+        fine: step size with which a Gauss method of 16 stages reaches 1e-17, for the reference; ``None`` with close
+            encounters, where the steps are the adaptive ones of this package.
         bodies: masses and constant of gravity if coordinates are Cartesian positions of gravitating bodies.
         loops: source of ``rates(out, t, x, unused)`` in Python with loops, for Numba, if faster than unrolled code.
         velocity_of: function from (k, m) momenta in extended precision to velocities if a rounding of momenta matters;
@@ -70,12 +71,12 @@ class Case:
 
     name: str
     system: MechanicalSystem
-    formulations: tuple[Formulation, ...]
+    formulations: tuple[Formulation, ...] = ()
     q: Array
     velocity: Array
     span: float
     step: float
-    fine: float
+    fine: float | None = None
     bodies: Bodies | None = None
     loops: str | None = None
     velocity_of: Callable[[Any], Any] | None = None
@@ -305,7 +306,7 @@ def gravitating(masses: Sequence[float], q: Sequence[float], velocity: Sequence[
         velocity=rotated(velocity, 3),
         bodies=Bodies(masses=tuple(masses), gravity=gravity, fixed_centre=False, axes=3),
         velocity_of=partial(divided, masses),
-        **{"step": 0.1, "fine": 0.1} | others,
+        **{"step": 0.1} | others,
     )
 
 

@@ -42,12 +42,10 @@ def links(n: int) -> Case:
     return Case(
         name=f"mechanisms:{n}",
         system=LagrangianSystem.from_kanes_method(method, name=f"{n} links", parameters=parameters),
-        formulations=(),
         q=q,
         velocity=0.0 * q,
         span=1.0,
         step=0.0625,
-        fine=0.0625,
     )
 
 

@@ -35,7 +35,7 @@ def bench(
     \b
       planar-pendulum, duffing, kepler:0.2, kepler:0.5, henon-heiles, outer-solar-system, double-pendulum,
       relativistic-particle, fput-chain:8, fput-chain:64, fput-chain:256    single trajectories
-      forced:double-pendulum, :chain:5                                      friction and driving forces
+      forced:double-pendulum                                                friction and driving forces
       ensemble:planar-pendulum, :kepler:0.2, :outer-solar-system            64 trajectories at once
       adaptive:kepler:0.9, ..   adaptive and fixed step size; heyoka and IAS15
       rotations:free-top, :heavy-top, :dumbbell, :bodies                    rigid bodies; heyoka, MuJoCo
