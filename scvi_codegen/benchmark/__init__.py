@@ -1,8 +1,8 @@
 """Benchmark: this package and other integrators, compared at equal error.
 
-    cases/       systems with their initial states and spans: unforced, forced, adaptive,
-                 rotations, robots, fields, large array systems; accelerations derived by hand, and final states in
-                 extended precision, independent of the package's steppers (references)
+    cases/       systems with their initial states and spans: unforced, forced, adaptive, rotations, robots, fields,
+                 large array systems; accelerations derived by hand, and final states in extended precision,
+                 independent of the package's steppers (references)
     contenders/  functions from a case and a step size or tolerance to its final state: steppers of this package; peers:
                  heyoka (taylor), REBOUND, CyRK, SciPy (peers), MuJoCo, Pinocchio (engines), OpenMM (arrays),
                  PyDy (mechanisms), py-pde and spectral methods by hand (pdes)

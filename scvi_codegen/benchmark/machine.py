@@ -1,14 +1,8 @@
-"""Description of the machine on which the benchmark runs.
-
-Limits of one core of this machine: memory bandwidth by STREAM's triad, arithmetic by multiply-adds in registers.
-
-Benchmark of one C source with several compilers, and for several processors, in turn.
-"""
+"""Description of the machine on which the benchmark runs."""
 
 from __future__ import annotations
 
 import importlib.metadata
-import importlib.util
 import os
 import platform
 import subprocess

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from scvi_codegen.benchmark.report import OURS, CaseResult
@@ -23,12 +22,7 @@ MOST_ABREAST = 4
 
 
 def plot_curves(results: Sequence[CaseResult], path: str | os.PathLike[str]) -> None:
-    """Draw all cases into one file, .png or .svg; raises as :func:`save_figure`."""
-    save_figure(partial(draw_curves, results), path)
-
-
-def save_figure(draw: Callable[[], Figure], path: str | os.PathLike[str]) -> None:
-    """Draw a figure in the package's style into a file.
+    """Draw all cases into one file, .png or .svg.
 
     Raises:
         StateError: for another suffix.
@@ -36,7 +30,7 @@ def save_figure(draw: Callable[[], Figure], path: str | os.PathLike[str]) -> Non
     """
     check_plot_path(path)
     with style():
-        save(draw(), path)
+        save(draw_curves(results), path)
 
 
 def draw_curves(results: Sequence[CaseResult]) -> Figure:

@@ -272,7 +272,6 @@ def rows(result: CaseResult) -> list[dict[str, Any]]:
 
     ``setting``: the fastest that reaches ``at_error``, else the most accurate one; ``at_error``: the smallest error
     that this method and heyoka (else the best peer) both reach; ``seconds``: time of this method there, interpolated;
-    ``best_by_minima``: like best, from the shortest times instead of the medians.
     """
     made = [_row(result, method) for method in result.methods()]
     return [row for row in made if row]
@@ -302,7 +301,6 @@ def _row(result: CaseResult, method: str) -> dict[str, Any]:
         "at_error": error,
         "options": "" if method.startswith(OURS) else shown.options,
         "seconds": time_at(points, error) or math.nan,
-        "best_by_minima": _ratio([each.fastest_point for each in best], [each.fastest_point for each in own]),
     }
 
 

@@ -9,14 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from scvi_codegen.benchmark.cases.unforced import (
-    Case,
-    case,
-    gravitating,
-    kepler_case,
-    rotated,
-    scaled,
-)
+from scvi_codegen.benchmark.cases.unforced import Case, case, gravitating, kepler_case, rotated, scaled
 from scvi_codegen.models.problems import problem
 
 ECCENTRICITIES = (0.0, 0.2, 0.5, 0.9, 0.99, 0.999)

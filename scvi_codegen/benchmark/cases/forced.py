@@ -23,9 +23,17 @@ def driven_pendulum() -> Case:
         forces={"a0": "F*cos(w*t)"},
         dissipation="c*a0_dot**2/2 + c*(a1_dot - a0_dot)**2/2",
     )
-    q, how = scaled((0.3, 0.3), 0.05), {"span": 200.0, "step": 0.125, "fine": 0.125}
-    formulations = hand_solved(driven_accelerations)
-    return Case(name="forced:double-pendulum", system=system, formulations=formulations, q=q, velocity=0.0 * q, **how)
+    q = scaled((0.3, 0.3), 0.05)
+    return Case(
+        name="forced:double-pendulum",
+        system=system,
+        formulations=hand_solved(driven_accelerations),
+        q=q,
+        velocity=0.0 * q,
+        span=200.0,
+        step=0.125,
+        fine=0.125,
+    )
 
 
 def driven_accelerations(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:

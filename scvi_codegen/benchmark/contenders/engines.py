@@ -6,6 +6,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.benchmark.cases.unforced import Array, Case
+from scvi_codegen.benchmark.contenders.arrays import step_counts
 from scvi_codegen.benchmark.contenders.dop853 import LOOSE, dop853, start_of
 from scvi_codegen.benchmark.report import Contender
 
@@ -21,11 +23,6 @@ LARGEST_STEP, HALVINGS = 0.02, 6
 STIFF = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Impedance of stiff equality constraints."""
 INTEGRATORS = ("RK4", "implicitfast", "Euler")
-
-
-def step_counts(span: float, *, quick: bool) -> list[int]:
-    """Return numbers of steps in a span, from the largest step size down."""
-    return [max(1, round(span / LARGEST_STEP * 2**k)) for k in range(2 if quick else HALVINGS)]
 
 
 def mujoco_contenders(case: Case, quick: bool) -> Iterator[Contender]:
@@ -45,7 +42,7 @@ def mujoco_contenders(case: Case, quick: bool) -> Iterator[Contender]:
     prepare = _mujoco_preparation(case, model, data, together=together)
     for integrator in INTEGRATORS:
         for stiff in (False, True)[: 2 if model.neq else 1]:
-            for steps in step_counts(case.span, quick=quick):
+            for steps in step_counts(replace(case, step=LARGEST_STEP), range(2 if quick else HALVINGS)):
                 yield Contender(
                     method=f"MuJoCo {integrator}{', stiff' * stiff}",
                     setting=f"h={case.span / steps:.4g}",
@@ -169,7 +166,7 @@ def pinocchio_contenders(case: Case, quick: bool) -> Iterator[Contender]:
         return evaluate
 
     ends, starts = lru_cache(maxsize=None)(runge_kutta), len(case.q)
-    for steps in step_counts(case.span, quick=quick):
+    for steps in step_counts(replace(case, step=LARGEST_STEP), range(2 if quick else HALVINGS)):
         name, setting = "Pinocchio aba, RK4 (bound)", f"h={case.span / steps:.4g}"
         yield Contender(name, setting, "4 aba a step in C++", seconds, partial(timed, steps), starts=starts)
     yield from dop853("aba from Python", seconds, case, quick, rates, LOOSE, "Pinocchio DOP853")

@@ -49,17 +49,8 @@ def links(n: int) -> Case:
     )
 
 
-def lambdify_contenders(case: Case, quick: bool) -> Iterator[Contender]:
-    """Yield DOP853 with SymPy's equations by ``lambdify``."""
-    return _contenders("lambdify DOP853", case, _by_lambdify, quick)
-
-
-def pydy_contenders(case: Case, quick: bool) -> Iterator[Contender]:
-    """Yield DOP853 with SymPy's equations by PyDy's Cython function."""
-    return _contenders("PyDy DOP853", case, _by_pydy, quick)
-
-
-def _by_lambdify(method: KanesMethod, values: dict[sympy.Symbol, float]) -> Rates:
+def by_lambdify(method: KanesMethod, values: dict[sympy.Symbol, float]) -> Rates:
+    """Return the right-hand side by ``lambdify``."""
     state = {function: sympy.Dummy() for function in (*method.q, *method.u)}
     both = [part.xreplace(values).xreplace(state) for part in (method.mass_matrix, method.forcing)]
     equations = sympy.lambdify([list(state.values())], both, cse=True)
@@ -72,7 +63,8 @@ def _by_lambdify(method: KanesMethod, values: dict[sympy.Symbol, float]) -> Rate
     return rates
 
 
-def _by_pydy(method: KanesMethod, values: dict[sympy.Symbol, float]) -> Rates:
+def by_pydy(method: KanesMethod, values: dict[sympy.Symbol, float]) -> Rates:
+    """Return the right-hand side by PyDy's Cython function."""
     from pydy.codegen.ode_function_generators import generate_ode_function
 
     used = method.mass_matrix.free_symbols | method.forcing.free_symbols
@@ -90,7 +82,8 @@ def _by_pydy(method: KanesMethod, values: dict[sympy.Symbol, float]) -> Rates:
     return lambda t, x: np.array(generated(x, t, numbers))  # the function reuses its array
 
 
-def _contenders(name: str, case: Case, make: Callable[..., Rates], quick: bool) -> Iterator[Contender]:
+def kane_contenders(name: str, make: Callable[..., Rates], case: Case, quick: bool) -> Iterator[Contender]:
+    """Yield DOP853 with SymPy's equations."""
     began = time.perf_counter()
     rates = make(*_pendulum(case.dimension - 1))
     rates(0.0, start_of(case, 0))

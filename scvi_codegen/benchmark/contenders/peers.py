@@ -23,7 +23,7 @@ from scvi_codegen.benchmark.cases.unforced import Array, Case
 from scvi_codegen.benchmark.contenders import arrays, pdes
 from scvi_codegen.benchmark.contenders.dop853 import absolute_tolerance, by_tolerance, dop853, start_of
 from scvi_codegen.benchmark.contenders.engines import mujoco_contenders, pinocchio_contenders
-from scvi_codegen.benchmark.contenders.mechanisms import lambdify_contenders, pydy_contenders
+from scvi_codegen.benchmark.contenders.mechanisms import by_lambdify, by_pydy, kane_contenders
 from scvi_codegen.benchmark.contenders.taylor import heyoka_contenders
 from scvi_codegen.benchmark.contenders.tracing import rates_text
 from scvi_codegen.benchmark.report import Contender
@@ -163,7 +163,7 @@ def _field(case: Case) -> bool:
     return case.field is not None
 
 
-def _sympy_mechanism(case: Case) -> bool:
+def _kane(case: Case) -> bool:
     return case.name.startswith("mechanisms")
 
 
@@ -186,8 +186,8 @@ PEERS = {
     "fft": Peer(modules=("scipy",), contenders=pdes.fft_contenders, suits=_field),
     "numba": Peer(modules=("numba",), contenders=pdes.numba_contenders, suits=_field),
     "hand": Peer(modules=(), contenders=arrays.by_hand_contenders, suits=_by_hand),
-    "lambdify": Peer(modules=(), contenders=lambdify_contenders, suits=_sympy_mechanism),
-    "pydy": Peer(modules=("pydy",), contenders=pydy_contenders, suits=_sympy_mechanism),
+    "lambdify": Peer(modules=(), contenders=partial(kane_contenders, "lambdify DOP853", by_lambdify), suits=_kane),
+    "pydy": Peer(modules=("pydy",), contenders=partial(kane_contenders, "PyDy DOP853", by_pydy), suits=_kane),
     "openmm": Peer(modules=("openmm",), contenders=arrays.openmm_contenders, suits=lambda case: "atoms" in case.name),
 }
 """Peers by the name on the command line, the fastest first; "hand", "fft" and "numba" are programs
