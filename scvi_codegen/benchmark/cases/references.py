@@ -116,7 +116,8 @@ def equal_steps(span: float, h: float) -> Extended:
 def states_after(field: Field, start: Extended, steps: Extended) -> Extended:
     """Return (k, d) states after these steps."""
     a, b, guess_table = gauss_tables(STAGES)
-    x, before, t, stages = start, None, np.longdouble(0), None
+    x, before, t = start, None, np.longdouble(0)
+    stages: Extended | None = None
     for h in steps:
         guess = None if stages is None or h != before else np.tensordot(guess_table, stages, 1)
         stages = _stages(field, (t + h * a.sum(axis=1))[:, np.newaxis], x, h * a, guess)
