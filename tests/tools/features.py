@@ -104,6 +104,17 @@ def forces(of: Kind, _: Path) -> Any:
     return of.run(of.compiled(of.system(forces={"x": "cos(t)"}, dissipation=friction)))
 
 
+def first_order(of: Kind, _: Path) -> Any:
+    size = "N" if of.run_time else "2"
+    names, state = ([f"x[{size}]", f"y[{size}]"], {"x": [0.3, -0.2], "y": [0.1, 0.4]})
+    lagrangian = f"sum(i in {size}, (x[i] + x[i]**3)*y_dot[i] - (x[i]**2 + y[i]**2)/2)"
+    if of.named:
+        names, state, lagrangian = ["x", "y"], {"x": 0.3, "y": 0.1}, "(x + x**3)*y_dot - (x**2 + y**2)/2"
+    run = of.compiled(sc.LagrangianSystem.from_text("vortices", names, lagrangian)).integrate(state, h=0.1, steps=3)
+    assert run.energy_error() < 1e-6
+    return run
+
+
 def damping(of: Kind, _: Path) -> Any:
     return of.run(of.compiled(of.system(damping=0.1)))
 
@@ -291,6 +302,7 @@ FEATURES: dict[str, Callable[[Kind, Path], Any]] = {
     "any kinetic energy": full_masses,
     "forces, Rayleigh dissipation": forces,
     "rotations, directions, spins": rotations,
+    "Lagrangians linear in velocities": first_order,
     "uniform damping": damping,
     "holonomic constraints": holonomic,
     "nonholonomic constraints": nonholonomic,
