@@ -60,6 +60,8 @@ STALE_SECONDS = 3600
 """Age after which an unfinished entry is attributed to a killed process; no compilation takes so long."""
 UNCOUNTED_SHARE = 1 / 16
 """Share of the free size that a process writes before it counts again."""
+FILLED = 0.9
+"""Part of the limit to which a full cache is reduced: entries are then counted again only after several builds."""
 _uncounted: dict[tuple[Path, int], float] = {}
 """Bytes that this process may write before it counts again, by folder and limit."""
 
@@ -197,11 +199,12 @@ def make_room(folder: Path, newest: Path) -> None:
 
 
 def _fit(folder: Path, newest: Path, limit: int) -> int:
-    """Remove entries until all fit; return the bytes of the remaining ones."""
+    """Remove entries if they exceed the limit, so that some room is left; return the bytes of the remaining ones."""
     entries = [(_last_use(path), _size(path), path) for path in _entries(folder) if path != newest]
     total = _size(newest) + sum(size for _, size, _ in entries)
+    goal = limit if total <= limit else FILLED * limit
     for _, size, path in sorted(entries):
-        if total <= limit:
+        if total <= goal:
             break
         discard(path)
         total -= size
