@@ -11,7 +11,7 @@ from sympy.printing.pycode import PythonCodePrinter
 from scvi_codegen.benchmark.cases.unforced import Rates
 
 
-class _Printer(PythonCodePrinter):  # type: ignore[misc]  # SymPy ships no stubs
+class _SourcePrinter(PythonCodePrinter):  # type: ignore[misc]  # SymPy ships no stubs
     def _print_Pow(self, expr: sympy.Pow, rational: bool = False) -> str:
         """Return multiples of 1/2 as products and square roots, which are several times faster than ``pow``."""
         base, halves = self._print(expr.base), int(2 * abs(expr.exp))
@@ -24,7 +24,7 @@ def rates_text(rates: Rates, parameters: Mapping[str, float], size: int) -> str:
     functions = SimpleNamespace(sin=sympy.sin, cos=sympy.cos, sqrt=sympy.sqrt, time=sympy.Symbol("t"))
     x = [sympy.Symbol(f"x[{n}]") for n in range(size)]
     shared, results = sympy.cse(rates(x, parameters, functions), sympy.numbered_symbols("w"))
-    printer = _Printer({"fully_qualified_modules": False})
+    printer = _SourcePrinter({"fully_qualified_modules": False})
     lines = [*shared, *((f"out[{n}]", result) for n, result in enumerate(results))]
     body = "".join(f"    {name} = {printer.doprint(value)}\n" for name, value in lines)
     return f"def rates(out, t, x, unused):\n{body}"
