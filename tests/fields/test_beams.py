@@ -77,6 +77,7 @@ def test_energy_of_a_nonlinear_density_is_its_quadrature():
     assert run.energy()[0] == pytest.approx(np.sum(weights * values), rel=1e-12)
 
 
+@pytest.mark.full
 def test_supported_plate():
     field = FieldSystem.from_text(
         "plate",

@@ -169,6 +169,7 @@ def test_waves_in_the_plane(method, options, bound):
     assert max(errors(field, method, options, exact)) < bound
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize(
     ("method", "options"),
     [("spectral-elements", {"degree": 9, "elements": 3}), ("finite-differences", {"order": 6, "points": 40})],

@@ -24,6 +24,7 @@ def mesh_of(name, density=LINEAR, fields=("u",)):
     return field.discretise(method, **options)
 
 
+@pytest.mark.covering
 @pytest.mark.filterwarnings("ignore:the mesh does not resolve")
 @pytest.mark.parametrize("method", ["svi:1", "svi:2", "svi:3", "svi:8", "gauss:5"])
 @pytest.mark.parametrize("name", MESHES)
