@@ -202,9 +202,9 @@ def _fit(folder: Path, newest: Path, limit: int) -> int:
     """Remove entries if they exceed the limit, so that some room is left; return the bytes of the remaining ones."""
     entries = [(_last_use(path), _size(path), path) for path in _entries(folder) if path != newest]
     total = _size(newest) + sum(size for _, size, _ in entries)
-    goal = limit if total <= limit else FILLED * limit
+    allowed = limit if total <= limit else FILLED * limit
     for _, size, path in sorted(entries):
-        if total <= goal:
+        if total <= allowed:
             break
         discard(path)
         total -= size
