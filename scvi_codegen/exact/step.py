@@ -42,7 +42,7 @@ STEADY = 0.1
 class SolvedStep:
     """Unknowns of a step, in the order of the derivation, and the final state.
 
-    ``momenta`` are p, or theta(q, y) of a first-order system, whose p stands for y.
+    ``momenta`` are p, or theta(q, y) of a first-order system, whose p is y.
     """
 
     unknowns: tuple[Number, ...]

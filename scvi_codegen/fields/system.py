@@ -274,8 +274,8 @@ class FieldSystem(Density):
         boundary = self.boundary[axis]
         if "degree" in options:
             fixed = None if boundary == PERIODIC else tuple(each != NATURAL for each in boundary)
-            slope = f"{self.fields[0]}_{axis}"
-            clamped = [fixed is not None and fixed[k] and slope in boundary[k] for k in range(2)]
+            derivative = f"{self.fields[0]}_{axis}"
+            clamped = [fixed is not None and fixed[k] and derivative in boundary[k] for k in range(2)]
             breaks = _breaks(axis, start, end, options.get("elements", 1))
             return spectral_elements(axis, breaks, options["degree"], fixed, (clamped[0], clamped[1]))
         if boundary != PERIODIC:

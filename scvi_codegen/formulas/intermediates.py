@@ -51,7 +51,7 @@ class Intermediate(Expr):  # type: ignore[misc]  # SymPy is untyped
 
     @property
     def definition(self) -> Expr:
-        """The expression that it stands for."""
+        """The expression that it abbreviates."""
         return self.args[0]
 
     @property

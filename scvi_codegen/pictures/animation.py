@@ -146,7 +146,7 @@ def _pendulum(lengths: Array, sign: float) -> MovingPoints:
 
 
 def _hanging(motion: DrawnMotion) -> float | None:
-    """Return 1 if the coordinates are angles of pendulums that hang at 0, -1 if they stand there, else ``None``.
+    """Return 1 if the coordinates are angles of pendulums that hang at 0, -1 if they are upright there, else ``None``.
 
     The potential energy must be that of weights, sum a_i (1 - cos q_i) with all a_i of one sign, and neighbours must be
     coupled: the kinetic energy of two momenta must not be the sum of that of each.

@@ -34,7 +34,7 @@ FORMS = {"as printed": "printed", "in full": "SCVI"}
 """Forms with their colours."""
 SETTING = (
     "Not a figure of the paper. Kepler's problem: one step h = 0.3 from q = (0.3, 0.8), p = (-1.1, 0.4), and runs over "
-    "2.4 with steps down to 0.025 for the order. With nine points errors reach round-off before their slope settles.",
+    "2.4 with steps down to 0.025 for the order. With nine points errors reach round-off before the order is visible.",
     "`scvi-codegen derive MODEL --method scvi:2` prints the equations in full, with --printed those of the paper.",
 )
 

@@ -281,6 +281,6 @@ def _(method: SCVI) -> Iterator[Content]:
         yield Formula(Symbol("L_d") + terms, Symbol("G"))
     elif not method.variational:
         yield Paragraph(
-            "As printed in the paper, partial derivatives of L_d stand for total ones: with more than two nodes the "
+            "As printed in the paper, partial derivatives of L_d replace total ones: with more than two nodes the "
             "step is not symplectic."
         )

@@ -79,7 +79,7 @@ static void invert(double (*matrix)[POINTS], double (*inverse)[POINTS])
   }
 }
 
-/* Stores `by` times the inverse of 1 - slope A for a coordinate; a positive (unstable) slope counts as 0. */
+/* Stores `by` times the inverse of 1 - derivative A for a coordinate; a positive (unstable) derivative counts as 0. */
 static void keep_inverse(linear_system *of, long long i, double derivative, double by)
 {
   double matrix[POINTS][POINTS], inverse[POINTS][POINTS];

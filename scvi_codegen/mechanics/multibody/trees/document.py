@@ -22,7 +22,7 @@ class Element:
     """Element of a document, with the defaults of its attributes.
 
     Attributes:
-        file: where it stands, for messages.
+        file: path of the document, for messages.
         node: tag, attributes and children.
         defaults: values of attributes that it does not have.
     """
