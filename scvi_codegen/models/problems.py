@@ -3,28 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+import tomllib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
+from importlib.resources import files
 from types import MappingProxyType
+from typing import Any
 
 from scvi_codegen.display.cards import Html, card, listed, plain
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.models.systems import (
-    cart_pole,
-    charged_particle,
-    double_pendulum,
-    duffing,
-    fput_chain,
-    harmonic_oscillator,
-    henon_heiles,
-    kepler,
-    outer_solar_system,
-    planar_pendulum,
-    point_vortices,
-    relativistic_particle,
-    spherical_pendulum,
-)
+from scvi_codegen.models import systems
 from scvi_codegen.representation import summary
 from scvi_codegen.validation import TEXT, checks_arguments
 
@@ -77,56 +67,17 @@ class Problem:
             )
 
 
-_POSITIONS = (
-    *(0.0, 0.0, 0.0),
-    *(-3.5023653, -3.8169847, -1.5507963),
-    *(9.0755314, -3.0458353, -1.6483708),
-    *(8.3101420, -16.2901086, -7.2521278),
-    *(11.4707666, -25.7294829, -10.8169456),
-    *(-15.5387357, -25.2225594, -3.1902382),
-)
-
-_VELOCITIES = (
-    *(0.0, 0.0, 0.0),
-    *(0.00565429, -0.00412490, -0.00190589),
-    *(0.00168318, 0.00483525, 0.00192462),
-    *(0.00354178, 0.00137102, 0.00055029),
-    *(0.00288930, 0.00114527, 0.00039677),
-    *(0.00276725, -0.00170702, -0.00136504),
-)
-
-
-def _entry(
-    name: str,
-    title: str,
-    system: Callable[[], MechanicalSystem],
-    *,
-    start: tuple[Sequence[float], Sequence[float]],
-    step: float,
-    span: float,
-    reference: str,
-    momenta: bool = False,
-) -> tuple[str, Callable[[], Problem]]:
-    def build() -> Problem:
-        q, second = map(tuple, start)
-        return Problem(
-            name=name,
-            title=title,
-            system=system(),
-            q=q,
-            velocity=None if momenta else second,
-            p=second if momenta else None,
-            step=step,
-            span=span,
-            reference=reference,
-        )
-
-    return name, build
+def _entry(name: str) -> Problem:
+    """Return a problem of the table; its system is the function of that name."""
+    fields: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in _TABLE[name].items()
+    }
+    return Problem(name=name, system=getattr(systems, name.replace("-", "_"))(), **fields)
 
 
 def _fput_problem(n: int = 8) -> Problem:
     """Return the chain with its energy in the first mode, of amplitude 1."""
-    system = fput_chain(n)
+    system = systems.fput_chain(n)
     amplitude = math.sqrt(2 / (n + 1))
     return Problem(
         name="fput-chain" if n == 8 else f"fput-chain:{n}",
@@ -140,127 +91,9 @@ def _fput_problem(n: int = 8) -> Problem:
     )
 
 
-_HLW = "E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration, 2nd ed., Springer (2006)"
-
-_GOLDSTEIN = "H. Goldstein, C. Poole, J. Safko, Classical Mechanics, 3rd ed., Addison-Wesley (2002)"
-
-_LANDAU = "L. D. Landau, E. M. Lifshitz, Mechanics, 3rd ed., Butterworth-Heinemann (1976)"
-
+_TABLE = tomllib.loads(files("scvi_codegen.models").joinpath("problems.toml").read_text(encoding="utf-8"))
 PROBLEMS: Mapping[str, Callable[[], Problem]] = MappingProxyType(
-    dict(
-        [
-            _entry(
-                "harmonic-oscillator",
-                "mass on a linear spring",
-                harmonic_oscillator,
-                start=((1.0,), (0.0,)),
-                step=0.5,
-                span=100.0,
-                reference=f"{_LANDAU}, section 21",
-            ),
-            _entry(
-                "planar-pendulum",
-                "pendulum swinging beyond the horizontal",
-                planar_pendulum,
-                start=((2.0,), (0.0,)),
-                step=0.5,
-                span=100.0,
-                reference=f"{_HLW}, section I.1.3",
-            ),
-            _entry(
-                "duffing",
-                "undriven oscillator in a double well",
-                duffing,
-                start=((0.75,), (0.75,)),
-                step=0.25,
-                span=100.0,
-                reference="G. Duffing, Erzwungene Schwingungen, Vieweg (1918)",
-            ),
-            _entry(
-                "kepler",
-                "Kepler ellipse of eccentricity 0.5 and period 2 pi",
-                kepler,
-                start=((0.5, 0.0), (0.0, math.sqrt(3.0))),
-                step=0.25,
-                span=200.0,
-                reference=f"{_HLW}, section I.2.3",
-            ),
-            _entry(
-                "double-pendulum",
-                "double pendulum, chaotic",
-                double_pendulum,
-                start=((2.0, 2.5), (0.0, 0.0)),
-                step=0.05,
-                span=20.0,
-                reference=f"{_LANDAU}, section 5, problem 1",
-            ),
-            _entry(
-                "spherical-pendulum",
-                "spherical pendulum, precessing",
-                spherical_pendulum,
-                start=((1.0, 0.0), (0.0, 2.0)),
-                step=0.1,
-                span=50.0,
-                reference=f"{_LANDAU}, section 14, problem 1",
-            ),
-            _entry(
-                "cart-pole",
-                "pendulum hung from a cart that rolls freely",
-                cart_pole,
-                start=((0.0, 2.0), (0.0, 0.0)),
-                step=0.1,
-                span=20.0,
-                reference=f"{_LANDAU}, section 5, problem 2",
-            ),
-            _entry(
-                "henon-heiles",
-                "Henon-Heiles system at energy 1/8, partly chaotic",
-                henon_heiles,
-                start=((0.0, 0.0), (math.sqrt(0.24), 0.1)),
-                step=0.5,
-                span=500.0,
-                reference="M. Henon, C. Heiles, Astron. J. 69 (1964) 73",
-            ),
-            _entry(
-                "charged-particle",
-                "drift of a charge in a magnetic field with a gradient",
-                charged_particle,
-                start=((0.0, 0.0, 0.0), (1.0, 0.0, 0.1)),
-                step=0.5,
-                span=100.0,
-                reference="J. D. Jackson, Classical Electrodynamics, 3rd ed., Wiley (1998), section 12.4",
-            ),
-            _entry(
-                "relativistic-particle",
-                "relativistic oscillator reaching 0.87 c",
-                relativistic_particle,
-                start=((1.4142135623730951,), (0.0,)),
-                step=0.25,
-                span=100.0,
-                reference=f"{_GOLDSTEIN}, section 7.9",
-            ),
-            _entry(
-                "outer-solar-system",
-                "Sun and the five outer planets",
-                outer_solar_system,
-                start=(_POSITIONS, _VELOCITIES),
-                step=200.0,
-                span=200_000.0,
-                reference=f"{_HLW}, section I.2.4",
-            ),
-            _entry(
-                "point-vortices",
-                "two pairs of vortices that leapfrog; given by a Hamiltonian, without a Lagrangian",
-                point_vortices,
-                start=((-0.5, 0.5, -0.25, 0.25), (0.0, 0.0, 0.0, 0.0)),
-                step=0.2,
-                span=20.0,
-                reference="H. Aref, J. Math. Phys. 48 (2007) 065401",
-                momenta=True,
-            ),
-            ("fput-chain", _fput_problem),
-        ]
-    )
+    {name: partial(_entry, name) for name in _TABLE} | {"fput-chain": _fput_problem}
 )
 """Catalogue: functions that build the entries, by command-line name."""
 
