@@ -8,7 +8,7 @@ Recomputed steps are checked against the run.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -40,7 +40,10 @@ class Gradient:
         q, p: (m,) or (m, c) derivatives with respect to the initial state.
         parameters: (k,) or (k, c) with respect to the parameters, in the order of ``stepper.parameters``.
         t: number or (c,) with respect to the initial time, which shifts all times.
-        h: number or (c,) with respect to the common step size; ``None`` if step sizes differ.
+        h: number or (c,) with respect to the common step size; ``None`` if step sizes differ, and with inputs.
+        inputs: of a run with inputs, by name, (k, 4) or (k, 4, c) derivatives with respect to the coefficients of each
+            piece that the run passes, in the order of the run: ascending powers of the time since the start of the
+            piece. ``parameters`` is NaN for those of inputs.
     """
 
     q: Array
@@ -48,22 +51,9 @@ class Gradient:
     parameters: Array
     t: Array
     h: Array | None
+    inputs: dict[str, Array] = field(default_factory=dict)
 
     __repr__ = summary("q", "p", "parameters")
-
-
-def tangent_vectors(states: SavedStates, directions: ArrayLike | None) -> Array:
-    """Return (n, 2m, k) tangent vectors at the states, from (2m, k) directions of (q, p) or (2m + parameters + 2, k).
-
-    Without directions the full state-transition matrices of (q, p) are returned.
-
-    Raises:
-        StateError: if the directions have another shape, or the states are not at whole steps.
-    """
-    size = 2 * states.stepper.dimension
-    columns = np.eye(size) if directions is None else finite(directions, "directions")
-    vectors, _ = forward(states, tangents_from_directions(states.stepper, columns))
-    return vectors[:, :size].reshape(len(states), size, *columns.shape[1:])
 
 
 def tangents_from_directions(stepper: LinearisedMethod, directions: Array) -> Array:
@@ -87,14 +77,6 @@ def sensitivity(states: SavedStates) -> Sensitivity:
     """Return the derivatives of all states with respect to all inputs of the run."""
     columns, _ = forward(states, np.eye(states.stepper._input_size))
     return Sensitivity.of(columns, states.stepper.dimension, stretched=_has_fixed_step_size(states))
-
-
-def vector_jacobian_product(states: SavedStates, cotangents: ArrayLike) -> Gradient:
-    """Return the vector-Jacobian product of the run with (n, 2m) or (n, 2m, c) cotangents of the states."""
-    derivatives = checked_cotangents(states.stepper, len(states), cotangents)
-    seeds = seeds_of(states.stepper, derivatives)
-    result = backward(states, seeds, np.zeros_like(seeds[0]))
-    return gradient_of(states, result.T.reshape(states.stepper._input_size, *derivatives.shape[2:]))
 
 
 def seeds_of(stepper: LinearisedMethod, derivatives: Array) -> Array:

@@ -1,4 +1,9 @@
-"""Second derivatives of functions of the states of a run: tangent propagation, then second-order adjoints."""
+"""Second derivatives of functions of the states of a run: tangent propagation, then second-order adjoints.
+
+With J the Jacobian of all states and F', F'' the derivatives of a function F of the states, the Hessian of F with
+respect to the initial data times a direction v is J^T F'' J v plus F' contracted with the second derivative of the
+states along v (tangent over adjoint).
+"""
 
 from __future__ import annotations
 
@@ -7,39 +12,9 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.runtime.sensitivity.gradients import (
-    Gradient,
-    checked_cotangents,
-    finite,
-    gradient_of,
-    pieces,
-    propagate,
-    starts_of,
-    tangents_from_directions,
-)
+from scvi_codegen.runtime.sensitivity.gradients import checked_cotangents, finite, pieces, propagate, starts_of
 from scvi_codegen.runtime.sensitivity.step_derivatives import LinearisedMethod
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
-
-
-def hessian_product(
-    states: SavedStates, cotangents: ArrayLike, directions: ArrayLike, curvatures: ArrayLike | None
-) -> Gradient:
-    """Return the Hessian-vector product of a function F of the states along directions.
-
-    With J the Jacobian of all states and F', F'' the derivatives of F, the result is J^T F'' J v plus F' contracted
-    with the second derivative of the states along v (tangent over adjoint).
-
-    Args:
-        cotangents: (n, 2m) F'.
-        directions: directions v of (q, p), or of (q, p, parameters, t, h).
-        curvatures: (n, 2m, 2m) F'' at each state.
-    """
-    derivatives, hessian_blocks = checked_function(states.stepper, len(states), cotangents, curvatures)
-    columns = finite(directions, "directions")
-    states.stepper._second_derivatives  # noqa: B018  (raises MethodError if unavailable)
-    tangents = tangents_from_directions(states.stepper, columns)
-    adjoints = second_order_adjoints(states, derivatives, hessian_blocks, tangents, np.zeros((2, *tangents.shape)))
-    return gradient_of(states, adjoints[1].T.reshape(states.stepper._input_size, *columns.shape[1:]))
 
 
 def checked_function(

@@ -2,19 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
 from scvi_codegen.runtime.chaos.tangent_propagation import InitialTangents, along
-from scvi_codegen.runtime.sensitivity.derivatives_with_inputs import DerivativesWithInputs
-from scvi_codegen.runtime.sensitivity.gradients import Gradient, sensitivity, tangent_vectors, vector_jacobian_product
-from scvi_codegen.runtime.sensitivity.hessians import hessian_product
+from scvi_codegen.runtime.core.validation import columns_of_inputs
+from scvi_codegen.runtime.sensitivity.gradients import (
+    Gradient,
+    backward,
+    checked_cotangents,
+    finite,
+    forward,
+    gradient_of,
+    seeds_of,
+    sensitivity,
+    tangents_from_directions,
+)
+from scvi_codegen.runtime.sensitivity.hessians import checked_function, second_order_adjoints
 from scvi_codegen.runtime.sensitivity.step_derivatives import Sensitivity
 from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
 from scvi_codegen.validation import SWITCH, checked_count, checks_arguments
+
+COEFFICIENTS = 4
+"""Number of coefficients of a piece of an input; its fifth parameter is the reference time, which is held fixed."""
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -27,17 +43,12 @@ class TrajectoryDerivatives(SavedStates):
     """
 
     @property
-    def _pieces(self) -> tuple[SavedStates, ...]:
-        """Trajectories between the breakpoints of inputs; empty without inputs."""
-        pieces: tuple[SavedStates, ...] = getattr(self, "pieces", ())
-        return pieces
-
-    @property
-    def _with_inputs(self) -> DerivativesWithInputs:
-        return DerivativesWithInputs(self._pieces)
+    def _runs(self) -> tuple[SavedStates, ...]:
+        """Trajectories between the breakpoints of inputs, this one without inputs; each begins where the last ends."""
+        return getattr(self, "pieces", ()) or (self,)
 
     def _check_without_inputs(self, what: str) -> None:
-        if self._pieces:
+        if self._runs != (self,):
             raise StateError(f"{what} is not available for runs with inputs: use tangent or pullback, or run.pieces")
 
     def tangent(self, directions: ArrayLike | None = None) -> Array:
@@ -51,7 +62,13 @@ class TrajectoryDerivatives(SavedStates):
         Raises:
             StateError: if the directions have another shape, or the states are not at whole steps.
         """
-        return self._with_inputs.tangent(directions) if self._pieces else tangent_vectors(self, directions)
+        size = 2 * self.stepper.dimension
+        columns = np.eye(size) if directions is None else finite(directions, "directions")
+        tangents, parts = self._initial_tangents(columns), list[Array]()
+        for run in self._runs:
+            part, tangents = forward(run, tangents)
+            parts.append(part[1:] if parts else part)
+        return np.concatenate(parts)[:, :size].reshape(-1, size, *columns.shape[1:])
 
     def sensitivity(self) -> Sensitivity:
         """Return the derivatives of all states with respect to the initial state, the parameters, t and h.
@@ -76,7 +93,13 @@ class TrajectoryDerivatives(SavedStates):
         Raises:
             StateError: if the shape is another, or the states are not at whole steps.
         """
-        return self._with_inputs.pullback(cotangents) if self._pieces else vector_jacobian_product(self, cotangents)
+        derivatives = checked_cotangents(self.stepper, len(self), cotangents)
+        seeds = seeds_of(self.stepper, derivatives)
+        now, by_runs = np.zeros_like(seeds[0]), list[Array]()
+        for run, run_seeds in self._back(seeds):
+            now = backward(run, run_seeds, self._without_inputs(now))
+            by_runs.append(now)
+        return self._gradient(by_runs[::-1], derivatives.shape[2:])
 
     def hessian_product(
         self, cotangents: ArrayLike, directions: ArrayLike, curvatures: ArrayLike | None = None
@@ -98,9 +121,68 @@ class TrajectoryDerivatives(SavedStates):
             MethodError: if time is transformed, or the system is damped.
             StateError: if a shape is another, or the states are not at whole steps.
         """
-        if self._pieces:
-            return self._with_inputs.hessian_product(cotangents, directions, curvatures)
-        return hessian_product(self, cotangents, directions, curvatures)
+        derivatives, hessian_blocks = checked_function(self.stepper, len(self), cotangents, curvatures)
+        columns = finite(directions, "directions")
+        self.stepper._second_derivatives  # noqa: B018  (raises MethodError if unavailable)
+        at_starts = [self._initial_tangents(columns)]
+        for run in self._runs[:-1]:
+            at_starts.append(forward(run, at_starts[-1])[1])
+        now, by_runs = np.zeros((2, *at_starts[0].shape)), list[Array]()
+        backward_runs = zip(self._back(derivatives), self._back(hessian_blocks), reversed(at_starts), strict=True)
+        for (run, run_seeds), (_, curved), tangents in backward_runs:
+            now = second_order_adjoints(run, run_seeds, curved, tangents, self._without_inputs(now))
+            by_runs.append(now[1])
+        return self._gradient(by_runs[::-1], columns.shape[1:])
+
+    @property
+    def _fixed_indices(self) -> list[int]:
+        """Indices among all variables of the parameters of inputs and of h in a run with inputs; empty without."""
+        if self._runs == (self,):
+            return []
+        return [*(2 * self.stepper.dimension + k for k in columns_of_inputs(self.stepper.interface)), -1]
+
+    def _initial_tangents(self, directions: Array) -> Array:
+        """Return (k, variables) initial variations; raise ``StateError`` if they vary inputs, or h with inputs."""
+        tangents = tangents_from_directions(self.stepper, directions)
+        if tangents[:, self._fixed_indices].any():
+            raise StateError("directions must be 0 for the parameters of inputs and for h, which are fixed with inputs")
+        return tangents
+
+    def _back(self, along: Array) -> list[tuple[SavedStates, Array]]:
+        """Return the runs in reverse with the rows of their states; a shared state belongs to the earlier run."""
+        ends, result = accumulate((len(run) - 1 for run in self._runs), initial=0), list[tuple[SavedStates, Array]]()
+        for run, (first, last) in zip(self._runs, pairwise(ends), strict=True):
+            run_seeds = along[first : last + 1].copy()
+            if result:
+                run_seeds[0] = 0.0
+            result.append((run, run_seeds))
+        return result[::-1]
+
+    def _without_inputs(self, derivatives: Array) -> Array:
+        """Return adjoints without those of inputs and h, which differ in the previous piece."""
+        masked = derivatives.copy()
+        masked[..., self._fixed_indices] = 0.0
+        return masked
+
+    def _gradient(self, by_runs: Sequence[Array], shape: tuple[int, ...]) -> Gradient:
+        """Construct from (k, variables) adjoints at the start of each run."""
+        stepper, m = self.stepper, self.stepper.dimension
+        columns = by_runs[0].T.copy()
+        columns[self._fixed_indices] = np.nan
+        gradient = gradient_of(self, columns.reshape(stepper._input_size, *shape))
+        if not self._fixed_indices:
+            return gradient
+        inputs = {}
+        for name in stepper.interface.inputs:
+            first = stepper.parameters.index(f"{name}_0")
+            began = np.array([run.parameters[first + COEFFICIENTS] for run in self._runs])
+            starts, of = (
+                np.flatnonzero(np.diff(began, prepend=np.nan)),
+                slice(2 * m + first, 2 * m + first + COEFFICIENTS),
+            )
+            rows = np.stack([derivatives[:, of].T for derivatives in by_runs])
+            inputs[name] = np.add.reduceat(rows, starts).reshape(len(starts), COEFFICIENTS, *shape)
+        return replace(gradient, h=None, inputs=inputs)
 
     def chaos_indicators(self, count: int | None = None, *, directions: ArrayLike | None = None) -> ChaosIndicators:
         """Return the growth of tangent vectors along the run, from which all chaos indicators are computed.
