@@ -5,9 +5,8 @@ from __future__ import annotations
 from scvi_codegen.reproduce import (
     claims,
     correction,
+    figures,
     iterations,
-    kepler_figures,
-    oscillator_figures,
     refinement_figures,
 )
 
@@ -18,6 +17,6 @@ ORDER = """
     figure-21 figure-22 figure-23 figure-24 figure-25 figure-26 figure-27 figure-28 figure-29 figure-30
     correction claims
 """
-MODULES = (kepler_figures, oscillator_figures, refinement_figures, iterations, correction, claims)
+MODULES = (figures, refinement_figures, iterations, correction, claims)
 _BY_NAME = {experiment.name: experiment for module in MODULES for experiment in module.EXPERIMENTS}
 EXPERIMENTS = {name: _BY_NAME[name] for name in ORDER.split()}

@@ -1,21 +1,38 @@
-"""Figures of runs as data: views turn runs into panels, checks into numbers and the conditions of a verdict."""
+"""Figures of runs (1, 3-5, 9-15, 21-30): views turn runs into panels, checks into numbers and conditions of a verdict.
+
+Their settings, views and checks are those of ``figures.toml``.
+"""
 
 from __future__ import annotations
 
 import math
 import re
+import tomllib
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
-from inspect import cleandoc
+from importlib.resources import files
 from itertools import pairwise
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from numpy.typing import ArrayLike
 
 from scvi_codegen.display.page.blocks import TableBlock
+from scvi_codegen.errors import MethodWarning
+from scvi_codegen.methods import as_method, method_from_specification
 from scvi_codegen.reproduce.drawing import Panel, Picture, Series, largest_in_bins, thinned
 from scvi_codegen.reproduce.experiment import Comparison, Experiment, Result, comparison
-from scvi_codegen.reproduce.runs import MEASURES, PERIOD, MeasuredRun, RunSetting
+from scvi_codegen.reproduce.runs import (
+    EXACT,
+    MEASURES,
+    PERIOD,
+    SECTION_3,
+    MeasuredRun,
+    RunSetting,
+    Scheme,
+    system_of,
+)
 
 Runs: TypeAlias = Mapping[str, MeasuredRun]
 View: TypeAlias = Callable[[Runs], Iterable[Panel]]
@@ -58,16 +75,17 @@ def _value(term: str, attribute: str, runs: Runs) -> float:
     return math.nan if value is None else float(factor or 1.0) * abs(value)
 
 
-def figure(title: str, setting: RunSetting, views: Sequence[View], checks: str) -> Experiment:
+def figure(name: str, title: str, setting: RunSetting, views: Sequence[View], checks: str) -> Experiment:
     """Return the experiment that runs the schemes of a setting, draws views of them and tests statements.
 
     Args:
-        title: name and title of the experiment, ``"figure-1: Title"``.
+        name: name of the experiment, ``"figure-1"``.
+        title: title of the experiment.
         setting: problem and schemes.
         views: functions that return the panels.
         checks: statements of the paper, a line each, followed by indented lines as in :func:`compared`.
     """
-    tests = re.findall(r"^(\S.*)\n((?:[ ]+.*(?:\n|$))+)", cleandoc(checks), re.MULTILINE)
+    tests = re.findall(r"^(\S.*)\n((?:[ ]+.*(?:\n|$))+)", checks, re.MULTILINE)
     measures = dict.fromkeys(re.findall(r"(\w+):", " ".join(test.split("|")[0] for _, test in tests)))
 
     def run(_: Mapping[str, Result]) -> Result:
@@ -82,8 +100,7 @@ def figure(title: str, setting: RunSetting, views: Sequence[View], checks: str) 
             picture=picture,
         )
 
-    name, _, rest = title.partition(": ")
-    return Experiment(name=name, title=rest, run=run)
+    return Experiment(name=name, title=title, run=run)
 
 
 def measured_table(runs: Runs, measures: Sequence[str]) -> TableBlock:
@@ -104,7 +121,7 @@ def _series(run: MeasuredRun, xs: ArrayLike, ys: ArrayLike, **style: str) -> Ser
 def plane(
     *keys: str,
     kind: str = "phase",
-    part: slice = slice(None),
+    part: str = ":",
     window: tuple[float, float] | None = None,
     more: str = "",
 ) -> View:
@@ -113,10 +130,11 @@ def plane(
     Args:
         keys: runs, by default all.
         kind: ``"phase"`` for (q_i, p_i) of every coordinate, ``"orbit"`` for (q_1, q_2).
-        part: states that are drawn.
+        part: states that are drawn, as in ``"-63:"``.
         window: range of both axes.
         more: text after the label in the title.
     """
+    drawn = slice(*(int(bound) if bound else None for bound in part.split(":")))
 
     def curves(run: MeasuredRun, states: slice) -> list[tuple[ArrayLike, ArrayLike]]:
         q, p = run.q[states], run.p[states]
@@ -124,7 +142,7 @@ def plane(
 
     def view(runs: Runs) -> Iterable[Panel]:
         for run in (runs[key] for key in keys or runs):
-            dots = [_series(run, *xy, marker=".", line="", label="") for xy in curves(run, part)]
+            dots = [_series(run, *xy, marker=".", line="", label="") for xy in curves(run, drawn)]
             exact = [_series(run.setting.reference, *xy, label="") for xy in curves(run.setting.reference, slice(None))]
             xlabel, ylabel = ("q", "p") if kind == "phase" else ("$q_1$", "$q_2$")
             curves_and_dots, title = (*exact, *dots), f"{run.label}{more}"
@@ -133,12 +151,12 @@ def plane(
     return view
 
 
-def over_time(quantity: str, *keys: str, title: str = "", periods: bool = False, error: bool = True) -> View:
+def over_time(*keys: str, quantity: str, title: str = "", periods: bool = False, error: bool = True) -> View:
     """Return the view of a quantity over time, one panel with all runs.
 
     Args:
-        quantity: attribute of the runs.
         keys: runs, by default all.
+        quantity: attribute of the runs.
         title: title of the panel.
         periods: True for time in periods of 2 pi.
         error: True for the largest absolute value in each of some hundred intervals, on a logarithmic axis.
@@ -161,5 +179,44 @@ def over_time(quantity: str, *keys: str, title: str = "", periods: bool = False,
     return view
 
 
-energy_errors = partial(over_time, "energy_error")
-momentum_errors = partial(over_time, "momentum_error")
+def _settings(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, RunSetting]:
+    """Return the settings of the file by name."""
+    settings = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MethodWarning)  # SVI with fewer Gauss points than the degree
+        for name, table in tables.items():
+            system, q, velocity = table["system"], tuple(table["q"]), tuple(table["velocity"])
+            settings[name] = RunSetting(
+                system=system_of(system),
+                q=q,
+                velocity=velocity,
+                h=table["h"],
+                span=table["span"],
+                schemes={key: _scheme(**scheme) for key, scheme in table["schemes"].items()},
+                sentences=tuple(table["sentences"]),
+                options=replace(SECTION_3, tolerance=table["tolerance"]),
+                exact=partial(EXACT[system], q, velocity) if system in EXACT else None,
+            )
+    return settings
+
+
+def _scheme(label: str, method: str | dict[str, Any], color: str, h: float | None = None) -> Scheme:
+    return Scheme(label, as_method(method) if isinstance(method, str) else method_from_specification(method), color, h)
+
+
+def _figure(
+    name: str, title: str, setting: str, views: Sequence[dict[str, Any]], checks: str, span: float | None = None
+) -> Experiment:
+    """Return the figure of a table of the file; ``span`` if it differs from that of the setting."""
+    chosen = SETTINGS[setting] if span is None else replace(SETTINGS[setting], span=span)
+    return figure(name, title, chosen, [_view(**view) for view in views], checks)
+
+
+def _view(draw: str, runs: Sequence[str] = (), **how: Any) -> View:
+    return VIEWS[draw](*runs, **how)
+
+
+VIEWS: Mapping[str, Callable[..., View]] = {"plane": plane, "over time": over_time}
+_TABLES = tomllib.loads(files("scvi_codegen.reproduce").joinpath("figures.toml").read_text(encoding="utf-8"))
+SETTINGS = _settings(_TABLES.pop("settings"))
+EXPERIMENTS = tuple(_figure(name, **table) for name, table in _TABLES.items())

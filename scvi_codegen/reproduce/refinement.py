@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scvi_codegen.display.page.blocks import Cell, TableBlock
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.exact.step import derived_step
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import SVI, SpectralCollocation
 from scvi_codegen.methods.method import Method
 from scvi_codegen.reproduce.drawing import Array, Panel, Picture, Series
@@ -47,7 +47,7 @@ MOSTLY = 0.9
 class InitialValue(NamedTuple):
     """System with unit masses, initial state, errors of (q, p) after h by quantity, and small steps for fits."""
 
-    system: LagrangianSystem
+    system: MechanicalSystem
     q: tuple[Number, ...]
     p: tuple[Number, ...]
     errors: Callable[[Sequence[Number], Sequence[Number], Number], Mapping[str, Number]]

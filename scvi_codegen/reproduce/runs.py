@@ -8,7 +8,7 @@ flags that give the same bits on every machine.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
@@ -18,10 +18,10 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StepFailedError
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import SCVI, SVI
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.systems import kepler
+from scvi_codegen.models.problems import problem
 from scvi_codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.reproduce.drawing import Array
@@ -36,12 +36,20 @@ NO_DRIFT = 1e-12
 """Largest error that counts as round-off."""
 PERIOD = 2.0 * math.pi
 """Period of Kepler's problem with semi-major axis 1."""
-KEPLER = kepler()
-"""System q'' = -q / |q|^3, built once."""
+
+
+@lru_cache
+def system_of(name: str) -> MechanicalSystem:
+    """Return a system of the catalogue, built once."""
+    return problem(name).system
+
+
+KEPLER = system_of("kepler")
+"""System q'' = -q / |q|^3."""
 
 
 @lru_cache(maxsize=256)
-def stepper_of(system: LagrangianSystem, method: Method, solver: str = "auto") -> Stepper:
+def stepper_of(system: MechanicalSystem, method: Method, solver: str = "auto") -> Stepper:
     """Return the compiled integrator, cached in the process."""
     return compile_stepper(system, method, solver=solver, flags=PORTABLE_FLAGS)
 
@@ -68,7 +76,7 @@ class RunSetting:
         exact: function that returns the exact (q, p) at given times, or ``None``.
     """
 
-    system: LagrangianSystem
+    system: MechanicalSystem
     q: tuple[float, ...]
     velocity: tuple[float, ...]
     h: float
@@ -215,6 +223,11 @@ def angular_momentum(q: Array, p: Array) -> Array:
     return result
 
 
+def exact_oscillator(q: Sequence[float], p: Sequence[float], t: Array) -> tuple[Array, Array]:
+    """Return (q, p) of the oscillator q'' = -q after times t, one row each."""
+    return np.outer(np.cos(t), q) + np.outer(np.sin(t), p), np.outer(np.cos(t), p) - np.outer(np.sin(t), q)
+
+
 def perihelion(e: float) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return (q, v) at perihelion for semi-major axis 1 (energy -1/2, period 2 pi) and eccentricity e."""
     return (1.0 - e, 0.0), (0.0, math.sqrt((1.0 + e) / (1.0 - e)))
@@ -237,6 +250,11 @@ def exact_kepler(q: ArrayLike, p: ArrayLike, t: ArrayLike) -> tuple[Array, Array
     return np.outer(f, start) + np.outer(g, velocity), np.outer(f_dot, start) + np.outer(g_dot, velocity)
 
 
+EXACT: Mapping[str, Callable[[Sequence[float], Sequence[float], Array], tuple[Array, Array]]] = {
+    "kepler": exact_kepler,
+    "harmonic-oscillator": exact_oscillator,
+}
+"""Exact flows by system, with all constants 1."""
 MEASURES: Mapping[str, Measure] = {
     "t": Measure("t", "", lambda r: r.trajectory.t),
     "q": Measure("positions", "", lambda r: r.trajectory.q),

@@ -7,12 +7,10 @@ import pytest
 
 import scvi_codegen as sc
 from scvi_codegen.reproduce import correction
-from scvi_codegen.reproduce import kepler_figures as kepler
-from scvi_codegen.reproduce import oscillator_figures as oscillators
 from scvi_codegen.reproduce.catalogue import EXPERIMENTS
 from scvi_codegen.reproduce.drawing import draw
 from scvi_codegen.reproduce.experiment import Verdict, judged
-from scvi_codegen.reproduce.figures import compared
+from scvi_codegen.reproduce.figures import SETTINGS, compared
 from scvi_codegen.reproduce.report import statement
 from scvi_codegen.reproduce.runs import (
     KEPLER,
@@ -47,24 +45,24 @@ def test_results_are_complete(name):
 
 
 SIZES = [
-    (kepler.LONG, "svi", {"energy": 1.3e-9, "momentum": 0.0}),
-    (kepler.LONG, "sc", {"energy": 1.3e-3, "momentum": 2.7e-4}),
-    (kepler.LONG, "svi1", {"energy": 1.0e-11, "momentum": 0.0}),
-    (kepler.LONG, "sc1", {"energy": 7.1e-5, "momentum": 1.0e-5}),
-    (kepler.THREE, "sc", {"last_revolution": 2 * np.pi / 2.95}),
-    (kepler.NINE, "printed5", {"momentum": 1.3e-2, "energy": 3.4e-2, "turn": 200 * 0.044}),
-    (kepler.NINE, "printed6", {"momentum": 2.1e-4, "energy": 6.5e-4}),
-    (kepler.NINE, "printed7", {"momentum": 1.9e-5, "energy": 8.2e-5}),
-    (kepler.NINE, "full5", {"momentum": 0.0, "energy": 2.9e-7}),
-    (kepler.NINE, "full6", {"momentum": 0.0, "energy": 7.4e-9}),
-    (kepler.NINE, "full7", {"momentum": 0.0, "energy": 1.3e-10}),
-    (oscillators.OSCILLATOR, "svi7", {"position": 7.7e-12, "energy": 1.0e-13}),
-    (oscillators.OSCILLATOR, "svi8", {"position": 0.0, "energy": 0.0}),
-    (oscillators.OSCILLATOR, "sc", {"position": 9.5e-9}),
-    (oscillators.PENDULUM, "svi", {"energy": 1.1e-8}),
-    (oscillators.PENDULUM, "finer_svi", {"energy": 8.2e-11}),
-    (oscillators.PENDULUM, "sc", {"energy": 5.4e-2}),
-    (oscillators.PENDULUM, "finer_sc", {"energy": 3.7e-4}),
+    (SETTINGS["kepler-318-revolutions"], "svi", {"energy": 1.3e-9, "momentum": 0.0}),
+    (SETTINGS["kepler-318-revolutions"], "sc", {"energy": 1.3e-3, "momentum": 2.7e-4}),
+    (SETTINGS["kepler-318-revolutions"], "svi1", {"energy": 1.0e-11, "momentum": 0.0}),
+    (SETTINGS["kepler-318-revolutions"], "sc1", {"energy": 7.1e-5, "momentum": 1.0e-5}),
+    (SETTINGS["kepler-two-points"], "sc", {"last_revolution": 2 * np.pi / 2.95}),
+    (SETTINGS["kepler-nine-points"], "printed5", {"momentum": 1.3e-2, "energy": 3.4e-2, "turn": 200 * 0.044}),
+    (SETTINGS["kepler-nine-points"], "printed6", {"momentum": 2.1e-4, "energy": 6.5e-4}),
+    (SETTINGS["kepler-nine-points"], "printed7", {"momentum": 1.9e-5, "energy": 8.2e-5}),
+    (SETTINGS["kepler-nine-points"], "full5", {"momentum": 0.0, "energy": 2.9e-7}),
+    (SETTINGS["kepler-nine-points"], "full6", {"momentum": 0.0, "energy": 7.4e-9}),
+    (SETTINGS["kepler-nine-points"], "full7", {"momentum": 0.0, "energy": 1.3e-10}),
+    (SETTINGS["oscillator"], "svi7", {"position": 7.7e-12, "energy": 1.0e-13}),
+    (SETTINGS["oscillator"], "svi8", {"position": 0.0, "energy": 0.0}),
+    (SETTINGS["oscillator"], "sc", {"position": 9.5e-9}),
+    (SETTINGS["pendulum"], "svi", {"energy": 1.1e-8}),
+    (SETTINGS["pendulum"], "finer_svi", {"energy": 8.2e-11}),
+    (SETTINGS["pendulum"], "sc", {"energy": 5.4e-2}),
+    (SETTINGS["pendulum"], "finer_sc", {"energy": 3.7e-4}),
 ]
 
 
@@ -92,14 +90,14 @@ def test_exact_orbits_stay_on_their_ellipse_and_period():
 
 
 def test_spectral_collocation_with_two_points_falls_into_the_centre():
-    run = kepler.THREE.run("sc2")
+    run = SETTINGS["kepler-two-points"].run("sc2")
     assert run.failed
     assert run.end < 1.0
     assert run.last_energy < -1.5
 
 
 def test_ten_thousand_periods_with_two_points():
-    run = kepler.AGES.run("scvi")
+    run = SETTINGS["kepler-10000-periods"].run("scvi")
     assert run.steps == 400_000
     assert run.growth == pytest.approx(1.0, abs=1e-3)
     assert run.momentum < 1e-11
@@ -107,7 +105,7 @@ def test_ten_thousand_periods_with_two_points():
 
 def test_two_points_make_the_printed_form_the_variational_one():
     whole, printed = (sc.SCVI(1, "gauss-legendre:2", variational=flag) for flag in (True, False))
-    pendulum = oscillators.PENDULUM.system
+    pendulum = SETTINGS["pendulum"].system
     ends = [stepper_of(pendulum, m).step([0.5], [0.1], h=0.1, options=SECTION_4) for m in (whole, printed)]
     assert np.abs(np.subtract(*ends)).max() < 1e-15
 
@@ -123,7 +121,7 @@ def test_drift_is_distinguished_from_oscillation():
 def test_area_changes_as_the_energy_of_an_oscillator():
     """Implicit Euler multiplies the energy of the oscillator, and the area, by 1/(1 + h^2) a step."""
     euler = Scheme("implicit Euler", sc.SpectralCollocation(1), "SC")
-    setting = RunSetting(oscillators.OSCILLATOR.system, (0.0,), (1.0,), 0.01, 200.0, {}, ())
+    setting = RunSetting(SETTINGS["oscillator"].system, (0.0,), (1.0,), 0.01, 200.0, {}, ())
     run = MeasuredRun(setting, euler)
     assert run.area == pytest.approx(np.exp(-np.log1p(1e-4) * 0.8 * 20_000) - 1.0, rel=0.02)
 
@@ -138,7 +136,7 @@ def test_area_changes_as_the_energy_of_an_oscillator():
     ],
 )
 def test_verdicts_follow_from_conditions(conditions, verdict):
-    runs = {key: oscillators.OSCILLATOR.run(key) for key in ("sc", "svi8")}
+    runs = {key: SETTINGS["oscillator"].run(key) for key in ("sc", "svi8")}
     found = compared("It is so.", f"position: {conditions}; end: sc | accuracy order | Note.", runs)
     assert (found.claim, found.verdict, found.bears_on) == ("It is so.", verdict, ("accuracy", "order"))
     assert f"{runs['sc'].position:.1e} (SC)" in found.measured
@@ -147,7 +145,7 @@ def test_verdicts_follow_from_conditions(conditions, verdict):
 
 
 def test_a_missing_quantity_satisfies_no_condition():
-    runs = {"sc2": kepler.THREE.run("sc2")}
+    runs = {"sc2": SETTINGS["kepler-two-points"].run("sc2")}
     assert runs["sc2"].last_revolution is None
     assert compared("", "last_revolution: sc2 < 1, 1 < sc2", runs).verdict is Verdict.FAILS
 
