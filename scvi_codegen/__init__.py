@@ -15,118 +15,15 @@ Names are imported when they are first used, so code that only steps never impor
 from __future__ import annotations
 
 import importlib
+import re
+from pathlib import Path
 from typing import Any
 
 from scvi_codegen.version import __version__ as __version__
 
-_HOMES = {
-    "advice.advice": ("Advice", "advise"),
-    "frameworks.casadi": ("casadi_flow", "casadi_step"),
-    "frameworks.control_task": ("ControlledMotion",),
-    "frameworks.optimal_control": ("optimal_control",),
-    "frameworks.flow": ("JaxFlow", "jax_flow"),
-    "frameworks.torch": ("TorchFlow", "torch_flow"),
-    "frameworks.rebound": ("GravitatingBodies", "from_rebound", "to_rebound"),
-    "fields.derivation": ("FieldDerivation",),
-    "fields.laws": ("ConservationLaw",),
-    "fields.local": ("LocalLaw",),
-    "fields.mesh": ("MeshSystem",),
-    "fields.system": ("FieldSystem",),
-    "files.cache": ("CacheInfo", "cache_info", "clear_cache"),
-    "compiler": ("compile_stepper",),
-    "pipeline": ("generate_source",),
-    "runtime.ensemble.result": ("EnsembleTrajectory",),
-    "exact.discrete_lagrangian": ("ExactStep", "exact_discrete_lagrangian", "exact_map"),
-    "runtime.chaos.indicators": ("ChaosIndicators",),
-    "runtime.events.event": ("Crossings", "Event", "impact"),
-    "runtime.estimation.fitting": ("Fit", "fit"),
-    "runtime.sensitivity.gradients": ("Gradient",),
-    "runtime.sensitivity.step_derivatives": ("Sensitivity",),
-    "mechanics.first_order": ("FirstOrderSystem",),
-    "mechanics.hamiltonian": ("HamiltonianSystem",),
-    "mechanics.legendre": ("hamiltonian_of", "lagrangian_of"),
-    "mechanics.time_transformation": ("reparametrise",),
-    "mechanics.derived_systems": ("change_coordinates", "variational_system"),
-    "derivation.equations": ("StepEquations", "derive"),
-    "errors": (
-        "AccuracyWarning",
-        "ArgumentError",
-        "BuildError",
-        "CacheWarning",
-        "ControlError",
-        "EventError",
-        "EventWarning",
-        "ExpressionError",
-        "FitError",
-        "MethodError",
-        "MethodWarning",
-        "MissingLibraryError",
-        "ModelFileError",
-        "OrbitError",
-        "PackageError",
-        "PlotError",
-        "RecordingError",
-        "RecordingWarning",
-        "ScviCodegenError",
-        "StateError",
-        "StepFailedError",
-        "SystemDefinitionError",
-        "SystemDefinitionWarning",
-    ),
-    "methods": (
-        "SCVI",
-        "SVI",
-        "ChebyshevGauss",
-        "ChebyshevLobatto",
-        "CollocationRK",
-        "Composition",
-        "ExplicitEuler",
-        "Gauss",
-        "LobattoIIIA",
-        "RadauIA",
-        "RadauIIA",
-        "RungeKutta",
-        "SpectralCollocation",
-        "StoermerVerlet",
-        "as_method",
-    ),
-    "mechanics.arrays.rolling": ("RolledSums", "roll_sums", "unroll_sums"),
-    "models.packages.fmu": ("generate_fmu",),
-    "models.model": ("Model",),
-    "models.model_files.model_file": ("load_model", "save_model"),
-    "advice.solve_ivp": ("OdeResult", "solve_ivp"),
-    "tables.nodes": ("Nodes", "chebyshev_lobatto", "equispaced", "legendre_lobatto"),
-    "models.packages.package": ("generate_package", "load_package"),
-    "pictures.animation": ("Film", "animate"),
-    "pictures.conserved": ("plot_energy", "plot_momentum_maps"),
-    "pictures.overview": ("plot_section", "plot_trajectory"),
-    "pictures.attitudes": ("plot_attitude",),
-    "pictures.paths": ("plot_motion", "plot_phase"),
-    "pictures.arrays": ("plot_arrays", "plot_spectrum"),
-    "models.problems": ("PROBLEMS", "problem"),
-    "tables.quadrature": (
-        "Quadrature",
-        "clenshaw_curtis",
-        "fejer",
-        "gauss_legendre",
-        "gauss_lobatto",
-        "gauss_radau",
-        "hermite",
-    ),
-    "tables.spaces": ("Polynomials", "Splines", "Trigonometric"),
-    "native.options": ("SolverOptions",),
-    "results.recording": ("RecordedRun", "load_run", "record_run", "resume_run"),
-    "runtime.orbits.solver": ("periodic_orbit",),
-    "runtime.orbits.periodic_orbit": ("PeriodicOrbit",),
-    "runtime.run.run": ("Run",),
-    "runtime.core.stepper": ("Stepper",),
-    "mechanics.symmetry.checking": ("check_symmetry",),
-    "mechanics.symmetry.symmetry": ("Symmetry", "symmetries"),
-    "mechanics.lagrangian": ("LagrangianSystem",),
-    "runtime.trajectory.trajectory": ("Trajectory",),
-    "verification": ("Certificate", "verify"),
-}
-_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+_STUB = Path(__file__).with_name("__init__.pyi").read_text(encoding="utf-8")
+_HOME_OF: dict[str, str] = {name: home for home, name in re.findall(r"^from (\S+) import ([A-Za-z]\w*)", _STUB, re.M)}
+"""Modules of the public names, which type checkers read from the same list."""
 
 __all__ = [*sorted(_HOME_OF)]
 
@@ -134,7 +31,7 @@ __all__ = [*sorted(_HOME_OF)]
 def __getattr__(name: str) -> Any:
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+    value = getattr(importlib.import_module(_HOME_OF[name]), name)
     globals()[name] = value
     return value
 
