@@ -13,45 +13,25 @@ import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from inspect import Parameter, signature
-from typing import Any, Final, TypeVar, cast
+from pathlib import Path
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
 from scvi_codegen.errors import ArgumentError, ScviCodegenError, StateError, closest
 
-SYNONYMS: Final = {
-    "h step": "dt delta_t timestep time_step stepsize step_size max_step first_step",
-    "steps": "n N nsteps n_steps num_steps nt",
-    "t": "t0 time start_time t_start start",
-    "t_end span": "T tf t_final t_max tmax tend t_span t_bound duration length time",
-    "tolerance": "tol rtol atol eps epsilon accuracy error",
-    "save_every": "every stride output_every skip",
-    "t_eval": "times saveat t_out",
-    "q y0": "x q0 x0 position positions state coords",
-    "p": "p0 momentum momenta",
-    "velocity q_dot": "v v0 qdot dq velocities",
-    "parameters": "params param args constants",
-    "options": "solver_options",
-    "degree": "n s stages order degrees",
-    "quadrature": "points k",
-    "method": "solver integrator scheme name type kind",
-    "coordinates": "q variables coords x positions",
-    "momenta": "p",
-    "lagrangian": "L l",
-    "hamiltonian": "H h",
-    "forces": "force",
-    "constraints": "constraint",
-    "inputs": "input control controls u",
-    "initial": "init start state y0 initial_conditions",
-    "run": "integrate integration simulation settings solve",
-    "system": "model problem",
-}
-"""Synonyms in other programs, by the names used here for arguments and keys."""
+
+@functools.cache
+def hints() -> Mapping[str, Mapping[str, str]]:
+    """Return ``synonyms`` in other programs by the names used here, and ``explanations`` by keyword."""
+    import tomllib  # not needed without an error
+
+    return tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
 def likely_names(word: str) -> Iterator[str]:
     """Yield the names used here for a word, the likeliest first."""
-    for here, elsewhere in SYNONYMS.items():
+    for here, elsewhere in hints()["synonyms"].items():
         if {word, word.lower()} & {*here.split(), *elsewhere.split()}:
             yield from here.split()
 
@@ -59,30 +39,6 @@ def likely_names(word: str) -> Iterator[str]:
 def synonym_hint(word: str, known: Collection[str]) -> str:
     """Return ``"; did you mean 'h'?"`` if a known word has the same meaning, else an empty string."""
     return next((f"; did you mean '{meant}'?" for meant in likely_names(word) if meant in known), "")
-
-
-EXPLANATIONS: Final = {
-    "inputs": "pass them to .integrate(..., inputs={'u': (t, values)}) or .integrate_ensemble, and values that change "
-    "during a run to run.set_inputs(u=...)",
-    "t_eval": "save all states, and interpolate the run: run.at(times)",
-    "events": "pass them to .integrate(..., events=...) or compile_stepper(..., events=...)",
-    "threads": "threads share the steps of arrays whose sizes are known at run time only, coordinates=['q[N]']; others "
-    "are too short to be shared",
-    "observe": "it reduces states of arrays whose sizes are known at run time only, coordinates=['q[N]']; here save "
-    "fewer states by save_every",
-    "tables": "with sizes, tables are passed when compiling: compile_stepper(system, method, sizes=..., tables=...)",
-    "save_every": "pass it to run.record(n, save_every=...) or .integrate",
-    "steps": "pass the number to run.advance(n) or run.record(n)",
-    "h": "pass it to a stepper: compile_stepper(...).integrate(q, p, h=..., steps=...)",
-    "parameters": "pass their values to the run, .integrate(..., parameters={...}), and their names to the system",
-    "velocity": "use momenta, p = stepper.momentum(q, velocity)",
-    "t_end": "for adaptive steps use .integrate(..., t_end=...); for a fixed number of steps give h = (t_end "
-    "- t) / steps",
-    "degree": "include it in the method, 'svi:8' or SVI(8)",
-    "solver": "pass it when compiling: compile_stepper(system, method, solver=...)",
-    "method": "pass it when compiling: compile_stepper(system, method)",
-}
-"""Explanations by keyword, for functions that do not have it."""
 
 
 def keyword_hint(name: str, known: Collection[str]) -> str:
@@ -95,8 +51,8 @@ def keyword_hint(name: str, known: Collection[str]) -> str:
     if here := synonym_hint(name, known):
         return here
     for word in (name, *likely_names(name)):
-        if word in EXPLANATIONS and word not in known:
-            return f": {EXPLANATIONS[word]}"
+        if word in hints()["explanations"] and word not in known:
+            return f": {hints()['explanations'][word]}"
     hint = closest(name, known)
     return f": it takes {', '.join(known)}" if hint == "." else hint
 

@@ -1,4 +1,7 @@
-"""Safe parsing of TOML of any origin: text that would exhaust memory, time or the parser is rejected."""
+"""Safe parsing of TOML of any origin: text that would exhaust memory, time or the parser is rejected.
+
+Tables that belong to this package are TOML files beside its modules.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import tomllib
 from typing import Any
 
 from scvi_codegen.errors import ModelFileError
+from scvi_codegen.files.cache import PACKAGE
 
 MAX_CHARACTERS = 1_000_000
 MAX_BITS = 4096
@@ -35,6 +39,11 @@ def read_toml(text: str) -> dict[str, Any]:
         raise ModelFileError(f"this is not TOML: a number is too long ({error})") from error
     _check_whole_numbers(document)
     return document
+
+
+def package_table(path: str) -> dict[str, Any]:
+    """Return the document in a file of this package, as ``"models/problems.toml"``."""
+    return tomllib.loads((PACKAGE / path).read_text(encoding="utf-8"))
 
 
 def _check_whole_numbers(document: dict[str, Any]) -> None:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from importlib.resources import files
 from types import MappingProxyType
 from typing import Any
 
 from scvi_codegen.display.cards import Html, card, listed, plain
 from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.files.toml_text import package_table
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models import systems
 from scvi_codegen.representation import summary
@@ -91,7 +90,7 @@ def _fput_problem(n: int = 8) -> Problem:
     )
 
 
-_TABLE = tomllib.loads(files("scvi_codegen.models").joinpath("problems.toml").read_text(encoding="utf-8"))
+_TABLE = package_table("models/problems.toml")
 PROBLEMS: Mapping[str, Callable[[], Problem]] = MappingProxyType(
     {name: partial(_entry, name) for name in _TABLE} | {"fput-chain": _fput_problem}
 )

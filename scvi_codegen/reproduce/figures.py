@@ -7,12 +7,10 @@ from __future__ import annotations
 
 import math
 import re
-import tomllib
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from importlib.resources import files
 from itertools import pairwise
 from typing import Any, TypeAlias
 
@@ -20,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.display.page.blocks import TableBlock
 from scvi_codegen.errors import MethodWarning
+from scvi_codegen.files.toml_text import package_table
 from scvi_codegen.methods import as_method, method_from_specification
 from scvi_codegen.reproduce.drawing import Panel, Picture, Series, largest_in_bins, thinned
 from scvi_codegen.reproduce.experiment import Comparison, Experiment, Result, comparison
@@ -217,6 +216,6 @@ def _view(draw: str, runs: Sequence[str] = (), **how: Any) -> View:
 
 
 VIEWS: Mapping[str, Callable[..., View]] = {"plane": plane, "over time": over_time}
-_TABLES = tomllib.loads(files("scvi_codegen.reproduce").joinpath("figures.toml").read_text(encoding="utf-8"))
+_TABLES = package_table("reproduce/figures.toml")
 SETTINGS = _settings(_TABLES.pop("settings"))
 EXPERIMENTS = tuple(_figure(name, **table) for name, table in _TABLES.items())

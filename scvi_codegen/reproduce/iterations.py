@@ -17,6 +17,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from scvi_codegen.display.page.blocks import TableBlock
+from scvi_codegen.files.toml_text import package_table
 from scvi_codegen.reproduce.drawing import Array
 from scvi_codegen.reproduce.experiment import Comparison, Experiment, Result, comparison
 from scvi_codegen.reproduce.runs import SECTION_3, perihelion
@@ -27,21 +28,7 @@ from scvi_codegen.tables.quadrature import gauss_legendre
 SPAN = 100.0
 ECCENTRICITY: Mapping[int, float] = {8: 0.2, 9: 0.5}
 COLUMNS = tuple((n, scheme) for n in (2, 5, 10, 15, 20) for scheme in ("SC", "SVI"))
-PRINTED: Mapping[int, Mapping[float, str]] = {
-    8: {
-        0.5: "-       10/1520  8/1271  7/1168  7/1176  7/1176   7/1181   7/1181   7/1186   7/1185",
-        1.0: "-       -        11/870  9/735   9/709   8/695    8/696    8/695    8/697    8/697",
-        2.0: "-       -        37/739  11/485  11/476  10/416   10/451   10/414   10/425   10/417",
-        5.0: "-       -        -       -       -       15/279   18/311   14/240   14/261   17/239",
-        8.0: "-       -        -       -       -       -        -        23/225   135/536  29/215",
-    },
-    9: {
-        0.5: "-       -        13/1511 10/1303 9/1277  9/1270   9/1271   9/1271   9/1274   9/1274",
-        1.0: "-       -        -       14/834  13/815  11/764   11/771   11/760   11/765   11/762",
-        2.0: "-       -        -       19/674  -       14/504   17/535   13/481   14/504   18/492",
-        5.0: "-       -        -       -       -       15/279   -        65/433   -        114/607",
-    },
-}
+PRINTED: Mapping[str, Mapping[str, str]] = package_table("reproduce/paper.toml")["iterations"]
 """Counts by table and h: max/total for each of :data:`COLUMNS`; a dash where the paper has none."""
 AS_PRINTED = 0.9
 """Least share of cells that converge or fail as printed for a table to count as reproduced."""
@@ -128,8 +115,8 @@ Counts: TypeAlias = Mapping[Key, Count]
 def printed_counts(number: int) -> Counts:
     """Return the paper's table."""
     cells = {
-        (h, *column): cell
-        for h, text in PRINTED[number].items()
+        (float(h), *column): cell
+        for h, text in PRINTED[str(number)].items()
         for column, cell in zip(COLUMNS, text.split(), strict=True)
     }
     return {key: Count(None, None) if cell == "-" else Count(*map(int, cell.split("/"))) for key, cell in cells.items()}

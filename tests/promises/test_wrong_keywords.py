@@ -9,7 +9,7 @@ from samples import QUICK_FLAGS
 import scvi_codegen as sc
 from scvi_codegen.errors import ArgumentError, StateError
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.validation import EXPLANATIONS, SYNONYMS, keyword_hint
+from scvi_codegen.validation import hints, keyword_hint
 
 PUSHED = sc.LagrangianSystem.from_text(
     name="pushed pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)", forces={"q": "u"}, inputs=["u"]
@@ -85,10 +85,10 @@ def test_no_synonym_hides_a_keyword():
     """A known keyword is never reported as a synonym, and every suggested location exists."""
     assert keyword_hint("q", ["y0"]) == "; did you mean 'y0'?"
     assert keyword_hint("n", ["mass"]).startswith(": pass the number to run.advance(n)")
-    assert not [here for here, elsewhere in SYNONYMS.items() if {*here.split()} & {*elsewhere.split()}]
+    assert not [here for here, elsewhere in hints()["synonyms"].items() if {*here.split()} & {*elsewhere.split()}]
     for name in ("integrate", "integrate_ensemble", "momentum"):
         assert hasattr(Stepper, name)
-        assert any(f".{name}" in place for place in EXPLANATIONS.values())
+        assert any(f".{name}" in place for place in hints()["explanations"].values())
 
 
 def test_undeclared_input_is_explained(stepper, chain):
