@@ -31,9 +31,9 @@ from scvi_codegen.tables.precision import mp
 NAME = re.compile(r"[A-Za-z_]\w*")
 
 
-def semidiscrete_system(system: Density, axes: Mapping[str, Axis]) -> MeshSystem:
+def semidiscrete_system(system: Density, axes: Mapping[str, Axis], discretisation: Mapping[str, Any]) -> MeshSystem:
     """Return the semi-discrete system of a density on a tensor product of axes."""
-    return _Assembly(system, axes).result()
+    return _Assembly(system, axes).result(discretisation)
 
 
 class _Assembly:
@@ -44,7 +44,7 @@ class _Assembly:
         self.axes = axes
         self.used: dict[str, tuple[str, Any]] = {}
 
-    def result(self) -> MeshSystem:
+    def result(self, discretisation: Mapping[str, Any]) -> MeshSystem:
         system = self.system
         sizes = ", ".join(f"N{axis}" for axis in self.axes)
         terms = [*self.kinetic(), *self.in_space()]
@@ -83,6 +83,7 @@ class _Assembly:
             "axes": tuple(self.axes.values()),
             "points": dict(zip(self.axes, grids, strict=True)),
             "weights": np.prod(masses, axis=0),
+            "discretisation": discretisation,
         }
         return MeshSystem(system=replace(assembled, mesh=Mesh(**parts)), **parts)
 

@@ -56,8 +56,8 @@ class FieldDerivation:
             yield from (f"    J{axis} = {_written(part)}" for axis, part in law.flux.items())
 
 
-def derivation_of(system: Density, mesh: Any = None) -> FieldDerivation:
-    """Return the derivation of a density, with the semi-discrete system of a mesh."""
+def derivation_of(system: Density, assembled: Any = None) -> FieldDerivation:
+    """Return the derivation of a density, with its semi-discrete system."""
     variations = Variations(system)
     order = 1 if system.momenta else 2
     equations = {
@@ -71,15 +71,15 @@ def derivation_of(system: Density, mesh: Any = None) -> FieldDerivation:
         field_system=system,
         equations=equations,
         laws=variations.laws() if system.dissipation == 0 else (),
-        semidiscrete={} if mesh is None else _semidiscrete(mesh),
+        semidiscrete={} if assembled is None else _semidiscrete(assembled),
     )
 
 
-def _semidiscrete(mesh: Any) -> dict[str, str]:
+def _semidiscrete(assembled: Any) -> dict[str, str]:
     """Return the texts of the semi-discrete Lagrangian and of its energy, or of the semi-discrete Hamiltonian."""
-    if mesh.field_system.momenta:
-        return {"semi-discrete Hamiltonian": mesh.system.definition["hamiltonian"]}
-    text = mesh.system.definition["lagrangian"]
+    if assembled.momenta:
+        return {"semi-discrete Hamiltonian": assembled.definition["hamiltonian"]}
+    text = assembled.definition["lagrangian"]
     terms = text.split("\n+ ")
     kinetic = [each for each in terms if "_dot[" in each]
     others = [each for each in terms if each not in kinetic]

@@ -41,12 +41,14 @@ class Mesh:
         axes: discretisations of the axes.
         points: coordinates of the points by axis, in the shape of the fields, (Nx,), (Nx, Ny), ..
         weights: quadrature weights at the points, in the same shape.
+        discretisation: its method and options.
     """
 
     field_system: Density
     axes: tuple[Axis, ...]
     points: Mapping[str, Array]
     weights: Array
+    discretisation: Mapping[str, Any]
 
     __repr__ = summary("field_system")
 
@@ -104,7 +106,7 @@ class Mesh:
 
     def derive(self) -> FieldDerivation:
         """Return the equations and conservation laws of the density, with the semi-discrete L and its energy."""
-        return derivation_of(self.field_system, self)
+        return derivation_of(self.field_system, getattr(self, "system", None))
 
     def local_laws(self, run: Any, *names: str) -> dict[str, LocalLaw]:
         """Return density, flux and residual of the conservation laws of the density along a run, by name.

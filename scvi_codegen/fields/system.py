@@ -267,7 +267,7 @@ class FieldSystem(Density):
                     raise SystemDefinitionError(f"'{method}' needs {name}= for the axis '{axis}'")
                 chosen[name] = value
             axes[axis] = self._axis(axis, method, chosen)
-        return semidiscrete_system(self, axes)
+        return semidiscrete_system(self, axes, {"method": method, **options})
 
     def _axis(self, axis: str, method: str, options: Mapping[str, Any]) -> Axis:
         start, end = self.space[axis]

@@ -163,7 +163,7 @@ def test_a_catalogue_reference_may_be_changed():
             "[[events]]\nfunctio = 'q'\n[system]",
             "unknown key 'functio' in [[events]]; did you mean 'function'?",
         ),
-        ("[method]", "[zzz]", "Known: system, forces, torques, torques_space, inputs, sizes, "),
+        ("[method]", "[zzz]", "Known: system, field, forces, torques, torques_space, inputs, sizes, "),
         ("lagrangian", "lagrangain", "unknown key 'lagrangain' in [system]; did you mean 'lagrangian'?"),
         ("degree", "degre", "unknown key 'degre' in [method] for svi; did you mean 'degree'?"),
         ("save_every", "save_evry", "unknown key 'save_evry' in [run]; did you mean 'save_every'?"),

@@ -12,6 +12,7 @@ from scvi_codegen.cli.model_options import ModelOptions, model_arguments, read_m
 from scvi_codegen.derivation import Start, derivation_html
 from scvi_codegen.derivation.equations import StepEquations
 from scvi_codegen.derivation.equations import derive as derive_equations
+from scvi_codegen.fields.derivation import derivation_of
 
 
 @click.command()
@@ -28,6 +29,8 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
 
     --html writes a self-contained page with the whole derivation: equations of motion, trial curve, tables, equations
     with the paper's numbers, Jacobian, operation counts, and the C code next to its formulas.
+
+    For fields first the equations and conservation laws of the density, and the semi-discrete system.
 
     For an array model: each term group with its derivatives with respect to its entries, masses, and the step; with
     --html and --radicals the equations for its sizes.
@@ -52,6 +55,8 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
         return
     equations = derive_equations(model.system, model.method, radicals=radicals)
     text = equations.to_latex() if latex else equations.to_text()
+    if not latex and model.array_system is not None and model.array_system.mesh is not None:
+        text = f"{derivation_of(model.array_system.mesh.field_system, model.array_system).to_text()}\n{text}"
     formulas = _formulas(equations) if isinstance(equations, StepEquations) else {}
     emit(text, output, **about, **formulas, text=text)
 

@@ -38,11 +38,11 @@ def document_of(model: Model, *, as_arrays: bool = True) -> dict[str, Any]:
         document["inputs"] = {name: _as_lists(table) for name, table in model.inputs.items()}
     if model.events:
         document["events"] = [_event_entry(event) for event in model.events]
-    if sizes := {name: size for name, size in model.sizes.items() if size}:
+    if (sizes := {name: size for name, size in model.sizes.items() if size}) and "field" not in document:
         document["sizes"] = sizes
     if parameters:
         document["parameters"] = parameters
-    if model.tables:
+    if model.tables and "field" not in document:
         declared = {each.partition("[")[0]: each for each in system.definition.get("tables", ())}
         document["tables"] = {declared[name]: np.asarray(rows).tolist() for name, rows in model.tables.items()}
     return {**document, **motion}
@@ -63,6 +63,11 @@ def _system_and_state(
         return _of_rotations(system), model.parameters, motion
     if as_arrays and system.definition:
         state = {"t": model.t, **_state_by_array(model, names)}
+        if model.array_system is not None and (mesh := model.array_system.mesh) is not None:
+            from scvi_codegen.models.model_files.field_section import field_section  # not needed for other systems
+
+            numbers = {name: value for name, value in model.parameters.items() if name not in model.fields}
+            return {"field": field_section(mesh)}, numbers, motion | {"initial": state}
         return _definition(system), _declared_parameters(model), motion | {"initial": state}
     return _formulas(system, names), model.parameters, motion
 

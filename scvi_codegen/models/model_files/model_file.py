@@ -59,6 +59,9 @@
 A Hamiltonian is given in ``[system]`` as ``hamiltonian = "p**2/2 - cos(q)"``, with ``momenta = ["p"]`` or
 the names ``p_q``; with constraints the model is that of its Lagrangian.
 
+A density of fields is given in ``[field]``, in the place of ``[system]``: see
+:mod:`scvi_codegen.models.model_files.field_section`.
+
 ``[system]`` may also be ``catalogue = "kepler"`` alone; then ``[parameters]`` changes default values, and missing
 entries of ``[initial]`` and ``[run]`` are the catalogue's. Written files are complete.
 
@@ -119,9 +122,14 @@ SYSTEM_KEYS = (
     "point_forces",
 )
 RUN_KEYS = ("step", "tolerance", "error", "controller", "span", "steps", "save_every")
-KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
+FIELD_KEYS = (
+    *("name", "fields", "momenta", "space", "boundary", "density", "hamiltonian", "dissipation"),
+    "discretisation",
+)
+KEYS = {"system": SYSTEM_KEYS, "field": FIELD_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
 SECTIONS = (
     "system",
+    "field",
     "forces",
     *TORQUES,
     "inputs",
@@ -241,7 +249,13 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
     document, specification, solver = _merged(document, changes, entry)
     with warnings.catch_warnings():  # other formulas than that of the system may use its parameters
         warnings.simplefilter("ignore", SystemDefinitionWarning)
-        system, values = read_values(document, read_system(document, entry), folder)
+        if "field" in document:
+            from scvi_codegen.models.model_files.field_section import read_field  # not needed for other systems
+
+            system = read_field(document)
+        else:
+            system = read_system(document, entry)
+        system, values = read_values(document, system, folder)
     arrays = Model.arrays_of(system)
     method = read_method(fitted(specification, one_coordinate(arrays) if arrays else system))
     values |= {"inputs": _read_inputs(document.get("inputs", {}), folder), "solver": solver}
@@ -274,7 +288,7 @@ def _without_solver(layer: Document) -> Document:
 
 def _with_time_transformation(model: Model, document: Document, specification: Section) -> Model:
     """Return the model with the time transformation of its file; warn of probable mistakes in the formulas."""
-    g, controller = document["system"].get("time_transformation"), document["run"].get("controller")
+    g, controller = document.get("system", {}).get("time_transformation"), document["run"].get("controller")
     if g is not None or controller is not None:
         model, where = model.with_known_sizes(), "[system] time_transformation"
         system, g = in_section(where, lambda: with_time_transformation(model.system, g, controller))

@@ -24,6 +24,7 @@ KEYS: Final = {
     "initial": "q q_dot p t",
     "method": "method degree quadrature",
     "system": "lagrangian hamiltonian damping dissipation constraints time_transformation inputs",
+    "field": "density space boundary discretisation",
 }
 EVENT_KEYS: Final = ("function", "direction", "terminal", "then", "where", "restitution")
 LOCATIONS: Final = {
@@ -53,7 +54,13 @@ Built = TypeVar("Built")
 Section = Mapping[str, Any]
 Document = Mapping[str, Section]
 
-ALTERNATIVES = ({"lagrangian", "hamiltonian"}, {"p", "q_dot"}, {"step", "tolerance", "error"}, {"span", "steps"})
+ALTERNATIVES = (
+    {"lagrangian", "hamiltonian"},
+    {"density", "hamiltonian"},
+    {"p", "q_dot"},
+    {"step", "tolerance", "error"},
+    {"span", "steps"},
+)
 """Groups of alternative keys, of which one is given."""
 INHERITED = ("degree", "quadrature", "nodes", "stages")
 """Arguments of a method that are inherited when another method is merged over it, if that accepts them."""
@@ -195,8 +202,13 @@ TURNING = ("rotations", "directions", "spins")
 """Keys of [system] that declare coordinates of another kind."""
 TORQUES = ("torques", "torques_space")
 """Sections with three formulas by rotation, in the body frame and in the space frame."""
-REQUIRED = {"system": ("name", "coordinates", "lagrangian"), "initial": ("q", "q_dot"), "run": ("span",)}
-"""Required keys, or their alternatives."""
+REQUIRED = {
+    "field": ("name", "fields", "space", "density", "discretisation"),
+    "system": ("name", "coordinates", "lagrangian"),
+    "initial": ("q", "q_dot"),
+    "run": ("span",),
+}
+"""Required keys, or their alternatives; [field] is in the place of [system]."""
 
 
 def has_arrays(document: Document, sizes: str = r"\w") -> bool:
@@ -216,7 +228,7 @@ def check_complete(document: Document) -> None:
     """Raise an error that lists all missing keys; arrays whose sizes are names are at rest by default."""
     missing = []
     for name, keys in REQUIRED.items():
-        for key in keys:
+        for key in () if name == ("system" if "field" in document else "field") else keys:
             choice = next((choice for choice in ALTERNATIVES if key in choice), {key})
             if choice.isdisjoint(document.get(name, {})) and not _is_optional(document, key):
                 missing.append(f"{' or '.join(sorted(choice))} in [{name}]")
@@ -233,13 +245,14 @@ def _is_optional(document: Document, key: str) -> bool:
     section = document.get("system", {})
     if key == "coordinates":
         return not section.keys().isdisjoint(TURNING)
-    return key == "q_dot" and (has_arrays(document, "[A-Za-z_]") or "spins" in section)
+    return key == "q_dot" and ("field" in document or has_arrays(document, "[A-Za-z_]") or "spins" in section)
 
 
 def check_used(document: Document, parameters: Section) -> None:
     """Raise an error for an added parameter that no formula contains."""
-    section = document["system"]
+    section = document.get("field") or document["system"]
     formulas = [section.get(key, "") for key in (*FORMULAS, "time_transformation", "point_forces")]
+    formulas = [*section.values()] if "field" in document else formulas
     acting = [formula for name in ("forces", *TORQUES) for formula in document.get(name, {}).values()]
     formula = " ".join(map(str, (*formulas, *acting, *document.get("events", ()))))
     for name in parameters:

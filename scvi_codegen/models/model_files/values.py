@@ -101,6 +101,10 @@ def read_values(
     time = {"t": real(section.get("t", 0.0), "[initial] t")}
     entries = _parameter_entries(document.get("parameters", {}), system)
     if isinstance(any_system, ArraySystem):
+        if any_system.mesh is not None:
+            from scvi_codegen.models.model_files.field_section import fields_at_points  # not needed for other systems
+
+            document = {**document, "initial": fields_at_points(section, any_system)}
         return system, _values_of_arrays(document, any_system, entries, folder) | time
     names = [coordinate.name for coordinate in system.coordinates]
     section = _by_coordinate(section, system)

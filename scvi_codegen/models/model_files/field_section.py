@@ -1,0 +1,106 @@
+"""Section ``[field]`` of model files: a density with its discretisation in space, in the place of ``[system]``.
+
+    [field]
+    name = "sine-Gordon"
+    fields = ["u"]                                      # and momenta = ["p"] with hamiltonian = ".."
+    space = { x = [-20.0, 20.0] }                       # bounds are numbers or formulas of numbers
+    boundary = { x = "periodic" }                       # or two ends, ["natural", "sin(t)"]; default: natural ends
+    density = "u_t**2/2 - u_x**2/2 - c*(1 - cos(u))"
+    discretisation = { method = "spectral-elements", degree = 8, elements = 40 }
+
+    [initial]
+    q = { u = "4*atan(exp(x))" }                        # a formula in the axes, t and parameters, or an array
+    q_dot = { u = "0" }                                 # or p; q = { a = "..", b = ".." } sets momenta b, too
+
+Keys are the arguments of :meth:`~scvi_codegen.FieldSystem.from_text` and
+:meth:`~scvi_codegen.FieldSystem.discretise`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.errors import ModelFileError
+from scvi_codegen.fields.axes import NATURAL, PERIODIC
+from scvi_codegen.fields.mesh import Mesh
+from scvi_codegen.fields.system import FieldSystem
+from scvi_codegen.formulas.array_notation import array_text
+from scvi_codegen.formulas.expressions import array_value
+from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.symbols import TIME, symbol
+from scvi_codegen.models.model_files.sections import Document, Section, check_keys, in_section
+from scvi_codegen.models.time_span import real
+
+OTHERS = ("forces", "torques", "torques_space", "inputs", "sizes", "tables")
+"""Sections that a density replaces."""
+
+
+def read_field(document: Document) -> Any:
+    """Return the semi-discrete system of the density in ``[field]``."""
+    check_keys(document.get("system", {}), ("time_transformation",), "key", "[system] beside [field]")
+    for name in OTHERS:
+        if document.get(name):
+            raise ModelFileError(f"[{name}] is not available beside [field]: write its terms in density or dissipation")
+    arguments = dict(document["field"])
+    if not isinstance(options := arguments.pop("discretisation"), dict) or "method" not in options:
+        raise ModelFileError(f'[field] discretisation must be a table, {{ method = "fourier", .. }}, not {options!r}')
+    parameters = document.get("parameters", {})
+    system = in_section("[field]", lambda: FieldSystem.from_text(**arguments, parameters=parameters))
+    return in_section("[field] discretisation", lambda: system.discretise(**options)).system
+
+
+def fields_at_points(section: Section, system: Any) -> Section:
+    """Return ``[initial]`` with numbers and formulas of fields evaluated at the points of the mesh."""
+    mesh: Mesh = system.mesh
+    density, state = mesh.field_system, dict(section)
+    names = {TIME: real(section.get(TIME, 0.0), "[initial] t"), **mesh.points}
+    names |= {each.name: value for each, value in zip(system.parameters, system.defaults, strict=True)}
+    for key in {"q", "p", "q_dot"} & section.keys():
+        value = section[key]
+        if not isinstance(value, dict) or "file" in value:
+            value = {density.fields[0]: value}
+        known = [each.name for each in system.coordinates]
+        check_keys(value, [*known, *density.momenta] if key == "q" else known, "field", f"[initial] {key}")
+        state[key] = {name: _values(each, f"[initial] {key}, {name}", mesh, names) for name, each in value.items()}
+    for momentum, each in zip(density.momenta, density.fields, strict=bool(density.momenta)):
+        if momentum in state.get("q", {}):
+            values = in_section(f"[initial] q, {momentum}", lambda: mesh.weights * state["q"].pop(momentum))  # noqa: B023
+            state["p"] = {**state.get("p", {}), each: values.tolist()}
+    return state
+
+
+def _values(value: Any, where: str, mesh: Mesh, names: Mapping[str, Any]) -> Any:
+    """Return the values of a number or a formula at the points; other values as they are."""
+    if isinstance(value, dict | list):
+        return value
+    formula = in_section(where, lambda: parse_expression(str(value), {name: symbol(name) for name in names}))
+    with np.errstate(all="ignore"):
+        values = array_value(formula, {symbol(name): number for name, number in names.items()})
+    return np.broadcast_to(np.asarray(values, float), mesh.weights.shape).tolist()
+
+
+def field_section(mesh: Mesh) -> dict[str, Any]:
+    """Return the section of a semi-discrete system."""
+    density = mesh.field_system
+    boundary = {
+        axis: ends if ends == PERIODIC else [end if end == NATURAL else _texts(end) for end in ends]
+        for axis, ends in density.boundary.items()
+    }
+    section: dict[str, Any] = {"name": density.name, "fields": [*density.fields]}
+    section |= {"momenta": [*density.momenta]} if density.momenta else {}
+    section |= {"space": {axis: [*ends] for axis, ends in density.space.items()}, "boundary": boundary}
+    section["hamiltonian" if density.momenta else "density"] = array_text(density.density)
+    section |= {} if density.dissipation == 0 else {"dissipation": array_text(density.dissipation)}
+    return {**section, "discretisation": _plain(mesh.discretisation)}
+
+
+def _texts(end: Mapping[str, Any]) -> dict[str, str]:
+    return {name: array_text(value) for name, value in end.items()}
+
+
+def _plain(value: Any) -> Any:
+    """Return options with arrays as lists."""
+    return {key: _plain(x) for key, x in value.items()} if isinstance(value, Mapping) else np.asarray(value).tolist()
