@@ -9,12 +9,14 @@ import importlib
 import multiprocessing
 import os
 import signal
+import sys
 import traceback
 import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import TypeAlias
 
@@ -142,7 +144,8 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.connection, there = context.Pipe()
         self.process, self.running = context.Process(target=_work, args=(there, module), daemon=True), ""
-        self.process.start()
+        with _sigint_blocked():
+            self.process.start()
         there.close()
 
     def give(self, name: str) -> None:
@@ -159,6 +162,20 @@ class _Worker:
             self.process.join(PATIENCE)
             return Failure(name=name, message=f"its process ended with exit status {self.process.exitcode}")
         return outcome
+
+
+@contextmanager
+def _sigint_blocked() -> Iterator[None]:
+    """Block SIGINT, also for processes started meanwhile, which inherit the mask: Ctrl-C does not end their imports."""
+    if sys.platform == "win32":
+        yield
+        return
+    resource_tracker.ensure_running()  # its own start unblocks SIGINT
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _work(connection: Connection, module: str) -> None:

@@ -296,10 +296,6 @@ print("interrupted" if done.interrupted else "not interrupted", [path.name for p
 """
 
 
-JUST_STARTING = 2
-"""Lines that a process which was just starting may come to say of that, until it is ended."""
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals for process groups")
 def test_interrupt_ends_all_processes_and_saves_results(tmp_path):
     path = f"import sys; sys.path[:0] = {sys.path!r}\n"
@@ -316,8 +312,7 @@ def test_interrupt_ends_all_processes_and_saves_results(tmp_path):
     interrupt_group(child)
     output, errors = child.communicate(timeout=300.0)  # by itself it would take twice as long
     assert output == "interrupted ['table-9.txt']\n"
-    reported = errors.split("Traceback (most recent call last):\n")[1:]
-    assert [text for text in reported if not ("in spawn_main" in text or text.count("\n") <= JUST_STARTING)] == []
+    assert "Traceback" not in errors
     assert (tmp_path / "made" / "table-9.txt").is_file()
 
 
