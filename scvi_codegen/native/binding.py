@@ -132,6 +132,10 @@ class Binding:
         """Return zeroed numbers of C, as in ``"long long *"`` and ``"double[3]"``."""
         return self._ffi.new(what)
 
+    def vector(self, part: Any) -> NDArray[np.float64]:
+        """Return an array of doubles of a struct, in the same memory."""
+        return np.frombuffer(self._ffi.buffer(part))
+
     def buffer(self, struct: Any) -> Any:
         """Return the bytes of a struct, writable."""
         return self._ffi.buffer(struct)

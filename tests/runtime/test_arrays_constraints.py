@@ -10,6 +10,7 @@ import scvi_codegen as sc
 from scvi_codegen.derivation.equations import derive
 from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, SystemDefinitionError
 from scvi_codegen.models.packages.package import generate_package
+from scvi_codegen.native.binding import Binding
 
 RATTLE = sc.SVI(1, "gauss-lobatto:2")
 ROUNDING = 2.0**-52
@@ -101,9 +102,9 @@ def test_every_state_of_a_chain_satisfies_its_constraints(stepper, count):
 def test_chain_needs_one_product_per_correction(stepper):
     q, data = chain(500)
     run = stepper.start(q, h=1e-4, **data)
-    memory, binding = run._memory, run.stepper.binding.raw
-    report = binding.new("report *")
-    binding.function("advance")(memory.run, memory.problem, 10, binding.null, report)
+    memory, binding = run._memory, run.stepper.binding
+    report = Binding.new(binding, "report *")
+    Binding.function(binding, "advance")(memory, binding._arrays[memory].problem, 10, binding.null, report)
     assert report.products <= report.iterations
 
 

@@ -12,7 +12,6 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.errors import StateError
-from scvi_codegen.runtime.arrays.memory import RUN_FIELDS
 from scvi_codegen.runtime.run.memory import RANGES
 from scvi_codegen.runtime.run.saving import DIGEST, MAGIC
 
@@ -143,17 +142,18 @@ def put_together(header: dict[str, Any], rest: bytes) -> bytes:
 class TestDamage:
     """Bytes of the whole file, numbers behind a right checksum: refused, or a run that goes on within its arrays."""
 
-    @pytest.mark.parametrize("value", [-1.0, 3.0, 0.5, 1e300, -1e300, np.nan, np.inf, 2.0**63, -(2.0**62)])
-    @pytest.mark.parametrize("name", [name for name in RUN_FIELDS if name in RANGES])
-    def test_invalid_counts_are_rejected(self, chain: Any, name: str, value: float) -> None:
+    @pytest.mark.parametrize("value", [-1, 3, 2**40, 2**63 - 1, -(2**62)])
+    @pytest.mark.parametrize("name", RANGES)
+    def test_invalid_counts_are_rejected(self, chain: Any, name: str, value: int) -> None:
         run = start(chain, h=None, t_end=2.0)
         run.advance(3)
         header, rest = parts(run.checkpoint())
         fields = bytearray(rest)
-        first = len(rest) - len(run.snapshot) + 8 * RUN_FIELDS.index(name)
-        fields[first : first + 8] = np.float64(value).tobytes()
+        fields_of = dict(run.stepper.binding._ffi.typeof(run._memory).item.fields)
+        first = len(rest) - len(run.snapshot) + fields_of[name].offset - fields_of["t"].offset
+        fields[first : first + 8] = np.int64(value).tobytes()
         least, most = RANGES[name]
-        if least <= value <= most and value == int(value):
+        if least <= value <= most:
             chain.from_checkpoint(put_together(header, bytes(fields)), t_end=2.0).advance(3)
             return
         with pytest.raises(StateError, match=name):

@@ -9,6 +9,7 @@ import scvi_codegen as sc
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.methods import as_method
+from scvi_codegen.native.binding import Binding
 from scvi_codegen.runtime.arrays import envelope
 
 RANDOM = np.random.default_rng(1)
@@ -56,9 +57,11 @@ def smooth(shape):
 def products_of(stepper, q, h, *, steps=1, **given):
     """Return the number of products of steps, which must converge."""
     run = stepper.start(q, h=h, **given)
-    memory, binding = run._memory, run.stepper.binding.raw
-    report = binding.new("report *")
-    assert binding.function("advance")(memory.run, memory.problem, steps, binding.null, report) == 0
+    memory, binding = run._memory, run.stepper.binding
+    report = Binding.new(binding, "report *")
+    assert (
+        Binding.function(binding, "advance")(memory, binding._arrays[memory].problem, steps, binding.null, report) == 0
+    )
     return report.products
 
 

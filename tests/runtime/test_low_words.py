@@ -123,7 +123,8 @@ class Begun:
     def words(self) -> tuple[Any, ...]:
         """q, p and their low words; of an array those of the run itself."""
         if self.array:
-            return tuple(self.run._memory.numbers[name].ravel() for name in ("q", "p", "carry_q", "carry_p"))
+            vector, memory = self.run.stepper.binding.vector, self.run._memory
+            return tuple(vector(getattr(memory, name)) for name in ("q", "p", "carry_q", "carry_p"))
         return self.run.q, self.run.p, *self.run._compensation
 
     def time(self) -> Fraction:

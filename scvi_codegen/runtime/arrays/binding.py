@@ -1,7 +1,8 @@
 """Binding of arrays whose sizes are known at run time, with the functions of a binding of known sizes.
 
-The C functions of arrays take the data of the problem and a run whose arrays lie in memory of the caller. Here they
-have the arguments of the functions of known sizes, so that steppers, runs and trajectories are the same for both.
+The C functions of arrays take the data of the problem and a run whose arrays lie in memory of the caller: one block of
+the C struct, from whose field t on the state begins, and the arrays of the state. Here they have the arguments of the
+functions of known sizes, so that steppers, runs and trajectories are the same for both.
 """
 
 from __future__ import annotations
@@ -9,11 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import cached_property, partial
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.indices import ArrayMap
@@ -23,7 +26,6 @@ from scvi_codegen.native.options import FAILURES, NOT_CONVERGED
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.envelope import envelope_of
 from scvi_codegen.runtime.arrays.interface import Numbers, RunSizes
-from scvi_codegen.runtime.arrays.memory import ArrayMemory
 from scvi_codegen.runtime.core.validation import by_name
 
 FAILURES_BY_SOLVER = {
@@ -47,18 +49,34 @@ FAILURES_BY_SOLVER = {
 }
 
 
-class _Report(SimpleNamespace):
-    """Report of a call, with the messages of its failures."""
+ALIGNMENT = 64
+"""Alignment in bytes, the size of the widest SIMD register."""
 
-    interface: Interface
 
-    @property
-    def failures(self) -> dict[str, tuple[str, str]]:
-        failures = FAILURES_BY_SOLVER.get(self.interface.solver, FAILURES)
-        if (mesh := self.interface.layout.mesh) is None:
-            return failures
-        limit = f". The highest frequency of the mesh is at most {mesh.highest_frequency():.3g}: see its largest_step()"
-        return {word: (what, remedy + limit) for word, (what, remedy) in failures.items()}
+def aligned(count: int) -> Numbers:
+    """Return ``count`` zeros, aligned to a SIMD register."""
+    try:
+        memory = np.zeros(count + ALIGNMENT // 8)
+    except (MemoryError, ValueError) as error:
+        raise StateError(f"there is not enough memory for {count} numbers") from error
+    start = -memory.ctypes.data % ALIGNMENT // 8
+    return memory[start : start + count]
+
+
+class BoundRun(NamedTuple):
+    """Arrays of a run that are not in its memory, because they are computed from the problem and not restored.
+
+    Attributes:
+        problem: C struct of the problem.
+        parameters: current scalar parameters and fields, in one vector; NaN before they are set.
+        computed: arrays by the name of their pointer in the C struct of the run.
+        stored: memory behind the C struct of the run, from its first number to the end of the last array of the state.
+    """
+
+    problem: Any
+    parameters: Numbers
+    computed: dict[str, NDArray[Any]]
+    stored: Any
 
 
 class ArrayBinding(Binding):
@@ -67,65 +85,161 @@ class ArrayBinding(Binding):
     Args:
         library: the compiled source.
         interface: interface of the source.
-        arrays: sizes, tables and number of threads per step.
+        sizes: sizes, tables and number of threads per step.
     """
 
     reusable = False
 
-    def __init__(self, library: Library, interface: Interface, arrays: RunSizes) -> None:
+    def __init__(self, library: Library, interface: Interface, sizes: RunSizes) -> None:
         super().__init__(library, interface.prefix)
-        self.raw = Binding(library, interface.prefix)
-        self.interface, self.arrays, self._unused = interface, arrays, list[ArrayMemory]()
+        self.interface, self.sizes, self._unused = interface, sizes, list[Any]()
         self.shapes, self.fields = (
-            [(array.name, array.shape(arrays.sizes)) for array in each]
+            [(array.name, array.shape(sizes.sizes)) for array in each]
             for each in (interface.layout.coordinates, interface.layout.fields)
         )
         self.count = sum(math.prod(shape) for _, shape in self.shapes)
         self.parameter_count = len(interface.parameters) + sum(math.prod(shape) for _, shape in self.fields)
-        self.envelope = envelope_of(interface.layout, arrays)
+        self.envelope = envelope_of(interface.layout, sizes)
+        self._arrays: WeakKeyDictionary[Any, BoundRun] = WeakKeyDictionary()
+
+    @cached_property
+    def failures(self) -> dict[str, tuple[str, str]]:
+        """Messages of failed steps."""
+        failures = FAILURES_BY_SOLVER.get(self.interface.solver, FAILURES)
+        if (mesh := self.interface.layout.mesh) is None:
+            return failures
+        limit = f". The highest frequency of the mesh is at most {mesh.highest_frequency():.3g}: see its largest_step()"
+        return {word: (what, remedy + limit) for word, (what, remedy) in failures.items()}
 
     def new(self, what: str) -> Any:
-        """Return memory of a run, or a report, as :meth:`Binding.new` does."""
+        """Return a run with its arrays, or the report of a call, as :meth:`Binding.new` does."""
         if what == "run *":
-            return ArrayMemory(self)
-        return _Report(interface=self.interface, steps=0, stored=0, iterations=0, change=0.0, t=0.0)
+            return self._new_run()
+        return SimpleNamespace(failures=self.failures, steps=0, stored=0, iterations=0, change=0.0, t=0.0)
+
+    def _new_run(self) -> Any:
+        """Return the C struct of a run, followed in memory by the arrays of its state."""
+        n, layout, problem = self.count, self.interface.layout, super().new("problem *")
+        for k, name in enumerate(layout.sizes):
+            problem.size[k] = self.sizes.sizes[name]
+        for k, table in enumerate(layout.tables):
+            problem.table[k] = self.pointer(self.sizes.places[table.name].reshape(-1))
+        first, computed = super().new("run *"), dict[str, NDArray[Any]](inverse_mass=aligned(n))
+        lengths = {"q": 2 * n, "carry_q": 2 * n, "work": n * self.constant("WORK")}
+        if layout.constraints:
+            computed |= self._constraint_indices(first, problem)
+            lengths["held"] = 11 * first.constraints + 2 * (first.entries + first.pairs)
+        if self.envelope is not None:
+            factors = ALIGNMENT + (n + self.envelope.entries) * 2 * self.constant("SHIFTS")
+            computed |= {"pattern": self.envelope.pattern, "compared_factors": aligned(factors)}
+            lengths["factors"] = factors
+        size, places = len(bytes(self._ffi.buffer(first))), dict[str, int]()
+        end = -(-size // ALIGNMENT) * ALIGNMENT
+        for name, length in lengths.items():
+            places[name], end = end // 8, end + -(-8 * length // ALIGNMENT) * ALIGNMENT
+        memory = aligned(end // 8)
+        run = self._ffi.from_buffer(f"{self._prefix}_run *", memory)
+        run[0] = first[0]
+        for name, place in places.items():
+            setattr(run, name, self.pointer(memory[place:]))
+        run.p, run.carry_p, run.threads = run.q + n, run.carry_q + n, self.sizes.threads  # p directly after q
+        for name, array in computed.items():
+            setattr(run, name, self.pointer(array))
+        parameters, head = np.full(self.parameter_count, np.nan), self._ffi.offsetof(f"{self._prefix}_run", "t")
+        for k, field in enumerate(by_name(parameters[len(self.interface.parameters) :], self.fields).values()):
+            problem.field[k] = self.pointer(field)
+        stored = self._ffi.buffer(self._ffi.cast("char *", run) + head, end - head)
+        self._arrays[run] = BoundRun(problem, parameters, computed, stored)
+        return run
+
+    def _constraint_indices(self, run: Any, problem: Any) -> dict[str, NDArray[Any]]:
+        """Store the numbers of constraints, entries and pairs in a run, and return its arrays of indices."""
+        super().function("constraint_sizes")(problem, run)
+        count, entries = run.constraints, run.entries
+        if not 0 <= count <= entries < 2**31:
+            raise StateError(
+                f"invalid constraints ({count} with {entries} coordinates): check the bounds of their loops"
+            )
+        places = np.zeros(3 * (count + entries) + self.count + 3, dtype=np.int32)
+        run.places = self.pointer(places)
+        run.pairs = super().function("constraint_pairs")(run, problem)
+        columns = np.zeros(run.pairs + 1, dtype=np.int32)
+        run.columns = self.pointer(columns)
+        super().function("constraint_pairs")(run, problem)
+        return {"places": places, "columns": columns}
+
+    def vector(self, part: Any, count: int | None = None) -> Numbers:
+        """Return the numbers at a pointer, by default as many as coordinates."""
+        size = self.count if count is None else count
+        return np.frombuffer(self._ffi.buffer(part, 8 * size)) if size else np.empty(0)
 
     def buffer(self, struct: Any) -> Any:
-        """Return the memory of a run, whose bytes are readable and writable, and arrays as they are."""
-        return struct
+        """Return the bytes of the state of a run, writable."""
+        return self._arrays[struct].stored
 
     def has(self, name: str) -> bool:
         """Return whether there is such a function."""
         if name in ("advance_to", "project"):
-            return bool(super().has(name))
+            return super().has(name)
         return hasattr(self, f"_{name}")
 
     def function(self, name: str, memory: Any = None) -> Callable[..., Any]:
-        """Return a function with the arguments of the C function of known sizes, bound to the memory of a run."""
+        """Return a function with the arguments of the C function of known sizes, bound to a run."""
         function = getattr(self, f"_{name}")
         return function if memory is None else partial(function, memory)
 
-    def _set_parameters(self, memory: ArrayMemory, values: Numbers) -> None:
-        if memory.set_parameters(values) and self.interface.layout.constraints:  # rates may jump, positions may not
-            q = memory.q.copy()
-            self.raw.function("project")(memory.run, memory.problem, self.null, self.raw.new("report *"))
-            memory.q[:] = q
+    def _set_parameters(self, run: Any, values: Numbers) -> None:
+        """Set scalar parameters and fields; an extrapolated predictor is kept, reused forces are discarded.
 
-    def _start(self, memory: ArrayMemory, t: float, h: float, q: Any, p: Any) -> None:
-        memory.start(t, h, self._vector(q), self._vector(p))
+        Raises:
+            StateError: if a coordinate has no positive mass.
+        """
+        problem, parameters, computed, _ = self._arrays[run]
+        changed = not np.isnan(parameters).all()
+        if np.array_equal(values, parameters) and changed:
+            return
+        parameters[:], scalars = values, len(self.interface.parameters)
+        problem.parameters[0:scalars] = parameters[:scalars].tolist()
+        if changed:
+            run.guess *= self.interface.layout.continued
+            self._discard_factors(run)
+        inverse = computed["inverse_mass"]
+        if super().function("inverse_masses")(problem, run.inverse_mass):
+            index = int(np.argmin(np.where((inverse > 0) & np.isfinite(inverse), 1.0, -1.0)))
+            what = f"coordinate {index} of {len(inverse)}"
+            raise StateError(f"{what} has no positive mass: add its kinetic energy to L, or check the parameters")
+        if changed and self.interface.layout.constraints:  # rates may jump, positions may not
+            q = self.vector(run.q).copy()
+            super().function("project")(run, problem, self.null, super().new("report *"))
+            self.vector(run.q)[:] = q
 
-    def _step_error(self, memory: ArrayMemory) -> float:
-        return float(self.raw.function("step_error")(memory.run))
+    def _discard_factors(self, run: Any) -> None:
+        """Let the next step compute the factors of the linear part: their first number is their step size."""
+        if self.envelope is not None:
+            run.factors[0] = 0.0
 
-    def _advance(self, memory: ArrayMemory, *arguments: Any) -> int:
-        return self._advance_plan(memory, None, *arguments)
+    def _start(self, run: Any, t: float, h: float, q: Any, p: Any) -> None:
+        """Start at a state; nothing of an earlier run remains."""
+        head = self._ffi.offsetof(f"{self._prefix}_run", "t")
+        self._ffi.buffer(run)[head:] = bytes(self._ffi.sizeof(f"{self._prefix}_run") - head)
+        run.t, run.h, self.vector(run.q)[:], self.vector(run.p)[:] = t, h, self.vector(q), self.vector(p)
+        self.vector(run.carry_q, 2 * self.count)[:] = 0.0
+        self._discard_factors(run)
 
-    def _advance_to(self, memory: ArrayMemory, t_end: float, tolerance: float, *arguments: Any) -> int:
-        return self._advance_plan(memory, (t_end, tolerance), *arguments)
+    def _step_error(self, run: Any) -> float:
+        return float(super().function("step_error")(run))
+
+    def _advance(self, run: Any, *arguments: Any) -> int:
+        return self._advance_plan(run, None, *arguments)
+
+    def _advance_to(self, run: Any, t_end: float, tolerance: float, *arguments: Any) -> int:
+        status = self._advance_plan(run, (t_end, tolerance), *arguments)
+        run.h = 0.0  # of the last step
+        return status
 
     def _advance_plan(
         self,
-        memory: ArrayMemory,
+        run: Any,
         plan: tuple[float, float] | None,
         steps: int,
         save_every: int,
@@ -139,54 +253,55 @@ class ArrayBinding(Binding):
         __: Any,
     ) -> int:
         """Take steps and store every ``save_every``-th state, and the state at the target time."""
-        made, done, row, status = self.raw.new("report *"), 0, 0, 0
-        function = self.raw.function("advance" if plan is None else "advance_to", memory.run)
-        arrived = plan is not None and _arrived(memory, plan[0])
+        made, done, row, status, problem = super().new("report *"), 0, 0, 0, self._arrays[run].problem
+        function = super().function("advance" if plan is None else "advance_to", run)
+        arrived = plan is not None and _arrived(run, plan[0])
         while done < steps and not (status or arrived):
-            size = min(save_every - memory.step % save_every, steps - done)
-            status = function(memory.problem, *(plan or ()), size, options, made)
-            done, memory.iterations = done + made.steps, memory.iterations + made.iterations
-            arrived = plan is not None and _arrived(memory, plan[0])
-            if not status and (memory.step % save_every == 0 or arrived):
-                t[row], iterations[row] = memory.t, memory.iterations
-                for target, name in ((q, "q"), (p, "p")):
-                    self._ffi.memmove(target + row * self.count, getattr(memory.run, name), 8 * self.count)
-                row, memory.iterations = row + 1, 0
+            size = min(save_every - run.step % save_every, steps - done)
+            status = function(problem, *(plan or ()), size, options, made)
+            done, run.iterations = done + made.steps, run.iterations + made.iterations
+            arrived = plan is not None and _arrived(run, plan[0])
+            if not status and (run.step % save_every == 0 or arrived):
+                t[row], iterations[row] = run.t, run.iterations
+                for target, state in ((q, run.q), (p, run.p)):
+                    self._ffi.memmove(target + row * self.count, state, 8 * self.count)
+                row, run.iterations = row + 1, 0
         report.steps, report.stored, report.iterations = done, row, made.iterations
         report.change, report.t = made.change, made.t
-        return status
+        return int(status)
 
     def _step(
         self, t: float, h: float, q: Any, p: Any, parameters: Any, options: Any, q1: Any, p1: Any, report: Any, _: Any
     ) -> int:
-        with self._at(t, q, p, parameters, h) as memory:
+        with self._at(t, q, p, parameters, h) as run:
             unused = self.numbers("double *"), self.numbers("int *")
-            return self._advance(memory, 1, 1, None, options, unused[0], q1, p1, unused[1], report, None)
+            return self._advance(run, 1, 1, None, options, unused[0], q1, p1, unused[1], report, None)
 
     def _energies(self, count: int, t: Any, q: Any, p: Any, parameters: Any, result: Any, _: Any) -> int:
         parts = np.empty((count, 3))
-        self._energy_parts(count, t, q, p, parameters, self.raw.pointer(parts))
-        self._vector(result, count)[:] = parts[:, 2]
+        self._energy_parts(count, t, q, p, parameters, self.pointer(parts))
+        self.vector(result, count)[:] = parts[:, 2]
         return 0
 
     def _energy_parts(self, count: int, t: Any, q: Any, p: Any, parameters: Any, parts: Any) -> None:
         """Compute (n, 3) kinetic, potential and total energies in double-double arithmetic; 0, H, H if given by H."""
         n = self.count
-        with self._at(0.0, q, p, parameters) as memory:
+        with self._at(0.0, q, p, parameters) as run:
+            problem, energies = self._arrays[run].problem, super().function("energies")
             for k in range(count):
-                memory.q[:], memory.p[:] = self._vector(q + k * n), self._vector(p + k * n)
-                arrays = (memory.run.q, memory.run.p, memory.run.inverse_mass, parts + 3 * k)
-                self.raw.function("energies")(memory.problem, t[k], *arrays)
+                for state, given in ((run.q, q), (run.p, p)):
+                    self._ffi.memmove(state, given + k * n, 8 * n)
+                energies(problem, t[k], run.q, run.p, run.inverse_mass, parts + 3 * k)
         if self.interface.layout.velocity_formulas:  # the terms of H are no parts of the energy
-            self._vector(parts, 3 * count).reshape(-1, 3)[:, :2] = np.nan
+            self.vector(parts, 3 * count).reshape(-1, 3)[:, :2] = np.nan
 
     def _velocity(self, t: float, q: Any, p: Any, parameters: Any, result: Any, _: Any) -> int:
         if self.interface.layout.momenta:
             raise StateError("velocities are unavailable for a system defined by a Hamiltonian: use the momenta p")
         if formulas := self.interface.layout.velocity_formulas:
             return self._evaluate(formulas, ("p_{}", "{}_dot"), t, q, p, parameters, result)
-        with self._at(t, q, p, parameters) as memory:
-            self._vector(result)[:] = memory.p * memory.numbers["inverse_mass"]
+        with self._at(t, q, p, parameters) as run:
+            self.vector(result)[:] = self.vector(p) * self.vector(run.inverse_mass)
         return 0
 
     def _momentum(self, t: float, q: Any, v: Any, parameters: Any, result: Any, _: Any) -> int:
@@ -194,8 +309,8 @@ class ArrayBinding(Binding):
             raise StateError("the system is defined by a Hamiltonian: give momenta p instead of velocity")
         if formulas := self.interface.layout.momentum_formulas:
             return self._evaluate(formulas, ("{}_dot", "p_{}"), t, q, v, parameters, result)
-        with self._at(t, q, v, parameters) as memory:
-            self._vector(result)[:] = memory.p / memory.numbers["inverse_mass"]
+        with self._at(t, q, v, parameters) as run:
+            self.vector(result)[:] = self.vector(v) / self.vector(run.inverse_mass)
         return 0
 
     def _evaluate(
@@ -205,14 +320,14 @@ class ArrayBinding(Binding):
         from scvi_codegen.formulas.numpy_values import Elements  # here, because it imports SymPy
         from scvi_codegen.formulas.symbols import TIME, symbol
 
-        values, scalars = self._vector(parameters, self.parameter_count), len(self.interface.parameters)
+        values, scalars = self.vector(parameters, self.parameter_count), len(self.interface.parameters)
         numbers: dict[Any, float] = {symbol(TIME): t}
         numbers |= {symbol(name): x for name, x in zip(self.interface.parameters, values.tolist(), strict=False)}
-        arrays = by_name(self._vector(q), self.shapes) | by_name(values[scalars:], self.fields)
-        arrays |= {names[0].format(name): each for name, each in by_name(self._vector(moving), self.shapes).items()}
-        targets = {names[1].format(name): each for name, each in by_name(self._vector(result), self.shapes).items()}
+        arrays = by_name(self.vector(q), self.shapes) | by_name(values[scalars:], self.fields)
+        arrays |= {names[0].format(name): each for name, each in by_name(self.vector(moving), self.shapes).items()}
+        targets = {names[1].format(name): each for name, each in by_name(self.vector(result), self.shapes).items()}
         for force in formulas:
-            elements = Elements(force.loops, self.arrays.sizes, self.arrays.places)
+            elements = Elements(force.loops, self.sizes.sizes, self.sizes.places)
             for access, formula in force.targets:
                 value = elements.values(formula, force.slots, arrays, numbers)
                 targets[access.array.name][elements.of(access)] = value
@@ -221,7 +336,7 @@ class ArrayBinding(Binding):
     def _momentum_maps(self, count: int, t: Any, q: Any, p: Any, parameters: Any, values: Any, sizes: Any) -> int:
         maps, n = self.interface.layout.maps, self.count
         for k in range(count):
-            states = [by_name(self._vector(each + k * n), self.shapes) for each in (q, p)]
+            states = [by_name(self.vector(each + k * n), self.shapes) for each in (q, p)]
             absolute = [{name: np.abs(each) for name, each in state.items()} for state in states]
             for j, each in enumerate(maps):
                 values[k * len(maps) + j] = momentum_of(states[0][each.array], states[1][each.array], each)
@@ -230,56 +345,51 @@ class ArrayBinding(Binding):
         return 0
 
     def _constraint_values(self, count: int, t: Any, q: Any, p: Any, parameters: Any, g: Any, rate: Any, _: Any) -> int:
-        for k, memory in self._states(count, t, q, p, parameters):
-            row = k * memory.constraints
-            self.raw.function("constraint_values")(memory.run, memory.problem, g + row, rate + row)
+        for k, run in self._states(count, t, q, p, parameters):
+            row = k * run.constraints
+            super().function("constraint_values")(run, self._arrays[run].problem, g + row, rate + row)
         return 0
 
     def _multipliers(self, count: int, t: Any, q: Any, p: Any, parameters: Any, values: Any, _: Any) -> int:
-        for k, memory in self._states(count, t, q, p, parameters):
-            multipliers = self.raw.function("multipliers")
-            if status := multipliers(memory.run, memory.problem, values + k * memory.constraints):
+        for k, run in self._states(count, t, q, p, parameters):
+            multipliers = super().function("multipliers")
+            if status := multipliers(run, self._arrays[run].problem, values + k * run.constraints):
                 return int(status)
         return 0
 
     def _project(self, t: float, q: Any, p: Any, parameters: Any, q1: Any, p1: Any, _: Any) -> int:
-        with self._at(t, q, p, parameters) as memory:
-            report = self.raw.new("report *")
-            status = int(self.raw.function("project")(memory.run, memory.problem, self.null, report))
-            self._vector(q1)[:], self._vector(p1)[:] = memory.q, memory.p
+        with self._at(t, q, p, parameters) as run:
+            report = super().new("report *")
+            status = int(super().function("project")(run, self._arrays[run].problem, self.null, report))
+            self.vector(q1)[:], self.vector(p1)[:] = self.vector(run.q), self.vector(run.p)
         return status
 
     def _apart(self, t: float, q: Any, p: Any, q1: Any, p1: Any, parameters: Any, result: Any, _: Any) -> int:
         """Compute the distances of two states, relative to their largest numbers."""
         for k, pair in enumerate(((q, q1), (p, p1))):
-            before, after = map(self._vector, pair)
+            before, after = map(self.vector, pair)
             size = float(max(np.abs(before).max(initial=0.0), np.abs(after).max(initial=0.0)))
             result[k] = float(np.abs(after - before).max(initial=0.0)) / (size or 1.0)
         return 0
 
-    def _states(self, count: int, t: Any, q: Any, p: Any, parameters: Any) -> Iterator[tuple[int, ArrayMemory]]:
+    def _states(self, count: int, t: Any, q: Any, p: Any, parameters: Any) -> Iterator[tuple[int, Any]]:
         for k in range(count):
-            with self._at(t[k], q + k * self.count, p + k * self.count, parameters) as memory:
-                yield k, memory
+            with self._at(t[k], q + k * self.count, p + k * self.count, parameters) as run:
+                yield k, run
 
     @contextmanager
-    def _at(self, t: float, q: Any, p: Any, parameters: Any, h: float = 0.0) -> Iterator[ArrayMemory]:
-        """Provide memory of a run at a state; it may be used by one thread at a time."""
+    def _at(self, t: float, q: Any, p: Any, parameters: Any, h: float = 0.0) -> Iterator[Any]:
+        """Provide a run at a state; it may be used by one thread at a time."""
         try:
-            memory = self._unused.pop()
+            run = self._unused.pop()
         except IndexError:
-            memory = ArrayMemory(self)
-        memory.start(t, h, self._vector(q), self._vector(p))
-        memory.set_parameters(self._vector(parameters, self.parameter_count))
+            run = self._new_run()
+        self._start(run, t, h, q, p)
+        self._set_parameters(run, self.vector(parameters, self.parameter_count))
         try:
-            yield memory
+            yield run
         finally:
-            self._unused.append(memory)
-
-    def _vector(self, pointer: Any, count: int | None = None) -> Numbers:
-        """Return the numbers at a pointer."""
-        size = self.count if count is None else count
-        return np.frombuffer(self._ffi.buffer(pointer, 8 * size)) if size else np.empty(0)
+            self._unused.append(run)
 
 
 def momentum_of(q: Numbers, p: Numbers, of: ArrayMap, *, absolute: bool = False) -> float:
@@ -294,5 +404,5 @@ def momentum_of(q: Numbers, p: Numbers, of: ArrayMap, *, absolute: bool = False)
     return float(np.sum(q[..., of.component] * p[..., of.other] + sign * q[..., of.other] * p[..., of.component]))
 
 
-def _arrived(memory: ArrayMemory, t_end: float) -> bool:
-    return bool(memory.t == t_end and memory.t_low == 0.0)
+def _arrived(run: Any, t_end: float) -> bool:
+    return bool(run.t == t_end and run.t_low == 0.0)

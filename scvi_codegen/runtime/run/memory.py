@@ -10,6 +10,7 @@ import numpy as np
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, checked_options, step_failure
 from scvi_codegen.runtime.constraints.projection import check_reachable
 from scvi_codegen.runtime.core.integrator import Integrator
@@ -63,7 +64,7 @@ class Memory(OneThread):
         super().__init__()
         self.stepper, binding = stepper, stepper.binding
         self._memory = memory = binding.new("run *")
-        self._q, self._p = (np.frombuffer(binding.buffer(part)) for part in (memory.q, memory.p))
+        self._q, self._p = map(binding.vector, (memory.q, memory.p))
         self._parameters = stepper.defaults
         self._arguments = binding.pointer(self._parameters), binding.null
         self._options: SolverOptions | None = None
@@ -147,7 +148,7 @@ class Memory(OneThread):
         if len(saved) != len(buffer):
             raise StateError(f"invalid saved run: it has {len(saved)} bytes, those of this stepper have {len(buffer)}")
         buffer[:] = saved
-        _check_memory(memory)
+        _check_memory(memory, stepper.binding)
         if plan is None and memory.h == 0.0:
             raise StateError("the saved run has adaptive steps: give t_end")
         plan = StepPlan(h=memory.h) if plan is None else plan
@@ -265,8 +266,8 @@ class Memory(OneThread):
     @property
     def _compensation(self) -> tuple[Array, Array]:
         """(m,) compensation terms of :attr:`q` and of :attr:`p`, added in the following steps."""
-        carries = self._memory.carry_q, self._memory.carry_p
-        return self.stepper.named(np.array(list(carries[0]))), self.stepper.named(np.array(list(carries[1])))
+        vector, memory = self.stepper.binding.vector, self._memory
+        return self.stepper.named(vector(memory.carry_q).copy()), self.stepper.named(vector(memory.carry_p).copy())
 
     @alone
     def _resume_at(self, steps: int, time: tuple[float, float], carries: tuple[Array, Array]) -> None:
@@ -413,9 +414,10 @@ def _time(memory: Any) -> float:
     return float(memory.t if hasattr(memory, "t") else memory.t0 + memory.step * memory.h)
 
 
-def _check_memory(memory: Any) -> None:
+def _check_memory(memory: Any, binding: Binding) -> None:
     """Raise :class:`StateError` if the bytes cannot belong to a run."""
-    if not np.isfinite([_time(memory), memory.h, *memory.q, *memory.p, *memory.carry_q, *memory.carry_p]).all():
+    vectors = map(binding.vector, (memory.q, memory.p, memory.carry_q, memory.carry_p))
+    if not np.isfinite(np.concatenate([[_time(memory), memory.h], *vectors])).all():
         raise StateError(f"invalid saved run: its state is not finite, h = {memory.h:g}")
     for name, (least, most) in RANGES.items():
         if not least <= (value := getattr(memory, name, least)) <= most:
