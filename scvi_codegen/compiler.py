@@ -32,7 +32,7 @@ from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.events.event import EventLike, as_events
-from scvi_codegen.validation import MAPPING, TEXT, TEXTS, ArgumentType, check_kind, checks_arguments
+from scvi_codegen.validation import TEXTS, ArgumentType, check_kind, checks_arguments
 
 if TYPE_CHECKING:
     from sympy import Expr
@@ -47,14 +47,7 @@ SYSTEM_OR_ARRAYS = ArgumentType(
 """Type check of systems, also of those with arrays of run-time sizes."""
 
 
-@checks_arguments(
-    system=SYSTEM_OR_ARRAYS,
-    solver=TEXT,
-    flags=TEXTS,
-    prefix=TEXT,
-    sizes=MAPPING,
-    tables=MAPPING,
-)
+@checks_arguments(system=SYSTEM_OR_ARRAYS, flags=TEXTS)
 def compile_stepper(
     system: MechanicalSystem | ArraySystem,
     method: Method | str,

@@ -59,7 +59,7 @@ from scvi_codegen.rendering.program_source import (
 )
 from scvi_codegen.rendering.source import ArrayLayout, Interface, Source
 from scvi_codegen.runtime.events.event import Event, EventLike, as_events
-from scvi_codegen.validation import SWITCH, TEXT, checks_arguments
+from scvi_codegen.validation import checks_arguments
 
 LONGEST_PREFIX = 64
 C_HEADERS = frozenset(
@@ -319,7 +319,7 @@ class Sources:
         return None if self.of_arrays else made[kind]()
 
 
-@checks_arguments(system=SYSTEM, solver=TEXT, prefix=TEXT, symmetries=SYMMETRIES, amalgamate=SWITCH)
+@checks_arguments(system=SYSTEM, symmetries=SYMMETRIES)
 def generate_source(
     system: MechanicalSystem,
     method: Method | str,

@@ -10,6 +10,7 @@ import functools
 import numbers
 import operator
 import os
+import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from inspect import Parameter, signature
@@ -149,6 +150,28 @@ FUNCTION = ArgumentType("a function", callable)
 CANVAS = ArgumentType("Matplotlib axes", lambda value: hasattr(value, "plot") and hasattr(value, "figure"))
 
 
+KINDS = {
+    r"str": TEXT,
+    r"bool": SWITCH,
+    r"str \| float": FORMULA,
+    r"str \| (os\.)?PathLike\[str\]": PATH,
+    r"Sequence\[str\]": NAMES,
+    r"Sequence\[str\] \| Mapping\[str, Any\]": TABLES,
+    r"Sequence\[Mapping\[str, Any\]\]": MAPPINGS,
+    r"Sequence\[Expr( \| str)?\]": FORMULAS,
+    r"Mapping\[str, [^|]+\]": MAPPING,
+    r"Mapping\[(Any|Expr|Symbol)( \| str)?, [^|]+\]": MAPPED,
+    r"Callable\[.*\]": FUNCTION,
+}
+"""Checks of arguments by patterns of their annotations."""
+
+
+def kind_of(annotation: object) -> ArgumentType | None:
+    """Return the check of arguments with an annotation; ``None`` if they are checked when they are converted."""
+    text = str(annotation).removesuffix(" | None")
+    return next((kind for pattern, kind in KINDS.items() if re.fullmatch(pattern, text)), None)
+
+
 def check_kind(kind: ArgumentType, value: Any, name: str, error: type[ScviCodegenError] = ArgumentError) -> None:
     """Raise an error that names the argument if the value fails the check."""
     if not kind.accepts(value):
@@ -167,10 +190,12 @@ def _check_sizes(kind: ArgumentType, value: Any, function: str, error: type[Scvi
 def checks_arguments(
     error: type[ScviCodegenError] = ArgumentError, /, **kinds: ArgumentType
 ) -> Callable[[Called], Called]:
-    """Check arguments by name at each call; an argument whose default is ``None`` may be ``None``.
+    """Check arguments at each call by their annotations (:data:`KINDS`), or by ``kinds``, which take precedence.
 
-    >>> @checks_arguments(name=TEXT)
-    ... def greet(name):
+    An argument whose default is ``None`` may be ``None``.
+
+    >>> @checks_arguments()
+    ... def greet(name: str):
     ...     return f"hello {name}"
     >>> greet(3)
     Traceback (most recent call last):
@@ -186,10 +211,12 @@ def checks_arguments(
         known = dict.fromkeys(name for name in names if name not in ("self", "cls"))
         open_ended = any(each.kind is Parameter.VAR_KEYWORD for each in parameters.values())
         optional = {name for name in names if parameters[name].default is None}
+        annotated = {name: kind for name in names if (kind := kind_of(parameters[name].annotation))}
+        checks = annotated | kinds
         positions = [
-            (names.index(name) if name in names else MOST_ARGUMENTS, name, kind) for name, kind in kinds.items()
+            (names.index(name) if name in names else MOST_ARGUMENTS, name, kind) for name, kind in checks.items()
         ]
-        unchecked = frozenset(known).difference(kinds)
+        unchecked = frozenset(known).difference(checks)
         first = min((position for position, _, _ in positions), default=MOST_ARGUMENTS)
 
         @functools.wraps(function)

@@ -31,7 +31,7 @@ from scvi_codegen.representation import summary
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import States
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
-from scvi_codegen.validation import SWITCH, TEXT, checks_arguments
+from scvi_codegen.validation import checks_arguments
 
 DEGREES = (2, 4, 6, 8, 10, 12)
 """Degrees, or numbers of stages, among which ``advise`` chooses."""
@@ -108,7 +108,7 @@ class Advice:
         return card(f"Advice: {self.method.title}", facts, pilots)
 
 
-@checks_arguments(system=SYSTEM_OR_ARRAYS, degree=SWITCH, solver=TEXT)
+@checks_arguments(system=SYSTEM_OR_ARRAYS)
 @without_accuracy_warnings()
 def advise(
     system: MechanicalSystem | ArraySystem,

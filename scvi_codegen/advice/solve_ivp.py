@@ -30,7 +30,7 @@ from scvi_codegen.runtime.run.global_error import checked_error
 from scvi_codegen.runtime.run.largest_step import accuracy_message, largest_step
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-from scvi_codegen.validation import SWITCH, checks_arguments, of
+from scvi_codegen.validation import checks_arguments, of
 
 Array = NDArray[np.float64]
 Solution: TypeAlias = Callable[[ArrayLike], Array]
@@ -73,7 +73,7 @@ class OdeResult:
         return self.status >= 0
 
 
-@checks_arguments(system=of("a system or its stepper", MechanicalSystem, ArraySystem, Stepper), dense_output=SWITCH)
+@checks_arguments(system=of("a system or its stepper", MechanicalSystem, ArraySystem, Stepper))
 def solve_ivp(
     system: MechanicalSystem | ArraySystem | Stepper,
     t_span: Sequence[float],

@@ -41,7 +41,7 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import Block, Row, StageGroup, StageSystem, Table
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.tables.precision import Number
-from scvi_codegen.validation import SWITCH, checks_arguments
+from scvi_codegen.validation import checks_arguments
 
 if TYPE_CHECKING:
     from scvi_codegen.derivation.arrays import ArrayStepEquations
@@ -177,7 +177,7 @@ class StepEquations:
 def derive(system: ArraySystem, method: Method | str, *, radicals: bool = False) -> ArrayStepEquations: ...
 @overload
 def derive(system: MechanicalSystem, method: Method | str, *, radicals: bool = False) -> StepEquations: ...
-@checks_arguments(system=SYSTEM_OR_ARRAYS, radicals=SWITCH)
+@checks_arguments(system=SYSTEM_OR_ARRAYS)
 def derive(
     system: MechanicalSystem | ArraySystem, method: Method | str, *, radicals: bool = False
 ) -> StepEquations | ArrayStepEquations:

@@ -23,7 +23,7 @@ from scvi_codegen.fields.mesh import MeshSystem
 from scvi_codegen.formulas.array_notation import array_text
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import TIME, check_names, number, symbol
-from scvi_codegen.validation import MAPPING, NAMES, TEXT, checks_arguments
+from scvi_codegen.validation import checks_arguments
 
 CLAMPED = "clamped"
 MOST_AXES = 3
@@ -47,18 +47,7 @@ class FieldSystem(Density):
     """
 
     @classmethod
-    @checks_arguments(
-        SystemDefinitionError,
-        name=TEXT,
-        fields=NAMES,
-        space=MAPPING,
-        density=TEXT,
-        hamiltonian=TEXT,
-        momenta=NAMES,
-        boundary=MAPPING,
-        parameters=MAPPING,
-        dissipation=TEXT,
-    )
+    @checks_arguments(SystemDefinitionError)
     def from_text(
         cls,
         name: str,
@@ -114,7 +103,7 @@ class FieldSystem(Density):
         return replace(system, dissipation=parse_expression(dissipation, known))
 
     @classmethod
-    @checks_arguments(SystemDefinitionError, name=TEXT, space=MAPPING, boundary=MAPPING, parameters=MAPPING)
+    @checks_arguments(SystemDefinitionError)
     def from_sympy(
         cls,
         *,

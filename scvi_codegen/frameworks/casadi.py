@@ -35,12 +35,12 @@ from scvi_codegen.methods.stage_system import StageGroup, StageSystem, Table
 from scvi_codegen.native import building
 from scvi_codegen.rendering.flow import casadi_name, with_casadi_flow
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.validation import SWITCH, TEXTS, checked_count, checks_arguments, of
+from scvi_codegen.validation import TEXTS, checked_count, checks_arguments, of
 
 FLOW_ARGUMENTS = ("q", "p", "parameters", "t", "h")
 
 
-@checks_arguments(StateError, stepper=of("a compiled stepper", Stepper), hessian=SWITCH)
+@checks_arguments(StateError, stepper=of("a compiled stepper", Stepper))
 def casadi_flow(stepper: Stepper, *, steps: int, save_every: int | None = None, hessian: bool = False) -> Any:
     """Return a fixed number of steps of a stepper as a ``casadi.Function``.
 
@@ -188,7 +188,7 @@ HIGHEST = len(PARTS) - 2
 """Highest degree of inputs within a step; compiled steps have cubics."""
 
 
-@checks_arguments(ArgumentError, system=SYSTEM, along=TEXTS, solved=SWITCH)
+@checks_arguments(ArgumentError, system=SYSTEM, along=TEXTS)
 def casadi_step(
     system: MechanicalSystem, method: Method | str, *, degree: int = 0, along: Sequence[str] = (), solved: bool = False
 ) -> Any:

@@ -21,21 +21,10 @@ from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.validation import MAPPING, TEXT, checked_count, checks_arguments
+from scvi_codegen.validation import MAPPING, checked_count, checks_arguments
 
 
-@checks_arguments(
-    StateError,
-    system=SYSTEM,
-    start=MAPPING,
-    end=MAPPING,
-    cost=TEXT,
-    end_cost=TEXT,
-    bounds=MAPPING,
-    parameters=MAPPING,
-    guess=MAPPING,
-    options=MAPPING,
-)
+@checks_arguments(StateError, system=SYSTEM, start=MAPPING, end=MAPPING, bounds=MAPPING)
 def optimal_control(
     system: MechanicalSystem,
     method: Method | str,

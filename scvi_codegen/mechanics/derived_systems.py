@@ -24,10 +24,10 @@ from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
-from scvi_codegen.validation import MAPPING, NAMES, checked_count, checks_arguments, of
+from scvi_codegen.validation import checked_count, checks_arguments, of
 
 
-@checks_arguments(system=of("a LagrangianSystem", LagrangianSystem), old=MAPPING, coordinates=NAMES)
+@checks_arguments(system=of("a LagrangianSystem", LagrangianSystem))
 def change_coordinates(
     system: LagrangianSystem, old: Mapping[str, str], *, coordinates: Sequence[str]
 ) -> LagrangianSystem:

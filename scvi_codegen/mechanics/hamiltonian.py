@@ -15,17 +15,7 @@ from typing import TYPE_CHECKING, Any
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.mechanics.system import MechanicalSystem, zero
 from scvi_codegen.representation import summary
-from scvi_codegen.validation import (
-    FORMULA,
-    FORMULAS,
-    MAPPED,
-    MAPPING,
-    NAMES,
-    TABLES,
-    TEXT,
-    TEXTS,
-    checks_arguments,
-)
+from scvi_codegen.validation import FORMULAS, TEXTS, checks_arguments
 
 if TYPE_CHECKING:
     from sympy import Expr, Symbol
@@ -72,20 +62,7 @@ class HamiltonianSystem(MechanicalSystem):
         check_definition(self, "Hamiltonian", self.momenta, "a momentum")
 
     @classmethod
-    @checks_arguments(
-        SystemDefinitionError,
-        name=TEXT,
-        coordinates=NAMES,
-        hamiltonian=TEXT,
-        momenta=NAMES,
-        rotations=MAPPING,
-        spins=NAMES,
-        parameters=MAPPING,
-        damping=FORMULA,
-        constraints=TEXTS,
-        inputs=NAMES,
-        tables=TABLES,
-    )
+    @checks_arguments(SystemDefinitionError, constraints=TEXTS)
     def from_text(
         cls,
         name: str,
@@ -135,17 +112,7 @@ class HamiltonianSystem(MechanicalSystem):
         return cls._of_text(arguments | acting | {"inputs": inputs, "tables": tables} | turning)
 
     @classmethod
-    @checks_arguments(
-        SystemDefinitionError,
-        name=TEXT,
-        coordinates=FORMULAS,
-        momenta=FORMULAS,
-        rotations=MAPPING,
-        spins=NAMES,
-        parameters=MAPPED,
-        forces=MAPPED,
-        inputs=FORMULAS,
-    )
+    @checks_arguments(SystemDefinitionError, inputs=FORMULAS)
     def from_sympy(
         cls,
         *,

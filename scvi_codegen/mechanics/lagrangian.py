@@ -10,22 +10,7 @@ from typing import TYPE_CHECKING, Any
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.representation import summary
-from scvi_codegen.validation import (
-    FORMULA,
-    FORMULAS,
-    MAPPED,
-    MAPPING,
-    MAPPINGS,
-    NAMES,
-    NUMBERS,
-    PATH,
-    SWITCH,
-    TABLES,
-    TEXT,
-    TEXTS,
-    ArgumentType,
-    checks_arguments,
-)
+from scvi_codegen.validation import FORMULAS, MAPPED, NAMES, NUMBERS, TEXTS, ArgumentType, checks_arguments
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -83,24 +68,7 @@ class LagrangianSystem(MechanicalSystem):
         return self.lagrangian
 
     @classmethod
-    @checks_arguments(
-        SystemDefinitionError,
-        name=TEXT,
-        coordinates=NAMES,
-        lagrangian=TEXT,
-        rotations=MAPPING,
-        directions=NAMES,
-        torques=MAPPING,
-        torques_space=MAPPING,
-        point_forces=MAPPINGS,
-        parameters=MAPPING,
-        forces=MAPPING,
-        dissipation=TEXT,
-        damping=FORMULA,
-        constraints=TEXTS,
-        inputs=NAMES,
-        tables=TABLES,
-    )
+    @checks_arguments(SystemDefinitionError, constraints=TEXTS)
     def from_text(
         cls,
         name: str,
@@ -171,19 +139,7 @@ class LagrangianSystem(MechanicalSystem):
         return cls._of_text(arguments | acting | {"inputs": inputs, "tables": tables} | turning)
 
     @classmethod
-    @checks_arguments(
-        SystemDefinitionError,
-        name=TEXT,
-        coordinates=FORMULAS,
-        rotations=MAPPED,
-        directions=NAMES,
-        velocities=FORMULAS,
-        parameters=MAPPED,
-        forces=MAPPED,
-        constraints=FORMULAS,
-        inputs=FORMULAS,
-        tables=TABLES,
-    )
+    @checks_arguments(SystemDefinitionError, inputs=FORMULAS, torques=MAPPED, torques_space=MAPPED)
     def from_sympy(
         cls,
         *,
@@ -353,7 +309,7 @@ class LagrangianSystem(MechanicalSystem):
         return cls.from_sympy(name=name, parameters=parameters, inputs=inputs, **of_system(system).formulas())
 
     @classmethod
-    @checks_arguments(SystemDefinitionError, path=PATH, floating=SWITCH, gravity=NUMBERS, actuated=JOINTS)
+    @checks_arguments(SystemDefinitionError, gravity=NUMBERS, actuated=JOINTS)
     def from_urdf(
         cls,
         path: str | PathLike[str],
@@ -387,7 +343,7 @@ class LagrangianSystem(MechanicalSystem):
         return cls._of_tree(name or robot, links, gravity, actuated)
 
     @classmethod
-    @checks_arguments(SystemDefinitionError, path=PATH, actuated=JOINTS)
+    @checks_arguments(SystemDefinitionError, actuated=JOINTS)
     def from_mjcf(
         cls, path: str | PathLike[str], *, actuated: Sequence[str] | bool = False, name: str | None = None
     ) -> LagrangianSystem:

@@ -24,7 +24,7 @@ from scvi_codegen.mechanics.reading import default_momenta
 from scvi_codegen.mechanics.rotations.hamiltonian import hamiltonian_of_rotations
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import mp
-from scvi_codegen.validation import NAMES, TEXTS, checks_arguments, of
+from scvi_codegen.validation import TEXTS, checks_arguments, of
 
 LARGEST_INVERSE = 3
 """Largest number of coupled momenta (velocities) whose quadratic form is inverted symbolically."""
@@ -124,7 +124,7 @@ def _is_inverse(system: MechanicalSystem, root: Expr, derivative: Expr, x: Symbo
     return tried > 0
 
 
-@checks_arguments(system=of("a LagrangianSystem", LagrangianSystem), momenta=NAMES)
+@checks_arguments(system=of("a LagrangianSystem", LagrangianSystem))
 def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = None) -> HamiltonianSystem:
     """Return the Hamiltonian p . v - L of a Lagrangian, with v eliminated by p = dL/dv (paper, section 1.1).
 

@@ -15,7 +15,7 @@ from scvi_codegen.files.toml_text import package_table
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models import systems
 from scvi_codegen.representation import summary
-from scvi_codegen.validation import TEXT, checks_arguments
+from scvi_codegen.validation import checks_arguments
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,7 +97,7 @@ PROBLEMS: Mapping[str, Callable[[], Problem]] = MappingProxyType(
 """Catalogue: functions that build the entries, by command-line name."""
 
 
-@checks_arguments(name=TEXT)
+@checks_arguments()
 def problem(name: str) -> Problem:
     """Return an entry of the catalogue; a chain takes a size, as in ``fput-chain:64``.
 

@@ -23,7 +23,7 @@ from scvi_codegen.pictures.arrays import array_values, mesh_of
 from scvi_codegen.pictures.attitudes import solids
 from scvi_codegen.pictures.canvas import COLORS, MOTION, Array, DrawnMotion, check_plot_path, color, plain, style
 from scvi_codegen.representation import summary
-from scvi_codegen.validation import FUNCTION, PATH, REAL, checks_arguments
+from scvi_codegen.validation import REAL, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
@@ -205,7 +205,7 @@ SIZE = 4.8
 """Width and height of the figure in inches."""
 
 
-@checks_arguments(trajectory=MOTION, path=PATH, seconds=REAL, positions=FUNCTION)
+@checks_arguments(trajectory=MOTION, seconds=REAL)
 def animate(
     trajectory: DrawnMotion,
     path: str | os.PathLike[str] | None = None,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.pictures.canvas import color, panel, plain
-from scvi_codegen.validation import CANVAS, PATH, TEXT, ArgumentType, checks_arguments
+from scvi_codegen.validation import CANVAS, ArgumentType, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,7 +42,7 @@ def array_values(motion: Any, name: str | None) -> tuple[str, NDArray[np.float64
     return chosen, arrays[chosen]
 
 
-@checks_arguments(trajectory=ARRAYS, array=TEXT, path=PATH, ax=CANVAS)
+@checks_arguments(trajectory=ARRAYS, ax=CANVAS)
 def plot_arrays(
     trajectory: Any,
     path: str | os.PathLike[str] | None = None,
@@ -110,7 +110,7 @@ def _draw_positions(drawn: Axes, values: NDArray[np.float64], name: str) -> None
     drawn.legend()
 
 
-@checks_arguments(trajectory=ARRAYS, field=TEXT, path=PATH, ax=CANVAS)
+@checks_arguments(trajectory=ARRAYS, ax=CANVAS)
 def plot_spectrum(
     trajectory: Any,
     path: str | os.PathLike[str] | None = None,

@@ -19,7 +19,7 @@ from scvi_codegen.pictures.canvas import (
     save,
     style,
 )
-from scvi_codegen.validation import CANVAS, PATH, WHOLE, checks_arguments
+from scvi_codegen.validation import CANVAS, WHOLE, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,7 +43,7 @@ def unit_vectors(motion: DrawnMotion, axis: int = 3) -> dict[str, Array]:
     return result
 
 
-@checks_arguments(trajectory=MOTION, path=PATH, axis=WHOLE, ax=CANVAS)
+@checks_arguments(trajectory=MOTION, axis=WHOLE, ax=CANVAS)
 def plot_attitude(
     trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None, *, axis: int = 3, ax: Axes | None = None
 ) -> Axes:

@@ -21,7 +21,7 @@ from scvi_codegen.pictures.canvas import (
     plain,
     several,
 )
-from scvi_codegen.validation import CANVAS, PATH, checks_arguments
+from scvi_codegen.validation import CANVAS, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -59,7 +59,7 @@ class ResidualPlot:
 BINS = 600
 
 
-@checks_arguments(trajectories=HISTORIES, path=PATH, ax=CANVAS)
+@checks_arguments(trajectories=HISTORIES, ax=CANVAS)
 def plot_energy(
     trajectories: EnergyHistory | Sequence[EnergyHistory],
     path: str | os.PathLike[str] | None = None,
@@ -82,7 +82,7 @@ def plot_energy(
     return drawn
 
 
-@checks_arguments(trajectory=MOTION, path=PATH, ax=CANVAS)
+@checks_arguments(trajectory=MOTION, ax=CANVAS)
 def plot_momentum_maps(
     trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None
 ) -> Axes:

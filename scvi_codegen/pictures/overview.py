@@ -33,13 +33,13 @@ from scvi_codegen.pictures.canvas import (
 )
 from scvi_codegen.pictures.conserved import draw_energy_error, plot_energy, plot_momentum_maps
 from scvi_codegen.pictures.paths import draw_paths, path_panels, plot_motion, plot_phase
-from scvi_codegen.validation import CANVAS, NAMES, PATH, checks_arguments
+from scvi_codegen.validation import CANVAS, NAMES, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-@checks_arguments(trajectory=MOTION, path=PATH)
+@checks_arguments(trajectory=MOTION)
 def plot_trajectory(trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None) -> tuple[Axes, ...]:
     """Draw the path of a trajectory on the left, its relative energy error over time on the right.
 
@@ -82,7 +82,7 @@ FEW_POINTS = 2000
 DIRECTION_TEXT = {1: ", rising", 0: "", -1: ", falling"}
 
 
-@checks_arguments(trajectories=MOTIONS, path=PATH, ax=CANVAS, axes=NAMES)
+@checks_arguments(trajectories=MOTIONS, ax=CANVAS, axes=NAMES)
 def plot_section(
     trajectories: Motions,
     path: str | os.PathLike[str] | None = None,

@@ -23,7 +23,7 @@ from scvi_codegen.pictures.canvas import (
     plain,
     several,
 )
-from scvi_codegen.validation import CANVAS, NAMES, PATH, checks_arguments
+from scvi_codegen.validation import CANVAS, NAMES, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,7 +32,7 @@ MAX_POINTS = 20_000
 MAX_CURVES = 6
 
 
-@checks_arguments(trajectory=MOTION, path=PATH, ax=CANVAS)
+@checks_arguments(trajectory=MOTION, ax=CANVAS)
 def plot_motion(trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
     """Draw the path of a trajectory: orbits, a plane of coordinates, a phase plane, or all coordinates over time.
 
@@ -53,7 +53,7 @@ def plot_motion(trajectory: DrawnMotion, path: str | os.PathLike[str] | None = N
     return drawn
 
 
-@checks_arguments(trajectories=MOTIONS, path=PATH, ax=CANVAS, axes=NAMES)
+@checks_arguments(trajectories=MOTIONS, ax=CANVAS, axes=NAMES)
 def plot_phase(
     trajectories: Motions,
     path: str | os.PathLike[str] | None = None,

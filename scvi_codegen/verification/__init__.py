@@ -30,7 +30,7 @@ from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.runtime.core.stepper import STEPPER, Stepper
 from scvi_codegen.runtime.core.validation import checked_vector
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
-from scvi_codegen.validation import MAPPING, TEXT, TEXTS, checks_arguments
+from scvi_codegen.validation import TEXTS, checks_arguments
 from scvi_codegen.verification.certificate import Certificate, Check, Outcome, issued
 from scvi_codegen.verification.convergence import convergence_checks, identity_checks
 from scvi_codegen.verification.derivatives import derivative_checks, time_transformation_derivative_checks
@@ -50,14 +50,7 @@ LONGEST, HALVINGS, PART = 1.0, 40, 0.1
 """Largest step tried, number of halvings, and the largest change of the state per step relative to its size."""
 
 
-@checks_arguments(
-    system=SYSTEM_OR_ARRAYS,
-    stepper=STEPPER,
-    solver=TEXT,
-    flags=TEXTS,
-    parameters=MAPPING,
-    tables=MAPPING,
-)
+@checks_arguments(system=SYSTEM_OR_ARRAYS, stepper=STEPPER, flags=TEXTS)
 @without_accuracy_warnings()
 def verify(
     system: MechanicalSystem | ArraySystem,

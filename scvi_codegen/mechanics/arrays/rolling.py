@@ -30,7 +30,7 @@ from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.mechanics.term_groups import MAX_GROUPS, SimilarTerms, TermGroup, similar_terms
 from scvi_codegen.representation import summary
-from scvi_codegen.validation import MAPPING, checks_arguments
+from scvi_codegen.validation import checks_arguments
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +208,7 @@ def unrolled_at(
     return unroll_sums(system, sizes, parameters=arrays), others
 
 
-@checks_arguments(SystemDefinitionError, system=ARRAYS, sizes=MAPPING, tables=MAPPING, parameters=MAPPING)
+@checks_arguments(SystemDefinitionError, system=ARRAYS)
 def unroll_sums(
     system: ArraySystem | MechanicalSystem,
     sizes: Mapping[str, int],

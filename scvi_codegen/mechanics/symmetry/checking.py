@@ -25,7 +25,7 @@ from scvi_codegen.mechanics.symmetry.sampling import Sample, rates_of
 from scvi_codegen.mechanics.symmetry.symmetry import MAX_SEARCHED_COORDINATES, Symmetry
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.tables.precision import mp
-from scvi_codegen.validation import FORMULAS, TEXT, checks_arguments
+from scvi_codegen.validation import checks_arguments
 
 NEGLIGIBLE = mp.mpf(10) ** -40
 
@@ -75,7 +75,7 @@ DECIDED_AT = 3
 """Number of points at which the change of L is tested."""
 
 
-@checks_arguments(system=SYSTEM, direction=FORMULAS, name=TEXT)
+@checks_arguments(system=SYSTEM)
 def check_symmetry(
     system: MechanicalSystem,
     direction: Sequence[Expr | str] | None = None,

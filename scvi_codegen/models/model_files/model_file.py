@@ -112,7 +112,7 @@ from scvi_codegen.models.model_files.sections import (
 )
 from scvi_codegen.models.model_files.values import read_values
 from scvi_codegen.models.problems import Problem
-from scvi_codegen.validation import PATH, checks_arguments, of
+from scvi_codegen.validation import checks_arguments, of
 
 if TYPE_CHECKING:
     from scvi_codegen.models.model_files.input_tables import InputTable
@@ -145,7 +145,7 @@ ARRAY_SECTIONS = ("sizes", "tables")
 """Sections of systems with arrays."""
 
 
-@checks_arguments(path=PATH)
+@checks_arguments()
 def load_model(path: str | os.PathLike[str], changes: Document | None = None) -> Model:
     """Read a model file, with the sections ``changes`` merged over its own.
 
@@ -164,7 +164,7 @@ def load_model(path: str | os.PathLike[str], changes: Document | None = None) ->
         raise ModelFileError(f"{path}: {error}") from error
 
 
-@checks_arguments(model=of("a Model", Model), path=PATH)
+@checks_arguments(model=of("a Model", Model))
 def save_model(model: Model, path: str | os.PathLike[str]) -> None:
     """Write a model file atomically; reading it returns an equal model.
 

@@ -34,7 +34,7 @@ from scvi_codegen.native.building import PORTABLE_FLAGS, TARGETS, library_for, l
 from scvi_codegen.pipeline import generate_source
 from scvi_codegen.rendering.program_source import ExampleRun, with_fmu
 from scvi_codegen.rendering.source import Interface, Source
-from scvi_codegen.validation import PATH, SWITCH, TEXT, TEXTS, checks_arguments
+from scvi_codegen.validation import TEXTS, checks_arguments
 from scvi_codegen.version import __version__
 
 ENERGY, HELD = "energy", "input, held from one communication point to the next"
@@ -169,7 +169,7 @@ SUFFIXES = {"darwin": ".dylib", "windows": ".dll"}
 """File suffixes of libraries other than .so."""
 
 
-@checks_arguments(model=MODEL, path=PATH, solver=TEXT, flags=TEXTS, platforms=TEXTS, force=SWITCH)
+@checks_arguments(model=MODEL, flags=TEXTS, platforms=TEXTS)
 def generate_fmu(
     model: Model,
     path: str | os.PathLike[str],

@@ -34,7 +34,7 @@ from scvi_codegen.models.packages.folders import (
 )
 from scvi_codegen.rendering.source import Interface, Source, check_interface
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.validation import PATH, SWITCH, TEXT, ArgumentType, checks_arguments
+from scvi_codegen.validation import ArgumentType, checks_arguments
 
 if TYPE_CHECKING:
     from scvi_codegen.models.model import Model
@@ -48,7 +48,7 @@ ADVANCE_TO = "_advance_to("
 MODEL = ArgumentType("a Model", lambda value: hasattr(value, "system") and hasattr(value, "method"))
 
 
-@checks_arguments(model=MODEL, folder=PATH, solver=TEXT, force=SWITCH)
+@checks_arguments(model=MODEL)
 def generate_package(
     model: Model,
     folder: str | os.PathLike[str],
@@ -91,7 +91,7 @@ def generate_package(
     return target
 
 
-@checks_arguments(folder=PATH)
+@checks_arguments()
 def load_package(folder: str | os.PathLike[str]) -> Stepper:
     """Return the stepper of a generated folder, compiled from the C code in it (from the cache if that is unchanged).
 

@@ -23,7 +23,7 @@ from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.quantities import quantities
 from scvi_codegen.runtime.trajectory.saved_states import checked_row
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-from scvi_codegen.validation import MAPPING, PATH, checks_arguments
+from scvi_codegen.validation import checks_arguments
 
 if TYPE_CHECKING:
     from scvi_codegen.runtime.core.stepper import Stepper
@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 PIECES_IN_MEMORY = 2
 
 
-@checks_arguments(folder=PATH)
+@checks_arguments()
 def load_run(folder: str | os.PathLike[str]) -> RecordedRun:
     """Return the run recorded in a folder, as far as it goes; another process may still be recording it.
 
@@ -215,7 +215,7 @@ class RecordedRun:
             units=checked_units(units),
         )
 
-    @checks_arguments(path=PATH, units=MAPPING)
+    @checks_arguments()
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
         """Write ``.npz``, ``.csv``, ``.h5`` or ``.zarr`` in parts; otherwise as :meth:`Trajectory.save`.
 

@@ -39,7 +39,7 @@ from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.run_loop import record
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-from scvi_codegen.validation import FUNCTION, PATH, REAL, TEXT, checked_count, checks_arguments, of
+from scvi_codegen.validation import REAL, checked_count, checks_arguments, of
 
 LOCK = ".lock"
 CHECKPOINT_SECONDS = 10.0
@@ -47,14 +47,7 @@ SHORTEST_CHUNK_SECONDS, LONGEST_CHUNK_SECONDS = 0.01, 0.1
 """Bounds of the duration of a chunk in seconds, which limits the loss when a process is killed."""
 
 
-@checks_arguments(
-    run=of("a Run, as stepper.start gives it", Run),
-    folder=PATH,
-    checkpoint_seconds=REAL,
-    model=TEXT,
-    progress=FUNCTION,
-    stop=FUNCTION,
-)
+@checks_arguments(run=of("a Run, as stepper.start gives it", Run), checkpoint_seconds=REAL)
 def record_run(
     run: Run,
     folder: str | os.PathLike[str],
@@ -133,7 +126,7 @@ def record_run(
     return load_run(target)
 
 
-@checks_arguments(folder=PATH, checkpoint_seconds=REAL, progress=FUNCTION, stop=FUNCTION)
+@checks_arguments(checkpoint_seconds=REAL)
 def resume_run(
     folder: str | os.PathLike[str],
     *,

@@ -52,7 +52,7 @@ from scvi_codegen.runtime.run.step_plan import StepPlan, checked_plan, planned_s
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-from scvi_codegen.validation import FUNCTION, MAPPING, checked_count, checks_arguments, of
+from scvi_codegen.validation import checked_count, checks_arguments, of
 
 
 class Stepper(Integrator):
@@ -65,7 +65,7 @@ class Stepper(Integrator):
         further: dict[str, Any] = {"flags": self.flags, "events": self.events, "reason": self._reason}
         return partial(Stepper, variants=variants, **further), (self._plain, self.interface)
 
-    @checks_arguments(StateError, progress=FUNCTION, observe=FUNCTION, inputs=MAPPING)
+    @checks_arguments(StateError)
     def integrate(
         self,
         q: States,
@@ -293,7 +293,7 @@ class Stepper(Integrator):
         plan = self._plan(h, t_end, tolerance) if t_end is not None or transformed else None
         return Run.restored(stepper, saved, parameters=parameters, options=options, plan=plan)
 
-    @checks_arguments(StateError, progress=FUNCTION, inputs=MAPPING)
+    @checks_arguments(StateError)
     def integrate_ensemble(
         self,
         q: States,
@@ -371,7 +371,7 @@ class Stepper(Integrator):
         warn_of_energy_errors(trajectories)
         return trajectories
 
-    @checks_arguments(StateError, progress=FUNCTION)
+    @checks_arguments(StateError)
     def chaos_indicators_ensemble(
         self,
         q: States,

@@ -25,7 +25,7 @@ from scvi_codegen.runtime.run.global_error import ConfirmedEnsemble, GlobalError
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.joining import relative_changes
 from scvi_codegen.runtime.trajectory.quantities import quantities
-from scvi_codegen.validation import MAPPING, PATH, checks_arguments
+from scvi_codegen.validation import checks_arguments
 
 if TYPE_CHECKING:
     import xarray
@@ -139,7 +139,7 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
                 if good.size:
                     yield j, good, values
 
-    @checks_arguments(path=PATH, units=MAPPING)
+    @checks_arguments()
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
         """Write ``.npz``, ``.csv`` (one state a line: trajectory, t, q, p), ``.h5``, ``.nc`` or ``.zarr``, atomically.
 

@@ -24,7 +24,7 @@ from scvi_codegen.runtime.estimation.measurements import Measurements, distinct,
 from scvi_codegen.runtime.estimation.multiple_shooting import LOOSE, TIGHT, Chain, Limits, chained, joined
 from scvi_codegen.runtime.inputs.segments import checked_inputs
 from scvi_codegen.runtime.rotations.states import homogeneous_state
-from scvi_codegen.validation import MAPPING, NAMES, SWITCH, checked_count, checks_arguments
+from scvi_codegen.validation import checked_count, checks_arguments
 
 SAME = 1e-10
 """Sensitivity relative to the largest below which an unknown counts as undetermined."""
@@ -95,15 +95,7 @@ class Fit:
         return ResidualPlot(self.t, self.residuals, self.deviations, self.observed)
 
 
-@checks_arguments(
-    StateError,
-    stepper=STEPPER,
-    unknown=NAMES,
-    fit_initial_state=SWITCH,
-    observed=NAMES,
-    inputs=MAPPING,
-    bounds=MAPPING,
-)
+@checks_arguments(StateError, stepper=STEPPER)
 def fit(
     stepper: Stepper,
     t: ArrayLike,

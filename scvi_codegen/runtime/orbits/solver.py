@@ -33,7 +33,7 @@ from scvi_codegen.runtime.rotations.reduction import Reduction
 from scvi_codegen.runtime.rotations.states import homogeneous_state
 from scvi_codegen.runtime.run.times import steps_within, times_after
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
-from scvi_codegen.validation import NAMES, SWITCH, checked_count, checks_arguments
+from scvi_codegen.validation import checked_count, checks_arguments
 
 MOST_ITERATIONS, MOST_HALVINGS = 50, 12
 EASY, GROWTH = 10.0, 4.0
@@ -54,7 +54,7 @@ EQUILIBRIUM_MOTION = 1e-6
 """Motion over a period, relative to the size of the state, below which an orbit counts as an equilibrium."""
 
 
-@checks_arguments(StateError, stepper=STEPPER, fixed=NAMES, fixed_period=SWITCH)
+@checks_arguments(StateError, stepper=STEPPER)
 def periodic_orbit(
     stepper: Stepper,
     q: ArrayLike,

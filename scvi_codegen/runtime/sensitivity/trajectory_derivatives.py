@@ -27,7 +27,7 @@ from scvi_codegen.runtime.sensitivity.gradients import (
 from scvi_codegen.runtime.sensitivity.hessians import checked_function, second_order_adjoints
 from scvi_codegen.runtime.sensitivity.step_derivatives import Sensitivity
 from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
-from scvi_codegen.validation import SWITCH, checked_count, checks_arguments
+from scvi_codegen.validation import checked_count, checks_arguments
 
 COEFFICIENTS = 4
 """Number of coefficients of a piece of an input; its fifth parameter is the reference time, which is held fixed."""
@@ -201,7 +201,7 @@ class TrajectoryDerivatives(SavedStates):
             raise StateError("deviations require a run of at least one step")
         return along(self, InitialTangents.checked(self.stepper, count, directions))
 
-    @checks_arguments(StateError, history=SWITCH)
+    @checks_arguments(StateError)
     def lyapunov_exponents(self, *, history: bool = False) -> Array:
         """Return the (2m,) finite-time Lyapunov exponents of the run, descending; raises as :meth:`chaos_indicators`.
 

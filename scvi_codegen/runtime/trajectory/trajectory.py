@@ -32,7 +32,7 @@ from scvi_codegen.runtime.trajectory.joining import Number, concatenated, joined
 from scvi_codegen.runtime.trajectory.quantities import quantities
 from scvi_codegen.runtime.trajectory.saved_states import Array, checked_row, checked_rows
 from scvi_codegen.runtime.trajectory.work_and_impulses import work_and_impulses_until
-from scvi_codegen.validation import MAPPING, PATH, checks_arguments
+from scvi_codegen.validation import checks_arguments
 
 if TYPE_CHECKING:
     import pandas
@@ -385,7 +385,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
 
         return animate(self, path, seconds=seconds, positions=positions)
 
-    @checks_arguments(path=PATH, units=MAPPING)
+    @checks_arguments()
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
         """Write ``.npz``, ``.csv``, ``.h5`` (or ``.nc``) or ``.zarr``, atomically.
 
