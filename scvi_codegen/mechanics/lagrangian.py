@@ -300,6 +300,11 @@ class LagrangianSystem(MechanicalSystem):
         Like :meth:`from_kanes_method`, but with the potential energies of its bodies, unless its equations were formed
         by Kane's method, which does not use them.
 
+        A spherical joint becomes a rotation ``R_JOINT`` of the child's frame in the parent's, with the angular velocity
+        ``omega_JOINT`` in the child's frame, unless loads, constraints or energies contain its angles. A rigid body
+        that is not connected to the inertial frame has the position ``x_BODY``, ``y_BODY``, ``z_BODY`` of its mass
+        center, the rotation ``R_BODY`` and the angular velocity ``omega_BODY``.
+
         Args:
             system: its equations need not have been formed.
             name, parameters, inputs: see :meth:`from_kanes_method`.

@@ -6,7 +6,10 @@ v(q, q_dot, t) linear in the rates and T = sum m v.v/2 they are
     d/dt T_v - T_q = f + N,        N_i = sum m v . (d/dt dv/dq_dot_i - dv/dq_i).
 
 N is zero if velocities are the rates of positions. If velocity constraints are built into them, as for a rolling
-wheel, it is not: N then contains the gyroscopic forces of Chaplygin's equations, which do no work.
+wheel, it is not: N then contains the gyroscopic forces of Chaplygin's equations, which do no work. Of a rotation
+R_dot = R hat(w), with the derivatives X_k about its axes in place of d/dq_i, N contains the commutators of the axes,
+
+    N_k = sum m v . (d/dt dv/dw_k - X_k v - (dv/dw x w)_k).
 
 Sources: T. R. Kane, D. A. Levinson, *Dynamics* (1985), chapters 2 to 6; Ju. I. Neimark, N. A. Fufaev, *Dynamics of
 Nonholonomic Systems* (1972), chapter III.
@@ -33,6 +36,7 @@ from sympy.integrals.manualintegrate import manualintegrate
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.expressions import Tape, jacobian, unsupported_part
+from scvi_codegen.formulas.rotations.names import RotationNames
 from scvi_codegen.mechanics.multibody.variables import Variables
 from scvi_codegen.tables.precision import mp
 
@@ -180,18 +184,24 @@ def kinetic_energy(motions: Iterable[BodyMotion]) -> Expr:
 
 
 def gyroscopic_forces(motions: Iterable[BodyMotion], variables: Variables) -> tuple[Expr, ...]:
-    """Return N, m expressions; exact zeros where it is zero, that is, unless constraints are built into velocities."""
-    terms: list[list[Expr]] = [[] for _ in variables.x]
+    """Return N, one expression for each rate; exact zeros unless constraints are built into velocities."""
+    terms: list[list[Expr]] = [[] for _ in variables.rates]
     for motion in motions:
         for i, excess in _excess(motion, variables).items():
             terms[i] += [p * e for p, e in zip(motion.momentum, excess, strict=True)]
     forces = tuple(sympy.Add(*row) for row in terms)
-    return tuple(sympy.S.Zero for _ in forces) if are_zero(forces) else forces
+    in_coordinates = RotationNames(variables.rotations).in_coordinates  # matrices of quaternions are orthogonal
+    return tuple(sympy.S.Zero for _ in forces) if are_zero(map(in_coordinates, forces)) else forces
 
 
 def _excess(motion: BodyMotion, variables: Variables) -> dict[int, tuple[Expr, ...]]:
     """Return d/dt dw/dq_dot_i - dw/dq_i by coordinate, minus dw/dq_dot_i x W if the axes rotate with W."""
-    partial, pulls = jacobian(motion.rates, variables.v), jacobian(motion.rates, variables.x)
+    partial, pulls = jacobian(motion.rates, variables.rates), variables.pulls(motion.rates)
+    for k in range(len(variables.x), len(variables.rates), 3):  # commutators of the axes of rotations
+        w = Matrix(variables.rates[k : k + 3])
+        for a in range(3):
+            across = Matrix([partial.get((a, k + axis), 0) for axis in range(3)]).cross(w)
+            pulls |= {(a, k + axis): pulls.get((a, k + axis), sympy.S.Zero) + c for axis, c in enumerate(across)}
     result = {}
     for i in {column for _, column in (*partial, *pulls)}:
         partials = [partial.get((a, i), sympy.S.Zero) for a in range(3)]
@@ -201,18 +211,47 @@ def _excess(motion: BodyMotion, variables: Variables) -> dict[int, tuple[Expr, .
     return result
 
 
-def load_forces(loads: Iterable[Any], frame: ReferenceFrame, variables: Variables) -> tuple[Expr, ...]:
+def load_forces(
+    loads: Iterable[Any], frame: ReferenceFrame, variables: Variables, origin: Any = None
+) -> tuple[Expr, ...]:
     """Return the generalised forces of loads, f_i = sum F . dv/dq_dot_i over points; of torques over frames.
+
+    With rotations, forces at points r(q, R) whose velocities are the rates of r act on coordinates and on the entries
+    of rotations, F . dr/dR, which have a potential more often than torques.
 
     Args:
         loads: pairs of a point and a force, or of a frame and a torque.
         frame: the inertial frame.
         variables: converts expressions to plain symbols.
+        origin: point at rest, from which positions are measured.
+
+    Returns:
+        Forces on the rates, and on the entries of rotations.
     """
-    terms: list[list[Expr]] = [[] for _ in variables.x]
+    m, n = len(variables.x), len(variables.rates)
+    terms: list[list[Expr]] = [[] for _ in range(n + len(variables.entries))]
     for point, vector in loads:
         velocity = point.vel(frame) if hasattr(point, "vel") else point.ang_vel_in(frame)
         force = [variables.read(component) for component in vector.to_matrix(frame)]
-        for (a, i), derivative in jacobian(_components(point, velocity, frame, variables), variables.v).items():
+        rates = _components(point, velocity, frame, variables)
+        position = _position(point, rates, frame, variables, origin)
+        if position is None:
+            arms = jacobian(rates, variables.rates)
+        else:
+            along = jacobian(position, (*variables.x, *variables.entries))
+            arms = {(a, i if i < m else i - m + n): derivative for (a, i), derivative in along.items()}
+        for (a, i), derivative in arms.items():
             terms[i].append(force[a] * derivative)
     return tuple(sympy.Add(*row) for row in terms)
+
+
+def _position(
+    point: Any, rates: Sequence[Expr], frame: ReferenceFrame, variables: Variables, origin: Any
+) -> list[Expr] | None:
+    """Return the position of a point in a system with rotations; ``None`` if its velocity is not the rate of it."""
+    if not variables.rotations or not hasattr(point, "vel"):
+        return None
+    position = [variables.read(component) for component in point.pos_from(origin).to_matrix(frame)]
+    in_coordinates = RotationNames(variables.rotations).in_coordinates
+    excess = (in_coordinates(variables.rate(r) - v) for r, v in zip(position, rates, strict=True))
+    return position if are_zero(excess) else None

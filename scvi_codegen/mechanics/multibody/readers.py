@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import sympy
 from sympy import Expr, Symbol
-from sympy.physics.mechanics import KanesMethod, dynamicsymbols
+from sympy.physics.mechanics import KanesMethod, LinearSpring, dynamicsymbols
 
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.rotations.members import Rotation
 from scvi_codegen.mechanics.multibody.kinetics import (
     gyroscopic_forces,
     kinetic_energy,
@@ -19,6 +20,7 @@ from scvi_codegen.mechanics.multibody.kinetics import (
     motions_of,
     potential_of,
 )
+from scvi_codegen.mechanics.multibody.turning import with_rotations
 from scvi_codegen.mechanics.multibody.variables import Variables, independent_of, solved_for_speeds
 
 if TYPE_CHECKING:
@@ -40,6 +42,8 @@ class Multibody:
         potential: total potential energy of the bodies.
         configuration: expressions in q and t that are 0.
         velocity: expressions in q, dq/dt, u and t that are 0, with or without the rates of ``configuration``.
+        rotations: rotations of frames; their entries and rates are symbols in the formulas of frames.
+        origin: point at rest in the inertial frame, required with rotations.
     """
 
     frame: ReferenceFrame
@@ -53,6 +57,8 @@ class Multibody:
     potential: Expr = sympy.S.Zero
     configuration: tuple[Expr, ...]
     velocity: tuple[Expr, ...]
+    rotations: tuple[Rotation, ...] = ()
+    origin: Any = None
 
     def formulas(self) -> Mapping[str, Any]:
         """Return arguments of :meth:`LagrangianSystem.from_sympy`: lagrangian, coordinates, forces and constraints.
@@ -61,7 +67,7 @@ class Multibody:
             SystemDefinitionError: if SymPy does not know a velocity, speeds are not a combination of the rates of the
                 coordinates, or masses depend on coordinates.
         """
-        variables = Variables(self.coordinates, self.time, self.speeds, self.auxiliary)
+        variables = Variables(self.coordinates, self.time, self.speeds, self.auxiliary, self.rotations)
         equations = (
             [row for row in map(variables.read, self.kinematics) if row.has(*variables.u)] if variables.u else []
         )
@@ -78,10 +84,15 @@ class Multibody:
         variables.substitute_speeds(solved_for_speeds(equations, variables))
         energy, forces = self._dynamics(variables)
         write = variables.write
+        torques = {
+            each.name: list(map(write, forces[len(variables.x) + 3 * k :][:3])) for k, each in enumerate(self.rotations)
+        }
         return {
             "lagrangian": write(energy) - self.potential,
             "coordinates": list(self.coordinates),
-            "forces": {q: write(f) for q, f in zip(self.coordinates, forces, strict=True) if f != 0},
+            "rotations": {each.name: each.rate for each in self.rotations},
+            "torques": {name: torque for name, torque in torques.items() if any(torque)},
+            "forces": {q: write(f) for q, f in zip(self.coordinates, forces, strict=False) if f != 0},
             "constraints": [*self.configuration, *(write(variables.read(each)) for each in rolling)],
         }
 
@@ -103,7 +114,7 @@ class Multibody:
         """Return T - V, with the potential of conservative loads, and all other forces."""
         try:
             motions = motions_of(self.bodies, self.frame, variables)
-            groups = [load_forces(group, self.frame, variables) for group in self.loads]
+            groups = [load_forces(group, self.frame, variables, self.origin) for group in self.loads]
         except (ValueError, TypeError) as error:
             reason = " ".join(str(error).split())
             raise SystemDefinitionError(
@@ -115,7 +126,7 @@ class Multibody:
             )
         potential, forces = _split(groups, variables)
         beyond = gyroscopic_forces(motions, variables)
-        return kinetic_energy(motions) - potential, tuple(map(sympy.Add, forces, beyond))
+        return kinetic_energy(motions) - potential, tuple(map(sympy.Add, variables.projected(forces), beyond))
 
 
 def _split(groups: Sequence[Sequence[Expr]], variables: Variables) -> tuple[Expr, tuple[Expr, ...]]:
@@ -124,13 +135,21 @@ def _split(groups: Sequence[Sequence[Expr]], variables: Variables) -> tuple[Expr
     parts = [[sympy.expand_mul(f).as_independent(*changing, as_Add=True) for f in group] for group in groups]
     static = [[part[0] for part in group] for group in parts]
     varying = [[part[1] for part in group] for group in parts]
-    size = len(variables.x)
-    whole = potential_of(_sum(static, size), variables.x)
+    size = len(variables.rates) + len(variables.entries)
+    whole = _potential_of(_sum(static, size), variables)
     if whole is not None:
         return whole, _sum(varying, size)
-    potentials = [potential_of(group, variables.x) for group in static]
+    potentials = [_potential_of(group, variables) for group in static]
     rest = [group for group, potential in zip(static, potentials, strict=True) if potential is None]
     return sympy.Add(*(potential for potential in potentials if potential is not None)), _sum([*rest, *varying], size)
+
+
+def _potential_of(forces: Sequence[Expr], variables: Variables) -> Expr | None:
+    """Return the potential of forces on coordinates and on entries of rotations; ``None`` if others act, or without."""
+    places = [*range(len(variables.x)), *range(len(variables.rates), len(forces))]
+    if any(forces[len(variables.x) : len(variables.rates)]):
+        return None
+    return potential_of([forces[i] for i in places], (*variables.x, *variables.entries))
 
 
 def _sum(rows: Iterable[Sequence[Expr]], size: int) -> tuple[Expr, ...]:
@@ -191,9 +210,14 @@ def of_kanes_method(method: KanesMethod) -> Multibody:
 def of_system(system: System) -> Multibody:
     """Return the bodies, joints, loads and actuators of a ``System``, whether or not its equations were formed.
 
-    Potential energies of bodies are included unless its equations were formed by Kane's method, which omits them.
+    Spherical joints and free bodies become rotations (:mod:`scvi_codegen.mechanics.multibody.turning`). Potential
+    energies of bodies are included unless its equations were formed by Kane's method, which omits them.
     """
-    groups = [tuple(actuator.to_loads()) for actuator in system.actuators]
+    by_kane = isinstance(system.eom_method, KanesMethod)
+    system, rotations = with_rotations(system)
+    springs = [each for each in system.actuators if rotations and isinstance(each, LinearSpring)]
+    groups = [tuple(each.to_loads()) for each in system.actuators if each not in springs]
+    energies = () if by_kane else (body.potential_energy for body in system.bodies)
     return Multibody(
         frame=system.frame,
         time=dynamicsymbols._t,
@@ -203,13 +227,13 @@ def of_system(system: System) -> Multibody:
         auxiliary=tuple(system.u_aux),
         bodies=tuple(system.bodies),
         loads=(*groups, *((load,) for load in system.loads)),
-        potential=_potential(system),
+        potential=sympy.Add(*energies, *map(_energy_of_spring, springs)),
         configuration=tuple(system.holonomic_constraints),
         velocity=tuple(system.velocity_constraints),
+        rotations=rotations,
+        origin=system.fixed_point,
     )
 
 
-def _potential(system: System) -> Expr:
-    if isinstance(system.eom_method, KanesMethod):
-        return sympy.S.Zero
-    return sympy.Add(*(body.potential_energy for body in system.bodies))
+def _energy_of_spring(spring: LinearSpring) -> Expr:
+    return spring.stiffness * (spring.pathway.length - spring.equilibrium_length) ** 2 / 2

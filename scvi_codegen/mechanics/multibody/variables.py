@@ -18,7 +18,9 @@ from sympy.matrices.exceptions import NonInvertibleMatrixError
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.expressions import Tape, evaluated, gradient, jacobian, unsupported_part
+from scvi_codegen.formulas.rotations.members import Rotation
 from scvi_codegen.mechanics.derived_expressions import row_rank
+from scvi_codegen.mechanics.rotations.points import torque_of
 from scvi_codegen.tables.precision import mp
 
 
@@ -30,15 +32,23 @@ class Variables:
         time: their argument.
         speeds: generalised speeds; one that equals a dq/dt gets no symbol of its own.
         auxiliary: auxiliary speeds, which are 0.
+        rotations: rotations, whose entries and rates are symbols.
 
     Attributes:
         x, v: symbols of coordinates and velocities, m each.
+        entries: entries of the matrices of rotations.
+        rates: velocities and, of each rotation, the components of its angular velocity.
         u: symbols of the generalised speeds.
         time: symbol of time.
     """
 
     def __init__(
-        self, coordinates: Sequence[Expr], time: Symbol, speeds: Sequence[Expr] = (), auxiliary: Sequence[Expr] = ()
+        self,
+        coordinates: Sequence[Expr],
+        time: Symbol,
+        speeds: Sequence[Expr] = (),
+        auxiliary: Sequence[Expr] = (),
+        rotations: Sequence[Rotation] = (),
     ) -> None:
         rates = [q.diff(time) for q in coordinates]
         independent = [u for u in speeds if u not in rates]
@@ -50,6 +60,9 @@ class Variables:
         self._own = len(self._written)
         self._plain: dict[Expr, Expr] = {function: symbol for symbol, function in self._written.items()}
         self._plain |= dict.fromkeys(auxiliary, sympy.S.Zero)
+        self.rotations = tuple(rotations)
+        self.entries = tuple(entry for each in rotations for entry in each.entries)
+        self.rates = (*self.v, *(rate for each in rotations for rate in each.rates))
 
     @property
     def other_functions(self) -> tuple[Symbol, ...]:
@@ -74,10 +87,30 @@ class Variables:
         return expression.xreplace(self._written)
 
     def rate(self, function: Expr) -> Expr:
-        """Return d/dt of a function of coordinates and time."""
-        flow = dict(zip(self.x, self.v, strict=True)) | {self.time: sympy.S.One}
-        along = tuple(flow)
-        return sympy.Add(*(derivative * flow[along[j]] for j, derivative in gradient(function, along).items()))
+        """Return d/dt of a function of coordinates, rotations and time."""
+        terms = (derivative * self.rates[j] for (_, j), derivative in self.pulls([function]).items())
+        return sympy.Add(*terms, *gradient(function, (self.time,)).values())
+
+    def pulls(self, functions: Sequence[Expr]) -> dict[tuple[int, int], Expr]:
+        """Return the derivatives with respect to coordinates, and about the axes of rotations, by row and rate."""
+        along = dict(jacobian(functions, self.x))
+        turned = jacobian(functions, self.entries) if self.entries else {}
+        for row in {row for row, _ in turned}:
+            derivatives = [turned.get((row, j), sympy.S.Zero) for j in range(len(self.entries))]
+            along |= {(row, len(self.x) + k): torque for k, torque in enumerate(self._torques(derivatives))}
+        return along
+
+    def _torques(self, derivatives: Sequence[Expr]) -> list[Expr]:
+        """Return derivatives about the axes of rotations from those with respect to their entries."""
+        torques: list[Expr] = []
+        for k, each in enumerate(self.rotations):
+            torques += torque_of(Matrix(3, 3, each.entries), Matrix(3, 3, derivatives[9 * k : 9 * k + 9]))
+        return torques
+
+    def projected(self, forces: Sequence[Expr]) -> tuple[Expr, ...]:
+        """Return forces on the rates from forces on the rates and on the entries of rotations, in this order."""
+        m, n = len(self.x), len(self.rates)
+        return (*forces[:m], *map(sympy.Add, forces[m:n], self._torques(forces[n:])))
 
 
 def _symbol(function: Expr) -> Symbol:
@@ -133,7 +166,7 @@ def independent_of(known: Sequence[Expr], asked: Sequence[Expr], rates: Sequence
 def _values(expressions: Sequence[Expr], rates: Sequence[Symbol]) -> NDArray[np.float64]:
     """Return the coefficients of the rates and the remainder without rates, row by row, at a random point."""
     entries = dict(jacobian(expressions, rates))
-    resting = dict.fromkeys(rates, 0)
+    resting = dict.fromkeys(rates, sympy.S.Zero)
     entries |= {(k, len(rates)): expression.xreplace(resting) for k, expression in enumerate(expressions)}
     if problem := next(filter(None, map(unsupported_part, entries.values())), None):
         raise SystemDefinitionError(f"in the constraints: {problem}")

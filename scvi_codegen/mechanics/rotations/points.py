@@ -55,7 +55,7 @@ def forces_at_points(
                 yield each.name, Matrix([force.dot(point.diff(entry)) for entry in each.entries])
             elif isinstance(each, Rotation):
                 derivatives = Matrix(3, 3, [force.dot(point.diff(entry)) for entry in each.entries])
-                yield each.name, _torque(Matrix(3, 3, each.entries), derivatives)
+                yield each.name, torque_of(Matrix(3, 3, each.entries), derivatives)
 
 
 def _vectors(
@@ -91,7 +91,7 @@ def _three(formulas: Any, what: str, read: Callable[[Any], Expr]) -> Matrix:
     return Matrix([read(str(each)) for each in formulas])
 
 
-def _torque(matrix: Matrix, derivatives: Matrix) -> Matrix:
+def torque_of(matrix: Matrix, derivatives: Matrix) -> Matrix:
     """Return tau_k = sum_ij D_ij (R hat(e_k))_ij, with column j of R hat(e_k) = R (e_k x e_j)."""
     weights: Matrix = matrix.T * derivatives
     pairs: tuple[tuple[int, int], ...] = ((2, 1), (0, 2), (1, 0))

@@ -1,0 +1,165 @@
+"""Spherical joints and free bodies of SymPy's ``System`` are rotations: SymPy's equations in angles, and MJCF."""
+
+import numpy as np
+import pytest
+import sympy
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+from sympy.physics.mechanics import (
+    LinearPathway,
+    LinearSpring,
+    PinJoint,
+    ReferenceFrame,
+    RigidBody,
+    SphericalJoint,
+    System,
+    TorqueActuator,
+    dynamicsymbols,
+    inertia,
+)
+
+import scvi_codegen as sc
+
+ANGLES, SPEEDS = np.array([0.4, -0.3, 0.5]), np.array([0.5, 1.0, -0.8])
+
+
+def body(name, mass, *moments):
+    """Return a rigid body of numbers."""
+    made = RigidBody(name, mass=sympy.Rational(str(mass)))
+    made.central_inertia = inertia(made.frame, *(sympy.Rational(str(each)) for each in moments))
+    return made
+
+
+def arm_on_a_ball_joint():
+    """Return a body on a ball joint with tilted frames and a spring, and an arm with a damped hinge on it."""
+    wall, upper, lower = (
+        RigidBody("wall"),
+        body("upper", 1.5, 0.3, 0.2, 0.1, 0.02),
+        body("lower", 0.8, 0.05, 0.04, 0.03),
+    )
+    tilted = ReferenceFrame("tilted")
+    tilted.orient_axis(upper.frame, upper.x, sympy.Rational(1, 3))
+    ball = SphericalJoint("ball", wall, upper, child_point=upper.z / 2, child_interframe=tilted)
+    pin = PinJoint("pin", upper, lower, parent_point=-upper.z / 2, child_point=lower.z / 3, joint_axis=upper.y)
+    model = System.from_newtonian(wall)
+    model.add_joints(ball, pin)
+    model.apply_uniform_gravity(-sympy.Rational(981, 100) * wall.z)
+    hook = wall.masscenter.locatenew("hook", wall.x)
+    hook.set_vel(wall.frame, 0)
+    model.add_actuators(LinearSpring(3, LinearPathway(hook, lower.masscenter), sympy.Rational(1, 2)))
+    model.add_actuators(TorqueActuator(-pin.speeds[0] / 20, pin.parent_interframe.y, lower.frame, upper.frame))
+    return model, tilted, ball
+
+
+def in_angles(model, q, u, span):
+    """Return the final coordinates and speeds by SymPy's equations and SciPy."""
+    state = [*model.q, *model.u]
+    mass, forcing = (sympy.lambdify([state], each, cse=True) for each in (model.mass_matrix_full, model.forcing_full))
+    rates = lambda t, y: np.linalg.solve(mass(y), forcing(y)).ravel()  # noqa: E731
+    return solve_ivp(rates, (0, span), [*q, *u], method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+
+
+def test_a_spherical_joint_moves_as_in_angles():
+    model, tilted, ball = arm_on_a_ball_joint()
+    model.form_eoms()
+    q, u, span = [*ANGLES, 0.2], [*SPEEDS, 0.3], 0.8
+    end = in_angles(model, q, u, span)
+    velocity = tilted.ang_vel_in(ball.parent_interframe).to_matrix(tilted)
+    omega = sympy.lambdify([[*ball.coordinates, *ball.speeds]], velocity)([*ANGLES, *SPEEDS]).ravel()
+    system = sc.LagrangianSystem.from_system(model)
+    assert [each.name for each in system.coordinates] == ["q_pin", *(f"R_ball_{letter}" for letter in "wxyz")]
+    assert [name for name, _ in system.reduced.forces] == ["q_pin"], "the spring and the weights are a potential"
+    start = {"q_pin": 0.2, "R_ball": {"euler": "XYZ", "angles": ANGLES}}
+    stepper = sc.compile_stepper(system, "svi:5")
+    run = stepper.integrate(start, velocity={"q_pin": 0.3, "omega_ball": omega}, h=0.01, steps=80)
+    expected = Rotation.from_euler("XYZ", end[:3]).as_matrix()
+    np.testing.assert_allclose(run.rotation("R_ball")[-1], expected, atol=1e-10)
+    np.testing.assert_allclose(run.q[-1, 0], end[3], atol=1e-10)
+
+
+def test_reading_leaves_the_system_as_it_was():
+    model, _, ball = arm_on_a_ball_joint()
+    before = ball.child.masscenter.vel(model.frame), ball.child.frame.dcm(model.frame), model.q, model.kdes
+    sc.LagrangianSystem.from_system(model)
+    assert (ball.child.masscenter.vel(model.frame), ball.child.frame.dcm(model.frame), model.q, model.kdes) == before
+
+
+@pytest.mark.parametrize("kind", ["load", "constraint", "velocity"])
+def test_a_spherical_joint_whose_angles_occur_elsewhere_keeps_them(kind):
+    wall, top = RigidBody("wall"), body("top", 1, 0.3, 0.2, 0.1)
+    ball = SphericalJoint("ball", wall, top, child_point=top.z / 2)
+    model = System.from_newtonian(wall)
+    model.add_joints(ball)
+    angle, speed = ball.coordinates[1], ball.speeds[1]
+    if kind == "load":
+        model.add_loads((ball.child.frame, -angle * model.frame.y))
+    elif kind == "constraint":
+        model.add_holonomic_constraints(angle - sympy.Rational(1, 10))
+    else:
+        ball.child.masscenter.set_vel(model.frame, speed * model.frame.x)
+    system = sc.LagrangianSystem.from_system(model)
+    assert [each.name for each in system.coordinates] == ["q0_ball", "q1_ball", "q2_ball"]
+    assert not system.rotations
+
+
+MJCF = """
+<mujoco>
+  <option gravity="0 0 -9.81"/>
+  <worldbody>
+    <body name="base">
+      <freejoint/>
+      <inertial pos="0 0 0" mass="2" diaginertia="0.5 0.4 0.3"/>
+      <body name="leg" pos="0.3 0 -0.1">
+        <joint name="q_hip" axis="0 1 0" pos="0 0 0"/>
+        <inertial pos="0 0 -0.4" mass="0.7" diaginertia="0.1 0.12 0.02"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_a_body_without_joints_to_the_frame_is_free_as_in_mjcf(tmp_path):
+    ground, base, leg = RigidBody("ground"), body("base", 2, 0.5, 0.4, 0.3), body("leg", 0.7, 0.1, 0.12, 0.02)
+    parent, child = (3 * base.x - base.z) / 10, 2 * leg.z / 5
+    model = System.from_newtonian(ground)
+    model.add_bodies(leg, base)
+    model.add_joints(PinJoint("hip", base, leg, parent_point=parent, child_point=child, joint_axis=base.y))
+    model.apply_uniform_gravity(-sympy.Rational(981, 100) * ground.z)
+    (tmp_path / "leg.xml").write_text(MJCF)
+    ends = []
+    for system in (sc.LagrangianSystem.from_system(model), sc.LagrangianSystem.from_mjcf(tmp_path / "leg.xml")):
+        start = {"x_base": 0.1, "y_base": 0, "z_base": 0.5, "R_base": [0.9, 0.1, -0.3, 0.2], "q_hip": 0.4}
+        rates = {"x_base": 0.3, "y_base": -0.2, "z_base": 1.0, "omega_base": [0.5, -1, 2.0], "q_hip": -1.5}
+        run = sc.compile_stepper(system, "svi:4").integrate(start, velocity=rates, h=0.02, steps=100)
+        assert np.ptp(run.energy()) < 1e-9
+        names = [each.name for each in system.coordinates]
+        ends.append([*run.rotation()[-1].ravel(), *(run.q[-1, names.index(each)] for each in ("x_base", "q_hip"))])
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-10)
+
+
+def test_rolling_built_into_velocities_and_a_ball_joint_have_the_forces_of_kanes_equations():
+    """A sledge whose velocity is along its heading, with a body on a ball joint."""
+    heading, path, turn, speed = dynamicsymbols("heading path turn speed")
+    ground, sledge, rider = RigidBody("ground"), body("sledge", 1, 0.2, 0.2, 0.3), body("rider", 0.5, 0.1, 0.05, 0.2)
+    sledge.frame.orient_axis(ground.frame, heading, ground.z)
+    sledge.masscenter.set_vel(ground.frame, path.diff() * sledge.x)
+    model = System.from_newtonian(ground)
+    ball = SphericalJoint("ball", sledge, rider, child_point=-rider.z / 2)
+    model.add_joints(ball)
+    model.add_coordinates(heading, path)
+    model.add_speeds(turn, speed)
+    model.add_kdes(heading.diff() - turn, path.diff() - speed)
+    model.form_eoms()
+    q, u = [*ANGLES, 0.3, 0.0], [*SPEEDS, 0.7, 1.2]
+    end = in_angles(model, q, u, 0.8)
+    velocity = rider.frame.ang_vel_in(sledge.frame).to_matrix(rider.frame)
+    omega = sympy.lambdify([[*ball.coordinates, *ball.speeds]], velocity)([*ANGLES, *SPEEDS]).ravel()
+    system = sc.LagrangianSystem.from_system(model)
+    assert any(name == "R_ball" for name, _ in system.reduced.forces)
+    start = {"heading": 0.3, "path": 0, "R_ball": {"euler": "XYZ", "angles": ANGLES}}
+    rates = {"heading": 0.7, "path": 1.2, "omega_ball": omega}
+    run = sc.compile_stepper(system, "svi:5").integrate(start, velocity=rates, h=0.01, steps=80)
+    expected = Rotation.from_euler("XYZ", end[:3]).as_matrix()
+    np.testing.assert_allclose(run.rotation("R_ball")[-1], expected, atol=1e-10)
+    np.testing.assert_allclose(run.q[-1, :2], end[3:5], atol=1e-10)
