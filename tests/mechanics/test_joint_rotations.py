@@ -77,7 +77,7 @@ def test_a_spherical_joint_moves_as_in_angles():
     np.testing.assert_allclose(run.q[-1, 0], end[3], atol=1e-10)
 
 
-def test_reading_leaves_the_system_as_it_was():
+def test_reading_does_not_change_the_system():
     model, _, ball = arm_on_a_ball_joint()
     before = ball.child.masscenter.vel(model.frame), ball.child.frame.dcm(model.frame), model.q, model.kdes
     sc.LagrangianSystem.from_system(model)
@@ -85,7 +85,7 @@ def test_reading_leaves_the_system_as_it_was():
 
 
 @pytest.mark.parametrize("kind", ["load", "constraint", "velocity"])
-def test_a_spherical_joint_whose_angles_occur_elsewhere_keeps_them(kind):
+def test_a_spherical_joint_whose_angles_occur_elsewhere_is_not_replaced(kind):
     wall, top = RigidBody("wall"), body("top", 1, 0.3, 0.2, 0.1)
     ball = SphericalJoint("ball", wall, top, child_point=top.z / 2)
     model = System.from_newtonian(wall)
