@@ -212,7 +212,7 @@ def _equations(
 ) -> StageEquations:
     """Return the stage equations; ``newton``: with the stage groups, ``curve``: with the error estimate."""
     m, sites = system.dimension, layout_of(stages, system.dimension)
-    blocks, rows = [stages.blocks[b] for b in sites.columns[m]], [stages.rows[r] for r in sites.rows[m]]
+    blocks, rows = [stages.blocks[b] for b in sites.columns[None]], [stages.rows[r] for r in sites.rows[None]]
     stage_groups = tuple(lowered_stage_group(system, group, sites) for group in stages.stage_groups) if newton else ()
     coupled = [*forms_of(system).legendre_jacobian, *_coupled_coordinates(stage_groups)]
     order = bandwidth_ordering(coupled, sites.count)
@@ -224,7 +224,7 @@ def _equations(
         mass_positions=tuple(sorted(range(m), key=order.__getitem__).index(i) for i in range(m)),
         bandwidth=bandwidth(coupled, order),
         momentum_rows=lower_vector(tuple(row.momentum for row in rows)),
-        end_position=lower_vector(stages.end_position.columns([b + 1 for b in sites.columns[m]]).entries[0]),
+        end_position=lower_vector(stages.end_position.columns([b + 1 for b in sites.columns[None]]).entries[0]),
         straight=tuple(int(block.straight[1]) for block in blocks),
         momentum_blocks=tuple(block.momentum for block in blocks),
         moving_blocks=tuple(int(block.moves) for block in blocks),

@@ -28,7 +28,7 @@ from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, cu
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.symmetry.symmetry import work_rates
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.stage_system import Gather, StageGroup, StageSystem
+from scvi_codegen.methods.stage_system import Gather, Scatter, StageGroup, StageSystem, Table
 from scvi_codegen.tables.precision import mp
 
 
@@ -130,19 +130,26 @@ def comment_text(text: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class UnknownLayout:
-    """Groups of blocks of the same size, each at as many sites: first those with m components, at the coordinates.
+    """Groups of blocks of the same size, each at as many sites: first those at the coordinates, of size ``None``.
 
     Attributes:
+        dimension: number of coordinates.
         first: the first site, by size.
         columns: the indices of the B blocks, by size.
         rows: the indices of the B rows, by size.
         count: number of sites.
     """
 
-    first: dict[int, int]
-    columns: dict[int, tuple[int, ...]]
-    rows: dict[int, tuple[int, ...]]
+    dimension: int
+    first: dict[int | None, int]
+    columns: dict[int | None, tuple[int, ...]]
+    rows: dict[int | None, tuple[int, ...]]
     count: int
+
+    def size(self, count: int, table: Table, members: dict[int | None, tuple[int, ...]], first: int = 0) -> int | None:
+        """Return the size of the ``members`` in a table of ``count`` components: multipliers may be as many as m."""
+        used = any(line[k + first] for line in table.entries for k in members.get(count, ()))
+        return count if used or count != self.dimension else None
 
 
 def layout_of(stages: StageSystem, dimension: int) -> UnknownLayout:
@@ -151,20 +158,32 @@ def layout_of(stages: StageSystem, dimension: int) -> UnknownLayout:
     Raises:
         MethodError: unless there are as many blocks as rows, and equally many, of every size.
     """
-    blocks, rows = stages.block_sizes(dimension), stages.row_sizes(dimension)[:-1]
-    sizes = [dimension, *sorted({*blocks, *rows} - {dimension})]
+    blocks, rows = [block.size for block in stages.blocks], [row.size for row in stages.rows]
+    sizes = [None, *sorted({size for size in (*blocks, *rows) if size is not None})]
+    numbers = [dimension if size is None else size for size in sizes]
     columns, lines = ({size: _indices_of_size(size, each) for size in sizes} for each in (blocks, rows))
     if len({len(places) for group in (columns, lines) for places in group.values()}) > 1:
-        counts = ", ".join(f"{len(columns[size])} blocks and {len(lines[size])} rows of {size}" for size in sizes)
+        counts = ", ".join(
+            f"{len(columns[size])} blocks and {len(lines[size])} rows of {number}"
+            for size, number in zip(sizes, numbers, strict=True)
+        )
         raise MethodError(
             "stage equations must have as many blocks as rows of every size, and equally many of all "
             f"sizes; got {counts}"
         )
-    first = {size: sum(sizes[:k]) for k, size in enumerate(sizes)}
-    return UnknownLayout(first, columns, lines, sum(sizes))
+    first = {size: sum(numbers[:k]) for k, size in enumerate(sizes)}
+    return UnknownLayout(dimension, first, columns, lines, sum(numbers))
 
 
-def _indices_of_size(size: int, sizes: Sequence[int]) -> tuple[int, ...]:
+def _block_size(gather: Gather, sites: UnknownLayout) -> int | None:
+    return sites.size(len(gather.arguments), gather.table, sites.columns, 1)
+
+
+def _row_size(scatter: Scatter, sites: UnknownLayout) -> int | None:
+    return sites.size(len(scatter.results), scatter.table, sites.rows)
+
+
+def _indices_of_size(size: int | None, sizes: Sequence[int | None]) -> tuple[int, ...]:
     return tuple(place for place, each in enumerate(sizes) if each == size)
 
 
@@ -313,7 +332,7 @@ def _derivative_blocks(
             rows, columns = range(top, top + len(scatter.results)), range(left, left + len(gather.arguments))
             found = [(i - top, j - left) for i, j in entries if i in rows and j in columns]
             if found:
-                row, column = sites.first[len(scatter.results)], sites.first[len(gather.arguments)]
+                row, column = sites.first[_row_size(scatter, sites)], sites.first[_block_size(gather, sites)]
                 pairs = tuple((row + i, column + j) for i, j in found)
                 blocks.append(DerivativeBlock(scatter=s, gather=g, first=len(partials), entries=pairs))
                 partials.extend(entries[top + i, left + j] for i, j in found)
@@ -353,11 +372,11 @@ def _check_symmetry(group: StageGroup, entries: Mapping[tuple[int, int], sympy.E
 
 def _gather_loop(group: StageGroup, index: int, sites: UnknownLayout) -> GatherLoop:
     gather = group.gathers[index]
-    size = len(gather.arguments)
+    size = _block_size(gather, sites)
     return GatherLoop(
         name=f"{group.name}_gather_{index}",
         first=sites.first[size],
-        sites=size,
+        sites=len(gather.arguments),
         offset=sum(len(other.arguments) for other in group.gathers[:index]),
         from_state=bool(gather.table.entries[0][0]),
         power=gather.power + 1,
@@ -367,11 +386,11 @@ def _gather_loop(group: StageGroup, index: int, sites: UnknownLayout) -> GatherL
 
 def _scatter_loop(group: StageGroup, index: int, sites: UnknownLayout) -> ScatterLoop:
     scatter = group.scatters[index]
-    size = len(scatter.results)
+    size = _row_size(scatter, sites)
     return ScatterLoop(
         name=f"{group.name}_scatter_{index}",
         first=sites.first[size],
-        sites=size,
+        sites=len(scatter.results),
         offset=sum(len(other.results) for other in group.scatters[:index]),
         power=scatter.power,
         table=lower_matrix(scatter.table.columns([*sites.rows[size], -1]).entries),

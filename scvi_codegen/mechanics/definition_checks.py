@@ -238,13 +238,11 @@ def _check_constraints(system: MechanicalSystem) -> None:
             f"the constraint '{name}' is not linear in the velocity {system.velocities[i]}: "
             "constraints must have the form g(q, t) = 0, or A(q, t) v + b(q, t) = 0"
         )
-    if len(names) >= system.dimension:
+    if len(names) > system.dimension:
         raise SystemDefinitionError(
-            f"{len(names)} constraints on {system.dimension} coordinates of '{system.name}' leave no degree of "
-            "freedom: the constraints alone determine the motion (a fully driven or overconstrained mechanism), and "
-            "there is nothing to integrate. Fewer independent constraints than coordinates are required. Leave out "
-            "redundant constraints; of a driven joint, replace the prescribed motion by a force or torque (an input "
-            "can carry it)"
+            f"there are {len(names)} constraints, but only {system.dimension} coordinates of '{system.name}': the "
+            "mechanism is overconstrained. At most as many independent constraints as coordinates are required "
+            "(as many prescribe the motion). Leave out redundant constraints"
         )
     if dependent := _dependent(system):
         raise SystemDefinitionError(

@@ -102,13 +102,14 @@ def check_regular(method: Method, system: MechanicalSystem) -> None:
 
 
 def is_symplectic(method: Method, system: MechanicalSystem) -> bool:
-    """Return whether the steps preserve dq ^ dp: not with forces, damping or nonholonomic constraints."""
+    """Return whether the steps preserve dq ^ dp: not with forces, damping, rolling or prescribed motion."""
     return system.damping == 0 and is_conformally_symplectic(method, system)
 
 
 def is_conformally_symplectic(method: Method, system: MechanicalSystem) -> bool:
     """Return whether the steps multiply dq ^ dp by exp(-gamma h), where gamma is the damping rate."""
-    return method.symplectic and not system.forces and not any(nonholonomic_expressions(system))
+    prescribed = len(system.constraints) == system.dimension
+    return method.symplectic and not (system.forces or prescribed or any(nonholonomic_expressions(system)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

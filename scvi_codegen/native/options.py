@@ -100,8 +100,9 @@ def step_failure(
     *,
     step: int,
     h: float,
+    remark: str = "",
 ) -> StepFailedError:
-    """Return the exception for a failed step: number, time, step size (0: adaptive), cause and remedy.
+    """Return the exception for a failed step: number, time, step size (0: adaptive), cause, remedy and a remark.
 
     The report may have messages of its own, ``failures``.
     """
@@ -110,5 +111,5 @@ def step_failure(
     what, remedy = getattr(report, "failures", FAILURES)[word]
     if word == NOT_CONVERGED:
         what += f" (last update {report.change:.3g}; {report.iterations} iterations in this call)"
-    message = f"step {step} at t = {report.t:.17g}{length} failed: {what}. {remedy}"
+    message = f"step {step} at t = {report.t:.17g}{length} failed: {what}. {remedy}{remark}"
     return StepFailedError(message, status=word, step=step, t=report.t, residual=report.change)

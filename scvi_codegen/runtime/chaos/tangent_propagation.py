@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.chaos.growth import Growth, ill_conditioned, r_factors
@@ -62,6 +62,11 @@ class InitialTangents:
     def checked(cls, stepper: Integrator, count: int | None, directions: ArrayLike | None) -> InitialTangents:
         """Construct from user arguments; raise :class:`StateError` for invalid numbers or directions."""
         size = 2 * stepper.dimension
+        if len(stepper.interface.constraints) == stepper.dimension:
+            raise MethodError(
+                f"'{stepper.interface.system}' has no tangent vectors: its constraints prescribe the motion. Leave out "
+                "a constraint, or use jacobian for derivatives by parameters"
+            )
         reduction = Reduction(stepper.interface) if stepper.interface.rotations else None
         if directions is None:
             most = reduction.size if reduction else size

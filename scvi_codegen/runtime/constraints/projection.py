@@ -11,7 +11,7 @@ from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, warn
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import REASONS, STATUS
 from scvi_codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
-from scvi_codegen.runtime.constraints.rank import Jacobian, rank_deficiency
+from scvi_codegen.runtime.constraints.rank import Jacobian, nearly_dependent, rank_deficiency
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import (
     Array,
@@ -156,6 +156,13 @@ def _dependent(stepper: Integrator, q: Array, t: float, parameters: Parameters, 
     if stepper.interface.layout.coordinates and max(stepper.dimension, len(stepper.constraints)) > MOST_DENSE:
         return ""
     return rank_deficiency(stepper.constraints, q, _linearised(stepper, t, parameters), nearest=nearest)
+
+
+def singular_position(stepper: Integrator, q: Array, t: float, parameters: Array) -> str:
+    """Return a remark on a failed step from positions where the constraints are nearly dependent, or ""."""
+    if not stepper.constraints or max(stepper.dimension, len(stepper.constraints)) > MOST_DENSE:
+        return ""
+    return nearly_dependent(_linearised(stepper, t, parameters)(q)[1])
 
 
 def _linearised(stepper: Integrator, t: float, parameters: Parameters) -> Jacobian:

@@ -17,6 +17,8 @@ from scvi_codegen.runtime.core.validation import Array
 
 DEPENDENT = 1e-9
 """Smallest singular value of G, with rows of length 1, below which rows count as linearly dependent."""
+NEARLY_DEPENDENT = 0.15
+"""The same for constraints at a state from which a step fails."""
 NAMED_SHARE = 1e-6
 """Entries of a null vector above this fraction of 1 mark the constraints that are dependent."""
 CONTRADICTED = 1e-7
@@ -27,13 +29,29 @@ Jacobian: TypeAlias = Callable[[Array], tuple[Array, Array]]
 """Values g and Jacobian G of the constraints at positions."""
 
 
+def _unit_rows(jacobian: Array) -> Array:
+    sizes = np.linalg.norm(jacobian, axis=1, keepdims=True)
+    return jacobian / np.where(sizes > 0.0, sizes, 1.0)
+
+
 def dependence(jacobian: Array) -> tuple[int, NDArray[np.intp]]:
     """Return the rank of (c, m) rows, and the (k,) indices of those that depend on each other."""
-    sizes = np.linalg.norm(jacobian, axis=1, keepdims=True)
-    left, values, _ = np.linalg.svd(jacobian / np.where(sizes > 0.0, sizes, 1.0))
+    left, values, _ = np.linalg.svd(_unit_rows(jacobian))
     null = left[:, np.append(values, np.zeros(len(left) - len(values))) <= DEPENDENT]
     shares = np.abs(null).max(axis=1, initial=0.0)
     return len(left) - null.shape[1], np.flatnonzero(shares > NAMED_SHARE)
+
+
+def nearly_dependent(jacobian: Array) -> str:
+    """Return a remark with the rank that a nearly singular Jacobian loses, or ""."""
+    values = np.linalg.svd(_unit_rows(jacobian), compute_uv=False) if np.isfinite(jacobian).all() else np.ones(1)
+    if values[-1] > NEARLY_DEPENDENT:
+        return ""
+    return (
+        f". The Jacobian of the constraints is nearly singular there (smallest singular value {values[-1]:.2g} with "
+        f"rows of length 1; rank {np.count_nonzero(values > NEARLY_DEPENDENT)} of {len(values)} where it is 0), as at "
+        "a dead point of a mechanism: end the run before it, or prescribe the motion of another coordinate"
+    )
 
 
 def rank_deficiency(names: Sequence[str], q: Array, at: Jacobian, *, nearest: bool = False) -> str:

@@ -8,11 +8,11 @@ from typing import Any, Self
 
 import numpy as np
 
-from scvi_codegen.errors import StateError
+from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, checked_options, step_failure
-from scvi_codegen.runtime.constraints.projection import check_reachable
+from scvi_codegen.runtime.constraints.projection import check_reachable, singular_position
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import (
     Array,
@@ -331,10 +331,15 @@ class Memory(OneThread):
         finally:
             self._lock.release()
 
+    def _failure(self, status: int) -> StepFailedError:
+        """Return the exception for a failed step of the run."""
+        remark = singular_position(self.stepper, self._q, self.t, self._parameters)
+        return step_failure(status, self._report, step=self.steps, h=self.h, remark=remark)
+
     def _taken(self, steps: int) -> int:
         """Take steps in one C call and return their number."""
         if status := self._advance(steps, NO_OUTPUT, self._discarded):
-            raise step_failure(status, self._report, step=self.steps, h=self.h)
+            raise self._failure(status)
         taken: int = self._report.steps
         return taken
 
@@ -343,7 +348,7 @@ class Memory(OneThread):
         t, pointer = np.empty(steps), self.stepper.binding.pointer
         arrays = (pointer(t), pointer(q), pointer(p), pointer(np.empty(steps, dtype=np.int32)))
         if status := self._advance(steps, 1, arrays):
-            raise step_failure(status, self._report, step=self.steps, h=self.h)
+            raise self._failure(status)
         return t
 
     def _run_to_target(self) -> None:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.native.arguments import empty_array
-from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.core.validation import BINARY64, FEW, Array
 from scvi_codegen.runtime.events.event import Crossings
 from scvi_codegen.runtime.run.chunks import drive
@@ -196,7 +195,7 @@ class _StateRecorder:
     def check(self, status: int) -> None:
         """Raise :class:`StepFailedError` for the status of a failed step."""
         if status:
-            raise step_failure(status, self.memory._report, step=self.memory.steps, h=self.memory.h)
+            raise self.memory._failure(status)
 
     def _states(self) -> States:
         """Return the rows in use; copies if most are not, or if the run uses the memory again."""
