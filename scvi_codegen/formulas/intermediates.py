@@ -12,6 +12,7 @@ symbols and replacements of an intermediate quantity are therefore computed once
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from itertools import count
 from typing import Any
 from weakref import WeakValueDictionary
@@ -111,6 +112,39 @@ def intermediate(expression: Expr) -> Expr:
     """
     rest = expression.as_coeff_Mul()[1]
     return expression if rest.is_Atom or isinstance(rest, Intermediate) else Intermediate(expression)
+
+
+def separated(expressions: Sequence[Expr], variables: Collection[Symbol]) -> tuple[list[Expr], dict[Expr, Symbol]]:
+    """Return expressions as functions of variables and of new symbols, and the parts that these stand for.
+
+    The parts are the largest ones that do not depend on the variables, and are no numbers: values that need not be
+    computed again when only the variables change.
+    """
+    known: dict[Expr, Expr] = {}
+    parts: dict[Expr, Symbol] = {}
+
+    def read(node: Expr) -> Expr:
+        if node not in known:
+            known[node] = written(node)
+        return known[node]
+
+    def written(node: Expr) -> Expr:
+        if node in variables:
+            return node
+        if node.free_symbols.isdisjoint(variables):
+            factor, part = node.as_coeff_Mul()
+            return node if part.is_number else factor * parts.setdefault(part, Symbol(f"_{len(parts)}", real=True))
+        if isinstance(node, Intermediate):
+            return intermediate(read(node.definition))
+        if not (node.is_Add or node.is_Mul):
+            return node.func(*map(read, node.args))
+        constant = [each for each in node.args if each.free_symbols.isdisjoint(variables)]
+        return node.func(read(node.func(*constant)), *(read(each) for each in node.args if each not in constant))
+
+    for each in intermediates(*expressions):
+        if not each.free_symbols.isdisjoint(variables):
+            read(each)
+    return [*map(read, expressions)], parts
 
 
 def written_out(expression: Expr) -> Expr:

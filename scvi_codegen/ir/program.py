@@ -145,6 +145,7 @@ class Quantities:
     Attributes:
         legendre: p and dp/dv at (q, v); for a Hamiltonian, v and dv/dp at (q, p).
         mass_entries: (i, j) of the derivatives of ``legendre``.
+        inverse_legendre: v at (q, p) of a Lagrangian, if it has a formula.
         energy: L at (q, v), which with ``legendre`` gives the energy; for a Hamiltonian, H at (q, p).
         hamiltonian: whether the system is Hamiltonian.
         momentum_maps: first integrals from symmetries.
@@ -157,6 +158,7 @@ class Quantities:
 
     legendre: Kernel | None = None
     mass_entries: tuple[tuple[int, int], ...] = ()
+    inverse_legendre: Kernel | None = None
     energy: Kernel | None = None
     hamiltonian: bool = False
     momentum_maps: tuple[MomentumMap, ...] = ()
@@ -277,7 +279,7 @@ class Program:
         kernels = (
             *(kernel for group in stage_groups for kernel in (group.value, group.derivative)),
             *(found.legendre, found.energy, *(group.integrand for group in stage_groups), found.momentum_kernel),
-            found.first_order_rates,
+            *(found.first_order_rates, found.inverse_legendre),
             *(integrals.kernel if integrals else None, constraints and constraints.kernel),
             *(constraints and constraints.motion, self.damping, rattle and rattle.force, rattle and rattle.mass),
         )

@@ -162,8 +162,8 @@ def _coupled(system: LagrangianSystem) -> PointDerivatives:
         "point_derivatives",
         (*forms.momentum, *different),
         of=of,
-        partials=forms.lower_mass.values(),
-        purpose="L_v, the distinct entries of L_qq, L_qv and -L_vq, and the lower triangle of L_vv at all points.",
+        partials=forms.mass_terms,
+        purpose="L_v, the distinct entries of L_qq, L_qv and -L_vq, and terms of L_vv at all points.",
     )
     return PointDerivatives(
         partials=at_points,

@@ -246,6 +246,7 @@ def _quantities(
     """Return the functions of the state that a run evaluates or integrates."""
     return Quantities(
         legendre=_legendre_kernel(system),
+        inverse_legendre=_inverse_legendre_kernel(system),
         mass_entries=tuple(forms_of(system).legendre_jacobian),
         energy=_energy_kernel(system),
         hamiltonian=bool(system.auxiliaries),
@@ -355,8 +356,16 @@ def _legendre_kernel(system: MechanicalSystem) -> Kernel:
         if forms.one_form
         else "H_p and H_pp at u = (q, p)."
         if system.auxiliaries
-        else "Momenta L_v and mass matrix L_vv at u = (q, v).",
+        else f"Momenta L_v {'' if forms.inverse_mass else 'and mass matrix L_vv '}at u = (q, v).",
     )
+
+
+def _inverse_legendre_kernel(system: MechanicalSystem) -> Kernel | None:
+    """Return the kernel of the velocities at (q, p), ``None`` if they have no formula."""
+    inverse, of = forms_of(system).inverse_mass, (*system.coordinates, *system.momentum_symbols)
+    if inverse is None:
+        return None
+    return system_kernel(system, "inverse_legendre", inverse.velocities, of=of, purpose="L_vv^-1 p at u = (q, p).")
 
 
 def _rates_of_first_order(system: MechanicalSystem) -> Kernel | None:

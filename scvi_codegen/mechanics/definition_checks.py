@@ -13,7 +13,7 @@ from sympy import Expr, Symbol
 from scvi_codegen.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
 from scvi_codegen.formulas.expressions import Tape, hessian, jacobian, unsupported_part
 from scvi_codegen.formulas.symbols import DOT, PARTS, TIME, check_names, number, symbol
-from scvi_codegen.mechanics.derived_expressions import null_direction, row_rank, sample_points, singular_part
+from scvi_codegen.mechanics.derived_expressions import forms_of, null_direction, row_rank, sample_points, singular_part
 from scvi_codegen.mechanics.forces import check_damping, constraint_jacobian
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Number, mp
@@ -170,6 +170,8 @@ def _check_velocities(system: MechanicalSystem) -> None:
 
 
 def _check_mass_matrix(system: MechanicalSystem) -> None:
+    if forms_of(system).inverse_mass:
+        return
     others = (*system.coordinates, system.time)
     singular = singular_part(system.lagrangian, system.velocities, others, system.constants)
     if singular is None:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from sympy import Expr, Matrix, Symbol
 
 from scvi_codegen.formulas.expressions import Tape, gradient, hessian, jacobian
+from scvi_codegen.formulas.intermediates import separated
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Number, mp
 
@@ -49,6 +50,23 @@ def multipliers(system: MechanicalSystem) -> tuple[Symbol, ...]:
 def auxiliary_multipliers(system: MechanicalSystem) -> tuple[Symbol, ...]:
     """Return the multipliers of ``constitutive`` at a collocation node: m, or none without auxiliary variables."""
     return tuple(sympy.Symbol(f"{p.name}_multiplier", real=True) for p in system.auxiliaries)
+
+
+@dataclass(frozen=True, slots=True)
+class InverseMass:
+    """Solution of L_vv v = p in two parts, of which the first depends on positions only.
+
+    Attributes:
+        velocities: v = L_vv^-1 p in (q, p).
+        terms: expressions in q that occur in it, such as gains and inverse pivots.
+        symbols: symbols of their values.
+        solution: v in these symbols and p.
+    """
+
+    velocities: tuple[Expr, ...]
+    terms: tuple[Expr, ...]
+    symbols: tuple[Symbol, ...]
+    solution: tuple[Expr, ...]
 
 
 @dataclass(frozen=True)
@@ -84,6 +102,31 @@ class Forms:
     def lower_mass(self) -> Entries:
         """Lower triangle of the symmetric mass matrix L_vv; solvers need only this part."""
         return {(i, j): entry for (i, j), entry in self.mass.items() if i >= j}
+
+    @cached_property
+    def inverse_mass(self) -> InverseMass | None:
+        """Solution with a variable mass matrix by the derivative of the dual energy; ``None`` if that is unknown.
+
+        The dual energy of another Lagrangian, which a copy of a system may still have, is detected at a random point,
+        and not used. Constant rotations of bodies are orthogonal only to round-off, and so is the agreement.
+        """
+        system, momenta = self.system, self.system.momentum_symbols
+        energy = getattr(system, "dual_energy", sympy.S.Zero)
+        if energy == 0 or system.constraints or system.damping != 0 or system.clock:
+            return None
+        velocities = self._gradient_tuple(energy, momenta)
+        point = next(sample_points(momenta, system.coordinates, system.constants))
+        values = dict(zip(system.velocities, Tape(velocities, list(point))(list(point.values())), strict=True))
+        again = Tape(self.momentum, [*point, *values])([*point.values(), *values.values()])
+        if any(abs(p - point[symbol]) > SAME_MOMENTUM for p, symbol in zip(again, momenta, strict=True)):
+            return None
+        solution, parts = separated(velocities, frozenset(momenta))
+        return InverseMass(velocities, tuple(parts), tuple(parts.values()), tuple(solution)) if parts else None
+
+    @cached_property
+    def mass_terms(self) -> tuple[Expr, ...]:
+        """Expressions from which systems with the mass matrix are solved: terms of its inverse, or its lower half."""
+        return self.inverse_mass.terms if self.inverse_mass else tuple(self.lower_mass.values())
 
     @cached_property
     def constitutive(self) -> tuple[Expr, ...]:
@@ -124,7 +167,9 @@ class Forms:
 
     @cached_property
     def legendre_jacobian(self) -> Entries:
-        """Jacobian of ``regular_legendre``: L_vv, or H_pp."""
+        """Jacobian of ``regular_legendre``: L_vv, or H_pp; empty if the inverse of L_vv is known."""
+        if self.inverse_mass:
+            return {}
         return jacobian(self.regular_legendre, self.system.auxiliaries) if self.system.auxiliaries else self.mass
 
     @cached_property
@@ -202,7 +247,7 @@ class Forms:
 
         False with damping: velocities at the points are then not the sums of forces in the tables of a method.
         """
-        if self.system.auxiliaries or self.system.damping != 0:
+        if self.system.auxiliaries or self.system.damping != 0 or self.inverse_mass:
             return False
         constant = set(self.system.parameters)
         if any(i != j or not entry.free_symbols <= constant for (i, j), entry in self.mass.items()):
@@ -261,6 +306,8 @@ NEGLIGIBLE = mp.mpf(10) ** -40
 DEPENDENT = 1e-10
 """Rank tolerance, relative to the largest singular value of the normalised rows."""
 LARGEST_NULL_SPACE = 8
+SAME_MOMENTUM = 1e-12
+"""Largest difference of momenta of order 1/10 that may be due to rounded constants."""
 
 
 def row_rank(matrix: NDArray[np.float64]) -> int:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.mechanics.system import MechanicalSystem, zero
 from scvi_codegen.representation import summary
 from scvi_codegen.validation import FORMULAS, MAPPED, NAMES, NUMBERS, TEXTS, ArgumentType, checks_arguments
 
@@ -40,6 +40,8 @@ class LagrangianSystem(MechanicalSystem):
         name, coordinates, time, parameters, defaults: see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
         lagrangian: L, exact: it contains no floating-point numbers.
         reduced: of a system with rotations or directions, its formulas in the names of these.
+        dual_energy: the kinetic energy as a function of coordinates and momenta if that takes fewer operations than the
+            mass matrix, which then is not computed, else 0.
 
     Raises:
         SystemDefinitionError: naming the symbol at fault, if a name is invalid or used twice, L contains an unknown
@@ -49,6 +51,7 @@ class LagrangianSystem(MechanicalSystem):
 
     lagrangian: Expr
     reduced: Reduced | None = None
+    dual_energy: Expr = field(default_factory=zero)
 
     __repr__ = summary("name", "coordinates")
 
@@ -374,9 +377,10 @@ class LagrangianSystem(MechanicalSystem):
 
     @classmethod
     def _of_tree(cls, name: str, links: Any, gravity: Any, actuated: Sequence[str] | bool) -> LagrangianSystem:
-        from scvi_codegen.mechanics.multibody.trees.energies import arguments_of
+        from scvi_codegen.mechanics.multibody.trees.articulated import system_of_tree
 
-        return cls.from_sympy(name=name, **arguments_of(links, gravity, actuated))
+        system: LagrangianSystem = system_of_tree(cls, name, links, gravity, actuated)
+        return system
 
     @classmethod
     def _read(cls, arguments: Mapping[str, Any]) -> tuple[Any, bool]:

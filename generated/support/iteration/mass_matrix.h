@@ -1,7 +1,8 @@
 #ifndef SUPPORT_MASS_MATRIX_H
 #define SUPPORT_MASS_MATRIX_H
 
-/* Linear systems with the mass matrix in every lane, which is diagonal (DIAGONAL_MASS) or full. */
+/* Linear systems with the mass matrix in every lane, which is diagonal (DIAGONAL_MASS), known by terms of its inverse
+ * (MASS_TERMS), or full. */
 #ifdef DIAGONAL_MASS
 /* Diagonal mass matrices. Requires: points.h or trajectories.h. */
 enum { DIAGONAL = 1,
@@ -19,6 +20,26 @@ static inline void solve_mass(const lanes *mass, lanes *r)
 {
   for (int i = 0; i < M; i++)
     r[i] *= mass[i];
+}
+#elif defined(MASS_TERMS)
+/* Terms of the inverses of mass matrices. Requires: points.h or trajectories.h, the kernel solve_lanes. */
+enum { DIAGONAL = 0,
+  MASS = MASS_TERMS };
+
+/* The terms are ready for use. */
+static inline void factor_mass(lanes *mass)
+{
+  (void)mass;
+}
+
+/* r = mass^-1 r in every lane. */
+static inline void solve_mass(const lanes *mass, lanes *r)
+{
+  const weight t = {0.0}; /* and no parameters: the terms contain them */
+  lanes u[MASS + M];
+  memcpy(u, mass, sizeof(lanes) * MASS);
+  memcpy(u + MASS, r, sizeof(lanes) * M);
+  solve_lanes(u, t, 0, r);
 }
 #else
 /* Full mass matrices in every lane, in their lower triangles. Requires: points.h or trajectories.h. */

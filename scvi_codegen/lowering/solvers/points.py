@@ -205,7 +205,8 @@ def coupled_iteration(problem: StepProblem) -> FixedPointIteration | None:
 
 def _coupled(system: LagrangianSystem, tables: VelocityTables) -> FixedPointIteration | None:
     lanes, forms = lane_count(max(len(tables.abscissae), len(tables.blocks))), forms_of(system)
-    full = any(i != j for i, j in forms.lower_mass)
+    inverse = forms.inverse_mass
+    full = not inverse and any(i != j for i, j in forms.lower_mass)
     if lanes > MOST_LANES or (full and lanes * system.dimension**2 > LARGEST_MASS_MATRICES):
         return None
     of, projected = (*system.coordinates, *system.velocities), bool(tables.velocity)
@@ -219,6 +220,7 @@ def _coupled(system: LagrangianSystem, tables: VelocityTables) -> FixedPointIter
         else system_kernel(system, "force_lanes", forms.force, of=of, purpose="L_q at all points.")
     )
     macros = (("PROJECTED", projected), ("FOLLOWED", followed), ("FROZEN_MASS", frozen))
+    sizes = (("MASS_TERMS", len(inverse.terms)),) if inverse else ()
     integrands, damping = integrand_kernel(system, "integrand_lanes", of), damping_kernel(system)
     return _point_iteration(
         "coupled",
@@ -230,11 +232,13 @@ def _coupled(system: LagrangianSystem, tables: VelocityTables) -> FixedPointIter
                 "point_lanes",
                 (*values, *followed),
                 of=of,
-                partials=forms.lower_mass.values(),
-                purpose=f"{evaluated} and the lower triangle of L_vv at all points, u = (q, v).",
+                partials=forms.mass_terms,
+                purpose=f"{evaluated} and "
+                f"{'the terms of its inverse' if inverse else 'the lower triangle'} of L_vv at all points, u = (q, v).",
             ),
             None if followed else force,
             integrands,
+            _solution_kernel(system),
         ),
         forces=() if followed else ("point_lanes", force.name),
         stored=2 * lanes,
@@ -242,11 +246,22 @@ def _coupled(system: LagrangianSystem, tables: VelocityTables) -> FixedPointIter
             *(("damped_points",) if damping else ()),
             *("point_weights", "mass_matrix", "corrections", "coupled_iteration"),
         ),
-        macros=tuple((name, 1) for name, holds in macros if holds),
-        mass_entries=tuple(forms.lower_mass),
+        macros=(*((name, 1) for name, holds in macros if holds), *sizes),
+        mass_entries=() if inverse else tuple(forms.lower_mass),
         damping=damping,
         derivatives_part="" if projected or damping or integrands else "coupled_derivatives",
         serves_many=not projected,
+    )
+
+
+def _solution_kernel(system: LagrangianSystem) -> Kernel | None:
+    """Return the kernel of solutions with the mass matrix from the terms of its inverse, ``None`` if it is unknown."""
+    inverse = forms_of(system).inverse_mass
+    if inverse is None:
+        return None
+    of = (*inverse.symbols, *system.momentum_symbols)
+    return system_kernel(
+        system, "solve_lanes", inverse.solution, of=of, purpose="L_vv^-1 p at all points, u = (terms of L_vv^-1, p)."
     )
 
 

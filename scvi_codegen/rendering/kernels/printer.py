@@ -226,7 +226,7 @@ def _call(part: Part) -> str:
 
 
 def _mass_element(fixed_point: FixedPointIteration, k: int) -> str:
-    i, j = fixed_point.mass_entries[k]
+    i, j = fixed_point.mass_entries[k] if fixed_point.mass_entries else (k, k)
     return f"derivative[{i}]" if fixed_point.diagonal else f"derivative[{i} * M + {j}]"
 
 

@@ -43,26 +43,20 @@ from scvi_codegen.mechanics.multibody.trees.tree import (
 )
 
 
-def arguments_of(links: Sequence[Link], gravity: Vector, actuated: Collection[str] | bool) -> dict[str, Any]:
-    """Return arguments of :meth:`LagrangianSystem.from_sympy` for a tree: coordinates, rotations, lagrangian, forces.
+class Tree:
+    """Formulas of the links of a tree, from the root to the leaves and back.
 
     Args:
         links: with parents before their children.
         gravity: acceleration of gravity in the world frame.
-        actuated: names of the joints on which an input ``tau_NAME`` acts, or ``True`` for all hinges and slides.
 
     Raises:
-        SystemDefinitionError: if nothing moves, or a joint does not exist.
+        SystemDefinitionError: if nothing moves.
     """
-    return _Tree(aligned(named(without_fixed(links))), gravity).arguments(actuated)
-
-
-class _Tree:
-    """Formulas of the links of a tree, from the root to the leaves and back."""
 
     def __init__(self, links: Sequence[Link], gravity: Vector) -> None:
-        self.links = links
-        self.gravity = _vector(gravity)
+        links = self.links = aligned(named(without_fixed(links)))
+        self.gravity = exact_vector(gravity)
         self.joints = {link.joint.name: link.joint for link in links}
         self.moments, self.masses = self.first_moments()
 
@@ -74,11 +68,12 @@ class _Tree:
                 known = closest(other, [*self.joints])
                 raise SystemDefinitionError(f"joint '{joint.name}' follows '{other}', which is no moving joint{known}")
             q, v = self.coordinate(self.joints[other])
-            return _number(factor) * q + _number(offset), _number(factor) * v
+            return exact_number(factor) * q + exact_number(offset), exact_number(factor) * v
         return symbol(joint.name), symbol(joint.name + DOT)
 
     def displacement(self, joint: Joint) -> Expr:
-        return self.coordinate(joint)[0] - _number(joint.zero)
+        """Return the coordinate of a hinge or slide from the zero of the model."""
+        return self.coordinate(joint)[0] - exact_number(joint.zero)
 
     def turned(self, joint: Joint, vector: Matrix, *, back: bool = False) -> Matrix:
         """Return a vector turned by A, from the frame of the link to that of its parent; ``back``: by A^T."""
@@ -87,20 +82,20 @@ class _Tree:
             q = self.displacement(joint)
             turns = [Matrix([[cos(q), -sin(q), 0], [sin(q), cos(q), 0], [0, 0, 1]])]
         if joint.kind != "free":
-            turns.insert(0, _matrix(joint.pose.rotation))
+            turns.insert(0, exact_matrix(joint.pose.rotation))
         for turn in turns if back else reversed(turns):
             vector = as_quantities((turn.T if back else turn) * vector)
         return vector
 
     def origin(self, joint: Joint) -> Matrix:
         """Return the origin of the link in the frame of its parent."""
-        at = _vector(joint.pose.position)
-        return at + _matrix(joint.pose.rotation)[:, 2] * self.displacement(joint) if joint.kind == "slide" else at
+        at = exact_vector(joint.pose.position)
+        return at + exact_matrix(joint.pose.rotation)[:, 2] * self.displacement(joint) if joint.kind == "slide" else at
 
     def first_moments(self) -> tuple[list[Matrix], list[Expr]]:
         """Return the first moment and the mass of each subtree, in the frame of its root."""
-        moments = [_number(each.inertia.mass) * _vector(each.inertia.center) for each in self.links]
-        masses = [_number(each.inertia.mass) for each in self.links]
+        moments = [exact_number(each.inertia.mass) * exact_vector(each.inertia.center) for each in self.links]
+        masses = [exact_number(each.inertia.mass) for each in self.links]
         for i in reversed(range(len(self.links))):
             parent, joint = self.links[i].parent, self.links[i].joint
             if parent >= 0:
@@ -132,10 +127,10 @@ class _Tree:
                 w += Matrix(rotation_of(joint).rates)
             turning.append(as_quantities(w))
             moving.append(as_quantities(v))
-            velocity = as_quantities(moving[-1] + turning[-1].cross(_vector(link.inertia.center)))
-            momenta.append(_number(link.inertia.mass) * velocity)
+            velocity = as_quantities(moving[-1] + turning[-1].cross(exact_vector(link.inertia.center)))
+            momenta.append(exact_number(link.inertia.mass) * velocity)
             terms.append(velocity.dot(momenta[-1]) / 2)
-            terms.append((turning[-1].T * _matrix(link.inertia.matrix) * turning[-1])[0] / 2)
+            terms.append((turning[-1].T * exact_matrix(link.inertia.matrix) * turning[-1])[0] / 2)
             terms.append(self.quadratic(joint, joint.armature))
         return Add(*terms, *self.free_bases(momenta))
 
@@ -160,7 +155,7 @@ class _Tree:
         else:
             rates = [*rotation_of(joint).rates]
             rates += [symbol(name + DOT) for name in position_of(joint)] if joint.kind == "free" else []
-        return _number(factor) * Add(*(rate**2 for rate in rates)) / 2
+        return exact_number(factor) * Add(*(rate**2 for rate in rates)) / 2
 
     def potential_energy(self) -> Expr:
         """Return V of gravity and springs."""
@@ -174,7 +169,9 @@ class _Tree:
                 place = self.masses[i] * position + self.turned(joint, self.moments[i])
                 terms.append(-self.gravity.dot(place))
             if joint.stiffness:
-                terms.append(_number(joint.stiffness) * (self.coordinate(joint)[0] - _number(joint.rest)) ** 2 / 2)
+                terms.append(
+                    exact_number(joint.stiffness) * (self.coordinate(joint)[0] - exact_number(joint.rest)) ** 2 / 2
+                )
         return Add(*terms)
 
     def dissipation(self) -> Expr:
@@ -186,7 +183,14 @@ class _Tree:
         return [each.name for each in self.joints.values() if each.kind in SINGLE and not each.follows]
 
     def arguments(self, actuated: Collection[str] | bool) -> dict[str, Any]:
-        """Return the arguments of :meth:`LagrangianSystem.from_sympy`."""
+        """Return arguments of :meth:`LagrangianSystem.from_sympy`: coordinates, rotations, lagrangian, forces.
+
+        Args:
+            actuated: names of the joints on which an input ``tau_NAME`` acts, or ``True`` for all hinges and slides.
+
+        Raises:
+            SystemDefinitionError: if a joint does not exist.
+        """
         singles = self.single_coordinates()
         driven = (singles if actuated else []) if isinstance(actuated, bool) else [*map(identifier, actuated)]
         for name in driven:
@@ -220,13 +224,16 @@ def as_quantities(vector: Matrix) -> Matrix:
     return vector.applyfunc(intermediate)
 
 
-def _number(value: float) -> Expr:
+def exact_number(value: float) -> Expr:
+    """Return the rational number that a floating-point number is printed as."""
     return S(int(value)) if value == int(value) else Rational(repr(float(value)))
 
 
-def _vector(values: Vector) -> Matrix:
-    return Matrix([_number(float(each)) for each in values])
+def exact_vector(values: Vector) -> Matrix:
+    """Return a vector of such numbers."""
+    return Matrix([exact_number(float(each)) for each in values])
 
 
-def _matrix(values: Vector) -> Matrix:
-    return Matrix([[_number(float(each)) for each in row] for row in values])
+def exact_matrix(values: Vector) -> Matrix:
+    """Return a matrix of such numbers."""
+    return Matrix([[exact_number(float(each)) for each in row] for row in values])
