@@ -1,8 +1,8 @@
 """Derivation report on one page of HTML, from the Lagrangian to the C: every equation, table and operation count.
 
     >>> from scvi_codegen.methods import SVI
-    >>> from scvi_codegen.models.systems import planar_pendulum
-    >>> "Euler-Lagrange equations" in derivation_html(planar_pendulum(), SVI(2))
+    >>> from scvi_codegen.models.problems import problem
+    >>> "Euler-Lagrange equations" in derivation_html(problem("planar-pendulum").system, SVI(2))
     True
 
 The page is self-contained: formulas are MathML, pictures inline, without scripts or network. Formulas that are too long

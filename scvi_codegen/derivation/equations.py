@@ -1,8 +1,8 @@
 """Closed form of a step: all equations as exact SymPy expressions, with the paper's numbers.
 
     >>> from scvi_codegen.methods import SCVI
-    >>> from scvi_codegen.models.systems import planar_pendulum
-    >>> equation = derive(planar_pendulum(), SCVI(1, "gauss-legendre:2"), radicals=True).equations[0]
+    >>> from scvi_codegen.models.problems import problem
+    >>> equation = derive(problem("planar-pendulum").system, SCVI(1, "gauss-legendre:2"), radicals=True).equations[0]
     >>> names = {symbol.name: symbol for symbol in equation.residual.free_symbols}
     >>> expected = sympy.sympify("m*l**2*((Q_1 - q_k)/h**2 - v_0/h) + m*g*l*sin(Q_1)", names)
     >>> equation.number, sympy.simplify(equation.residual - expected)

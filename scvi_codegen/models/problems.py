@@ -12,6 +12,7 @@ from typing import Any
 from scvi_codegen.display.cards import Html, card, listed, plain
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.files.toml_text import package_table
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models import systems
 from scvi_codegen.representation import summary
@@ -67,11 +68,12 @@ class Problem:
 
 
 def _entry(name: str) -> Problem:
-    """Return a problem of the table; its system is the function of that name."""
-    fields: dict[str, Any] = {
-        key: tuple(value) if isinstance(value, list) else value for key, value in _TABLE[name].items()
-    }
-    return Problem(name=name, system=getattr(systems, name.replace("-", "_"))(), **fields)
+    """Return a problem of the table."""
+    fields: dict[str, Any] = dict(_TABLE[name])
+    definition = fields.pop("system", None)
+    fields |= {key: tuple(fields[key]) for key in ("q", "velocity", "p") if key in fields}
+    system = LagrangianSystem.from_text(**definition) if definition else getattr(systems, name.replace("-", "_"))()
+    return Problem(name=name, system=system, **fields)
 
 
 def _fput_problem(n: int = 8) -> Problem:

@@ -13,7 +13,7 @@ from scvi_codegen.derivation.equations import derive
 from scvi_codegen.display.page.blocks import TableBlock
 from scvi_codegen.methods import SCVI, SVI, SpectralCollocation
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.systems import planar_pendulum
+from scvi_codegen.models.problems import problem
 from scvi_codegen.reproduce.drawing import Panel, Picture, Series
 from scvi_codegen.reproduce.experiment import Comparison, Experiment, Result, comparison
 from scvi_codegen.reproduce.runs import KEPLER, ROUNDOFF, MeasuredRun, RunSetting, Scheme, exact_kepler, largest
@@ -73,7 +73,7 @@ def measured(points: int, gauss: int, *, variational: bool) -> Structure:
 def two_points_agree() -> bool:
     """Return True if the printed (34d), (34e) with two points equal (27a), (27c) of SVI, derivatives of L_d."""
     methods = SCVI(1, "gauss-legendre:2", variational=False), SVI(1, "gauss-legendre:2")
-    pairs = zip(*(derive(planar_pendulum(), method).idel_equations for method in methods), strict=True)
+    pairs = zip(*(derive(problem("planar-pendulum").system, method).idel_equations for method in methods), strict=True)
     return all(sympy.expand(one.residual - other.residual) == 0 for one, other in pairs)
 
 

@@ -8,9 +8,8 @@ from functools import partial
 
 import numpy as np
 
-from scvi_codegen.models.systems import harmonic_oscillator
 from scvi_codegen.reproduce.refinement import SCHEMES, WINDOW, InitialValue, Law, StepCase, Study, refinement
-from scvi_codegen.reproduce.runs import KEPLER
+from scvi_codegen.reproduce.runs import KEPLER, system_of
 from scvi_codegen.tables.precision import Number, mp
 
 
@@ -34,10 +33,8 @@ def _kepler(eccentricity: float) -> InitialValue:
     return InitialValue(KEPLER, *start, partial(_kepler_errors, e), fitted)
 
 
-OSCILLATOR = InitialValue(
-    harmonic_oscillator(), (mp.zero,), (mp.one,), _oscillator_errors, tuple(mp.mpf(2) ** k for k in (-8, -6, -4))
-)
-
+SMALL_STEPS = tuple(mp.mpf(2) ** k for k in (-8, -6, -4))
+OSCILLATOR = InitialValue(system_of("harmonic-oscillator"), (mp.zero,), (mp.one,), _oscillator_errors, SMALL_STEPS)
 BY_POINTS, BY_DEGREE = StepCase("N points", OSCILLATOR), StepCase("N the degree", OSCILLATOR, 0, judged=False)
 BEYOND = StepCase("N the degree, N + 1 Gauss points", OSCILLATOR, 0, 1, judged=False)
 CIRCLE, ELLIPSE = (

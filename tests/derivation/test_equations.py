@@ -25,7 +25,11 @@ from scvi_codegen.methods import (
     StoermerVerlet,
 )
 from scvi_codegen.methods.discretise import paper_equations
-from scvi_codegen.models.systems import double_pendulum, duffing, kepler, planar_pendulum
+from scvi_codegen.models.problems import problem
+
+DOUBLE_PENDULUM, DUFFING, KEPLER, PENDULUM = (
+    problem(name).system for name in ("double-pendulum", "duffing", "kepler", "planar-pendulum")
+)
 
 UNIT = {"m": 1, "l": 1, "g": 1}
 
@@ -35,7 +39,7 @@ def unit_pendulum(expression):
 
 
 def test_two_point_pendulum_equals_equations_36_and_37():
-    derived = derive(planar_pendulum(), SCVI(1, "gauss-legendre:2"), radicals=True)
+    derived = derive(PENDULUM, SCVI(1, "gauss-legendre:2"), radicals=True)
     q1, v, q, p, h = sympy.symbols("Q_1 v_0 q_k p_k h", real=True)
     first, second = (3 + sqrt(3)) / 6, (3 - sqrt(3)) / 6
     equation_36 = q1 / h**2 + sin(q1) - v / h - q / h**2
@@ -50,7 +54,7 @@ def test_two_point_pendulum_equals_equations_36_and_37():
 
 def test_two_point_svi_equals_equations_28_to_30():
     """The Galerkin form (28): A~ Q~ = -G - (p_k, 0, ..)^T with (29) for the free particle's part."""
-    derived = derive(planar_pendulum(), SVI(1, "gauss-legendre:2"), radicals=True)
+    derived = derive(PENDULUM, SVI(1, "gauss-legendre:2"), radicals=True)
     q1, q, h = sympy.symbols("Q_1 q_k h", real=True)
     (row,) = derived.equations
     kinetic = unit_pendulum(row.residual).subs(sympy.Symbol("p_k", real=True), 0)
@@ -75,7 +79,7 @@ def test_three_point_scvi_is_the_derivative_of_its_generating_function():
     accelerations = differentiated(v, *differentiated(q, middle, end))
     G = action + first * (accelerations[0] + sin(middle)) + second * (accelerations[1] + sin(end))
     expected = {"34d": p + G.diff(q), "dG/dQ": G.diff(middle), "dG/dv0": G.diff(v), "34e": G.diff(end)}
-    derived = derive(planar_pendulum(), SCVI(2, "gauss-legendre:2"), radicals=True)
+    derived = derive(PENDULUM, SCVI(2, "gauss-legendre:2"), radicals=True)
     rows = {e.number: unit_pendulum(e.residual) for e in (*derived.equations, *derived.end_momentum)}
     assert set(expected) <= set(rows)
     for k in (2, 3, 5):
@@ -83,7 +87,7 @@ def test_three_point_scvi_is_the_derivative_of_its_generating_function():
         assert max(abs(float((rows[number] - value).xreplace(state))) for number, value in expected.items()) < 1e-12
 
 
-SYSTEMS = [planar_pendulum(), kepler(), double_pendulum(), duffing().with_parameters(gamma=0.3, omega=1.3)]
+SYSTEMS = [PENDULUM, KEPLER, DOUBLE_PENDULUM, DUFFING.with_parameters(gamma=0.3, omega=1.3)]
 METHODS = [
     SVI(1),
     SVI(2, "gauss-lobatto:3", "legendre-lobatto"),
@@ -186,12 +190,12 @@ def test_matrix_form_is_zero_where_the_scalar_form_is(system, form, degree):
 
 def test_matrix_form_is_one_of_spectral_collocation():
     with pytest.raises(MethodError, match="spectral collocation"):
-        derive(planar_pendulum(), SVI(2)).matrix_form()
+        derive(PENDULUM, SVI(2)).matrix_form()
 
 
 @pytest.mark.parametrize("method", [SVI(3, "gauss-legendre:3"), SCVI(2), SpectralCollocation(4), Gauss(3)])
 def test_radicals_equal_the_values(method):
-    entries = [entry for entry in derive(planar_pendulum(), method).entries if entry.exact is not None]
+    entries = [entry for entry in derive(PENDULUM, method).entries if entry.exact is not None]
     assert entries
     for entry in entries:
         assert abs(sympy.N(entry.exact, 60) - sympy.Float(str(entry.value), 60)) < sympy.Float("1e-50")
@@ -199,8 +203,8 @@ def test_radicals_equal_the_values(method):
 
 def test_radicals_are_used_where_they_are_short():
     for method in (SVI(2), SVI(3), SCVI(2, "gauss-legendre:3"), SpectralCollocation(3), Gauss(3), RadauIIA(2)):
-        assert derive(planar_pendulum(), method, radicals=True).entries == ()
-    assert derive(planar_pendulum(), SVI(9), radicals=True).entries != ()
+        assert derive(PENDULUM, method, radicals=True).entries == ()
+    assert derive(PENDULUM, SVI(9), radicals=True).entries != ()
 
 
 def test_derivation_names_avoid_names_of_the_system():
@@ -215,7 +219,7 @@ def test_derivation_names_avoid_names_of_the_system():
 
 
 def test_equations_have_displays():
-    derived = derive(kepler(), SCVI(2))
+    derived = derive(KEPLER, SCVI(2))
     assert "lambda_1_q1" in derived.to_text()
     assert r"\tag{34d}" in derived._repr_latex_()
     assert derived._repr_latex_().count(r"\begin{align*}") == 3  # equations, tables, momentum maps
@@ -226,7 +230,7 @@ def test_equations_have_displays():
 
 
 def test_explicit_time_appears_with_the_points():
-    derived = derive(duffing(), SVI(1, "gauss-legendre:2"))
+    derived = derive(DUFFING, SVI(1, "gauss-legendre:2"))
     assert cos(sympy.Symbol("omega", real=True) * (derived.time + sympy.Symbol("d_1", real=True) * derived.step)) in (
         derived.equations[0].residual.atoms(cos)
     )
@@ -234,13 +238,13 @@ def test_explicit_time_appears_with_the_points():
 
 @pytest.mark.parametrize("method", [SVI(2), SVI(2, "hermite:2"), SCVI(2)], ids=lambda method: method.name)
 def test_latex_has_single_indices_and_exponents(method):
-    text = derive(kepler(), method).to_latex()
+    text = derive(KEPLER, method).to_latex()
     assert not re.search(r"_\{[^{}]*\}_|\^\{[^{}]*\}\^", text)
     assert text.count("p_{q_{2},k+1} &=") == text.count("q_{1,k+1} &=") == 1
 
 
 def test_zero_weight_is_shown_as_zero():
-    derived = derive(planar_pendulum(), SpectralCollocation(2, form="phase-space"))
+    derived = derive(PENDULUM, SpectralCollocation(2, form="phase-space"))
     assert {entry.symbol.name: entry.exact for entry in derived.entries}["b_2"] == 0
 
 

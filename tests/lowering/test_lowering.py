@@ -23,9 +23,11 @@ from scvi_codegen.ir.arithmetic import DEEPEST_EXPRESSION, lower_kernel
 from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
 from scvi_codegen.methods import SCVI, SVI, Gauss, RadauIIA, SpectralCollocation
 from scvi_codegen.models.problems import PROBLEMS, problem
-from scvi_codegen.models.systems import double_pendulum, duffing, fput_chain, kepler
+from scvi_codegen.models.systems import fput_chain
 from scvi_codegen.native.compilers import find_compiler
 from scvi_codegen.rendering.kernels.printer import print_expression, print_number
+
+DOUBLE_PENDULUM, DUFFING, KEPLER = (problem(name).system for name in ("double-pendulum", "duffing", "kepler"))
 
 mp = mpmath.mp.clone()
 mp.dps = 120
@@ -180,7 +182,7 @@ def test_negative_half_integer_powers_are_separate_functions():
 
 
 def test_gradient_of_kepler_has_no_division():
-    system = kepler()
+    system = KEPLER
     forces = gradient(system.lagrangian, system.coordinates)
     partials = jacobian(tuple(forces.values()), system.coordinates)
     kernel = lower_kernel(
@@ -215,7 +217,7 @@ def test_integer_powers_are_products_and_others_are_calls():
 
 
 @pytest.mark.parametrize("family", [SVI, SCVI, SpectralCollocation, Gauss], ids=lambda family: family.__name__)
-@pytest.mark.parametrize("system", [double_pendulum(), duffing()], ids=lambda system: system.name)
+@pytest.mark.parametrize("system", [DOUBLE_PENDULUM, DUFFING], ids=lambda system: system.name)
 def test_symbolic_cost_does_not_grow_with_the_degree(family, system):
     small, large = (lowered(system, family(degree)) for degree in (2, 12))
     assert large.kernels == small.kernels
@@ -253,7 +255,7 @@ def test_functions_without_a_c_counterpart_are_rejected():
 
 
 def test_lowering_is_reproducible():
-    first, second = (lowered(double_pendulum(), SCVI(3)) for _ in range(2))
+    first, second = (lowered(DOUBLE_PENDULUM, SCVI(3)) for _ in range(2))
     assert first == second
 
 

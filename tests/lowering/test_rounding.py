@@ -10,12 +10,14 @@ import sympy
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.ir.kernel import exact_number, lower_matrix, lower_vector
 from scvi_codegen.methods import SCVI, SVI, RadauIIA, SpectralCollocation
-from scvi_codegen.models.systems import double_pendulum, kepler
+from scvi_codegen.models.problems import problem
 from scvi_codegen.pipeline import generate_source, program_of
 from scvi_codegen.rendering.kernels.printer import DOUBLE, SINGLE
 from scvi_codegen.tables.basis import cardinal_derivatives, cardinal_integrals, next_step
 from scvi_codegen.tables.nodes import chebyshev_lobatto, legendre_gauss
 from scvi_codegen.tables.precision import mp
+
+DOUBLE_PENDULUM, KEPLER = (problem(name).system for name in ("double-pendulum", "kepler"))
 
 METHODS = (SCVI(3), SCVI(2, "gauss-lobatto:3"), SVI(4, "clenshaw-curtis:5"), SpectralCollocation(3), RadauIIA(3))
 
@@ -58,13 +60,13 @@ def test_coefficients_are_rounded_once_to_nearest():
 
 
 def test_program_has_more_digits_than_a_double():
-    fixed_point = program_of(kepler(), SVI(3)).fixed_point
+    fixed_point = program_of(KEPLER, SVI(3)).fixed_point
     product = [x for row in fixed_point.numbers("PRODUCT") for x in row[: fixed_point.points]]
     assert all(mp.mpf(DOUBLE.rounded(x)) != x for x in product)
 
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
-@pytest.mark.parametrize("system", [kepler(), double_pendulum()], ids=lambda system: system.name)
+@pytest.mark.parametrize("system", [KEPLER, DOUBLE_PENDULUM], ids=lambda system: system.name)
 def test_generated_tables_contain_no_spurious_zeros(system, method):
     source, _ = generate_source(system, method)
     assert re.findall(r"\b\d[\d.]*e-(?:[4-9]\d|[12]\d\d)\b", source.code) == []

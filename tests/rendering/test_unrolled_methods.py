@@ -10,10 +10,11 @@ from tiers import first_of_each
 
 from scvi_codegen import SCVI, SVI, Gauss, StoermerVerlet, compile_stepper, generate_source, problem
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.models.systems import planar_pendulum
 from scvi_codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.rendering.kernels import functions
 from scvi_codegen.runtime.core.stepper import Stepper
+
+PENDULUM = problem("planar-pendulum").system
 
 pytestmark = pytest.mark.usefixtures("as_users_compile")
 
@@ -23,8 +24,8 @@ HAMILTONIAN = HamiltonianSystem.from_text(
     name="pendulum", coordinates=["x"], momenta=["y"], hamiltonian="y**2*(1 + x**2/5)/2 - cos(x)"
 )
 CASES = {
-    "pendulum, two points": (planar_pendulum(), TWO_POINTS),
-    "pendulum, trapezium": (planar_pendulum(), StoermerVerlet()),
+    "pendulum, two points": (PENDULUM, TWO_POINTS),
+    "pendulum, trapezium": (PENDULUM, StoermerVerlet()),
     "double pendulum": (problem("double-pendulum").system, SVI(1)),
     "Kepler": (problem("kepler").system, TWO_POINTS),
     "driven": (problem("duffing").system.with_parameters(gamma=0.7, omega=1.3), TWO_POINTS),
@@ -67,7 +68,7 @@ def test_unrolled_and_tabulated_methods_agree_to_round_off_with_fma(case, monkey
 def test_example_of_the_paper_is_solved():
     """Equation (37) and (34e), with the numbers that the paper prints, at the states of the compiled step."""
     h, q0, p0 = 0.1, 0.5, 0.2
-    stepper = compile_stepper(planar_pendulum(), TWO_POINTS, solver="newton")
+    stepper = compile_stepper(PENDULUM, TWO_POINTS, solver="newton")
     q1, p1 = (float(x[0]) for x in stepper.step([q0], [p0], h, parameters={"m": 1.0, "l": 1.0, "g": 1.0}))
     near, far = (3 + math.sqrt(3)) / 6, (3 - math.sqrt(3)) / 6
     first, second = math.sin(near * q0 + far * q1), math.sin(far * q0 + near * q1)

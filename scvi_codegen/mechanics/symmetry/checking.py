@@ -99,8 +99,8 @@ def check_symmetry(
         SystemDefinitionError: with the change of L, if it is not the time derivative of f, or if that is undecided;
             with the rate of a generator that is not conserved; naming the symbol, if one is unknown.
 
-    >>> from scvi_codegen.models.systems import kepler
-    >>> print(check_symmetry(kepler(), ["-q2", "q1"]))
+    >>> from scvi_codegen.models.problems import problem
+    >>> print(check_symmetry(problem("kepler").system, ["-q2", "q1"]))
     symmetry = q1*p_q2 - q2*p_q1
     """
     if generator is not None:

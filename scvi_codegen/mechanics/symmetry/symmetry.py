@@ -165,8 +165,8 @@ def symmetries(system: MechanicalSystem | ArraySystem) -> tuple[Symmetry, ...] |
     They are affine in q and t for a Lagrangian, in (q, p) and t for a Hamiltonian. Those of arrays of any size are the
     translations and rotations of whole arrays.
 
-    >>> from scvi_codegen.models.systems import kepler
-    >>> print(*symmetries(kepler()))
+    >>> from scvi_codegen.models.problems import problem
+    >>> print(*symmetries(problem("kepler").system))
     angular momentum = q1*p_q2 - q2*p_q1
     """
     if isinstance(system, ArraySystem):
