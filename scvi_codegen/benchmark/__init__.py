@@ -35,7 +35,7 @@ from scvi_codegen.benchmark.sections import BUILDERS
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import run_drift, run_first_steps
 from scvi_codegen.errors import ScviCodegenError, StateError, closest
-from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.files.atomic import write_text
 
 __all__ = ["CASES", "PEERS", "SCHEMA", "SECTIONS", "Plan", "Report", "benchmark"]
 
@@ -156,7 +156,7 @@ def _known(json_path: str) -> dict[str, Result]:
 
 def _write(report: Report, json_path: str) -> None:
     text = json.dumps(report.data(), indent=1, allow_nan=False) + "\n"
-    write_atomically(json_path, lambda file: file.write(text.encode()))
+    write_text(json_path, text)
 
 
 def _reports(

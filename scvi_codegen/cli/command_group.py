@@ -30,7 +30,7 @@ from scvi_codegen.errors import (
     SystemDefinitionWarning,
     closest,
 )
-from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.files.atomic import write_text
 from scvi_codegen.native.announcements import announce_to
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -240,7 +240,6 @@ def emit(text: str, /, output: str | None, **numbers: Any) -> None:
         tell(text, **numbers)
         return
     check_writable(Path(output), "'-o'")
-    data = (text.rstrip("\n") + "\n").encode()
-    write_atomically(output, lambda file: file.write(data))
+    write_text(output, text.rstrip("\n") + "\n")
     tell(**numbers, written=[output])
     note(f"wrote {output}")

@@ -29,6 +29,11 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[IO[bytes]], 
         raise
 
 
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write a text in UTF-8 atomically."""
+    write_atomically(path, lambda file: file.write(text.encode()))
+
+
 @contextmanager
 def replaced(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a path on the same disk for a new file or folder, which then replaces ``path``.

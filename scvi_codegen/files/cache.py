@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any
 import platformdirs
 
 from scvi_codegen.errors import BuildError, CacheWarning, warn
-from scvi_codegen.files.atomic import remove, write_atomically
+from scvi_codegen.files.atomic import remove, write_text
 
 if TYPE_CHECKING:
     import sympy
@@ -323,7 +323,7 @@ def _write(path: Path, text: str) -> None:
     with suppress(OSError):
         make_folder(path.parent.parent)
         make_folder(path.parent)
-        write_atomically(path, lambda file: file.write(record.encode()))
+        write_text(path, record)
         path.chmod(path.stat().st_mode & ~0o022)
 
 

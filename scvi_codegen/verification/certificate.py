@@ -11,12 +11,11 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from enum import StrEnum
-from functools import partial
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from scvi_codegen.display.cards import Html, card, grid, plain
 from scvi_codegen.errors import MethodError, StateError, StepFailedError, SystemDefinitionError
-from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.files.atomic import write_text
 from scvi_codegen.native.announcements import announced
 from scvi_codegen.representation import summary
 
@@ -182,7 +181,7 @@ class Certificate:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the JSON to a file atomically."""
-        write_atomically(path, partial(_write, self.to_json()))
+        write_text(path, self.to_json())
 
 
 def issued(files: Mapping[str, str], *, q: Iterable[float], p: Iterable[float], **attributes: Any) -> Certificate:
@@ -212,10 +211,6 @@ def _row(check: Check) -> tuple[Html, ...]:
     numbers = ["" if number is None else f"{number:.3g}" for number in (check.measured, check.bound)]
     words = "; ".join(filter(None, (check.statement, check.remark)))
     return plain(check.name), outcome, *map(plain, numbers), plain(words)
-
-
-def _write(text: str, file: IO[bytes]) -> None:
-    file.write(text.encode())
 
 
 def _finite(value: Any) -> Any:

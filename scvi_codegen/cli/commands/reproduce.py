@@ -21,7 +21,7 @@ from scvi_codegen.cli.command_group import (
     tell,
 )
 from scvi_codegen.cli.reports import counted
-from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.files.atomic import write_text
 from scvi_codegen.pictures.canvas import check_plot_path
 from scvi_codegen.reproduce.experiment import Experiment, Result
 from scvi_codegen.reproduce.report import report_html, tally, write_result
@@ -160,7 +160,8 @@ def reproduce_experiments(
             for outcome in outcomes:
                 progress.report(f"{outcome.name:{width}}  {_add(done, outcome, folder)}")
         if html is not None:
-            done.files.append(_write_page(sorted(done.results, key=lambda r: list(experiments).index(r.name)), html))
+            write_text(html, report_html(sorted(done.results, key=lambda r: list(experiments).index(r.name))))
+            done.files.append(html)
     except KeyboardInterrupt:
         done.interrupted = True
     return done
@@ -178,12 +179,6 @@ def _add(done: Reproduction, outcome: Result | Failure, folder: Path) -> str:
     done.files += write_result(outcome, folder)
     done.results.append(outcome)
     return f"{outcome.verdict.value:13}  {outcome.title}"
-
-
-def _write_page(results: Sequence[Result], path: Path) -> Path:
-    page = report_html(results).encode()
-    write_atomically(path, lambda file: file.write(page))
-    return path
 
 
 @dataclass(frozen=True, slots=True)

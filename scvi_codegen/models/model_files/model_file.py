@@ -82,7 +82,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.errors import ModelFileError, SystemDefinitionWarning
-from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.files.atomic import write_text
 from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.lowering.arrays import one_coordinate
@@ -176,12 +176,8 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
     target = Path(path)
     name, *others = (texts := _written(model, target.stem))
     for other in others:
-        _write(target.with_name(other), texts[other])
-    _write(target, texts[name])
-
-
-def _write(path: Path, text: str) -> None:
-    write_atomically(path, lambda file: file.write(text.encode()))
+        write_text(target.with_name(other), texts[other])
+    write_text(target, texts[name])
 
 
 def catalogue_model(name: str, changes: Document | None = None) -> Model:

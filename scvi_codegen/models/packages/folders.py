@@ -9,12 +9,11 @@ import os
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from scvi_codegen.errors import PackageError
-from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.files.atomic import write_text
 from scvi_codegen.rendering.source import PREFIX, Source
 from scvi_codegen.rendering.text import included
 
@@ -34,7 +33,7 @@ def write_folder(target: Path, texts: Mapping[str, str], *, force: bool) -> None
             (target / name).unlink(missing_ok=True)
         for name, text in texts.items():
             (target / name).parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(target / name, partial(_write, text))
+            write_text(target / name, text)
     except OSError as error:
         raise PackageError(f"{error.filename or target} cannot be written: {error.strerror or error}") from error
 
@@ -43,10 +42,6 @@ def record_text(texts: Mapping[str, str], **described: Any) -> str:
     """Return the text of ``interface.json``: checksums of files, and further entries."""
     files = {name: _checksum(text.encode()) for name, text in texts.items()}
     return json.dumps({"format": FORMAT, **described, "files": files}, indent=1) + "\n"
-
-
-def _write(text: str, file: IO[bytes]) -> None:
-    file.write(text.encode())
 
 
 def _checksum(data: bytes) -> str:

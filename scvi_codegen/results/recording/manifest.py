@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import RecordingError
-from scvi_codegen.files.atomic import sync_folder, write_atomically
+from scvi_codegen.files.atomic import sync_folder, write_atomically, write_text
 from scvi_codegen.files.export import COLUMNS, Piece, loaded
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.compilers import check_flags, compiler_title, fingerprint
@@ -294,4 +294,4 @@ def read_manifest(folder: Path) -> Manifest:
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write the manifest into a folder atomically; raise OSError on failure."""
-    write_atomically(folder / MANIFEST, lambda file: file.write(manifest.to_json().encode()))
+    write_text(folder / MANIFEST, manifest.to_json())
