@@ -16,9 +16,10 @@ derivatives of the constraints at its ends,
     p = p0 + h/2 (F0 + G0^T lambda),  q1 = q0 + h M^-1 p  with  g(q1) = 0,
     p1 = p + h/2 (F1 + G1^T mu)                           with  G1 M^-1 p1 + g_t = 0,
 
-symmetric and symplectic on the constrained phase space; compositions of such steps satisfy the constraints after each
-of them and attain their order. Both systems of multipliers are solved iteratively with G M^-1 G^T at the start or end
-of the step, a sparse matrix whose pattern is computed once per run.
+symmetric and symplectic on the constrained phase space. Forces that depend on velocities are F(q0, v0) and F(q1, v1),
+where v1 = M^-1 p1 is solved for together with mu. Compositions of such steps satisfy the constraints after each of them
+and attain their order. Both systems of multipliers are solved iteratively with G M^-1 G^T at the start or end of the
+step, a sparse matrix whose pattern is computed once per run.
 
 Sources: J.-P. Ryckaert, G. Ciccotti, H. J. C. Berendsen, J. Comput. Phys. 23 (1977); H. C. Andersen, ibid. 52 (1983);
 S. Reich, SIAM J. Numer. Anal. 33 (1996), on compositions; E. Barth, K. Kuczera, B. Leimkuhler, R. D. Skeel, J. Comput.
@@ -89,15 +90,10 @@ def constrained_steps(system: ArraySystem, stages: StageSystem, method: Method) 
     """Return the kernels and fractions of constrained steps; ``None`` without constraints.
 
     Raises:
-        MethodError: for other methods, and for velocity-dependent forces.
+        MethodError: for other methods.
     """
     if not system.constraints:
         return None
-    if system.velocities:
-        raise MethodError(
-            "velocity-dependent forces are not supported for array systems with constraints: remove "
-            "the forces or the constraints"
-        )
     pairs = list(_kernels(system))
     conditions, curvatures = (tuple(kernels) for kernels in zip(*pairs, strict=True))
     return ConstrainedSteps(conditions=conditions, curvatures=curvatures, parts=lower_vector(_parts(stages, method)))

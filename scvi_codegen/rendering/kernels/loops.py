@@ -78,7 +78,7 @@ def loop_context(program: Program) -> dict[str, Any]:
 def _work(program: Program) -> int:
     """Return the number of doubles of ``work`` per coordinate."""
     if program.fixed_point is None:
-        return CONSTRAINED_VECTORS if program.loops.constrained else EXPLICIT_VECTORS
+        return CONSTRAINED_VECTORS + bool(program.layout.velocities) if program.loops.constrained else EXPLICIT_VECTORS
     own = 2 * ITERATION_VECTORS if program.layout.momenta else ITERATION_VECTORS + bool(program.layout.velocities)
     linear = NEWTON_VECTORS + program.fixed_point.lanes if program.loops.products else 0
     waves = FOURIER_VECTORS * program.fixed_point.lanes + _roots_per_coordinate(program) if program.loops.reach else 0

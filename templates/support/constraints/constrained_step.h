@@ -8,10 +8,15 @@
  * Numerical Integration, sec. VII.1.4), composed with the coefficients PART. Requires: arrays.h, add_forces,
  * evaluate_constraints, constraint_matrix.h, progress.h, PARTS of a step, PART and their ends, PART_END. */
 
+#ifdef FORCES_OF_VELOCITIES
+#define VELOCITY_FORCES 1
+#else
+#define VELOCITY_FORCES 0
+#endif
 #define NEAR_ENOUGH 1e-3 /* relative residual to which the linear system of a correction is solved */
 
 /* Parts of `work`: magnitudes for rounding errors; forces; increments of positions and momenta; constraint forces;
- * trial increments, and the positions they lead to. */
+ * trial increments, and the positions they lead to, with the velocities behind them if forces depend on these. */
 typedef struct {
   double *X, *F, *dq, *dp, *R, *D, *Y;
 } parts_of_work;
@@ -51,8 +56,19 @@ static void compute_constraint_forces(const constraint_system *held, const doubl
       x[held->of.place[e]] += held->derivative[e] * lambda[k];
 }
 
-static void find_forces(const constrained_run *of, const double *X, double t, double *F)
+/* Forces at positions X, and at the velocities of p + dp, of p if dp is NULL. */
+static void find_forces(const constrained_run *of, const double *X, const double *dp, double t, double *F)
 {
+#ifdef FORCES_OF_VELOCITIES
+  double *Y = of->parts.Y;
+  if (X != Y)
+    memcpy(Y, X, sizeof(double) * (size_t)of->n);
+  for (long long i = 0; i < of->n; i++)
+    Y[of->n + i] = of->run->inverse_mass[i] * (of->run->p[i] + (dp ? dp[i] : 0.0));
+  X = Y;
+#else
+  (void)dp;
+#endif
   memset(F, 0, sizeof(double) * (size_t)of->n);
   add_forces(of->run, of->given, X, t, 1.0, F);
 }
@@ -60,7 +76,7 @@ static void find_forces(const constrained_run *of, const double *X, double t, do
 /* Computes forces, constraint derivatives and their matrix at the state. */
 static int begin(const constrained_run *of)
 {
-  find_forces(of, of->run->q, of->run->t, of->parts.F);
+  find_forces(of, of->run->q, NULL, of->run->t, of->parts.F);
   evaluate_constraints(of->given, of->run->q, of->run->t, of->held.g, of->held.rate, of->held.derivative);
   return assemble(&of->held, of->run->inverse_mass) ? OK : SINGULAR;
 }
@@ -146,16 +162,30 @@ static void find_right(const constraint_system *held, const double *rate, const 
   }
 }
 
+/* Replaces the forces of weight `by` in p + dp by those at its velocities; returns the squared size of M^-1 times their
+ * change. */
+static double update_forces(const constrained_run *of, double by, double t)
+{
+  const parts_of_work *parts = &of->parts;
+  find_forces(of, parts->Y, parts->dp, t, parts->R);
+  for (long long i = 0; i < of->n; i++) {
+    parts->R[i] -= parts->F[i];
+    parts->F[i] += parts->R[i];
+  }
+  return push(parts->dp, parts->R, by, of->run->inverse_mass, of->n);
+}
+
 /* Projects the momenta onto G M^-1 p + g_t = 0 by constraint forces of weight `by`; the change of the velocities times
- * `unit` is compared with `size`. X contains the magnitudes of their terms. */
-static int project_momenta(const constrained_run *of, double by, double unit, double size)
+ * `unit` is compared with `size`. X contains the magnitudes of their terms. Forces at the time t, if not NULL, are
+ * those at the velocities that result. */
+static int project_momenta(const constrained_run *of, double by, double unit, double size, const double *t)
 {
   const constraint_system *held = &of->held;
   const run_memory *run = of->run;
   progress now = before_iterations();
   for (int k = 0;; k++) {
     int status;
-    double moved;
+    double moved = t && VELOCITY_FORCES ? update_forces(of, by, *t) : 0.0;
     for (long long i = 0; i < of->n; i++)
       of->parts.D[i] = run->inverse_mass[i] * (run->p[i] + of->parts.dp[i]);
     find_right(held, held->rate, of->parts.D, 1.0 / by);
@@ -166,7 +196,8 @@ static int project_momenta(const constrained_run *of, double by, double unit, do
     if (status != OK)
       return status;
     compute_constraint_forces(held, held->change, of->parts.R, of->n);
-    moved = unit * by * (unit * by) * push(of->parts.dp, of->parts.R, by, run->inverse_mass, of->n);
+    moved += push(of->parts.dp, of->parts.R, by, run->inverse_mass, of->n);
+    moved *= unit * by * (unit * by);
     take_change(&now, relative_change(moved, of->options->absolute ? 1.0 : size), of->options, k, of->report);
   }
 }
@@ -188,14 +219,14 @@ static int constrained_substep(const constrained_run *of, double h, double t)
   memcpy(held->derivative, held->next, sizeof(double) * (size_t)held->entries);
   if (!assemble(held, run->inverse_mass))
     return SINGULAR;
-  find_forces(of, parts->Y, t, parts->F);
+  find_forces(of, parts->Y, parts->dp, t, parts->F);
   compute_constraint_forces(held, held->lambda, parts->R, of->n);
   for (long long i = 0; i < of->n; i++) {
     parts->dp[i] += h / 2 * (parts->F[i] + parts->R[i]);
     parts->X[i] = run->inverse_mass[i] *
         (fabs(run->p[i] + parts->dp[i]) + fabs(h / 2) * (fabs(parts->F[i]) + fabs(parts->R[i])));
   }
-  return project_momenta(of, h / 2, h, size);
+  return project_momenta(of, h / 2, h, size, &t);
 }
 
 /* Performs a step. The increments start with the compensation terms of the state; a failed step leaves the state

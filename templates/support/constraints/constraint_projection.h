@@ -66,7 +66,7 @@ int NAME(project)(run_memory *run, const problem *given, const solver_options *o
     of.parts.X[i] = fabs(run->inverse_mass[i] * run->p[i]);
     size += of.parts.X[i] * of.parts.X[i];
   }
-  status = project_momenta(&of, 1.0, 1.0, size);
+  status = project_momenta(&of, 1.0, 1.0, size, NULL);
   if (status != OK)
     return status;
   memcpy(run->q, of.parts.Y, sizeof(double) * (size_t)of.n);
@@ -96,10 +96,10 @@ int NAME(multipliers)(run_memory *run, const problem *given, double *lambda)
   int status = run->guess ? OK : begin(&of);
   if (status != OK)
     return status;
+  find_forces(&of, run->q, NULL, run->t, F);
   for (long long i = 0; i < of.n; i++)
     pulled[i] = run->inverse_mass[i] * run->p[i];
   compute_second_derivatives(given, run->q, pulled, run->t, held->g);
-  find_forces(&of, run->q, run->t, F);
   memset(lambda, 0, sizeof(double) * (size_t)held->count);
   for (int round = 0; status == OK && round < REFINEMENTS; round++) {
     compute_constraint_forces(held, lambda, of.parts.R, of.n);
