@@ -6,8 +6,6 @@ first run: truncation, round-off, and their growth along the trajectory.
 Verification, on the whole run, of the error for which a step size was recommended.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

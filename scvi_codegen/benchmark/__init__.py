@@ -17,8 +17,6 @@ The rules: medians of alternating rounds; stepping time only, compile time apart
 the best formulation known to us, which are named; whole work-precision curves, no step or tolerance tuned afterwards.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

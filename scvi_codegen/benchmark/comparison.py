@@ -4,8 +4,6 @@ Times are processor times of the process. Every contender steps in one thread an
 equals the wall time of an idle machine; on a busy one it excludes the time of other programs.
 """
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence

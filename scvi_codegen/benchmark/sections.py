@@ -1,7 +1,5 @@
 """Sections of the benchmark that compare contenders at equal error: a case with its contenders and reference each."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial

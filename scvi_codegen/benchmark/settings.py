@@ -1,7 +1,5 @@
 """Settings of a benchmark, and processor times of functions."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Tables without contenders at equal error: energy drift, and time to the first step."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os

@@ -3,8 +3,6 @@
 ``--help`` and ``--version`` therefore import neither SymPy nor NumPy.
 """
 
-from __future__ import annotations
-
 import click
 
 from scvi_codegen.cli.command_group import Commands

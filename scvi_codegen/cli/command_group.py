@@ -4,8 +4,6 @@ A command whose result a program can use is decorated with :func:`reporting` and
 as numbers: by default the text is printed, with ``--json`` the numbers, with ``--quiet`` neither.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """Runs of ``scvi-codegen run --ensemble``: trajectories of a grid or a table, and their summary."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Documents of ``scvi-codegen run --json``: the numbers behind the summaries of runs."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any

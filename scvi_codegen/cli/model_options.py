@@ -1,7 +1,5 @@
 """The argument MODEL and the options that override it, converted to a :class:`Model`."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -1,7 +1,5 @@
 """Runs in folders, with checkpoints: ``run -o FOLDER.run``, ``run --resume FOLDER`` and ``export``."""
 
-from __future__ import annotations
-
 import math
 import os
 import shlex

@@ -1,7 +1,5 @@
 """Integration for ``scvi-codegen run`` in short chunks, so that Ctrl-C and failed steps lose nothing; its summary."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator

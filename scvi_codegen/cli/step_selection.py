@@ -1,7 +1,5 @@
 """Step-size selection of ``scvi-codegen run``: ``--tolerance``, ``--error`` and ``--advise``."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from dataclasses import replace

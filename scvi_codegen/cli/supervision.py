@@ -3,8 +3,6 @@
 The memory is checked before the run starts: the system kills larger processes without a message.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

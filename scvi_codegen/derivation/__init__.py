@@ -10,8 +10,6 @@ are replaced by their size (:mod:`scvi_codegen.display.page.blocks`), so that th
 readable.
 """
 
-from __future__ import annotations
-
 from scvi_codegen.derivation.page.document import derivation_html
 from scvi_codegen.derivation.page.jacobian import Start
 

@@ -1,7 +1,5 @@
 """Derivation of array systems: L or H, the derivatives of every term with respect to its entries, and a step."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

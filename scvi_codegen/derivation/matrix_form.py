@@ -1,7 +1,5 @@
 """Kronecker forms (18) and (21) of spectral collocation, by Lemmas 2.1 and 2.2, independent of the equations."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

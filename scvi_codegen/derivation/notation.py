@@ -5,8 +5,6 @@ Named numbers of a method's tables, with their short exact forms.
 Numbers of 60 digits are recognised as short combinations of radicals by PSLQ.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Notebook cards as HTML: a title, facts, tables and small pictures, in the notebook's colours."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from html import escape
 from typing import NewType

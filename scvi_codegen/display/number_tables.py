@@ -1,7 +1,5 @@
 """Tables of nodes, quadratures and Runge-Kutta tableaux: radicals if they are short, and decimals."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import singledispatch

@@ -4,8 +4,6 @@ The residual has 60 digits and the Jacobian 16: close to the zero each iteration
 refinement of linear systems.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, TypeAlias
 

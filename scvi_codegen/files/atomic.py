@@ -1,7 +1,5 @@
 """Atomic writes: files are written to a temporary name in the same folder, then renamed."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import tempfile

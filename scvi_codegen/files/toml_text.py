@@ -3,8 +3,6 @@
 Tables that belong to this package are TOML files beside its modules.
 """
 
-from __future__ import annotations
-
 import re
 import tomllib
 from typing import Any

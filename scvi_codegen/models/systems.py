@@ -1,7 +1,5 @@
 """Mechanical systems of the literature; every physical constant is a parameter."""
 
-from __future__ import annotations
-
 from itertools import combinations, pairwise
 
 from scvi_codegen.errors import SystemDefinitionError

@@ -1,7 +1,5 @@
 """Time span and step size of a model."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Catalogue of all experiments by name, in the paper's order; ``claims``, which judges the others, is last."""
 
-from __future__ import annotations
-
 from scvi_codegen.reproduce import (
     claims,
     correction,

@@ -1,7 +1,5 @@
 """Claims of the paper, each with all measurements that concern it and one verdict."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from scvi_codegen.files.toml_text import package_table

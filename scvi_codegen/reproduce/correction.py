@@ -1,7 +1,5 @@
 """Additional experiment: why (34d) needs the chain-rule term, measured on Kepler's problem for both forms of SCVI."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import lru_cache, partial
 from typing import NamedTuple

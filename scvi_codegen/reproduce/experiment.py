@@ -3,8 +3,6 @@
 Everything is plain data that can be sent between processes; a formula is SymPy.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum

@@ -3,8 +3,6 @@
 Their settings, views and checks are those of ``figures.toml``.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import warnings

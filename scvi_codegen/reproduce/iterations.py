@@ -6,8 +6,6 @@ maps Q at the nodes to the points where forces are evaluated, the nodes themselv
 written in NumPy and starts anew in each step, as the counts of the paper do.
 """
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ the degree, as in other figures. Verdicts are based on the cases that are judged
 on what a caption leaves open.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

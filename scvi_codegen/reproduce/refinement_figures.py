@@ -1,7 +1,5 @@
 """Figures of errors of one step: over the number of points (6, 16, 17) and over the step size (7, 8, 18-20)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial

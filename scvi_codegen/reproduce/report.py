@@ -5,8 +5,6 @@ It adapts to light and dark mode (pictures keep a light background), to narrow s
 into text for it.
 """
 
-from __future__ import annotations
-
 import base64
 import csv
 import io

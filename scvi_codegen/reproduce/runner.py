@@ -3,8 +3,6 @@
 Experiments that judge the results of others run after all others, in this process.
 """
 
-from __future__ import annotations
-
 import importlib
 import multiprocessing
 import os

@@ -8,8 +8,6 @@ number of points, so that 50 digits are correct even for equispaced points of hi
 Points and results are numbers of 60 digits; arguments may be anything ``mpmath`` converts exactly.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from functools import cache
 from itertools import accumulate

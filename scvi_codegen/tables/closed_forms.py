@@ -5,8 +5,6 @@ The 60-digit numbers of :mod:`~scvi_codegen.tables.nodes`, :mod:`~scvi_codegen.t
 root of a quadratic polynomial and the square root of such a root. SymPy is imported only where an expression is made.
 """
 
-from __future__ import annotations
-
 from fractions import Fraction
 from functools import lru_cache
 from itertools import takewhile

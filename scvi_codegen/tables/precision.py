@@ -5,8 +5,6 @@ Nodes, weights and cardinal functions are computed once, at generation time, and
 thread-local: functions of mpmath that raise it meanwhile do not affect tables computed by other threads.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from typing import Any, TypeAlias

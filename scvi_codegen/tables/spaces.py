@@ -8,8 +8,6 @@ derivatives.
 Splines replace the wavelets that the paper mentions: with few basis functions per step there is nothing to compress.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import lru_cache

@@ -3,8 +3,6 @@
 Coefficients below 1e-30 of their scale count as zero, so that exact zeros are recognised as such.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from itertools import pairwise, zip_longest
 from typing import TypeAlias

@@ -1,7 +1,5 @@
 """Certificate: one check for each guaranteed property, with the measured number and its bound."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib.metadata
 import json

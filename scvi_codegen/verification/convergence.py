@@ -6,8 +6,6 @@ here the latter is compared with the exact motion, which is computed from the fo
 Methods that are the same map are solved in 60 digits by different paths through the generator, and compared.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial, singledispatch

@@ -3,8 +3,6 @@
 A step in transformed time, dt = g dtau, has its duration as a further result, and the energy as a further parameter.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial

@@ -8,8 +8,6 @@ that continue until nothing changes. By default the iterations stop when the res
 residual has a sign, and the drift that it causes is measured by itself.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ so that at a small step size the predictor is far better. An error in its tables
 number of iterations, so that no state would show it.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Checks of preserved structure: symplectic form, reversibility, momentum maps, constraints; largest usable step."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from functools import partial

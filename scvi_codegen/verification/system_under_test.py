@@ -3,8 +3,6 @@
 System under test: the stepper, a stepper with Newton's method alone, and generic states.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property

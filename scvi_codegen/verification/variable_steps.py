@@ -1,7 +1,5 @@
 """Checks of runs with a time transformation or with adaptive step size, beyond those of their single steps."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial

@@ -1,7 +1,5 @@
 """Problems with close encounters for adaptive step size: eight initial states each."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace

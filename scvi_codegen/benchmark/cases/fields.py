@@ -3,8 +3,6 @@
 Every contender has its own mesh; its error is that of its final values at its own points, relative in root mean square.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """Double pendulum with friction in both joints and a motor in the first, which moves it from rest over the span."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

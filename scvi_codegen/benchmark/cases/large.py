@@ -1,7 +1,5 @@
 """Array systems of any size for timing: a ring of springs, a field, a crystal and a cluster of bodies."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

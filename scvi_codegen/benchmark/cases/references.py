@@ -8,8 +8,6 @@ With close encounters the steps are the adaptive ones of this package, which a m
 far, and halves of them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import inspect

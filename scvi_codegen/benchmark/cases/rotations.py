@@ -8,8 +8,6 @@
 States of the hand-derived equations are quaternions (w, x, y, z) and angular velocities in the body frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial

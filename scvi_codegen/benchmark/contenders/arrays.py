@@ -1,7 +1,5 @@
 """Peers for array systems: leapfrog and a composition in hand-written C, and OpenMM."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from importlib.resources import files
 from typing import Any

@@ -1,7 +1,5 @@
 """Contenders of the Runge-Kutta method DOP853 at several tolerances, by SciPy or another solver."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 

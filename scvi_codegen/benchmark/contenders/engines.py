@@ -1,7 +1,5 @@
 """Contenders of multibody programs for cases that have a model of MuJoCo: MuJoCo's integrators, and Pinocchio."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Callable, Iterator

@@ -6,8 +6,6 @@ lambdify    mass matrix and forcing by ``lambdify(..., cse=True)``, NumPy's solv
 pydy        the same equations by its Cython generator
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 

@@ -3,8 +3,6 @@
 Steppers of this package at the step sizes that :func:`scvi_codegen.advise` recommends for a list of tolerances.
 """
 
-from __future__ import annotations
-
 import itertools
 import tempfile
 import time

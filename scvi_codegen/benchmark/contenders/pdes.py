@@ -1,7 +1,5 @@
 """Peers for partial differential equations: py-pde, split steps with SciPy's FFT by hand, and differences in Numba."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from functools import partial

@@ -7,8 +7,6 @@ cyrk        DOP853 in C++ (CyRK), right-hand side compiled by Numba.
 scipy       ``solve_ivp`` with DOP853, right-hand side compiled by Numba if it is there, else plain Python.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import math
 import time

@@ -1,7 +1,5 @@
 """Conversion of accelerations, written for any kind of number, into straight-line Python source for Numba."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Command ``scvi-codegen bench``: timings of this package and of other integrators at equal error."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

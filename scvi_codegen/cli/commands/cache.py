@@ -1,7 +1,5 @@
 """Command ``scvi-codegen cache``: the cache of compiled integrators."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 
 import click

@@ -1,7 +1,5 @@
 """Command ``scvi-codegen derive``: the equations of one step, or the page from L to C."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Command ``scvi-codegen doctor``: checks of libraries, the compiler, a trial run and the cache of this machine."""
 
-from __future__ import annotations
-
 import os
 import platform
 import re

@@ -1,7 +1,5 @@
 """Command ``scvi-codegen export``: write the states of a run in a folder to one file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

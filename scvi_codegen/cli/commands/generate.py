@@ -1,7 +1,5 @@
 """Command ``scvi-codegen generate``: C, a Makefile and a Python package in a folder; or an FMU."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import click

@@ -1,7 +1,5 @@
 """Command ``scvi-codegen methods``: list the methods and their properties, or print a tableau."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Command ``scvi-codegen reproduce``: run experiments of the paper, write their files and print the verdicts."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager

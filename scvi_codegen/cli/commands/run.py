@@ -1,7 +1,5 @@
 """Command ``scvi-codegen run``: integrate a model or an ensemble, in memory or into a folder, and print a summary."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Command ``scvi-codegen systems``: list the catalogue, or print one system as a model file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Command ``scvi-codegen verify``: the certificate of a model, or of the C code in a generated folder."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 Trial curve of a method, in words and formulas, and its tables.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import singledispatch
 from html import escape

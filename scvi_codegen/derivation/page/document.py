@@ -1,7 +1,5 @@
 """Sections of the page, in order, and the page."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 from scvi_codegen.derivation.notation import table_entries

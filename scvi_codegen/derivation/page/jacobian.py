@@ -3,8 +3,6 @@
 Jacobian of the stage equations: sparsity pattern, and values at the initial guess of a step.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape

@@ -3,8 +3,6 @@
 Functions around the kernels, in the order of their calls: their purpose, and their C.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from itertools import count, takewhile

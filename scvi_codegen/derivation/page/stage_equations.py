@@ -3,8 +3,6 @@
 Equations of a step: in compact form with sums, and component by component if they are short.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import groupby
 

@@ -8,8 +8,6 @@ Browsers do not break lines within ``<math>``, so :func:`mathml_terms` returns a
 line may end.
 """
 
-from __future__ import annotations
-
 import sympy
 
 from scvi_codegen.display.mathml.printer import Printer

@@ -1,7 +1,5 @@
 """Parser of names of symbols: ``theta_1_dot`` is a letter with an accent and an index, ``l_1_0`` is l_0(tau_1)."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """SymPy's presentation MathML printer with names, numbers, sums and functions of the package."""
 
-from __future__ import annotations
-
 import html
 import re
 from collections.abc import Iterator, Sequence

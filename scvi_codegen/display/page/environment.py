@@ -3,8 +3,6 @@
 Jinja environment of pages, ``templates/page.html.jinja`` and those that extend it, with their filters.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from functools import cache

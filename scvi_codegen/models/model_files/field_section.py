@@ -16,8 +16,6 @@ Keys are the arguments of :meth:`~scvi_codegen.FieldSystem.from_text` and
 :meth:`~scvi_codegen.FieldSystem.discretise`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -10,8 +10,6 @@ its name, or is called ``value``, or is the only one other than ``t``: one file 
 An input is kept as a table of plain numbers, which can be compared and written to files.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 import os

@@ -1,7 +1,5 @@
 """Sections of model files: merging, validation of keys, methods, systems with their forces, hints for unknown keys."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final, TypeVar

@@ -34,8 +34,6 @@ Formulas are those of :mod:`scvi_codegen.formulas.grammar`: parsed by it and eva
 code.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """Example runs of generated folders and FMUs, with the model's initial state and output interval; README of folders."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from string import Template
 from typing import Any

@@ -1,7 +1,5 @@
 """Generated folders: written completely, without overwriting edited files; their prefix, record and C code."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import keyword

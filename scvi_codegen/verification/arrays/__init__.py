@@ -5,8 +5,6 @@ equations in 60 digits, its exact motion and its compiled steps, none of which h
 compared with NumPy, and conserved quantities are measured along a run.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace

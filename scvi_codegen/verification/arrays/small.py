@@ -1,7 +1,5 @@
 """Reduction of arrays to a few indices, for certificates."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 

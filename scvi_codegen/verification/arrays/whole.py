@@ -1,7 +1,5 @@
 """Checks of array systems at full size: rates against NumPy, reversibility and conserved quantities."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
