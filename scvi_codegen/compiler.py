@@ -17,7 +17,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from numpy.typing import ArrayLike
 
@@ -79,7 +79,7 @@ def compile_stepper(
         time_transformation: time-rescaling function g(q, t) > 0 (g(q, p, t) of a Hamiltonian), or a name accepted by
             :func:`~scvi_codegen.reparametrise`. Runs with h and t_end then take constant steps h in tau, dt = g dtau,
             by the reversible controller of Hairer and Soederlind; time-dependent and forced systems are supported.
-            Momentum maps are preserved.
+            Momentum maps are preserved. Entries and sums of arrays are written in index notation.
         sizes: whole numbers for the sizes of arrays, ``{"N": 8}``: the system of all entries q_0, q_1, .. is compiled,
             which has every feature. Without them arrays have the sizes that each run gives them: neither the length of
             the C source nor its compile time depends on the number of coordinates, and the solver is ``"fixed-point"``,
@@ -98,13 +98,18 @@ def compile_stepper(
 
         check_kind(SYMMETRIES, symmetries, "symmetries")
     if sizes is not None or tables is not None:
+        from scvi_codegen.formulas.array_entries import is_indexed
+        from scvi_codegen.mechanics.arrays.elements import formula_at_sizes
         from scvi_codegen.mechanics.arrays.rolling import unroll_sums
 
+        if isinstance(time_transformation, str) and is_indexed(time_transformation):
+            time_transformation = formula_at_sizes(cast(Any, system), time_transformation, sizes or {}, tables)
         system = unroll_sums(system, sizes or {}, tables=tables)
     if known_sizes := not hasattr(system, "REQUIRES_SIZES"):
         method = as_method(method, system)
     else:
-        _check_sizes_not_needed(system, symmetries=symmetries, events=events)
+        if symmetries:
+            raise MethodError(f"symmetries= is unavailable for '{system.name}': {SIZES_REQUIRED}")
         method = as_method(method)
     sources = CachedSources(system, method, solver, prefix, symmetries, time_transformation)
     variants = Variants(make=sources.variant)
@@ -119,17 +124,11 @@ def compile_stepper(
             prefix=prefix,
             time_transformation=time_transformation,
         )
-        return Stepper(source, interface, variants=variants, flags=flags, of_sizes=of_sizes, reason=reason)
+        further: dict[str, Any] = {"events": as_events(events), "of_sizes": of_sizes, "reason": reason}
+        return Stepper(source, interface, variants=variants, flags=flags, **further)
     source, interface = sources.integrator()
     cast(MechanicalSystem, system).store_key()
     return Stepper(source, interface, variants=variants, flags=flags, events=as_events(events))
-
-
-def _check_sizes_not_needed(system: MechanicalSystem | ArraySystem, **arguments: object) -> None:
-    """Raise an error for an argument that requires known sizes."""
-    for name, value in arguments.items():
-        if value:
-            raise MethodError(f"{name} of compile_stepper() is not available for '{system.name}': {SIZES_REQUIRED}")
 
 
 class CachedSources:

@@ -1,7 +1,7 @@
 """Parser for array formulas: the grammar of formulas with arrays, and with ``sum(loops, formula)``.
 
     L     = a sum of  [factor "*"] "sum" "(" loop ("," loop)* "," formula ")"  and of formulas without a sum
-    atom  = .. | array "[" index ("," index)* "]"
+    atom  = .. | array "[" index ("," index)* "]" | "rotate_" k "(" rotation ["[" .. "]"] "," a "," b "," c ")"
 
 Loops and indices are those of :mod:`scvi_codegen.indices`. A sum within a sum must have integer bounds, and is
 unrolled: ``sum(k in 3, r_dot[i, k]**2)``.
@@ -28,6 +28,9 @@ _TOKEN = re.compile(
 )
 MAX_UNROLLED_TERMS, MAX_NESTED_TERMS = 64, 4096
 """Maximum number of terms of one sum within a sum, and of all such nested sums."""
+
+ROTATING = ("rotate_1", "rotate_2", "rotate_3", "unrotate_1", "unrotate_2", "unrotate_3")
+"""Functions of formulas: components of R (a, b, c), from body to space, and of its inverse."""
 
 Bound: TypeAlias = Loop | int
 
@@ -205,6 +208,8 @@ class ArrayParser(_Indices):
         """Parse a sum, an array entry, or a name of the scalar grammar."""
         if name == "sum" and self.peek().text == "(":
             return self.summed(column)
+        if name in ROTATING and self.peek().text == "(":
+            return self.rotated(name, column)
         if name in self.arrays:
             return self.entry(self.arrays[name], column)
         if name in self.tables:
@@ -320,7 +325,30 @@ class ArrayParser(_Indices):
         if array.axes and self.peek().text != "[":
             self.refuse(f"'{array.name}' is an array: write {array}", column)
         indices = self.brackets(array, column) if array.axes else ()
-        access = Access(array=array, places=indices)
+        return self.slot(Access(array=array, places=indices))
+
+    def rotated(self, name: str, column: int) -> Expr:
+        """Parse ``(R[i], a, b, c)`` after ``rotate_k``: component k of R (a, b, c), or of its inverse."""
+        self.open(column)
+        self.expect("(")
+        token = self.take_name("a rotation")
+        matrix = {f"{j}{k}": self.arrays.get(f"{token.text}_{j}{k}") for j in "123" for k in "123"}
+        first = matrix["11"]
+        if first is None:
+            known = ", ".join(each.removesuffix("_11") for each in self.arrays if each.endswith("_11")) or "none"
+            self.refuse(f"{name} needs a rotation first, not '{token.text}'. Rotations: {known}", token.column)
+        places = self.brackets(first, token.column) if first.axes else ()
+        terms = []
+        for each in "123":
+            self.expect(",")
+            array = matrix[each + name[-1] if name.startswith("un") else name[-1] + each]
+            assert array is not None  # rotations have all nine entries
+            terms.append(self.slot(Access(array=array, places=places)) * self.sum())
+        self.close()
+        return Add(*terms)
+
+    def slot(self, access: Access) -> Symbol:
+        """Return the symbol of an array entry."""
         slot = symbol(str(access))
         self.accesses[slot] = access
         return slot

@@ -34,6 +34,7 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.formulas.array_entries import formula_of_entries, is_indexed, momentum_arrays
 from scvi_codegen.formulas.expressions import gradient, hessian
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.rotations.names import RotationNames
@@ -197,7 +198,7 @@ def time_rescaling_function(system: MechanicalSystem, g: str | Expr, *, in_time:
     if isinstance(g, Expr):
         formula = g.xreplace({free: readable[free.name] for free in g.free_symbols if free.name in readable})
     elif isinstance(g, str):
-        formula = _read(g, readable)
+        formula = _read(system, g, readable)
     else:
         raise SystemDefinitionError(f"time_transformation must be a name, text or a SymPy expression, not {g!r}")
     formula = names.in_coordinates(formula)
@@ -215,7 +216,10 @@ def time_rescaling_function(system: MechanicalSystem, g: str | Expr, *, in_time:
     return formula.xreplace(driven)
 
 
-def _read(text: str, known: Mapping[str, Symbol]) -> Expr:
+def _read(system: MechanicalSystem, text: str, known: Mapping[str, Symbol]) -> Expr:
+    if is_indexed(text) and system.arrays:
+        momenta = momentum_arrays(system.arrays, (each.name for each in system.auxiliaries))
+        return formula_of_entries(text, (*system.arrays, *momenta), known)
     try:
         return parse_expression(text, known)
     except SystemDefinitionError as error:

@@ -26,10 +26,13 @@ from sympy import Expr, Symbol
 from sympy.core.function import AppliedUndef
 
 from scvi_codegen.errors import EventError, SystemDefinitionError, closest
+from scvi_codegen.formulas.array_entries import formula_of_entries, is_indexed, momentum_arrays
+from scvi_codegen.formulas.arrays import parse_coordinate
 from scvi_codegen.formulas.expressions import evaluated, unsupported_part
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.rotations.names import RotationNames
 from scvi_codegen.formulas.symbols import DOT, TIME, identifier, input_formulas, symbol
+from scvi_codegen.indices import Array
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Kernel, lower_matrix, lower_vector
 from scvi_codegen.rendering.program_source import EventSearch, render_events
@@ -86,7 +89,7 @@ class EventFormulas:
     def __init__(self, interface: Interface, events: Sequence[SearchedEvent]) -> None:
         self.interface, self.events = interface, events
         self._turning = RotationNames.of_declarations(interface.rotations)
-        self._known = self._turning.symbols | _names(interface)
+        self._known, self._arrays = self._turning.symbols | _names(interface), _arrays(interface)
         self.q = [symbol(name) for name in interface.coordinates]
         self.v = [symbol(name + DOT) for name in interface.coordinates]
         self.parameters = tuple(symbol(name) for name in interface.parameters)
@@ -118,6 +121,8 @@ class EventFormulas:
         return lower_kernel(name, arguments=self.arguments, time=time, parameters=parameters, values=values)
 
     def _read(self, formula: Formula, what: str) -> Expr:
+        if isinstance(formula, str) and self._arrays and is_indexed(formula):
+            formula = formula_of_entries(formula, self._arrays, self._known)
         expression = self._turning.in_coordinates(_expression(formula, self._known, what))
         return cast(Expr, expression.xreplace(input_formulas(self.interface.inputs, symbol(TIME))))
 
@@ -133,7 +138,7 @@ class EventFormulas:
             return [0] * (len(gradient) + 1), [*gradient, restitution]
         variables = {each: k for k, each in enumerate(self.arguments)}
         named = {name: variables[each] for name, each in self._known.items() if each in variables}
-        indices = [named.get(name, -1) for name, _ in event.changes]
+        indices = [named.get(str(self._read(name, "then=") if "[" in name else name), -1) for name, _ in event.changes]
         for index, (name, value) in zip(indices, event.changes, strict=True):
             if index < 0:
                 raise EventError(
@@ -163,6 +168,13 @@ def _check_changes(interface: Interface, events: Sequence[SearchedEvent]) -> Non
                 f"the event '{changing[0].function}' changes the state, which is not supported with {what}: make the "
                 "event terminal, change the state in Python, and start the next run from it"
             )
+
+
+def _arrays(interface: Interface) -> list[Array]:
+    """Return the arrays whose entries a function may contain: coordinates, parameters, velocities and momenta."""
+    arrays = [parse_coordinate(declaration) for declaration in interface.arrays]
+    moving = [Array(array.name + DOT, array.axes) for array in arrays if array.elements[0] in interface.coordinates]
+    return [*arrays, *moving, *momentum_arrays(arrays, interface.momenta)]
 
 
 def _names(interface: Interface) -> dict[str, Symbol]:

@@ -9,13 +9,11 @@ from typing import Any
 from sympy import Add, Expr, Matrix, S, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.formulas.arrays import ROTATING
 from scvi_codegen.formulas.expressions import gradient, hessian
 from scvi_codegen.formulas.grammar import Parser, parsed
 from scvi_codegen.formulas.rotations.members import AXES, Direction, Homogeneous, Rotation, Spin, momenta_of
 from scvi_codegen.formulas.symbols import DOT, check_name, symbol
-
-ROTATING = ("rotate_1", "rotate_2", "rotate_3", "unrotate_1", "unrotate_2", "unrotate_3")
-"""Functions of formulas: components of R (a, b, c), from body to space, and of its inverse."""
 
 Forces = tuple[tuple[str, tuple[Expr, ...]], ...]
 """Components of a force by name: one of a coordinate, three of a rotation (torque in the body frame) or direction."""
