@@ -8,6 +8,7 @@ Hamiltonian density are p_i = W_i b_i at points with the weights W_i: sum_i dq_i
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -19,11 +20,11 @@ from sympy import Add, Expr
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.fields.axes import Axis, Cells, digits, same
-from scvi_codegen.fields.density import Density
+from scvi_codegen.fields.density import Density, place_text
 from scvi_codegen.fields.mesh import Mesh, MeshSystem
 from scvi_codegen.formulas.array_notation import array_text
 from scvi_codegen.formulas.arrays import MAX_UNROLLED_TERMS
-from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.formulas.symbols import TIME, symbol
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.tables.precision import mp
@@ -47,7 +48,7 @@ class _Assembly:
     def result(self, discretisation: Mapping[str, Any]) -> MeshSystem:
         system = self.system
         sizes = ", ".join(f"N{axis}" for axis in self.axes)
-        terms = [*self.kinetic(), *self.in_space()]
+        terms = [*self.kinetic(), *self.in_space(), *self.at_places()]
         dissipation = None
         if system.dissipation != 0:
             here = {axis: f"i{axis}" for axis in self.axes}
@@ -62,7 +63,7 @@ class _Assembly:
         conjugate = [f"{each}[{sizes}]" for each in system.momenta]
         arguments: dict[str, Any] = {
             "name": system.name,
-            "coordinates": [f"{each}[{sizes}]" for each in system.fields],
+            "coordinates": [*(f"{each}[{sizes}]" for each in system.fields), *system.scalars],
             "parameters": {
                 **dict(zip(map(str, system.parameters), system.defaults, strict=True)),
                 **{f"{name}[{size}]": values for name, (size, values) in self.used.items()},
@@ -119,6 +120,25 @@ class _Assembly:
             mass = self.system.density.diff(rate, 2)
             here = ", ".join(f"i{axis}" for axis in self.axes)
             yield self.over_points(f"({self.written(mass, self.at_points([*self.axes]))})*{each}_dot[{here}]**2/2")
+
+    def at_places(self) -> Iterator[str]:
+        """Yield the point Lagrangians."""
+        for place, formula in self.system.point_lagrangians:
+            rows = [self.axes[axis].interpolation(at).items() for axis, at in place.items()]
+            terms = [
+                (", ".join(str(k) for k, _ in row), math.prod(x for _, x in row)) for row in itertools.product(*rows)
+            ]
+            known = {each.name for each in formula.free_symbols}
+            texts = {f"{each}_{TIME}": f"{each}_dot" for each in self.system.scalars}
+            for each in self.system.fields:
+                if f"{each}_{TIME}" in known and len(terms) > 1:
+                    raise SystemDefinitionError(
+                        f"the point Lagrangian at {place_text(place)} contains {each}_{TIME}, but no point of the mesh "
+                        'is there: choose points= such that one is, or "spectral-elements", whose elements end there'
+                    )
+                texts[f"{each}_{TIME}"] = f"{each}_dot[{terms[0][0]}]"
+                texts[each] = " + ".join(f"{digits(x)}*{each}[{index}]" for index, x in terms)
+            yield f"({self.written(formula, texts)})"
 
     def over_points(self, body: str) -> str:
         loops = ", ".join(f"i{axis} in N{axis}" for axis in self.axes)

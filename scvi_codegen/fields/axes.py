@@ -105,6 +105,8 @@ class Axis:
         inside: (E, b) whether a point is unknown; the value at the others is prescribed.
         reference: of elements, the points on [-1, 1].
         edges: of elements, their ends.
+        stencil: number of points for the interpolation of values between equidistant points (differences).
+        periodic: whether it has no ends.
         pairs: (N, N) matrices K of the quadratic forms sum_(i<j) K_ij (u_i - u_j)^2/2 of int u_x^2/2 dx and int
             u_xx^2/2 dx (Fourier).
         stiffness: upper bounds of int u_x^2 dx and int u_xx^2 dx by sum_i weights_i u_i^2.
@@ -123,8 +125,29 @@ class Axis:
     inside: NDArray[np.bool_] = field(default_factory=lambda: np.ones((0, 0), bool))
     reference: Vector = ()
     edges: Edges | None = None
+    stencil: int = 0
+    periodic: bool = True
     pairs: tuple[Array, ...] = ()
     stiffness: tuple[float, ...] = ()
+
+    def interpolation(self, at: float) -> dict[int, float]:
+        """Return the coefficients of the values at points in the value at a coordinate, by the index of the point."""
+        distance = self.points - at
+        if self.periodic:
+            distance -= self.length * np.round(distance / self.length)
+        if np.abs(distance).min() <= 1e-12 * self.length:
+            return {int(np.abs(distance).argmin()): 1.0}
+        if self.table is not None:
+            raise SystemDefinitionError(
+                f"the point Lagrangian at {self.name} = {at:g} is not at an unknown value of the mesh, but inside of "
+                'an element or at an end with a prescribed value: use "spectral-elements", and a place off that end'
+            )
+        if self.pairs:
+            angle, n = np.pi * distance / self.length, len(self.points)
+            values = np.sin(n * angle) / (n * (np.sin(angle) if n % 2 else np.tan(angle)))
+            return dict(enumerate(values.tolist()))
+        near = np.sort(np.abs(distance).argsort(kind="stable")[: self.stencil]).tolist()
+        return {k: float(np.prod([distance[j] / (distance[j] - distance[k]) for j in near if j != k])) for k in near}
 
     def differentiated(self, values: Array, along: int) -> Array:
         """Return the derivative at the points of values along one of their axes; see :meth:`MeshSystem.derivative`."""
@@ -247,6 +270,7 @@ def spectral_elements(
         points=points[inside],
         weights=masses[inside],
         length=float(breaks[-1] - breaks[0]),
+        periodic=fixed is None,
         quadrature=rule.weights,
         operators=(identity_matrix(p + 1), derivative, matrix_product(derivative, derivative)),
         stiffness=(largest, largest**2),
@@ -333,6 +357,7 @@ def differences(name: str, start: float, end: float, points: int, order: int, *,
         points=at,
         weights=np.full(count, h),
         length=end - start,
+        stencil=order,
         quadrature=(mp.mpf(1),),
         operators=tuple((row,) for row in rows),
         cells=(Cells(f"{index} in N{name} periodic", index, places),),

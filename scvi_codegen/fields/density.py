@@ -34,6 +34,9 @@ class Density:
             formula in t by field.
         parameters, defaults: adjustable numbers and their default values.
         dissipation: Rayleigh density D of velocities, whose forces are -dD/du_t.
+        scalars: names of further coordinates, which are functions of time.
+        point_lagrangians: place by axis, and the Lagrangian of fields, scalars and velocities there, which is added to
+            the integral of the density.
         density: L or H; ``u_t``, ``u_x``, ``u_xx``, ``u_xy`` are the derivatives of ``u``.
     """
 
@@ -46,6 +49,8 @@ class Density:
     defaults: tuple[float, ...]
     density: Expr
     dissipation: Expr = S.Zero
+    scalars: tuple[str, ...] = ()
+    point_lagrangians: tuple[tuple[Mapping[str, float], Expr], ...] = ()
 
     __repr__ = summary("name", "fields", "space")
 
@@ -114,3 +119,8 @@ def derivatives_of(fields: Sequence[str], axes: Sequence[str]) -> dict[str, tupl
     orders |= {axis * 2: {axis: 2} for axis in axes}
     orders |= {one + two: {one: 1, two: 1} for one, two in combinations(axes, 2)}
     return {f"{each}_{name}": (each, order) for each in fields for name, order in orders.items()}
+
+
+def place_text(place: Mapping[str, float]) -> str:
+    """Return a place as text, ``x = 0.5, y = 1``."""
+    return ", ".join(f"{axis} = {value:g}" for axis, value in place.items())

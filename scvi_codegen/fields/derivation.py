@@ -9,7 +9,7 @@ from typing import Any
 import sympy
 from sympy import Eq, Expr
 
-from scvi_codegen.fields.density import Density
+from scvi_codegen.fields.density import Density, place_text
 from scvi_codegen.fields.laws import ConservationLaw, Variations, names_of
 from scvi_codegen.formulas.symbols import TIME, symbol
 from scvi_codegen.formulas.translation import format_expression
@@ -41,6 +41,8 @@ class FieldDerivation:
     def _lines(self) -> Iterator[str]:
         letter, title = ("H", "Hamilton") if self.field_system.momenta else ("L", "Euler-Lagrange")
         yield f"{self.field_system.name}: {letter} = {format_expression(self.field_system.density)}"
+        for place, formula in self.field_system.point_lagrangians:
+            yield f"  at {place_text(place)}: {format_expression(formula)}"
         yield ""
         yield f"{title} equations"
         for each in self.equations.values():

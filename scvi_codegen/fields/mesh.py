@@ -135,7 +135,8 @@ class Mesh:
 
         Explicit methods of second order are stable for h below 2/frequency; fixed-point iterations converge for h times
         frequency below about 1 to 3. The bound is the sum over axes of the largest factors of u_x**2 and u_xx**2 times
-        the largest eigenvalues of the derivatives on an element, plus that of u**2.
+        the largest eigenvalues of the derivatives on an element, plus that of u**2. Point Lagrangians add the sum of
+        their factors of squares of coordinates by the masses of these.
 
         Args:
             parameters: values of parameters that differ from the defaults.
@@ -163,7 +164,26 @@ class Mesh:
             pairs = zip(system.fields, system.momenta, strict=True)
             return max(float(np.sqrt(total[one] * total[two])) for one, two in pairs)
         masses = [1 / largest(1 / system.density.diff(rate, 2)) for rate in system.rates]
-        return max(float(np.sqrt(total[each] / mass)) for each, mass in zip(system.fields, masses, strict=True))
+        squared = max(total[each] / mass for each, mass in zip(system.fields, masses, strict=True))
+        return float(np.sqrt(squared + self._point_terms(dict(zip(system.fields, masses, strict=True)), values)))
+
+    def _point_terms(self, densities: Mapping[str, float], values: Mapping[Any, float]) -> float:
+        """Return the sum of second derivatives of point Lagrangians by coordinates, relative to their masses."""
+        system = self.field_system
+        rest = {symbol(each): 0 for each in (*system.fields, *system.scalars)} | dict(values)
+
+        def second(formula: sympy.Expr, name: str) -> float:
+            return float(formula.diff(symbol(name), 2).xreplace(rest))
+
+        every = [formula for _, formula in system.point_lagrangians]
+        inverse = {each: 1 / sum(second(part, f"{each}_{TIME}") for part in every) for each in system.scalars}
+        total = 0.0
+        for place, formula in system.point_lagrangians:
+            rows = [(axis, axis.interpolation(place[axis.name])) for axis in self.axes]
+            share = float(np.prod([sum(x * x / axis.weights[k] for k, x in row.items()) for axis, row in rows]))
+            inverse |= {each: share / mass for each, mass in densities.items()}
+            total += sum(factor * abs(second(formula, each)) for each, factor in inverse.items())
+        return total
 
     def largest_step(self, method: Method | str, **parameters: float) -> float:
         """Return the largest step size by the bound :meth:`highest_frequency`: of stability or of convergence.

@@ -60,6 +60,8 @@ class FieldSystem(Density):
         boundary: Mapping[str, Any] | None = None,
         parameters: Mapping[str, float] | None = None,
         dissipation: str | None = None,
+        scalars: Sequence[str] = (),
+        point_lagrangians: Sequence[Mapping[str, Any]] = (),
     ) -> FieldSystem:
         """Read a density from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 
@@ -78,6 +80,10 @@ class FieldSystem(Density):
             parameters: default value by name.
             dissipation: Rayleigh density of velocities, axes and parameters, whose forces -dD/du_t are added to those
                 of L; ``"100*x**4*u_t**2/2"`` absorbs waves at an end.
+            scalars: names of coordinates beside the fields, functions of time.
+            point_lagrangians: Lagrangians of fields at places, which are added to the integral of the density: masses,
+                springs, defects. They contain fields, scalars, their velocities, t and parameters:
+                ``{"x": 0.5, "lagrangian": "m*X_t**2/2 - k*(u - X)**2/2"}``.
 
         Raises:
             SystemDefinitionError: naming the symbol, if the density is outside the grammar, not regular in the
@@ -95,12 +101,15 @@ class FieldSystem(Density):
             _check_derivative(match[0], match[1], [*space], parameters or {})
         read = partial(parse_expression, text)
         system = cls._of(name, fields, momenta, space, boundary, parameters, first_order, read)
-        if dissipation is None:
-            return system
-        if first_order:
-            raise SystemDefinitionError(f"'{name}' has a Hamiltonian density, which has no dissipation=: omit it")
-        known = {each.name: each for each in (*system.rates, *map(symbol, space), *system.parameters)}
-        return replace(system, dissipation=parse_expression(dissipation, known))
+        for key, value in (("dissipation", dissipation), ("point_lagrangians", point_lagrangians)):
+            if first_order and value:
+                raise SystemDefinitionError(f"'{name}' has a Hamiltonian density, which has no {key}=: omit it")
+        if dissipation is not None:
+            known = {each.name: each for each in (*system.rates, *map(symbol, space), *system.parameters)}
+            system = replace(system, dissipation=parse_expression(dissipation, known))
+        check_names((*fields, *scalars), (*map(str, system.parameters), *system.derivatives, *space), ())
+        places = tuple(_at_place(system, scalars, each) for each in point_lagrangians)
+        return replace(system, scalars=tuple(scalars), point_lagrangians=places)
 
     @classmethod
     @checks_arguments(SystemDefinitionError)
@@ -261,11 +270,12 @@ class FieldSystem(Density):
     def _axis(self, axis: str, method: str, options: Mapping[str, Any]) -> Axis:
         start, end = self.space[axis]
         boundary = self.boundary[axis]
+        places = [place[axis] for place, _ in self.point_lagrangians]
         if "degree" in options:
             fixed = None if boundary == PERIODIC else tuple(each != NATURAL for each in boundary)
             derivative = f"{self.fields[0]}_{axis}"
             clamped = [fixed is not None and fixed[k] and derivative in boundary[k] for k in range(2)]
-            breaks = _breaks(axis, start, end, options.get("elements", 1))
+            breaks = _breaks(axis, start, end, options.get("elements", 1), places if "elements" in options else ())
             return spectral_elements(axis, breaks, options["degree"], fixed, (clamped[0], clamped[1]))
         if boundary != PERIODIC:
             raise SystemDefinitionError(
@@ -331,15 +341,40 @@ def _boundary(axis: str, boundary: Any, fields: Sequence[str], known: Mapping[st
     return tuple(ends)
 
 
-def _breaks(axis: str, start: float, end: float, elements: Any) -> Any:
-    """Return the ends of the elements."""
+def _at_place(system: Density, scalars: Sequence[str], entry: Any) -> tuple[Mapping[str, float], Expr]:
+    """Return place and formula of a point Lagrangian."""
+    if not isinstance(entry, Mapping) or {*entry} != {*system.space, "lagrangian"}:
+        keys = ", ".join(f'"{axis}": ..' for axis in system.space)
+        raise SystemDefinitionError(
+            f'a point Lagrangian needs a place and a formula, {{{keys}, "lagrangian": ".."}}, not {entry!r}'
+        )
+    place = {axis: float(parse_expression(str(entry[axis]), {})) for axis in system.space}
+    for axis, (start, end) in system.space.items():
+        if not start <= place[axis] <= end:
+            raise SystemDefinitionError(
+                f"the point Lagrangian at {axis} = {place[axis]:g} is outside of the axis, {start:g} to {end:g}: "
+                "give a place inside"
+            )
+    rates = [f"{each}_{TIME}" for each in (*system.fields, *scalars)]
+    names = (*system.fields, *scalars, *rates, TIME, *map(str, system.parameters))
+    return place, parse_expression(str(entry["lagrangian"]), {each: symbol(each) for each in names})
+
+
+def _breaks(axis: str, start: float, end: float, elements: Any, places: Sequence[float]) -> Any:
+    """Return the ends of the elements, which contain some places.
+
+    Equal elements are divided at the places into parts with elements that are at most as long.
+    """
     if np.ndim(elements) == 0:
         whole = hasattr(elements, "__index__") and not isinstance(elements, bool)
         if not whole or (count := operator.index(elements)) < 1:
             raise SystemDefinitionError(
                 f"elements= of '{axis}' must be a number of elements or their ends, not {elements!r}"
             )
-        return np.linspace(start, end, count + 1)
+        ends = np.unique([start, *places, end])
+        numbers = np.ceil(np.diff(ends) / (end - start) * count - 1e-9).astype(int)
+        parts = [np.linspace(*part, n + 1) for *part, n in zip(ends, ends[1:], numbers, strict=False)]
+        return np.unique(np.concatenate(parts))
     breaks = np.asarray(elements, float)
     if (
         breaks.ndim != 1
@@ -349,4 +384,4 @@ def _breaks(axis: str, start: float, end: float, elements: Any) -> Any:
         or breaks[-1] != end
     ):
         raise SystemDefinitionError(f"the ends of the elements of '{axis}' must ascend from {start:g} to {end:g}")
-    return breaks
+    return np.union1d(breaks, places)

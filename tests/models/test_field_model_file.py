@@ -75,9 +75,30 @@ q = { u = "x*cos(pi*y)", v = 0 }
 tolerance = 1e-9
 span = 0.5
 """
+OSCILLATOR = """
+[field]
+name = "string with an oscillator"
+fields = ["u"]
+scalars = ["X"]
+space = { x = [0, 1] }
+density = "u_t**2/2 - u_x**2/2"
+point_lagrangians = [{ x = "1/3", lagrangian = "M*X_t**2/2 - k*(u - X)**2/2" }]
+discretisation = { method = "spectral-elements", degree = 8, elements = 3 }
+
+[parameters]
+M = 0.3
+k = 2.0
+
+[initial]
+q = { u = "cos(pi*x)", X = "M/3" }
+
+[run]
+step = 0.01
+steps = 5
+"""
 
 
-@pytest.mark.parametrize("text", [STRING, SCHROEDINGER, PLANE])
+@pytest.mark.parametrize("text", [STRING, SCHROEDINGER, PLANE, OSCILLATOR])
 @pytest.mark.filterwarnings("ignore::scvi_codegen.AccuracyWarning")
 def test_file_is_read_back_with_equal_bits(text):
     model = parse_model(text)

@@ -7,6 +7,9 @@
     boundary = { x = "periodic" }                       # or two ends, ["natural", "sin(t)"]; default: natural ends
     density = "u_t**2/2 - u_x**2/2 - c*(1 - cos(u))"
     discretisation = { method = "spectral-elements", degree = 8, elements = 40 }
+    # dissipation = "0.1*u_t**2/2"
+    # scalars = ["X"]                                   # coordinates beside the fields, for point Lagrangians:
+    # point_lagrangians = [{ x = 0.0, lagrangian = "m*X_t**2/2 - k*(u - X)**2/2" }]
 
     [initial]
     q = { u = "4*atan(exp(x))" }                        # a formula in the axes, t and parameters, or an array
@@ -63,6 +66,7 @@ def fields_at_points(section: Section, system: Any) -> Section:
         known = [each.name for each in system.coordinates]
         check_keys(value, [*known, *density.momenta] if key == "q" else known, "field", f"[initial] {key}")
         state[key] = {name: _values(each, f"[initial] {key}, {name}", mesh, names) for name, each in value.items()}
+        state[key] |= {name: float(np.ravel(state[key][name])[0]) for name in {*density.scalars} & value.keys()}
     for momentum, each in zip(density.momenta, density.fields, strict=bool(density.momenta)):
         if momentum in state.get("q", {}):
             values = in_section(f"[initial] q, {momentum}", lambda: mesh.weights * state["q"].pop(momentum))  # noqa: B023
@@ -92,6 +96,10 @@ def field_section(mesh: Mesh) -> dict[str, Any]:
     section |= {"space": {axis: [*ends] for axis, ends in density.space.items()}, "boundary": boundary}
     section["hamiltonian" if density.momenta else "density"] = array_text(density.density)
     section |= {} if density.dissipation == 0 else {"dissipation": array_text(density.dissipation)}
+    if density.point_lagrangians:
+        section["scalars"] = [*density.scalars]
+        places = [{**place, "lagrangian": array_text(formula)} for place, formula in density.point_lagrangians]
+        section["point_lagrangians"] = places
     return {**section, "discretisation": _plain(mesh.discretisation)}
 
 

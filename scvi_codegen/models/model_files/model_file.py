@@ -124,7 +124,7 @@ SYSTEM_KEYS = (
 RUN_KEYS = ("step", "tolerance", "error", "controller", "span", "steps", "save_every")
 FIELD_KEYS = (
     *("name", "fields", "momenta", "space", "boundary", "density", "hamiltonian", "dissipation"),
-    "discretisation",
+    *("scalars", "point_lagrangians", "discretisation"),
 )
 KEYS = {"system": SYSTEM_KEYS, "field": FIELD_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
 SECTIONS = (

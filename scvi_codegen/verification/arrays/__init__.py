@@ -105,6 +105,7 @@ def _state_of_fields(mesh: Any, method: Method | str, h: float | None) -> tuple[
     """Return random fields at the points of a mesh, their momenta, and a step size at which iterations converge."""
     random = np.random.default_rng(0)
     q, p = ({each: random.uniform(-0.5, 0.5, mesh.weights.shape) for each in mesh.field_system.fields} for _ in "qp")
+    q |= dict.fromkeys(mesh.field_system.scalars, np.array(0.1))
     return q, {each: mesh.weights * values for each, values in p.items()}, h or min(mesh.largest_step(method) / 4, 0.05)
 
 
