@@ -373,7 +373,7 @@ def _breaks(axis: str, start: float, end: float, elements: Any, places: Sequence
             )
         ends = np.unique([start, *places, end])
         numbers = np.ceil(np.diff(ends) / (end - start) * count - 1e-9).astype(int)
-        parts = [np.linspace(*part, n + 1) for *part, n in zip(ends, ends[1:], numbers, strict=False)]
+        parts = [np.linspace(a, b, n + 1) for a, b, n in zip(ends[:-1], ends[1:], numbers, strict=True)]
         return np.unique(np.concatenate(parts))
     breaks = np.asarray(elements, float)
     if (

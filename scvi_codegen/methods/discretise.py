@@ -108,7 +108,7 @@ def is_symplectic(method: Method, system: MechanicalSystem) -> bool:
 
 def is_conformally_symplectic(method: Method, system: MechanicalSystem) -> bool:
     """Return whether the steps multiply dq ^ dp by exp(-gamma h), where gamma is the damping rate."""
-    prescribed = len(system.constraints) == system.dimension
+    prescribed = 0 < len(system.constraints) == getattr(system, "dimension", 0)  # 0: sizes known at run time
     return method.symplectic and not (system.forces or prescribed or any(nonholonomic_expressions(system)))
 
 
