@@ -3,6 +3,7 @@
     array    = name "[" size ("," size)* "]"                      declared, as q[N], r[N, 3], bonds[B, 2]
     loop     = name "in" (bound ".." bound | size) ["periodic"]   i in N, i in 0..N-2, i in N periodic
              | name "<" name "in" size                            i < j in N: every pair once
+             | name "<" name "in" list                            i < j in near: pairs of a list of neighbours
     place    = whole number | size (+|-) whole number             0, N-1
              | index (+|-) whole number                           i, i+1
              | table "[" index "," whole number "]"               bonds[b, 0]
@@ -116,6 +117,7 @@ class Loop:
         first, end: bounds; ``first`` is 0 in a pair loop.
         periodic: periodic boundary: index ``end`` wraps to ``first``.
         behind: the smaller index of a pair loop, or "".
+        near: list of neighbours that contains the pairs, or "".
     """
 
     index: str
@@ -123,6 +125,7 @@ class Loop:
     end: Size
     periodic: bool = False
     behind: str = ""
+    near: str = ""
 
     @property
     def is_whole(self) -> bool:
@@ -131,7 +134,7 @@ class Loop:
 
     def __str__(self) -> str:
         if self.behind:
-            return f"{self.behind} < {self.index} in {self.end}"
+            return f"{self.behind} < {self.index} in {self.near or self.end}"
         span = str(self.end) if self.is_whole and not self.end.number else f"{self.first}..{self.end + -1}"
         return f"{self.index} in {span}{' periodic' if self.periodic else ''}"
 

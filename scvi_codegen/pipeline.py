@@ -180,6 +180,7 @@ def describe_arrays(
         velocity_formulas=sites.velocities if sites else (),
         couplings=system.potentials if solver == "newton" else (),
         data=system.data,
+        neighbours=tuple(near.name for near in system.neighbours),
         mesh=system.mesh,
     )
     return Interface(

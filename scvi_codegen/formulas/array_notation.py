@@ -42,7 +42,8 @@ def latex_sums(term: ArrayTerm) -> str:
 
 def _sum(loop: Loop) -> str:
     if loop.behind:
-        return rf"\sum_{{0 \le {loop.behind} < {loop.index} < {loop.end}}}"
+        listed = rf",\ \mathrm{{{loop.near}}}" if loop.near else ""
+        return rf"\sum_{{0 \le {loop.behind} < {loop.index} < {loop.end}{listed}}}"
     if loop.periodic:
         return rf"\sum_{{{loop.index} \in \mathbb{{Z}}_{{{loop.end}}}}}"
     return rf"\sum_{{{loop.index}={loop.first}}}^{{{loop.end + -1}}}"

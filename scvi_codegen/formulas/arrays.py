@@ -18,6 +18,7 @@ from sympy import Add, Expr, S, Symbol
 
 from scvi_codegen.errors import ExpressionError, SystemDefinitionError, closest
 from scvi_codegen.formulas.grammar import Parser, Token, parsed
+from scvi_codegen.formulas.neighbours import Neighbours
 from scvi_codegen.formulas.symbols import check_name, symbol
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
 
@@ -78,7 +79,11 @@ def parse_coordinate(text: str) -> Array:
 
 
 def parse_sums(
-    text: str, arrays: Sequence[Array], symbols: Mapping[str, Symbol], tables: Sequence[Array] = ()
+    text: str,
+    arrays: Sequence[Array],
+    symbols: Mapping[str, Symbol],
+    tables: Sequence[Array] = (),
+    neighbours: Sequence[Neighbours] = (),
 ) -> tuple[ArrayTerm, ...]:
     """Parse a sum of sums.
 
@@ -87,6 +92,7 @@ def parse_sums(
         arrays: arrays whose entries may occur: coordinates, their velocities, parameters.
         symbols: other symbols that may occur, by name.
         tables: index tables.
+        neighbours: lists of neighbours.
 
     Returns:
         Its terms, with one term per distinct tuple of loops.
@@ -98,7 +104,7 @@ def parse_sums(
     >>> [str(term) for term in parse_sums("-k*sum(i in 0..N-2, (q[i+1] - q[i])**2)", [q], {"k": symbol("k")})]
     ['sum(i in 0..N-2, -k*(q[i+1] - q[i])**2)']
     """
-    parser = ArrayParser(text, symbols, arrays, tables)
+    parser = ArrayParser(text, symbols, arrays, tables, neighbours)
     whole = parsed(parser)
     by_loops: dict[tuple[Loop, ...], list[Expr]] = {}
     for placeholder, (loops, formula, column) in parser.sums.items():
@@ -194,11 +200,17 @@ class ArrayParser(_Indices):
     """Parser for formulas with array entries and sums."""
 
     def __init__(
-        self, text: str, symbols: Mapping[str, Symbol], arrays: Sequence[Array], tables: Sequence[Array]
+        self,
+        text: str,
+        symbols: Mapping[str, Symbol],
+        arrays: Sequence[Array],
+        tables: Sequence[Array],
+        neighbours: Sequence[Neighbours] = (),
     ) -> None:
         super().__init__(text, symbols)
         self.arrays, self.tables = ({each.name: each for each in group} for group in (arrays, tables))
         self.sizes = {name for array in (*arrays, *tables) for name in array.names}
+        self.neighbours = {each.name: each for each in neighbours}
         self.in_scope: dict[str, Bound] = {}
         self.nested = 1
         self.accesses: dict[Symbol, Access] = {}
@@ -239,11 +251,32 @@ class ArrayParser(_Indices):
         if inner or (self.sizes and all(not loop.first.name and not loop.end.name for loop in loops)):
             return self.written_out(loops, column)
         self.in_scope |= {loop.index: loop for loop in loops}
-        formula = self.sum()
+        formula = self.sum() * self.inside(loops)
         self.end_of_sum(loops)
         placeholder = symbol(f"sum {len(self.sums)}")
         self.sums[placeholder] = (tuple(loops), formula, column)
         return placeholder
+
+    def inside(self, loops: Sequence[Loop]) -> Expr:
+        """Return the factor of a summand that is 1 for pairs closer than the cutoff of their list, else 0."""
+        factor: Expr = S.One
+        for loop in loops:
+            if loop.near:
+                near = self.neighbours[loop.near]
+                pair = (self.position_of(near, index) for index in (loop.behind, loop.index))
+                factor *= near.inside(*pair)
+        return factor
+
+    def position_of(self, near: Neighbours, index: str) -> list[Expr]:
+        """Return the components of the position of a point."""
+        bound = self.in_scope[index]
+        first = Place(base=Size("", bound)) if isinstance(bound, int) else Place(index=index)
+        slots: list[Expr] = []
+        for k in range(near.components):
+            access = Access(array=near.array, places=(first, Place(base=Size("", k)))[: len(near.array.axes)])
+            slots.append(symbol(str(access)))
+            self.accesses[slots[-1]] = access
+        return slots
 
     def end_of_sum(self, loops: Sequence[Loop]) -> None:
         """Parse the closing bracket of a sum and release its indices."""
@@ -279,7 +312,7 @@ class ArrayParser(_Indices):
         for row in rows:
             self.position = start
             self.in_scope |= row
-            formulas.append(self.sum())
+            formulas.append(self.sum() * self.inside(loops))
         self.end_of_sum(loops)
         self.nested //= count
         return Add(*formulas)
@@ -292,10 +325,13 @@ class ArrayParser(_Indices):
             self.check_index(token)
         self.expect("in")
         column, size = self.column, self.size()
+        near = self.neighbours.get(size.name) if pair else None
+        if near is not None:
+            size = near.array.axes[0]
         span = (size, self.size() + 1) if self.accept("..") else (Size("", 0), size)
         for end in span:
             if end.name and end.name not in self.sizes:
-                known = ", ".join(sorted(self.sizes)) or "none"
+                known = ", ".join(sorted({*self.sizes, *self.neighbours})) or "none"
                 self.refuse(
                     f"'{end.name}' is not the size of an array{closest(end.name, self.sizes)} Sizes: {known}",
                     column,
@@ -307,7 +343,8 @@ class ArrayParser(_Indices):
         if span[0] != Size("", 0) or periodic:
             self.refuse(f"pairs must run over a whole axis, as {first.text} < {pair.text} in N", column)
         outer = Loop(index=first.text, first=span[0], end=span[1])
-        return [outer, Loop(index=pair.text, first=span[0], end=span[1], behind=first.text)]
+        name = near.name if near else ""
+        return [outer, Loop(index=pair.text, first=span[0], end=span[1], behind=first.text, near=name)]
 
     def check_index(self, token: Token) -> None:
         """Raise an error for an index name that is already in use."""

@@ -197,6 +197,8 @@ class LoopedTerms:
             the fixed-point iteration.
         reach: largest distance of lattice places that these couple; 0 if none, or if distances are not constant.
         shifts: with Newton's method, the eigenvectors of the method's matrix (:class:`ShiftTables`).
+        neighbours: lists of neighbours: name, number of components; a kernel of their periods (0: none), cutoff and
+            skin, which writes to the first position.
     """
 
     forces: tuple[LoopedKernel, ...] = ()
@@ -207,6 +209,7 @@ class LoopedTerms:
     diagonals: tuple[LoopedKernel, ...] = ()
     reach: int = 0
     shifts: ShiftTables | None = None
+    neighbours: tuple[tuple[str, int, LoopedKernel], ...] = ()
 
     @property
     def applied(self) -> tuple[LoopedKernel, ...]:

@@ -47,10 +47,12 @@ def check_solver_of_arrays(
             "Runge-Kutta method"
         )
     iterated = isinstance(chosen, FixedPointIteration) and chosen.name in ("separable", "Hamiltonian")
-    if solver == "newton" and (not loops.products or system.momenta or system.velocities or not iterated):
+    plain = not (system.momenta or system.velocities or system.neighbours)
+    if solver == "newton" and not (loops.products and plain and iterated):
         raise SizesRequiredError(
             "Newton's method for array systems requires a Lagrangian with a potential that is not linear, forces of "
-            "positions and time, no constraints, and an implicit method: leave out solver='newton'"
+            "positions and time, no constraints, no lists of neighbours, and an implicit method: leave out "
+            "solver='newton'"
         )
     if not (iterated or isinstance(chosen, Splitting | ConstrainedSteps)):
         explicit = "" if system.momenta else ", Stoermer-Verlet or a composition"

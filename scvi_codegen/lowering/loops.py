@@ -6,12 +6,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 
-from sympy import Add, Expr, Symbol
+from sympy import Add, Expr, S, Symbol
 
 from scvi_codegen.formulas.array_statements import ArrayForce
 from scvi_codegen.formulas.arrays import ArrayTerm
 from scvi_codegen.formulas.expressions import gradient
-from scvi_codegen.indices import Access, Array
+from scvi_codegen.formulas.neighbours import MAX_COMPONENTS, Neighbours
+from scvi_codegen.indices import Access, Array, Place
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.equations import ConstrainedSteps
 from scvi_codegen.ir.kernel import Constant, Load, LoopedKernel, exact_number
@@ -47,7 +48,18 @@ def looped_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, n
         products=products,
         diagonals=diagonals,
         reach=reach_of(system.coordinates, diagonals),
+        neighbours=tuple(_list(system, each) for each in system.neighbours),
     )
+
+
+def _list(system: ArraySystem, near: Neighbours) -> tuple[str, int, LoopedKernel]:
+    """Return name, components and lengths of a list of neighbours."""
+    lengths = [*near.box, *[S.Zero] * (MAX_COMPONENTS - len(near.box)), near.cutoff, near.skin]
+    none = ArrayTerm(loops=(), formula=S.One, slots=())
+    first = Access(array=near.array, places=(Place(),) * len(near.array.axes))
+    name, purpose = f"list_{near.name}", "Periods, cutoff and skin of a list of neighbours."
+    looped = looped_kernel(system, name, lengths, none, targets=[first], text=near.name, purpose=purpose)
+    return near.name, near.components, looped
 
 
 def _added(

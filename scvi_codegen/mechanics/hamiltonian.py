@@ -78,6 +78,7 @@ class HamiltonianSystem(MechanicalSystem):
         constraints: Sequence[str] = (),
         inputs: Sequence[str] = (),
         tables: Sequence[str] | Mapping[str, Any] = (),
+        neighbours: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> HamiltonianSystem | Any:
         """Read H from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 
@@ -100,6 +101,7 @@ class HamiltonianSystem(MechanicalSystem):
             inputs: names of functions of time whose values are passed to each run
                 (:mod:`scvi_codegen.formulas.symbols`).
             tables: declarations of index tables.
+            neighbours: lists of neighbours.
 
         >>> HamiltonianSystem.from_text(
         ...     name="pendulum", coordinates=["q"], momenta=["p"], hamiltonian="p**2/2 - cos(q)"
@@ -108,7 +110,7 @@ class HamiltonianSystem(MechanicalSystem):
         """
         arguments = {"name": name, "coordinates": coordinates, "hamiltonian": hamiltonian, "momenta": momenta}
         acting = {"parameters": parameters, "forces": forces, "damping": damping, "constraints": constraints}
-        turning = {"rotations": rotations, "spins": spins}
+        turning = {"rotations": rotations, "spins": spins, "neighbours": neighbours}
         return cls._of_text(arguments | acting | {"inputs": inputs, "tables": tables} | turning)
 
     @classmethod

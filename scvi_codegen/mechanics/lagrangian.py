@@ -90,6 +90,7 @@ class LagrangianSystem(MechanicalSystem):
         constraints: Sequence[str] = (),
         inputs: Sequence[str] = (),
         tables: Sequence[str] | Mapping[str, Any] = (),
+        neighbours: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> LagrangianSystem | Any:
         """Read L from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 
@@ -123,6 +124,10 @@ class LagrangianSystem(MechanicalSystem):
             inputs: names of functions of time whose values are passed to each run
                 (:mod:`scvi_codegen.formulas.symbols`).
             tables: declarations of index tables with their columns, ``["bonds[B, 2]", "pins[P]"]``.
+            neighbours: lists of the pairs of points closer than a cutoff, over which ``sum(i < j in near, ..)`` runs:
+                ``{"near": {"of": "r", "cutoff": "c", "box": "L", "skin": 0.3}}``. Lengths are numbers or formulas of
+                parameters; ``box`` is one length or one per component, and absent without a periodic boundary;
+                ``skin`` is by default an eighth of the cutoff (:mod:`scvi_codegen.formulas.neighbours`).
 
         >>> oscillator = LagrangianSystem.from_text(
         ...     name="oscillator", coordinates=["x"], lagrangian="m*x_dot**2/2 - k*x**2/2",
@@ -139,7 +144,8 @@ class LagrangianSystem(MechanicalSystem):
         acting = {"forces": forces, "dissipation": dissipation, "damping": damping, "constraints": constraints}
         acting |= {"torques": torques, "torques_space": torques_space}
         turning: dict[str, Any] = {"rotations": rotations, "directions": directions, "point_forces": point_forces}
-        return cls._of_text(arguments | acting | {"inputs": inputs, "tables": tables} | turning)
+        acting |= {"inputs": inputs, "tables": tables, "neighbours": neighbours}
+        return cls._of_text(arguments | acting | turning)
 
     @classmethod
     @checks_arguments(SystemDefinitionError, inputs=FORMULAS, torques=MAPPED, torques_space=MAPPED)
@@ -162,6 +168,7 @@ class LagrangianSystem(MechanicalSystem):
         constraints: Sequence[Expr] = (),
         inputs: Sequence[Any] = (),
         tables: Sequence[str] | Mapping[str, Any] = (),
+        neighbours: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> LagrangianSystem | Any:
         """Create the system from a SymPy expression in plain symbols or in functions of time.
 
@@ -185,7 +192,7 @@ class LagrangianSystem(MechanicalSystem):
             damping: damping rate of all momenta, an expression in parameters.
             constraints: expressions in coordinates, time and, linearly, velocities that are 0, or equations ``Eq``.
             inputs: functions of time, symbols or names whose values are passed to each run.
-            tables: declarations of index tables, as of :meth:`from_text`.
+            tables, neighbours: declarations of index tables and lists of neighbours, as of :meth:`from_text`.
 
         With arrays, ``coordinates`` and ``parameters`` are as of :meth:`from_text`, and the Lagrangian consists of
         ``Sum`` and ``Indexed``: a periodic index is ``Mod(i + 1, N)``, pairs are ``(j, i + 1, N - 1), (i, 0, N - 2)``,
@@ -215,6 +222,7 @@ class LagrangianSystem(MechanicalSystem):
             constraints=constraints,
             inputs=inputs,
             tables=tables,
+            neighbours=neighbours,
             rotations=rotations,
             directions=directions,
             torques=torques,

@@ -45,7 +45,8 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
     ordinary, parameters, inputs = (arguments[each] for each in ("coordinates", "parameters", "inputs"))
     of_momenta = "momenta" in arguments
     turning = [arguments.get(each) for each in TURNING]
-    if are_arrays(ordinary, parameters or (), arguments["tables"], *(each or () for each in turning)):
+    declared = (parameters, arguments["tables"], *turning)
+    if are_arrays(ordinary, *(each or () for each in declared)) or arguments.get("neighbours"):
         if arguments.get("point_forces"):
             raise SystemDefinitionError("point_forces of arrays are not supported: give torques and forces by index")
         return _of_arrays(cls, arrays_from_text(arguments)), True
@@ -116,6 +117,7 @@ def system_from_sympy(
     constraints: Sequence[Any] = (),
     inputs: Sequence[Any] = (),
     tables: Sequence[str] | Mapping[str, Any] = (),
+    neighbours: Mapping[str, Any] | None = None,
     **turning: Any,
 ) -> Any:
     """Return the system of a SymPy expression, its ``function`` ``"Lagrangian"`` or ``"Hamiltonian"``.
@@ -126,7 +128,7 @@ def system_from_sympy(
     names = RotationNames.declared(*(turning.get(each) for each in TURNING), momentum=momenta is not None)
     if function == "Lagrangian" and are_arrays(each for each in coordinates if isinstance(each, str)):
         others = (velocities, forces, dissipation, damping, constraints, inputs, *turning.values())
-        return _arrays_from_sympy(cls, formula, others, name, list(coordinates), parameters, tables)
+        return _arrays_from_sympy(cls, formula, others, name, list(coordinates), parameters, tables, neighbours)
 
     def expression_of(value: Any, what: str) -> Expr:
         return sympy_expression(value, what).xreplace(of_frames)
@@ -188,16 +190,23 @@ def system_from_sympy(
 
 
 def _arrays_from_sympy(
-    cls: Any, formula: Any, others: Iterable[Any], name: str, coordinates: list[Any], parameters: Any, tables: Any
+    cls: Any,
+    formula: Any,
+    others: Iterable[Any],
+    name: str,
+    coordinates: list[Any],
+    parameters: Any,
+    tables: Any,
+    neighbours: Any,
 ) -> Any:
     """Return the system of a Lagrangian with arrays; ``others`` are arguments that must be empty."""
     if any(others):
         raise SystemDefinitionError(
-            "from_sympy reads the Lagrangian, parameters and tables of a system with arrays: give the rest "
+            "from_sympy reads Lagrangian, parameters, tables and neighbours of a system with arrays: give the rest "
             "as text to from_text"
         )
     arguments = {"name": name, "coordinates": coordinates, "parameters": parameters, "tables": tables}
-    return _of_arrays(cls, arrays_from_sympy(formula, **arguments))
+    return _of_arrays(cls, arrays_from_sympy(formula, **arguments, neighbours=neighbours))
 
 
 def _components(force: Any, what: str, read: Callable[[Any, str], Expr]) -> Any:

@@ -194,6 +194,7 @@ class ArrayLayout(ArrayDeclarations):
             Hamiltonian (:class:`~scvi_codegen.formulas.array_statements.ArrayForce`).
         couplings: terms of the potential energy, which couple the coordinates that occur in them.
         data: values of fields and tables by name for runs that pass none.
+        neighbours: names of the lists of neighbours.
         mesh: of the fields of a density (:class:`~scvi_codegen.fields.mesh.Mesh`).
     """
 
@@ -207,6 +208,7 @@ class ArrayLayout(ArrayDeclarations):
     velocity_formulas: tuple[Any, ...] = ()
     couplings: tuple[Any, ...] = ()
     data: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    neighbours: tuple[str, ...] = ()
     mesh: Any = field(default=None, compare=False, repr=False)
 
 

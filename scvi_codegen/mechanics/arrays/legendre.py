@@ -81,6 +81,7 @@ COMMON = (
     "fields",
     "field_defaults",
     "tables",
+    "neighbours",
     "forces",
     "inputs",
 )

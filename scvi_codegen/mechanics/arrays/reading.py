@@ -14,6 +14,7 @@ from scvi_codegen.formulas.array_notation import array_text
 from scvi_codegen.formulas.array_statements import parse_constraint, parse_force
 from scvi_codegen.formulas.arrays import parse_array, parse_coordinate, parse_sums
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.neighbours import parse_neighbours
 from scvi_codegen.formulas.rotations.arrays import member_arrays, torque_components
 from scvi_codegen.formulas.symbols import DOT, TIME, input_formulas, number, symbol, with_inputs
 from scvi_codegen.indices import Array
@@ -25,7 +26,7 @@ LISTED = ("coordinates", "directions", "spins", "momenta", "constraints", "input
 """Arguments that are lists."""
 DEFINING = (
     *("coordinates", "rotations", "directions", "spins", "momenta", "lagrangian", "hamiltonian", "dissipation"),
-    *("damping", "constraints", "inputs", "tables", "forces", "torques", "torques_space", "point_forces"),
+    *("damping", "constraints", "inputs", "tables", "neighbours", "forces", "torques", "torques_space", "point_forces"),
 )
 """Arguments that define a system, in the order of model files."""
 
@@ -60,6 +61,7 @@ def arrays_from_text(arguments: Mapping[str, Any]) -> ArraySystem:
     text = str(lagrangian if hamiltonian is None else hamiltonian)
     known = {key: symbol(key) for key in (*scalars, *inputs, TIME)}
     driven = input_formulas(inputs, symbol(TIME))
+    lists = parse_neighbours(arguments.get("neighbours") or {}, arrays, {key: known[key] for key in scalars})
     turning = member_arrays(
         *(arguments.get(key) for key in ("rotations", "directions", "spins")), momentum=hamiltonian is not None
     )
@@ -89,7 +91,8 @@ def arrays_from_text(arguments: Mapping[str, Any]) -> ArraySystem:
         fields=tuple(fields.values()),
         field_defaults=tuple(values[key] for key in fields),
         tables=index_tables,
-        terms=tuple(substituted(term, driven) for term in parse_sums(text, everything, known, index_tables)),
+        neighbours=lists,
+        terms=tuple(substituted(term, driven) for term in parse_sums(text, everything, known, index_tables, lists)),
         forces=tuple(substituted(force, driven) for force in chain(*applied)),
         inputs=tuple(inputs),
         constraints=tuple(

@@ -24,6 +24,7 @@ from scvi_codegen.formulas.array_notation import latex_sum
 from scvi_codegen.formulas.array_statements import ArrayForce
 from scvi_codegen.formulas.arrays import ArrayTerm
 from scvi_codegen.formulas.expressions import hessian, unsupported_part
+from scvi_codegen.formulas.neighbours import Neighbours
 from scvi_codegen.formulas.rotations.arrays import MemberArray
 from scvi_codegen.formulas.symbols import DOT, check_names, input_formulas, symbol
 from scvi_codegen.indices import SIZES_REQUIRED, Access, Array, Loop
@@ -58,6 +59,7 @@ class ArraySystem:
         fields: arrays of parameters, whose values, one per element, are passed to each run.
         field_defaults: default value of all elements of each field.
         tables: index tables, ``bonds[B, 2]``, passed to each run.
+        neighbours: lists of the pairs closer than a cutoff.
         terms: of the Lagrangian or the Hamiltonian.
         forces: generalised forces of coordinates, velocities (momenta of a Hamiltonian) and time.
         inputs: names of functions of time passed to each run, each represented by five of the parameters.
@@ -79,6 +81,7 @@ class ArraySystem:
     field_defaults: tuple[float, ...]
     tables: tuple[Array, ...]
     terms: tuple[ArrayTerm, ...]
+    neighbours: tuple[Neighbours, ...] = ()
     forces: tuple[ArrayForce, ...] = ()
     inputs: tuple[str, ...] = ()
     constraints: tuple[ArrayTerm, ...] = ()
@@ -292,7 +295,7 @@ class ArraySystem:
 
     def _check_names(self) -> None:
         check_names(*([each.name for each in group] for group in (self.positions, self.parameters, self.momenta)))
-        known = [each.name for each in (*self.arrays, *self.parameters)]
+        known = [each.name for each in (*self.arrays, *self.parameters, *self.neighbours)]
         known += [array.name for each in self.rotations for array in each.formulas if array.name != each.member.name]
         for name in known:
             if known.count(name) > 1 or name in self.sizes:

@@ -12,6 +12,7 @@
     # constraints = ["x**2 + y**2 = l**2"]              # g(q, t) = 0, or equations
     # inputs = ["u"]                                    # functions of time given as data
     # rotations = { R = "omega" }                       # rigid bodies: R_11, .., omega_1, ..; directions, spins: names
+    # neighbours.near = { of = "r", cutoff = "c", box = "L" }   # lists for sums over i < j in near
     # point_forces = [{ body = "R", point = ["0", "0", "l"], force = ["F", "0", "0"] }]
 
     [forces]                                            # on coordinates; default: 0
@@ -118,7 +119,17 @@ if TYPE_CHECKING:
     from scvi_codegen.models.model_files.input_tables import InputTable
 
 SYSTEM_KEYS = (
-    *("name", "coordinates", *TURNING, "momenta", *FORMULAS, "inputs", "catalogue", "time_transformation"),
+    *(
+        "name",
+        "coordinates",
+        *TURNING,
+        "momenta",
+        *FORMULAS,
+        "inputs",
+        "neighbours",
+        "catalogue",
+        "time_transformation",
+    ),
     "point_forces",
 )
 RUN_KEYS = ("step", "tolerance", "error", "controller", "span", "steps", "save_every")

@@ -317,6 +317,7 @@ def read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
         "damping": formula_of(section, "damping", "[system]") if "damping" in section else None,
         "inputs": names_of(section, "inputs") if "inputs" in section else (),
         "tables": list(document.get("tables", {})),
+        "neighbours": section.get("neighbours"),
     }
     constraints = names_of(section, "constraints") if "constraints" in section else ()
     if "hamiltonian" in section:

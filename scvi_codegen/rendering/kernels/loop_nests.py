@@ -71,7 +71,7 @@ def sharing_of(looped: LoopedKernel) -> Sharing:
         return Sharing.IN_TURN
     if len(loops) > 1 and loops[1].behind == loops[0].index and loops[1].end == loops[0].end and loops[0].is_whole:
         pair = {loops[0].index, loops[1].index}
-        if _common_axes(targets, pair) and _width(targets, pair) == 0:
+        if _common_axes(targets, pair) and _width(targets, pair) == 0 and not loops[1].near:
             return Sharing.IN_TILES
     return Sharing.BY_PLACES
 
@@ -218,7 +218,7 @@ class Nest:
         if self.chunked:
             lines += [*self._part_passed_over(loop), f"lanes values[{len(self.looped.writes)}][CHUNK];"]
         lines += _loop(loop, "begin", "end", inner)
-        for each in behind:
+        for each in [[line for lines in behind for line in lines]] if loop.near else behind:
             lines += _loop(loop, "begin", "end", each)
         return [
             f"for (long long begin = {first}, end; begin < {end}; begin = end) {{",
@@ -232,6 +232,8 @@ class Nest:
             return "here->of.first", "here->of.end"
         if self.sharing is Sharing.IN_TILES and loop is self.looped.loops[1]:
             return f"between({_first(loop)}, here->behind.first, here->behind.end)", "here->behind.end"
+        if loop.near:
+            return _first(loop), f"near_{loop.near}->first[index_{loop.behind} + 1]"
         return _first(loop), size_text(loop.end)
 
     def adding(self, k: int, value: str) -> list[str]:
@@ -348,9 +350,19 @@ class Nest:
             for k, array in enumerate(arrays):
                 if f"{kind}_{array.name}[" in text:
                     yield f"const {number} *{kind}_{array.name} = given->{kind}[{k}];"
+        for loop in self.looped.loops:
+            if loop.near:
+                yield f"const neighbours *near_{loop.near} = given->near_{loop.near};"
+
+
+def counter(loop: Loop) -> str:
+    """Return the variable that counts the elements of a loop: its index, or a position in a list of neighbours."""
+    return f"{'at' if loop.near else 'index'}_{loop.index}"
 
 
 def _first(loop: Loop) -> str:
+    if loop.near:
+        return f"near_{loop.near}->first[index_{loop.behind}]"
     return f"index_{loop.behind} + 1" if loop.behind else size_text(loop.first)
 
 
@@ -360,7 +372,9 @@ def _shift(index: str, offset: int) -> str:
 
 def _loop(loop: Loop, first: str, end: str, lines: Sequence[str]) -> list[str]:
     """Return a loop over first <= index < end."""
-    name = f"index_{loop.index}"
+    name = counter(loop)
     head = f"for (long long {name} = {first}; {name} < {end}; {name}++)"
+    if loop.near:
+        lines = [f"const long long index_{loop.index} = near_{loop.near}->others[{name}];", *lines]
     body = [f"  {line}" for line in lines]
     return [head, *body] if len(lines) == 1 else [f"{head} {{", *body, "}"]

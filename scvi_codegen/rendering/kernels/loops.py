@@ -18,6 +18,7 @@ from scvi_codegen.rendering.kernels.loop_nests import (
     Nest,
     Sharing,
     count_text,
+    counter,
     product_text,
     sharing_of,
     sharing_text,
@@ -58,6 +59,7 @@ def loop_context(program: Program) -> dict[str, Any]:
         "forces": [_force_text(program, each) for each in loops.applied],
         "energies": [_energy_text(program, each, scalar) for each, scalar in terms],
         "masses": [_mass_text(program, each) for each in loops.masses],
+        "lists": [(name, _list_text(program, count, lengths)) for name, count, lengths in loops.neighbours],
         "force_names": [each.kernel.name for each in loops.forces],
         "energy_names": [scalar.name for _, scalar in terms],
         "mass_names": [each.kernel.name for each in loops.masses],
@@ -109,7 +111,7 @@ def _force_text(program: Program, looped: LoopedKernel) -> str:
 
     call = f"{looped.kernel.name}(u, t, parameters, value);"
     if nest.chunked:
-        here = f"[index_{looped.loops[-1].index} - begin]"
+        here = f"[{counter(looped.loops[-1])} - begin]"
         innermost = [call, *(f"values[{k}]{here} = by * value[{k}];" for k in slots)]
         behind = [added(k, f"values[{k}]{here}") for k in slots]
     else:
@@ -134,6 +136,20 @@ def _force_text(program: Program, looped: LoopedKernel) -> str:
     if text.count("given") == 1:  # among the arguments
         text = nest.function(name, arguments, ["(void)given;", *unused, *zero, *lines], values=values)
     return f"{text}\n\n{_sharing_text(program, looped)}"
+
+
+def _list_text(program: Program, components: int, lengths: LoopedKernel) -> str:
+    """Return a function that describes the points of a list of neighbours."""
+    nest = Nest(program.layout, lengths, "double", "")
+    start, name = nest.place_of(lengths.writes[0]), lengths.kernel.name
+    lines = [
+        f"{name}(NULL, 0.0, given->parameters, of->lengths);",
+        f"of->start = {start};",
+        f"of->count = {size_text(lengths.writes[0].array.axes[0])};",
+        f"of->components = {components};",
+    ]
+    text = nest.function(f"static void describe_{name}", ["const problem *given", "points *of"], lines)
+    return f"{kernel_text(lengths.kernel, DOUBLE)}\n\n{text}"
 
 
 def _sharing_text(program: Program, looped: LoopedKernel) -> str:

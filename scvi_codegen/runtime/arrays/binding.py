@@ -117,13 +117,25 @@ class ArrayBinding(Binding):
             return self._new_run()
         return SimpleNamespace(failures=self.failures, steps=0, stored=0, iterations=0, change=0.0, t=0.0)
 
-    def _new_run(self) -> Any:
-        """Return the C struct of a run, followed in memory by the arrays of its state."""
-        n, layout, problem = self.count, self.interface.layout, super().new("problem *")
+    def _new_problem(self) -> Any:
+        """Return the C struct of the problem, with its sizes, tables and lists of neighbours."""
+        problem, layout = super().new("problem *"), self.interface.layout
         for k, name in enumerate(layout.sizes):
             problem.size[k] = self.sizes.sizes[name]
         for k, table in enumerate(layout.tables):
             problem.table[k] = self.pointer(self.sizes.places[table.name].reshape(-1))
+        lists = [super(ArrayBinding, self).new("neighbours *") for _ in layout.neighbours]
+        for name, near in zip(layout.neighbours, lists, strict=True):
+            setattr(problem, f"near_{name}", near)
+        return (
+            self._ffi.gc(problem, partial(_release, super().function("release_neighbours"), lists))
+            if lists
+            else problem
+        )
+
+    def _new_run(self) -> Any:
+        """Return the C struct of a run, followed in memory by the arrays of its state."""
+        n, layout, problem = self.count, self.interface.layout, self._new_problem()
         first, computed = super().new("run *"), dict[str, NDArray[Any]](inverse_mass=aligned(n))
         lengths = {"q": 2 * n, "carry_q": 2 * n, "work": n * self.constant("WORK")}
         if layout.constraints:
@@ -402,6 +414,11 @@ def momentum_of(q: Numbers, p: Numbers, of: ArrayMap, *, absolute: bool = False)
         return float(np.sum(p[..., of.component]))
     sign = 1.0 if absolute else -1.0
     return float(np.sum(q[..., of.component] * p[..., of.other] + sign * q[..., of.other] * p[..., of.component]))
+
+
+def _release(function: Callable[[Any], None], _: object, problem: Any) -> None:
+    """Free the memory of lists of neighbours, whose C structs are the second argument."""
+    function(problem)
 
 
 def _arrived(run: Any, t_end: float) -> bool:

@@ -1,0 +1,222 @@
+"""Lists of neighbours made in C: exact for every evaluation of forces, and no bit depends on when they are made."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.errors import ExpressionError, StateError, StepFailedError, SystemDefinitionError
+from scvi_codegen.models.model_files.model_file import dump_model
+
+SQUARE = "sum(a in 3, wrap(r[i, a] - r[j, a], box)**2)"
+WELL = f"4*(1/{SQUARE}**6 - 1/{SQUARE}**3)*positive_part(1 - {SQUARE}**2/cut**4)**4"
+KINETIC = "sum(i in N, sum(a in 3, r_dot[i, a]**2)/2)"
+BOX = (64 / 0.8) ** (1 / 3)
+CUT = 1.9
+
+
+def liquid(skin: float | None = 0.3, pair: str = WELL) -> Any:
+    """Return the liquid with a list of neighbours, or with all pairs."""
+    near = {"near": {"of": "r", "box": "box", "cutoff": "cut", "skin": skin}}
+    return sc.LagrangianSystem.from_text(
+        name="liquid",
+        coordinates=["r[N, 3]"],
+        parameters={"box": BOX, "cut": CUT},
+        neighbours=near if skin else None,
+        lagrangian=f"{KINETIC} - sum(i < j in {'near' if skin else 'N'}, {pair})",
+    )
+
+
+@cache
+def stepper(method: str = "stoermer-verlet", skin: float | None = 0.3, pair: str = WELL) -> Any:
+    return sc.compile_stepper(liquid(skin, pair), method)
+
+
+def start(speed: float = 1.2) -> tuple[Any, Any]:
+    grid = np.stack(np.meshgrid(*[np.arange(4)] * 3), -1).reshape(-1, 3)
+    velocities = speed * np.random.default_rng(2).normal(size=(64, 3))
+    return (grid + 0.3) * BOX / 4 - 7 * BOX, velocities - velocities.mean(axis=0)
+
+
+def forces(r: Any) -> Any:
+    """Forces of all pairs by NumPy."""
+    apart = r[:, None] - r[None]
+    apart -= BOX * np.rint(apart / BOX)
+    square = (apart**2).sum(axis=-1) + 1e3 * np.eye(len(r))
+    s = np.maximum(1 - square**2 / CUT**4, 0.0)
+    slope = 4 * (-6 * square**-7 + 3 * square**-4) * s**4
+    slope -= 4 * (square**-6 - square**-3) * 8 * s**3 * square / CUT**4
+    return -(2 * slope[..., None] * apart).sum(axis=1)
+
+
+def test_no_pair_is_missed_in_a_long_run() -> None:
+    """The particles travel through several boxes; a run that missed a pair once would be elsewhere."""
+    r, v = start()
+    run = stepper().integrate(r, velocity=v, h=0.005, steps=6000, save_every=60)
+    assert abs(run.q["r"][-1] - r).max() > BOX
+    for k in range(len(run.t) - 1):
+        r, v = run.q["r"][k], run.p["r"][k]
+        for _ in range(60):
+            v = v + 0.0025 * forces(r)
+            r = r + 0.005 * v
+            v = v + 0.0025 * forces(r)
+        assert run.q["r"][k + 1] == pytest.approx(r, abs=1e-9)
+    assert run.energy_error() < 0.01
+    assert abs(run.momentum_maps()).max() < 1e-11
+
+
+@pytest.mark.parametrize("method", ["stoermer-verlet", "composition:8", "svi:2"])
+def test_no_bit_depends_on_skin_threads_and_interruptions(method: str) -> None:
+    r, v = start()
+    run = stepper(method).integrate(r, velocity=v, h=0.01, steps=60, save_every=20)
+    for skin in (0.05, 0.9):
+        other = stepper(method, skin).integrate(r, velocity=v, h=0.01, steps=60, save_every=20)
+        assert np.array_equal(run.q["r"], other.q["r"])
+        assert np.array_equal(run.energy(), other.energy())
+    whole = stepper(method).integrate(r, velocity=v, h=0.01, steps=60, save_every=20, threads=3)
+    assert np.array_equal(run.q["r"], whole.q["r"])
+    started = stepper(method).start(r, velocity=v, h=0.01)
+    started.advance(steps=37)
+    resumed = stepper(method).from_checkpoint(started.checkpoint())
+    resumed.advance(steps=23)
+    assert np.array_equal(resumed.q["r"], run.q["r"][-1])
+    all_pairs = stepper(method, None).integrate(r, velocity=v, h=0.01, steps=60, save_every=20)
+    assert run.q["r"] == pytest.approx(all_pairs.q["r"], abs=1e-10)
+
+
+def test_adaptive_steps_and_ensembles_have_the_pairs_of_all() -> None:
+    r, v = start()
+    run, other = (stepper("svi:3", skin).integrate(r, velocity=v, t_end=0.4, tolerance=1e-7) for skin in (0.2, None))
+    assert np.array_equal(run.t, other.t)
+    assert run.q["r"][-1] == pytest.approx(other.q["r"][-1], abs=1e-10)
+    several = stepper().integrate_ensemble(np.stack([r, r]), velocity=np.stack([v, -v]), h=0.005, steps=40)
+    for k, velocity in enumerate((v, -v)):
+        alone = stepper().integrate(r, velocity=velocity, h=0.005, steps=40)
+        assert np.array_equal(several.q[-1, k], alone.q["r"][-1].reshape(-1))
+
+
+SOFT = f"positive_part(1 - {SQUARE}/cut**2)**4"
+
+
+@pytest.mark.parametrize("method", ["stoermer-verlet", "svi:2"])
+def test_steps_longer_than_the_skin_miss_no_pair(method: str) -> None:
+    r, v = start(6.0)
+    run, other = (
+        stepper(method, skin, SOFT).integrate(r, velocity=v, h=0.1, steps=40, parameters={"cut": 2.0})
+        for skin in (0.01, None)
+    )
+    assert abs(np.diff(run.q["r"], axis=0)).max() > 1.0
+    assert run.q["r"] == pytest.approx(other.q["r"], abs=1e-11)
+    with pytest.raises(StepFailedError, match="infinite or NaN"):
+        stepper("svi:2", 0.01, SOFT).integrate(r, velocity=20 * v, h=0.1, steps=1)
+
+
+def test_parameters_that_change_make_another_list() -> None:
+    r, v = start()
+    runs = []
+    for skin in (0.01, None):
+        run = stepper(skin=skin, pair=SOFT).start(r, velocity=v, h=0.001)
+        run.advance(steps=2)
+        run.update(parameters={"box": 0.97 * BOX, "cut": 2.1})
+        run.advance(steps=2)
+        runs.append(run.q["r"])
+    assert runs[0] == pytest.approx(runs[1], abs=1e-12)
+
+
+@pytest.mark.parametrize("box", [None, "5", ["5", "L"], ["9", "4*L"]])
+def test_boxes_of_other_shapes_and_none(box: Any) -> None:
+    """In two dimensions, with an offset in the state, cells of any number per axis, and values of each particle."""
+    lengths = [] if box is None else [box] * 2 if isinstance(box, str) else box
+    parts = [f"wrap(r[i, {a}] - r[j, {a}], {lengths[a]})" if lengths else f"(r[i, {a}] - r[j, {a}])" for a in (0, 1)]
+    square = " + ".join(f"{part}**2" for part in parts)
+    pair = f"m[i]*m[j]*exp(-({square}))"
+    inside = f"unit_step(1.1**2 - ({square}))"
+    runs = []
+    for near, term in (({"of": "r", "cutoff": 1.1, **({"box": box} if box else {})}, pair), (None, f"{inside}*{pair}")):
+        system = sc.LagrangianSystem.from_text(
+            name="flat",
+            coordinates=["x", "r[N, 2]"],
+            parameters={"L": 4.0, "m[N]": 1.0},
+            neighbours={"near": near} if near else None,
+            lagrangian=f"""x_dot**2/2 - x**2/2 + sum(i in N, sum(a in 2, r_dot[i, a]**2)/2)
+                - sum(i < j in {"near" if near else "N"}, {term})""",
+        )
+        generator = np.random.default_rng(5)
+        state = {"x": 1.0, "r": generator.uniform(-6, 6, size=(70, 2))}
+        velocity = {"x": 0.0, "r": generator.normal(size=(70, 2))}
+        run = sc.compile_stepper(system, "stoermer-verlet").integrate(
+            state, velocity=velocity, h=0.01, steps=150, parameters={"m": np.linspace(0.5, 1.5, 70)}
+        )
+        runs.append((run.q["r"], run.energy()))
+    assert runs[0][0] == pytest.approx(runs[1][0], abs=1e-11)
+    assert runs[0][1] == pytest.approx(runs[1][1], abs=1e-10)
+
+
+def test_known_sizes_model_files_and_sympy_have_the_same_sum(tmp_path: Path) -> None:
+    r, v = start()
+    few = {"r": r[:5]}
+    expected = stepper("svi:2").integrate(few, velocity=v[:5], h=0.01, steps=20)
+    known = sc.compile_stepper(liquid(), "svi:2", sizes={"N": 5})
+    run = known.integrate(r[:5].reshape(-1), velocity=v[:5].reshape(-1), h=0.01, steps=20)
+    assert run.q == pytest.approx(expected.q["r"].reshape(21, -1), abs=1e-12)
+    moved = stepper("svi:2").jacobian(few, {"r": v[:5]}, h=0.01)
+    assert moved == pytest.approx(known.jacobian(r[:5].reshape(-1), v[:5].reshape(-1), h=0.01), abs=1e-9)
+    model = sc.Model(system=liquid(), q=few, velocity={"r": v[:5]}, h=0.01, method=sc.SVI(2), span=0.2)
+    path = tmp_path / "liquid.toml"
+    path.write_text(dump_model(model))
+    again = sc.load_model(path)
+    assert again.system == model.system
+    assert again.integrate().q["r"][-1] == pytest.approx(expected.q["r"][-1], abs=1e-12)
+
+
+def test_a_list_in_sympy() -> None:
+    from sympy import IndexedBase, Sum, exp, symbols
+
+    q, velocity, (i, j, N, near) = IndexedBase("q"), IndexedBase("q_dot"), symbols("i j N near", integer=True)
+    pairs = Sum(exp(-((q[i] - q[j]) ** 2)), (j, i + 1, near - 1), (i, 0, near - 2))
+    system = sc.LagrangianSystem.from_sympy(
+        name="line",
+        coordinates=["q[N]"],
+        lagrangian=Sum(velocity[i] ** 2 / 2, (i, 0, N - 1)) - pairs,
+        neighbours={"near": {"of": "q", "cutoff": 2}},
+    )
+    assert "sum(i < j in near, -exp(-(q[i] - q[j])**2)*unit_step(4 - (q[i] - q[j])**2))" in map(str, system.terms)
+
+
+@pytest.mark.parametrize(
+    ("near", "message"),
+    [
+        ({"of": "r"}, "must have the keys of and cutoff"),
+        ({"of": "r", "cutoff": 1, "radius": 2}, "may have box and skin"),
+        ({"of": "s", "cutoff": 1}, "'s', which is not an array of positions"),
+        ({"of": "x", "cutoff": 1}, "'x', which is not an array of positions"),
+        ({"of": "r", "cutoff": 1, "box": [1, 2]}, "one length, or one per component"),
+        ({"of": "r", "cutoff": -1}, "must be positive"),
+        ({"of": "r", "cutoff": "r"}, "'r'"),
+    ],
+)
+def test_lists_that_are_refused(near: Any, message: str) -> None:
+    with pytest.raises((SystemDefinitionError, ExpressionError), match=message):
+        sc.LagrangianSystem.from_text(
+            name="gas",
+            coordinates=["x", "r[N, 3]"],
+            neighbours={"near": near},
+            lagrangian=f"x_dot**2 + {KINETIC} - sum(i < j in near, (r[i, 0] - r[j, 0])**2)",
+        )
+
+
+def test_a_list_of_another_name_and_of_no_pairs() -> None:
+    with pytest.raises(ExpressionError, match="near"):
+        sc.LagrangianSystem.from_text(
+            name="gas",
+            coordinates=["r[N, 3]"],
+            neighbours={"near": {"of": "r", "cutoff": 1}},
+            lagrangian=f"{KINETIC} - sum(i < j in nears, r[i, 0]*r[j, 0])",
+        )
+    with pytest.raises(StateError, match="3"):
+        stepper().integrate(np.zeros((4, 2)), h=0.1, steps=1)
