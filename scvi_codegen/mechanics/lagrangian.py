@@ -368,7 +368,8 @@ class LagrangianSystem(MechanicalSystem):
         Hinges and slides are coordinates with the name of the joint. A ball joint is a rotation ``R_JOINT`` relative to
         the parent with the angular velocity ``omega_JOINT`` in the frame of the body; a free joint has the position
         ``x_JOINT``, ``y_JOINT``, ``z_JOINT`` as well. A joint without a name has that of its body. Inertias of bodies
-        follow from their ``inertial`` or geoms. Contacts, limits, actuators, sensors and dry friction are not read.
+        follow from their ``inertial`` or geoms. Equalities of bodies, sites and joints are constraints. Contacts,
+        limits, actuators, sensors and dry friction are not read.
 
         Args:
             path, actuated: see :meth:`from_urdf`.
@@ -376,18 +377,21 @@ class LagrangianSystem(MechanicalSystem):
 
         Raises:
             SystemDefinitionError: naming file and element, if something is malformed, or changes the mechanics and is
-                not read: equality constraints, tendons with stiffness, inertias of meshes.
+                not read: equalities of tendons, tendons with stiffness, inertias of meshes.
         """
+        from scvi_codegen.mechanics.multibody.trees.closures import conditions_of
         from scvi_codegen.mechanics.multibody.trees.mjcf import links_of_mjcf
 
-        model, links, gravity = links_of_mjcf(path)
-        return cls._of_tree(name or model, links, gravity, actuated)
+        model, links, gravity, closures = links_of_mjcf(path)
+        return cls._of_tree(name or model, links, gravity, actuated, conditions_of(links, closures))
 
     @classmethod
-    def _of_tree(cls, name: str, links: Any, gravity: Any, actuated: Sequence[str] | bool) -> LagrangianSystem:
+    def _of_tree(
+        cls, name: str, links: Any, gravity: Any, actuated: Sequence[str] | bool, constraints: Sequence[Expr] = ()
+    ) -> LagrangianSystem:
         from scvi_codegen.mechanics.multibody.trees.articulated import system_of_tree
 
-        system: LagrangianSystem = system_of_tree(cls, name, links, gravity, actuated)
+        system: LagrangianSystem = system_of_tree(cls, name, links, gravity, actuated, constraints)
         return system
 
     @classmethod

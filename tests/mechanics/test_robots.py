@@ -245,7 +245,7 @@ def test_malformed_urdf_is_refused_by_name(change, tmp_path):
 
 
 MUJOCO_CHANGES = {
-    "equality": ("</mujoco>", "<equality><weld/></equality></mujoco>", "contains <weld>, which is not read"),
+    "equality": ("</mujoco>", "<equality><weld/></equality></mujoco>", "<weld> 'weld' has no attribute 'body1'"),
     "tendon": ("</mujoco>", '<tendon><fixed stiffness="1"/></tendon></mujoco>', "has a stiffness"),
     "mesh": ('type="box"', 'type="mesh"', "give its body an <inertial>"),
     "class": ('childclass="limb"', 'childclass="lim"', "of the class 'lim'"),

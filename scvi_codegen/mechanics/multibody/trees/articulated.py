@@ -45,19 +45,25 @@ SMALLEST = 12
 
 
 def system_of_tree(
-    kind: Any, name: str, links: Sequence[Link], gravity: Vector, actuated: Collection[str] | bool
+    kind: Any,
+    name: str,
+    links: Sequence[Link],
+    gravity: Vector,
+    actuated: Collection[str] | bool,
+    constraints: Sequence[Expr] = (),
 ) -> Any:
     """Return the system of a tree, of class ``kind``; other arguments as of :class:`Tree` and its ``arguments``."""
     tree = Tree(links, gravity)
 
     def made(**fields: Any) -> Any:
         members = fields.get("rotations", ())
-        if len(fields["coordinates"]) - len(members) < SMALLEST:
+        if constraints or len(fields["coordinates"]) - len(members) < SMALLEST:
             return kind(**fields)
         return kind(**fields, dual_energy=_in_quaternions(dual_energy(tree), **fields))
 
     arguments = tree.arguments(actuated)
-    return system_from_sympy(made, "Lagrangian", arguments.pop("lagrangian"), name=name, **arguments)
+    formula = arguments.pop("lagrangian")
+    return system_from_sympy(made, "Lagrangian", formula, name=name, constraints=constraints, **arguments)
 
 
 def _in_quaternions(

@@ -1,4 +1,4 @@
-"""Reader of MJCF, the model format of MuJoCo: bodies, joints, inertias of bodies and geoms, gravity.
+"""Reader of MJCF, the model format of MuJoCo: bodies, joints, inertias of bodies and geoms, gravity, equalities.
 
 Contacts, meshes, limits of joints, actuators and sensors are not read. Attributes and defaults are those of
 https://mujoco.readthedocs.io/en/stable/XMLreference.html.
@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.mechanics.multibody.trees.closures import Closure, Coupling, at_reference
 from scvi_codegen.mechanics.multibody.trees.document import Element, root_of
 from scvi_codegen.mechanics.multibody.trees.shapes import SHAPES, volume_and_inertia
 from scvi_codegen.mechanics.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about
@@ -28,8 +29,8 @@ MOST_INCLUDED = 20
 AXES = dict(zip("xyz", np.eye(3), strict=True))
 
 
-def links_of_mjcf(path: str | PathLike[str]) -> tuple[str, list[Link], Vector]:
-    """Return the name of the model, its links with parents first, and the acceleration of gravity.
+def links_of_mjcf(path: str | PathLike[str]) -> tuple[str, list[Link], Vector, list[Closure | Coupling]]:
+    """Return the name of the model, its links with parents first, the acceleration of gravity, and its equalities.
 
     Raises:
         SystemDefinitionError: naming file and element, if something is malformed or changes the mechanics and is not
@@ -38,7 +39,8 @@ def links_of_mjcf(path: str | PathLike[str]) -> tuple[str, list[Link], Vector]:
     model = _MujocoModel(root_of(path, "mujoco"))
     for body in model.inside("worldbody"):
         model.read(body, -1, Pose(), "main")
-    return model.root.node.get("model", Path(path).stem), model.scaled(), model.gravity
+    name, closures = model.root.node.get("model", Path(path).stem), [*model.closures()]
+    return name, model.scaled(), model.gravity, closures
 
 
 class _MujocoModel:
@@ -57,7 +59,7 @@ class _MujocoModel:
                 options |= section.node.attrib
             elif section.node.tag == "default":
                 self.read_defaults(section, {})
-            elif section.node.tag in ("equality", "deformable") and len(section.node):
+            elif section.node.tag == "deformable" and len(section.node):
                 section.refuse(f"contains <{section.node[0].tag}>, which is not read: remove it or write a constraint")
             elif section.node.tag == "tendon":
                 for tendon in section.children("spatial", "fixed"):
@@ -69,6 +71,8 @@ class _MujocoModel:
             warnings.warn(f"{root.file}: forces of the medium (density, viscosity) are not read", stacklevel=5)
         self.turn = 1.0 if self.settings.get("angle", "degree") == "radian" else np.pi / 180
         self.links: list[Link] = []
+        self.places: dict[tuple[str, str], tuple[int, Pose]] = {("body", "world"): (-1, Pose())}
+        """Link and pose in it of bodies and sites, by tag and name."""
 
     def read_defaults(self, element: Element, inherited: Mapping[str, Mapping[str, str]]) -> None:
         """Store the attributes of a default class, which inherits those of the class around it."""
@@ -96,13 +100,19 @@ class _MujocoModel:
         for child in body.children(*REFUSED):
             child.refuse("is not read: write its bodies out")
         inherited = body.node.get("childclass", inherited)
+        for site in body.children("site"):
+            self.places["site", site.name] = link, at @ self.pose(self.with_defaults(site, inherited))
         for frame in body.children("frame"):
             self.read(frame, link, at @ self.pose(frame), inherited)
         for inner in body.children("body"):
             if inner.number("gravcomp", 0) != 0:
                 inner.refuse("has a gravity compensation, which is not read: remove gravcomp")
             pose = at @ self.pose(inner)
-            self.read(inner, self.add(inner, link, pose, inner.node.get("childclass", inherited)), Pose(), inherited)
+            self.places["body", inner.name] = (
+                self.add(inner, link, pose, inner.node.get("childclass", inherited)),
+                Pose(),
+            )
+            self.read(inner, self.places["body", inner.name][0], Pose(), inherited)
 
     def add(self, body: Element, parent: int, pose: Pose, inherited: str) -> int:
         """Add a link for each joint of a body and one that carries its inertia; return the position of the last."""
@@ -127,6 +137,55 @@ class _MujocoModel:
                     yield element, self.pose(child) @ inner
             else:
                 yield child, Pose()
+
+    def closures(self) -> Iterator[Closure | Coupling]:
+        """Yield the equalities that are active; their softness is not read.
+
+        https://mujoco.readthedocs.io/en/stable/XMLreference.html#equality
+        """
+        for section in self.inside("equality"):
+            for node in section.node:
+                each = self.with_defaults(Element(section.file, node), "main")
+                if each.text("active", "true") == "false":
+                    continue
+                if node.tag == "joint":
+                    yield self.coupling(each)
+                elif node.tag not in ("connect", "weld"):
+                    each.refuse("is not read: remove it or write a constraint")
+                elif each.has("site1"):
+                    (one, at), (two, pose) = self.place(each, "site1"), self.place(each, "site2")
+                    yield Closure((one, two), (at, pose), node.tag == "weld")
+                else:
+                    yield self.closure(each)
+
+    def place(self, element: Element, key: str) -> tuple[int, Pose]:
+        """Return the link and the pose in it of the body or site that an attribute names."""
+        kind, name = key[:-1], element.text(key, "world" if key == "body2" else None)
+        if (kind, name) not in self.places:
+            known = [each for tag, each in self.places if tag == kind]
+            element.refuse(f"names the {kind} '{name}', which does not exist{closest(name, known)}")
+        return self.places[kind, name]
+
+    def closure(self, equality: Element) -> Closure:
+        """Return a connection or weld of two bodies, by default as they are placed at the reference configuration."""
+        (one, at), (two, other) = self.place(equality, "body1"), self.place(equality, "body2")
+        turning = equality.node.tag == "weld"
+        relative = at_reference(self.links, two).inverse @ at_reference(self.links, one)
+        if not turning:
+            anchor = Pose(equality.vector("anchor"))
+            return Closure((one, two), (at @ anchor, relative @ anchor), turning)
+        pose = equality.vector("relpose", (0, 1, 0, 0, 0, 0, 0), (7,))
+        if not pose[3:].any():
+            return Closure((one, two), (relative.inverse, other), turning)
+        return Closure((one, two), (Pose(pose[:3], _of_quaternion(equality, pose[3:])), other), turning)
+
+    def coupling(self, equality: Element) -> Coupling:
+        """Return a relation between two joints, or the fixed value of one."""
+        zeros = {each.joint.name: each.joint.zero for each in self.links}
+        joint, other = equality.text("joint1"), equality.text("joint2", "") or None
+        given = equality.vector("polycoef", (0, 1, 0, 0, 0), range(1, 6))
+        coefficients = tuple(map(float, given if other else given[:1]))
+        return Coupling(joint, other, coefficients, zeros.get(joint, 0.0), zeros.get(other or "", 0.0))
 
     def joint(self, joint: Element, name: str, pose: Pose, frame: Pose, parent: int) -> Joint:
         """Return a joint whose link has a pose in its parent."""

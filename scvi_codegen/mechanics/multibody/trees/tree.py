@@ -30,6 +30,11 @@ class Pose:
     def __matmul__(self, inner: Pose) -> Pose:
         return Pose(self.position + self.rotation @ inner.position, self.rotation @ inner.rotation)
 
+    @property
+    def inverse(self) -> Pose:
+        """Pose of the outer frame in the inner one."""
+        return Pose(-self.rotation.T @ self.position, self.rotation.T)
+
 
 @dataclass(frozen=True, slots=True)
 class Inertia:

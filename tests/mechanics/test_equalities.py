@@ -1,0 +1,136 @@
+"""Equalities of MJCF: closed loops against the same mechanisms as trees, and against formulas."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import scvi_codegen as sc
+from scvi_codegen.errors import SystemDefinitionError
+
+BOX = '<inertial pos="0.1 0 -0.2" mass="2" diaginertia="0.3 0.2 0.1"/>'
+ROD = '<inertial pos="0 0 -0.3" mass="1" diaginertia="0.1 0.12 0.02"/>'
+TURNED = Rotation.from_euler("XYZ", [0.3, 0, 0.2]).as_matrix()
+"""Attitude of the box."""
+OMEGA, RATE = np.array([0.5, -1.0, 2.0]), np.array([-1.0, 0.4, 0.3])
+
+
+def model(tmp_path, bodies, equalities=""):
+    """Return the system of bodies in the world and equalities."""
+    file = tmp_path / "model.xml"
+    file.write_text(
+        f'<mujoco><compiler angle="radian"/><worldbody>{bodies}</worldbody><equality>{equalities}</equality></mujoco>'
+    )
+    return sc.LagrangianSystem.from_mjcf(file)
+
+
+def run_of(system, q, velocity):
+    """Return a run of a second."""
+    run = sc.compile_stepper(system, "svi:4").integrate(q, velocity=velocity, h=0.01, steps=100)
+    assert np.ptp(run.energy()) < 1e-9
+    return run
+
+
+def rod(inner=""):
+    """Return a rod that hangs from a ball joint at (0, 0, 1)."""
+    joint = '<joint name="hang" type="ball"/>'
+    return f'<body name="rod" pos="0 0 1">{joint}{ROD}<site name="end" pos="0 0 -0.6" euler="0.1 0.2 0"/>{inner}</body>'
+
+
+def box(joint, position):
+    """Return a box at a position, with a joint."""
+    return f'<body name="box" pos="{position}" euler="0.3 0 0.2">{joint}{BOX}<site name="top" pos="0 0.2 0.1"/></body>'
+
+
+def named(values, letters="xyz"):
+    return {f"{letter}_box": float(value) for letter, value in zip(letters, values, strict=True)}
+
+
+@pytest.mark.parametrize(
+    "equality",
+    [
+        '<weld body1="rod" body2="box"/>',
+        '<weld body1="box" body2="rod" active="true"/>',
+        '<weld body1="rod" body2="box" relpose="0.1 0.2 -0.7 0.98383134 0.14869156 -0.01491892 0.09871239"/>',
+    ],
+)
+def test_welded_bodies_move_as_one(equality, tmp_path):
+    closed = model(tmp_path, rod() + box("<freejoint/>", "0.1 0.2 0.3"), equality)
+    assert len(closed.constraints) == 6
+    place = np.array([0.1, 0.2, 0.3])
+    speed = named(np.cross(OMEGA, place - [0, 0, 1]))
+    start = {"R_hang": np.eye(3), "R_box": TURNED} | named(place)
+    run = run_of(closed, start, {"omega_hang": OMEGA, "omega_box": TURNED.T @ OMEGA} | speed)
+    one = run_of(model(tmp_path, rod(box("", "0.1 0.2 -0.7"))), {"R_hang": np.eye(3)}, {"omega_hang": OMEGA})
+    atol = 1e-6 if "relpose" in equality else 1e-10  # the digits of relpose
+    np.testing.assert_allclose(run.rotation("R_hang")[-1], one.rotation()[-1], atol=atol)
+    np.testing.assert_allclose(run.rotation("R_box")[-1], one.rotation()[-1] @ TURNED, atol=atol)
+
+
+@pytest.mark.parametrize(
+    "equality",
+    ['<connect body1="box" body2="rod" anchor="0 0.2 0.1"/>', '<connect site1="end" site2="top"/>'],
+)
+def test_a_connection_of_points_is_a_ball_joint(equality, tmp_path):
+    end = np.array([0, 0, -0.6])
+    place = np.add(end, [0, 0, 1]) - TURNED @ [0, 0.2, 0.1]
+    text = " ".join(map(repr, map(float, place)))
+    closed = model(tmp_path, rod() + box("<freejoint/>", text), equality)
+    assert len(closed.constraints) == 3
+    spin = TURNED.T @ RATE
+    speed = named(np.cross(OMEGA, end) - np.cross(RATE, TURNED @ [0, 0.2, 0.1]))
+    start = {"R_hang": np.eye(3), "R_box": TURNED} | named(place)
+    run = run_of(closed, start, {"omega_hang": OMEGA, "omega_box": spin} | speed)
+    elbow = box('<joint name="elbow" type="ball" pos="0 0.2 0.1"/>', " ".join(map(str, place - [0, 0, 1])))
+    tree = model(tmp_path, rod(elbow))
+    relative = {"omega_hang": OMEGA, "omega_elbow": TURNED.T @ (RATE - OMEGA)}
+    nested = run_of(tree, {"R_hang": np.eye(3), "R_elbow": np.eye(3)}, relative)
+    expected = nested.rotation("R_hang")[-1] @ TURNED @ nested.rotation("R_elbow")[-1]
+    np.testing.assert_allclose(run.rotation("R_hang")[-1], nested.rotation("R_hang")[-1], atol=1e-10)
+    np.testing.assert_allclose(run.rotation("R_box")[-1], expected, atol=1e-10)
+
+
+def test_a_polynomial_between_joints_reduces_the_motion_to_one_coordinate(tmp_path):
+    slides = "".join(
+        f'<body><joint name="{name}" type="slide" axis="0 0 1" ref="{ref}"/>'
+        f'<inertial pos="0 0 0" mass="{mass}" diaginertia="1 1 1"/></body>'
+        for name, ref, mass in (("a", 0.5, 2), ("b", 0.25, 3))
+    )
+    system = model(tmp_path, slides, '<joint joint1="a" joint2="b" polycoef="0.1 0.3 0.2 0 0"/>')
+    run = run_of(system, {"a": 0.6 + 0.3 * 0.5 + 0.2 * 0.25, "b": 0.75}, {"a": 0.5, "b": 1.0})
+    one = sc.LagrangianSystem.from_text(
+        "one", ["b"], "(2*(0.3 + 0.4*(b - 0.25))**2 + 3)*b_dot**2/2 - 9.81*(2*(0.3*b + 0.2*(b - 0.25)**2) + 3*b)"
+    )
+    expected = sc.compile_stepper(one, "svi:4").integrate([0.75], velocity=[1.0], h=0.01, steps=100)
+    np.testing.assert_allclose(run.q[-1, 1], expected.q[-1, 0], atol=1e-11)
+    fixed = model(tmp_path, slides, '<joint joint1="a" polycoef="0.2"/>')
+    at_rest = run_of(fixed, {"a": 0.7, "b": 0}, {"a": 0, "b": 0})
+    np.testing.assert_allclose(at_rest.q[-1], [0.7, -9.81 / 2], atol=1e-11)
+
+
+BARS = (
+    f'<body name="crank"><joint name="a" axis="0 1 0"/>{ROD}<body name="bar" pos="0 0 0.4">'
+    f'<joint name="b" axis="0 1 0"/>{ROD}</body></body><body name="rocker" pos="1 0 0"><joint name="c" axis="0 1 0"/>'
+    f"{ROD}</body>"
+)
+
+
+def test_equations_across_the_plane_of_a_mechanism_are_omitted(tmp_path):
+    loop = '<connect body1="bar" body2="rocker" anchor="1 0 0.1"/>'
+    assert len(model(tmp_path, BARS, loop).constraints) == 2
+    assert len(model(tmp_path, BARS, '<weld body1="bar" body2="rocker"/>').constraints) == 3
+    assert model(tmp_path, BARS, loop.replace("/>", ' active="false"/>')).constraints == ()
+
+
+@pytest.mark.parametrize(
+    ("equality", "message"),
+    [
+        ('<connect body1="ba" anchor="0 0 0"/>', "names the body 'ba', which does not exist; did you mean 'bar'"),
+        ('<weld site1="end" site2="top"/>', "names the site 'end', which does not exist"),
+        ('<joint joint1="d"/>', "names 'd', which is no hinge or slide"),
+        ('<tendon tendon1="t"/>', "<tendon> 'tendon' is not read"),
+        ('<weld body1="bar" relpose="1 2 3"/>', "must be 7 finite numbers"),
+    ],
+)
+def test_equalities_that_cannot_be_read_are_refused_by_name(equality, message, tmp_path):
+    with pytest.raises(SystemDefinitionError, match=message):
+        model(tmp_path, BARS, equality)
