@@ -71,8 +71,8 @@ def with_events(source: Source, interface: Interface, events: tuple[SearchedEven
         ExpressionError: for text outside the grammar, with its column.
         EventError: naming the invalid symbol or function, or what events that change the state do not support.
     """
-    formulas = EventFormulas(interface, events)
-    return replace(source, beside=render_events(_search(formulas, controlled="_advance_to(" in source.header)))
+    formulas = None if interface.layout.coordinates else EventFormulas(interface, events)
+    return replace(source, beside=render_events(_search(interface, events, formulas, "_advance_to(" in source.header)))
 
 
 class EventFormulas:
@@ -230,29 +230,42 @@ def _translated(function: Expr, what: str) -> Expr:
         raise EventError(f"in the {what}: {error}") from error
 
 
-def _search(formulas: EventFormulas, *, controlled: bool) -> EventSearch:
+def _search(
+    interface: Interface, events: Sequence[SearchedEvent], formulas: EventFormulas | None, controlled: bool
+) -> EventSearch:
     """Return the data of the search: Chebyshev points of the second kind, and the inverse Vandermonde matrix."""
     points = chebyshev_lobatto(DEGREE).points
     inverse = mp.matrix([[x**k for k in range(DEGREE + 1)] for x in points]) ** -1
     coefficients = tuple(tuple(inverse[k, j] for j in range(DEGREE + 1)) for k in range(DEGREE + 1))
-    interface, guards = formulas.interface, [guard for _, guard in formulas.guards]
-    values = [value for _, each in formulas.changes for value in each]
-    counts = [len(each) for _, each in formulas.changes]
-    every = (*formulas.functions, *guards, *values)
-    return EventSearch(
+    search = EventSearch(
         prefix=interface.prefix,
-        dimension=interface.dimension,
-        kernel=formulas.kernel("event_functions", formulas.functions),
-        uses_velocity=any(value.free_symbols.intersection(formulas.v) for value in every),
+        dimension=0,
+        kernel=None,
+        uses_velocity=False,
         transformed=bool(interface.energy_parameter),
         nodes=lower_vector(to_unit(points)),
         coefficients=lower_matrix(coefficients),
         doubts=(0.5 ** (DEGREE - 2), 0.5 ** (DEGREE - 1)),
+        guards=None,
+        guarded=tuple(number for number, event in enumerate(events) for _ in event.conditions),
+        changes=None,
+        changed=(0,) * any(event.changes_state for event in events),
+        first_values=(0,) * (len(events) + 1),
+        impacts=tuple(int(event.restitution is not None) for event in events),
+        controlled=controlled,
+    )
+    if formulas is None:
+        return search
+    guards = [guard for _, guard in formulas.guards]
+    values = [value for _, each in formulas.changes for value in each]
+    every = (*formulas.functions, *guards, *values)
+    return replace(
+        search,
+        dimension=interface.dimension,
+        kernel=formulas.kernel("event_functions", formulas.functions),
+        uses_velocity=any(value.free_symbols.intersection(formulas.v) for value in every),
         guards=formulas.kernel("event_guards", guards) if guards else None,
-        guarded=tuple(number for number, _ in formulas.guards),
         changes=formulas.kernel("event_changes", values) if values else None,
         changed=tuple(index for indices, _ in formulas.changes for index in indices),
-        first_values=(0, *accumulate(counts)),
-        impacts=tuple(int(event.restitution is not None) for event in formulas.events),
-        controlled=controlled,
+        first_values=(0, *accumulate(len(each) for _, each in formulas.changes)),
     )

@@ -102,8 +102,8 @@ class EventSearch:
     """Data of the search for zeros of functions of the state.
 
     Attributes:
-        prefix, dimension: of the integrator.
-        kernel: the functions at u = (q, p, v).
+        prefix, dimension: of the integrator; 0 for arrays of run-time sizes, whose formulas the caller evaluates.
+        kernel: the functions at u = (q, p, v); ``None`` for arrays of run-time sizes.
         uses_velocity: whether v occurs in them.
         transformed: whether time is, so that the integrator's velocities are dq/dtau.
         nodes: (d + 1,) fractions of a part of a step at which they are evaluated.
@@ -119,7 +119,7 @@ class EventSearch:
 
     prefix: str
     dimension: int
-    kernel: Kernel
+    kernel: Kernel | None
     uses_velocity: bool
     transformed: bool
     nodes: tuple[float, ...]
@@ -134,9 +134,9 @@ class EventSearch:
     controlled: bool
 
     @property
-    def further(self) -> tuple[Kernel, ...]:
-        """Kernels of conditions and changes."""
-        return tuple(kernel for kernel in (self.guards, self.changes) if kernel is not None)
+    def kernels(self) -> tuple[Kernel, ...]:
+        """Kernels of functions, conditions and changes."""
+        return tuple(kernel for kernel in (self.kernel, self.guards, self.changes) if kernel is not None)
 
 
 def render(program: Program, control: Control | None = None, *, fallback: Fallback | None = None) -> Source:
@@ -218,9 +218,8 @@ def render_events(search: EventSearch) -> Source:
     context = {
         "search": search,
         "prefix": search.prefix,
-        "kernel": search.kernel,
-        "cut": is_divided((search.kernel, *search.further)),
-        "inverse_roots": inverse_roots((search.kernel, *search.further)),
+        "cut": is_divided(search.kernels),
+        "inverse_roots": inverse_roots(search.kernels),
     }
     return _render(f"{search.prefix}_events", context, "events")
 

@@ -263,6 +263,85 @@ def test_particles_in_a_box_are_arrays():
     assert kicked.p["r"][-1, 2, 1] == pytest.approx(0.6)
 
 
+CHAIN = LagrangianSystem.from_text(
+    name="chain",
+    coordinates=["q[N]"],
+    parameters={"m": 1.5, "e": 0.9, "b": 0.1},
+    lagrangian="sum(i in N, m*q_dot[i]**2/2) - sum(i in N-1, (q[i+1] - q[i])**2/2 + (q[i+1] - q[i])**4/20) + 0*(e+b)",
+)
+
+
+@pytest.mark.parametrize(
+    ("plan", "bound"), [({"h": 0.25, "steps": 160}, 1e-11), ({"t_end": 40.0, "tolerance": 1e-10}, 1e-7)]
+)
+def test_events_in_index_notation_equal_those_of_known_sizes(plan, bound):
+    """Walls that move, sums, maps of velocities and parameters: formulas by NumPy against compiled ones."""
+    stepper, n = compile_stepper(CHAIN, "svi:4", flags=FLAGS), 20
+    known = stepper.with_sizes(N=n)
+    squares = " + ".join(f"q_{i}**2" for i in range(n))
+    pairs = [
+        (impact("1/2 + b*sin(t) - q[0]", "e"), impact("1/2 + b*sin(t) - q_0", "e")),
+        (impact("4 - sum(i in N, q[i]**2)"), impact(f"4 - ({squares})")),
+        (
+            Event("t - 11.3", then={"q_dot[N-1]": "-e*q_dot[N-1] + q[0]"}, where="q[0] < 9"),
+            Event("t - 11.3", then={f"q_{n - 1}_dot": f"-e*q_{n - 1}_dot + q_0"}),
+        ),
+        (Event("q[3]", 1, then={"p_q[2]": "p_q[2] + b"}), Event("q_3", 1, then={"p_q_2": "p_q_2 + b"})),
+    ]
+    q, v = np.exp(-(((np.arange(n) - 6.0) / 3.0) ** 2)), 0.1 * np.cos(np.arange(n))
+    runs = [
+        each.integrate(q, velocity=v, events=[pair[k] for pair in pairs], **plan)
+        for k, each in enumerate((stepper, known))
+    ]
+    assert [len(each) for each in runs[0].events] == [len(each) for each in runs[1].events]
+    assert min(map(len, runs[0].events)) > 0
+    assert np.abs(runs[0].q["q"][-1] - np.asarray(runs[1].q)[-1]).max() < bound
+    for own, other in zip(runs[0].events, runs[1].events, strict=True):
+        assert np.abs(own.t - other.t).max() < bound
+        assert np.abs(own.p["q"] - np.asarray(other.p)).max() < bound
+
+
+def test_wall_of_a_long_chain():
+    """The reflected wave returns as that of a short chain: 10^4 coordinates are not compiled one by one."""
+    stepper, ends = compile_stepper(CHAIN, "svi:4", flags=FLAGS), []
+    for n in (100, 10_000):
+        q = np.exp(-(((np.arange(n) - 10.0) / 3.0) ** 2))
+        run = stepper.integrate(q, velocity=0 * q, h=0.5, steps=40, save_every=40, events=impact("1/2 - q[0]"))
+        ends.append((run.events[0].t, run.q["q"][-1, :50]))
+    assert len(ends[0][0]) > 0
+    assert np.abs(ends[0][0] - ends[1][0]).max() < 1e-13
+    assert np.abs(ends[0][1] - ends[1][1]).max() < 1e-13
+
+
+def test_derivatives_through_events_in_index_notation():
+    stepper, q = compile_stepper(CHAIN, "svi:4", flags=FLAGS), np.exp(-(((np.arange(8) - 3.0) / 2.0) ** 2))
+    known = stepper.with_sizes(N=8)
+    runs = [
+        each.integrate(q, velocity=0 * q, h=0.25, steps=40, events=impact(wall, "e"))
+        for each, wall in ((stepper, "1/2 - q[0]"), (known, "1/2 - q_0"))
+    ]
+    assert len(runs[0].events[0]) > 0
+    tangents = [np.asarray(run.tangent()[-1]) for run in runs]
+    assert np.abs(tangents[0] - tangents[1]).max() < 1e-11
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: impact("q[0] - q_dot[1]"), "contains 'q_dot'"),
+        (lambda: impact("3"), "constant and never crosses zero"),
+        (lambda: Event("q[0]", then={"m": "1"}), "'m' is not an entry of a coordinate"),
+        (lambda: Event("q[0]", then={"sum(i in N, q[i])": "1"}), "is not an entry of a coordinate"),
+        (lambda: Event("q[0]", then={"q_dot[0]": "1", "p_q[1]": "1"}), "sets momenta and velocities"),
+        (lambda: Event("q[0] - 1/4", then={"p_q[0]": "log(q[0] - 9)"}), "not finite"),
+    ],
+)
+def test_errors_of_index_notation_name_the_symbol(make, words):
+    q = np.exp(-(((np.arange(8) - 3.0) / 2.0) ** 2))
+    with pytest.raises(EventError, match=words):
+        compile_stepper(CHAIN, "svi:4", flags=FLAGS).integrate(q, velocity=0 * q, h=0.25, steps=40, events=make())
+
+
 # Derivatives.
 
 BOX = LagrangianSystem.from_text(

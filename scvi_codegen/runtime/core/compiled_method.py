@@ -25,7 +25,7 @@ from scvi_codegen.runtime.arrays.any_size import (
 from scvi_codegen.runtime.arrays.binding import ArrayBinding
 from scvi_codegen.runtime.arrays.interface import RunSizes
 from scvi_codegen.runtime.core.validation import Array, flat_state, named, shapes_of
-from scvi_codegen.runtime.events.array_events import events_of_entries
+from scvi_codegen.runtime.events.array_events import EventBinding, events_of_entries
 from scvi_codegen.runtime.events.event import Event, EventLike, as_events
 
 MOST_EVENT_SETS = 16
@@ -115,13 +115,19 @@ class CompiledMethod:
     def _load(self) -> None:
         """Load the library with the events; of arrays of run-time sizes once these are known."""
         interface, events = self.interface, self.events
-        if interface.layout.coordinates:
-            self.source = self._plain
-            if self.problem is not None and self.origin is not None:
-                library = building.load(self.source, flags=self.flags)
-                self.binding: Binding = ArrayBinding(library, self.origin.interface, self.problem)
+        self.source = self._plain
+        if self.any_size:
             return
-        self.source = _event_variant(self._plain, interface, events) if events else self._plain
+        if self.problem is not None and self.origin is not None:
+            interface = self.origin.interface
+            if events:
+                self.source = _event_variant(self._plain, interface, events)
+            library = building.load(self.source, flags=self.flags)
+            arrays = library, interface, self.problem
+            self.binding: Binding = EventBinding(*arrays, events) if events else ArrayBinding(*arrays)
+            return
+        if events:
+            self.source = _event_variant(self._plain, interface, events)
         library = building.load(self.source, flags=self.flags)
         self.binding = Binding(library, interface.prefix, interface.workspace, fallback=self._load_fallback)
 
@@ -162,13 +168,12 @@ class CompiledMethod:
             self._check_not_of_run(tables, threads)
             return self, q
         problem = sizes_of_run(self.interface, q, parameters, tables, threads)
-        if (self._reason or self.events) and problem.threads > 1:
-            why = self._reason or "Runs with events are compiled with the sizes of each call"
-            raise MethodError(f"omit threads: this system is compiled with the sizes of each call. {why}")
-        compiled = self._reason or self.events
-        bound = self.with_sizes(problem.sizes, tables=problem.places) if compiled else self._bound_to(problem)
+        if self._reason and problem.threads > 1:
+            raise MethodError(f"omit threads: this system is compiled with the sizes of each call. {self._reason}")
+        bound = self.with_sizes(problem.sizes, tables=problem.places) if self._reason else self._bound_to(problem)
         if self.events:
-            bound = bound.with_events(events_of_entries(self.interface, problem, self.events))
+            of_entries = events_of_entries(self.interface, problem, self.events) if self._reason else self.events
+            bound = bound.with_events(of_entries)
         return bound, q if bound.interface.rotations or bound.interface.variables else flat_state(
             bound.interface, q, "q"
         )
@@ -408,8 +413,6 @@ class CompiledMethod:
         wanted = as_events(events)
         if wanted == self.events:
             return self
-        if self.problem is not None and self.origin is not None and wanted:
-            return self.known.with_events(events_of_entries(self.origin.interface, self.problem, wanted))
         if wanted not in self._event_variants:
             while len(self._event_variants) >= MOST_EVENT_SETS:
                 self._event_variants.pop(next(iter(self._event_variants)), None)

@@ -19,8 +19,8 @@ from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
 if TYPE_CHECKING:
     from scvi_codegen.runtime.run.memory import Memory
 
-INITIAL_CAPACITY = 256
-"""Initial number of crossings that one call can return; doubled when exceeded."""
+INITIAL_CAPACITY, LEAST_CAPACITY, CROSSING_NUMBERS = 256, 16, 2**21
+"""Initial number of crossings that one call can return, doubled when exceeded; fewer of more than 8192 coordinates."""
 
 
 class CrossingSearch:
@@ -47,11 +47,7 @@ class CrossingSearch:
             self.watch.acts[number] = terminal and event.changes_state
             if terminal and event.terminal:
                 self.watch.remaining[number] = int(event.terminal) - (crossed[number] if crossed else 0)
-        m = stepper.dimension
-        numbers = [("t", float), ("fraction", float), ("function", np.int32), ("direction", np.int32)]
-        fields = [*numbers, ("q", float, (m,)), ("p", float, (m,))]
-        self._record = np.dtype(fields, align=True)
-        self._capacity = INITIAL_CAPACITY
+        self._capacity = min(INITIAL_CAPACITY, max(LEAST_CAPACITY, CROSSING_NUMBERS // stepper.dimension))
 
     @property
     def ended(self) -> bool:
@@ -91,7 +87,7 @@ class CrossingSearch:
                 workspace,
             )
             count = int(filled[0])
-            self.recorded.append(np.frombuffer(self.binding.buffer(crossings), self._record, count).copy())
+            self.recorded.append(self.binding.records(crossings)[:count].copy())
             done += int(report.steps)
             if status:
                 raise self._failure(status, report, first + done, float(h[done]))
@@ -133,7 +129,7 @@ class CrossingSearch:
             run._report,
             run._workspace,
         )
-        self.recorded.append(np.frombuffer(binding.buffer(crossings), self._record, int(filled[0])).copy())
+        self.recorded.append(binding.records(crossings)[: int(filled[0])].copy())
         report, count = run._report, int(run._report.stored) + 1
         failure = self._failure(status, report, number + int(report.steps), run.h) if status else None
         if not (failure or self.ended or report.steps == size or run.arrived):
@@ -176,7 +172,8 @@ class CrossingSearch:
 
     def crossings(self) -> tuple[Crossings, ...]:
         """Return the crossings by event."""
-        records, named = np.concatenate([np.empty(0, self._record), *self.recorded]), self.stepper.named
+        none = self.binding.records(self.binding.new("crossing[1]"))[:0]
+        records, named = np.concatenate([none, *self.recorded]), self.stepper.named
         return tuple(
             Crossings(event=event, t=mine["t"].copy(), q=named(mine["q"].copy()), p=named(mine["p"].copy()))
             for number, event in enumerate(self.stepper.events)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import StateError
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.events.array_events import events_of_entries
 from scvi_codegen.runtime.events.event import Event
 
 if TYPE_CHECKING:
@@ -112,7 +113,10 @@ def _jump(
     else:
         h = SMALL_STEP * float(starts.h[k - 1])
         departure = 0.5 * (products(after, h, t, size_seed) + products(after, -h, t, size_seed))[:, 0]
-    values = _derivatives(stepper.interface, event)(before, t, parameters)
+    formulas = event  # in the names of the coordinates of known sizes
+    if stepper.origin is not None and stepper.problem is not None:
+        (formulas,) = events_of_entries(stepper.origin.interface, stepper.problem, (event,))
+    values = _derivatives(stepper.known.interface, formulas)(before, t, parameters)
     gradient = np.concatenate([values.gradient, np.zeros(1)])
     rate = values.gradient[: 2 * m] @ arrival + values.gradient[-1]
     steepest = np.linalg.norm(values.gradient[: 2 * m]) * np.linalg.norm(arrival) + abs(values.gradient[-1])

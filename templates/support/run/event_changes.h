@@ -23,24 +23,36 @@ enum {
 #define CHANGE_END 1e-6 /* relative to a step: remaining time at which an accumulation ends the run */
 
 typedef NAME(run) event_run;
+typedef NAME(report) array_report;
 
 /* Wall of an impact at a state: n = (g_q, g_t, e); the rate of g in the direction of the run, a bound of its terms, and
- * how far rounding may move the state behind the wall. */
+ * how far rounding may move the state behind the wall. Of a map n are its values. */
 typedef struct {
-  real value[CHANGE_VALUES], rate, size, slack;
+  real rate, size, slack;
   const real *n;
 } event_wall;
 
-static void copy_state(real *q, real *p, const real *q0, const real *p0)
+/* Copies a run; in index notation also its arrays, into those of `to`. */
+static void copy_run(event_run *to, const event_run *from)
 {
-  memcpy(q, q0, sizeof(real) * M);
-  memcpy(p, p0, sizeof(real) * M);
+#ifdef EVENTS_OF_ANY_SIZE
+  const event_run own = *to;
+  *to = *from;
+  to->q = own.q;
+  to->p = own.p;
+  to->carry_q = own.carry_q;
+  to->carry_p = own.carry_p;
+  copy_state(to->q, to->p, from->q, from->p);
+  copy_state(to->carry_q, to->carry_p, from->carry_q, from->carry_p);
+#else
+  *to = *from;
+#endif
 }
 
 /* Velocities at p + lambda n, and n.v + g_t. */
 static int approach(const event_step *step, const event_sample *at, const real *n, real lambda, real *v, real *rate)
 {
-  real p[M];
+  real *const p = step->memory + 2 * M;
   int status;
   for (int i = 0; i < M; i++)
     p[i] = at->p[i] + lambda * n[i];
@@ -54,13 +66,11 @@ static int approach(const event_step *step, const event_sample *at, const real *
 /* Values of the kernel event_changes; the wall of function e if it is one. */
 static int evaluate_changes(const event_step *step, int e, const event_sample *at, event_wall *wall)
 {
-  real u[3 * M], v[M];
-  int status = event_arguments(at->t, at->q, at->p, step->parameters, u, step->workspace);
-  if (status == OK)
-    event_changes(u, at->t, step->parameters, wall->value);
+  real *const v = step->memory + 3 * M, *const value = step->memory + 13 * M;
+  int status = event_kernel(EVENT_MAPS + e, at->t, at->q, at->p, step->parameters, value, step->workspace);
+  wall->n = value + FIRST_VALUE[e];
   if (status != OK || !IS_IMPACT[e])
     return status;
-  wall->n = wall->value + FIRST_VALUE[e];
   status = approach(step, at, wall->n, 0.0, v, &wall->rate);
   wall->size = fabs(wall->n[M]);
   wall->slack = fabs(wall->n[M] * at->t);
@@ -81,9 +91,11 @@ static int impact(const event_step *step, event_sample *at, const event_wall *wa
   const real *n = wall->n, restitution = step->h < 0.0 ? 1.0 / n[M + 1] : n[M + 1];
   const real rate = step->h < 0.0 ? -wall->rate : wall->rate;
   event_sample moved = *at;
-  real v[M], lambda, at_rest = 0.0, after = 0.0, energy = 0.0, now = 0.0, correction, before = INFINITY;
+  real *const v = step->memory + 3 * M;
+  real lambda, at_rest = 0.0, after = 0.0, energy = 0.0, now = 0.0, correction, before = INFINITY;
   int status;
-  memset(moved.p, 0, sizeof moved.p);
+  moved.p = step->memory + 4 * M;
+  memset(moved.p, 0, sizeof(real) * M);
   status = approach(step, &moved, n, 0.0, v, &at_rest);
   if (status == OK)
     status = approach(step, &moved, n, 1.0, v, &after);
@@ -115,26 +127,33 @@ static int impact(const event_step *step, event_sample *at, const event_wall *wa
   return status;
 }
 
-/* Sets the variables of a map to its values; velocities are set last, by their momenta. */
+/* Sets the variables of a map to its values; velocities are set last, by their momenta. In index notation the values are
+ * those of q and p. */
 static int apply_map(const event_step *step, int e, event_sample *at, const real *value)
 {
-  const event_sample before = *at;
-  real v[M];
+#ifdef EVENTS_OF_ANY_SIZE
+  (void)step, (void)e;
+  copy_state(at->q, at->p, value, value + M);
+  return OK;
+#else
+  const int *const changed = CHANGED + FIRST_VALUE[e], count = FIRST_VALUE[e + 1] - FIRST_VALUE[e];
+  real *const v = step->memory + 3 * M;
   int by_velocity = 0, status = OK;
-  for (int i = FIRST_VALUE[e]; i < FIRST_VALUE[e + 1]; i++) {
-    by_velocity |= CHANGED[i] >= 2 * M;
-    if (CHANGED[i] < M)
-      at->q[CHANGED[i]] = value[i];
-    else if (CHANGED[i] < 2 * M)
-      at->p[CHANGED[i] - M] = value[i];
-  }
-  if (!by_velocity)
-    return OK;
-  status = NAME(velocity)(before.t, before.q, before.p, step->parameters, v, step->workspace);
-  for (int i = FIRST_VALUE[e]; i < FIRST_VALUE[e + 1]; i++)
-    if (CHANGED[i] >= 2 * M)
-      v[CHANGED[i] - 2 * M] = value[i];
-  return status == OK ? NAME(momentum)(at->t, at->q, v, step->parameters, at->p, step->workspace) : status;
+  for (int i = 0; i < count; i++)
+    by_velocity |= changed[i] >= 2 * M;
+  if (by_velocity)
+    status = NAME(velocity)(at->t, at->q, at->p, step->parameters, v, step->workspace);
+  for (int i = 0; i < count; i++)
+    if (changed[i] < M)
+      at->q[changed[i]] = value[i];
+    else if (changed[i] < 2 * M)
+      at->p[changed[i] - M] = value[i];
+    else
+      v[changed[i] - 2 * M] = value[i];
+  return by_velocity && status == OK
+      ? NAME(momentum)(at->t, at->q, v, step->parameters, at->p, step->workspace)
+      : status;
+#endif
 }
 
 /* Changes the state by function e: by its map, or by an impact if the wall is approached. */
@@ -146,7 +165,7 @@ static int change_state(const event_step *step, int e, event_sample *at)
     step->watch->rounding[e] = wall.slack / -wall.rate;
     status = impact(step, at, &wall);
   } else if (status == OK && !IS_IMPACT[e])
-    status = apply_map(step, e, at, wall.value);
+    status = apply_map(step, e, at, wall.n);
   if (status == OK && !(all_finite(at->q, M) && all_finite(at->p, M))) {
     step->watch->undefined = e + 1;
     status = NOT_FINITE;
@@ -183,10 +202,9 @@ static void note_hit(const event_step *step, int e, real t)
 static int refine_crossing(const event_step *step, long long first, event_sample *at, real *part)
 {
   event_crossing *crossing = step->found + first;
-  event_sample moved;
   event_wall wall;
   solver_report own;
-  real back = 0.0;
+  real back = 0.0, *const q = step->memory, *const p = q + M;
   int status;
   at->t = crossing->t;
   copy_state(at->q, at->p, crossing->q, crossing->p);
@@ -198,11 +216,10 @@ static int refine_crossing(const event_step *step, long long first, event_sample
   if (status != OK || !(back > 0.0 && back <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->h)))
     return status;
   back = step->h < 0.0 ? -back : back;
-  status = NAME(step)(at->t, -back, at->q, at->p, step->parameters, step->options, moved.q, moved.p, &own,
-      step->workspace);
+  status = NAME(step)(at->t, -back, at->q, at->p, step->parameters, step->options, q, p, &own, step->workspace);
   at->t -= back;
   *part -= back;
-  copy_state(at->q, at->p, moved.q, moved.p);
+  copy_state(at->q, at->p, q, p);
   for (long long i = first; i < *step->filled; i++) {
     step->found[i].t = at->t;
     copy_state(step->found[i].q, step->found[i].p, at->q, at->p);
@@ -303,8 +320,8 @@ static void set_run(event_run *run, real t, const event_sample *at)
 {
   run->t = t;
   copy_state(run->q, run->p, at->q, at->p);
-  memset(run->carry_q, 0, sizeof run->carry_q);
-  memset(run->carry_p, 0, sizeof run->carry_p);
+  memset(run->carry_q, 0, sizeof(real) * M);
+  memset(run->carry_p, 0, sizeof(real) * M);
   run->guess = 0;
 }
 
@@ -312,7 +329,9 @@ static void set_run(event_run *run, real t, const event_sample *at)
 static int change_in_step(const event_run *before, event_run *run, event_step *step, real length, int iterations,
     const stored_states *to)
 {
-  event_sample left = {.t = before->t}, right = {.fraction = 1.0, .t = run->t};
+  real *const states = step->memory + 7 * M;
+  event_sample left = {.t = before->t, .q = states, .p = states + M};
+  event_sample right = {.fraction = 1.0, .t = run->t, .q = states + 2 * M, .p = states + 3 * M};
   int status;
   step->whole = length;
   copy_state(left.q, left.p, before->q, before->p);
@@ -321,7 +340,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   for (int changes = 0; status == OK; changes++) {
     const long long first = *step->filled;
     long long group = first;
-    event_sample at;
+    event_sample at = {.q = states + 4 * M, .p = states + 5 * M};
     solver_report own;
     real part = length;
     int acts = 0, ends;
@@ -336,7 +355,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       status = settle_crossings(step, first);
     if (status == NOT_CONVERGED && step->watch->accumulated) {
       step->watch->ended = 1; /* the start of this part is where crossings accumulate */
-      *run = *before;
+      copy_run(run, before);
       run->t_low = 0.0;
       set_run(run, left.t, &left);
       return OK;
@@ -373,15 +392,15 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     step->watch->started = 0;
     if (status == OK && (ends || before->h == 0.0 || step->watch->ended)) {
       if (!ends) {
-        *run = *before;
+        copy_run(run, before);
         run->step += before->h == 0.0; /* adaptive */
         run->t_low = 0.0;
       }
       set_run(run, ends ? run->t : at.t, &at);
       return OK;
     }
-    left = at;
-    left.fraction = 0.0;
+    left.t = at.t;
+    copy_state(left.q, left.p, at.q, at.p);
     if (status == OK)
       status = evaluate_functions(step, &left);
     if (status == OK)
@@ -391,24 +410,48 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   return status;
 }
 
+/* One step of a run: adaptive, or of its h. */
+static int advance_run(event_run *run, real t_end, real tolerance, const event_step *step, int *iterations,
+    solver_report *own)
+{
+  int status = NOT_CONVERGED;
+#ifdef EVENTS_OF_ANY_SIZE
+  array_report made;
+  if (run->h != 0.0)
+    status = NAME(advance)(run, event_host->problem, 1, step->options, &made);
+#if EVENTS_CONTROLLED
+  else {
+    status = NAME(advance_to)(run, event_host->problem, t_end, tolerance, 1, step->options, &made);
+    run->h = 0.0;
+  }
+#endif
+  own->change = made.change;
+  own->iterations = made.iterations;
+  *iterations = (int)made.iterations;
+#else
+  real t, *const q = step->memory, *const p = q + M;
+  if (run->h != 0.0)
+    status = NAME(advance)(run, 1, 1, step->parameters, step->options, &t, q, p, iterations, own, step->workspace);
+#if EVENTS_CONTROLLED
+  else
+    status = NAME(advance_to)(run, t_end, tolerance, 1, 1, step->parameters, step->options, &t, q, p, iterations, own,
+        step->workspace);
+#endif
+#endif
+  (void)t_end, (void)tolerance;
+  return status;
+}
+
 /* One step of a run, shorter if it would pass t_end; returns its size in *length. */
 static int take_step(event_run *run, real t_end, real tolerance, const event_step *step, real *length, int *iterations)
 {
   const real start = run->t, left = (t_end - run->t) - run->t_low;
-  event_sample end;
+  event_sample end = {.q = step->memory, .p = step->memory + M};
   solver_report own;
-  int status = NOT_CONVERGED;
-  if (run->h == 0.0) {
-#if EVENTS_CONTROLLED
-    status = NAME(advance_to)(run, t_end, tolerance, 1, 1, step->parameters, step->options, &end.t, end.q, end.p,
-        iterations, &own, step->workspace);
-#endif
-    (void)tolerance;
-    *length = run->t - start;
-  } else if (fabs(left) >= (1.0 - CHANGE_WHOLE) * fabs(run->h)) {
-    status = NAME(advance)(run, 1, 1, step->parameters, step->options, &end.t, end.q, end.p, iterations, &own,
-        step->workspace);
-    *length = run->h;
+  int status;
+  if (run->h == 0.0 || fabs(left) >= (1.0 - CHANGE_WHOLE) * fabs(run->h)) {
+    status = advance_run(run, t_end, tolerance, step, iterations, &own);
+    *length = run->h == 0.0 ? run->t - start : run->h;
   } else {
     *length = left;
     status = NAME(step)(run->t, left, run->q, run->p, step->parameters, step->options, end.q, end.p, &own,
@@ -430,23 +473,32 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, r
     int *iterations, long long *number, long long room, event_crossing *found, long long *filled, solver_report *report,
     real *workspace)
 {
+  EVENT_MEMORY(watch, memory, 13 * M + CHANGE_VALUES)
   const event_watch initial = *watch;
   const stored_states to = {states, number, t, q, p, length, iterations};
   int status = OK;
   memset(report, 0, sizeof *report);
   *filled = 0;
   while (report->steps < steps && !watch->ended && (t_end - run->t) - run->t_low != 0.0) {
-    const event_run before = *run;
+    event_run before = *run;
     const event_watch watched = *watch;
     const long long kept = report->stored, crossed = *filled;
-    event_step step = {0.0, 0.0, 0.0, NULL, NULL, parameters, options, watch, found, room, filled, report, workspace};
+    event_step step = {0.0, 0.0, 0.0, NULL, NULL, parameters, options, watch, found, room, filled, report, workspace,
+        memory};
     real size;
     int count = 0;
+#ifdef EVENTS_OF_ANY_SIZE
+    before.q = memory + 15 * M + 2;
+    before.p = before.q + M;
+    before.carry_q = before.p + M;
+    before.carry_p = before.carry_q + M;
+    copy_run(&before, run);
+#endif
     status = take_step(run, t_end, tolerance, &step, &size, &count);
     if (status == OK)
       status = change_in_step(&before, run, &step, size, count, &to);
     if (status != OK) {
-      *run = before;
+      copy_run(run, &before);
       report->stored = kept;
       *filled = crossed;
       if (status == EVENT_NO_ROOM) {

@@ -69,29 +69,64 @@ typedef NAME(crossing) event_crossing;
 #define EVENT_GUARDS 0 /* values of the kernel event_guards: conditions of crossings, each of the function GUARDED */
 #endif
 
-/* Arguments (q, p, v) of the kernels of events at a state. */
-static int event_arguments(real t, const real *q, const real *p, const real *parameters, real *u, real *workspace)
+/* Kernels of events; EVENT_MAPS + e: changes by function e. */
+enum {
+  EVENT_FUNCTIONS,
+  EVENT_CONDITIONS,
+  EVENT_MAPS
+};
+
+/* Values of a kernel of events at a state; in index notation they are computed by the caller. */
+static int event_kernel(int kernel, real t, const real *q, const real *p, const real *parameters, real *value,
+    real *workspace)
 {
+#ifdef EVENTS_OF_ANY_SIZE
+  (void)workspace;
+  return event_host->evaluate(kernel, t, q, p, parameters, value);
+#else
+  real u[3 * M];
+  int status = OK;
   memcpy(u, q, sizeof(real) * M);
   memcpy(u + M, p, sizeof(real) * M);
   memset(u + 2 * M, 0, sizeof(real) * M);
-  return EVENTS_USE_VELOCITIES ? event_velocity(t, q, p, parameters, u + 2 * M, workspace) : OK;
+  if (EVENTS_USE_VELOCITIES)
+    status = event_velocity(t, q, p, parameters, u + 2 * M, workspace);
+  if (status != OK)
+    return status;
+  if (kernel == EVENT_FUNCTIONS)
+    event_functions(u, t, parameters, value);
+#if EVENT_GUARDS > 0
+  else if (kernel == EVENT_CONDITIONS)
+    event_guards(u, t, parameters, value);
+#endif
+#ifdef EVENT_CHANGES
+  else
+    event_changes(u, t, parameters, value);
+#endif
+  return OK;
+#endif
 }
 
 int NAME(event_values)(real t, const real *q, const real *p, const real *parameters, real *value, real *workspace)
 {
-  real u[3 * M];
-  const int status = event_arguments(t, q, p, parameters, u, workspace);
+  const int status = event_kernel(EVENT_FUNCTIONS, t, q, p, parameters, value, workspace);
   if (status != OK)
     return status;
-  event_functions(u, t, parameters, value);
   return all_finite(value, EVENTS) ? OK : NOT_FINITE;
 }
 
-/* State at a fraction of a step, and the event functions there. */
+/* Event functions at a fraction of a step, and the state there, in memory that later samples may use as well. */
 typedef struct {
-  real fraction, t, g[EVENTS], q[M], p[M];
+  real fraction, t, g[EVENTS], *q, *p;
 } event_sample;
+
+#ifdef EVENTS_OF_ANY_SIZE
+#define EVENT_MEMORY(watch, name, size)                    \
+  real *const name = (event_host = (watch)->host)->memory; \
+  (watch)->used = 0;
+#else
+#define EVENT_MEMORY(watch, name, size) real name[size];
+#endif
 
 /* A step that is searched, and the array for its crossings. */
 typedef struct {
@@ -103,7 +138,14 @@ typedef struct {
   long long room, *filled;
   solver_report *report;
   real *workspace;
+  real *memory; /* state of the last sample (2 M), work (5 M); states, values and work of changes */
 } event_step;
+
+static void copy_state(real *q, real *p, const real *q0, const real *p0)
+{
+  memcpy(q, q0, sizeof(real) * M);
+  memcpy(p, p0, sizeof(real) * M);
+}
 
 /* Evaluates the functions at the state of a sample; watch->undefined is 1 + the index of the first that is not
  * finite. */
@@ -121,8 +163,11 @@ static int evaluate_functions(const event_step *step, event_sample *sample)
 static int take_sample(const event_step *step, real fraction, event_sample *sample)
 {
   solver_report own;
-  const int status = NAME(step)(step->t, fraction * step->h, step->q, step->p, step->parameters, step->options,
-      sample->q, sample->p, &own, step->workspace);
+  int status;
+  sample->q = step->memory;
+  sample->p = step->memory + M;
+  status = NAME(step)(step->t, fraction * step->h, step->q, step->p, step->parameters, step->options, sample->q,
+      sample->p, &own, step->workspace);
   sample->fraction = fraction;
   sample->t = step->t + duration_of_part(fraction * step->h, &own);
   step->report->iterations += own.iterations;
@@ -253,14 +298,21 @@ static int add_crossing(const event_step *step, int e, const event_sample *from,
   if (*step->filled == step->room)
     return EVENT_NO_ROOM;
   status = enclose_crossing(step, e, *from, &at);
+  if (status == OK && at.q == step->memory)
+    status = take_sample(step, at.fraction, &at);
   if (status != OK)
     return status;
+#ifdef EVENTS_OF_ANY_SIZE
+  if (step->watch->used == step->room)
+    return EVENT_NO_ROOM;
+  crossing->q = event_host->states + 2 * M * step->watch->used++;
+  crossing->p = crossing->q + M;
+#endif
   crossing->t = at.t;
   crossing->fraction = at.fraction;
   crossing->function = e;
   crossing->direction = direction;
-  memcpy(crossing->q, at.q, sizeof at.q);
-  memcpy(crossing->p, at.p, sizeof at.p);
+  copy_state(crossing->q, crossing->p, at.q, at.p);
   ++*step->filled;
   return OK;
 }
@@ -327,23 +379,39 @@ static int search_part(const event_step *step, int e, const event_sample *left, 
   return status == OK ? search_part(step, e, &sample, right, NULL, splits - 1) : status;
 }
 
-/* Change of a function if each coordinate changes by one ulp: the effect of rounding of the state. */
+/* Change of a function if each coordinate changes by one ulp: the effect of rounding of the state. In index notation
+ * the largest change if all coordinates change at once, with alternating signs of three patterns. */
 static int rounding_of(const event_step *step, int e, const event_sample *at, real *noise)
 {
+  event_sample next = *at;
+  next.q = step->memory + 2 * M;
   *noise = 0.0;
+#ifdef EVENTS_OF_ANY_SIZE
+  for (int pattern = 0; pattern < 3; pattern++) {
+    int status;
+    for (int i = 0; i < M; i++)
+      next.q[i] = at->q[i] * (1.0 + ((i * pattern / 2) % 2 ? -DBL_EPSILON : DBL_EPSILON));
+    status = evaluate_functions(step, &next);
+    if (status != OK)
+      return status;
+    *noise = fmax(*noise, fabs(next.g[e] - at->g[e]));
+  }
+#else
+  memcpy(next.q, at->q, sizeof(real) * M);
   for (int i = 0; i < M; i++) {
-    event_sample next = *at;
     int status;
     next.q[i] *= 1.0 + DBL_EPSILON;
     status = evaluate_functions(step, &next);
     if (status != OK)
       return status;
     *noise += fabs(next.g[e] - at->g[e]);
+    next.q[i] = at->q[i];
   }
+#endif
   return OK;
 }
 
-/* Central difference of a function along (q, p, t), divided by the size of the change. */
+/* Central difference of a function along (q, p, t), divided by the size of the change; dq or dp NULL: zeros. */
 static int difference(const event_step *step, int e, const event_sample *at, const real *dq, const real *dp, real dt,
     real size, real *found)
 {
@@ -351,9 +419,11 @@ static int difference(const event_step *step, int e, const event_sample *at, con
   for (int side = 0; side < 2; side++) {
     const real part = side ? size : -size;
     int status;
+    ends[side].q = step->memory;
+    ends[side].p = step->memory + M;
     for (int i = 0; i < M; i++) {
-      ends[side].q[i] += part * dq[i];
-      ends[side].p[i] += part * dp[i];
+      ends[side].q[i] = at->q[i] + (dq ? part * dq[i] : 0.0);
+      ends[side].p[i] = at->p[i] + (dp ? part * dp[i] : 0.0);
     }
     ends[side].t += part * dt;
     status = evaluate_functions(step, ends + side);
@@ -368,8 +438,9 @@ static int difference(const event_step *step, int e, const event_sample *at, con
  * difference along q is as long as rounding of q requires; those along p and t may be shorter. */
 static int first_change(const event_step *step, int e, const event_sample *at, real noise, real *change, real *doubt)
 {
-  const real none[M] = {0.0}, little = 0x1p-10;
-  real v[M], dq[M], dp[M], fast = 0.0, large = 0.0, size, by_q = 0.0, by_rest = 0.0;
+  const real little = 0x1p-10;
+  real *const v = step->memory + 2 * M, *const dq = v + M, *const dp = dq + M;
+  real fast = 0.0, large = 0.0, size, by_q = 0.0, by_rest = 0.0;
   event_sample next;
   int status = event_velocity(at->t, at->q, at->p, step->parameters, v, step->workspace);
   if (status == OK)
@@ -383,9 +454,9 @@ static int first_change(const event_step *step, int e, const event_sample *at, r
     large = fmax(large, fabs(at->q[i]));
   }
   size = fast > 0.0 && 0x1p-17 * large / fast > little ? 0x1p-17 * large / fast : little;
-  status = difference(step, e, at, dq, none, 0.0, size, &by_q);
+  status = difference(step, e, at, dq, NULL, 0.0, size, &by_q);
   if (status == OK)
-    status = difference(step, e, at, none, dp, (next.t - at->t) / little, little, &by_rest);
+    status = difference(step, e, at, NULL, dp, (next.t - at->t) / little, little, &by_rest);
   *change = by_q + by_rest;
   *doubt = noise / size + (by_rest != 0.0 ? noise / little : 0.0);
   return status;
@@ -476,11 +547,10 @@ static int check_guards(const event_step *step, int e, real t, const real *q, co
   int status = OK;
   *open = 1;
 #if EVENT_GUARDS > 0
-  real u[3 * M], value[EVENT_GUARDS];
-  status = event_arguments(t, q, p, step->parameters, u, step->workspace);
+  real value[EVENT_GUARDS];
+  status = event_kernel(EVENT_CONDITIONS, t, q, p, step->parameters, value, step->workspace);
   if (status != OK)
     return status;
-  event_guards(u, t, step->parameters, value);
   for (int i = 0; i < EVENT_GUARDS; i++)
     *open &= GUARDED[i] != e || value[i] >= 0.0;
 #else
@@ -495,10 +565,9 @@ static int keep_coincident(const event_step *step, long long last)
 {
   const long long filled = *step->filled;
   const event_crossing end = step->found[last];
-  event_sample at = {.t = end.t};
+  event_sample at = {.t = end.t, .q = step->memory, .p = step->memory + M};
   int status;
-  memcpy(at.q, end.q, sizeof at.q);
-  memcpy(at.p, end.p, sizeof at.p);
+  copy_state(at.q, at.p, end.q, end.p);
   status = evaluate_functions(step, &at);
   *step->filled = last + 1;
   for (long long i = last + 1; status == OK && i < filled; i++) {
@@ -544,19 +613,20 @@ int NAME(crossings)(event_watch *watch, long long count, const real *h, const re
     const real *p, const real *parameters, const solver_options *options, long long room,
     event_crossing *found, long long *filled, solver_report *report, real *workspace)
 {
+  EVENT_MEMORY(watch, memory, 7 * M)
   event_sample left, right;
   memset(report, 0, sizeof *report);
   *filled = 0;
   for (long long k = 0; k < count && !watch->ended; k++) {
     const long long start = k > 0 ? k - 1 : 0, first = *filled;
     const event_step step = {t[start], h[start], h[start], q + start * M, p + start * M, parameters, options, watch,
-        found, room, filled, report, workspace};
+        found, room, filled, report, workspace, memory};
     int status;
     report->t = t[start];
     right.fraction = k > 0 ? 1.0 : 0.0;
     right.t = t[k];
-    memcpy(right.q, q + k * M, sizeof right.q);
-    memcpy(right.p, p + k * M, sizeof right.p);
+    right.q = (real *)(q + k * M); /* not changed */
+    right.p = (real *)(p + k * M);
     status = evaluate_functions(&step, &right);
     if (status == OK && k > 0) {
       left.fraction = 0.0;
