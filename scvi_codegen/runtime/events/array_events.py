@@ -234,7 +234,7 @@ class EventBinding(ArrayBinding):
     def __init__(self, library: Library, interface: Interface, sizes: RunSizes, events: tuple[Event, ...]) -> None:
         super().__init__(library, interface, sizes)
         self.events = ArrayEvents(EventFormulasOfArrays(interface, sizes), events)
-        self._states: WeakKeyDictionary[Any, Numbers] = WeakKeyDictionary()
+        self._rows: WeakKeyDictionary[Any, Numbers] = WeakKeyDictionary()
 
     def new(self, what: str) -> Any:
         """Return memory of a run, a search or crossings, or a report."""
@@ -243,7 +243,7 @@ class EventBinding(ArrayBinding):
 
     def records(self, structs: Any) -> NDArray[np.void]:
         """Return a copy of crossings, by the names of their fields."""
-        states = self._states.get(structs, np.zeros((0, 2 * self.count)))
+        states = self._rows.get(structs, np.zeros((0, 2 * self.count)))
         fields = [("t", float), ("fraction", float), ("function", np.int32), ("direction", np.int32)]
         records = np.zeros(len(structs), [*fields, ("q", float, (self.count,)), ("p", float, (self.count,))])
         first = self._ffi.cast("size_t", self.pointer(states))
@@ -267,7 +267,7 @@ class EventBinding(ArrayBinding):
         *inputs, room, found, filled, report, workspace = arguments
         new = super(ArrayBinding, self).new
         failures, host, made = list[BaseException](), new("event_host *"), new("event_report *")
-        work, self._states[found] = np.empty(19 * self.count + 2), np.empty((room, 2 * self.count))
+        work, self._rows[found] = np.empty(19 * self.count + 2), np.empty((room, 2 * self.count))
         functions = {"step": self._step, "velocity": self._velocity, "energies": self._energies}
         functions["evaluate"] = self._event_values
         types = dict(self._ffi.typeof(host).item.fields)
@@ -279,7 +279,7 @@ class EventBinding(ArrayBinding):
         }
         for key, value in callbacks.items():
             setattr(host, key, value)
-        host.count, host.memory, host.states = self.count, self.pointer(work), self.pointer(self._states[found])
+        host.count, host.memory, host.states = self.count, self.pointer(work), self.pointer(self._rows[found])
         if run is not None:
             host.problem = self._arrays[run].problem
         function, watch.host = super(ArrayBinding, self).function(name, run), host
