@@ -74,8 +74,6 @@ def residual_group(
     return StageGroup(
         name="node",
         abscissae=abscissae,
-        weights=(mp.one,) * len(abscissae),
-        weight_names=("",) * len(abscissae),
         gathers=gathers,
         scatters=(replace(residual, results=forms_of(system).euler_lagrange), *others),
     )
@@ -129,8 +127,6 @@ def single_point(
     return StageGroup(
         name=name,
         abscissae=(abscissa,),
-        weights=(mp.one,),
-        weight_names=("",),
         gathers=(
             Gather(arguments=system.coordinates, table=position, power=0),
             Gather(arguments=system.velocities, table=velocity, power=-1),

@@ -158,8 +158,6 @@ def _velocity_conditions(system: MechanicalSystem, stages: StageSystem, group: S
         StageGroup(
             name="rolling",
             abscissae=gauss.abscissae,
-            weights=(mp.one,) * size,
-            weight_names=("",) * size,
             gathers=tuple(gathers),
             scatters=(Scatter(results=conditions_table, table=table, power=0),),
             computes="Velocity constraints",
@@ -193,8 +191,6 @@ def _end(system: MechanicalSystem, stages: StageSystem, points: int) -> StageGro
     return StageGroup(
         name="end",
         abscissae=(mp.one,),
-        weights=(mp.one,),
-        weight_names=("",),
         gathers=(
             Gather(arguments=system.coordinates, table=Table.joined(stages.end_position, others), power=0),
             Gather(arguments=system.velocities, table=Table.named("", column), power=-1),

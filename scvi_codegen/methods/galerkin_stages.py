@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 
-from sympy import Expr
-
 from scvi_codegen.errors import MethodError
 from scvi_codegen.mechanics.derived_expressions import curve_rates, forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -82,7 +80,7 @@ def galerkin_system(
         if abscissae[-1] == 1:
             position = (*position[:-1], end_position)
         shape = replace(exact, position=position, end=end_position, weights=weights, unrounded=exact)
-    gathers = _curve_gathers(system, position, (velocity, *derivatives))
+    gathers = curve_gathers(system, position, (velocity, *derivatives))
     return stationary_increments(
         stage_groups=action_groups(system, abscissae, (weights, *derivative_weights), gathers),
         blocks=tuple(Block(name=f"V_{b}", power=1, straight=(mp.zero, mp.one)) for b in range(1, size + 1)),
@@ -133,17 +131,37 @@ def action_groups(
     )
 
 
-def _curve_gathers(system: MechanicalSystem, position: Matrix, velocities: Sequence[Matrix]) -> tuple[Gather, ...]:
-    """Return Q, v and further time derivatives of the curve, one per table."""
-    points = len(position)
+def curve_gathers(
+    system: MechanicalSystem,
+    position: Matrix,
+    velocities: Sequence[Matrix],
+    *,
+    names: tuple[str, str] = ("a", "l"),
+    first: int = 1,
+    other_blocks: int = 0,
+) -> tuple[Gather, ...]:
+    """Return Q, v and further time derivatives of the curve, one per table.
+
+    Args:
+        system: the mechanical system.
+        position: matrix from the unknowns to q / h.
+        velocities: matrices from them to v and h^k d^k v/dt^k.
+        names: of the entries of both.
+        first: number of their first column.
+        other_blocks: number of unknowns that the curve does not depend on.
+    """
+    points, (of_position, of_velocity) = len(position), names
+    padding = Table.constant(points, other_blocks)
     rates = (system.velocities, *curve_rates(system, len(velocities) - 1))
-    gather_table = Table.joined(Table.constant(points, 1, 1), Table.named("a", position))
+    gather_table = Table.joined(Table.constant(points, 1, 1), Table.named(of_position, position, column=first), padding)
     return (
         Gather(arguments=system.coordinates, table=gather_table, power=0),
         *(
             Gather(
                 arguments=arguments,
-                table=Table.joined(Table.constant(points, 1), Table.named(f"{'d' * k}l", table)),
+                table=Table.joined(
+                    Table.constant(points, 1), Table.named(f"{'d' * k}{of_velocity}", table, column=first), padding
+                ),
                 power=-1 - k,
             )
             for k, (arguments, table) in enumerate(zip(rates, velocities, strict=True))
@@ -186,25 +204,8 @@ def position_block(v: int, nodes: Nodes) -> Block:
 def phase_space_system(system: MechanicalSystem, tableau: Tableau) -> StageSystem:
     """Return (22) on Hamilton's equations, with momenta eliminated by p_i = L_v(q_i, V_i)."""
     size = len(tableau.b)
-    group = StageGroup(
-        name="stage",
-        abscissae=tableau.c,
-        weights=(mp.one,) * size,
-        weight_names=("",) * size,
-        gathers=(
-            Gather(
-                arguments=system.coordinates,
-                table=Table.joined(Table.constant(size, 1, 1), Table.named("a", tableau.A)),
-                power=0,
-            ),
-            Gather(
-                arguments=system.velocities,
-                table=Table.joined(Table.constant(size, 1), Table.identity(size)),
-                power=-1,
-            ),
-        ),
-        scatters=(),
-    )
+    gathers = curve_gathers(system, tableau.A, (identity_matrix(size),))
+    group = StageGroup(name="stage", abscissae=tableau.c, gathers=gathers, scatters=())
     b_column = Table(entries=tuple((x,) for x in tableau.b), names=tuple((f"b_{n + 1}",) for n in range(size)))
     return StageSystem(
         blocks=tuple(Block(name=f"V_{i}", power=1, straight=(mp.zero, mp.one)) for i in range(1, size + 1)),
@@ -213,11 +214,11 @@ def phase_space_system(system: MechanicalSystem, tableau: Tableau) -> StageSyste
             lagrangian_scatters(
                 group,
                 system,
-                Scatter(results=(), table=Table.joined(_transposed(tableau), b_column), power=1),
+                Scatter(results=(), table=Table.joined(Table.named("a", tableau.A).transposed, b_column), power=1),
                 Scatter(results=(), table=Table.joined(Table.identity(size, -1), Table.constant(size, 1)), power=0),
             ),
         ),
-        end_position=Table.joined(Table.constant(1, 1, 1), _transposed_row(b_column)),
+        end_position=Table.joined(Table.constant(1, 1, 1), b_column.transposed),
         end_momentum=mp.one,
         end_numbers=("22", "22"),
         extrapolation=next_step(tableau.c),
@@ -233,36 +234,14 @@ def phase_space_system(system: MechanicalSystem, tableau: Tableau) -> StageSyste
     )
 
 
-def _transposed(tableau: Tableau) -> Table:
-    size = len(tableau.b)
-    table = Table.named("a", tableau.A)
-    return Table(
-        entries=tuple(tuple(table.entries[i][j] for i in range(size)) for j in range(size)),
-        names=tuple(tuple(table.names[i][j] for i in range(size)) for j in range(size)),
-    )
-
-
-def _transposed_row(column: Table) -> Table:
-    return Table(entries=(tuple(x for (x,) in column.entries),), names=(tuple(name for (name,) in column.names),))
-
-
 def lagrangian_scatters(
     group: StageGroup, system: MechanicalSystem, force_scatter: Scatter, momentum_scatter: Scatter
 ) -> StageGroup:
     """Return ``group`` with L_q and L_v as kernel results, which fill in the ``results`` of these scatters."""
-    filled = (
-        _with_results(force_scatter, forms_of(system).force),
-        _with_results(momentum_scatter, forms_of(system).momentum),
+    return replace(
+        group,
+        scatters=(
+            replace(force_scatter, results=forms_of(system).force),
+            replace(momentum_scatter, results=forms_of(system).momentum),
+        ),
     )
-    return StageGroup(
-        name=group.name,
-        abscissae=group.abscissae,
-        weights=group.weights,
-        weight_names=group.weight_names,
-        gathers=group.gathers,
-        scatters=filled,
-    )
-
-
-def _with_results(scatter: Scatter, results: tuple[Expr, ...]) -> Scatter:
-    return Scatter(results=results, table=scatter.table, power=scatter.power, scale=scatter.scale)

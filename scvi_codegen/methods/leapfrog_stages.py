@@ -76,8 +76,6 @@ def _drift_group(system: MechanicalSystem, drifts: Vector) -> StageGroup:
     return StageGroup(
         name="drift",
         abscissae=tuple(mp.fsum(drifts[:k]) for k in moving),
-        weights=(mp.one,) * size,
-        weight_names=("",) * size,
         gathers=(
             Gather(
                 arguments=system.velocities,

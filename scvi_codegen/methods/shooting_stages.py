@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics.derived_expressions import curve_rates, forms_of, multipliers
+from scvi_codegen.mechanics.derived_expressions import forms_of, multipliers
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.acceleration_stages import (
     acceleration_extrapolation,
@@ -16,7 +15,12 @@ from scvi_codegen.methods.acceleration_stages import (
     nodal_gathers,
     residual_group,
 )
-from scvi_codegen.methods.galerkin_stages import action_groups, lagrangian_scatters, nodal_quadrature_group
+from scvi_codegen.methods.galerkin_stages import (
+    action_groups,
+    curve_gathers,
+    lagrangian_scatters,
+    nodal_quadrature_group,
+)
 from scvi_codegen.methods.stage_structure import PrintedCurve, ShotCurve
 from scvi_codegen.methods.stage_system import (
     Block,
@@ -66,7 +70,7 @@ def shooting_increments(
         system,
         rule.abscissae,
         (weights, *rule.unit_derivative_weights),
-        _curve_gathers(system, position, velocities, other_blocks=size),
+        curve_gathers(system, position, velocities, names=("r", "u"), first=0, other_blocks=size),
     )
     extrapolated = acceleration_extrapolation(tableau)
     return stationary_increments(
@@ -100,8 +104,6 @@ def _multiplier_group(system: MechanicalSystem, tableau: Tableau, *, rounded: bo
     return ScalarStageGroup(
         name="node",
         abscissae=tableau.c,
-        weights=(mp.one,) * size,
-        weight_names=("",) * size,
         gathers=(position, velocity, acceleration, multiplier_gather),
         scalar=forms_of(system).multiplied_residual,
         power=1,
@@ -124,29 +126,6 @@ def _curve(tableau: Tableau, rule: Quadrature) -> tuple[Matrix, tuple[Matrix, ..
     return position, velocities, matrix_product((tableau.b,), moved)[0]
 
 
-def _curve_gathers(
-    system: MechanicalSystem, position: Matrix, velocities: Sequence[Matrix], *, other_blocks: int = 0
-) -> tuple[Gather, ...]:
-    points = len(position)
-    padding = Table.constant(points, other_blocks)
-    rates = (system.velocities, *curve_rates(system, len(velocities) - 1))
-    return (
-        Gather(
-            arguments=system.coordinates,
-            table=Table.joined(Table.constant(points, 1, 1), Table.named("r", position, column=0), padding),
-            power=0,
-        ),
-        *(
-            Gather(
-                arguments=arguments,
-                table=Table.joined(Table.constant(points, 1), Table.named(f"{'d' * k}u", table, column=0), padding),
-                power=-1 - k,
-            )
-            for k, (arguments, table) in enumerate(zip(rates, velocities, strict=True))
-        ),
-    )
-
-
 def printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrature, nodes: Nodes) -> StageSystem:
     """Return (34a) and the partial derivatives (34d), (34e), unknowns (v0, z_i = h a_i)."""
     size, points = len(tableau.b), len(rule)
@@ -166,7 +145,7 @@ def printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrat
             abscissae=rule.abscissae,
             weights=rule.unit_weights,
             weight_names=tuple(f"w_{n}" for n in range(1, points + 1)),
-            gathers=_curve_gathers(system, position_rows, velocities),
+            gathers=curve_gathers(system, position_rows, velocities, names=("r", "u"), first=0),
             scatters=(),
         ),
         system,
@@ -203,8 +182,6 @@ def shooting_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> 
     node = ScalarStageGroup(
         name="node",
         abscissae=nodes.abscissae[1:],
-        weights=(mp.one,) * size,
-        weight_names=("",) * size,
         gathers=(*nodal_gathers(system, nodes, other_blocks=size), multiplier_gather),
         scalar=forms_of(system).multiplied_residual,
         power=-1,

@@ -76,6 +76,11 @@ class Table:
         """Return the identity matrix, or its negative."""
         return cls.named("", [[sign * int(i == j) for j in range(size)] for i in range(size)])
 
+    @property
+    def transposed(self) -> Table:
+        """The transposed table."""
+        return Table(entries=tuple(zip(*self.entries, strict=True)), names=tuple(zip(*self.names, strict=True)))
+
     def columns(self, indices: Sequence[int]) -> Table:
         """Return the columns with these indices, in that order."""
         return Table(
@@ -147,20 +152,31 @@ class Scatter:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StageGroup:
-    """Points c_n in [0, 1] with weights, evaluated by one kernel.
+class StagePoints:
+    """Points c_n in [0, 1] with weights, 1 without names by default, and the arguments of a kernel there."""
+
+    name: str
+    abscissae: Vector
+    weights: Vector = ()
+    weight_names: tuple[str, ...] = ()
+    gathers: tuple[Gather, ...]
+
+    def __post_init__(self) -> None:
+        points = len(self.abscissae)
+        object.__setattr__(self, "weights", self.weights or (mp.one,) * points)
+        object.__setattr__(self, "weight_names", self.weight_names or ("",) * points)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StageGroup(StagePoints):
+    """Points evaluated by one kernel.
 
     If the kernel is the gradient of ``scalar``, sum_n w_n h^(1 + scalar_power) scalar(u_n) is part of a generating
     function, and of the discrete Lagrangian if ``in_action``; if ``forced``, forces are added to the gradient.
     ``computes`` describes the results of the kernel if the name does not.
     """
 
-    name: str
-    abscissae: Vector
-    weights: Vector
-    gathers: tuple[Gather, ...]
     scatters: tuple[Scatter, ...]
-    weight_names: tuple[str, ...]
     scalar: sympy.Expr | None = None
     scalar_power: int = 0
     in_action: bool = False
@@ -220,18 +236,13 @@ class StageSystem:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ScalarStageGroup:
+class ScalarStageGroup(StagePoints):
     """Points whose weighted sum sum_n scale w_n h^(1 + power) s(u_n) is part of a generating function.
 
     ``forces`` f_g, for the first gathers, are added to its derivatives, as in the principle of Lagrange and d'Alembert:
     the variation is ds + sum_g f_g . du_g.
     """
 
-    name: str
-    abscissae: Vector
-    weights: Vector
-    weight_names: tuple[str, ...]
-    gathers: tuple[Gather, ...]
     scalar: sympy.Expr
     power: int = 0
     scale: Fraction = Fraction(1)

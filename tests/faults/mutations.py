@@ -42,7 +42,6 @@ from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.methods import (
     acceleration_stages,
     composition,
-    galerkin_stages,
     leapfrog_stages,
     shooting_stages,
     stage_system,
@@ -298,9 +297,9 @@ MUTATIONS = (
     here(
         "momentum by A for A^T",
         case("kepler/sc-phase-space"),
-        galerkin_stages,
-        "_transposed",
-        changed_result(lambda table: replace(table, entries=transposed(table.entries), names=transposed(table.names))),
+        stage_system.Table,
+        "transposed",
+        lambda original: property(lambda table: original.fget(table) if len(table.entries[0]) == 1 else table),
     ),
     here(
         "A for A^2",
