@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import chain, islice
 
-from sympy import Add, Expr, S, Symbol
+from sympy import Add, Expr, S, Symbol, preorder_traversal
 
 from scvi_codegen.formulas.array_statements import ArrayForce
 from scvi_codegen.formulas.arrays import ArrayTerm
@@ -23,6 +24,9 @@ from scvi_codegen.mechanics.arrays.terms import entries_of, force_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.term_groups import SplitSystem, TermGroup
 
+LONG_FORMULA = 1000
+"""Nodes of the expressions from which on a comment does not contain a formula."""
+
 
 def looped_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, newton: bool) -> LoopedTerms:
     """Return the kernels of the terms of a system of arrays; ``newton``: with the Jacobian of the forces."""
@@ -35,13 +39,13 @@ def looped_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, n
         forces=(
             *(_potential(system, term, number) for number, term in enumerate(potentials)),
             *(
-                _added(system, f"force_{number}", force, arguments, f"forces {force}", "Forces.")
+                _added(system, f"force_{number}", force, arguments, f"forces {_shown(force)}", "Forces.")
                 for number, force in enumerate(system.applied_forces, len(potentials))
             ),
         ),
         masses=tuple(_added(system, f"mass_{number}", mass, (), text, "A mass.") for text, mass, number in masses),
         constants=tuple(
-            looped_kernel(system, f"constant_{number}", [term.formula], term, text=str(term), purpose="The term.")
+            looped_kernel(system, f"constant_{number}", [term.formula], term, text=_shown(term), purpose="The term.")
             for number, term in enumerate(system.energy_offsets)
         ),
         constrained=constrained,
@@ -77,10 +81,19 @@ def _potential(system: ArraySystem, term: ArrayTerm, number: int) -> LoopedKerne
     signs = [-1 if access.array in system.momenta else 1 for access, _ in force.targets]  # of -H: -H_q and H_p
     targets = tuple((access, sign * value) for sign, (access, value) in zip(signs, force.targets, strict=True))
     purpose = "Derivatives with respect to its coordinates."
-    looped = _added(system, f"force_{number}", replace(force, targets=targets), system.state, str(term), purpose)
+    looped = _added(system, f"force_{number}", replace(force, targets=targets), system.state, _shown(term), purpose)
     u = entries_of(term, system.state)
     scalar = looped_kernel(system, f"term_{number}", [term.formula], term, u, text="", purpose="The term.")
     return replace(looped, scalar=scalar.kernel)
+
+
+def _shown(of: ArrayTerm | ArrayForce) -> str:
+    """Return a term or force as text for a comment; instead of long formulas, the arrays that they contain."""
+    formulas = [of.formula] if isinstance(of, ArrayTerm) else [formula for _, formula in of.targets]
+    if sum(1 for _ in islice(chain(*map(preorder_traversal, formulas)), LONG_FORMULA)) < LONG_FORMULA:
+        return str(of)
+    loops = ", ".join(map(str, of.loops))
+    return f"a long formula of {', '.join(sorted({access.array.name for _, access in of.slots}))} for {loops}"
 
 
 def _jacobian(system: ArraySystem) -> tuple[tuple[LoopedKernel, ...], tuple[LoopedKernel, ...]]:
@@ -109,7 +122,7 @@ def _derived(system: ArraySystem, force: ArrayForce, number: int) -> tuple[Loope
         of=force,
         u=moving,
         targets=[access for access, _ in force.targets],
-        text=f"derivatives of {force}",
+        text=f"derivatives of {_shown(force)}",
     )
     return (
         looped(f"product_{number}", along, along=w, purpose="Jacobian of the forces times a direction."),

@@ -72,7 +72,8 @@ def masses_of(term: ArrayTerm, velocities: Mapping[str, Array]) -> tuple[ArrayFo
     known, masses = dict(term.slots), []
     for v in velocity_symbols(term, velocities):
         mass = term.formula.diff(v, 2)
-        slots = tuple(pair for pair in term.slots if pair[0] in mass.free_symbols)
+        free = mass.free_symbols
+        slots = tuple(pair for pair in term.slots if pair[0] in free)
         access = replace(known[v], array=velocities[known[v].array.name])
         masses.append(ArrayForce(loops=term.loops, slots=slots, targets=((access, mass),)))
     return tuple(masses)
@@ -118,7 +119,8 @@ def terms_at_rest(
     results = []
     for term in terms:
         at_rest = term.formula.xreplace(dict.fromkeys(velocity_symbols(term, velocities), S.Zero))
-        slots = tuple(pair for pair in term.slots if pair[0] in at_rest.free_symbols)
+        free = at_rest.free_symbols
+        slots = tuple(pair for pair in term.slots if pair[0] in free)
         if at_rest and moving == any(access.array in state for _, access in slots):
             results.append(replace(term, formula=-at_rest if negative else at_rest, slots=slots))
     return tuple(results)
