@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 from sympy import Expr
@@ -253,7 +253,7 @@ class Sources:
         """Return whether Newton's iteration comes from a separate fallback library."""
         return self.solver == "auto" and self.program().fixed_point is not None and not self.program().newton
 
-    @property
+    @cached_property
     def interface(self) -> Interface:
         """Interface of the generated library."""
         if self.of_arrays:

@@ -43,7 +43,7 @@ def _forces(system: ArraySystem) -> Iterator[ArrayForce]:
     """Yield what one element of each sum adds to the rates of momenta (-H_p: to those of positions)."""
     yield from system.all_forces
     yield from (force_of(term, system.coordinates) for term in system.constraints)  # G^T lambda, for any lambda
-    moving = [*system.coordinates, *(_velocity(array) for array in system.coordinates)]
+    moving = (*system.coordinates, *(_velocity(array) for array in system.coordinates))
     yield from (force_of(term, moving) for term in system.coupled_terms)
 
 

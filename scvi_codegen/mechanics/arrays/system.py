@@ -37,6 +37,7 @@ from scvi_codegen.mechanics.arrays.terms import (
     masses_of,
     substituted,
     terms_at_rest,
+    velocity_symbols,
 )
 from scvi_codegen.mechanics.definition_checks import warn_of_negative, warn_of_unused
 from scvi_codegen.mechanics.forces import check_damping
@@ -286,11 +287,13 @@ class ArraySystem:
         warn_of_unused(self.name, self.function, values, self.inputs, used)
         moving = {array.name: array for array in self.momenta} or self._velocities
         for name in moving:
-            kinetic = [mass for term in self.terms for mass in masses_of(term, {name: moving[name]})]
+            this = {name: moving[name]}
+            kinetic = [term for term in self.terms for _ in velocity_symbols(term, this)]
             if len(kinetic) == 1:  # masses of several loops are added where these meet
-                uniform = {slot: symbol(access.array.name) for slot, access in kinetic[0].slots}
+                (mass,) = masses_of(kinetic[0], this)
+                uniform = {slot: symbol(access.array.name) for slot, access in mass.slots}
                 warn_of_negative(
-                    self.name, {f"d2{self.function[0]}/d{name}2": kinetic[0].targets[0][1].xreplace(uniform)}, values
+                    self.name, {f"d2{self.function[0]}/d{name}2": mass.targets[0][1].xreplace(uniform)}, values
                 )
 
     def _check_names(self) -> None:

@@ -31,7 +31,8 @@ from scvi_codegen.indices import Access, Array, Size
 Term = TypeVar("Term", ArrayTerm, ArrayForce)
 
 
-def force_of(term: ArrayTerm, state: Collection[Array]) -> ArrayForce:
+@lru_cache(maxsize=256)
+def force_of(term: ArrayTerm, state: tuple[Array, ...]) -> ArrayForce:
     """Return the derivatives of a term with respect to its entries of the state."""
     moving = entries_of(term, state)
     partials = gradient(term.formula, [slot for slot, _ in moving])
@@ -48,7 +49,7 @@ def friction(terms: Sequence[ArrayTerm], coordinates: Mapping[Array, Array]) -> 
     """Return the forces -dD/dv of Rayleigh's dissipation function; ``coordinates``: by the arrays of velocities."""
     forces = []
     for term in terms:
-        force = force_of(term, coordinates)
+        force = force_of(term, tuple(coordinates))
         targets = tuple((replace(access, array=coordinates[access.array]), -rate) for access, rate in force.targets)
         if not targets:
             raise SystemDefinitionError(
@@ -69,9 +70,10 @@ def friction_of(mass: ArrayForce, rate: Expr) -> ArrayForce:
 
 def masses_of(term: ArrayTerm, velocities: Mapping[str, Array]) -> tuple[ArrayForce, ...]:
     """Return the mass contributions of a term, one per velocity."""
-    known, masses = dict(term.slots), []
-    for v in velocity_symbols(term, velocities):
-        mass = term.formula.diff(v, 2)
+    known, masses, symbols = dict(term.slots), [], velocity_symbols(term, velocities)
+    derivatives = gradient(term.formula, symbols)
+    for k, v in enumerate(symbols):
+        mass = derivatives.get(k, S.Zero).diff(v)
         free = mass.free_symbols
         slots = tuple(pair for pair in term.slots if pair[0] in free)
         access = replace(known[v], array=velocities[known[v].array.name])
