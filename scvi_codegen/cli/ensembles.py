@@ -16,7 +16,6 @@ from scvi_codegen.native.options import FAILURES, SolverOptions
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
-from scvi_codegen.runtime.ensemble.selection import ensemble_work
 
 SHOWN_FAILURES = 8
 """Largest number of failed trajectories that are listed."""
@@ -87,7 +86,7 @@ def _work(model: Model, stepper: Stepper, states: EnsembleStates, options: Solve
     }
     if model.system.inputs or model.has_shorter_last_step:
         inputs = model.all_inputs()
-        return ensemble_work(*start, inputs=inputs, h=model.step, t_end=model.end, **common)
+        return Ensemble(*start, inputs=inputs, h=model.step, t_end=model.end, **common)
     if model.h is None:
         return Ensemble(*start, t_end=model.t + model.covered, tolerance=model.tolerance, **common)
     work = Ensemble(*start, h=model.h, steps=model.step_count, **common)

@@ -7,21 +7,16 @@ blocks of a lost worker are simply computed again by others.
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from numpy.typing import ArrayLike
-
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
-from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
-from scvi_codegen.runtime.ensemble.selection import ensemble_work
 from scvi_codegen.validation import checked_count
 
 if TYPE_CHECKING:
-    from scvi_codegen.native.options import SolverOptions
     from scvi_codegen.runtime.core.stepper import Stepper
     from scvi_codegen.runtime.core.validation import States
 
@@ -42,32 +37,20 @@ def integrate_ensemble(
     q: States,
     p: States | None = None,
     *,
-    velocity: States | None = None,
-    h: float | None = None,
-    steps: int | None = None,
-    t_end: ArrayLike | None = None,
-    tolerance: float | None = None,
-    save_every: int = 1,
-    t: float = 0.0,
-    t_eval: ArrayLike | None = None,
-    parameters: EnsembleParameters = None,
-    options: SolverOptions | None = None,
-    inputs: Mapping[str, Any] | None = None,
     progress: Callable[[int], None] | None = None,
     address: str | None = None,
     blocks: int | None = None,
+    **arguments: Any,
 ) -> EnsembleTrajectory:
     """Run ``stepper.integrate_ensemble`` on a cluster; results are bitwise equal on equal processors.
 
     Args:
         stepper: the stepper; each worker compiles its source again and needs this package and a C compiler.
         q, p: (k, m) initial positions and momenta.
-        velocity: (k, m) initial velocities, instead of p.
-        h, steps, t_end, tolerance, save_every, t, t_eval, parameters, options: as of ``stepper.integrate_ensemble``.
-        inputs: as of ``stepper.integrate_ensemble``; not combined with ``t_eval``.
         progress: called with the number of completed trajectories.
         address: address of a scheduler, ``"tcp://10.0.0.1:8786"``; by default a cluster of threads in this process.
         blocks: number of blocks of trajectories, by default four for each thread of the cluster.
+        arguments: those of ``stepper.integrate_ensemble`` except ``threads`` and ``error``.
 
     Returns:
         An :class:`EnsembleTrajectory`, also if workers were lost during the computation.
@@ -77,15 +60,7 @@ def integrate_ensemble(
         StateError: if a shape, name or number is invalid; raised before anything is sent.
         BuildError: if a worker cannot compile the source.
     """
-    start: dict[str, Any] = {
-        "velocity": velocity,
-        "t": t,
-        "parameters": parameters,
-        "options": options,
-        "save_every": save_every,
-    }
-    step_arguments: dict[str, Any] = {"h": h, "steps": steps, "t_end": t_end, "tolerance": tolerance}
-    work = ensemble_work(stepper, q, p, inputs=inputs, t_eval=t_eval, **step_arguments, **start)
+    work = Ensemble(stepper, q, p, **arguments)
     wanted = None if blocks is None else checked_count(blocks, "blocks", least=1)
     with _client(address) as client:
         count = wanted or BLOCKS_A_THREAD * sum(client.ncores().values())

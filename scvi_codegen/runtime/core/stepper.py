@@ -24,9 +24,9 @@ from scvi_codegen.runtime.constraints.projection import consistent, constraint_v
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, Parameters, States, is_one_state
+from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, momenta_of_each
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
-from scvi_codegen.runtime.ensemble.selection import ensemble_work
 from scvi_codegen.runtime.events.event import Event, EventLike
 from scvi_codegen.runtime.inputs.segments import (
     advance_to,
@@ -153,8 +153,8 @@ class Stepper(Integrator):
             raise StateError("observe is not supported with inputs or t_eval: omit observe")
         if interface.rotations or interface.variables:
             q, p, velocity = homogeneous_state(interface, q, p, velocity)
-        stepper._check_no_changes("error=" if error else "check_growth=True", wanted=bool(error or check_growth))
         if error is not None:
+            stepper._check_no_changes("error=")
             alternatives = {"h": h, "steps": steps, "tolerance": tolerance, "observe": observe}
             return confirmed_run(
                 checked_error(error, alternatives, has_tau=self._has_tau),
@@ -170,7 +170,7 @@ class Stepper(Integrator):
             plan, count = planned_steps(h, steps, t_end, tolerance, save_every, begin, *transformed)
             run = stepper._started(q, p, velocity, plan, t, parameters, options, reuse=True)
             if check_growth:
-                check_growth_requested(plan)
+                check_growth_requested(plan, stepper)
             times = None if t_eval is None else stepper._output_times(t_eval, run, count)
             trajectory = run._recorded(count, save_every=save_every, times=times, progress=progress, observe=observe)
             warn_of_large_steps(trajectory)
@@ -185,7 +185,7 @@ class Stepper(Integrator):
         plan = self._plan(h, end if to_end else None, tolerance)
         run = stepper._started(q, p, velocity, plan, t, values(first_inner_time(t, end)), options, reuse=True)
         if check_growth:
-            check_growth_requested(plan)
+            check_growth_requested(plan, stepper)
         save_every = checked_count(save_every, "save_every", least=1)
         trajectory = record_pieces(run, data, end, save_every=save_every, values=values, progress=progress)
         warn_of_unresolved_fields(trajectory)
@@ -348,7 +348,7 @@ class Stepper(Integrator):
         if error is not None:
             others = {"h": h, "steps": steps, "tolerance": tolerance}
             error = checked_error(error, others, has_tau=self._has_tau)
-        work = ensemble_work(
+        work = Ensemble(
             self,
             q,
             p,

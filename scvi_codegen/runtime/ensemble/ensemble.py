@@ -20,8 +20,20 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import EventError, StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import SolverOptions, checked_options
-from scvi_codegen.runtime.core.validation import Array, States, columns_of_inputs, parameter_index
-from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, start_of_ensemble
+from scvi_codegen.runtime.core.validation import (
+    Array,
+    States,
+    check_left_to_inputs,
+    columns_of_inputs,
+    parameter_index,
+)
+from scvi_codegen.runtime.ensemble.initial_states import (
+    EnsembleParameters,
+    checked_ensemble,
+    momenta_of_each,
+    parameters_of_each,
+    start_of_ensemble,
+)
 from scvi_codegen.runtime.ensemble.lanes import CommonRuns
 from scvi_codegen.runtime.ensemble.result import EVENT_FAILED, INTERRUPTED, OK, EnsembleTrajectory, Span
 from scvi_codegen.runtime.ensemble.schedule import CommonSteps
@@ -29,6 +41,9 @@ from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runtime.inputs.segments import (
     Input,
     breakpoints_until,
+    checked_inputs,
+    final_time,
+    first_inner_time,
     inputs_of_slice,
     parameters_at,
 )
@@ -46,6 +61,7 @@ CHUNK_SECONDS = 0.02
 """Target duration of a chunk in seconds; bounds the delay of an interruption."""
 GROWTH = 8.0
 """Largest ratio of successive chunk sizes."""
+EITHER = "give either h with steps or t_end (fixed step size), or t_end alone (adaptive step size)"
 
 
 class SavedLane(NamedTuple):
@@ -61,13 +77,11 @@ class SavedLane(NamedTuple):
 class Ensemble:
     """Integration of many trajectories; arguments as of ``integrate_ensemble``.
 
-    Args:
-        h, steps, t_end: common step size with the number of steps, or with the final time and a shorter step before
-            each breakpoint and at the end; without h the final time or times of adaptive steps.
-        inputs: validated inputs, with ``t_end``.
-        error: bound of the global error of each trajectory with adaptive steps.
+    Raises:
+        StateError: if a shape, name or number is invalid, or the stepper has a time transformation.
 
     Attributes:
+        inputs: validated inputs.
         start: (k, m) initial positions and momenta.
         common: the trajectories with common steps, ``None`` with adaptive steps.
         plans: step plan of each trajectory with adaptive steps.
@@ -78,12 +92,13 @@ class Ensemble:
         self,
         stepper: Any,
         q: States,
-        p: States,
+        p: States | None,
         *,
+        inputs: Mapping[str, Any] | None = None,
+        velocity: States | None = None,
         h: float | None = None,
         steps: int | None = None,
-        t_end: Any = None,
-        inputs: Mapping[str, Input] | None = None,
+        t_end: ArrayLike | None = None,
         tolerance: float | None = None,
         save_every: int = 1,
         t: float = 0.0,
@@ -93,15 +108,26 @@ class Ensemble:
         error: float | None = None,
     ) -> None:
         interface = stepper.interface
+        steps, t_end = _steps_or_end(t, h, steps, t_end, inputs, tolerance=tolerance, t_eval=t_eval)
+        if interface.time_transformation:
+            raise StateError("ensembles do not support time_transformation: compile the stepper without it")
         if h is None and interface.energy_parameter:
             raise StateError("adaptive steps are unavailable in transformed time: give h and steps (fixed step in tau)")
         if h is None:
             stepper._check_adaptive()
         self.stepper = stepper
-        self.options, self.inputs = checked_options(options), inputs or {}
+        self.options, self.inputs = checked_options(options), dict[str, Input]()
+        if inputs is not None:
+            count = len(checked_ensemble(stepper, q, q)[0])
+            self.inputs = checked_inputs(interface, inputs, count)
+            check_left_to_inputs(interface, parameters)
+            inside = first_inner_time(t, float(real_array(0.0 if t_end is None else t_end, "t_end").flat[0]))
+            values = parameters_of_each(stepper, parameters, count)
+            parameters = parameters_at(stepper.parameters, values, self.inputs, inside)
+        p = momenta_of_each(stepper, q, p, velocity, t, parameters)
         self.t0, self.save_every = checked_number(t, "the time t"), checked_count(save_every, "save_every", least=1)
         settings: dict[str, Any] = {"inputs": self.inputs, "save_every": self.save_every}
-        fixed = None if h is None else CommonSteps(self.t0, h, steps=steps, t_end=t_end, **settings)
+        fixed = None if h is None else CommonSteps(self.t0, h, steps=steps, t_end=cast(Any, t_end), **settings)
         *start, self.parameters = start_of_ensemble(stepper, q, p, self.t0, parameters)
         self.start = start[0], start[1]
         if not stepper._has_energy(parameters):
@@ -115,7 +141,7 @@ class Ensemble:
         self.error, self.confirmations = error, list[GlobalError | None]()
         self.t_eval: Array | None = None
         if fixed is None:
-            self.plans = self._plans(t_end, tolerance)
+            self.plans = self._plans(cast(ArrayLike, t_end), tolerance)
             self.confirmations = [None] * (0 if error is None else len(self))
             self.t_eval = self._output_times(t_eval)
         if self.inputs:
@@ -347,3 +373,34 @@ class Ensemble:
         return SavedLane(
             np.array([self.t0])[first], self.start[0][[j]][first], self.start[1][[j]][first], INTERRUPTED, 0
         )
+
+
+def _steps_or_end(
+    t: float,
+    h: float | None,
+    steps: int | None,
+    t_end: ArrayLike | None,
+    inputs: object,
+    **adaptive: object,
+) -> tuple[int | None, ArrayLike | None]:
+    """Return the number of common steps or the final time; with adaptive steps the final time or times.
+
+    Raises:
+        StateError: for missing or contradictory arguments.
+    """
+    if inputs is not None and adaptive["t_eval"] is not None:
+        raise StateError("t_eval is not supported with inputs: omit t_eval")
+    if (h is None and (t_end is None or steps is not None)) or (inputs is None and steps is t_end is None):
+        raise StateError(EITHER)
+    if h is None:
+        return None, t_end
+    if steps is not None and t_end is not None and inputs is None:
+        raise StateError(f"give either steps={steps} or t_end with h, not both")
+    for name, value in adaptive.items():
+        if value is not None:
+            raise StateError(f"{name} requires adaptive steps: give t_end without h and steps")
+    if t_end is not None and np.ndim(t_end):
+        raise StateError("with h all trajectories have one t_end: give one number, or omit h (adaptive step size)")
+    if inputs is None and t_end is None:
+        return steps, None
+    return None, final_time(t, h, steps, None if t_end is None else checked_number(t_end, "t_end"))

@@ -237,8 +237,9 @@ SLOW = 0.9
 """Fraction of the decades to the threshold that the extrapolated growth must reach for the run to be repeated."""
 
 
-def check_growth_requested(plan: StepPlan) -> None:
-    """Raise ``StateError`` unless steps are adaptive."""
+def check_growth_requested(plan: StepPlan, stepper: Integrator) -> None:
+    """Raise ``StateError`` unless steps are adaptive, ``MethodError`` if events change the state."""
+    stepper._check_no_changes("check_growth=True")
     if not plan.adaptive:
         raise StateError(
             "check_growth=True requires adaptive steps, but the step size is fixed: give t_end without h, or omit "

@@ -398,7 +398,7 @@ class Memory(OneThread):
 
     def _end_energies(self, t: Array, q: Array, p: Array) -> tuple[float, float] | None:
         """Return the energies of the first and the last state of a run so far; ``None`` outside the domain of L."""
-        binding, m = self.stepper.binding, self.stepper.dimension
+        binding, m = self.stepper.binding, len(self._q)
         if self._energies is None:
             self._energies = binding.function("energies"), binding.numbers("double[2]")
         (function, energies), (at, positions, momenta) = self._energies, binding.pointers(t, q, p)
