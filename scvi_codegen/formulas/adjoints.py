@@ -9,8 +9,6 @@ these products are those of the composite rigid body algorithm, and the mass mat
 A. Griewank and A. Walther, Evaluating Derivatives, SIAM 2008, chapters 3 and 10.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from heapq import heapify, heappop, heappush
 from typing import TypeAlias

@@ -8,8 +8,6 @@ indices); a sum is read term by term.
     Sum(f, (j, i + 1, N - 1), (i, 0, N - 2))        sum(i < j in N, f)
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from sympy import Expr, Idx, Indexed, Mod, Sum, Symbol, Tuple, latex

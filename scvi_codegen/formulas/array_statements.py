@@ -8,8 +8,6 @@ target     = array "[" (index | size | whole number | entry) ("," ..)* "]"      
 entry      = table "[" index ("," whole number)? "]"                            q[pins[p]], r[bonds[b, 1], a]
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ Loops and indices are those of :mod:`scvi_codegen.indices`. A sum within a sum m
 unrolled: ``sum(k in 3, r_dot[i, k]**2)``.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ A sum over ``i < j in near`` is the sum over all pairs of its summand times a st
 code evaluates only the pairs of the list (templates/support/arrays/neighbours.h).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

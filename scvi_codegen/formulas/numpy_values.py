@@ -1,7 +1,5 @@
 """Evaluation of formulas by NumPy at all elements of loops, without generated code."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

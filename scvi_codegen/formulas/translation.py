@@ -4,8 +4,6 @@ Functions of time and their derivatives become coordinates and velocities. The t
 :mod:`scvi_codegen.formulas.grammar`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -14,8 +14,6 @@ Nothing here changes a value: constants are exact and rounded when they are prin
 ``tests/lowering/test_lowering.py`` reads kernels back and compares.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from fractions import Fraction

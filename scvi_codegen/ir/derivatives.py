@@ -1,7 +1,5 @@
 """Derivatives of a step, besides its program: kernels of derivatives with respect to parameters and time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from scvi_codegen.ir.equations import LoweredStageGroup

@@ -7,8 +7,6 @@ around the kernels (gather, scatter, Newton's method, fixed-point iterations, th
 the same for every method and system, and is in the templates.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from scvi_codegen.indices import Array, ArrayDeclarations

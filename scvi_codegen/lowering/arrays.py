@@ -1,7 +1,5 @@
 """Systems of arrays of run-time sizes: the system whose tables serve all coordinates, and the available solvers."""
 
-from __future__ import annotations
-
 from scvi_codegen.errors import MethodError, ScviCodegenError, SizesRequiredError
 from scvi_codegen.ir.equations import ConstrainedSteps, FixedPointIteration, Splitting
 from scvi_codegen.ir.program import LoopedTerms

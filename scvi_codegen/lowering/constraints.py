@@ -26,8 +26,6 @@ S. Reich, SIAM J. Numer. Anal. 33 (1996), on compositions; E. Barth, K. Kuczera,
 Chem. 16 (1995), on the iteration.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import partial
 

@@ -11,8 +11,6 @@ the motion. Explicit leapfrog steps of rho between the steps of a symmetric meth
 (2005), section 2.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -4,8 +4,6 @@ The derivatives of the stage equations with respect to parameters and time, and 
 factors; those of forces and momenta at the points serve tangent vectors by fixed-point iteration.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 from sympy import Add, Expr, Mul, S, Symbol

@@ -1,7 +1,5 @@
 """Loops around kernels: the terms of systems of arrays, and the term groups of named coordinates."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial

@@ -5,8 +5,6 @@ matrix: on positions, on velocities, or on momenta and velocities (:mod:`~scvi_c
 accelerations, or on accelerations and multipliers (:mod:`~scvi_codegen.lowering.solvers.curves`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial

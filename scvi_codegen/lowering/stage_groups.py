@@ -6,8 +6,6 @@ good ordering the blocks are in a narrow band, outside of which nothing is store
 bandwidth 1, a closed one 2, and if all coordinates are coupled the band is the whole matrix.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 

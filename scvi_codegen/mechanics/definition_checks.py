@@ -1,7 +1,5 @@
 """Checks of system definitions: errors for invalid ones, warnings for those that are probably mistakes."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from functools import reduce

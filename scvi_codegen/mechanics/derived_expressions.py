@@ -9,8 +9,6 @@ Each expression is derived on first use, once per system: :func:`forms_of` retur
 systems. The regularity of the mass matrix d2L/dv2, or of d2H/dp2, is tested in 60 digits at random points.
 """
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

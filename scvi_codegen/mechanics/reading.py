@@ -1,7 +1,5 @@
 """Systems read from text or from SymPy expressions: the fields of Lagrangian and Hamiltonian systems."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Integration methods: each has an order, symmetry and symplecticity, and defines its stage equations for a system."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from inspect import Parameter, signature
 from typing import Any, Final

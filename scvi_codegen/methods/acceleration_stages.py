@@ -1,7 +1,5 @@
 """Stage equations in v0 and z_i = h (acceleration at c_i): Euler-Lagrange equations at stages of a tableau."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from fractions import Fraction
 

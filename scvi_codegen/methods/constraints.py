@@ -26,8 +26,6 @@ Wenger, S. Ober-Bloebaum, S. Leyendecker, Adv. Comput. Math. 43 (2017). Other no
 Perlmutter, J. Nonlinear Sci. 16 (2006); D. Martin de Diego, R. Sato Martin de Almagro, arXiv 1810.10926.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import sympy

@@ -10,8 +10,6 @@ and one such pair of rows per node where a multiplied residual is made stationar
 the method equals that of the Lagrangian, step for step: (35f) is the Legendre transform at the points.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 

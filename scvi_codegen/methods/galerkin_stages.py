@@ -4,8 +4,6 @@ The compiled form represents a curve by its velocities V_b at s points: Q = q0 +
 notation it is the polynomial through the positions Q^v at the nodes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """Stage equations of leapfrog steps: kicks and drifts in turn, explicit for separable systems."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 from scvi_codegen.errors import MethodError

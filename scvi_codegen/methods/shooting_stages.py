@@ -1,7 +1,5 @@
 """Stage equations of shooting-based methods, (33)-(34): compiled and nodal, with total and partial derivatives."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from scvi_codegen.errors import MethodError

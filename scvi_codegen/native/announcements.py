@@ -3,8 +3,6 @@
 They are announced on stderr where that is a terminal, and always by the logger ``scvi_codegen`` at level INFO.
 """
 
-from __future__ import annotations
-
 import logging
 import sys
 import threading

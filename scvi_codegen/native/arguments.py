@@ -1,7 +1,5 @@
 """Checks of numbers that users pass to steppers; each raises :class:`StateError` with the name and the value."""
 
-from __future__ import annotations
-
 import math
 import sys
 from typing import Any

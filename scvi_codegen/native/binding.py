@@ -4,8 +4,6 @@ A library with only the fixed-point iteration uses Newton's method of a second l
 first requests it (:mod:`scvi_codegen.rendering.kernels.simd`); that call is then repeated from its start.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, Self

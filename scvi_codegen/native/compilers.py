@@ -5,8 +5,6 @@ somebody else may contain only the flags listed here. Others can be set in the e
 SCVI_CODEGEN_CFLAGS. Compilers, with all the processes that they start, end with their parent.
 """
 
-from __future__ import annotations
-
 import hashlib
 import importlib.util
 import json

@@ -1,7 +1,5 @@
 """Solver options, status codes of steps, and advice for each failure."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Jinja environment of the C templates, with its filters."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import TypeAlias

@@ -4,8 +4,6 @@ The support headers contain all of it: ``flow.h`` the function, ``xla_flow.h`` a
 frameworks.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

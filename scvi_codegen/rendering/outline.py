@@ -4,8 +4,6 @@ Not a C parser: it relies on the layout of the templates, with a function's head
 brace alone on a line.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

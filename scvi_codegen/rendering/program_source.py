@@ -5,8 +5,6 @@ loops over the program's tables and the C that does not depend on it. Kernels ar
 :mod:`scvi_codegen.rendering.kernels.printer` through filters.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain

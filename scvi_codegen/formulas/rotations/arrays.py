@@ -1,7 +1,5 @@
 """Arrays of rotations, directions and spins in formulas in index notation: ``R_33[i]``, ``omega_1[i]``, ``n_3[i]``."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product

@@ -22,8 +22,6 @@ If l is quadratic in the velocities with a constant mass matrix, the Hamiltonian
 collocation method with s Gauss points for degree s needs about half of the operations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

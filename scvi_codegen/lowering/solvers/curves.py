@@ -22,8 +22,6 @@ multipliers) makes it converge twice as fast as a simultaneous update. The equat
 ``methods/shooting.py`` in these unknowns.
 """
 
-from __future__ import annotations
-
 from sympy import S
 
 from scvi_codegen.formulas.expressions import gradient

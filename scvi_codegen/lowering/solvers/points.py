@@ -36,8 +36,6 @@ once and used in stages and updates alike, and A_nj / w_j = 1 - mu_jn, exact sin
 rounded map still has a generating function: its energy error does not drift.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from functools import partial
 from typing import Any

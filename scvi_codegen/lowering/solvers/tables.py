@@ -19,8 +19,6 @@ with q1 and p1 by the rows ``end_position`` and ``end_momentum``. The solvers of
 both derived from them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import chain

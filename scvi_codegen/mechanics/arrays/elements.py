@@ -1,7 +1,5 @@
 """Elements of arrays of known sizes: fields of the equivalent system of named coordinates q_0, q_1, ..."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

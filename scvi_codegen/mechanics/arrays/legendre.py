@@ -6,8 +6,6 @@ where the velocities v_e of the elements e are disjoint, and b and C depend on p
 magnetic field, pendulums in spherical angles, masses that depend on the position.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

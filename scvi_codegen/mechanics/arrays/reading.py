@@ -1,7 +1,5 @@
 """Systems of arrays read from text or from SymPy expressions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import chain
 from typing import Any

@@ -5,8 +5,6 @@ entries of ``q`` add up to 0 identically (Noether); so the cost of the proof doe
 coordinates.
 """
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterator, Sequence
 from typing import TypeAlias

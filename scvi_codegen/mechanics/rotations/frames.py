@@ -1,7 +1,5 @@
 """Rotations declared by frames of ``sympy.physics.vector`` that are oriented by a quaternion."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

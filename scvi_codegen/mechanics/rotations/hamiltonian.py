@@ -10,8 +10,6 @@ H has no term in q . p and is singular in p. Its velocities satisfy q . q_dot = 
 symmetry with the same reduced space T*SO(3).
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import sympy

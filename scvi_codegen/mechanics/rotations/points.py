@@ -8,8 +8,6 @@ in the body frame, the generalised force on a coordinate is f . dr/dx, the torqu
 and the force on a direction f . dr/dn. For r = x + R s this is f on x and s x R^T f on R.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 

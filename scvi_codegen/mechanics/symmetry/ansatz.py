@@ -4,8 +4,6 @@ The state is q_0 .. q_(m-1), p_0 .. p_(m-1), with indices 0 .. 2 m - 1. Momentum
 directions: ``angular momentum z``, ``momentum of phi``, ``boost x``.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations, combinations_with_replacement

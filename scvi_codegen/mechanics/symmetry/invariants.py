@@ -8,8 +8,6 @@ their values at random parameters. A result is accepted if its rate is zero to 4
 parameters.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ v (or p), an analytic function that is zero at all points is identically zero. C
 into Cartesian positions of bodies; the forces of term groups are computed for all bodies at once.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import random

@@ -7,8 +7,6 @@ Terms are in the order in which the loops of ``support/newton/stages.h`` add the
 with 0 are omitted, products with 1 simplified.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -11,8 +11,6 @@ each thread evaluates all terms and adds to its own elements. The choice depends
 additions on sizes, never on the number of threads.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from enum import Enum, auto

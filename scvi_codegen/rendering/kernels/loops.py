@@ -1,7 +1,5 @@
 """Systems of arrays as C: functions of nested loops around kernels, lattices, and the template's context."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import accumulate

@@ -4,8 +4,6 @@ The numbers of a program are exact; a target determines how they are rounded and
 take them. The support headers use the header of its name.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import TypeAlias

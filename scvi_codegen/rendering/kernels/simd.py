@@ -10,8 +10,6 @@ uses a second library, compiled when the iteration first fails; an exported sour
 library is set once, for all steppers of a source: one generator makes one Newton solver for the same iteration.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
