@@ -1,7 +1,5 @@
 """Lagrangian or Hamiltonian density of fields: symbols, derivatives, and the parts of a Lagrangian density."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations

@@ -1,7 +1,5 @@
 """Derivation of a density: equations, semi-discrete system and conservation laws, as text."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any

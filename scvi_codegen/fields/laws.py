@@ -10,8 +10,6 @@ conservation law ``D_t J^t + sum_i D_i J^i = 0`` of every solution, with
 has L = sum p u_t - H. Candidates for Q and K are tested: ``dL - D_t K^t - sum D_i K^i`` must be zero identically.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property

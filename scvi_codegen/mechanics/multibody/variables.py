@@ -3,8 +3,6 @@
 SymPy's functions of time and speeds are converted to plain symbols, and back.
 """
 
-from __future__ import annotations
-
 import random
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Steppers of arrays of any size: each call binds one to the sizes and tables of its arrays."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
 from functools import cache, partial, update_wrapper

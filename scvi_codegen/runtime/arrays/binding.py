@@ -5,8 +5,6 @@ the C struct, from whose field t on the state begins, and the arrays of the stat
 functions of known sizes, so that steppers, runs and trajectories are the same for both.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -5,8 +5,6 @@ A. Jennings, Comput. J. 9 (1966), 281). Coordinates of parallel arrays are inter
 periodic boundary are last.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

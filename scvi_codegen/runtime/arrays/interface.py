@@ -1,7 +1,5 @@
 """Validation of the arrays of a run."""
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,6 @@ states and derivatives are computed trajectory by trajectory in C, chunk by chun
 so memory does not limit the number of initial states.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final

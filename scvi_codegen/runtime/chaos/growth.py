@@ -3,8 +3,6 @@
 Tangent vectors are represented as Q R: orthonormal Q, and R with columns of length 1 and separate logarithms of norms.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

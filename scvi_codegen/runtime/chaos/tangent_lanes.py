@@ -5,8 +5,6 @@ block of steps the tangent frame of every lane is replaced by Q of its QR factor
 as many steps if its R shows that the tangent vectors became nearly parallel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """States on the constraints g(q, t) = 0 of a system: residuals, projection, multipliers, initial consistency."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -5,8 +5,6 @@ on the constraint manifold (``(u - 1)**2 + y**2 = 1`` by ``x**2 + y**2 = 1`` and
 but not at generic points.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
 

@@ -3,8 +3,6 @@
 All C calls release the GIL and share no state, so one integrator may be used from many threads.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

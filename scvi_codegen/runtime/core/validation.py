@@ -1,7 +1,5 @@
 """States and parameters of an integrator: validation against its interface, and arrays and single names by name."""
 
-from __future__ import annotations
-
 import difflib
 import math
 import re

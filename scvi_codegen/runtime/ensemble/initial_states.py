@@ -1,7 +1,5 @@
 """Validation of the initial states and parameters of ensembles."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Common fixed steps of an ensemble, in segments of equal steps between the breakpoints of inputs."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from itertools import accumulate

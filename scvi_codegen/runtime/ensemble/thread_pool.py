@@ -1,7 +1,5 @@
 """Thread pool for work on each of many trajectories; C runs without the GIL."""
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Callable

@@ -6,8 +6,6 @@ techniques for O.D.E.*, Progress in Scientific Computing 2 (1983) 95: linearised
 linear least-squares problem, so errors do not grow over the whole record.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeAlias

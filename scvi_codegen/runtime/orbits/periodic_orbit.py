@@ -1,7 +1,5 @@
 """Periodic orbit: trajectory, Floquet multipliers and stability."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import cached_property
 

@@ -1,7 +1,5 @@
 """Rotations, directions and spins of the states of a trajectory."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any

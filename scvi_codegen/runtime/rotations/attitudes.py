@@ -5,8 +5,6 @@ frame to components in the space frame. Formulas: :mod:`scvi_codegen.mechanics.r
 ``scipy.spatial.transform.Rotation`` (lower case: rotations about axes of space; upper case: about axes of the body).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Named quantities of rotations, directions, spins and fields on meshes, for tables and files."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

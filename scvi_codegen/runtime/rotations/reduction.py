@@ -12,8 +12,6 @@ z and i z; a + i b is the component of dz along the unit vector orthogonal to z.
 directions, so the second pair of formulas undoes the first whatever the lengths and signs of quaternions are.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Loop that advances runs in chunks of bounded duration; the only one that looks at the clock."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Short descriptions of runs and results for ``repr``."""
 
-from __future__ import annotations
-
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.representation import one_line
 from scvi_codegen.runtime.run.memory import Memory

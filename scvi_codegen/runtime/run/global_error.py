@@ -9,8 +9,6 @@ one run with nearly the same error is not rare, three are. (R. D. Skeel, Thirtee
 Math. 48 (1986) 1-20; E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, II.4.)
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

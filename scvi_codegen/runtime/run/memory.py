@@ -1,7 +1,5 @@
 """Memory of a run: one plain C struct that is started, advanced, saved and restored bitwise."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from typing import Any, Self

@@ -4,8 +4,6 @@ The run advances in chunks with all states; events are searched between these st
 saved. States are therefore bitwise equal with and without events.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Lock of a run: a second thread that enters raises an error, because C functions modify one struct."""
 
-from __future__ import annotations
-
 import functools
 import threading
 from collections.abc import Callable, Iterator

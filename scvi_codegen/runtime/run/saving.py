@@ -1,7 +1,5 @@
 """Checkpoints: the bytes of a run, of arrays of run-time sizes preceded by sizes, tables and parameters."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -4,8 +4,6 @@ Where g = 0 not a number of steps of tau advances t. In transformed time roundin
 the constraint K = g (H - E) = 0 holds there for any energy.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Double-double times t + n h of runs; numbers of steps that make up a span."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ between these are recomputed from each saved state to the next (checkpointing), 
 Recomputed steps are checked against the run.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise

@@ -5,8 +5,6 @@ respect to the initial data times a direction v is J^T F'' J v plus F' contracte
 states along v (tangent over adjoint).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

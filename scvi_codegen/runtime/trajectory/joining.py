@@ -1,7 +1,5 @@
 """Joining of the trajectories of consecutive segments of a run."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, TypeVar

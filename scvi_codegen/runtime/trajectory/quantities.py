@@ -1,7 +1,5 @@
 """Derived quantities of states: velocities, energies, momentum maps; NaN where undefined."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 

@@ -4,8 +4,6 @@ Newton's iteration solves the steps again, from a linear initial guess. It may c
 equations; recomputed steps that do not end in the next saved state raise an error.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import TypeVar
 

@@ -1,7 +1,5 @@
 """Saved states of a run with the data needed for dense output, events and derivatives."""
 
-from __future__ import annotations
-
 import math
 import operator
 from dataclasses import dataclass, field

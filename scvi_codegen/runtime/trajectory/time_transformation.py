@@ -4,8 +4,6 @@ A run in transformed time takes steps of tau and integrates t with the method's 
 refer to t: velocities are dq/dt and energies are those of the original system.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Work and impulse of the forces along a run, by the quadrature of each step."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from scvi_codegen.runtime.trajectory.recomputation import recomputed_steps

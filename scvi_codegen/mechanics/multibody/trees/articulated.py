@@ -17,8 +17,6 @@ G. Rodriguez, A. Jain, K. Kreutz-Delgado, A spatial operator algebra for manipul
 Robotics Research 10 (1991), 371-381; R. Featherstone, Rigid Body Dynamics Algorithms, Springer 2008, chapter 7.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import Any

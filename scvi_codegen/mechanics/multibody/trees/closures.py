@@ -6,8 +6,6 @@ is zero, which has rank 3 where R_1 = R_2. Equations that are dependent at a ran
 a planar mechanism, are omitted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any

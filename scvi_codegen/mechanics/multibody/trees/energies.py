@@ -19,8 +19,6 @@ the energies of n bodies have O(n) operations.
 R. Featherstone, Rigid Body Dynamics Algorithms, Springer 2008, chapters 3 and 4.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Sequence
 from itertools import chain
 from typing import Any

@@ -4,8 +4,6 @@ Contacts, meshes, limits of joints, actuators and sensors are not read. Attribut
 https://mujoco.readthedocs.io/en/stable/XMLreference.html.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Iterator, Mapping

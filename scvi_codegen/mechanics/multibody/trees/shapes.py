@@ -1,7 +1,5 @@
 """Mass and inertia of bodies of constant density: sphere, ellipsoid, box, cylinder, capsule."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

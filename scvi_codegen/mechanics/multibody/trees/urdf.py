@@ -4,8 +4,6 @@ Meshes, collisions, transmissions, joint limits and dry friction are not read. A
 https://docs.ros.org/en/rolling/p/urdfdom: ``rpy`` are rotations about the fixed axes x, y, z, in this order.
 """
 
-from __future__ import annotations
-
 import warnings
 from os import PathLike
 
