@@ -106,6 +106,9 @@ from scvi_codegen.results.recording import RecordedRun as RecordedRun
 from scvi_codegen.results.recording import load_run as load_run
 from scvi_codegen.results.recording import record_run as record_run
 from scvi_codegen.results.recording import resume_run as resume_run
+from scvi_codegen.runtime.arrays.molecular_dynamics import pressure as pressure
+from scvi_codegen.runtime.arrays.molecular_dynamics import radial_distribution as radial_distribution
+from scvi_codegen.runtime.arrays.molecular_dynamics import temperature as temperature
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators as ChaosIndicators
 from scvi_codegen.runtime.core.stepper import Stepper as Stepper
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory as EnsembleTrajectory

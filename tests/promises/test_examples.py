@@ -42,6 +42,7 @@ SCRIPTS = (
     "inspect_derivation",
     "joints",
     "kepler_conservation",
+    "lennard_jones_liquid",
     "logarithmic_hamiltonian",
     "mechanism_from_joints",
     "poincare_section",

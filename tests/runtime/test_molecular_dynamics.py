@@ -1,0 +1,108 @@
+"""Temperature, pressure and radial distribution function beside sums over all pairs by NumPy."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.errors import ArgumentError, StateError
+
+COUNT, CUT = 120, 1.7
+LENGTHS = np.array([4.1, 4.6, 5.3])
+SQUARE = " + ".join(f"wrap(r[i, {a}] - r[j, {a}], L{a})**2" for a in range(3))
+
+
+@cache
+def stepper(masses: str = "m[i]") -> Any:
+    system = sc.LagrangianSystem.from_text(
+        name="gas",
+        coordinates=["r[N, 3]"],
+        parameters={"m[N]": 1.0, **{f"L{a}": float(length) for a, length in enumerate(LENGTHS)}},
+        neighbours={"near": {"of": "r", "cutoff": CUT, "box": ["L0", "L1", "L2"]}},
+        lagrangian=f"""sum(i in N, {masses}*sum(a in 3, r_dot[i, a]**2)/2)
+            - sum(i < j in near, 2*positive_part(1 - ({SQUARE})/{CUT}**2)**4)""",
+    )
+    return sc.compile_stepper(system, "stoermer-verlet")
+
+
+def motion(**options: Any) -> Any:
+    generator = np.random.default_rng(3)
+    r, v = generator.uniform(-3, 9, size=(COUNT, 3)), generator.normal(size=(COUNT, 3))
+    masses = {"m": np.linspace(0.5, 2.0, COUNT)}
+    return stepper().integrate(r, velocity=v, h=0.01, steps=30, save_every=10, parameters=masses, **options)
+
+
+def apart(r: Any) -> Any:
+    """Distances of the nearest images, without those of particles from themselves."""
+    between = r[:, None] - r[None]
+    between -= LENGTHS * np.rint(between / LENGTHS)
+    return np.sqrt((between**2).sum(axis=-1))[np.triu_indices(len(r), 1)]
+
+
+def test_temperature_and_pressure_are_those_of_sums_over_all_pairs() -> None:
+    run = motion()
+    masses = np.linspace(0.5, 2.0, COUNT)[:, None]
+    kinetic = (run.p["r"] ** 2 / masses).sum(axis=(1, 2)) / 2
+    assert sc.temperature(run) == pytest.approx(2 * kinetic / (3 * COUNT - 3), rel=1e-13)
+    virial = []
+    for r in run.q["r"]:
+        d = apart(r)
+        s = np.maximum(1 - d**2 / CUT**2, 0.0)
+        virial.append((16 * s**3 * d**2 / CUT**2).sum())
+    expected = (2 * kinetic + virial) / (3 * LENGTHS.prod())
+    assert sc.pressure(run, ["L0", "L1", "L2"]) == pytest.approx(expected, rel=1e-8)
+
+
+def test_radial_distribution_counts_each_pair_once() -> None:
+    run = motion()
+    r, g = sc.radial_distribution(run, ["L0", "L1", "L2"], bins=25)
+    edges = np.linspace(0, LENGTHS.min() / 2, 26)
+    counts = sum(np.histogram(apart(each), edges)[0] for each in run.q["r"])
+    shells = 4 / 3 * np.pi * np.diff(edges**3) / LENGTHS.prod()
+    assert r == pytest.approx((edges[1:] + edges[:-1]) / 2)
+    assert g == pytest.approx(counts / (len(run.t) * COUNT * (COUNT - 1) / 2 * shells))
+
+
+def test_observers_are_the_functions_of_trajectories() -> None:
+    box = ["L0", "L1", "L2"]
+    run = motion()
+
+    def observe(now: Any) -> Any:
+        _, g = sc.radial_distribution(now, box, largest=2.0, bins=5)
+        return [sc.temperature(now), sc.pressure(now, box), *g]
+
+    observed = motion(observe=observe).observed
+    assert observed[:, 0] == pytest.approx(sc.temperature(run), rel=1e-14)
+    assert observed[:, 1] == pytest.approx(sc.pressure(run, box), rel=1e-12)
+    assert observed[:, 2:].mean(axis=0) == pytest.approx(sc.radial_distribution(run, box, largest=2.0, bins=5)[1])
+
+
+def test_free_particles_are_an_ideal_gas() -> None:
+    line = sc.LagrangianSystem.from_text(
+        name="line", coordinates=["q[N]"], parameters={"L": 2.0}, lagrangian="sum(i in N, q_dot[i]**2/2) + L/L"
+    )
+    generator = np.random.default_rng(8)
+    start = {"q": generator.uniform(size=400) * 2}
+    run = sc.compile_stepper(line, "svi:2").integrate(
+        start, velocity={"q": generator.normal(size=400)}, h=1.0, steps=40
+    )
+    assert sc.pressure(run, "L")[-1] == pytest.approx(399 * sc.temperature(run)[-1] / 2.0, rel=1e-9)
+    assert sc.radial_distribution(run, "L", bins=4)[1] == pytest.approx(np.ones(4), rel=0.02)
+
+
+def test_unknown_boxes_and_other_systems_are_refused() -> None:
+    run = motion()
+    with pytest.raises(ArgumentError, match="'L' is not a parameter"):
+        sc.pressure(run, "L")
+    with pytest.raises(ArgumentError, match="one name or 3"):
+        sc.pressure(run, ["L0", "L1"])
+    with pytest.raises(ArgumentError, match=r"at most half of the shortest period, 2\.05"):
+        sc.radial_distribution(run, ["L0", "L1", "L2"], largest=2.1)
+    few = sc.LagrangianSystem.from_text("one", ["x", "y"], "(x_dot**2 + y_dot**2)/2", parameters={})
+    still = sc.compile_stepper(few, "svi:2").integrate([0.0, 0.0], [1.0, 0.0], h=0.1, steps=2)
+    with pytest.raises(StateError, match="kinetic energy is unknown"):
+        sc.temperature(still)
