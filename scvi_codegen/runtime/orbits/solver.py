@@ -103,17 +103,30 @@ def periodic_orbit(
     """
     stepper = stepper.bind(q, parameters)[0].known
     q, p, velocity = homogeneous_state(stepper.interface, q, p, velocity)
-    search = _OrbitSearch.checked(
-        stepper,
+    interface, names = stepper.interface, state_names(stepper)
+    stepper._check_fixed_steps("periodic_orbit")
+    check_inputs_given(interface, parameters)
+    if interface.constraints:
+        raise MethodError("periodic_orbit does not support constraints: use independent coordinates")
+    if energy is not None and interface.exchange_names:
+        raise MethodError(f"energy cannot be prescribed, because forces act on '{interface.system}': omit energy")
+    if (period := checked_number(period, "the period")) <= 0.0:
+        raise StateError(f"the period must be positive, not {period:g}")
+    if (steps is None) == (h is None):
+        raise StateError(f"give either steps (of a period) or h (largest); got {'neither' if h is None else 'both'}")
+    for name in fixed:
+        if name not in names:
+            raise StateError(f"fixed names '{name}', which is no coordinate or momentum{closest(name, names)}")
+    search = _OrbitSearch(
+        stepper=stepper,
+        reduction=Reduction(interface),
         period=period,
-        steps=steps,
-        h=h,
-        fixed_period=fixed_period,
-        energy=energy,
-        fixed=fixed,
-        gain=gain,
-        t=t,
-        parameters=parameters,
+        steps=checked_count(steps, "steps", least=1) if h is None else int(steps_within(period, checked_step(h))),
+        fixed_indices=(*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else [])),
+        energy=None if energy is None else checked_number(energy, "the energy"),
+        gain=np.zeros(stepper.dimension) if gain is None else checked_vector(interface, gain, "gain"),
+        t=checked_number(t, "the time t"),
+        parameters=stepper._parameters(parameters),
         options=options,
     )
     momenta = stepper._initial_momenta(q, p, velocity, search.t, search.parameters)
@@ -140,52 +153,6 @@ class _OrbitSearch:
     t: float
     parameters: Array
     options: SolverOptions | None
-
-    @classmethod
-    def checked(
-        cls,
-        stepper: Stepper,
-        *,
-        period: float,
-        steps: int | None,
-        h: float | None,
-        fixed_period: bool,
-        energy: float | None,
-        fixed: Sequence[str],
-        gain: ArrayLike | None,
-        t: float,
-        parameters: Parameters,
-        options: SolverOptions | None,
-    ) -> _OrbitSearch:
-        """Construct from validated arguments of :func:`periodic_orbit`."""
-        interface, names = stepper.interface, state_names(stepper)
-        stepper._check_fixed_steps("periodic_orbit")
-        check_inputs_given(interface, parameters)
-        if interface.constraints:
-            raise MethodError("periodic_orbit does not support constraints: use independent coordinates")
-        if energy is not None and interface.exchange_names:
-            raise MethodError(f"energy cannot be prescribed, because forces act on '{interface.system}': omit energy")
-        if (period := checked_number(period, "the period")) <= 0.0:
-            raise StateError(f"the period must be positive, not {period:g}")
-        if (steps is None) == (h is None):
-            raise StateError(
-                f"give either steps (of a period) or h (largest); got {'neither' if h is None else 'both'}"
-            )
-        for name in fixed:
-            if name not in names:
-                raise StateError(f"fixed names '{name}', which is no coordinate or momentum{closest(name, names)}")
-        return cls(
-            stepper=stepper,
-            reduction=Reduction(interface),
-            period=period,
-            steps=checked_count(steps, "steps", least=1) if h is None else int(steps_within(period, checked_step(h))),
-            fixed_indices=(*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else [])),
-            energy=None if energy is None else checked_number(energy, "the energy"),
-            gain=np.zeros(stepper.dimension) if gain is None else checked_vector(interface, gain, "gain"),
-            t=checked_number(t, "the time t"),
-            parameters=stepper._parameters(parameters),
-            options=options,
-        )
 
     def orbit(self, guess: Array) -> PeriodicOrbit:
         """Return the orbit near a guess."""
