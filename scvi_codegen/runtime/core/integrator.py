@@ -1,7 +1,5 @@
 """Compiled method for one system: single steps and the discrete Lagrangian as pure functions of their arguments."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

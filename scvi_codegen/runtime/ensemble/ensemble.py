@@ -5,8 +5,6 @@ adaptive steps are computed by the single integrator, so they are bitwise equal 
 C runs without the GIL, so threads share the work; results are bitwise equal for any number of threads.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace

@@ -4,8 +4,6 @@ With a suitable time transformation all steps of tau have similar errors, so a f
 violations appear in ``step_error`` of the run, the largest error of all its steps.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """Derivatives of a trajectory with respect to its initial state and parameters, and chaos indicators."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
