@@ -219,7 +219,7 @@ def factors(n: Array, errors: Array, line: Law) -> Array:
     return result
 
 
-def refinement(title: str, study: Study) -> Experiment:
+def refinement(name: str, title: str, study: Study) -> Experiment:
     """Return the experiment of a figure of errors over N or over h."""
 
     def run(_: Mapping[str, Result]) -> Result:
@@ -237,8 +237,7 @@ def refinement(title: str, study: Study) -> Experiment:
             picture=picture,
         )
 
-    name, _, rest = title.partition(": ")
-    return Experiment(name=name, title=rest, run=run)
+    return Experiment(name=name, title=title, run=run)
 
 
 def _superiority(study: Study, curves: Sequence[ErrorCurve]) -> Comparison:

@@ -1,12 +1,17 @@
-"""Figures of errors of one step: over the number of points (6, 16, 17) and over the step size (7, 8, 18-20)."""
+"""Figures of errors of one step: over the number of points (6, 16, 17) and over the step size (7, 8, 18-20).
+
+Their studies are those of ``refinement.toml``.
+"""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
-from scvi_codegen.reproduce.refinement import SCHEMES, WINDOW, InitialValue, Law, StepCase, Study, refinement
+from scvi_codegen.files.toml_text import package_table
+from scvi_codegen.reproduce.experiment import Experiment
+from scvi_codegen.reproduce.refinement import InitialValue, Law, StepCase, Study, refinement
 from scvi_codegen.reproduce.runs import KEPLER, system_of
 from scvi_codegen.tables.precision import Number, mp
 
@@ -33,84 +38,36 @@ def _kepler(eccentricity: float) -> InitialValue:
 
 SMALL_STEPS = tuple(mp.mpf(2) ** k for k in (-8, -6, -4))
 OSCILLATOR = InitialValue(system_of("harmonic-oscillator"), (mp.zero,), (mp.one,), _oscillator_errors, SMALL_STEPS)
-BY_POINTS, BY_DEGREE = StepCase("N points", OSCILLATOR), StepCase("N the degree", OSCILLATOR, 0, judged=False)
-BEYOND = StepCase("N the degree, N + 1 Gauss points", OSCILLATOR, 0, 1, judged=False)
-CIRCLE, ELLIPSE = (
-    StepCase("circle, N points", _kepler(0.0), 1, -1),
-    StepCase("e = 0.5, N the degree", _kepler(0.5), 0, judged=False),
-)
-COUNTS = "N counts Chebyshev points, as the caption says, so the degree is N - 1. N read as the degree is shown, too."
-OVER_N = Study(
-    sentences=(
-        "m = k = 1, q(0) = 0, p(0) = 1; one step, h = 20, errors at its end, solved to round-off.",
-        f"{COUNTS} The caption gives no quadrature: SVI has N Gauss points.",
-        f"Lines c b^N are fitted to errors from {WINDOW[0]:g} to {WINDOW[1]:g}, and only these are compared.",
-    ),
-    cases=(BY_POINTS, BY_DEGREE),
-    quantities=("q", "energy"),
-    steps=(20.0,),
-    degrees={"SVI": range(10, 31, 3), "SC": range(10, 37, 3)},
-    lines={(s, q): law for q in ("q", "energy") for s, law in (("SVI", Law(1e14, 0.09)), ("SC", Law(1e10, 0.21)))},
-    resolved=WINDOW[1],
-)
-OVER_H = Study(
-    sentences=(
-        "m = k = 1, q(0) = 0, p(0) = 1; one step of size h, errors at its end, solved to round-off.",
-        f"{COUNTS} The caption gives no quadrature: SVI has N Gauss points.",
-        "Dotted lines are those of the legend. Powers are fitted to small steps in 60 digits.",
-    ),
-    cases=(BY_POINTS, BY_DEGREE),
-    quantities=("q",),
-    steps=tuple(10.0 ** (0.3 * k - 3.0) for k in range(14)),
-    powers={
-        "q": {3: 1.5, 5: 1e-2, 7: 1e-5, 9: 1e-5, 13: 1e-10},
-        "energy": {2: 1.0, 4: 1e-2, 6: 1e-5, 8: 1e-5, 11: 1e-9},
-    },
-)
-KEPLER_OVER_N = Study(
-    sentences=(
-        "Kepler's problem, one step h = 5 from the perihelion, errors at its end, solved to round-off; SVI has N - 1 "
-        "Gauss points. A missing point means that the iteration found no solution.",
-        "The caption names no eccentricity. The circle e = 0, e = 0.2 of Table 8 and e = 0.5 of Figs. 13-15 are run, "
-        "and each verdict is on all three: what is found on the circle alone holds in part.",
-    ),
-    cases=tuple(StepCase(f"e = {e:g}", _kepler(e), 1, -1) for e in (0.0, 0.2, 0.5)),
-    quantities=("q1", "q2"),
-    steps=(5.0,),
-    degrees=dict.fromkeys(SCHEMES, (7, 8, 9, 10, 11, 13, 15, 17, 19, 21)),
-    lines={(s, q): law for q in ("q1", "q2") for s, law in (("SVI", Law(1e10, 0.03)), ("SC", Law(1e7, 0.1)))},
-)
-KEPLER_OVER_H = Study(
-    sentences=(
-        "Kepler's problem, one step of h = 0.001 to 3 from the perihelion, errors at its end, solved to round-off; SVI "
-        "has as many Gauss points as its degree.",
-        "The caption says that N counts Chebyshev points and names no eccentricity: first so, with e = 0; then N the "
-        "degree, as in other figures of section 3, with e = 0.5, that of Figs. 13-15.",
-        "Dotted lines are those of the legend. Powers are fitted to small steps in 60 digits.",
-    ),
-    cases=(CIRCLE, ELLIPSE),
-    quantities=("q1", "q2"),
-    steps=tuple(float(h) for h in np.geomspace(1e-3, 3.0, 36)),
-    powers={
-        "q1": {2: 1.5, 4: 1e-2, 6: 1e-5, 8: 1e-4, 12: 1e-8},
-        "q2": {3: 1.5, 5: 1e-2, 7: 1e-5, 10: 1e-7},
-    },
-)
-INVARIANT_LINES = {
-    ("SC", "momentum"): Law(1e6, 0.1),
-    ("SC", "energy"): Law(1e6, 0.1),
-    ("SVI", "energy"): Law(1e13, 0.004),
+CASES = {
+    case.title: case
+    for case in (
+        StepCase("N points", OSCILLATOR),
+        StepCase("N the degree", OSCILLATOR, 0, judged=False),
+        StepCase("N the degree, N + 1 Gauss points", OSCILLATOR, 0, 1, judged=False),
+        *(StepCase(f"e = {e:g}", _kepler(e), 1, -1) for e in (0.0, 0.2, 0.5)),
+        StepCase("circle, N points", _kepler(0.0), 1, -1),
+        StepCase("e = 0.5, N the degree", _kepler(0.5), 0, judged=False),
+    )
 }
-BOTH = replace(KEPLER_OVER_N, quantities=("momentum", "energy"), lines=INVARIANT_LINES)
-ENERGY = replace(OVER_H, quantities=("energy",), cases=(BY_POINTS, BY_DEGREE, BEYOND))
-KEPLER_MOMENTUM, KEPLER_ENERGY = (replace(KEPLER_OVER_H, quantities=(what,)) for what in ("momentum", "energy"))
-EXPERIMENTS = (
-    refinement("figure-6: Harmonic oscillator: error over one step h = 20 with more and more points", OVER_N),
-    refinement("figure-7: Harmonic oscillator: error of q over one step of size h", OVER_H),
-    refinement("figure-8: Harmonic oscillator: error of the energy over one step of size h", ENERGY),
-    refinement("figure-16: Kepler: error of q1 and q2 in one step h = 5 over the number of points", KEPLER_OVER_N),
-    refinement("figure-17: Kepler: error of momentum and energy in one step h = 5 over the number of points", BOTH),
-    refinement("figure-18: Kepler: error of q1 and q2 in one step over the step", KEPLER_OVER_H),
-    refinement("figure-19: Kepler: error of the momentum in one step over the step", KEPLER_MOMENTUM),
-    refinement("figure-20: Kepler: error of the energy in one step over the step", KEPLER_ENERGY),
-)
+STEPS = {
+    "oscillator-over-h": tuple(10.0 ** (0.3 * k - 3.0) for k in range(14)),
+    "kepler-over-h": tuple(float(h) for h in np.geomspace(1e-3, 3.0, 36)),
+}
+
+
+def _study(name: str, **changes: Any) -> Study:
+    """Return a study of the file, with some of its entries changed."""
+    table = {"steps": STEPS.get(name), **_TABLES["studies"][name], **changes}
+    lines = {(scheme, q): Law(*law) for scheme, laws in table.pop("lines", {}).items() for q, law in laws.items()}
+    powers = {q: {int(power): x for power, x in each.items()} for q, each in table.pop("powers", {}).items()}
+    table |= {key: tuple(table[key]) for key in ("sentences", "quantities", "steps")}
+    return Study(**table | {"cases": tuple(CASES[title] for title in table["cases"]), "lines": lines, "powers": powers})
+
+
+def _figure(name: str, title: str, study: str, **changes: Any) -> Experiment:
+    return refinement(name, title, _study(study, **changes))
+
+
+_TABLES = package_table("reproduce/refinement.toml")
+STUDIES = {name: _study(name) for name in _TABLES["studies"]}
+EXPERIMENTS = tuple(_figure(name, **table) for name, table in _TABLES.items() if name != "studies")

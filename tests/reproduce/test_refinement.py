@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.reproduce import refinement_figures as figures
 from scvi_codegen.reproduce.catalogue import EXPERIMENTS
 from scvi_codegen.reproduce.experiment import Verdict
 from scvi_codegen.reproduce.refinement import (
@@ -19,17 +18,22 @@ from scvi_codegen.reproduce.refinement import (
     step_errors,
     within,
 )
+from scvi_codegen.reproduce.refinement_figures import CASES, STUDIES
 from scvi_codegen.tables.precision import mp
 
 pytestmark = pytest.mark.long
 
 KEPLER = ("q1", "q2", "momentum", "energy")
 ORDERS = [
-    (figures.BY_POINTS, ("q", "energy"), {"SVI": ((5, 4), (9, 8), (13, 12)), "SC": ((3, 2), (5, 4), (7, 6))}),
-    (figures.BY_DEGREE, ("q", "energy"), {"SVI": ((5, None), (9, None), (13, None)), "SC": ((3, 4), (5, 6), (7, 8))}),
-    (figures.BEYOND, ("energy",), {"SVI": ((6,), (10,), (14,)), "SC": ((4,), (6,), (8,))}),
+    (CASES["N points"], ("q", "energy"), {"SVI": ((5, 4), (9, 8), (13, 12)), "SC": ((3, 2), (5, 4), (7, 6))}),
     (
-        figures.CIRCLE,
+        CASES["N the degree"],
+        ("q", "energy"),
+        {"SVI": ((5, None), (9, None), (13, None)), "SC": ((3, 4), (5, 6), (7, 8))},
+    ),
+    (CASES["N the degree, N + 1 Gauss points"], ("energy",), {"SVI": ((6,), (10,), (14,)), "SC": ((4,), (6,), (8,))}),
+    (
+        CASES["circle, N points"],
         KEPLER,
         {
             "SVI": ((4, 3, None, 6), (8, 7, None, 14), (12, 11, None, 22)),
@@ -37,7 +41,7 @@ ORDERS = [
         },
     ),
     (
-        figures.ELLIPSE,
+        CASES["e = 0.5, N the degree"],
         KEPLER,
         {
             "SVI": ((6, 5, None, 6), (10, 9, None, 10), (14, 13, None, 14)),
@@ -59,7 +63,7 @@ def test_convergence_orders_of_the_local_error(case, quantities, expected):
 
 def test_constants_of_two_points_are_those_found_by_hand():
     """Implicit Euler, q = h / (1 + h^2), and SVI of degree 1 with two Gauss points, whose error is 7/360 h^5."""
-    two = [fitted_power(figures.BY_POINTS, scheme, 2, "q").constant for scheme in ("SC", "SVI")]
+    two = [fitted_power(CASES["N points"], scheme, 2, "q").constant for scheme in ("SC", "SVI")]
     assert two == pytest.approx([5 / 6, 7 / 360], rel=0.01)
 
 
@@ -68,11 +72,11 @@ def test_errors_are_those_of_an_independent_step():
     P, Q = sc.Gauss(16).tableau.stability_function()
     z = mp.mpc(0, 20)
     exact = mp.polyval(P[::-1], z) / mp.polyval(Q[::-1], z)  # of p + i q under rotation
-    found = step_errors(figures.BY_DEGREE, "SVI", 16, 20.0)["q"]
+    found = step_errors(CASES["N the degree"], "SVI", 16, 20.0)["q"]
     assert found == pytest.approx(float(abs(exact.imag - mp.sin(20))), rel=1e-6)
 
 
-@pytest.mark.parametrize("case", [figures.BY_POINTS, figures.ELLIPSE])
+@pytest.mark.parametrize("case", [CASES["N points"], CASES["e = 0.5, N the degree"]])
 @pytest.mark.parametrize("scheme", ["SVI", "SC"])
 def test_compiled_errors_are_those_in_60_digits(case, scheme):
     for h in (0.02, 0.2):
@@ -83,7 +87,7 @@ def test_compiled_errors_are_those_in_60_digits(case, scheme):
 @pytest.mark.parametrize(("scheme", "constant", "base"), [("SVI", 1e10, 0.03), ("SC", 1e7, 0.1)])
 def test_errors_on_the_circle_follow_the_lines_of_figure_16(scheme, constant, base):
     for points in (10, 14):
-        errors = step_errors(figures.KEPLER_OVER_N.cases[0], scheme, points, 5.0)
+        errors = step_errors(STUDIES["kepler-over-n"].cases[0], scheme, points, 5.0)
         assert 1 / 10 < errors["q1"] / (constant * base**points) < 1
         assert 1 / 20 < errors["q2"] / (constant * base**points) < 1
 
@@ -102,15 +106,15 @@ def test_lines_are_fitted_to_resolved_errors():
 
 
 COARSE = {
-    6: replace(figures.OVER_N, degrees={"SVI": (16, 19, 22), "SC": (16, 22, 28)}),
-    7: replace(figures.OVER_H, steps=figures.OVER_H.steps[:13:3]),
-    18: replace(figures.KEPLER_OVER_H, steps=figures.KEPLER_OVER_H.steps[::7], quantities=("q1",)),
+    6: replace(STUDIES["oscillator-over-n"], degrees={"SVI": (16, 19, 22), "SC": (16, 22, 28)}),
+    7: replace(STUDIES["oscillator-over-h"], steps=STUDIES["oscillator-over-h"].steps[:13:3]),
+    18: replace(STUDIES["kepler-over-h"], steps=STUDIES["kepler-over-h"].steps[::7], quantities=("q1",)),
 }
 """Whole, these take many compilations and solutions in 60 digits."""
 
 
 def test_figures_have_the_papers_lines_and_verdicts_can_fail():
-    found = {number: refinement(f"figure-{number}: title", study).result({}) for number, study in COARSE.items()}
+    found = {number: refinement(f"figure-{number}", "title", study).result({}) for number, study in COARSE.items()}
     assert {number: result.verdict for number, result in found.items()} == {
         6: Verdict.HOLDS,
         7: Verdict.PARTLY,
@@ -121,7 +125,7 @@ def test_figures_have_the_papers_lines_and_verdicts_can_fail():
     assert bases["N points", "SC", None, "q"] == pytest.approx(0.221, abs=0.002)
     assert all(len(row) == len(table.columns) for each in found.values() for table in each.tables for row in table.rows)
     wrong = replace(COARSE[7], powers={"q": {4: 1.0, 5: 1e3}})
-    powers, constants, _ = refinement("figure-7: title", wrong).result({}).checks
+    powers, constants, _ = refinement("figure-7", "title", wrong).result({}).checks
     assert (powers.verdict, constants.verdict) == (Verdict.PARTLY, Verdict.FAILS)
 
 
