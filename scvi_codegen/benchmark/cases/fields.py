@@ -14,6 +14,7 @@ from scvi_codegen.benchmark.cases.unforced import Array, Case
 from scvi_codegen.benchmark.contenders.ours import compiled
 from scvi_codegen.benchmark.report import OURS, Contender
 from scvi_codegen.fields.system import FieldSystem
+from scvi_codegen.files.toml_text import package_table
 
 Points = Mapping[str, Array]
 FREQUENCY = 0.6
@@ -22,7 +23,6 @@ SPEED = 0.5
 """Speed of the soliton."""
 WIDTH, MODES = 0.4, 20
 """Width of the bump, whose Fourier coefficients exp(-(k WIDTH)^2 / 2) are below round-off beyond these modes."""
-STEPS = tuple(50 * 2**k for k in range(6))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,6 +106,20 @@ def _prepared(case: FieldCase, mesh: Any, stepper: Any, steps: int, _: int) -> C
     return integrate
 
 
+def _case(name: str, exact: Callable[[Points, float], tuple[Array, Array]]) -> FieldCase:
+    """Return the field of the table with its exact solution."""
+    table = package_table("benchmark/cases/systems.toml")["fields"][name]
+    settings = []
+    for options in table["settings"]:
+        kind, methods, steps = (options.pop(key) for key in ("kind", "methods", "steps"))
+        size = "elements" if "elements" in options else "points"
+        settings += [(kind, {**options, size: count}, methods, steps) for count in options.pop(size)]
+    definition = table["field"]
+    definition["space"] = {axis: tuple(ends) for axis, ends in definition["space"].items()}
+    field = FieldSystem.from_text(**definition)
+    return FieldCase(name=name, field=field, span=table["span"], exact=exact, settings=settings, pde=table["pde"])
+
+
 def breather() -> FieldCase:
     """Return the breather of the sine-Gordon equation for ten units of time."""
     w, e = FREQUENCY, np.sqrt(1.0 - FREQUENCY**2)
@@ -114,25 +128,7 @@ def breather() -> FieldCase:
         inner, rate = (factor / np.cosh(e * points["x"]) for factor in (e / w * np.sin(w * t), e * np.cos(w * t)))
         return 4.0 * np.arctan(inner), 4.0 * rate / (1.0 + inner**2)
 
-    return FieldCase(
-        name="breather",
-        field=FieldSystem.from_text(
-            "sine-Gordon",
-            fields=["u"],
-            space={"x": (-40.0, 40.0)},
-            boundary={"x": "periodic"},
-            density="u_t**2/2 - u_x**2/2 - (1 - cos(u))",
-        ),
-        span=10.0,
-        exact=exact,
-        settings=[
-            *(("fourier", {"points": n}, ("svi:4", "svi:6"), STEPS[:3]) for n in (96, 128, 192, 256)),
-            *(("spectral-elements", {"degree": 8, "elements": n}, ("svi:4",), STEPS[2:5]) for n in (20, 40)),
-            *(("finite-differences", {"order": 8, "points": n}, ("stoermer-verlet",), STEPS[1:]) for n in (256, 512)),
-            *(("finite-differences", {"order": 8, "points": n}, ("svi:4",), STEPS[1:4]) for n in (256, 512)),
-        ],
-        pde={"u": "v", "v": "laplace(u) - sin(u)"},
-    )
+    return _case("breather", exact)
 
 
 def wave() -> FieldCase:
@@ -148,26 +144,7 @@ def wave() -> FieldCase:
         u, rate = (along[0] @ (both * each) @ along[1].T for each in moving)
         return u, rate
 
-    return FieldCase(
-        name="wave-2d",
-        field=FieldSystem.from_text(
-            "wave",
-            fields=["u"],
-            space={"x": ("-pi", "pi"), "y": ("-pi", "pi")},
-            boundary={"x": "periodic", "y": "periodic"},
-            density="u_t**2/2 - u_x**2/2 - u_y**2/2",
-        ),
-        span=3.0,
-        exact=exact,
-        settings=[
-            *(("fourier", {"points": n}, ("svi:4", "stoermer-verlet"), STEPS[:3]) for n in (32, 48)),
-            *(
-                ("finite-differences", {"order": 8, "points": n}, ("stoermer-verlet", "svi:4"), STEPS[1:4])
-                for n in (64, 128)
-            ),
-        ],
-        pde={"u": "v", "v": "laplace(u)"},
-    )
+    return _case("wave-2d", exact)
 
 
 def schroedinger() -> FieldCase:
@@ -178,24 +155,7 @@ def schroedinger() -> FieldCase:
         psi = np.exp(1j * (SPEED * x + (1.0 - SPEED**2) * t / 2)) / np.cosh(x - SPEED * t)
         return psi.real, psi.imag
 
-    return FieldCase(
-        name="schroedinger",
-        field=FieldSystem.from_text(
-            "nonlinear Schroedinger",
-            fields=["a"],
-            momenta=["b"],
-            space={"x": (-40.0, 40.0)},
-            boundary={"x": "periodic"},
-            hamiltonian="(a_x**2 + b_x**2)/4 - (a**2 + b**2)**2/4",
-        ),
-        span=5.0,
-        exact=exact,
-        settings=[
-            *(("fourier", {"points": n}, ("svi:2", "svi:4"), STEPS[2:5]) for n in (128, 192, 256)),
-            *(("finite-differences", {"order": 8, "points": n}, ("svi:4",), STEPS[2:5]) for n in (256, 512)),
-        ],
-        pde={"c": "0.5j*laplace(c) + 1j*c*abs(c)**2"},
-    )
+    return _case("schroedinger", exact)
 
 
 FIELDS: Mapping[str, Callable[[], FieldCase]] = {
