@@ -258,23 +258,11 @@ class ArrayParser(_Indices):
     def inside(self, loops: Sequence[Loop]) -> Expr:
         """Return the factor of a summand that is 1 for pairs closer than the cutoff of their list, else 0."""
         factor: Expr = S.One
-        for loop in loops:
-            if loop.near:
-                near = self.neighbours[loop.near]
-                pair = (self.position_of(near, index) for index in (loop.behind, loop.index))
-                factor *= near.inside(*pair)
+        for near, loop in ((self.neighbours[loop.near], loop) for loop in loops if loop.near):
+            condition = ArrayParser(near.inside(loop.behind, loop.index), self.symbols, [near.array], ())
+            condition.in_scope, condition.accesses = self.in_scope, self.accesses
+            factor *= parsed(condition)
         return factor
-
-    def position_of(self, near: Neighbours, index: str) -> list[Expr]:
-        """Return the components of the position of a point."""
-        bound = self.in_scope[index]
-        first = Place(base=Size("", bound)) if isinstance(bound, int) else Place(index=index)
-        slots: list[Expr] = []
-        for k in range(near.components):
-            access = Access(array=near.array, places=(first, Place(base=Size("", k)))[: len(near.array.axes)])
-            slots.append(symbol(str(access)))
-            self.accesses[slots[-1]] = access
-        return slots
 
     def end_of_sum(self, loops: Sequence[Loop]) -> None:
         """Parse the closing bracket of a sum and release its indices."""

@@ -5,22 +5,18 @@ code evaluates only the pairs of the list (templates/support/arrays/neighbours.h
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from typing import Any
 
-from sympy import Add, Expr, Symbol
+from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.expressions import unit_step, wrap
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import check_name
 from scvi_codegen.indices import Array
 
-DEFAULT_SKIN = "({cutoff})/8"
 MAX_COMPONENTS = 3
 """Largest number of components of a position."""
-KEYS = ("of", "cutoff", "box", "skin")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,11 +42,12 @@ class Neighbours:
         """Number of components of a position."""
         return self.array.axes[1].number if len(self.array.axes) > 1 else 1
 
-    def inside(self, one: Sequence[Expr], other: Sequence[Expr]) -> Expr:
-        """Return 1 for two positions closer than the cutoff, else 0."""
-        apart = [a - b for a, b in zip(one, other, strict=True)]
-        shortest = [wrap(x, period) for x, period in zip(apart, self.box, strict=True)] if self.box else apart
-        return unit_step(self.cutoff**2 - Add(*(x**2 for x in shortest)))
+    def inside(self, one: str, other: str) -> str:
+        """Return the formula that is 1 for points of two indices closer than the cutoff, else 0."""
+        entry = f"{self.array.name}[{{}}{', {}' * (len(self.array.axes) > 1)}]"
+        apart = [f"{entry.format(one, k)} - {entry.format(other, k)}" for k in range(self.components)]
+        apart = [f"wrap({x}, {period})" for x, period in zip(apart, self.box, strict=True)] if self.box else apart
+        return f"unit_step(({self.cutoff})**2 - ({' + '.join(f'({x})**2' for x in apart)}))"
 
 
 def parse_neighbours(
@@ -71,7 +68,7 @@ def parse_neighbours(
     for name, entry in argument.items():
         check_name(name)
         keys = set(entry) if isinstance(entry, Mapping) else set()
-        if not {"of", "cutoff"} <= keys <= set(KEYS):
+        if not {"of", "cutoff"} <= keys <= {"of", "cutoff", "box", "skin"}:
             raise SystemDefinitionError(
                 f"the neighbours '{name}' must have the keys of and cutoff, and may have box and skin, not {entry!r}"
             )
@@ -80,28 +77,16 @@ def parse_neighbours(
             raise SystemDefinitionError(
                 f"the neighbours '{name}' are of '{entry['of']}', which is not an array of positions, as r[N, 3]"
             )
-        length = partial(_length, symbols=symbols)
-        found = Neighbours(
-            name=name,
-            array=array,
-            box=(),
-            cutoff=length(entry["cutoff"]),
-            skin=length(entry.get("skin", DEFAULT_SKIN.format(**entry))),
-        )
-        box = entry.get("box", ())
-        periods = tuple(map(length, box if isinstance(box, Sequence) and not isinstance(box, str) else [box]))
-        if len(periods) == 1:
-            periods *= found.components
-        if found.components > MAX_COMPONENTS or len(periods) not in (0, found.components):
+        count, box = array.axes[1].number if len(array.axes) > 1 else 1, entry.get("box", ())
+        box = list(box) if isinstance(box, Sequence) and not isinstance(box, str) else [box] * count
+        if count > MAX_COMPONENTS or len(box) not in (0, count):
             raise SystemDefinitionError(
                 f"the box of the neighbours '{name}' must be one length, or one per component of {array} (at most 3)"
             )
-        results.append(replace(found, box=periods))
+        given = (*box, entry["cutoff"], entry.get("skin", f"({entry['cutoff']})/8"))
+        lengths = [parse_expression(str(value), symbols) for value in given]
+        if any(length.is_number and not length > 0 for length in lengths):
+            raise SystemDefinitionError(f"the lengths of the neighbours '{name}' must be positive, not {given}")
+        *periods, cutoff, skin = lengths
+        results.append(Neighbours(name=name, array=array, box=tuple(periods), cutoff=cutoff, skin=skin))
     return tuple(results)
-
-
-def _length(value: Any, symbols: Mapping[str, Symbol]) -> Expr:
-    length = parse_expression(str(value), symbols)
-    if length.is_number and not length > 0:
-        raise SystemDefinitionError(f"the lengths of lists of neighbours must be positive, not {value}")
-    return length

@@ -126,7 +126,8 @@ def system_from_sympy(
     names = RotationNames.declared(*(turning.get(each) for each in TURNING), momentum=momenta is not None)
     if function == "Lagrangian" and are_arrays(each for each in coordinates if isinstance(each, str)):
         others = (velocities, forces, dissipation, damping, constraints, inputs, *turning.values())
-        return _arrays_from_sympy(cls, formula, others, name, list(coordinates), parameters, tables, neighbours)
+        given = {"coordinates": list(coordinates), "parameters": parameters, "tables": tables, "neighbours": neighbours}
+        return _arrays_from_sympy(cls, formula, others, name=name, **given)
 
     def expression_of(value: Any, what: str) -> Expr:
         return sympy_expression(value, what).xreplace(of_frames)
@@ -187,24 +188,14 @@ def system_from_sympy(
     return system
 
 
-def _arrays_from_sympy(
-    cls: Any,
-    formula: Any,
-    others: Iterable[Any],
-    name: str,
-    coordinates: list[Any],
-    parameters: Any,
-    tables: Any,
-    neighbours: Any,
-) -> Any:
+def _arrays_from_sympy(cls: Any, formula: Any, others: Iterable[Any], **arguments: Any) -> Any:
     """Return the system of a Lagrangian with arrays; ``others`` are arguments that must be empty."""
     if any(others):
         raise SystemDefinitionError(
             "from_sympy reads Lagrangian, parameters, tables and neighbours of a system with arrays: give the rest "
             "as text to from_text"
         )
-    arguments = {"name": name, "coordinates": coordinates, "parameters": parameters, "tables": tables}
-    return _of_arrays(cls, arrays_from_sympy(formula, **arguments, neighbours=neighbours))
+    return _of_arrays(cls, arrays_from_sympy(formula, **arguments))
 
 
 def _components(force: Any, what: str, read: Callable[[Any, str], Expr]) -> Any:

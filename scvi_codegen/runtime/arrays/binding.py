@@ -125,11 +125,10 @@ class ArrayBinding(Binding):
         lists = [super(ArrayBinding, self).new("neighbours *") for _ in layout.neighbours]
         for name, near in zip(layout.neighbours, lists, strict=True):
             setattr(problem, f"near_{name}", near)
-        return (
-            self._ffi.gc(problem, partial(_release, super().function("release_neighbours"), lists))
-            if lists
-            else problem
-        )
+        if not lists:
+            return problem
+        release = super().function("release_neighbours")
+        return self._ffi.gc(problem, lambda given, _=lists: release(given))
 
     def _new_run(self) -> Any:
         """Return the C struct of a run, followed in memory by the arrays of its state."""
@@ -412,11 +411,6 @@ def momentum_of(q: Numbers, p: Numbers, of: ArrayMap, *, absolute: bool = False)
         return float(np.sum(p[..., of.component]))
     sign = 1.0 if absolute else -1.0
     return float(np.sum(q[..., of.component] * p[..., of.other] + sign * q[..., of.other] * p[..., of.component]))
-
-
-def _release(function: Callable[[Any], None], _: object, problem: Any) -> None:
-    """Free the memory of lists of neighbours, whose C structs are the second argument."""
-    function(problem)
 
 
 def _arrived(run: Any, t_end: float) -> bool:

@@ -3,11 +3,9 @@
 Each is a function of a trajectory or, as an observer of ``integrate(.., observe=)``, of a run.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,15 +13,11 @@ from scvi_codegen.errors import ArgumentError, StateError
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.validation import checked_count, checks_arguments
 
-if TYPE_CHECKING:
-    from scvi_codegen.runtime.run.run import Run
-    from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-
 RELATIVE_STRAIN = 1e-5
 """Relative change of lengths for the derivative of the energy: errors of 1e-9 by truncation and 1e-11 by rounding."""
 
 
-def temperature(states: Run | Trajectory) -> Any:
+def temperature(states: Any) -> Any:
     """Return the temperature in units of energy, twice the kinetic energy per degree of freedom.
 
     The degrees of freedom are the coordinates less the conserved linear momenta and the constraints.
@@ -39,7 +33,7 @@ def temperature(states: Run | Trajectory) -> Any:
     return 2 * _kinetic(states) / (stepper.dimension - momenta - len(stepper.constraints))
 
 
-def pressure(states: Run | Trajectory, box: str | Sequence[str]) -> Any:
+def pressure(states: Any, box: str | Sequence[str]) -> Any:
     """Return the pressure, minus the derivative of the energy by the volume, where positions scale with the box.
 
     In d dimensions p = (2 T - dU/ds) / (d V), with the potential energy U of all lengths times s; pair forces
@@ -53,17 +47,15 @@ def pressure(states: Run | Trajectory, box: str | Sequence[str]) -> Any:
         StateError: as :func:`temperature`, or if there are several arrays of coordinates.
         ArgumentError: if there is no such parameter.
     """
-    kinetic, stepper = _kinetic(states), states.stepper
-    lengths, parameters = _lengths(states, box), np.asarray(states.parameters)
-    states_of = (np.atleast_2d(np.asarray(each)) for each in (states.q, states.p))
-    (q, p), t = states_of, np.atleast_1d(np.asarray(states.t, dtype=float))
+    kinetic, (places, lengths) = _kinetic(states), _periods(states, box)
+    q, p, t = np.atleast_2d(states.q), np.atleast_2d(states.p), np.atleast_1d(states.t)
     potential = []
     for scale in (1 + RELATIVE_STRAIN, 1 - RELATIVE_STRAIN):
-        scaled = parameters.copy()
-        scaled[[stepper.parameters.index(name) for name in _names(box)]] *= scale
-        potential.append(stepper._energy_parts(q * scale, p, t, scaled)[:, 1])
+        scaled = np.array(states.parameters)
+        scaled[places] *= scale
+        potential.append(states.stepper._energy_parts(q * scale, p, t, scaled)[:, 1])
     slope = (potential[0] - potential[1]).reshape(np.shape(kinetic)) / (2 * RELATIVE_STRAIN)
-    return (2 * kinetic - slope) / (len(lengths) * math.prod(lengths))
+    return (2 * kinetic - slope) / (len(lengths) * lengths.prod())
 
 
 @checks_arguments()
@@ -84,8 +76,8 @@ def radial_distribution(
     """
     from scipy.spatial import cKDTree
 
-    lengths, dimension = np.array(_lengths(states, box)), len(_lengths(states, box))
-    half = lengths.min() / 2
+    _, lengths = _periods(states, box)
+    dimension, half = len(lengths), lengths.min() / 2
     if not 0 < (end := half if largest is None else largest) <= half:
         raise ArgumentError(f"largest must be positive and at most half of the shortest period, {half:g}, not {end:g}")
     edges = np.linspace(0, end, checked_count(bins, "bins", least=1) + 1)
@@ -94,8 +86,7 @@ def radial_distribution(
     inside = positions % lengths
     inside[inside >= lengths] = 0.0  # by rounding
     pairs = np.zeros(len(edges))
-    for points in inside:
-        tree = cKDTree(points, boxsize=lengths)
+    for tree in (cKDTree(points, boxsize=lengths) for points in inside):
         pairs += tree.count_neighbors(tree, edges)
     ball = math.pi ** (dimension / 2) / math.gamma(dimension / 2 + 1)
     count = positions.shape[1]
@@ -103,7 +94,7 @@ def radial_distribution(
     return (edges[1:] + edges[:-1]) / 2, np.diff(pairs) / uniform
 
 
-def _kinetic(states: Run | Trajectory) -> Any:
+def _kinetic(states: Any) -> Any:
     kinetic = np.asarray(states.energies)[..., 0]
     if states.stepper.interface.layout.momenta or not np.isfinite(kinetic).all():
         raise StateError(
@@ -113,21 +104,17 @@ def _kinetic(states: Run | Trajectory) -> Any:
     return kinetic
 
 
-def _names(box: str | Sequence[str]) -> list[str]:
-    return [box] if isinstance(box, str) else list(box)
-
-
-def _lengths(states: Run | Trajectory, box: str | Sequence[str]) -> list[float]:
-    """Return the length of a period of each component of a position."""
-    stepper, names = states.stepper, _names(box)
+def _periods(states: Any, box: str | Sequence[str]) -> tuple[list[int], Array]:
+    """Return the indices of the parameters of a box, and the length of a period of each component of a position."""
+    stepper, names = states.stepper, [box] if isinstance(box, str) else list(box)
     arrays = stepper.interface.layout.coordinates
     if len(arrays) != 1:
         raise StateError(f"{stepper!r} must have one array of coordinates, the positions, not {len(arrays)}")
     dimension = arrays[0].axes[-1].number or 1
+    if len(names) not in (1, dimension):
+        raise ArgumentError(f"box must be one name or {dimension}, one per component, not {len(names)}")
     for name in names:
         if name not in stepper.parameters:
             raise ArgumentError(f"'{name}' is not a parameter of {stepper!r}: give the name of the length of the box")
-    if len(names) not in (1, dimension):
-        raise ArgumentError(f"box must be one name or {dimension}, one per component, not {len(names)}")
-    lengths = [float(np.asarray(states.parameters)[stepper.parameters.index(name)]) for name in names]
-    return lengths if len(lengths) == dimension else lengths * dimension
+    places = [stepper.parameters.index(name) for name in names]
+    return places, np.resize(np.array(states.parameters)[places], dimension)
