@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 import scvi_codegen as sc
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.expressions import evaluate
-from scvi_codegen.mechanics.multibody.trees.shapes import SHAPES, volume_and_inertia
+from scvi_codegen.mechanics.multibody.trees.shapes import SHAPES
 
 ROBOTS = Path(__file__).parent / "robots"
 DELAY = 2e-4
@@ -66,7 +66,7 @@ def arm(state: dict[str, Any]) -> list[Body]:
 
 
 def solid(shape: str, *size: float, density: float = 500.0, mass: float | None = None) -> tuple[float, Any]:
-    volume, moments = volume_and_inertia(shape, np.array(size))
+    volume, moments = SHAPES[shape][1](np.array(size))
     mass = density * volume if mass is None else mass
     return mass, mass * np.diag(moments)
 
@@ -192,7 +192,7 @@ def test_inertias_of_shapes_are_integrals(shape):
         "capsule": lambda: x**2 + y**2 + np.maximum(abs(z) - size[-1], 0) ** 2 < size[0] ** 2,
     }[shape]()
     squares = np.array([(each[inside] ** 2).mean() for each in (x, y, z)])
-    volume, moments = volume_and_inertia(shape, size)
+    volume, moments = SHAPES[shape][1](size)
     assert volume == pytest.approx(inside.sum() * (2.8 / 160) ** 3, rel=0.02)
     assert moments == pytest.approx(squares.sum() - squares, rel=0.03)
 

@@ -101,3 +101,35 @@ def test_spin_chain_against_scipy(size):
     run = sc.compile_stepper(chain, "svi:4", flags=QUICK_FLAGS).integrate({"s": start}, h=0.02, steps=100)
     assert run.spin("s")[-1].ravel() == pytest.approx(exact, abs=1e-9)
     assert run.spin("s_3").shape == (101, 3)
+
+
+@pytest.mark.parametrize(
+    ("degree", "counts"),
+    [
+        (2, (40, 80)),
+        *(pytest.param(*each, marks=pytest.mark.full) for each in ((1, (200, 400)), (3, (16, 32)), (4, (10, 16)))),
+    ],
+)
+def test_the_order_on_a_chain_of_spins_is_twice_the_degree(degree, counts):
+    """Chain with neighbours, anisotropy and a field across it; the lengths of the spins are constant."""
+    neighbours = " + ".join(f"s_{k}[i]*s_{k}[i+1]" for k in (1, 2, 3))
+    chain = sc.HamiltonianSystem.from_text(
+        "anisotropic chain",
+        hamiltonian=f"-sum(i in 5 periodic, {neighbours}) - sum(i in 5, 0.4*s_3[i]**2 + 0.7*s_1[i])",
+        spins=["s[5]"],
+    )
+    start = np.random.default_rng(2).normal(size=(5, 3))
+
+    def rates(_: float, y: np.ndarray) -> np.ndarray:
+        s = y.reshape(5, 3)
+        field = np.roll(s, 1, axis=0) + np.roll(s, -1, axis=0) + np.array([0, 0, 0.8]) * s + [0.7, 0, 0]
+        return np.cross(s, field).ravel()
+
+    exact = solve_ivp(rates, (0, 2), start.ravel(), rtol=3e-14, atol=1e-15, method="DOP853").y[:, -1].reshape(5, 3)
+    stepper = sc.compile_stepper(chain, f"svi:{degree}", flags=QUICK_FLAGS)
+    runs = [stepper.integrate({"s": start}, h=2 / steps, steps=steps) for steps in counts]
+    errors = [np.abs(run.spin("s")[-1] - exact).max() for run in runs]
+    assert errors[1] > 1e-12
+    assert abs(np.log(errors[0] / errors[1]) / np.log(counts[1] / counts[0]) - 2 * degree) < 0.5
+    lengths = np.linalg.norm(runs[1].spin("s"), axis=-1)
+    assert np.ptp(lengths, axis=0).max() < 1e-13

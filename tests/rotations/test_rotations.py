@@ -215,33 +215,52 @@ def test_a_body_on_a_spring_turns_and_moves():
     assert np.abs(run.energy() - run.energy()[0]).max() < 1e-11
 
 
-def test_chaplygins_ball_rolls_as_its_first_integrals_demand():
-    """A ball with unequal moments rolls without slipping: the momentum about the contact point is fixed in space."""
-    ball = sc.LagrangianSystem.from_text(
-        "Chaplygin's ball",
-        ["x", "y"],
-        "(x_dot**2 + y_dot**2)/2 + (omega_1**2 + 2*omega_2**2 + 3*omega_3**2)/10",
-        rotations={"R": "omega"},
-        constraints=[
-            "x_dot = rotate_2(R, omega_1, omega_2, omega_3)",
-            "y_dot = -rotate_1(R, omega_1, omega_2, omega_3)",
-        ],
+BALL = sc.LagrangianSystem.from_text(
+    "Chaplygin's ball",
+    ["x", "y"],
+    "(x_dot**2 + y_dot**2)/2 + (omega_1**2 + 2*omega_2**2 + 3*omega_3**2)/10",
+    rotations={"R": "omega"},
+    constraints=[
+        "x_dot = rotate_2(R, omega_1, omega_2, omega_3)",
+        "y_dot = -rotate_1(R, omega_1, omega_2, omega_3)",
+    ],
+)
+"""Ball with unequal moments of inertia that rolls without slipping."""
+ROLLING = np.array([0.5, 1.0, -0.3])
+
+
+def rolled(stepper, h, steps, save_every=1):
+    turning = ATTITUDE.apply(ROLLING)
+    velocity = {"x": turning[1], "y": -turning[0], "omega": ROLLING}
+    return stepper.integrate(
+        {"x": 0, "y": 0, "R": ATTITUDE}, velocity=velocity, h=h, steps=steps, save_every=save_every
     )
-    omega = np.array([0.5, 1.0, -0.3])
-    start = {"x": 0, "y": 0, "R": ATTITUDE}
-    turning = ATTITUDE.apply(omega)
-    velocity = {"x": turning[1], "y": -turning[0], "omega": omega}
-    run = compiled(ball, "svi:2").integrate(start, velocity=velocity, h=0.1, steps=100)
+
+
+@pytest.mark.parametrize("steps", [1000, pytest.param(100_000, marks=pytest.mark.full)])
+def test_first_integrals_of_chaplygins_ball_are_constant(steps):
+    """The angular momentum about the contact point is fixed in space."""
+    run = rolled(compiled(BALL, "svi:4"), 0.1, steps, steps // 100)
     omega_in_space = run.angular_velocity(space=True)
     centre = np.stack([omega_in_space[:, 1], -omega_in_space[:, 0], 0 * run.t], axis=1)
     spin = np.einsum("nij,nj->ni", run.rotation(), run.angular_velocity() * [0.2, 0.4, 0.6])
     about_contact = spin + np.cross([0.0, 0.0, 1.0], centre)
-    assert np.abs(about_contact - about_contact[0]).max() < 1e-13
-    errors = []
-    for steps in (20, 40):
-        run = compiled(ball, "svi:2").integrate(start, velocity=velocity, h=2.0 / steps, steps=steps)
-        errors.append(error_of(run, rolling(omega)))
-    assert 3.7 < np.log2(errors[0] / errors[1]) < 4.3
+    assert np.abs(about_contact - about_contact[0]).max() < 1e-12
+    assert np.abs(run.energy() - run.energy()[0]).max() < 1e-13
+
+
+@pytest.mark.parametrize(
+    ("degree", "counts"),
+    [
+        (2, (20, 40)),
+        *(pytest.param(*each, marks=pytest.mark.full) for each in ((1, (80, 160)), (3, (8, 16)), (4, (5, 8)))),
+    ],
+)
+def test_the_order_on_chaplygins_ball_is_twice_the_degree(degree, counts):
+    stepper, expected = compiled(BALL, f"svi:{degree}"), rolling(ROLLING)
+    errors = [error_of(rolled(stepper, 2.0 / steps, steps), expected) for steps in counts]
+    assert errors[1] > 1e-12
+    assert abs(np.log(errors[0] / errors[1]) / np.log(counts[1] / counts[0]) - 2 * degree) < 0.5
 
 
 def rolling(omega):
