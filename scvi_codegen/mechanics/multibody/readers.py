@@ -217,6 +217,7 @@ def of_system(system: System) -> Multibody:
     system, rotations = with_rotations(system)
     springs = [each for each in system.actuators if rotations and isinstance(each, LinearSpring)]
     groups = [tuple(each.to_loads()) for each in system.actuators if each not in springs]
+    stored = (each.stiffness * (each.pathway.length - each.equilibrium_length) ** 2 / 2 for each in springs)
     energies = () if by_kane else (body.potential_energy for body in system.bodies)
     return Multibody(
         frame=system.frame,
@@ -227,13 +228,9 @@ def of_system(system: System) -> Multibody:
         auxiliary=tuple(system.u_aux),
         bodies=tuple(system.bodies),
         loads=(*groups, *((load,) for load in system.loads)),
-        potential=sympy.Add(*energies, *map(_energy_of_spring, springs)),
+        potential=sympy.Add(*energies, *stored),
         configuration=tuple(system.holonomic_constraints),
         velocity=tuple(system.velocity_constraints),
         rotations=rotations,
         origin=system.fixed_point,
     )
-
-
-def _energy_of_spring(spring: LinearSpring) -> Expr:
-    return spring.stiffness * (spring.pathway.length - spring.equilibrium_length) ** 2 / 2

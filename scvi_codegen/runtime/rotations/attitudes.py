@@ -88,33 +88,22 @@ def _of_angles(value: Mapping[str, Any], name: str) -> Array:
 
 
 def _of_matrices(matrix: Array, name: str) -> Array:
-    """Return the quaternions of rotation matrices (S. W. Shepperd, J. Guidance Control 1 (1978), 223-224)."""
+    """Return the quaternions of rotation matrices, whose largest components are positive.
+
+    The unit quaternion q maximises sum_ij R_ij R(q)_ij = q^T K q (I. Y. Bar-Itzhack, J. Guidance 23 (2000), 1085-1087).
+    """
     defect = np.abs(np.swapaxes(matrix, -1, -2) @ matrix - np.eye(3)).max()
     if not defect <= ORTHOGONAL or not (np.linalg.det(matrix) > 0).all():
         raise StateError(
             f"the matrix of '{name}' is not a rotation: R^T R differs from the identity by {defect:.1e}, or det R is "
             "negative. Give an orthogonal matrix with determinant 1"
         )
-    m = matrix
-    squares = np.stack(
-        [
-            1 + m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2],
-            1 + m[..., 0, 0] - m[..., 1, 1] - m[..., 2, 2],
-            1 - m[..., 0, 0] + m[..., 1, 1] - m[..., 2, 2],
-            1 - m[..., 0, 0] - m[..., 1, 1] + m[..., 2, 2],
-        ],
-        axis=-1,
-    )  # 4 (w^2, x^2, y^2, z^2)
-    products = np.empty((*m.shape[:-2], 4, 4))  # row i: 4 q_i (w, x, y, z)
-    for i in range(4):
-        products[..., i, i] = squares[..., i]
-    for i, (j, k) in enumerate(((2, 1), (0, 2), (1, 0)), start=1):  # w with x, y, z
-        products[..., 0, i] = products[..., i, 0] = m[..., j, k] - m[..., k, j]
-    for i, j in ((1, 2), (1, 3), (2, 3)):
-        products[..., i, j] = products[..., j, i] = m[..., i - 1, j - 1] + m[..., j - 1, i - 1]
-    largest = squares.argmax(axis=-1)[..., None, None]
-    row = np.take_along_axis(products, largest, axis=-2)[..., 0, :]
-    return np.asarray(row / np.linalg.norm(row, axis=-1, keepdims=True))
+    unit = np.eye(4)
+    pairs = unit[:, np.newaxis] + unit
+    forms = matrices(pairs) * (pairs**2).sum(axis=-1)[..., np.newaxis, np.newaxis]
+    forms = (forms - matrices(unit)[:, np.newaxis] - matrices(unit)) / 2  # |q|^2 R(q) = sum_ab q_a q_b forms_ab
+    q = np.linalg.eigh(np.einsum("...ij,abij->...ab", matrix, forms))[1][..., -1]
+    return np.asarray(q * np.sign(np.take_along_axis(q, np.abs(q).argmax(axis=-1, keepdims=True), axis=-1)))
 
 
 def unit_vectors(q: Array) -> Array:

@@ -8,16 +8,21 @@ a planar mechanism, are omitted.
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from sympy import Add, Dummy, Expr, Matrix, Rational, cos, eye, sin
+from sympy import Add, Dummy, Expr, Matrix, cos, eye, sin
 
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.expressions import gradient
 from scvi_codegen.formulas.intermediates import intermediate
 from scvi_codegen.formulas.rotations.names import RotationNames
 from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.mechanics.multibody.trees.energies import position_of, rotation_of
+from scvi_codegen.mechanics.multibody.trees.energies import (
+    exact_matrix,
+    exact_number,
+    exact_vector,
+    position_of,
+    rotation_of,
+)
 from scvi_codegen.mechanics.multibody.trees.tree import SINGLE, Link, Pose, hat, identifier, rounded
 from scvi_codegen.mechanics.multibody.variables import independent_of
 
@@ -71,9 +76,9 @@ def conditions_of(links: Sequence[Link], closures: Iterable[Closure | Coupling])
 def _conditions(links: Sequence[Link], closure: Closure | Coupling) -> Iterator[Expr]:
     """Yield the equations of one closure or coupling, with dependent ones."""
     if isinstance(closure, Coupling):
-        relative = _coordinate(links, closure.other) - _exact([closure.zero])[0] if closure.other else 0
-        terms = (a * relative**k for k, a in enumerate(_exact(closure.coefficients)))
-        yield _coordinate(links, closure.joint) - _exact([closure.offset])[0] - Add(*terms)
+        relative = _coordinate(links, closure.other) - exact_number(closure.zero) if closure.other else 0
+        terms = (a * relative**k for k, a in enumerate(map(exact_number, closure.coefficients)))
+        yield _coordinate(links, closure.joint) - exact_number(closure.offset) - Add(*terms)
         return
     (position, axes), (other, others) = map(_frame, (links, links), closure.links, closure.poses)
     yield from position - other
@@ -92,27 +97,22 @@ def _coordinate(links: Sequence[Link], name: str) -> Expr:
 
 def _frame(links: Sequence[Link], link: int, pose: Pose) -> tuple[Matrix, Matrix]:
     """Return position and axes in the world of a frame with a pose in a link."""
-    position, axes = _exact(pose.position), _exact(rounded(pose.rotation))
+    position, axes = exact_vector(pose.position), exact_matrix(rounded(pose.rotation))
     while link >= 0:
         joint = links[link].joint
-        origin, turn = _exact(joint.pose.position), _exact(rounded(joint.pose.rotation))
+        origin, turn = exact_vector(joint.pose.position), exact_matrix(rounded(joint.pose.rotation))
         if joint.kind == "free":
             origin, turn = Matrix([symbol(name) for name in position_of(joint)]), eye(3)
         if joint.kind in ("ball", "free"):
             turn *= Matrix(3, 3, rotation_of(joint).entries)
         elif joint.kind in SINGLE:
-            q = symbol(identifier(joint.name)) - _exact([joint.zero])[0]
-            across = _exact(rounded(hat(joint.axis)))
+            q = symbol(identifier(joint.name)) - exact_number(joint.zero)
+            across = exact_matrix(rounded(hat(joint.axis)))
             if joint.kind == "hinge":
                 turn = turn * (eye(3) + sin(q) * across + (1 - cos(q)) * across * across)
             else:
-                origin += turn * _exact(rounded(joint.axis)) * q
+                origin += turn * exact_vector(rounded(joint.axis)) * q
         position = (origin + turn * position).applyfunc(intermediate)
         axes = (turn * axes).applyfunc(intermediate)
         link = links[link].parent
     return position, axes
-
-
-def _exact(values: Any) -> Matrix:
-    """Return numbers as the rationals of their shortest decimal form."""
-    return Matrix(values).applyfunc(lambda value: Rational(repr(float(value))))

@@ -86,8 +86,8 @@ class Element:
         raise SystemDefinitionError(f"{self.file}: <{self.node.tag}> '{self.name}' {what}")
 
 
-def root_of(path: str | PathLike[str], tag: str) -> Element:
-    """Read a document whose outermost element must have a tag.
+def root_of(path: str | PathLike[str], *tags: str) -> Element:
+    """Read a document whose outermost element must have one of the tags.
 
     Raises:
         SystemDefinitionError: if the file cannot be read, is larger than 32 MiB, is no XML, declares entities, or has
@@ -107,6 +107,6 @@ def root_of(path: str | PathLike[str], tag: str) -> Element:
         node = ElementTree.fromstring(data)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise SystemDefinitionError(f"{file} is not XML: {error}") from error
-    if node.tag != tag:
-        raise SystemDefinitionError(f"{file} begins with <{node.tag}>, not with <{tag}>")
+    if node.tag not in tags:
+        raise SystemDefinitionError(f"{file} begins with <{node.tag}>, not with <{tags[0]}>")
     return Element(str(file), node)

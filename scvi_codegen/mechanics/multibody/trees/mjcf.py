@@ -13,10 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.errors import closest
+from scvi_codegen.formulas.rotations.members import matrix_of
 from scvi_codegen.mechanics.multibody.trees.closures import Closure, Coupling, at_reference
 from scvi_codegen.mechanics.multibody.trees.document import Element, root_of
-from scvi_codegen.mechanics.multibody.trees.shapes import SHAPES, volume_and_inertia
+from scvi_codegen.mechanics.multibody.trees.shapes import SHAPES
 from scvi_codegen.mechanics.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about
 
 REFUSED = ("attach", "replicate", "composite", "flexcomp", "plugin")
@@ -150,9 +151,6 @@ class _MujocoModel:
                     yield self.coupling(each)
                 elif node.tag not in ("connect", "weld"):
                     each.refuse("is not read: remove it or write a constraint")
-                elif each.has("site1"):
-                    (one, at), (two, pose) = self.place(each, "site1"), self.place(each, "site2")
-                    yield Closure((one, two), (at, pose), node.tag == "weld")
                 else:
                     yield self.closure(each)
 
@@ -165,17 +163,20 @@ class _MujocoModel:
         return self.places[kind, name]
 
     def closure(self, equality: Element) -> Closure:
-        """Return a connection or weld of two bodies, by default as they are placed at the reference configuration."""
-        (one, at), (two, other) = self.place(equality, "body1"), self.place(equality, "body2")
+        """Return a connection or weld of two sites, or of bodies, by default as in the reference configuration."""
+        kind = "site" if equality.has("site1") else "body"
+        (one, at), (two, other) = (self.place(equality, f"{kind}{k}") for k in (1, 2))
         turning = equality.node.tag == "weld"
-        relative = at_reference(self.links, two).inverse @ at_reference(self.links, one)
-        if not turning:
-            anchor = Pose(equality.vector("anchor"))
-            return Closure((one, two), (at @ anchor, relative @ anchor), turning)
-        pose = equality.vector("relpose", (0, 1, 0, 0, 0, 0, 0), (7,))
-        if not pose[3:].any():
-            return Closure((one, two), (relative.inverse, other), turning)
-        return Closure((one, two), (Pose(pose[:3], _of_quaternion(equality, pose[3:])), other), turning)
+        if kind == "body" and turning:
+            pose = equality.vector("relpose", (0, 1, 0, 0, 0, 0, 0), (7,))
+            if pose[3:].any():
+                at = Pose(pose[:3], _of_quaternion(equality, pose[3:]))
+            else:
+                at = at_reference(self.links, one).inverse @ at_reference(self.links, two)
+        elif kind == "body":
+            at = Pose(equality.vector("anchor"))
+            other = at_reference(self.links, two).inverse @ at_reference(self.links, one) @ at
+        return Closure((one, two), (at, other), turning)
 
     def coupling(self, equality: Element) -> Coupling:
         """Return a relation between two joints, or the fixed value of one."""
@@ -237,7 +238,7 @@ class _MujocoModel:
             return Inertia()
         if shape not in SHAPES or geom.has("shellinertia"):
             geom.refuse(f"is a {shape} whose inertia is not computed: give its body an <inertial>")
-        count = SHAPES[shape][0]
+        count, volume_and_inertia = SHAPES[shape]
         pose = self.pose(geom)
         if geom.has("fromto"):
             ends = geom.vector("fromto", sizes=(6,))
@@ -250,7 +251,7 @@ class _MujocoModel:
             size = np.array([radius] * (count - 1) + [half])
         else:
             size = geom.vector("size", sizes=range(count, 4))[:count]
-        volume, moments = volume_and_inertia(shape, size)
+        volume, moments = volume_and_inertia(size)
         mass = geom.number("mass") if geom.has("mass") else geom.number("density", 1000) * volume
         return Inertia(mass, matrix=mass * np.diag(moments)).seen_from(pose)
 
@@ -308,28 +309,13 @@ def _sections(root: Element, depth: int) -> Iterator[Element]:
             section.refuse(f"is nested deeper than {MOST_INCLUDED} files")
         else:
             file = Path(root.file).parent / section.text("file")
-            yield from _sections(_included(file), depth + 1)
-
-
-def _included(file: Path) -> Element:
-    try:
-        return root_of(file, "mujocoinclude")
-    except SystemDefinitionError as error:
-        if "begins with <mujoco>" not in str(error):
-            raise
-        return root_of(file, "mujoco")
+            yield from _sections(root_of(file, "mujocoinclude", "mujoco"), depth + 1)
 
 
 def _of_quaternion(element: Element, q: Vector) -> Vector:
-    length = float(np.linalg.norm(q))
-    if length == 0:
+    if not q.any():
         element.refuse("has a quaternion of length 0")
-    return about(*_axis_and_angle(q / length))
-
-
-def _axis_and_angle(q: Vector) -> tuple[Vector, float]:
-    sine = float(np.linalg.norm(q[1:]))
-    return (q[1:] / sine if sine else np.array([0.0, 0.0, 1.0])), 2 * float(np.arctan2(sine, q[0]))
+    return np.array(matrix_of([*map(float, q / np.linalg.norm(q))]), dtype=float)
 
 
 def _shortest_turn(axis: Vector) -> Vector:

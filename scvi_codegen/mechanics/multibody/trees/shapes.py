@@ -9,16 +9,6 @@ from scvi_codegen.mechanics.multibody.trees.tree import Vector
 Sizes = Vector
 
 
-def volume_and_inertia(shape: str, size: Sizes) -> tuple[float, Vector]:
-    """Return the volume and the three principal moments of inertia by mass, about the center and the axes x, y, z.
-
-    Args:
-        shape: one of ``SHAPES``.
-        size: radius; half axes; half lengths; radius and half length along z, of a capsule without its caps.
-    """
-    return SHAPES[shape][1](size)
-
-
 def _ellipsoid(size: Sizes) -> tuple[float, Vector]:
     squares = size**2
     return 4 / 3 * np.pi * float(np.prod(size)), (squares.sum() - squares) / 5
@@ -56,4 +46,6 @@ SHAPES: dict[str, tuple[int, Callable[[Sizes], tuple[float, Vector]]]] = {
     "cylinder": (2, _cylinder),
     "capsule": (2, _capsule),
 }
-"""Number of sizes, volume and inertia by shape."""
+"""By shape: the number of its sizes, and a function of these that returns the volume and the three principal moments of
+inertia by mass, about the center and the axes x, y, z. Sizes are the radius; half axes; half lengths; radius and half
+length along z, of a capsule without its caps."""
