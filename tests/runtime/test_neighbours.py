@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import subprocess
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from programs import needs
 
 import scvi_codegen as sc
 from scvi_codegen.errors import ExpressionError, StateError, StepFailedError, SystemDefinitionError
 from scvi_codegen.models.model_files.model_file import dump_model
+from scvi_codegen.native.compilers import find_compiler
 
 SQUARE = "sum(a in 3, wrap(r[i, a] - r[j, a], box)**2)"
 WELL = f"4*(1/{SQUARE}**6 - 1/{SQUARE}**3)*positive_part(1 - {SQUARE}**2/cut**4)**4"
@@ -172,6 +175,35 @@ def test_known_sizes_model_files_and_sympy_have_the_same_sum(tmp_path: Path) -> 
     again = sc.load_model(path)
     assert again.system == model.system
     assert again.integrate().q["r"][-1] == pytest.approx(expected.q["r"][-1], abs=1e-12)
+
+
+@pytest.mark.parametrize("sanitizer", ["address,undefined", "thread"])
+def test_programs_of_packages_make_their_lists(sanitizer: str, tmp_path: Path) -> None:
+    """With three threads and the compiler's sanitizers, from the same start to the same bits."""
+    needs("setarch")
+    r, v = start(3.0)
+    more = {"r": np.concatenate([r, r + np.array([0.5, 0.1, 0.6])])}
+    model = sc.Model(
+        system=liquid(0.1, SOFT),
+        q=more,
+        velocity={"r": np.concatenate([v, -v])},
+        h=0.01,
+        method=sc.SVI(2),
+        span=0.3,
+    )
+    folder = sc.generate_package(model, tmp_path / "soft")
+    flags = ["-std=c99", "-O1", "-ffp-contract=off", f"-fsanitize={sanitizer}", "-DSCVI_THREADS", "-pthread"]
+    command = [*find_compiler(), *flags, "-Wno-psabi", "main.c", "soft.c", "-lm", "-o", "main"]
+    built = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    if built.returncode:
+        pytest.skip(f"no sanitizer: {built.stderr[-200:]}")
+    for threads in ("1", "3"):
+        done = subprocess.run(
+            ["setarch", "-R", "./main", threads], cwd=folder, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        end = np.loadtxt(folder / "end.txt")
+        assert end[: 3 * len(more["r"])] == pytest.approx(model.integrate().q["r"][-1].reshape(-1), abs=1e-12)
 
 
 def test_a_list_in_sympy() -> None:
