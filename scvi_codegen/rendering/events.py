@@ -138,8 +138,13 @@ class EventFormulas:
             return [0] * (len(gradient) + 1), [*gradient, restitution]
         variables = {each: k for k, each in enumerate(self.arguments)}
         named = {name: variables[each] for name, each in self._known.items() if each in variables}
-        indices = [named.get(str(self._read(name, "then=") if "[" in name else name), -1) for name, _ in event.changes]
-        for index, (name, value) in zip(indices, event.changes, strict=True):
+        new = {
+            str(self._read(name, "then=")) if "[" in name else name: self._read(value, f"value '{value}' of '{name}'")
+            for name, value in event.changes
+        }
+        self._set_rates_of_rotations(new)
+        indices = [named.get(name, -1) for name in new]
+        for index, (name, value) in zip(indices, new.items(), strict=True):
             if index < 0:
                 raise EventError(
                     f"then={{'{name}': '{value}'}} of the event '{event.function}': '{name}' is not a coordinate, a "
@@ -151,16 +156,25 @@ class EventFormulas:
             raise EventError(
                 f"the event '{event.function}' sets momenta and velocities: set one or the other with then="
             )
-        return indices, [self._read(value, f"value '{value}' of '{name}' in then=") for name, value in event.changes]
+        return indices, [*new.values()]
+
+    def _set_rates_of_rotations(self, new: dict[str, Expr]) -> None:
+        """Replace new angular velocities or momenta of rotations by the derivatives or momenta of quaternions."""
+        for member in self._turning.rotations:
+            if set(new).isdisjoint(rate.name for rate in member.rates):
+                continue
+            rates = [new.pop(rate.name, self._turning.values[rate]) for rate in member.rates]
+            p = member.forces(rates)  # p = 2 E(q) m / |q|^2 of the angular momentum m, q_dot = |q|^2 p / 4
+            size = sympy.Add(*(symbol(name) ** 2 for name in member.coordinates))
+            for name, value in zip(member.coordinates, p, strict=True):
+                new[f"p_{name}" if member.momentum else name + DOT] = value if member.momentum else value * size / 4
 
 
 def _check_changes(interface: Interface, events: Sequence[SearchedEvent]) -> None:
     """Raise :class:`EventError` where changes of the state are not supported."""
     changing = [event for event in events if event.changes_state]
     unsupported = {
-        "constraints": bool(interface.constraints),
         "a time transformation": bool(interface.time_transformation or interface.energy_parameter),
-        "rotations, directions and spins": bool(interface.rotations),
     }
     for what, present in unsupported.items():
         if present and changing:
@@ -243,6 +257,7 @@ def _search(
         kernel=None,
         uses_velocity=False,
         transformed=bool(interface.energy_parameter),
+        constrained=bool(interface.constraints or interface.layout.constraints),
         nodes=lower_vector(to_unit(points)),
         coefficients=lower_matrix(coefficients),
         doubts=(0.5 ** (DEGREE - 2), 0.5 ** (DEGREE - 1)),

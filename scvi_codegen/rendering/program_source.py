@@ -104,6 +104,7 @@ class EventSearch:
         kernel: the functions at u = (q, p, v); ``None`` for arrays of run-time sizes.
         uses_velocity: whether v occurs in them.
         transformed: whether time is, so that the integrator's velocities are dq/dtau.
+        constrained: whether states satisfy constraints, also after changes.
         nodes: (d + 1,) fractions of a part of a step at which they are evaluated.
         coefficients: (d + 1, d + 1) from values there to coefficients of powers of x in [-1, 1].
         doubts: factors of the last two coefficients in the error estimate.
@@ -120,6 +121,7 @@ class EventSearch:
     kernel: Kernel | None
     uses_velocity: bool
     transformed: bool
+    constrained: bool
     nodes: tuple[float, ...]
     coefficients: tuple[tuple[float, ...], ...]
     doubts: tuple[float, float]

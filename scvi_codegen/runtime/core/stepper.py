@@ -342,9 +342,7 @@ class Stepper(Integrator):
         """
         if self.interface.rotations or self.interface.variables:
             q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
-        unsupported = {"error=": error, "an ensemble with fixed steps (h=)": h}
-        for what, argument in unsupported.items():
-            self._check_no_changes(what, wanted=argument is not None)
+        self._check_no_changes("error=", wanted=error is not None)
         if error is not None:
             others = {"h": h, "steps": steps, "tolerance": tolerance}
             error = checked_error(error, others, has_tau=self._has_tau)

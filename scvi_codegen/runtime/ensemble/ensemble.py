@@ -138,7 +138,11 @@ class Ensemble:
         self.saved: dict[int, SavedLane] = {}
         self.error, self.confirmations = error, list[GlobalError | None]()
         self.t_eval: Array | None = None
-        if fixed is None:
+        if fixed is not None and stepper.changes_states:  # one run each, as states within steps change
+            end = float(fixed.times(tau=False)[-1])
+            self.plans = [StepPlan(h=fixed.h, t_end=end)] * len(self)
+            self.t_eval, fixed = fixed.times(tau=False), None
+        elif fixed is None:
             self.plans = self._plans(cast(ArrayLike, t_end), tolerance)
             self.confirmations = [None] * (0 if error is None else len(self))
             self.t_eval = self._output_times(t_eval)
@@ -190,6 +194,8 @@ class Ensemble:
         }
         if self.common is None:
             ends = [plan.t_end for plan in self.plans[part]]
+            if h := self.plans[0].h:
+                return arguments | {"h": h, "t_end": ends[0]}
             return arguments | {"t_end": ends, "tolerance": self.plans[0].tolerance or None, "t_eval": self.t_eval}
         fixed = self.common.steps
         return arguments | {"h": fixed.h} | ({"steps": fixed.steps} if fixed.t_end is None else {"t_end": fixed.t_end})
@@ -272,7 +278,7 @@ class Ensemble:
         arguments: dict[str, Any] = self._parameters_and_inputs(j) | {
             "t": self.t0,
             "t_end": plan.t_end,
-            "save_every": self.save_every,
+            "save_every": self.save_every if self.t_eval is None else 1,
             "options": self.options,
             "progress": check_stop,
         }
@@ -287,7 +293,7 @@ class Ensemble:
                     self.confirmations[j], self.plans[j] = states.confirmation, states.plan
                     return SavedLane(states.t, states.q, states.p, OK, states.steps)
             try:
-                states = integrate(q, p, tolerance=plan.tolerance or None, **arguments)
+                states = integrate(q, p, h=plan.h or None, tolerance=plan.tolerance or None, **arguments)
             except StepFailedError as failure:
                 states, status = Trajectory.before(failure), failure.status
             except EventError as failure:
@@ -337,8 +343,8 @@ class Ensemble:
             p=p,
             status=np.array([each.status for each in lanes], dtype="<U32"),
             steps=np.array([each.steps for each in lanes], dtype=np.int64),
-            h=0.0,
-            plans=tuple(self.plans),
+            h=self.plans[0].h,
+            plans=tuple(plan for plan in self.plans if not plan.fixed),
             confirmations=tuple(self.confirmations),
             parameters=self.parameters,
             stepper=self.stepper,

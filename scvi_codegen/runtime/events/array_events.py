@@ -269,7 +269,7 @@ class EventBinding(ArrayBinding):
         failures, host, made = list[BaseException](), new("event_host *"), new("event_report *")
         work, self._rows[found] = np.empty(19 * self.count + 2), np.empty((room, 2 * self.count))
         functions = {"step": self._step, "velocity": self._velocity, "energies": self._energies}
-        functions["evaluate"] = self._event_values
+        functions |= {"project": self._project, "evaluate": self._event_values}
         types = dict(self._ffi.typeof(host).item.fields)
         callbacks = {
             key: self._ffi.callback(

@@ -75,6 +75,11 @@ def _changes(states: SavedStates, numbers: NDArray[np.intp]) -> dict[int, tuple[
             continue
         if states.forward < 0.0:
             raise StateError("derivatives through events that change the state require a run forward in time")
+        if states.stepper.constraints:
+            raise StateError(
+                "derivatives through events that change the state are not available with constraints, onto which the "
+                "new state is projected: use coordinates without constraints"
+            )
         here = slice(*np.searchsorted(crossings.t, span, side="right").tolist())
         rows = np.searchsorted(states.t, crossings.t[here])
         if not np.array_equal(states.t[rows], crossings.t[here]):

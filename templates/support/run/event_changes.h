@@ -8,7 +8,8 @@
  * A step is searched for crossings, advanced to the first that changes the state by a partial step, changed, and
  * continued from there: fixed steps to the end of the step, adaptive ones by a new step. Frictionless impacts change p
  * by lambda n, n = g_q; lambda = (1 + e)/2 lambda_1, where lambda_1 conserves energy:
- * H(p + lambda_1 n) - H(p) = -lambda_1 g_t. Requires: events.h, the kernel event_changes, CHANGE_VALUES, FIRST_VALUE,
+ * H(p + lambda_1 n) - H(p) = -lambda_1 g_t. With constraints (EVENT_CONSTRAINTS), of Jacobian G, n is g_q - G^T kappa,
+ * G H_pp n = 0: momenta are projected. Requires: events.h, the kernel event_changes, CHANGE_VALUES, FIRST_VALUE,
  * IS_IMPACT, CHANGED, EVENTS_CONTROLLED. */
 enum {
   CHANGE_ROUNDS = 20, /* largest number of passes over the walls of a corner */
@@ -49,6 +50,27 @@ static void copy_run(event_run *to, const event_run *from)
 #endif
 }
 
+/* Momenta that satisfy the constraints at a state, of which the impulses of an impact and of its constraint forces
+ * together are a multiple of the projected normal: P(p + lambda n). Positions are projected, too, if `moves`. */
+static int satisfy_constraints(const event_step *step, real t, real *q, real *p, int moves)
+{
+  int status = OK;
+#ifdef EVENT_CONSTRAINTS
+  real *const q1 = step->memory, *const p1 = q1 + M;
+#ifdef EVENTS_OF_ANY_SIZE
+  status = event_host->project(t, q, p, step->parameters, q1, p1, step->workspace);
+#else
+  status = NAME(project)(t, q, p, step->parameters, q1, p1, step->workspace);
+#endif
+  memcpy(p, p1, sizeof(real) * M);
+  if (moves)
+    memcpy(q, q1, sizeof(real) * M);
+#else
+  (void)step, (void)t, (void)q, (void)p, (void)moves;
+#endif
+  return status;
+}
+
 /* Velocities at p + lambda n, and n.v + g_t. */
 static int approach(const event_step *step, const event_sample *at, const real *n, real lambda, real *v, real *rate)
 {
@@ -56,7 +78,9 @@ static int approach(const event_step *step, const event_sample *at, const real *
   int status;
   for (int i = 0; i < M; i++)
     p[i] = at->p[i] + lambda * n[i];
-  status = NAME(velocity)(at->t, at->q, p, step->parameters, v, step->workspace);
+  status = satisfy_constraints(step, at->t, at->q, p, 0);
+  if (status == OK)
+    status = NAME(velocity)(at->t, at->q, p, step->parameters, v, step->workspace);
   *rate = n[M];
   for (int i = 0; i < M; i++)
     *rate += n[i] * v[i];
@@ -83,6 +107,29 @@ static int evaluate_changes(const event_step *step, int e, const event_sample *a
   return status;
 }
 
+/* sum + low += a b with the rounding errors of product and sum (Dekker; Ogita, Rump & Oishi, SIAM J. Sci. Comput. 26
+ * (2005) 1955). */
+static void add_product(real a, real b, real *sum, real *low)
+{
+  const real product = a * b, total = *sum + product, moved = total - *sum;
+  *low += fma(a, b, -product) + ((*sum - (total - moved)) + (product - moved));
+  *sum = total;
+}
+
+/* Correction of lambda by Newton's method for the energy equation of a quadratic kinetic energy divided by lambda,
+ * n.v + g_t + (lambda / 2) n.(W n) = 0, evaluated in twice the precision: the rounding error of lambda has a mean that is
+ * not zero, from which energy would drift over many impacts. v: velocities before the impact and changes W n. */
+static real correct_impulse(const real *n, const real *v, const real *change, real lambda, real rate)
+{
+  real sum = n[M], low = 0.0, bend = 0.0, bend_low = 0.0;
+  for (int i = 0; i < M; i++) {
+    add_product(n[i], v[i], &sum, &low);
+    add_product(n[i], change[i], &bend, &bend_low);
+  }
+  add_product(0.5 * lambda, bend, &sum, &low);
+  return lambda * (sum + (low + 0.5 * lambda * bend_low)) / rate;
+}
+
 /* Impulse of an impact: p += (1 + e)/2 lambda_1 n. Where the kinetic energy is quadratic, lambda_1 = -2 rate / (n.W n),
  * W = H_pp, reverses the rate; else Newton's method solves the energy equation, whose derivative by lambda is the rate.
  * A run backward in time undoes the impact. */
@@ -91,21 +138,27 @@ static int impact(const event_step *step, event_sample *at, const event_wall *wa
   const real *n = wall->n, restitution = step->h < 0.0 ? 1.0 / n[M + 1] : n[M + 1];
   const real rate = step->h < 0.0 ? -wall->rate : wall->rate;
   event_sample moved = *at;
-  real *const v = step->memory + 3 * M;
-  real lambda, at_rest = 0.0, after = 0.0, energy = 0.0, now = 0.0, correction, before = INFINITY;
+  real *const v = step->memory + 3 * M, *const rest = v + 2 * M, *const change = rest + M;
+  real lambda, low = 0.0, at_rest = 0.0, after = 0.0, energy = 0.0, now = 0.0, correction, before = INFINITY;
   int status;
   moved.p = step->memory + 4 * M;
   memset(moved.p, 0, sizeof(real) * M);
-  status = approach(step, &moved, n, 0.0, v, &at_rest);
+  status = approach(step, &moved, n, 0.0, rest, &at_rest);
   if (status == OK)
-    status = approach(step, &moved, n, 1.0, v, &after);
+    status = approach(step, &moved, n, 1.0, change, &after);
   lambda = -2.0 * rate / (after - at_rest);
   if (status == OK)
     status = approach(step, at, n, lambda, v, &after);
   if (status == OK && !(fabs(after + rate) <= CHANGE_SAFETY * DBL_EPSILON * wall->size))
     status = NAME(energy)(at->t, at->q, at->p, step->parameters, &energy, step->workspace);
-  else
+  else {
     before = 0.0; /* the kinetic energy is quadratic */
+    if (status == OK)
+      status = approach(step, at, n, 0.0, v, &after);
+    for (int i = 0; i < M; i++)
+      change[i] -= rest[i];
+    low = correct_impulse(n, v, change, lambda, rate);
+  }
   for (int k = 0; before > 0.0 && status == OK && k < CHANGE_ITERATIONS && !(after * rate < 0.0); k++) {
     lambda *= 2.0; /* beyond the minimum of the convex energy: Newton's method does not return to lambda = 0 */
     status = approach(step, at, n, lambda, v, &after);
@@ -113,7 +166,8 @@ static int impact(const event_step *step, event_sample *at, const event_wall *wa
   for (int k = 0; status == OK && k < CHANGE_ITERATIONS; k++) {
     for (int i = 0; i < M; i++)
       moved.p[i] = at->p[i] + lambda * n[i];
-    if (before > 0.0)
+    status = satisfy_constraints(step, at->t, at->q, moved.p, 0);
+    if (before > 0.0 && status == OK)
       status = NAME(energy)(at->t, at->q, moved.p, step->parameters, &now, step->workspace);
     correction = (now - energy + lambda * n[M]) / after;
     if (status != OK || !(fabs(correction) < before))
@@ -122,9 +176,14 @@ static int impact(const event_step *step, event_sample *at, const event_wall *wa
     lambda -= correction;
     status = approach(step, at, n, lambda, v, &after);
   }
-  for (int i = 0; i < M; i++)
-    at->p[i] += 0.5 * (1.0 + restitution) * lambda * n[i];
-  return status;
+  lambda *= 0.5 * (1.0 + restitution);
+  low *= 0.5 * (1.0 + restitution);
+  for (int i = 0; i < M; i++) {
+    real remainder = low * n[i];
+    add_product(lambda, n[i], at->p + i, &remainder);
+    at->p[i] += remainder;
+  }
+  return status == OK ? satisfy_constraints(step, at->t, at->q, at->p, 0) : status;
 }
 
 /* Sets the variables of a map to its values; velocities are set last, by their momenta. In index notation the values are
@@ -164,8 +223,11 @@ static int change_state(const event_step *step, int e, event_sample *at)
   if (status == OK && IS_IMPACT[e] && wall.rate < 0.0) {
     step->watch->rounding[e] = wall.slack / -wall.rate;
     status = impact(step, at, &wall);
-  } else if (status == OK && !IS_IMPACT[e])
+  } else if (status == OK && !IS_IMPACT[e]) {
     status = apply_map(step, e, at, wall.n);
+    if (status == OK)
+      status = satisfy_constraints(step, at->t, at->q, at->p, 1);
+  }
   if (status == OK && !(all_finite(at->q, M) && all_finite(at->p, M))) {
     step->watch->undefined = e + 1;
     status = NOT_FINITE;
