@@ -138,21 +138,19 @@ class Ensemble:
         self.saved: dict[int, SavedLane] = {}
         self.error, self.confirmations = error, list[GlobalError | None]()
         self.t_eval: Array | None = None
-        if fixed is not None and stepper.changes_states:  # one run each, as states within steps change
-            end = float(fixed.times(tau=False)[-1])
-            self.plans = [StepPlan(h=fixed.h, t_end=end)] * len(self)
-            self.t_eval, fixed = fixed.times(tau=False), None
-        elif fixed is None:
-            self.plans = self._plans(cast(ArrayLike, t_end), tolerance)
+        if fixed is None or stepper.changes_states:  # events change the states of each within steps
+            self.plans = self._plans(fixed, cast(ArrayLike, t_end), tolerance)
             self.confirmations = [None] * (0 if error is None else len(self))
-            self.t_eval = self._output_times(t_eval)
+            self.t_eval = self._output_times(t_eval) if fixed is None else fixed.times(tau=False)
         if self.inputs:
             self.parameters[:, columns_of_inputs(interface)] = 0.0
-        if fixed is not None:
+        if fixed is not None and not stepper.changes_states:
             self.common = CommonRuns(stepper, self.options, self.start, self.parameters, self.values_at, fixed)
 
-    def _plans(self, t_end: ArrayLike, tolerance: float | None) -> list[StepPlan]:
+    def _plans(self, fixed: CommonSteps | None, t_end: ArrayLike, tolerance: float | None) -> list[StepPlan]:
         """Return the step plan of each trajectory; all must run forward or all backward."""
+        if fixed is not None:
+            return [StepPlan(h=fixed.h, t_end=float(fixed.times(tau=False)[-1]))] * len(self)
         ends = real_array(t_end, "t_end")
         if ends.shape not in ((), (len(self),)):
             raise StateError(f"t_end must be one time or {len(self)} times, not of shape {ends.shape}")

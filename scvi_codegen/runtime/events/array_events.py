@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import EventError, ScviCodegenError
-from scvi_codegen.indices import Access, Array
+from scvi_codegen.indices import Array
 from scvi_codegen.native.building import Library
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.binding import ArrayBinding
@@ -44,15 +44,19 @@ class EventFormulasOfArrays:
     Attributes:
         momenta, velocities: their arrays; a system that is defined by a Hamiltonian has no velocities.
         moving: both.
+        symbols: time and parameters by name.
     """
 
     def __init__(self, interface: Interface, problem: RunSizes) -> None:
+        from scvi_codegen.formulas.symbols import TIME, symbol  # here: slow to import, with the modules that use it
+
         self.interface, self.problem = interface, problem
         coordinates, momenta = interface.layout.coordinates, interface.layout.momenta
         self.momenta = [*momenta] or [Array(f"p_{array.name}", array.axes) for array in coordinates]
         self.velocities = [] if momenta else [Array(f"{array.name}_dot", array.axes) for array in coordinates]
         self.moving = [*self.momenta, *self.velocities]
         self.arrays = [*coordinates, *interface.layout.fields, *self.moving]
+        self.symbols = {name: symbol(name) for name in (TIME, *interface.parameters)}
 
     def terms(self, formula: Any, event: Event) -> tuple[ArrayTerm, ...]:
         """Return the terms of a formula of an event.
@@ -61,12 +65,10 @@ class EventFormulasOfArrays:
             EventError: if the formula is invalid, or an index leaves its array.
         """
         from scvi_codegen.formulas.arrays import parse_sums  # here: slow to import, with the modules that use it
-        from scvi_codegen.formulas.symbols import TIME, symbol
 
         layout, problem = self.interface.layout, self.problem
-        symbols = {name: symbol(name) for name in (*self.interface.parameters, TIME)}
         try:
-            terms = parse_sums(str(formula), self.arrays, symbols, layout.tables)
+            terms = parse_sums(str(formula), self.arrays, self.symbols, layout.tables)
             accesses = tuple((access, term.loops) for term in terms for _, access in term.slots)
             check_accesses(replace(layout, accesses=accesses), problem.sizes, problem.places)
         except ScviCodegenError as error:
@@ -80,40 +82,28 @@ def events_of_entries(interface: Interface, problem: RunSizes, events: tuple[Eve
     Raises:
         EventError: if a formula is invalid, or an index leaves its array.
     """
-    from sympy import Add  # here: slow to import, with the modules that use it
+    from scvi_codegen.formulas.array_entries import EntryRules, entry_names, formula_of_entries  # here: imports SymPy
 
-    from scvi_codegen.formulas.numpy_values import Elements
-    from scvi_codegen.formulas.symbols import symbol
-
-    parser = EventFormulasOfArrays(interface, problem)
-    endings = {f"{name}_dot": (name, "_dot") for name in interface.coordinates}
-
-    def entries(access: Access, indices: tuple[Any, ...], count: int) -> list[str]:
-        array, ending = endings.get(access.array.name, (access.array.name, ""))
-        columns: list[NDArray[np.int64]] = [np.broadcast_to(each, count) for each in indices]
-        return ["_".join([array, *map(str, row)]) + ending for row in zip(*columns, strict=True)] or [array + ending]
+    parser, sizes = EventFormulasOfArrays(interface, problem), problem.sizes
+    names = {array.name: entry_names(array, sizes) for array in parser.arrays if array not in parser.velocities}
+    rules = EntryRules(sizes, problem.places, names)
 
     def formula(text: Any, event: Event) -> Expr:
-        total = []
-        for term in parser.terms(text, event):
-            elements = Elements(term.loops, problem.sizes, problem.places)
-            count = len(next(iter(elements.index.values()))) if elements.index else 1
-            names = [(slot, entries(access, elements.of(access), count)) for slot, access in term.slots]
-            total += [term.formula.xreplace({slot: symbol(each[k]) for slot, each in names}) for k in range(count)]
-        return cast("Expr", Add(*total))
+        try:
+            return formula_of_entries(str(text), parser.arrays, parser.symbols, interface.layout.tables, rules)
+        except ScviCodegenError as error:
+            raise EventError(f"the formula '{text}' of the event '{event.function}': {error}") from error
 
-    def event_of_entries(event: Event) -> Event:
-        changes = {str(formula(name, event)): formula(value, event) for name, value in event.changes}
-        where = tuple(cast("Any", formula(condition, event)) >= 0 for condition in event.conditions)
-        return replace(
+    return tuple(
+        replace(
             event,
             function=formula(event.function, event),
-            then=changes or None,
-            where=where or None,
+            then={str(formula(name, event)): formula(value, event) for name, value in event.changes} or None,
+            where=tuple(cast("Any", formula(each, event)) >= 0 for each in event.conditions) or None,
             restitution=None if event.restitution is None else formula(event.restitution, event),
         )
-
-    return tuple(map(event_of_entries, events))
+        for event in events
+    )
 
 
 class Term:
@@ -124,13 +114,12 @@ class Term:
 
         from scvi_codegen.formulas.expressions import PIECEWISE_CONSTANT
         from scvi_codegen.formulas.numpy_values import Elements
-        from scvi_codegen.formulas.symbols import TIME, symbol
 
         elements = Elements(term.loops, parser.problem.sizes, parser.problem.places)
         self.entries = [(access.array.name, elements.of(access)) for _, access in term.slots]
         self.count = len(next(iter(elements.index.values()))) if elements.index else 1
         self.array = term.slots[0][1].array if len(term.slots) == 1 and term.formula == term.slots[0][0] else None
-        variables = [slot for slot, _ in term.slots] + [symbol(name) for name in (TIME, *parser.interface.parameters)]
+        variables = [*(slot for slot, _ in term.slots), *parser.symbols.values()]
         self.is_constant = not term.formula.free_symbols
         modules: list[Any] = [{name: function for name, (_, function) in PIECEWISE_CONSTANT.items()}, "numpy"]
         self._value = lambdify(variables, term.formula, modules)
