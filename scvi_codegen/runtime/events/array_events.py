@@ -86,7 +86,7 @@ def events_of_entries(interface: Interface, problem: RunSizes, events: tuple[Eve
 
     parser, sizes = EventFormulasOfArrays(interface, problem), problem.sizes
     names = {array.name: entry_names(array, sizes) for array in parser.arrays if array not in parser.velocities}
-    rules = EntryRules(sizes, problem.places, names)
+    rules = EntryRules(sizes, cast("Any", problem.places), names)
 
     def formula(text: Any, event: Event) -> Expr:
         try:
