@@ -288,8 +288,12 @@ class Sources:
         """
         if second and (self.system.integrands or self.system.damping):
             return None
-        if forms_of(self.system).one_form:
-            raise MethodError(f"derivatives of steps are not available for the first-order system '{self.system.name}'")
+        if forms_of(self.system).one_form and (second or self.system.clock):
+            raise MethodError(
+                f"{'second derivatives' if second else 'derivatives in transformed time'} of steps are not available "
+                f"for the first-order system '{self.system.name}': use "
+                f"{'first derivatives and differences of them' if second else 'the system in physical time'}"
+            )
         program = self.program(fallback=True)
         if not program.newton:  # explicit steps
             program = self._derived(solver="newton")

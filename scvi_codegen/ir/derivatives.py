@@ -74,6 +74,7 @@ class Derivatives:
             gradient of mu . phi along dy; ``None`` if phi is linear.
         damping: derivatives of the rate of a damping with respect to parameters.
         clock: of the time of a time-transformed system.
+        momenta: derivatives of the momenta of a first-order system with respect to q, y, parameters and time.
         iterated: if vectors are propagated by fixed-point iteration, too; ``None`` if only by Newton's factors.
         lanes: vectors that are propagated at a time.
     """
@@ -83,6 +84,7 @@ class Derivatives:
     curvatures: tuple[Kernel | None, ...] = ()
     damping: InputDerivatives | None = None
     clock: TimeDerivatives | None = None
+    momenta: InputDerivatives | None = None
     iterated: PointDerivatives | None = None
     lanes: int = 8
 
@@ -95,7 +97,7 @@ class Derivatives:
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """Kernels that the program lacks."""
-        given: tuple[InputDerivatives, ...] = (*self.by_given, *((self.damping,) if self.damping else ()))
+        given: tuple[InputDerivatives, ...] = (*self.by_given, *(each for each in (self.damping, self.momenta) if each))
         clock = (self.clock.kernel, self.clock.level) if self.clock else ()
         given += (self.iterated.masses,) if self.iterated and self.iterated.masses else ()
         return tuple(each for each in (*(partials.kernel for partials in given), *self.curvatures, *clock) if each)
@@ -118,10 +120,16 @@ class Derivatives:
         return 2 * self.program.dimension + len(self.program.layout.parameters) + 2
 
     @property
+    def momentum_numbers(self) -> int:
+        """Number of derivatives of momenta at both ends of a step, of their factors and pivots, and of momenta."""
+        m = self.program.dimension
+        return 2 * len(self.momenta.entries) + m * (m + 2) if self.momenta else 0
+
+    @property
     def partials(self) -> int:
-        """Number of derivatives at all points: with respect to h, arguments, parameters and time, a damping."""
+        """Number of derivatives: at all points by h, arguments, parameters and time, a damping; of momenta."""
         damped = bool(self.damping)
-        return sum(
+        return self.momentum_numbers + sum(
             group.points
             * (
                 group.derivative.arguments

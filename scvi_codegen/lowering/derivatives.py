@@ -38,6 +38,7 @@ def derivatives_of(
         curvatures=tuple(_curvature(system, group) for group in stages.stage_groups) if second else (),
         damping=_input_derivatives(system, "damping", (stages.damping,), ()) if program.damping else None,
         clock=_time_derivatives(system, stages.stage_groups[0].arguments) if system.clock else None,
+        momenta=_momentum_derivatives(system) if program.quantities.first_order_rates else None,
         iterated=point_derivatives_of(system, program.fixed_point) if program.fixed_point else None,
     )
 
@@ -54,6 +55,17 @@ def _input_derivatives(
         entries.values(),
         of=arguments,
         purpose="Nonzero derivatives with respect to parameters and time.",
+    )
+    return InputDerivatives(entries=tuple(entries), kernel=kernel)
+
+
+def _momentum_derivatives(system: MechanicalSystem) -> InputDerivatives:
+    """Return the derivatives of the momenta theta of a first-order system."""
+    forms = forms_of(system)
+    entries = jacobian(forms.one_form, (*forms.legendre_arguments, *system.parameters, system.time))
+    purpose = "Nonzero derivatives of the momenta with respect to q, y, parameters and time."
+    kernel = system_kernel(
+        system, "momentum_derivatives", entries.values(), of=forms.legendre_arguments, purpose=purpose
     )
     return InputDerivatives(entries=tuple(entries), kernel=kernel)
 

@@ -44,6 +44,14 @@ MOST_CHOICES = 8
 """Largest number of choices of y whose gauge is integrated; the shortest result is used."""
 
 
+UNSUPPORTED = {
+    "constraints": "half of the variables are momenta of the others, so that a constraint acts on momenta",
+    "forces": "half of the variables are auxiliary, without momenta on which a force acts; a gradient belongs into H",
+    "damping": "half of the variables are auxiliary, without momenta that decrease",
+}
+"""Arguments that a first-order system does not support, with the reason."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FirstOrderSystem(HamiltonianSystem):
     """System of a Lagrangian that is linear in all velocities, whose coordinates are its whole state.
@@ -232,14 +240,15 @@ def first_order_system(fields: Mapping[str, Any]) -> FirstOrderSystem | None:
     if fields.get("rotations") or not is_first_order(lagrangian, velocities):
         return None
     name = fields["name"]
-    for key in ("constraints", "forces", "damping", "inputs"):
+    for key, reason in UNSUPPORTED.items():
         if fields.get(key):
             raise SystemDefinitionError(
-                f"the Lagrangian of '{name}' is linear in the velocities (a first-order system), for which {key} are "
-                f"not supported: leave them out, or add the missing kinetic energy, such as m*{velocities[0]}**2/2"
+                f"the Lagrangian of '{name}' is linear in the velocities (a first-order system), for which {key} is "
+                f"not supported: {reason}. Leave it out, or add the missing kinetic energy, such as "
+                f"m*{velocities[0]}**2/2"
             )
     form = OneForm(name, lagrangian, coordinates, velocities, fields["time"])
-    kept = {key: fields[key] for key in ("name", "time", "parameters", "defaults")}
+    kept = {each: fields[each] for each in ("name", "time", "parameters", "defaults", "inputs") if each in fields}
     text = {"coordinates": [q.name for q in coordinates], "lagrangian": format_expression(lagrangian)}
     return FirstOrderSystem(**kept, **first_order_form(form), definition=fields.get("definition") or text)
 

@@ -233,14 +233,18 @@ def test_lagrangians_without_a_gauge(coordinates: str, lagrangian: str, message:
 
 
 def test_unsupported_uses_are_named() -> None:
-    with pytest.raises(sc.SystemDefinitionError, match="forces are not supported"):
+    with pytest.raises(sc.SystemDefinitionError, match="forces is not supported: half of"):
         sc.LagrangianSystem.from_text("system", ["x", "y"], "x*y_dot - x**2 - y**2", forces={"x": "-x_dot"})
     particle = system("massless particle")
     for method in ("scvi:3", "composition"):
         with pytest.raises(sc.MethodError):
             sc.compile_stepper(particle, method).integrate([1.0, 0.2], h=0.1, steps=1)
-    with pytest.raises(sc.MethodError, match="derivatives of steps are not available for the first-order system"):
-        sc.compile_stepper(particle, "svi:2").jacobian([0.2], [1.0], 0.1)
+    run = sc.compile_stepper(particle, "svi:2").integrate([1.0, 0.2], h=0.1, steps=2)
+    with pytest.raises(sc.MethodError, match="second derivatives of steps are not available for the first-order"):
+        run.hessian_product(np.ones((3, 2)), np.ones(2))
+    slow = sc.compile_stepper(sc.reparametrise(particle, "1 + x**2"), "svi:2")
+    with pytest.raises(sc.MethodError, match="derivatives in transformed time of steps are not available"):
+        slow.jacobian(*particle.halves([1.0, 0.2]), 0.1)
     with pytest.raises(sc.SystemDefinitionError, match="use reparametrise"):
         sc.compile_stepper(particle, "svi:2", time_transformation="1 + x**2").integrate([1.0, 0.2], h=0.1, t_end=1.0)
 
@@ -251,3 +255,85 @@ def test_transformed_time() -> None:
     plain = sc.compile_stepper(particle, "svi:6").integrate([1.0, 0.2], h=0.05, steps=40)
     assert slow.t[-1] == pytest.approx(2.0)
     assert slow.variables[-1] == pytest.approx(plain.variables[-1], abs=1e-11)
+
+
+def differences(function, size: int, width: float = 1e-3) -> np.ndarray:
+    """Derivatives of a function by differences of fourth order, one column per argument."""
+    columns = []
+    for unit in width * np.eye(size):
+        near, far = (function(k * unit) - function(-k * unit) for k in (1, 2))
+        columns.append((8 * near - far) / (12 * width))
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize("method", ["svi:2", "stoermer-verlet", "radau-iia:2"])
+def test_derivatives_of_steps_against_differences(method: str) -> None:
+    """The one-form and H depend on parameters and time, so that every derivative of theta occurs."""
+    driven = sc.LagrangianSystem.from_text(
+        "driven",
+        ["x", "y", "a", "b"],
+        COUPLED.replace("(b + b**3/5)", "(1 + t/3)*(b + c*b**3 + c*a*y)"),
+        parameters={"c": 0.2},
+    )
+    stepper = sc.compile_stepper(driven, method)
+    z, h, t = np.concatenate(driven.halves(CASES["coupled"][3])), 0.1, 0.7
+
+    def end(state: np.ndarray, moment: float = t, step: float = h, c: float = 0.2) -> np.ndarray:
+        return np.concatenate(stepper.step(state[:2], state[2:], step, moment, [c]))
+
+    exact = stepper.sensitivity(z[:2], z[2:], h, t)
+    assert np.abs(exact.state - differences(lambda d: end(z + d), 4)).max() < 1e-11
+    assert np.abs(exact.parameters - differences(lambda d: end(z, c=0.2 + d[0]), 1)).max() < 1e-11
+    assert np.abs(exact.t - differences(lambda d: end(z, moment=t + d[0]), 1)[:, 0]).max() < 1e-11
+    assert np.abs(exact.h - differences(lambda d: end(z, step=h + d[0]), 1)[:, 0]).max() < 1e-11
+    seeds = np.array([1.0, -2.0, 0.5, 3.0])
+    assert np.abs(stepper.vjp(z[:2], z[2:], h, t, cotangents=seeds) - seeds @ exact.state).max() < 1e-13
+
+
+def test_sensitivities_fits_and_chaos_indicators_of_runs() -> None:
+    centre = system("guiding centre")
+    stepper, start = sc.compile_stepper(centre, "svi:2"), CASES["guiding centre"][3]
+    run = stepper.integrate(start, h=0.1, steps=50)
+    ends = [stepper.integrate(start, h=0.1, steps=50, parameters={"mu": 0.1 + d}) for d in (1e-4, -1e-4)]
+    by_mu = [np.concatenate([each.q[-1], each.p[-1]]) for each in ends]
+    assert run.sensitivity().parameters[-1][:, 0] == pytest.approx((by_mu[0] - by_mu[1]) / 2e-4, rel=1e-6)
+    q, p = centre.halves(start)
+    found = sc.fit(
+        stepper,
+        run.t,
+        run.variables[:, :2],
+        observed=["x", "y"],
+        q=q,
+        p=p,
+        h=0.1,
+        unknown=["mu"],
+        parameters={"mu": 0.2},
+    )
+    assert found.parameters["mu"] == pytest.approx(0.1, abs=1e-8)
+    exponents = run.lyapunov_exponents()
+    assert exponents[0] > exponents[-1]
+
+
+def test_periodic_orbits() -> None:
+    particle = system("massless particle")
+    orbit = sc.periodic_orbit(sc.compile_stepper(particle, "svi:4"), [1.0], [0.2], period=11.8, steps=40)
+    run = sc.compile_stepper(particle, "svi:4").integrate(orbit.q, orbit.p, h=orbit.period / 40, steps=40)
+    assert np.abs(run.variables[-1] - run.variables[0]).max() < 1e-11
+
+
+def test_inputs() -> None:
+    driven = sc.LagrangianSystem.from_text(
+        "driven", ["x", "y"], "(x + x**3)*y_dot - x**2/2 - y**2/2 - f*x - f**2*y", inputs=["f"]
+    )
+    times = np.linspace(0.0, 2.0, 3)
+    run = sc.compile_stepper(driven, "svi:4").integrate(
+        [0.3, 0.2], h=0.05, steps=40, inputs={"f": (times, [0.0, 1.0, 0.0])}
+    )
+
+    def right(t: float, z: np.ndarray) -> list[float]:
+        f = min(t, 2.0 - t)
+        return [-(z[1] + f**2) / (1 + 3 * z[0] ** 2), (z[0] + f) / (1 + 3 * z[0] ** 2)]
+
+    half = solve_ivp(right, (0.0, 1.0), [0.3, 0.2], method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
+    expected = solve_ivp(right, (1.0, 2.0), half, method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
+    assert np.abs(run.variables[-1] - expected).max() < 1e-10

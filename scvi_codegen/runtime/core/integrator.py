@@ -183,7 +183,7 @@ class Integrator(LinearisedMethod):
         if not self.interface.has_action:
             raise MethodError(
                 f"{self.interface.method} has no discrete Lagrangian for '{self.interface.system}': this requires SVI, "
-                "SCVI or a Gauss method, and no forces"
+                "SCVI or a Gauss method, no forces, and a system of second order"
             )
         check_inputs_given(self.interface, parameters)
         ends = self._vector(q0, "q0"), self._vector(q1, "q1"), self._parameters(parameters)

@@ -4,6 +4,9 @@
 #include "../newton/newton_from_line.h"
 #include "../newton/newton.h"
 #include "linear_maps.h"
+#ifdef FIRST_ORDER_SYSTEM
+#include "momenta_of_variables.h"
+#endif
 
 /* Tangent and adjoint vectors over a step solved by Newton's method. The step is a function of its inputs x and the
  * unknowns z, which satisfy R(z, x) = 0: dz = -R_z^-1 R_x dx forward (JVP), and with the transposed matrices backward
@@ -23,7 +26,12 @@ typedef struct {
   wide *grown; /* variations of gamma h; NULL without damping */
   real growth; /* gamma h */
   real p1[M];
+#ifdef FIRST_ORDER_SYSTEM
+  step_data with_momenta;
+  momentum_factors momenta;
+#endif
 } linearised_step;
+
 #ifdef TIME_TRANSFORMATION
 /* Linearised time of a time-transformed system: time is an integral along the curve, by the weights of the first
  * points. Requires: INTEGRAL_WEIGHT, RATE_ENTRY, RATE_DERIVATIVES, the kernels rate_derivatives and
@@ -104,6 +112,9 @@ static linearised_step linearised_in(const step_data *step, real *workspace)
   at.growth = 0;
   at.grown = NULL;
 #endif
+#ifdef FIRST_ORDER_SYSTEM
+  at.momenta = momentum_factors_in((real *)at.v - MOMENTUM_NUMBERS);
+#endif
   return at;
 }
 
@@ -111,7 +122,18 @@ static linearised_step linearised_in(const step_data *step, real *workspace)
 static int linearise_step(linearised_step *at, const solver_options *options, real *q1, real *p1,
     solver_report *report)
 {
+#ifdef FIRST_ORDER_SYSTEM
+  const int known = transform(at->step->t, at->step->q0, at->step->p0, at->step->parameters, at->momenta.theta,
+      at->step->scratch);
+  const step_data *step = &at->with_momenta;
+  at->with_momenta = *at->step;
+  at->with_momenta.theta0 = at->momenta.theta;
+  at->step = step;
+  if (known != OK)
+    return known;
+#else
   const step_data *step = at->step;
+#endif
   const long long before = report->iterations;
   real dq[M], dp[2 * M] = {0}, size_p[SITES], size_q[M], *partials = at->partials;
   int keep = 0, status = newton_from_line(step, at->data, dp, &keep, options, report);
@@ -125,13 +147,22 @@ static int linearise_step(linearised_step *at, const solver_options *options, re
     return SINGULAR;
   for (int f = 0; f < COUNT_OF_GROUPS; f++)
     partials = derivatives_of_group(STAGE_GROUPS + f, step, at->data->z, partials);
-  for (int i = 0; i < M; i++)
+#ifdef FIRST_ORDER_SYSTEM
+  status = variables_of_momenta(step, at->data->z, dq, dp);
+#endif
+  for (int i = 0; i < M; i++) {
+    dq[i] = step->q0[i] + dq[i];
     at->p1[i] = step->p0[i] + (dp[i] + dp[M + i]);
+  }
+#ifdef FIRST_ORDER_SYSTEM
+  if (status == OK)
+    status = linearise_momenta(step, dq, at->p1, &at->momenta);
+#endif
   for (int i = 0; q1 && i < M; i++) {
-    q1[i] = step->q0[i] + dq[i];
+    q1[i] = dq[i];
     p1[i] = at->p1[i];
   }
-  return OK;
+  return status;
 }
 
 /* From v (back: to it) to all rows, or from dz to the last one, that of p1, through all points. */
@@ -215,6 +246,9 @@ static void jvp_step(const linearised_step *at)
   memset(at->grown, 0, sizeof(wide));
   growth_wide(at->step, 0, at->v, at->grown);
 #endif
+#ifdef FIRST_ORDER_SYSTEM
+  momenta_wide(&at->momenta, 0, at->v);
+#endif
   momentum_rows(at, 0);
   through_points(at, 0, at->v, NULL);
   solve_forward(at);
@@ -222,6 +256,9 @@ static void jvp_step(const linearised_step *at)
   end_time(at, 0);
   end_position(at, 0);
   end_momentum(at, 0);
+#ifdef FIRST_ORDER_SYSTEM
+  variables_wide(&at->momenta, 0, at->v);
+#endif
 }
 
 /* Replaces v, adjoint variables of (q1, p1, parameters, t + h, h), by those of (q0, p0, parameters, t, h) (VJP). dz
@@ -232,6 +269,9 @@ static void vjp_with_unknowns(const linearised_step *at)
 #ifdef DAMPED
   memset(at->grown, 0, sizeof(wide));
 #endif
+#ifdef FIRST_ORDER_SYSTEM
+  variables_wide(&at->momenta, 1, at->v);
+#endif
   end_momentum(at, 1);
   end_position(at, 1);
   end_time(at, 1);
@@ -239,6 +279,9 @@ static void vjp_with_unknowns(const linearised_step *at)
   solve_back(at);
   through_points(at, 1, at->v, NULL);
   momentum_rows(at, 1);
+#ifdef FIRST_ORDER_SYSTEM
+  momenta_wide(&at->momenta, 1, at->v);
+#endif
 #ifdef DAMPED
   growth_wide(at->step, 1, at->v, at->grown);
 #endif
