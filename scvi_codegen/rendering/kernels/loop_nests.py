@@ -13,6 +13,7 @@ additions on sizes, never on the number of threads.
 
 import re
 from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import replace
 from enum import Enum, auto
 from typing import TypeAlias
 
@@ -198,6 +199,8 @@ class Nest:
             return [*lines, *innermost]
         lines += [line for k in outer for line in prepare(k)]
         loop, inner = self.looped.loops[depth_of], self._inside(depth_of + 1, prepare, innermost, finish, behind)
+        if loop.near:
+            lines.append(f"const section row = row_of(near_{loop.near}, index_{loop.behind}, {self._window()});")
         last = depth_of + 1 == len(self.looped.loops)
         lines += self._parts(loop, inner, behind) if last else _loop(loop, *self._span(loop), inner)
         return lines + [line for k in outer for line in finish(k)]
@@ -231,8 +234,16 @@ class Nest:
         if self.sharing is Sharing.IN_TILES and loop is self.looped.loops[1]:
             return f"between({_first(loop)}, here->behind.first, here->behind.end)", "here->behind.end"
         if loop.near:
-            return _first(loop), f"near_{loop.near}->first[index_{loop.behind} + 1]"
+            return "row.first", "row.end"
         return _first(loop), size_text(loop.end)
+
+    def _window(self) -> str:
+        """Return the elements that the rows of a list of neighbours add to in a task: here, their offset and width."""
+        arrays = {target.array for target in self.looped.writes}
+        if self.sharing is not Sharing.BY_PLACES or len(arrays) != 1:
+            return "NULL, 0, 0"
+        (array,) = arrays
+        return f"here, start_{array.name}, {product_text(replace(array, axes=array.axes[1:]))}"
 
     def adding(self, k: int, value: str) -> list[str]:
         """Return the lines that add to the element of a target, if the task adds to it."""
@@ -359,8 +370,6 @@ def counter(loop: Loop) -> str:
 
 
 def _first(loop: Loop) -> str:
-    if loop.near:
-        return f"near_{loop.near}->first[index_{loop.behind}]"
     return f"index_{loop.behind} + 1" if loop.behind else size_text(loop.first)
 
 

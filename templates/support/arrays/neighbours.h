@@ -226,6 +226,20 @@ static void update_list(neighbours *list, const points *of, const double *q, con
     list->valid = -1.0;
 }
 
+/* Part of the row of point i whose terms add to elements of a task; all of it if those of point i are among them. Point
+ * i has `width` elements from start + i width on. */
+static inline section row_of(const neighbours *list, long long i, const window *here, long long start, long long width)
+{
+  section row = {list->first[i], list->first[i + 1]};
+  if (!here || here->whole || (start + (i + 1) * width > here->of.first && start + i * width < here->of.end))
+    return row;
+  while (row.first < row.end && start + (list->others[row.first] + 1) * width <= here->of.first)
+    row.first++;
+  while (row.first < row.end && start + list->others[row.end - 1] * width >= here->of.end)
+    row.end--;
+  return row;
+}
+
 static void release(neighbours *list)
 {
   free(list->at), free(list->first), free(list->others), free(list->smaller);
