@@ -4,7 +4,8 @@ SymPy's functions of time and speeds are converted to plain symbols, and back.
 """
 
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -141,6 +142,15 @@ ATTEMPTS = 24
 SEED = 20250101
 
 
+def samples(expressions: Sequence[Expr]) -> Iterator[list[Any]]:
+    """Yield the values of expressions in 60 digits at random points, without points at which one is undefined."""
+    symbols = sorted(set().union(*(expression.free_symbols for expression in expressions)), key=str)
+    tape, generator = Tape(expressions, symbols), random.Random(SEED)
+    for _ in range(ATTEMPTS):
+        with suppress(ArithmeticError):
+            yield tape([mp.mpf(generator.uniform(0.1, 1.0)) for _ in symbols])
+
+
 def independent_of(known: Sequence[Expr], asked: Sequence[Expr], rates: Sequence[Symbol]) -> tuple[int, ...]:
     """Return the indices of ``asked`` expressions that are independent of earlier ones, by ranks at a point.
 
@@ -168,13 +178,7 @@ def _values(expressions: Sequence[Expr], rates: Sequence[Symbol]) -> NDArray[np.
     entries |= {(k, len(rates)): expression.xreplace(resting) for k, expression in enumerate(expressions)}
     if problem := next(filter(None, map(unsupported_part, entries.values())), None):
         raise SystemDefinitionError(f"in the constraints: {problem}")
-    symbols = sorted(set().union(*(entry.free_symbols for entry in entries.values())), key=str)
-    tape, generator = Tape(list(entries.values()), symbols), random.Random(SEED)
-    for _ in range(ATTEMPTS):
-        try:
-            values = tape([mp.mpf(generator.uniform(0.1, 1.0)) for _ in symbols])
-        except ArithmeticError:
-            continue
+    for values in samples([*entries.values()]):
         matrix = np.zeros((len(expressions), len(rates) + 1))
         for position, value in zip(entries, values, strict=True):
             matrix[position] = float(value)
