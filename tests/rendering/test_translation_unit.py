@@ -49,7 +49,7 @@ int main(void)
   status |= ring_inverse_masses(&problem, run.inverse_mass);
   for (int i = 0; i < N; i++)
     run.q[i] = 0.125 * i, run.p[i] = 0.5 - 0.0625 * i;
-  status |= ring_advance(&run, &problem, {steps}, NULL, &of_all);
+  status |= ring_advance(&run, {steps}, 0, &problem, NULL, NULL, NULL, NULL, NULL, &of_all);
   show(one.q, M), show(one.p, M), show(run.q, N), show(run.p, N);
   return status;
 }}

@@ -104,7 +104,7 @@ def test_chain_needs_one_product_per_correction(stepper):
     run = stepper.start(q, h=1e-4, **data)
     memory, binding = run._memory, run.stepper.binding
     report = Binding.new(binding, "report *")
-    Binding.function(binding, "advance")(memory, binding._arrays[memory].problem, 10, binding.null, report)
+    Binding.function(binding, "advance")(memory, 10, 0, binding._arrays[memory].problem, *[binding.null] * 5, report)
     assert report.products <= report.iterations
 
 

@@ -372,7 +372,7 @@ int main(void)
     run.q[i] = 0.3 * (i * 37 % 101) / 101.0;
   shared_inverse_masses(&given, run.inverse_mass);
   run.h = 0.01, run.threads = {threads};
-  return shared_advance(&run, &given, {steps}, 0, 0);
+  return shared_advance(&run, {steps}, 0, &given, 0, 0, 0, 0, 0, 0);
 }}
 """
 COUNTED = """

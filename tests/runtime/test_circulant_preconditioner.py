@@ -60,7 +60,10 @@ def products_of(stepper, q, h, *, steps=1, **given):
     memory, binding = run._memory, run.stepper.binding
     report = Binding.new(binding, "report *")
     assert (
-        Binding.function(binding, "advance")(memory, binding._arrays[memory].problem, steps, binding.null, report) == 0
+        Binding.function(binding, "advance")(
+            memory, steps, 0, binding._arrays[memory].problem, *[binding.null] * 5, report
+        )
+        == 0
     )
     return report.products
 

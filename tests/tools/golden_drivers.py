@@ -197,9 +197,9 @@ def arrays_driver(
     rows = "".join(f"static const int table_{k}[] = {{{', '.join(map(str, row))}}};\n" for k, row in enumerate(tables))
     listed = ", ".join(f"table_{k}" for k in range(len(tables))) or "NULL"
     run = (
-        f"CALL(advance_to)(&run, &problem, {t_end!r}, {tolerance!r}, {steps}, NULL, &report)"
+        f"CALL(advance_to)(&run, {t_end!r}, {tolerance!r}, {steps}, 0, &problem, NULL, NULL, NULL, NULL, NULL, &report)"
         if t_end
-        else f"CALL(advance)(&run, &problem, {steps}, NULL, &report)"
+        else f"CALL(advance)(&run, {steps}, 0, &problem, NULL, NULL, NULL, NULL, NULL, &report)"
     )
     held = """
   CALL(constraint_sizes)(&problem, &run);

@@ -6,7 +6,7 @@ functions of known sizes, so that steppers, runs and trajectories are the same f
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property, partial
 from types import SimpleNamespace
@@ -47,6 +47,8 @@ FAILURES_BY_SOLVER = {
 }
 
 
+REPORTED = ("steps", "stored", "iterations", "change", "t")
+"""Fields of the report of a call."""
 ALIGNMENT = 64
 """Alignment in bytes, the size of the widest SIMD register."""
 
@@ -239,44 +241,20 @@ class ArrayBinding(Binding):
         return float(super().function("step_error")(run))
 
     def _advance(self, run: Any, *arguments: Any) -> int:
-        return self._advance_plan(run, None, *arguments)
+        return self._call_steps("advance", run, arguments)
 
-    def _advance_to(self, run: Any, t_end: float, tolerance: float, *arguments: Any) -> int:
-        status = self._advance_plan(run, (t_end, tolerance), *arguments)
+    def _advance_to(self, run: Any, *arguments: Any) -> int:
+        status = self._call_steps("advance_to", run, arguments)
         run.h = 0.0  # of the last step
         return status
 
-    def _advance_plan(
-        self,
-        run: Any,
-        plan: tuple[float, float] | None,
-        steps: int,
-        save_every: int,
-        _: Any,
-        options: Any,
-        t: Any,
-        q: Any,
-        p: Any,
-        iterations: Any,
-        report: Any,
-        __: Any,
-    ) -> int:
-        """Take steps and store every ``save_every``-th state, and the state at the target time."""
-        made, done, row, status, problem = super().new("report *"), 0, 0, 0, self._arrays[run].problem
-        function = super().function("advance" if plan is None else "advance_to", run)
-        arrived = plan is not None and _arrived(run, plan[0])
-        while done < steps and not (status or arrived):
-            size = min(save_every - run.step % save_every, steps - done)
-            status = function(problem, *(plan or ()), size, options, made)
-            done, run.iterations = done + made.steps, run.iterations + made.iterations
-            arrived = plan is not None and _arrived(run, plan[0])
-            if not status and (run.step % save_every == 0 or arrived):
-                t[row], iterations[row] = run.t, run.iterations
-                for target, state in ((q, run.q), (p, run.p)):
-                    self._ffi.memmove(target + row * self.count, state, 8 * self.count)
-                row, run.iterations = row + 1, 0
-        report.steps, report.stored, report.iterations = done, row, made.iterations
-        report.change, report.t = made.change, made.t
+    def _call_steps(self, name: str, run: Any, arguments: Sequence[Any]) -> int:
+        """Call a function of C with the problem in place of parameters, and copy its report."""
+        *plan, _, options, t, q, p, iterations, report, _ = arguments
+        made, problem = super().new("report *"), self._arrays[run].problem
+        status = super().function(name)(run, *plan, problem, options, t, q, p, iterations, made)
+        for field in REPORTED:
+            setattr(report, field, getattr(made, field))
         return int(status)
 
     def _step(
@@ -411,7 +389,3 @@ def momentum_of(q: Numbers, p: Numbers, of: ArrayMap, *, absolute: bool = False)
         return float(np.sum(p[..., of.component]))
     sign = 1.0 if absolute else -1.0
     return float(np.sum(q[..., of.component] * p[..., of.other] + sign * q[..., of.other] * p[..., of.component]))
-
-
-def _arrived(run: Any, t_end: float) -> bool:
-    return bool(run.t == t_end and run.t_low == 0.0)

@@ -28,7 +28,8 @@ Jacobian: TypeAlias = Callable[[Array], tuple[Array, Array]]
 
 
 def _unit_rows(jacobian: Array) -> Array:
-    sizes = np.linalg.norm(jacobian, axis=1, keepdims=True)
+    with np.errstate(over="ignore"):
+        sizes = np.linalg.norm(jacobian, axis=1, keepdims=True)
     return jacobian / np.where(sizes > 0.0, sizes, 1.0)
 
 

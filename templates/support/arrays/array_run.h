@@ -16,7 +16,9 @@ typedef struct job {
   const problem *given;
   const solver_options *options;
   double t_end, tolerance;
-  long long steps;
+  long long steps, every; /* at most; between stored states, 0: none is stored */
+  double *t, *q, *p;
+  int *iterations;
 } job;
 
 #ifdef SCVI_THREADS
@@ -79,27 +81,49 @@ solver_options NAME(default_options)(void)
   return options;
 }
 
+/* Stores the state after a step if its number is a multiple of `every`, and at the end of an adaptive run; each thread
+ * its own coordinates. */
+static void store_state(run_memory *run, const job *way, solver_report *report, long long n, int arrived)
+{
+  const section own = mine(run, n);
+  const size_t size = sizeof(double) * (size_t)(own.end - own.first);
+  const long long row = report->stored, first = row * n + own.first;
+  if (way->every == 0 || (run->step % way->every != 0 && !arrived))
+    return;
+  memcpy(way->q + first, run->q + own.first, size);
+  memcpy(way->p + first, run->p + own.first, size);
+  if (run->part == 0) {
+    way->t[row] = run->t;
+    way->iterations[row] = (int)run->iterations;
+  }
+  run->iterations = 0;
+  report->stored++;
+}
+
 static int take_steps(run_memory *run, const job *way, solver_report *report)
 {
   const long long n = NAME(coordinates)(way->given);
   while (report->steps < way->steps) {
+    const long long before = report->iterations;
     int status;
     report->t = run->t;
     status = perform_step(run, way->given, n, way->options, report);
     if (status != OK)
       return status;
     add_compensated(&run->t, &run->t_low, run->h, 0.0);
+    run->iterations += report->iterations - before;
     run->step++;
     report->steps++;
+    store_state(run, way, report, n, 0);
   }
   return OK;
 }
 
-int NAME(advance)(run_memory *run, const problem *given, long long steps, const solver_options *options,
-    solver_report *report)
+int NAME(advance)(run_memory *run, long long steps, long long every, const problem *given,
+    const solver_options *options, double *t, double *q, double *p, int *iterations, solver_report *report)
 {
   const solver_options standard = NAME(default_options)();
-  const job way = {.go = take_steps, .given = given, .options = options ? options : &standard, .steps = steps};
+  const job way = {take_steps, given, options ? options : &standard, 0.0, 0.0, steps, every, t, q, p, iterations};
   solver_report unread;
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);

@@ -480,13 +480,15 @@ static int advance_run(event_run *run, real t_end, real tolerance, const event_s
 #ifdef EVENTS_OF_ANY_SIZE
   array_report made;
   if (run->h != 0.0)
-    status = NAME(advance)(run, event_host->problem, 1, step->options, &made);
+    status = NAME(advance)(run, 1, 0, event_host->problem, step->options, NULL, NULL, NULL, NULL, &made);
 #if EVENTS_CONTROLLED
   else {
-    status = NAME(advance_to)(run, event_host->problem, t_end, tolerance, 1, step->options, &made);
+    status = NAME(advance_to)(run, t_end, tolerance, 1, 0, event_host->problem, step->options, NULL, NULL, NULL, NULL,
+        &made);
     run->h = 0.0;
   }
 #endif
+  run->iterations = 0;
   own->change = made.change;
   own->iterations = made.iterations;
   *iterations = (int)made.iterations;

@@ -324,6 +324,7 @@ static int take_trials(run_memory *run, const job *way, solver_report *report)
   begin_trials(run, &now, way->tolerance, &standard);
   run->direction = (way->t_end - run->t) - run->t_low < 0 ? -1 : 1;
   while (report->steps < way->steps && (run->t != way->t_end || run->t_low != 0.0)) {
+    const long long before = report->iterations;
     int status = find_step(run, &now, options, report);
     if (status == OK)
       status = confirm_step(run, &now, options, report);
@@ -331,15 +332,18 @@ static int take_trials(run_memory *run, const job *way, solver_report *report)
       return status;
     accept_trial(run, &now);
     run->t = now.at.t, run->t_low = now.at.t_low, run->h = now.step.h;
+    run->iterations += report->iterations - before;
     report->steps++;
+    store_state(run, way, report, now.step.n, run->t == way->t_end && run->t_low == 0.0);
   }
   return OK;
 }
 
-int NAME(advance_to)(run_memory *run, const problem *given, double t_end, double tolerance, long long steps,
-    const solver_options *options, solver_report *report)
+int NAME(advance_to)(run_memory *run, double t_end, double tolerance, long long steps, long long every,
+    const problem *given, const solver_options *options, double *t, double *q, double *p, int *iterations,
+    solver_report *report)
 {
-  const job way = {take_trials, given, options, t_end, tolerance, steps};
+  const job way = {take_trials, given, options, t_end, tolerance, steps, every, t, q, p, iterations};
   solver_report unread;
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
