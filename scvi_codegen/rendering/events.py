@@ -173,15 +173,12 @@ class EventFormulas:
 def _check_changes(interface: Interface, events: Sequence[SearchedEvent]) -> None:
     """Raise :class:`EventError` where changes of the state are not supported."""
     changing = [event for event in events if event.changes_state]
-    unsupported = {
-        "a time transformation": bool(interface.time_transformation or interface.energy_parameter),
-    }
-    for what, present in unsupported.items():
-        if present and changing:
-            raise EventError(
-                f"the event '{changing[0].function}' changes the state, which is not supported with {what}: make the "
-                "event terminal, change the state in Python, and start the next run from it"
-            )
+    if changing and interface.energy_parameter:
+        raise EventError(
+            f"the event '{changing[0].function}' changes the state, which is impossible in transformed time, where the "
+            f"energy is the constant '{interface.energy_parameter}': compile the original system with "
+            "time_transformation=.., or use adaptive steps (t_end)"
+        )
 
 
 def _arrays(interface: Interface) -> list[Array]:

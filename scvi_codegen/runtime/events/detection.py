@@ -116,7 +116,7 @@ class CrossingSearch:
         status = binding.function("advance_with_changes", run._memory)(
             self.watch,
             plan.t_end,
-            plan.tolerance,
+            plan.tau or plan.tolerance,
             size,
             *run._arguments,
             most,

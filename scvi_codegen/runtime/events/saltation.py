@@ -75,10 +75,10 @@ def _changes(states: SavedStates, numbers: NDArray[np.intp]) -> dict[int, tuple[
             continue
         if states.forward < 0.0:
             raise StateError("derivatives through events that change the state require a run forward in time")
-        if states.stepper.constraints:
+        if states.stepper.constraints or states.stepper.interface.time_transformation:
             raise StateError(
                 "derivatives through events that change the state are not available with constraints, onto which the "
-                "new state is projected: use coordinates without constraints"
+                "new state is projected, and with a time transformation: use free coordinates and other steps"
             )
         here = slice(*np.searchsorted(crossings.t, span, side="right").tolist())
         rows = np.searchsorted(states.t, crossings.t[here])
