@@ -265,7 +265,7 @@ def test_ensembles_with_fixed_steps(plan):
 
 
 def test_energy_of_a_billiard_stays_at_round_off():
-    """Rounding errors of about 20,000 impulses of circular walls have the mean 0; without correction 2e-17 each adds up."""
+    """Rounding errors of 20,000 impulses of circular walls have the mean 0; without correction 2e-17 each adds up."""
     stepper = compile_stepper(POINT, "svi:1", flags=FLAGS, events=STADIUM)
     run = stepper.integrate([0.3, -0.2], velocity=[0.8, 0.6], h=2.0, steps=22_000, save_every=2000)
     assert sum(map(len, run.events)) > 19_000
