@@ -20,8 +20,9 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import combinations, permutations
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,10 @@ from scvi_codegen.tables.precision import Number, mp
 SAMPLES = 4
 NEGLIGIBLE = mp.mpf(10) ** -30
 """Largest value of an expression that is zero, relative to the largest of its terms."""
+MOST_SHEARED = 6
+"""Largest number of coordinates of which shears are tried."""
+MOST_SHOWN = 12
+"""Largest number of operations of an entry of the two-form in a message."""
 RANK_TOLERANCE = 1e-10
 MOST_CHOICES = 8
 """Largest number of choices of y whose gauge is integrated; the shortest result is used."""
@@ -290,6 +295,30 @@ def first_order_form(form: OneForm) -> dict[str, Any]:
     }
 
 
+def shear(form: OneForm) -> tuple[Symbol, Expr, tuple[str, ...]] | None:
+    """Return s, g and half of the variables between which omega vanishes if s - g(z) is put in the place of s.
+
+    This replaces omega(k, u) by omega(k, u) - g_k omega(s, u), which is zero if g_k is the ratio of the two and does
+    not depend on u and s: b_k / b_s of a guiding centre with the parallel velocity u.
+    """
+    z, v = form.coordinates, form.velocities
+    cyclic_first = sorted(range(len(z)), key=lambda i: form.lagrangian.has(z[i]))
+    for s, u, k in permutations(cyclic_first, 3) if len(z) <= MOST_SHEARED else ():
+        pairs = tuple(sorted((s, u))), tuple(sorted((k, u)))
+        ratio = sympy.S.Zero if form.vanishing.intersection(pairs) else form.omega(k, u) / form.omega(s, u)
+        if ratio == 0 or not all(form.is_zero(ratio.diff(z[i])) for i in (s, u)):
+            continue
+        g = sympy.integrate(ratio.xreplace({z[u]: sympy.S.One, z[s]: sympy.S.One}), z[k], manual=True)
+        if g.has(sympy.Integral, sympy.Piecewise):
+            continue
+        rate = v[s] - sympy.Add(*(g.diff(q) * dot for q, dot in zip(z, v, strict=True)))
+        sheared = replace(form, lagrangian=form.lagrangian.subs({z[s]: z[s] - g, v[s]: rate}, simultaneous=True))
+        for chosen in sheared.choices():
+            if sheared.integral(chosen) is not None:
+                return z[s], g, tuple(z[i].name for i in chosen)
+    return None
+
+
 def _refusal(form: OneForm, refused: Sequence[Sequence[int]]) -> str:
     z, half = form.coordinates, len(form.coordinates) // 2
     start = f"the Lagrangian of '{form.name}' is linear in the velocities, theta . v - H. "
@@ -301,10 +330,24 @@ def _refusal(form: OneForm, refused: Sequence[Sequence[int]]) -> str:
             "coordinates no longer occur in it"
         )
     pairs = ", ".join(f"({z[i]}, {z[j]})" for i, j in sorted(form.vanishing))
+    entries = {
+        (z[i], z[j]): form.omega(i, j) for i, j in combinations(range(len(z)), 2) if (i, j) not in form.vanishing
+    }
+    shown = [
+        f"omega{pair} = {format_expression(each)}" for pair, each in entries.items() if each.count_ops() < MOST_SHOWN
+    ]
+    found = shear(form)
+    remedy = "Use other coordinates, such as flux coordinates of a magnetic field, or canonical ones"
+    if found:
+        s, g, chosen = found
+        remedy = (
+            f"Put {format_expression(s - g)} in the place of {s}, and its time derivative in that of {s}_dot: then "
+            f"omega vanishes between {' and '.join(chosen)}"
+        )
     return (
-        f"{start}{half} coordinates are required between which the two-form d theta vanishes; it vanishes "
-        f"{'only between ' + pairs if pairs else 'between no two coordinates'}. Use other coordinates, such as flux "
-        "coordinates of a magnetic field, or canonical ones"
+        f"{start}{half} coordinates are required between which the two-form omega = d theta vanishes; it vanishes "
+        f"{'only between ' + pairs if pairs else 'between no two coordinates'}{': ' * bool(shown)}"
+        f"{', '.join(shown[:3])}. {remedy}"
     )
 
 

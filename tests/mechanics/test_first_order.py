@@ -116,6 +116,54 @@ def test_vortices_on_a_curved_surface_agree_with_the_published_reference() -> No
     assert run.energy_error() < 1e-14
 
 
+def test_lotka_volterra_in_four_dimensions_agrees_with_the_published_reference() -> None:
+    """GeometricProblems.jl, ``lotka_volterra_4d``: ``reference_solution`` at t = 100; in logarithms, sheared."""
+    energy = "(exp({a}) + exp(b) + exp(c) + exp(d) - {a} - 2*b - c - d)"
+    theta = "(b + d)*{a_dot} + c*b_dot + ({a} + d)*c_dot + b*d_dot - "
+    found = r"omega\(a, b\) = -1, .* Put a \+ c in the place of a, .* omega vanishes between b and c"
+    with pytest.raises(sc.SystemDefinitionError, match=found):
+        sc.LagrangianSystem.from_text("prey", [*"abcd"], (theta + energy).format(a="a", a_dot="a_dot"))
+    moved = (theta + energy).format(a="(a + c)", a_dot="(a_dot + c_dot)")
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_text("prey", [*"abcd"], moved), "svi:8")
+    a, b, c, d = stepper.integrate([math.log(2.0), 0.0, 0.0, 0.0], h=0.05, steps=2000).variables[-1]
+    published = [1.6390462434739954, 1.3764800055785835, 0.37903204434372284, 1.4399236281802124]
+    assert np.abs(np.exp([a + c, b, c, d]) - published).max() < 1e-11
+
+
+def test_a_shear_of_the_toroidal_angle() -> None:
+    """Guiding centre in the tokamak field of H. Qin, X. Guan, W. Tang, Physics of Plasmas 16 (2009) 042510."""
+    R, _, Z, u, q0, mu = z = sympy.symbols("R phi Z u q0 mu")
+    v = sympy.symbols("R_dot phi_dot Z_dot u_dot")
+    potential = [Z / (2 * R), -((R - 1) ** 2 + Z**2) / (2 * q0), -sympy.log(R) / 2]
+    field = [Z / (q0 * R), 1 / R, (1 - R) / (q0 * R)]
+    size = sympy.sqrt(Z**2 + q0**2 + (1 - R) ** 2) / (q0 * R)
+    scales = [1, R, 1, 0]
+    theta = [a + u * b * s / size for a, b, s in zip((*potential, 0), (*field, 0), scales, strict=True)]
+    hamiltonian = u**2 / 2 + mu * size
+    given = {"name": "tokamak", "coordinates": z[:4], "velocities": v, "parameters": {q0: 2**0.5, mu: 2.25e-6}}
+    lagrangian = sum(a * dot for a, dot in zip(theta, v, strict=True)) - hamiltonian
+    with pytest.raises(sc.SystemDefinitionError, match=r"Put -Z\*log\(R\)/q0 \+ phi in .* R and u"):
+        sc.LagrangianSystem.from_sympy(lagrangian=lagrangian, **given)
+    shear = Z * sympy.log(R) / q0
+    rate = shear.diff(R) * v[0] + shear.diff(Z) * v[2]
+    sheared = sc.LagrangianSystem.from_sympy(lagrangian=lagrangian.subs(v[1], v[1] - rate), **given)
+    run = sc.compile_stepper(sheared, "svi:4").integrate([1.05, 0.0, 0.0, -4.3e-4], h=400.0, steps=60)
+    assert run.momentum_errors().max() < 1e-13
+    numbers = {q0: 2**0.5, mu: 2.25e-6}
+    omega = [[theta[j].diff(z[i]) - theta[i].diff(z[j]) for j in range(4)] for i in range(4)]
+    gradient = [hamiltonian.diff(each) for each in z[:4]]
+    evaluate = sympy.lambdify(z[:4], [[[e.subs(numbers) for e in row] for row in (*omega, gradient)]])
+
+    def right(_: float, state: np.ndarray) -> np.ndarray:
+        rows = np.array(evaluate(*state)[0], float)
+        return np.linalg.solve(rows[:4], rows[4])
+
+    expected = solve_ivp(right, (0.0, 24000.0), [1.05, 0.0, 0.0, -4.3e-4], method="DOP853", rtol=1e-12, atol=1e-15)
+    end = run.variables[-1].copy()
+    end[1] -= end[2] * math.log(end[0]) / 2**0.5
+    assert np.abs(end - expected.y[:, -1]).max() < 1e-8
+
+
 def test_translations_of_vortices_conserve_their_centre() -> None:
     strengths, pairs = {1: 1.0, 2: 2.0, 3: 0.5}, ((1, 2), (1, 3), (2, 3))
     theta = " + ".join(f"{g}*x{i}*y{i}_dot" for i, g in strengths.items())
