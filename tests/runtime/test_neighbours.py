@@ -130,6 +130,39 @@ def test_steps_longer_than_the_skin_miss_no_pair(method: str) -> None:
         stepper("svi:2", 0.01, SOFT).integrate(r, velocity=20 * v, h=0.1, steps=1)
 
 
+def of_other_kind(kind: str, near: str) -> Any:
+    """Return a Hamiltonian, a system with bonds of fixed length, or one with friction between neighbours."""
+    given: dict[str, Any] = {"name": kind, "coordinates": ["r[N, 3]"], "parameters": {"box": BOX, "cut": CUT}}
+    if near == "near":
+        given["neighbours"] = {"near": {"of": "r", "box": "box", "cutoff": "cut", "skin": 0.05}}
+    lagrangian = f"{KINETIC} - sum(i < j in {near}, {SOFT})"
+    if kind == "hamiltonian":
+        formula = f"sum(i in N, sum(a in 3, p_r[i, a]**2)/2) + sum(i < j in {near}, {SOFT})"
+        return sc.HamiltonianSystem.from_text(**given, hamiltonian=formula)
+    if kind == "bonds":
+        bond = "sum(a in 3, (r[bonds[b, 0], a] - r[bonds[b, 1], a])**2) = (box/4)**2 for b in B"
+        return sc.LagrangianSystem.from_text(
+            **given, lagrangian=lagrangian, tables={"bonds[B, 2]": [[0, 1], [2, 3]]}, constraints=[bond]
+        )
+    friction = f"sum(i < j in {near}, {SOFT}*sum(a in 3, (r_dot[i, a] - r_dot[j, a])**2))"
+    return sc.LagrangianSystem.from_text(**given, lagrangian=lagrangian, dissipation=friction)
+
+
+@pytest.mark.parametrize(
+    ("kind", "method"), [("hamiltonian", "svi:2"), ("bonds", "stoermer-verlet"), ("friction", "svi:2")]
+)
+def test_hamiltonians_constraints_and_friction_have_lists(kind: str, method: str) -> None:
+    r, v = start()
+    r[[1, 3]] = r[[0, 2]] + np.array([[0, 0, BOX / 4], [0, BOX / 4, 0]])
+    v[:4] = 0.0
+    run, other = (
+        sc.compile_stepper(of_other_kind(kind, near), method).integrate(r, v, h=0.01, steps=40)
+        for near in ("near", "N")
+    )
+    assert abs(np.diff(run.q["r"][[0, -1]], axis=0)).max() > 0.2
+    assert run.q["r"] == pytest.approx(other.q["r"], abs=1e-11)
+
+
 def test_parameters_that_change_make_another_list() -> None:
     r, v = start()
     runs = []

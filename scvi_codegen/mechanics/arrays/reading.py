@@ -77,7 +77,7 @@ def arrays_from_text(arguments: Mapping[str, Any]) -> ArraySystem:
         moving = dict(zip(velocities, arrays, strict=False))
         for each in turning:
             moving |= zip(each.rates, each.torques(), strict=False)
-        applied.append(friction(parse_sums(dissipation, everything, known, index_tables), moving))
+        applied.append(friction(parse_sums(dissipation, everything, known, index_tables, lists), moving))
     kind = ArrayLagrangian if hamiltonian is None else ArrayHamiltonian
     system = kind(
         name=arguments["name"],

@@ -54,7 +54,7 @@ static double farthest(const points *of, const double *at, const double *X, long
 }
 
 /* Cells of width `reach` or more, about one per point at most; without a period cells are repeated. */
-static long long divide(const points *of, double reach, cells *in)
+static long long divide_box(const points *of, double reach, cells *in)
 {
   const double most = 1.0 + pow((double)of->count, 1.0 / of->components);
   long long total = 1;
@@ -136,7 +136,7 @@ static int reserve(int **indices, long long *capacity, long long size)
 }
 
 /* Appends the smaller neighbours of point i from its cell and the adjacent ones; returns 0 without memory. */
-static int search(neighbours *list, const points *of, const cells *in, int i, const double *x, double reach,
+static int find_smaller(neighbours *list, const points *of, const cells *in, int i, const double *x, double reach,
     long long total, long long *count)
 {
   const long long cell = cell_of(in, of, x), *size = in->size;
@@ -175,7 +175,7 @@ static int make_list(neighbours *list, const points *of, const double *x, double
 {
   const long long count = of->count;
   cells in = {0};
-  const long long total = divide(of, reach, &in);
+  const long long total = divide_box(of, reach, &in);
   double *memory = malloc(sizeof(double) * (size_t)(of->components * count + 1));
   long long *starts = calloc((size_t)(total + count + 3), sizeof(long long)), *begin = starts + total + 2, pairs = 0;
   int done = memory && starts && (in.order = malloc(sizeof(int) * (size_t)(count + 1)));
@@ -185,7 +185,7 @@ static int make_list(neighbours *list, const points *of, const double *x, double
       in.x[axis] = memory + axis * count;
     sort_points(&in, of, x, total);
     for (long long j = 0; j < count && done; j++) {
-      done = search(list, of, &in, (int)j, x + j * of->components, reach, total, &pairs);
+      done = find_smaller(list, of, &in, (int)j, x + j * of->components, reach, total, &pairs);
       begin[j + 1] = pairs;
     }
     done = done && transpose(list, of, begin);
