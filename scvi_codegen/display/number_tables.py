@@ -1,7 +1,6 @@
 """Tables of nodes, quadratures and Runge-Kutta tableaux: radicals if they are short, and decimals."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import singledispatch
 from typing import TypeAlias
 
@@ -9,6 +8,7 @@ import sympy
 
 from scvi_codegen.display.cards import Html, grid, plain
 from scvi_codegen.display.mathml import mathml
+from scvi_codegen.display.page.blocks import Cell, TableBlock
 from scvi_codegen.tables.closed_forms import exact_points, exact_rule, exact_tableau
 from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import Number, Vector, mp
@@ -26,35 +26,20 @@ MOST_ROWS = 12
 """Largest number of rows of a table in a notebook."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NumberTable:
-    """Lines of text and of exact numbers.
-
-    Attributes:
-        title: of the table.
-        columns: headings.
-        rows: as many cells as columns.
-    """
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str | sympy.Expr, ...], ...]
-
-
 @singledispatch
-def number_table(part: Part) -> NumberTable:
-    """Return all numbers of a part of a method."""
+def number_table(part: Part) -> TableBlock:
+    """Return all numbers of a part of a method, named by its title."""
     raise TypeError(f"{part!r} must be Nodes, a Quadrature or a Tableau")
 
 
 @number_table.register
-def _(nodes: Nodes) -> NumberTable:
+def _(nodes: Nodes) -> TableBlock:
     series = range(len(nodes.points))
     return _listed(f"Nodes: {nodes.name}, degree {nodes.degree}", series, [("node", nodes.points, exact_points(nodes))])
 
 
 @number_table.register
-def _(quadrature: Quadrature) -> NumberTable:
+def _(quadrature: Quadrature) -> TableBlock:
     points, weights = exact_rule(quadrature) or (None, None)
     columns: list[_Column] = [("point", quadrature.points, points), ("weight", quadrature.weights, weights)]
     columns += [(f"weight of derivative {k}", w, None) for k, w in enumerate(quadrature.derivative_weights, 1)]
@@ -62,25 +47,25 @@ def _(quadrature: Quadrature) -> NumberTable:
     return _listed(title, range(1, len(quadrature) + 1), columns)
 
 
-def _listed(title: str, series: range, columns: Sequence[_Column]) -> NumberTable:
+def _listed(title: str, series: range, columns: Sequence[_Column]) -> TableBlock:
     """Return a table with one row per point, numbered by the ``series``."""
     written = [written for column in columns for written in _columns(*column)]
-    return NumberTable(
-        title=title,
+    return TableBlock(
+        name=title,
         columns=("", *(name for name, _ in written)),
         rows=tuple((str(number), *(cells[k] for _, cells in written)) for k, number in enumerate(series)),
     )
 
 
-def numbers_html(table: NumberTable) -> Html:
+def numbers_html(table: TableBlock) -> Html:
     """Return the first rows of a table for a notebook."""
     rows = [[_cell(cell) for cell in row] for row in table.rows[:MOST_ROWS]]
     left_out = len(table.rows) - len(rows)
-    title = f"{table.title} (the first {MOST_ROWS} of {len(table.rows)} rows)" if left_out else table.title
+    title = f"{table.name} (the first {MOST_ROWS} of {len(table.rows)} rows)" if left_out else table.name
     return grid(rows, head=table.columns, caption=title)
 
 
-def _cell(cell: str | sympy.Expr) -> Html:
+def _cell(cell: Cell) -> Html:
     return plain(cell) if isinstance(cell, str) else Html(mathml(cell))
 
 
@@ -111,7 +96,7 @@ def _columns(
 
 
 @number_table.register
-def _(tableau: Tableau) -> NumberTable:
+def _(tableau: Tableau) -> TableBlock:
     exact = exact_tableau(tableau)
     rows: list[tuple[str | sympy.Expr, ...]]
     if exact is not None and all(short(x) for part in (*exact[0], *exact[1:]) for x in part):
@@ -121,8 +106,8 @@ def _(tableau: Tableau) -> NumberTable:
         rows = [(decimal(tableau.c[i]), *map(decimal, tableau.A[i])) for i in range(tableau.stages)]
         rows.append(("", *map(decimal, tableau.b)))
     labels = [*(str(i) for i in range(1, tableau.stages + 1)), "b"]
-    return NumberTable(
-        title=f"Runge-Kutta tableau: {tableau.name}, of order {tableau.order}",
+    return TableBlock(
+        name=f"Runge-Kutta tableau: {tableau.name}, of order {tableau.order}",
         columns=("", "c", *(f"a_i{k}" for k in range(1, tableau.stages + 1))),
         rows=tuple((label, *row) for label, row in zip(labels, rows, strict=True)),
     )

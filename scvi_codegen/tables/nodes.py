@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar, cast
 
 from scvi_codegen.errors import MethodError, closest
 from scvi_codegen.representation import summary
 from scvi_codegen.tables.precision import DIGITS, Number, Vector, mp
-from scvi_codegen.validation import WHOLE, checked_count, checks_arguments
+from scvi_codegen.validation import TEXT, WHOLE, checked_count, checks_arguments
 
 GUARD = 20
 MOST_POINTS = 128
@@ -28,6 +28,7 @@ Expressions: TypeAlias = tuple[Any, ...]
 """Tuple of SymPy expressions (SymPy is imported only where one is made)."""
 
 Item = TypeVar("Item")
+Family = TypeVar("Family", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -206,8 +207,15 @@ def nodes_of(name: str, degree: int, points: Callable[[int], Vector]) -> Nodes:
     return Nodes(name=name, degree=degree, points=points(point_count(degree, "the degree", least=1) + 1))
 
 
-@checks_arguments(MethodError, degree=WHOLE)
-@lru_cache(maxsize=None, typed=True)
+def cached_family(member: Family) -> Family:
+    """Decorate a function of whole numbers and texts: its arguments are checked, its results are cached."""
+    kinds = {
+        name: WHOLE if kind == "int" else TEXT for name, kind in member.__annotations__.items() if name != "return"
+    }
+    return checks_arguments(MethodError, **kinds)(cast("Family", lru_cache(maxsize=None, typed=True)(member)))
+
+
+@cached_family
 def chebyshev_lobatto(degree: int) -> Nodes:
     """Return the Chebyshev-Gauss-Lobatto nodes -cos(j pi / degree), both ends among them.
 
@@ -217,43 +225,37 @@ def chebyshev_lobatto(degree: int) -> Nodes:
     return nodes_of("chebyshev-lobatto", degree, chebyshev_lobatto_points)
 
 
-@checks_arguments(MethodError, degree=WHOLE)
-@lru_cache(maxsize=None, typed=True)
+@cached_family
 def legendre_lobatto(degree: int) -> Nodes:
     """Return -1, 1 and the extrema of the Legendre polynomial of this degree."""
     return nodes_of("legendre-lobatto", degree, legendre_lobatto_points)
 
 
-@checks_arguments(MethodError, degree=WHOLE)
-@lru_cache(maxsize=None, typed=True)
+@cached_family
 def equispaced(degree: int) -> Nodes:
     """Return nodes with equal gaps, both ends among them; interpolation on them is unstable beyond degree 10 or so."""
     return nodes_of("equispaced", degree, equispaced_points)
 
 
-@checks_arguments(MethodError, degree=WHOLE)
-@lru_cache(maxsize=None, typed=True)
+@cached_family
 def legendre_gauss(degree: int) -> Nodes:
     """Return the degree + 1 roots of the Legendre polynomial P_{degree+1}: no end among them."""
     return nodes_of("legendre-gauss", degree, legendre_gauss_points)
 
 
-@checks_arguments(MethodError, degree=WHOLE)
-@lru_cache(maxsize=None, typed=True)
+@cached_family
 def chebyshev_gauss(degree: int) -> Nodes:
     """Return the degree + 1 roots of the Chebyshev polynomial T_{degree+1}: no end among them."""
     return nodes_of("chebyshev-gauss", degree, chebyshev_gauss_points)
 
 
-@checks_arguments(MethodError, degree=WHOLE)
-@lru_cache(maxsize=None, typed=True)
+@cached_family
 def radau_left(degree: int) -> Nodes:
     """Return the degree + 1 left Radau points: -1 among them, 1 not."""
     return nodes_of("radau-left", degree, radau_left_points)
 
 
-@checks_arguments(MethodError, degree=WHOLE)
-@lru_cache(maxsize=None, typed=True)
+@cached_family
 def radau_right(degree: int) -> Nodes:
     """Return the degree + 1 right Radau points: 1 among them, -1 not."""
     return nodes_of("radau-right", degree, radau_right_points)

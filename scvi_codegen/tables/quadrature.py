@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Literal, TypeVar
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.representation import summary
 from scvi_codegen.tables.nodes import (
     ascending_points,
+    cached_family,
     chebyshev_gauss_points,
     chebyshev_lobatto_points,
     family_named,
@@ -29,7 +29,6 @@ from scvi_codegen.tables.nodes import (
     to_unit,
 )
 from scvi_codegen.tables.precision import DIGITS, Matrix, Number, Vector, mp
-from scvi_codegen.validation import TEXT, WHOLE, checks_arguments
 
 GUARD = 20
 COMPUTED_TOLERANCE = mp.mpf("1e-12")
@@ -171,8 +170,7 @@ def gauss_type(name: str, points: Vector, order: int, weight: Callable[[Number, 
     return Quadrature(name=f"{name}:{len(points)}", points=points, weights=tuple(weights), order=order)
 
 
-@checks_arguments(MethodError, n=WHOLE)
-@lru_cache(maxsize=None, typed=True)
+@cached_family
 def gauss_legendre(n: int) -> Quadrature:
     """Return the n-point Gauss-Legendre rule, of order 2n.
 
@@ -187,8 +185,7 @@ def gauss_legendre(n: int) -> Quadrature:
     return gauss_type("gauss-legendre", legendre_gauss_points(n), 2 * n, lambda x, P2: 2 * (1 - x * x) / (n * n * P2))
 
 
-@checks_arguments(MethodError, n=WHOLE)
-@lru_cache(maxsize=None, typed=True)
+@cached_family
 def gauss_lobatto(n: int) -> Quadrature:
     """Return the n-point Gauss-Lobatto rule (both ends are points, n >= 2), of order 2n - 2.
 
@@ -198,8 +195,7 @@ def gauss_lobatto(n: int) -> Quadrature:
     return gauss_type("gauss-lobatto", legendre_lobatto_points(n), 2 * n - 2, lambda x, P2: 2 / (n * (n - 1) * P2))
 
 
-@checks_arguments(MethodError, n=WHOLE, side=TEXT)
-@lru_cache(maxsize=None, typed=True)
+@cached_family
 def gauss_radau(n: int, side: Literal["left", "right"] = "left") -> Quadrature:
     """Return the n-point Gauss-Radau rule with a point at -1 (``"left"``) or at 1 (``"right"``), of order 2n - 1.
 
@@ -222,8 +218,7 @@ def cosine_sum(angle: Number, count: int, last: int) -> Number:
     return 1 - sum(terms)
 
 
-@checks_arguments(MethodError, n=WHOLE)
-@lru_cache(maxsize=None, typed=True)
+@cached_family
 def clenshaw_curtis(n: int) -> Quadrature:
     """Return the n-point Clenshaw-Curtis rule (n >= 2) on -cos(j pi / N), N = n - 1; of order n, or n + 1 for odd n.
 
@@ -239,8 +234,7 @@ def clenshaw_curtis(n: int) -> Quadrature:
     return Quadrature(name=f"clenshaw-curtis:{n}", points=points, weights=weights, order=n + n % 2)
 
 
-@checks_arguments(MethodError, n=WHOLE)
-@lru_cache(maxsize=None, typed=True)
+@cached_family
 def fejer(n: int) -> Quadrature:
     """Return Fejer's first rule with n points -cos((2j + 1) pi / 2n); of order n, or n + 1 for odd n.
 
@@ -252,8 +246,7 @@ def fejer(n: int) -> Quadrature:
     return Quadrature(name=f"fejer:{n}", points=chebyshev_gauss_points(n), weights=weights, order=n + n % 2)
 
 
-@checks_arguments(MethodError, n=WHOLE, derivatives=WHOLE)
-@lru_cache(maxsize=None, typed=True)
+@cached_family
 def hermite(n: int, derivatives: int = 1) -> Quadrature:
     """Return the rule that integrates the Hermite interpolant of f and its derivatives at n Lobatto points.
 

@@ -20,6 +20,7 @@ from scvi_codegen.errors import MethodError
 from scvi_codegen.representation import summary
 from scvi_codegen.tables.basis import cardinal_integrals, transpose
 from scvi_codegen.tables.nodes import (
+    cached_family,
     chebyshev_gauss_points,
     chebyshev_lobatto_points,
     point_count,
@@ -29,7 +30,6 @@ from scvi_codegen.tables.nodes import (
 from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
 from scvi_codegen.tables.quadrature import gauss_legendre, gauss_lobatto, gauss_radau, split_name
 from scvi_codegen.tables.stability import determinant_polynomial, has_roots_right, is_nonnegative, modulus_gap, reduced
-from scvi_codegen.validation import WHOLE, checks_arguments
 
 CONDITION_TOLERANCE = mp.mpf("1e-45")
 SMALL_DENOMINATOR, ROUNDINGS = 1000, 2
@@ -207,8 +207,7 @@ def _stages(s: Any) -> int:
     return point_count(s, "the number of stages", least=0, most=MAX_STAGES)
 
 
-@checks_arguments(MethodError, s=WHOLE)
-@lru_cache(maxsize=None, typed=True)
+@cached_family
 def gauss(s: int) -> Tableau:
     """Return the s-stage Gauss method: collocation on the Gauss-Legendre points; order 2s, symplectic, symmetric.
 
@@ -218,15 +217,13 @@ def gauss(s: int) -> Tableau:
     return collocation_tableau(gauss_legendre(_stages(s)).abscissae, f"gauss:{s}")
 
 
-@checks_arguments(MethodError, s=WHOLE)
-@lru_cache(maxsize=None, typed=True)
+@cached_family
 def radau_iia(s: int) -> Tableau:
     """Return the s-stage Radau IIA method: collocation on the right Radau points; order 2s - 1."""
     return collocation_tableau(gauss_radau(_stages(s), "right").abscissae, f"radau-iia:{s}")
 
 
-@checks_arguments(MethodError, s=WHOLE)
-@lru_cache(maxsize=None, typed=True)
+@cached_family
 def radau_ia(s: int) -> Tableau:
     """Return the s-stage Radau IA method: b of the left Radau quadrature, A from D(s); order 2s - 1.
 
@@ -235,15 +232,13 @@ def radau_ia(s: int) -> Tableau:
     return symplectic_partner(collocation_tableau(gauss_radau(_stages(s), "left").abscissae), f"radau-ia:{s}")
 
 
-@checks_arguments(MethodError, s=WHOLE)
-@lru_cache(maxsize=None, typed=True)
+@cached_family
 def lobatto_iiia(s: int) -> Tableau:
     """Return the s-stage Lobatto IIIA method (s >= 2): collocation on the Lobatto points; order 2s - 2, symmetric."""
     return collocation_tableau(gauss_lobatto(_stages(s)).abscissae, f"lobatto-iiia:{s}")
 
 
-@checks_arguments(MethodError, s=WHOLE)
-@lru_cache(maxsize=None, typed=True)
+@cached_family
 def lobatto_iiib(s: int) -> Tableau:
     """Return the s-stage Lobatto IIIB method (s >= 2), the symplectic partner of Lobatto IIIA; order 2s - 2.
 
@@ -252,16 +247,14 @@ def lobatto_iiib(s: int) -> Tableau:
     return symplectic_partner(lobatto_iiia(s), f"lobatto-iiib:{s}")
 
 
-@checks_arguments(MethodError, s=WHOLE)
-@lru_cache(maxsize=None, typed=True)
+@cached_family
 def chebyshev_gauss(s: int) -> Tableau:
     """Return collocation on the s Chebyshev-Gauss points: symmetric, of order s for even s and s + 1 for odd s."""
     s = point_count(s, "the number of Chebyshev-Gauss stages", least=1, most=MAX_STAGES)
     return collocation_tableau(to_unit(chebyshev_gauss_points(s)), f"chebyshev-gauss:{s}")
 
 
-@checks_arguments(MethodError, s=WHOLE)
-@lru_cache(maxsize=None, typed=True)
+@cached_family
 def chebyshev_lobatto(s: int) -> Tableau:
     """Return collocation on the s >= 2 Chebyshev-Lobatto points: symmetric, of order s (even s) or s + 1 (odd s)."""
     s = point_count(s, "the number of Chebyshev-Lobatto stages", least=2, most=MAX_STAGES)

@@ -147,19 +147,9 @@ def _certificate(
         *identity_checks(tested),
         largest_step(tested),
     )
+    parameters = {name.name: value for name, value in single.constants.items()}
     return issued(
-        stepper.source.files,
-        title=stepper.title,
-        system=single.name,
-        method=method.name,
-        flags=stepper.flags,
-        q=start.q,
-        p=start.p,
-        t=start.t,
-        h=start.h,
-        parameters={name.name: value for name, value in single.constants.items()},
-        checks=checks,
-        seconds=time.perf_counter() - began,
+        stepper, start, began=began, system=single.name, method=method.name, parameters=parameters, checks=checks
     )
 
 

@@ -5,8 +5,9 @@ import importlib.metadata
 import json
 import math
 import os
+import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
@@ -16,6 +17,8 @@ from scvi_codegen.errors import MethodError, StateError, StepFailedError, System
 from scvi_codegen.files.atomic import write_text
 from scvi_codegen.native.announcements import announced
 from scvi_codegen.representation import summary
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.verification.system_under_test import State
 
 
 class Outcome(StrEnum):
@@ -182,13 +185,19 @@ class Certificate:
         write_text(path, self.to_json())
 
 
-def issued(files: Mapping[str, str], *, q: Iterable[float], p: Iterable[float], **attributes: Any) -> Certificate:
-    """Return the certificate of C files by name for a state; ``attributes`` are the other attributes."""
+def issued(stepper: Stepper, state: State, *, began: float, **attributes: Any) -> Certificate:
+    """Return the certificate of a stepper measured at a state; ``attributes`` are the other attributes."""
+    assert stepper.source is not None
     return Certificate(
+        title=stepper.interface.title,
         version=_installed_version(),
-        checksum=hashlib.sha256("".join(files.values()).encode()).hexdigest(),
-        q=tuple(map(float, q)),
-        p=tuple(map(float, p)),
+        checksum=hashlib.sha256("".join(stepper.source.files.values()).encode()).hexdigest(),
+        flags=stepper.flags,
+        q=tuple(map(float, state.q)),
+        p=tuple(map(float, state.p)),
+        t=state.t,
+        h=state.h,
+        seconds=time.perf_counter() - began,
         **attributes,
     )
 

@@ -119,10 +119,7 @@ def curve_section(method: Method) -> Section:
 
 def tables_section(method: Method, entries: tuple[TableEntry, ...]) -> Section:
     """Return the section on nodes, weights, tableaux, and all entries that the equations name."""
-    contents: list[Content] = []
-    for part in method.parts:
-        numbers = number_table(part)
-        contents.append(TableBlock(columns=numbers.columns, rows=numbers.rows, name=numbers.title))
+    contents: list[Content] = [number_table(part) for part in method.parts]
     skipped = {*SHOWN_WITH_PARTS, *("ac" if any(isinstance(part, Tableau) for part in method.parts) else "")}
     for prefix in dict.fromkeys(_indices(entry)[0] for entry in entries):
         if prefix not in skipped:

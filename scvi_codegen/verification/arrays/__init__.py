@@ -84,20 +84,15 @@ def verify_arrays(
         *convergence_checks(tested),
         *whole_checks(start),
     )
-    initial = tested.initial
+    parameters = dict(zip(stepper.interface.parameters, arrays.numbers, strict=True))
     return issued(
-        stepper.source.files,
-        title=stepper.interface.title,
+        stepper,
+        tested.initial,
+        began=began,
         system=system.name,
         method=chosen.name,
-        flags=stepper.flags,
-        q=initial.q,
-        p=initial.p,
-        t=initial.t,
-        h=initial.h,
-        parameters=dict(zip(stepper.interface.parameters, arrays.numbers, strict=True)),
+        parameters=parameters,
         checks=checks,
-        seconds=time.perf_counter() - began,
     )
 
 
