@@ -16,13 +16,11 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.benchmark.cases.unforced import STATES, Case, Formulation, Vector, scaled
+from scvi_codegen.files.toml_text import package_table
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 
 BODIES, FEW_BODIES = 1000, 24
 SEED = 20261123
-TILT = (np.cos(0.3), np.sin(0.3), 0.0, 0.0)
-"""Initial attitude of the tops."""
-KINETIC = "(A*omega_1**2 + B*omega_2**2 + C*omega_3**2)/2"
 
 
 def attitude_rates(q: Vector, w: Vector, of: Mapping[str, Any], torque: Vector = ()) -> list[Any]:
@@ -87,65 +85,30 @@ def dumbbell(x: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
     return [*velocity, *rates[:4], *force, *rates[4:]]
 
 
-def _case(
-    name: str,
-    lagrangian: str,
-    rates: Callable[..., list[Any]],
-    parameters: Mapping[str, float],
-    q: Sequence[float],
-    velocity: Sequence[float],
-    *,
-    span: float,
-    fine: float,
-) -> Case:
-    system = LagrangianSystem.from_text(
-        name=name,
-        coordinates=["x", "y", "z"][: len(q) - 4],
-        rotations={"R": "omega"},
-        parameters=parameters,
-        lagrangian=lagrangian,
-    )
-    positions = np.tile(np.asarray(q, dtype=float), (STATES, 1))
+def rotation_case(name: str, rates: Callable[..., list[Any]]) -> Case:
+    """Return the case of a body with the rates derived by hand."""
+    table = package_table("benchmark/cases/systems.toml")["rotations"][name]
+    system = LagrangianSystem.from_text(name=name, rotations={"R": "omega"}, **table["system"])
+    positions = np.tile(table["q"], (STATES, 1))
     return Case(
         name=f"rotations:{name}",
         system=system,
         formulations=(Formulation(name="quaternion and angular velocity", rates=rates),),
         q=positions,
-        velocity=scaled(velocity, 0.05),
-        span=span,
-        step=fine,
-        fine=fine,
-        velocity_of=partial(_velocities, positions, [parameters[name] for name in "ABC"]),
-    )
-
-
-_top = partial(_case, q=TILT)
-
-
-def _dumbbell() -> Case:
-    distances = [
-        "sqrt(" + " + ".join(f"({x} {sign} l*R_{k}1)**2" for k, x in enumerate("xyz", 1)) + ")" for sign in "+-"
-    ]
-    kinetic = f"(x_dot**2 + y_dot**2 + z_dot**2)/2 + {KINETIC}"
-    return _case(
-        "dumbbell",
-        " + ".join([kinetic, *(f"1/(2*{distance})" for distance in distances)]),
-        dumbbell,
-        {"A": 0.02, "B": 0.026, "C": 0.03, "l": 0.03},
-        (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
-        (0.0, 1.1, 0.1, 0.3, 0.5, 2.0),
-        span=314.0,
-        fine=0.125,
+        velocity=scaled(table["velocity"], 0.05),
+        span=table["span"],
+        step=table["step"],
+        fine=table["step"],
+        velocity_of=partial(_velocities, positions, [table["system"]["parameters"][name] for name in "ABC"]),
     )
 
 
 def tumbling(count: int) -> Case:
     """Return free bodies of one shape: the trajectories of one system, which MuJoCo integrates as one model."""
-    parameters = {"A": 1.0, "B": 2.0, "C": 2.5}
-    plain = _case("bodies", KINETIC, free_top, parameters, TILT, (0.0, 0.0, 1.0), span=10.0, fine=0.0625)
+    plain = rotation_case("bodies", free_top)
     numbers = np.random.default_rng(SEED)
     q, velocity = numbers.normal(size=(count, 4)), numbers.normal(size=(count, 3))
-    inertia = " ".join(map(repr, parameters.values()))
+    inertia = " ".join(map(repr, plain.system.defaults))
     body = f'<body><joint type="ball"/><inertial pos="0 0 0" mass="1" diaginertia="{inertia}"/></body>'
     mjcf = f'<mujoco><option gravity="0 0 0"/><worldbody>{body * count}</worldbody></mujoco>'
     q /= np.linalg.norm(q, axis=1, keepdims=True)
@@ -153,26 +116,7 @@ def tumbling(count: int) -> Case:
 
 
 ROTATIONS: Mapping[str, Callable[[], Case]] = {
-    "free-top": partial(
-        _top,
-        "free-top",
-        KINETIC,
-        free_top,
-        {"A": 1.0, "B": 2.0, "C": 2.5},
-        velocity=(0.3, -0.5, 2.0),
-        span=1000.0,
-        fine=0.25,
-    ),
-    "heavy-top": partial(
-        _top,
-        "heavy-top",
-        f"{KINETIC} - w*R_33",
-        heavy_top,
-        {"A": 1.0, "B": 1.0, "C": 0.5, "w": 1.0},
-        velocity=(0.1, 0.0, 10.0),
-        span=300.0,
-        fine=0.125,
-    ),
-    "dumbbell": _dumbbell,
+    name: partial(rotation_case, name, rates)
+    for name, rates in (("free-top", free_top), ("heavy-top", heavy_top), ("dumbbell", dumbbell))
 }
 """Functions that build a case of one body, by the name after ``rotations:``."""
