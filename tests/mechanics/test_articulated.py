@@ -9,6 +9,7 @@ import pytest
 import sympy
 
 import scvi_codegen as sc
+from scvi_codegen.benchmark.cases import robots
 from scvi_codegen.formulas.expressions import Tape, gradient
 from scvi_codegen.formulas.intermediates import intermediate, intermediates, separated, written_out
 from scvi_codegen.ir.arithmetic import lower_kernel
@@ -146,3 +147,17 @@ def test_derivatives_and_ensembles_of_the_recursion(tmp_path, always):
     starts = q + np.linspace(-0.1, 0.1, 5)[:, None]
     crowds = [each.integrate_ensemble(starts, np.tile(p, (5, 1)), h=0.02, steps=20).q for each in (stepper, plain)]
     np.testing.assert_allclose(crowds[0], crowds[1], rtol=1e-11, atol=1e-11)
+
+
+def test_slow_iterations_are_accelerated():
+    case = robots.chain(16)
+    run = sc.compile_stepper(case.system, "svi:2").integrate(case.q[0], velocity=case.velocity[0], h=0.02, steps=50)
+    assert run.iterations.sum() < 17 * 50  # 20.4 a step without acceleration
+
+
+def test_turned_vectors_have_no_entries_of_rounding_errors():
+    numbers = robots.chain(4).system.lagrangian.atoms(sympy.Rational)
+    inner = {
+        number for each in intermediates(robots.chain(4).system.lagrangian) for number in each.atoms(sympy.Rational)
+    }
+    assert all(abs(number) > 1e-6 for number in (numbers | inner) if number)

@@ -14,6 +14,9 @@
 /* The mass matrices are those of the first of MASS_AGE iterations, which is at extrapolated points: their errors are
  * small and affect only the convergence rate. Requires: the kernel value_lanes. */
 enum { MASS_AGE = 16 };
+#ifdef POINTS
+#include "secants.h"
+#endif
 #endif
 
 /* Computes the increments of one step: the velocities z at the points are corrected by mass^-1 (P - L_v) until they
@@ -27,6 +30,10 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   lanes u[2 * M], value[GROUPS][VALUES], scaled[GROUPS][M], impulse[GROUPS][M], r[GROUPS][M], mass[GROUPS][MASS];
   number inverse_size[M] = {0.0};
   progress now = before_iterations();
+#ifdef SUPPORT_SECANTS_H
+  secants before;
+  before.known = before.count = 0;
+#endif
   int status = OK;
   if (*steps > 0)
     continue_curve(step, past, *steps, z);
@@ -116,6 +123,10 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
         change += moved * moved;
       }
     take_change(&now, total_change(change), options, k, report);
+#ifdef SUPPORT_SECANTS_H
+    if (k >= FIRST_ITERATIONS && (before.known || now.last > ACCELERATED_LEVEL))
+      accelerate(&before, k % MASS_AGE == 0, inverse_size, r, z);
+#endif
     if (must_amplify(&now, options, k))
       for (int n = 0; n < GROUPS; n++)
         for (int i = 0; i < M; i++)

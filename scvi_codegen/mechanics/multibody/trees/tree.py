@@ -18,6 +18,8 @@ SINGLE = ("hinge", "slide")
 """Kinds of joints with one coordinate."""
 ROUNDED = 1e-9
 """Entries of rotation matrices that differ less from 0, 1 or -1 are these numbers."""
+LOST = 1e-15
+"""Entries of turned vectors and matrices that are smaller, relative to the largest one, are rounding errors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,9 +148,11 @@ def aligned(links: Sequence[Link]) -> list[Link]:
             if np.hypot(along, across) > ROUNDED:
                 by = about(np.array([0.0, 0.0, 1.0]), float(np.arctan2(across, along)))
                 turn, constant = turn @ by, constant @ by
-        pose = Pose(outer.T @ joint.pose.position, rounded(constant))
+        pose = Pose(without_rounding(outer.T @ joint.pose.position), rounded(constant))
         turns.append(turn)
         inertia = link.inertia.seen_from(Pose(rotation=turn.T))
+        center, matrix = without_rounding(inertia.center), without_rounding(inertia.matrix)
+        inertia = replace(inertia, center=center, matrix=matrix)
         turned.append(Link(link.name, link.parent, replace(joint, pose=pose), inertia))
     return turned
 
@@ -157,6 +161,11 @@ def rounded(rotation: Vector) -> Vector:
     """Return a rotation matrix with entries that are nearly 0, 1 or -1 replaced by these."""
     nearest = np.round(rotation)
     return np.where(np.abs(rotation - nearest) < ROUNDED, nearest, rotation)
+
+
+def without_rounding(values: Vector) -> Vector:
+    """Return turned values with 0 in place of entries that are rounding errors of others."""
+    return np.where(np.abs(values) < LOST * np.abs(values).max(), 0.0, values)
 
 
 def about(axis: Vector, angle: float) -> Vector:
