@@ -16,8 +16,8 @@ TABLE = {
     )
     if row[0] not in ("feature", "---")
 }
-REASONS = r"known at run time|must have (the )?shape|run\.at\(times\)"
-"""Beginnings of reasons: of sizes, of states whose size is known, of output times."""
+REASONS = r"known at run time|must have (the )?shape|run\.at\(times\)|not an array of positions"
+"""Beginnings of reasons: of sizes, of states whose size is known, of output times, of lists of neighbours."""
 
 
 @pytest.fixture(scope="module")

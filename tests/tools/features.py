@@ -170,6 +170,12 @@ def threads(of: Kind, _: Path) -> Any:
     return of.run(threads=2)
 
 
+def neighbours(of: Kind, _: Path) -> Any:
+    near = {"near": {"of": of.first.removesuffix("[0]"), "cutoff": 0.5}}
+    system = of.system(neighbours=near, kinetic=" - sum(i < j in near, (q[i] - q[j])**4)")
+    return of.run(of.compiled(system))
+
+
 def other_sizes(of: Kind, _: Path) -> Any:
     q = {"x": 0.0, "q": [0.1, 0.2, 0.3]} if not of.named else [0.0, 0.1, 0.2, 0.3]
     return of.stepper().integrate(q, q, h=0.1, steps=1)
@@ -315,6 +321,7 @@ FEATURES: dict[str, Callable[[Kind, Path], Any]] = {
     "events": events,
     "events that change the state": changing_events,
     "ensembles": ensembles,
+    "lists of neighbours": neighbours,
     "threads within a step": threads,
     "sizes chosen by each run": other_sizes,
     "reduction of states `observe`": observe,
