@@ -230,11 +230,12 @@ class _Assembly:
         discretised = self.axes[axis]
         if cells.edge and discretised.edges:
             return self.array(f"edge_weight_{axis}", f"F{axis}", discretised.edges.weights, cells.index)
-        return self.array(f"jacobian_{axis}", self.extent(axis), discretised.jacobians, cells.index)
+        size = self.array(f"jacobian_{axis}", self.extent(axis), discretised.jacobians, cells.index)
+        return size if cells.weight == 1 else f"{digits(cells.weight)}*{size}"
 
     def extent(self, axis: str) -> str:
         """Return the size that counts the cells of an axis."""
-        return f"N{axis}" if self.axes[axis].table is None else f"E{axis}"
+        return f"N{axis}" if self.axes[axis].table is None and self.axes[axis].periodic else f"E{axis}"
 
     def quadrature(self, chosen: Mapping[str, Cells], others: Sequence[str], term: Expr) -> str:
         """Return the text of the weighted sum of a term over the quadrature points of a cell.
@@ -267,9 +268,10 @@ class _Assembly:
             body = f"sum({each}, {body})"
         return body
 
-    def coefficient(self, order: int | None, axis: str, index: tuple[str, ...]) -> str:
+    def coefficient(self, order: int | None, axis: str, index: tuple[str, ...], cells: Cells) -> str:
         """Return the text of an entry of the operator of a derivative, or of the quadrature for ``None``."""
-        entries: Any = self.axes[axis].quadrature if order is None else self.axes[axis].operators[order]
+        operators = cells.operators or self.axes[axis].operators
+        entries: Any = self.axes[axis].quadrature if order is None else operators[order]
         if self.axes[axis].table is None:
             for k in index:
                 entries = entries[int(k)]
@@ -282,7 +284,7 @@ class _Assembly:
     def quadrature_weight(self, axis: str, chosen: Mapping[str, Cells], k: str) -> str:
         """Return the text of a quadrature weight, 0 at the ends of elements if these are edges."""
         if not chosen[axis].interior:
-            return self.coefficient(None, axis, (k,))
+            return self.coefficient(None, axis, (k,), chosen[axis])
         values = np.array([0.0, *map(float, self.axes[axis].quadrature[1:-1]), 0.0])
         self.used[f"interior_weights_{axis}"] = (str(len(values)), values)
         return f"interior_weights_{axis}[{k}]"
@@ -344,12 +346,13 @@ class _Assembly:
         if cells.rule is not None:
             index = f"b{axis}"
             inner = self.combined(each, orders, chosen, at, {**slots, axis: index})
-            return f"sum({index} in {len(cells.places)}, {self.coefficient(order, axis, (at[axis], index))}*{inner})"
+            factor = self.coefficient(order, axis, (at[axis], index), cells)
+            return f"sum({index} in {len(cells.places)}, {factor}*{inner})"
         terms = []
         for slot in map(str, range(len(cells.places))):
             value = self.combined(each, orders, chosen, at, {**slots, axis: slot})
-            factor = self.coefficient(order, axis, (at[axis], slot))
-            if value != "0":
+            factor = self.coefficient(order, axis, (at[axis], slot), cells)
+            if "0" not in (value, factor):
                 terms.append(f"({factor})*({value})")
         return " + ".join(terms) or "0"
 

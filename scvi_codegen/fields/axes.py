@@ -6,8 +6,7 @@ A density T(u, u_x, x) is integrated cell by cell with the quadrature of the cel
 
 where b runs over the points that the cell uses. Spectral elements of degree p have the Gauss-Lobatto-Legendre points as
 points and quadrature, so that I is the identity and the mass matrix is diagonal (C. Canuto et al., Spectral Methods:
-Fundamentals in Single Domains, Springer 2006, section 5.4). Staggered differences of order 2 m evaluate u, u_x
-and u_xx between two points from 2 m points (u_xx: 2 m + 2) (B. Fornberg, Math. Comp. 51 (1988), 699-706).
+Fundamentals in Single Domains, Springer 2006, section 5.4). Differences: :mod:`scvi_codegen.fields.differences`.
 """
 
 from __future__ import annotations
@@ -55,6 +54,8 @@ class Cells:
         rule: beginning of the text of the index of point b, ``nodes_x[ex``, if a table has all of them.
         interior: whether the ends of elements have no weight, because they are edges.
         edge: whether it is an end of two elements, whose points follow each other.
+        operators: in place of those of the axis.
+        weight: factor of its quadrature weight.
     """
 
     loop: str
@@ -63,6 +64,8 @@ class Cells:
     rule: str | None = None
     interior: bool = False
     edge: bool = False
+    operators: tuple[Matrix, ...] = ()
+    weight: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,6 +93,24 @@ class Edges:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ClosedPoints:
+    """All points of an axis, those with prescribed values included; of elements those of each in turn.
+
+    Attributes:
+        points, weights: (P,) coordinates and quadrature weights.
+        positions, inside: (P,) positions among the unknown values, and whether the value is unknown.
+        neighbours, rates: (P, s) points and coefficients of the derivative at each.
+    """
+
+    points: Array
+    weights: Array
+    positions: NDArray[np.int64]
+    inside: NDArray[np.bool_]
+    neighbours: NDArray[np.int64]
+    rates: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Axis:
     """Discretised axis.
 
@@ -102,7 +123,7 @@ class Axis:
         cells: kinds of cells.
         jacobians, cell_points: (E,) and (E, a): J_e and x_ea.
         table: (E, b) positions of the points, or ``None`` if cells name their points without a table.
-        inside: (E, b) whether a point is unknown; the value at the others is prescribed.
+        closed: all points of an axis with ends, those of each element in turn; ``None`` for equidistant periodic ones.
         reference: of elements, the points on [-1, 1].
         edges: of elements, their ends.
         stencil: number of points for the interpolation of values between equidistant points (differences).
@@ -122,7 +143,7 @@ class Axis:
     jacobians: Array = field(default_factory=lambda: np.zeros(0))
     cell_points: Array = field(default_factory=lambda: np.zeros((0, 0)))
     table: NDArray[np.int64] | None = None
-    inside: NDArray[np.bool_] = field(default_factory=lambda: np.ones((0, 0), bool))
+    closed: ClosedPoints | None = None
     reference: Vector = ()
     edges: Edges | None = None
     stencil: int = 0
@@ -147,7 +168,7 @@ class Axis:
             values = np.sin(n * angle) / (n * (np.sin(angle) if n % 2 else np.tan(angle)))
             return dict(enumerate(values.tolist()))
         near = np.sort(np.abs(distance).argsort(kind="stable")[: self.stencil]).tolist()
-        return {k: float(np.prod([distance[j] / (distance[j] - distance[k]) for j in near if j != k])) for k in near}
+        return dict(zip(near, lagrange(distance[near]).tolist(), strict=True))
 
     def differentiated(self, values: Array, along: int) -> Array:
         """Return the derivative at the points of values along one of their axes; see :meth:`MeshSystem.derivative`."""
@@ -155,49 +176,42 @@ class Axis:
 
     @property
     def element_points(self) -> Array:
-        """Coordinates of the points of all elements, (E (p + 1),), or of the points."""
-        return self.points if self.table is None else self.cell_points.ravel()
+        """Coordinates of the points of all elements, or of all points."""
+        return self.points if self.closed is None else self.closed.points
 
     @property
     def element_weights(self) -> Array:
         """Quadrature weights at ``element_points``."""
-        if self.table is None:
-            return self.weights
-        return np.outer(self.jacobians, [float(w) for w in self.quadrature]).ravel()
+        return self.weights if self.closed is None else self.closed.weights
 
     def in_elements(self, values: Array, along: int, ends: Sequence[Array | None] = (None, None)) -> Array:
         """Return values at ``element_points``, those at ends are ``ends`` if prescribed, or 0."""
-        if self.table is None:
+        if self.closed is None:
             return values
-        local = self._in_elements(np.moveaxis(values, along, -1))
+        local = np.where(self.closed.inside, np.moveaxis(values, along, -1)[..., self.closed.positions], 0.0)
         for end, prescribed in enumerate(ends):
             if prescribed is not None:
-                local[..., -end, -end] = prescribed
-        return np.moveaxis(local.reshape(*local.shape[:-2], -1), -1, along)
+                local[..., -end] = prescribed
+        return np.moveaxis(local, -1, along)
 
     def derivative(self, values: Array, along: int) -> Array:
         """Return the derivative at ``element_points`` of values there."""
         array = np.moveaxis(values, along, -1)
-        if self.table is None:
+        if self.closed is None:
             k = 2j * np.pi * np.fft.rfftfreq(len(self.points), self.length / len(self.points))
             result = np.fft.irfft(k * np.fft.rfft(array), len(self.points))
         else:
-            matrix = np.array([[float(x) for x in row] for row in self.operators[1]])
-            local = array.reshape(*array.shape[:-1], *self.table.shape) @ matrix.T
-            result = (local / self.jacobians[:, None]).reshape(array.shape)
+            result = np.einsum("...ab,ab->...a", array[..., self.closed.neighbours], self.closed.rates)
         return np.moveaxis(result, -1, along)
 
     def from_elements(self, values: Array, along: int) -> Array:
         """Return values at the points, of values at ``element_points``: at shared points means weighted by length."""
-        if self.table is None:
+        if self.closed is None:
             return values
-        array = np.moveaxis(values, along, -1) * self.element_weights
-        local = array.reshape(*array.shape[:-1], *self.table.shape)
-        result = np.zeros((*array.shape[:-1], len(self.points)))
-        for entry in range(self.table.shape[1]):  # a point occurs once in each column of the table
-            elements = self.inside[:, entry]
-            result[..., self.table[elements, entry]] += local[..., elements, entry]
-        return np.moveaxis(result / self.weights, -1, along)
+        array, inside = np.moveaxis(values, along, -1) * self.closed.weights, self.closed.inside
+        result = np.zeros((len(self.points), *array.shape[:-1]))
+        np.add.at(result, self.closed.positions[inside], np.moveaxis(array[..., inside], -1, 0))
+        return np.moveaxis(np.moveaxis(result, 0, -1) / self.weights, -1, along)
 
     def modes(self, values: Array) -> Array:
         """Return the squared amplitudes of all modes but the constant, (.., E, p), or (.., 1, N//2) of Fourier modes.
@@ -206,16 +220,16 @@ class Axis:
             values: at the points along the last axis.
         """
         if self.table is None:
+            if not self.periodic:  # sine series of what a straight line through the ends leaves
+                steps = np.linspace(0, 1, values.shape[-1])
+                values = values - values[..., :1] - steps * (values[..., -1:] - values[..., :1])
+                values = np.concatenate([values, -values[..., -2:0:-1]], -1)
             return np.asarray(np.abs(np.fft.rfft(values)[..., None, 1:]) ** 2)
         points = np.array([float(x) for x in self.reference])
         to_modes = np.linalg.inv(np.polynomial.legendre.legvander(points, len(points) - 1))
-        modes = np.einsum("ab,...eb->...ea", to_modes, self._in_elements(values))[..., 1:] ** 2
+        local = self.in_elements(values, -1).reshape(*values.shape[:-1], *self.table.shape)
+        modes = np.einsum("ab,...eb->...ea", to_modes, local)[..., 1:] ** 2
         return np.asarray(modes / (np.arange(1, len(points)) + 0.5))
-
-    def _in_elements(self, array: Array) -> Array:
-        """Return values at the points of each element, (..., E, p + 1); prescribed ones are 0."""
-        assert self.table is not None
-        return np.where(self.inside, array[..., self.table], 0.0)
 
 
 def spectral_elements(
@@ -249,12 +263,12 @@ def spectral_elements(
         raise SystemDefinitionError(f"'{name}' has no points between its prescribed ends: use more elements")
     inside = slice(int(left), count - int(right))
     size, index = f"E{name}", f"e{name}"
-    table = f"nodes_{name}"
+    nodes = f"nodes_{name}"
     kinds = []
     if elements > left + right:
         loop = f"{index} in {size}" if not (left or right) else f"{index} in {int(left)}..{size}-{1 + int(right)}"
         kinds.append(
-            Cells(loop, index, tuple(CellPoint(f"{table}[{index}, {b}]") for b in range(p + 1)), f"{table}[{index}")
+            Cells(loop, index, tuple(CellPoint(f"{nodes}[{index}, {b}]") for b in range(p + 1)), f"{nodes}[{index}")
         )
     if elements == 1 and left and right:
         kinds = [Cells("", "0", (CellPoint(None, 0), *(CellPoint(str(b)) for b in range(p - 1)), CellPoint(None, 1)))]
@@ -265,6 +279,8 @@ def spectral_elements(
             last = tuple(CellPoint(f"N{name}-{p - b}") for b in range(p))
             kinds.append(Cells("", f"{size}-1", (*last, CellPoint(None, 1))))
     largest = _largest_quotient(rule.weights, derivative) / float(half.min()) ** 2
+    table = np.clip(places - int(left), 0, count - int(left) - int(right) - 1)
+    matrix = np.array([[float(x) for x in row] for row in derivative])
     return Axis(
         name=name,
         points=points[inside],
@@ -278,8 +294,15 @@ def spectral_elements(
         cells=tuple(kinds),
         jacobians=half,
         cell_points=at,
-        table=np.clip(places - int(left), 0, count - int(left) - int(right) - 1),
-        inside=(places >= int(left)) & (places < count - int(right)),
+        table=table,
+        closed=ClosedPoints(
+            points=at.ravel(),
+            weights=np.outer(half, [float(each) for each in rule.weights]).ravel(),
+            positions=table.ravel(),
+            inside=((places >= int(left)) & (places < count - int(right))).ravel(),
+            neighbours=np.arange(places.size).reshape(places.shape).repeat(p + 1, axis=0),
+            rates=np.vstack([matrix / length for length in half]),
+        ),
         reference=rule.points,
     )
 
@@ -326,47 +349,6 @@ def _edges(
     )
 
 
-def differences(name: str, start: float, end: float, points: int, order: int, *, second: bool) -> Axis:
-    """Return a periodic axis of equidistant points with staggered differences of order 2 m.
-
-    By symmetry the coefficients of u and h^2 u_xx at the midpoint are even and exact for even polynomials of degree up
-    to 2 m - 2, those of h u_x odd and exact for odd ones of degree up to 2 m - 1. ``second`` adds u_xx, with two points
-    more.
-    """
-    if isinstance(order, bool) or order not in (2, 4, 6, 8):
-        raise SystemDefinitionError(f"order= of finite differences is 2, 4, 6 or 8, not {order!r}")
-    count = point_count_of(name, points, least=2 * order)
-    m = order // 2 + second
-    halves = [mp.mpf(2 * k + 1) / 2 for k in range(m)]
-
-    def solved(moments: Sequence[float], parity: int) -> Vector:
-        matrix = mp.matrix([[2 * x ** (2 * r + parity) for x in halves] for r in range(m)])
-        return tuple(mp.lu_solve(matrix, mp.matrix(list(moments))))
-
-    value, odd = solved([1] + [0] * (m - 1), 0), solved([1] + [0] * (m - 1), 1)
-    rows = [(*reversed(value), *value), (*(-each for each in reversed(odd)), *odd)]
-    if second:
-        curvature = solved([0, 2] + [0] * (m - 2), 0)
-        rows.append((*reversed(curvature), *curvature))
-    h = (end - start) / count
-    index = f"e{name}"
-    places = tuple(CellPoint(index if k == 0 else f"{index}{k:+d}") for k in range(1 - m, m + 1))
-    at: Array = start + h * np.arange(count, dtype=np.float64)
-    return Axis(
-        name=name,
-        points=at,
-        weights=np.full(count, h),
-        length=end - start,
-        stencil=order,
-        quadrature=(mp.mpf(1),),
-        operators=tuple((row,) for row in rows),
-        cells=(Cells(f"{index} in N{name} periodic", index, places),),
-        jacobians=np.full(count, h),
-        cell_points=(at + h / 2)[:, None],
-        stiffness=tuple(float(sum(map(abs, row))) ** 2 / h ** (2 * k) for k, row in enumerate(rows) if k),
-    )
-
-
 def fourier(name: str, start: float, end: float, points: int) -> Axis:
     """Return a periodic axis of equidistant points with the derivatives of the trigonometric interpolant.
 
@@ -400,6 +382,12 @@ def _largest_quotient(weights: Vector, derivative: Matrix) -> float:
     roots = np.sqrt(np.array([float(each) for each in weights]))
     scaled = roots[:, None] * np.array([[float(x) for x in row] for row in derivative]) / roots
     return float(np.linalg.norm(scaled, 2)) ** 2
+
+
+def lagrange(distance: Array) -> Array:
+    """Return the coefficients of the polynomial interpolant at a place with these distances from the points."""
+    others = [(x, np.delete(distance, k)) for k, x in enumerate(distance)]
+    return np.array([np.prod(each / (each - x)) for x, each in others])
 
 
 def same(values: Sequence[float] | Array) -> float | None:

@@ -96,8 +96,10 @@ class Mesh:
             others = tuple(range(-count, -1))
             modes = each.modes(np.moveaxis(array, k - count, -1))
             ends = self.field_system.boundary[each.name]
-            if ends != PERIODIC and any(value != 0 for end in ends if end != NATURAL for value in end.values()):
-                modes[..., ~each.inside.all(axis=1), :] = 0  # prescribed values are not known here
+            prescribed = [] if ends == PERIODIC else [x for end in ends if end != NATURAL for x in end.values()]
+            closed = each.closed
+            if closed and each.table is not None and any(value != 0 for value in prescribed):  # not known here
+                modes[..., ~closed.inside.reshape(each.table.shape).all(axis=1), :] = 0
             highest = modes[..., -max(1, modes.shape[-1] // 6) :].sum(-1).sum(others)
             every = modes.sum(-1).sum(others)
             largest = every.max(-1)

@@ -16,9 +16,10 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.fields.assembly import semidiscrete_system
-from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis, differences, fourier, spectral_elements
+from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis, fourier, spectral_elements
 from scvi_codegen.fields.density import Density, derivatives_of
 from scvi_codegen.fields.derivation import FieldDerivation, derivation_of
+from scvi_codegen.fields.differences import differences
 from scvi_codegen.fields.mesh import MeshSystem
 from scvi_codegen.formulas.array_notation import array_text
 from scvi_codegen.formulas.grammar import parse_expression
@@ -271,23 +272,24 @@ class FieldSystem(Density):
         start, end = self.space[axis]
         boundary = self.boundary[axis]
         places = [place[axis] for place, _ in self.point_lagrangians]
+        fixed = None if boundary == PERIODIC else (boundary[0] != NATURAL, boundary[1] != NATURAL)
         if "degree" in options:
-            fixed = None if boundary == PERIODIC else tuple(each != NATURAL for each in boundary)
             derivative = f"{self.fields[0]}_{axis}"
             clamped = [fixed is not None and fixed[k] and derivative in boundary[k] for k in range(2)]
             breaks = _breaks(axis, start, end, options.get("elements", 1), places if "elements" in options else ())
             return spectral_elements(axis, breaks, options["degree"], fixed, (clamped[0], clamped[1]))
-        if boundary != PERIODIC:
-            raise SystemDefinitionError(
-                f"'{method}' needs a periodic axis, and '{axis}' has ends: use \"spectral-elements\""
-            )
         if method == "fourier":
+            if boundary != PERIODIC:
+                raise SystemDefinitionError(
+                    f"'fourier' needs a periodic axis, and '{axis}' has ends: use \"spectral-elements\" or "
+                    '"finite-differences"'
+                )
             return fourier(axis, start, end, options["points"])
         second = any(
             orders.get(axis) == 2 and symbol(name) in self.density.free_symbols
             for name, (_, orders) in self.derivatives.items()
         )
-        return differences(axis, start, end, options["points"], options["order"], second=second)
+        return differences(axis, (start, end), options["points"], options["order"], fixed, second=second)
 
 
 def _check_derivative(name: str, field: str, axes: Sequence[str], parameters: Mapping[str, float]) -> None:
