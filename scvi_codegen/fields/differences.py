@@ -57,7 +57,7 @@ def differences(
     at: Array = start + h * np.arange(count, dtype=np.float64)
     masses, stiffness = np.full(count, h), [float(sum(map(abs, row))) ** 2 for row in rows]
     places = tuple(CellPoint(index if k == 0 else f"{index}{k:+d}") for k in range(1 - m, m + 1))
-    cells: tuple[Cells, ...] = (Cells(f"{index} in N{name} periodic", index, places),)
+    cells = [Cells(f"{index} in N{name} periodic", index, places)]
     inner, closed = slice(None), None
     if fixed is not None:
         if second:
@@ -67,8 +67,12 @@ def differences(
             )
         end_rows, midpoints, ends, largest = _end_rows(np.array([float(x) for x in rows[1]]))
         masses[: len(ends)], masses[-len(ends) :] = h * ends, h * ends[::-1]
-        cells = (_inner_cells(name, m, len(midpoints), fixed), *_end_cells(name, end_rows, midpoints, fixed))
-        inner = slice(int(fixed[0]), count - int(fixed[1]))
+        left, right = map(int, fixed)
+        within = (
+            f"{index} in {2 * m - left}..N{name}-{2 * m + 2 - right}"  # that of the unknown to the left of the cell
+        )
+        cells = [Cells(within, f"{index}+1" if left else index, places), *_end_cells(name, end_rows, midpoints, fixed)]
+        inner = slice(left, count - right)
         closed = _closed(at, masses, order, inner)
         stiffness[1] = max(stiffness[1], largest)
     return Axis(
@@ -80,7 +84,7 @@ def differences(
         periodic=fixed is None,
         quadrature=(mp.mpf(1),),
         operators=tuple((row,) for row in rows),
-        cells=cells,
+        cells=tuple(cells),
         jacobians=np.full(count - (fixed is not None), h),
         cell_points=(at[: count - (fixed is not None)] + h / 2)[:, None],
         closed=closed,
@@ -125,14 +129,6 @@ def _end_rows(row: Array) -> tuple[Array, Array, Array, float]:
     interior[:, :width] /= np.sqrt(masses)
     largest = np.linalg.norm(interior, 2) ** 2
     return rows, weights, masses, 1.01 * float(largest)
-
-
-def _inner_cells(name: str, m: int, size: int, fixed: tuple[bool, bool]) -> Cells:
-    """Return the cells with the interior coefficients; the index of a cell is that of the unknown to its left."""
-    left, right = map(int, fixed)
-    index = f"e{name}"
-    places = tuple(CellPoint(index if k == 0 else f"{index}{k:+d}") for k in range(1 - m, m + 1))
-    return Cells(f"{index} in {size - left}..N{name}-{size + 2 - right}", f"{index}+1" if left else index, places)
 
 
 def _end_cells(name: str, rows: Array, weights: Array, fixed: tuple[bool, bool]) -> list[Cells]:
