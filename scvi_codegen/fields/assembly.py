@@ -32,12 +32,7 @@ from scvi_codegen.tables.precision import mp
 NAME = re.compile(r"[A-Za-z_]\w*")
 
 
-def semidiscrete_system(system: Density, axes: Mapping[str, Axis], discretisation: Mapping[str, Any]) -> MeshSystem:
-    """Return the semi-discrete system of a density on a tensor product of axes."""
-    return _Assembly(system, axes).result(discretisation)
-
-
-class _Assembly:
+class Assembly:
     """Texts of the sums of a semi-discrete Lagrangian, and the arrays that they use."""
 
     def __init__(self, system: Density, axes: Mapping[str, Axis]) -> None:
@@ -46,6 +41,7 @@ class _Assembly:
         self.used: dict[str, tuple[str, Any]] = {}
 
     def result(self, discretisation: Mapping[str, Any]) -> MeshSystem:
+        """Return the semi-discrete system of the density on the tensor product of the axes."""
         system = self.system
         sizes = ", ".join(f"N{axis}" for axis in self.axes)
         terms = [*self.kinetic(), *self.in_space(), *self.at_places()]
@@ -96,6 +92,7 @@ class _Assembly:
         return f"{name}[{index}]"
 
     def weight(self, axis: str) -> str:
+        """Return the text of the weight of a point along an axis."""
         return self.array(f"weight_{axis}", f"N{axis}", self.axes[axis].weights, f"i{axis}")
 
     def at_points(self, axes: Sequence[str]) -> dict[str, str]:
@@ -114,6 +111,7 @@ class _Assembly:
         return f"{'*'.join(inverse)}*{entry}"
 
     def kinetic(self) -> Iterator[str]:
+        """Yield the kinetic energy of each field."""
         if self.system.momenta:
             return
         for each, rate in zip(self.system.fields, self.system.rates, strict=True):
@@ -141,6 +139,7 @@ class _Assembly:
             yield f"({self.written(formula, texts)})"
 
     def over_points(self, body: str) -> str:
+        """Return the text of the quadrature of a body over all points."""
         loops = ", ".join(f"i{axis} in N{axis}" for axis in self.axes)
         return f"sum({loops}, {'*'.join(map(self.weight, self.axes))}*{body})"
 

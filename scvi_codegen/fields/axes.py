@@ -174,18 +174,8 @@ class Axis:
         """Return the derivative at the points of values along one of their axes; see :meth:`MeshSystem.derivative`."""
         return self.from_elements(self.derivative(self.in_elements(values, along), along), along)
 
-    @property
-    def element_points(self) -> Array:
-        """Coordinates of the points of all elements, or of all points."""
-        return self.points if self.closed is None else self.closed.points
-
-    @property
-    def element_weights(self) -> Array:
-        """Quadrature weights at ``element_points``."""
-        return self.weights if self.closed is None else self.closed.weights
-
     def in_elements(self, values: Array, along: int, ends: Sequence[Array | None] = (None, None)) -> Array:
-        """Return values at ``element_points``, those at ends are ``ends`` if prescribed, or 0."""
+        """Return values at all points of elements, those at ends are ``ends`` if prescribed, or 0."""
         if self.closed is None:
             return values
         local = np.where(self.closed.inside, np.moveaxis(values, along, -1)[..., self.closed.positions], 0.0)
@@ -195,7 +185,7 @@ class Axis:
         return np.moveaxis(local, -1, along)
 
     def derivative(self, values: Array, along: int) -> Array:
-        """Return the derivative at ``element_points`` of values there."""
+        """Return the derivative of values at all points of elements, there."""
         array = np.moveaxis(values, along, -1)
         if self.closed is None:
             k = 2j * np.pi * np.fft.rfftfreq(len(self.points), self.length / len(self.points))
@@ -205,7 +195,7 @@ class Axis:
         return np.moveaxis(result, -1, along)
 
     def from_elements(self, values: Array, along: int) -> Array:
-        """Return values at the points, of values at ``element_points``: at shared points means weighted by length."""
+        """Return values at the points, of values at those of all elements: at shared ones means weighted by length."""
         if self.closed is None:
             return values
         array, inside = np.moveaxis(values, along, -1) * self.closed.weights, self.closed.inside
@@ -278,9 +268,10 @@ def spectral_elements(
         if right:
             last = tuple(CellPoint(f"N{name}-{p - b}") for b in range(p))
             kinds.append(Cells("", f"{size}-1", (*last, CellPoint(None, 1))))
-    largest = _largest_quotient(rule.weights, derivative) / float(half.min()) ** 2
     table = np.clip(places - int(left), 0, count - int(left) - int(right) - 1)
     matrix = np.array([[float(x) for x in row] for row in derivative])
+    roots = np.sqrt(np.array([float(each) for each in rule.weights]))
+    largest = float(np.linalg.norm(roots[:, None] * matrix / roots, 2)) ** 2 / float(half.min()) ** 2
     return Axis(
         name=name,
         points=points[inside],
@@ -375,13 +366,6 @@ def point_count_of(axis: str, points: int, *, least: int, most: int = 10**9) -> 
     return checked_count(
         points, f"the number of points of '{axis}'", least=least, most=most, error=SystemDefinitionError
     )
-
-
-def _largest_quotient(weights: Vector, derivative: Matrix) -> float:
-    """Return the largest eigenvalue of D^T W D by W, for one element of half length 1."""
-    roots = np.sqrt(np.array([float(each) for each in weights]))
-    scaled = roots[:, None] * np.array([[float(x) for x in row] for row in derivative]) / roots
-    return float(np.linalg.norm(scaled, 2)) ** 2
 
 
 def lagrange(distance: Array) -> Array:

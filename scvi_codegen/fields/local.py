@@ -96,7 +96,7 @@ class FieldHistory:
         by_name = run.stepper.parameters_by_name(run.parameters)
         self.known: dict[Expr, Any] = {each: by_name[str(each)] for each in self.system.parameters}
         self.axes: dict[str, tuple[int, Axis]] = {axis.name: (k + 1, axis) for k, axis in enumerate(mesh.axes)}
-        coordinates = {TIME: self.t} | {axis.name: axis.element_points for axis in mesh.axes}
+        coordinates = {TIME: self.t} | {axis.name: (axis.closed or axis).points for axis in mesh.axes}
         self.known |= zip(map(symbol, coordinates), np.ix_(*coordinates.values()), strict=True)
         self.shape = tuple(len(values) for values in coordinates.values())
 
@@ -133,7 +133,7 @@ class FieldHistory:
     def integral(self, values: Array) -> Array:
         """Return the integral over space, (n,)."""
         for _, axis in reversed(self.axes.values()):
-            values = values @ axis.element_weights
+            values = values @ (axis.closed or axis).weights
         return values
 
     def at_points(self, values: Array) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError, closest
-from scvi_codegen.fields.assembly import semidiscrete_system
+from scvi_codegen.fields.assembly import Assembly
 from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis, fourier, spectral_elements
 from scvi_codegen.fields.density import Density, derivatives_of
 from scvi_codegen.fields.derivation import FieldDerivation, derivation_of
@@ -24,7 +23,7 @@ from scvi_codegen.fields.mesh import MeshSystem
 from scvi_codegen.formulas.array_notation import array_text
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import TIME, check_names, number, symbol
-from scvi_codegen.validation import checks_arguments
+from scvi_codegen.validation import checked_count, checks_arguments
 
 CLAMPED = "clamped"
 MOST_AXES = 3
@@ -266,7 +265,7 @@ class FieldSystem(Density):
                     raise SystemDefinitionError(f"'{method}' needs {name}= for the axis '{axis}'")
                 chosen[name] = value
             axes[axis] = self._axis(axis, method, chosen)
-        return semidiscrete_system(self, axes, {"method": method, **options})
+        return Assembly(self, axes).result({"method": method, **options})
 
     def _axis(self, axis: str, method: str, options: Mapping[str, Any]) -> Axis:
         start, end = self.space[axis]
@@ -311,11 +310,7 @@ def _check_derivative(name: str, field: str, axes: Sequence[str], parameters: Ma
 def _bounds(axis: str, ends: Any) -> tuple[float, float]:
     if isinstance(ends, str) or not hasattr(ends, "__len__") or len(ends) != 2:
         raise SystemDefinitionError(f"the axis '{axis}' needs a lower and an upper bound, not {ends!r}")
-    values = []
-    for each in ends:
-        value = parse_expression(str(each), {})
-        values.append(float(value))
-    lower, upper = values
+    lower, upper = (float(parse_expression(str(each), {})) for each in ends)
     if not (isfinite(lower) and isfinite(upper) and lower < upper):
         raise SystemDefinitionError(f"the bounds of the axis '{axis}' must be finite and ascending, not {ends!r}")
     return lower, upper
@@ -368,11 +363,8 @@ def _breaks(axis: str, start: float, end: float, elements: Any, places: Sequence
     Equal elements are divided at the places into parts with elements that are at most as long.
     """
     if np.ndim(elements) == 0:
-        whole = hasattr(elements, "__index__") and not isinstance(elements, bool)
-        if not whole or (count := operator.index(elements)) < 1:
-            raise SystemDefinitionError(
-                f"elements= of '{axis}' must be a number of elements or their ends, not {elements!r}"
-            )
+        what = f"elements= of '{axis}' (a number of elements or their ends)"
+        count = checked_count(elements, what, least=1, error=SystemDefinitionError)
         ends = np.unique([start, *places, end])
         numbers = np.ceil(np.diff(ends) / (end - start) * count - 1e-9).astype(int)
         parts = [np.linspace(a, b, n + 1) for a, b, n in zip(ends[:-1], ends[1:], numbers, strict=True)]

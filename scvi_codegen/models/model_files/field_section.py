@@ -88,7 +88,9 @@ def field_section(mesh: Mesh) -> dict[str, Any]:
     """Return the section of a semi-discrete system."""
     density = mesh.field_system
     boundary = {
-        axis: ends if ends == PERIODIC else [end if end == NATURAL else _texts(end) for end in ends]
+        axis: ends
+        if ends == PERIODIC
+        else [end if end == NATURAL else {each: array_text(x) for each, x in end.items()} for end in ends]
         for axis, ends in density.boundary.items()
     }
     section: dict[str, Any] = {"name": density.name, "fields": [*density.fields]}
@@ -101,10 +103,6 @@ def field_section(mesh: Mesh) -> dict[str, Any]:
         places = [{**place, "lagrangian": array_text(formula)} for place, formula in density.point_lagrangians]
         section["point_lagrangians"] = places
     return {**section, "discretisation": _plain(mesh.discretisation)}
-
-
-def _texts(end: Mapping[str, Any]) -> dict[str, str]:
-    return {name: array_text(value) for name, value in end.items()}
 
 
 def _plain(value: Any) -> Any:
