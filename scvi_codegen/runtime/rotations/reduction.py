@@ -45,7 +45,9 @@ class Reduction:
 
     def inward(self, q: Array, p: Array) -> Array:
         """Return (.., 2m, size) matrices from (a, b) to changes of (q, p)."""
-        m, result = self.dimension, self._matrix(q, transposed=False)
+        m, n = self.dimension, self.ordinary
+        result = np.zeros((*q.shape[:-1], 2 * m, self.size))
+        result[..., :n, :n] = result[..., m : m + n, self.size // 2 : self.size // 2 + n] = np.eye(n)
         for member, rows, own in self._parts():
             dq, dp, size = rows, slice(m + rows.start, m + rows.stop), self.size // 2
             a, b = own, slice(size + own.start, size + own.stop)
@@ -61,22 +63,13 @@ class Reduction:
         return result
 
     def outward(self, q: Array, p: Array) -> Array:
-        """Return (.., size, 2m) matrices from changes of (q, p) to (a, b)."""
-        m, result = self.dimension, self._matrix(q, transposed=True)
-        for member, rows, own in self._parts():
-            dq, dp, size = rows, slice(m + rows.start, m + rows.stop), self.size // 2
-            a, b = own, slice(size + own.start, size + own.stop)
-            position, momentum = q[..., rows], p[..., rows]
-            if member.kind == "spin":
-                other = _orthogonal_spin(position, momentum)[..., np.newaxis, :]
-                result[..., a, dq], result[..., a, dp] = other.real, other.imag
-                result[..., b, dq], result[..., b, dp] = -other.imag, other.real
-                continue
-            basis, unit, length = _basis(member, position)
-            columns = np.swapaxes(basis, -1, -2)
-            result[..., a, dq], result[..., b, dp] = columns / length, columns * length
-            result[..., b, dq] = (columns @ momentum[..., np.newaxis]) * unit[..., np.newaxis, :]
-        return result
+        """Return (.., size, 2m) matrices from changes of (q, p) to (a, b), the symplectic transposes of ``inward``."""
+        m, half = self.dimension, self.size // 2
+        columns = np.swapaxes(self.inward(q, p), -1, -2)
+        by_q, by_p = columns[..., :m], columns[..., m:]
+        of_a = np.concatenate([by_p[..., half:, :], -by_q[..., half:, :]], axis=-1)
+        of_b = np.concatenate([-by_p[..., :half, :], by_q[..., :half, :]], axis=-1)
+        return np.concatenate([of_a, of_b], axis=-2)
 
     def aligned(self, state: Array, like: Array) -> Array:
         """Return a state (2m,) with the lengths, signs and phases nearest to those of another."""
@@ -127,15 +120,6 @@ class Reduction:
                 p[rows] = length * p[rows]
                 p[rows] -= q[rows] * (q[rows] @ p[rows])
         return q, p
-
-    def _matrix(self, q: Array, *, transposed: bool) -> Array:
-        """Return the matrix with the entries of ordinary coordinates, 1."""
-        m, size = self.dimension, self.size
-        result = np.zeros((*q.shape[:-1], size, 2 * m) if transposed else (*q.shape[:-1], 2 * m, size))
-        for k in range(self.ordinary):
-            for column, row in ((k, k), (size // 2 + k, m + k)):
-                result[(..., column, row) if transposed else (..., row, column)] = 1.0
-        return result
 
     def _parts(self) -> Iterator[tuple[Member, slice, slice]]:
         """Yield the members with their columns among all coordinates, and among those of the reduced space."""
