@@ -31,7 +31,8 @@ from sympy import Expr, Matrix, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.expressions import Tape, hessian
-from scvi_codegen.formulas.symbols import DOT, symbol
+from scvi_codegen.formulas.intermediates import written_out
+from scvi_codegen.formulas.symbols import DOT, inputs_by_name, symbol
 from scvi_codegen.formulas.translation import format_expression
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.representation import summary
@@ -254,7 +255,9 @@ def first_order_system(fields: Mapping[str, Any]) -> FirstOrderSystem | None:
             )
     form = OneForm(name, lagrangian, coordinates, velocities, fields["time"])
     kept = {each: fields[each] for each in ("name", "time", "parameters", "defaults", "inputs") if each in fields}
-    text = {"coordinates": [q.name for q in coordinates], "lagrangian": format_expression(lagrangian)}
+    inputs = fields.get("inputs", ())
+    shown = format_expression(inputs_by_name(written_out(lagrangian), inputs))
+    text = {"coordinates": [q.name for q in coordinates], "lagrangian": shown, **({"inputs": inputs} if inputs else {})}
     return FirstOrderSystem(**kept, **first_order_form(form), definition=fields.get("definition") or text)
 
 

@@ -369,7 +369,7 @@ def test_periodic_orbits() -> None:
     assert np.abs(run.variables[-1] - run.variables[0]).max() < 1e-11
 
 
-def test_inputs() -> None:
+def test_inputs(tmp_path) -> None:
     driven = sc.LagrangianSystem.from_text(
         "driven", ["x", "y"], "(x + x**3)*y_dot - x**2/2 - y**2/2 - f*x - f**2*y", inputs=["f"]
     )
@@ -382,6 +382,9 @@ def test_inputs() -> None:
         f = min(t, 2.0 - t)
         return [-(z[1] + f**2) / (1 + 3 * z[0] ** 2), (z[0] + f) / (1 + 3 * z[0] ** 2)]
 
+    model = sc.Model(system=driven, method="svi:2", q=[0.3, 0.2], h=0.1, span=1.0)
+    sc.save_model(model, tmp_path / "driven.toml")
+    assert sc.load_model(tmp_path / "driven.toml").system == driven
     half = solve_ivp(right, (0.0, 1.0), [0.3, 0.2], method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
     expected = solve_ivp(right, (1.0, 2.0), half, method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
     assert np.abs(run.variables[-1] - expected).max() < 1e-10

@@ -112,6 +112,7 @@ def first_order(of: Kind, _: Path) -> Any:
         names, state, lagrangian = ["x", "y"], {"x": 0.3, "y": 0.1}, "(x + x**3)*y_dot - (x**2 + y**2)/2"
     run = of.compiled(sc.LagrangianSystem.from_text("vortices", names, lagrangian)).integrate(state, h=0.1, steps=3)
     assert run.energy_error() < 1e-6
+    assert np.isfinite(run.tangent()).all()
     return run
 
 
