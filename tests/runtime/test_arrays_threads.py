@@ -361,6 +361,8 @@ RACES = """
 enum {{ N = {count} }};
 static const int bonds[] = {{{bonds}}};
 static double work[N * SHARED_WORK] __attribute__((aligned(64))), rest[5 * N];
+static double t[{steps}], q[{steps} * N], p[{steps} * N];
+static int iterations[{steps}];
 int main(void)
 {{
   static shared_problem given = {{.size = {{{sizes}}}, .parameters = {{N}}}};
@@ -372,7 +374,7 @@ int main(void)
     run.q[i] = 0.3 * (i * 37 % 101) / 101.0;
   shared_inverse_masses(&given, run.inverse_mass);
   run.h = 0.01, run.threads = {threads};
-  return shared_advance(&run, {steps}, 0, &given, 0, 0, 0, 0, 0, 0);
+  return shared_advance(&run, {steps}, 1, &given, 0, t, q, p, iterations, 0);
 }}
 """
 COUNTED = """

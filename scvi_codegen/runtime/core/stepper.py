@@ -128,7 +128,7 @@ class Stepper(Integrator):
                 than 1e-7 (relative). ``True``: all steps, without a coarse run; ``False``: no check.
             tables, threads: of arrays of run-time sizes: (rows, columns) whole numbers by name, (rows,) for a single
                 column; and the number of threads per step, by default one, with bitwise equal results. Threads pay off
-                if a step takes longer than some tens of microseconds; they start again at every saved state. The shapes
+                if a step takes longer than some tens of microseconds; they are started by each call of C. The shapes
                 of the arrays determine the sizes, and without p and velocity the initial velocity is 0.
 
         Returns:
