@@ -190,10 +190,6 @@ class TestDamage:
                 refused += 1
         assert refused > 100
 
-    def test_run_of_a_former_version_is_named(self, chain: Any) -> None:
-        with pytest.raises(StateError, match=r"version 0\.2"):
-            chain.from_checkpoint(b"PK\x03\x04" + bytes(100))
-
     def test_run_of_another_integrator_is_rejected(self, chain: Any, pendulums: Any) -> None:
         with pytest.raises(StateError, match="not of 'pendulums"):
             pendulums.from_checkpoint(start(chain).checkpoint())

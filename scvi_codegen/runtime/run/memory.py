@@ -79,20 +79,10 @@ class Memory(OneThread):
         self._inputs = {name: slice(first, first + 5) for name, first in firsts.items()}
 
     @classmethod
-    def started(
-        cls,
-        stepper: Integrator,
-        q: States,
-        p: States,
-        *,
-        plan: StepPlan,
-        t: float = 0.0,
-        parameters: Parameters = None,
-        options: SolverOptions | None = None,
-    ) -> Self:
-        """Construct at (q, p) and t before the first step."""
+    def started(cls, stepper: Integrator, q: States, p: States, **arguments: Any) -> Self:
+        """Construct at (q, p) before the first step; arguments as of :meth:`_start`."""
         run = cls(stepper)
-        run._start(q, p, plan=plan, t=t, parameters=parameters, options=options)
+        run._start(q, p, **arguments)
         return run
 
     def _start(
@@ -101,9 +91,9 @@ class Memory(OneThread):
         p: States,
         *,
         plan: StepPlan,
-        t: float,
-        parameters: Parameters,
-        options: SolverOptions | None,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        options: SolverOptions | None = None,
     ) -> None:
         """Start at (q, p) and t; nothing of an earlier run remains."""
         stepper, interface = self.stepper, self.stepper.interface

@@ -16,8 +16,8 @@ from scvi_codegen.runtime.arrays.interface import RunSizes, check_accesses, read
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.validation import checked_count
 
-MAGIC, FORMER = b"scvi run 2\n", b"PK"
-"""First bytes of runs of run-time sizes, and of those of version 0.2."""
+MAGIC = b"scvi run 3\n"
+"""First bytes of runs of run-time sizes."""
 DIGEST = 32
 
 
@@ -48,11 +48,6 @@ def read_checkpoint(
     """
     if not isinstance(saved, bytes):
         raise StateError(f"a saved run must be bytes, not {type(saved).__name__}")
-    if saved.startswith(FORMER):
-        raise StateError(
-            "invalid saved run: it has the format of version 0.2, which this version does not read. Continue it with "
-            "version 0.2, or start a new run from its state"
-        )
     body = saved[len(MAGIC) + DIGEST :]
     if not saved.startswith(MAGIC) or hashlib.sha256(body).digest() != saved[len(MAGIC) : -len(body)]:
         raise StateError("invalid saved run: the checksum differs. Save the run again")
