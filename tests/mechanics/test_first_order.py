@@ -116,6 +116,20 @@ def test_vortices_on_a_curved_surface_agree_with_the_published_reference() -> No
     assert run.energy_error() < 1e-14
 
 
+def test_lotka_volterra_in_two_dimensions_agrees_with_the_published_reference() -> None:
+    """GeometricProblems.jl, ``lotka_volterra_2d``: ``reference_solution`` at t = 100, of energy error 5.6e-11."""
+    prey = "(y + log(y)/x)*x_dot + x*y_dot + x + y - log(x) - 2*log(y)"
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_text("prey", ["x", "y"], prey), "svi:8")
+    run = stepper.integrate([2.0, 1.0], h=0.05, steps=2000)
+    assert np.abs(run.variables[-1] - [0.34520671417508214, 1.1140647339845946]).max() < 3e-10
+
+    def right(_: float, z: np.ndarray) -> list[float]:
+        return [z[0] * (2 - z[1]), z[1] * (z[0] - 1)]
+
+    expected = solve_ivp(right, (0.0, 100.0), [2.0, 1.0], method="DOP853", rtol=2.3e-14, atol=1e-16).y[:, -1]
+    assert np.abs(run.variables[-1] - expected).max() < 3e-12
+
+
 def test_lotka_volterra_in_four_dimensions_agrees_with_the_published_reference() -> None:
     """GeometricProblems.jl, ``lotka_volterra_4d``: ``reference_solution`` at t = 100; in logarithms, sheared."""
     energy = "(exp({a}) + exp(b) + exp(c) + exp(d) - {a} - 2*b - c - d)"
