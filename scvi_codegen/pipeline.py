@@ -349,7 +349,7 @@ def generate_source(
 
     Raises:
         MethodError: if the solver is not available for the method, if a constant exceeds single precision, and if
-            events are combined with ``embedded``.
+            events are combined with ``embedded="single"``.
     """
     method = as_method(method, system)
     system = discretised_form(system, method)
@@ -361,7 +361,7 @@ def generate_source(
     source = render_embedded(program, embedded, control) if embedded else render(program, control)
     interface = describe(program, system, method, g=g)
     complete = with_events(source, interface, searched) if searched else source
-    return (complete.single_file() if amalgamate else complete), interface
+    return (complete.single_file() if amalgamate or embedded else complete), interface
 
 
 def _check_embedded(embedded: Embedded | None, solver: str, events: Sequence[Event]) -> None:
@@ -369,5 +369,5 @@ def _check_embedded(embedded: Embedded | None, solver: str, events: Sequence[Eve
         raise MethodError(f"embedded must be {' or '.join(EMBEDDED)}, not {embedded!r}")
     if embedded and solver == "fixed-point":
         raise MethodError("solver='fixed-point' is unavailable with embedded: use 'newton' or 'explicit'")
-    if embedded and events:
-        raise MethodError("source for a microcontroller does not support events: omit events or embedded")
+    if embedded == "single" and events:
+        raise MethodError("events require double precision, in which they are located: use embedded='double'")

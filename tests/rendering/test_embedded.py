@@ -1,5 +1,6 @@
 """C for microcontrollers: builds for ARM Cortex-M without a warning, runs under QEMU to the numbers of the host."""
 
+import re
 import subprocess
 from dataclasses import dataclass, replace
 from functools import cache
@@ -12,6 +13,7 @@ from programs import needs
 from samples import sample_named, stepper_for
 
 from scvi_codegen.cli import main
+from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, PackageError
 from scvi_codegen.ir.arithmetic import FUNCTIONS
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -24,6 +26,7 @@ from scvi_codegen.pipeline import generate_source
 from scvi_codegen.rendering.kernels.printer import SINGLE
 from scvi_codegen.rendering.program_source import EMBEDDED, Embedded
 from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.runtime.events.event import impact
 
 HERE = Path(__file__).parent / "embedded"
 CROSS, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"
@@ -282,3 +285,54 @@ def test_all_methods_compile_in_either_precision(tmp_path):
             (tmp_path / f"{prefix}.c").write_text(source.code)
             pure = PURE_SINGLE if precision == "single" else ()
             run(["gcc", *STRICT, *pure, "-c", f"{prefix}.c"], tmp_path)
+
+
+EVENTS_MAIN = """
+#include "hit_events.h"
+#include <stdio.h>
+int main(void)
+{
+  static double t[64], q[64], p[64], length[64], workspace[HIT_WORKSPACE];
+  static int iterations[64];
+  static long long number[64];
+  static hit_crossing found[32];
+  const double parameters[] = {1.0}, q0[] = {1.0}, p0[] = {0.0};
+  long long filled;
+  hit_watch watch = {.direction = {-1}, .acts = {1}};
+  hit_report report;
+  hit_run run;
+  hit_start(&run, 0.0, 0.1, q0, p0);
+  while (run.t < 8.0) {
+    if (hit_advance_with_changes(&run, &watch, 8.0, 0.0, 16, parameters, NULL, 64, t, q, p, length, iterations, number,
+            32, found, &filled, &report, workspace))
+      return 1;
+    for (int k = 0; k < filled; k++)
+      printf("%.17g %.17g\\n", found[k].t, found[k].p[0]);
+  }
+  return 0;
+}
+"""
+
+
+def test_impacts_without_allocation(tmp_path):
+    """The bounces of a ball by C alone, which allocates no memory, equal those of Python."""
+    needs("gcc")
+    ball = LagrangianSystem.from_text(
+        name="ball", coordinates=["y"], lagrangian="y_dot**2/2 - g*y", parameters={"g": 1.0}
+    )
+    source, _ = generate_source(ball, SVI(2), prefix="hit", events=impact("y", 0.8), embedded="double")
+    assert set(source.files) == {"hit.h", "hit.c", "hit_events.h", "hit_events.c"}
+    source.write(tmp_path)
+    (tmp_path / "main.c").write_text(EVENTS_MAIN)
+    command = ["gcc", *STRICT, "-O1", "hit.c", "hit_events.c", "main.c", "-o", "hit", "-lm"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    code = "".join(text for name, text in source.files.items() if name.endswith(".c"))
+    assert not re.search(r"\b[mc]alloc\b|\balloca\b", code)
+    printed = subprocess.run([tmp_path / "hit"], capture_output=True, text=True, check=True).stdout
+    found = np.array([line.split() for line in printed.splitlines()], dtype=float)
+    run = compile_stepper(ball, SVI(2)).integrate([1.0], [0.0], h=0.1, t_end=8.0, events=impact("y", 0.8))
+    assert len(found) == len(run.events[0]) == 4
+    assert np.abs(found[:, 0] - run.events[0].t).max() < 1e-13
+    assert np.abs(found[:, 1] - run.events[0].p[:, 0]).max() < 1e-13
+    with pytest.raises(MethodError, match="events require double precision"):
+        generate_source(ball, SVI(2), events=impact("y"), embedded="single")

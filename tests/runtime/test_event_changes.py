@@ -586,6 +586,19 @@ def test_lyapunov_exponent_of_the_stadium_billiard(point):
     assert abs(exponents[0] + exponents[3]) < 1e-10
 
 
+def test_gravity_wedge_is_integrable_at_45_degrees_only():
+    """Lehtihet & Miller, Physica D 21 (1986) 93: wedges of more than 45 degrees are chaotic."""
+    falling = LagrangianSystem.from_text(name="wedge", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y")
+    stepper, exponents = compile_stepper(falling, "svi:2", flags=FLAGS), []
+    for angle in (45, 50, 60):
+        walls = [impact(f"sin({angle}*pi/180)*y {sign} cos({angle}*pi/180)*x") for sign in "+-"]
+        run = stepper.integrate([0.05, 0.6], velocity=[0.4, 0.0], h=0.5, steps=1000, events=walls)
+        exponents.append(run.lyapunov_exponents()[0] * run.t[-1] / sum(map(len, run.events)))
+        assert np.ptp(run.energy()) < 2e-14
+    assert exponents[0] < 0.02
+    assert min(exponents[1:]) > 0.3
+
+
 def test_derivatives_are_refused_where_they_do_not_exist(point, ball):
     grazing = point.integrate(
         [-3.0, 1.0 - 1e-14], velocity=[1.0, 0.0], h=0.37, t_end=6.0, events=impact("x**2 + y**2 - 1")
@@ -737,6 +750,12 @@ def test_model_files_contain_events(tmp_path):
 def test_events_of_the_command_line_add_to_those_of_the_file(tmp_path):
     path = tmp_path / "ball.toml"
     path.write_text(MODEL)
+    derived = CliRunner().invoke(main, ["derive", str(path), "--event", "y - x**2 + t; restitution=1/2"])
+    assert derived.exit_code == 0, derived.output
+    assert "g = y = 0\n    p := p + (1 + e)/2 lambda n, H(q, p + lambda n) - H(q, p)" in derived.output
+    assert "n = (0, 1), g_t = 0\n    e = e" in derived.output
+    assert "n = (-2*x, 1), g_t = 1\n    e = 1/2" in derived.output
+    assert "g = x - 3 = 0, y >= 0\n    p_x := -p_x" in derived.output
     command = ["run", str(path), "--event", "t - 6; terminal=1", "--event", "y - 1/2; direction=1; p_y=p_y/2"]
     result = CliRunner().invoke(main, command)
     assert result.exit_code == 0, result.output

@@ -10,6 +10,7 @@ from scvi_codegen.cli.model_options import ModelOptions, model_arguments, read_m
 from scvi_codegen.derivation import Start, derivation_html
 from scvi_codegen.derivation.equations import StepEquations
 from scvi_codegen.derivation.equations import derive as derive_equations
+from scvi_codegen.derivation.events import events_text
 from scvi_codegen.fields.derivation import derivation_of
 
 
@@ -55,6 +56,9 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
     text = equations.to_latex() if latex else equations.to_text()
     if not latex and model.array_system is not None and model.array_system.mesh is not None:
         text = f"{derivation_of(model.array_system.mesh.field_system, model.array_system).to_text()}\n{text}"
+    if not latex and model.events:
+        names = ([*map(str, each)] for each in (model.system.coordinates, model.system.parameters))
+        text += f"\n{events_text(model.events, *names)}\n"
     formulas = _formulas(equations) if isinstance(equations, StepEquations) else {}
     emit(text, output, **about, **formulas, text=text)
 
