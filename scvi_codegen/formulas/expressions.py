@@ -1,4 +1,4 @@
-"""SymPy expressions: canonical form, check against the grammar, derivatives, evaluation in 60 digits and by NumPy.
+"""SymPy expressions: canonical form, check against the grammar, derivatives, evaluation in 60 digits.
 
 Derivatives are computed by forward accumulation, in which each node carries only its own non-zero partial derivatives.
 The Lagrangian of a lattice has a thousand terms and hundreds of variables, but each term depends on two or three.
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, reduce
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -464,43 +464,3 @@ def _partial(node: Expr, position: int) -> Expr:
     if isinstance(node, Function):
         return node.fdiff(position + 1)
     raise TypeError(f"cannot differentiate a {type(node).__name__}")
-
-
-def array_value(expression: Expr, known: dict[Expr, Any]) -> Any:
-    """Return the values of an expression, with the broadcast shape of the arrays in ``known``; NaN where undefined.
-
-    Args:
-        expression: an expression.
-        known: a number or an array for each symbol; values of subexpressions are added.
-
-    >>> x = Symbol("x", real=True)
-    >>> array_value(x**2 + 1, {x: np.arange(3.0)}).tolist()
-    [1.0, 2.0, 5.0]
-    """
-    for each in intermediates(expression):
-        _known_value(each, known)
-    return _known_value(expression, known)
-
-
-def _known_value(expression: Expr, known: dict[Expr, Any]) -> Any:
-    if expression not in known:
-        known[expression] = _node_value(expression, known)
-    return known[expression]
-
-
-def _node_value(expression: Any, known: dict[Expr, Any]) -> Any:
-    if not expression.args:
-        return float(expression) if not expression.is_Rational or abs(expression) < LARGEST else np.nan
-    arguments = [_known_value(argument, known) for argument in expression.args]
-    if isinstance(expression, Intermediate):
-        return arguments[0]
-    if expression.is_Add:
-        return reduce(np.add, arguments)
-    if expression.is_Mul:
-        return reduce(np.multiply, arguments)
-    if expression.is_Pow:
-        return np.power(arguments[0], float(arguments[1]) if expression.exp.is_Number else arguments[1])
-    name = type(expression).__name__
-    if name in PIECEWISE_CONSTANT:
-        return PIECEWISE_CONSTANT[name][1](*arguments)
-    return getattr(np, f"arc{name[1:]}" if name.startswith("a") else name)(*arguments)

@@ -1,7 +1,8 @@
-"""Evaluation of formulas by NumPy at all elements of loops, without generated code."""
+"""Evaluation of formulas by NumPy, also at all elements of loops, without generated code."""
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -9,11 +10,52 @@ from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.formulas.expressions import array_value
+from scvi_codegen.formulas.expressions import LARGEST, PIECEWISE_CONSTANT
+from scvi_codegen.formulas.intermediates import Intermediate, intermediates
 from scvi_codegen.indices import Access, Loop, Place
 
 MAX_ELEMENTS = 5_000_000
 """Maximum number of elements of the loops of a term that are evaluated at once."""
+
+
+def array_value(expression: Expr, known: dict[Expr, Any]) -> Any:
+    """Return the values of an expression, with the broadcast shape of the arrays in ``known``; NaN where undefined.
+
+    Args:
+        expression: an expression.
+        known: a number or an array for each symbol; values of subexpressions are added.
+
+    >>> x = Symbol("x", real=True)
+    >>> array_value(x**2 + 1, {x: np.arange(3.0)}).tolist()
+    [1.0, 2.0, 5.0]
+    """
+    for each in intermediates(expression):
+        _known_value(each, known)
+    return _known_value(expression, known)
+
+
+def _known_value(expression: Expr, known: dict[Expr, Any]) -> Any:
+    if expression not in known:
+        known[expression] = _node_value(expression, known)
+    return known[expression]
+
+
+def _node_value(expression: Any, known: dict[Expr, Any]) -> Any:
+    if not expression.args:
+        return float(expression) if not expression.is_Rational or abs(expression) < LARGEST else np.nan
+    arguments = [_known_value(argument, known) for argument in expression.args]
+    if isinstance(expression, Intermediate):
+        return arguments[0]
+    if expression.is_Add:
+        return reduce(np.add, arguments)
+    if expression.is_Mul:
+        return reduce(np.multiply, arguments)
+    if expression.is_Pow:
+        return np.power(arguments[0], float(arguments[1]) if expression.exp.is_Number else arguments[1])
+    name = type(expression).__name__
+    if name in PIECEWISE_CONSTANT:
+        return PIECEWISE_CONSTANT[name][1](*arguments)
+    return getattr(np, f"arc{name[1:]}" if name.startswith("a") else name)(*arguments)
 
 
 class Elements:

@@ -11,8 +11,9 @@ from sympy import Symbol, cos, exp, sin, sqrt
 import scvi_codegen as sc
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.files.cache import identity
-from scvi_codegen.formulas.expressions import array_value, evaluate, gradient, hessian, jacobian, unsupported_part
+from scvi_codegen.formulas.expressions import evaluate, gradient, hessian, jacobian, unsupported_part
 from scvi_codegen.formulas.intermediates import intermediate, intermediates, written_out, written_size
+from scvi_codegen.formulas.numpy_values import array_value
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.tables.precision import mp

@@ -9,8 +9,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 import scvi_codegen as sc
-from scvi_codegen.formulas.expressions import Tape, array_value, gradient
+from scvi_codegen.formulas.expressions import Tape, gradient
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.numpy_values import array_value
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.formulas.translation import format_expression
 from scvi_codegen.tables.precision import mp

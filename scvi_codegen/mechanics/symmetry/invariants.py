@@ -19,7 +19,8 @@ import sympy
 from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
-from scvi_codegen.formulas.expressions import array_value, gradient, parts
+from scvi_codegen.formulas.expressions import gradient, parts
+from scvi_codegen.formulas.numpy_values import array_value
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.symmetry.sampling import Rates, Sample, drawn_parameters
 from scvi_codegen.mechanics.system import MechanicalSystem

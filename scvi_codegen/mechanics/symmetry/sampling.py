@@ -19,7 +19,8 @@ import sympy
 from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
-from scvi_codegen.formulas.expressions import LARGEST, Tape, array_value, evaluate, parts
+from scvi_codegen.formulas.expressions import LARGEST, Tape, evaluate, parts
+from scvi_codegen.formulas.numpy_values import array_value
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.forces import constraint_multipliers, with_constraint_forces
 from scvi_codegen.mechanics.system import MechanicalSystem

@@ -29,8 +29,8 @@ from scvi_codegen.fields.axes import NATURAL, PERIODIC
 from scvi_codegen.fields.mesh import Mesh
 from scvi_codegen.fields.system import FieldSystem
 from scvi_codegen.formulas.array_notation import array_text
-from scvi_codegen.formulas.expressions import array_value
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.numpy_values import array_value
 from scvi_codegen.formulas.symbols import TIME, symbol
 from scvi_codegen.models.model_files.sections import Document, Section, check_keys, in_section
 from scvi_codegen.models.time_span import real

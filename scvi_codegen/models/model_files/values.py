@@ -47,8 +47,8 @@ from sympy import Expr
 from scvi_codegen.errors import ExpressionError, ModelFileError, closest
 from scvi_codegen.files.export import loaded
 from scvi_codegen.formulas.arrays import parse_array
-from scvi_codegen.formulas.expressions import array_value
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.numpy_values import array_value
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.indices import Array
 from scvi_codegen.mechanics.arrays.system import ArraySystem
