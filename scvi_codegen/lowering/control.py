@@ -12,6 +12,7 @@ the motion. Explicit leapfrog steps of rho between the steps of a symmetric meth
 """
 
 import math
+import operator
 from collections.abc import Sequence
 
 import sympy
@@ -26,6 +27,7 @@ from scvi_codegen.lowering.stage_groups import system_kernel
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.time_transformation import time_rescaling_function
+from scvi_codegen.tables.basis import least_squares
 
 LEVELS_PER_BINADE, REACH = 4, 2
 """Levels per factor of two, and the largest change of level for which the predictor is available."""
@@ -84,7 +86,7 @@ def _tables_by_ratio(
     points = _doubles(fixed_point.guess.abscissae)
     through = tuple(map(_doubles, fixed_point.predictor_matrix))
     count = len(points)
-    rows = least_squares(sources, [1.0 + ratio * x for ratio in ratios for x in points], degree)
+    rows = least_squares(sources, [1.0 + ratio * x for ratio in ratios for x in points], degree, _dot)
     tables = []
     for k, ratio in enumerate(ratios):
         scales = [ratio * age if fixed_point.kept is StoredValues.ACCELERATIONS else 1.0 for age in ages]
@@ -104,23 +106,8 @@ def _doubles(numbers: Sequence[Number]) -> tuple[float, ...]:
     return tuple(map(float, numbers))
 
 
-def least_squares(sources: Sequence[float], targets: Sequence[float], degree: int) -> list[list[float]]:
-    """Return the matrix from values at the sources to those of the least-squares polynomial at the targets."""
-    count, everywhere = len(sources), [*sources, *targets]
-    rows = [[0.0] * count for _ in targets]
-    before, here, norm_before = [0.0] * len(everywhere), [1.0] * len(everywhere), math.inf
-    for _ in range(degree + 1):
-        norm = math.fsum(value * value for value in here[:count])
-        for row, there in zip(rows, here[count:], strict=True):
-            row[:] = [entry + there * value / norm for entry, value in zip(row, here[:count], strict=True)]
-        centre = math.fsum(x * value * value for x, value in zip(sources, here, strict=False)) / norm
-        ratio = norm / norm_before
-        here, before = (
-            [(x - centre) * value - ratio * last for x, value, last in zip(everywhere, here, before, strict=True)],
-            here,
-        )
-        norm_before = norm
-    return rows
+def _dot(one: Sequence[float], other: Sequence[float]) -> float:
+    return math.fsum(map(operator.mul, one, other))
 
 
 def _padded(rows: list[list[float]], through: NumberTable, lanes: int) -> NumberTable:

@@ -8,7 +8,8 @@ number of points, so that 50 digits are correct even for equispaced points of hi
 Points and results are numbers of 60 digits; arguments may be anything ``mpmath`` converts exactly.
 """
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from itertools import accumulate
 from operator import mul
@@ -175,7 +176,7 @@ def extrapolation(points: Iterable[Number], shift: Number, degree: int | None = 
     if degree >= len(numbers):
         raise MethodError(f"degree {degree} is too high for {len(numbers)} points; give 0 to {len(numbers) - 1}")
     with mp.workdps(guard_digits(numbers) + len(numbers)):
-        rows = least_squares_shift(numbers, [point + offset for point in numbers], degree)
+        rows = least_squares(numbers, [point + offset for point in numbers], degree)
     return rounded(rows)
 
 
@@ -198,21 +199,25 @@ def continuation(points: Iterable[Number], degree: int) -> tuple[Matrix, Matrix]
             f"degree {degree} must be between 0 and {len(set(sources)) - 1} for {len(set(sources))} points"
         )
     with mp.workdps(guard_digits(numbers) + 2 * len(sources)):
-        rows = rounded(least_squares_shift(sources, [point + 1 for point in numbers], degree))
+        rows = rounded(least_squares(sources, [point + 1 for point in numbers], degree))
     return tuple(row[: len(numbers)] for row in rows), tuple(row[len(numbers) :] for row in rows)
 
 
-def least_squares_shift(points: Vector, targets: Sequence[Number], degree: int) -> list[list[Number]]:
-    """Return the least-squares matrix as a sum over orthogonal polynomials; see ``extrapolation``."""
-    count = len(points)
-    rows = [[mp.zero] * count for _ in targets]
-    before, here = [mp.zero] * (count + len(targets)), [mp.one] * (count + len(targets))
-    everywhere, norm_before = [*points, *targets], mp.inf
+def least_squares(
+    points: Sequence[Number], targets: Sequence[Number], degree: int, dot: Callable[..., Number] = mp.fdot
+) -> list[list[Number]]:
+    """Return the least-squares matrix as a sum over orthogonal polynomials; see ``extrapolation``.
+
+    ``dot`` is the scalar product of the numbers, here of any precision.
+    """
+    count, everywhere = len(points), [*points, *targets]
+    rows: list[list[Number]] = [[0] * count for _ in targets]
+    before, here, norm_before = [0] * len(everywhere), [1] * len(everywhere), math.inf
     for _ in range(degree + 1):
-        norm = mp.fdot(here[:count], here[:count])
+        norm = dot(here[:count], here[:count])
         for row, there in zip(rows, here[count:], strict=True):
             row[:] = [entry + there * value / norm for entry, value in zip(row, here[:count], strict=True)]
-        centre = mp.fdot((x * value for x, value in zip(points, here, strict=False)), here[:count]) / norm
+        centre = dot([x * value for x, value in zip(points, here, strict=False)], here[:count]) / norm
         ratio = norm / norm_before
         here, before = (
             [(x - centre) * value - ratio * last for x, value, last in zip(everywhere, here, before, strict=True)],
