@@ -136,7 +136,9 @@ class Assembly:
                     )
                 texts[f"{each}_{TIME}"] = f"{each}_dot[{terms[0][0]}]"
                 texts[each] = " + ".join(f"{digits(x)}*{each}[{index}]" for index, x in terms)
-            yield f"({self.written(formula, texts)})"
+            rates = [symbol(f"{each}_{TIME}") for each in (*self.system.fields, *self.system.scalars)]
+            rest = formula.xreplace(dict.fromkeys(rates, sympy.S.Zero))
+            yield from (f"({self.written(part, texts)})" for part in (sympy.expand(formula - rest), rest) if part != 0)
 
     def over_points(self, body: str) -> str:
         """Return the text of the quadrature of a body over all points."""

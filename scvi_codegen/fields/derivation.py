@@ -81,7 +81,7 @@ def _semidiscrete(assembled: Any) -> dict[str, str]:
         return {"semi-discrete Hamiltonian": assembled.definition["hamiltonian"]}
     text = assembled.definition["lagrangian"]
     terms = text.split("\n+ ")
-    kinetic = [each for each in terms if "_dot[" in each]
+    kinetic = [each for each in terms if "_dot" in each]
     others = [each for each in terms if each not in kinetic]
     energy = "\n+ ".join(kinetic) + "".join(f"\n- {each}" for each in others)
     return {"semi-discrete Lagrangian": text, "semi-discrete energy": energy}
