@@ -31,7 +31,7 @@ typedef struct {
 /* Cells in row-major order; points sorted by cell: point order[k] has the components x[axis][k]. */
 typedef struct {
   long long size[AXES_OF_CELLS], *first;
-  double width[AXES_OF_CELLS], *x[AXES_OF_CELLS];
+  double width[AXES_OF_CELLS], inverse[AXES_OF_CELLS], *x[AXES_OF_CELLS]; /* inverse: 1 / period, or 0 */
   int *order;
 } cells;
 
@@ -64,6 +64,7 @@ static long long divide_box(const points *of, double reach, cells *in)
     in->size[k] = (long long)(fit < most ? fit : most);
     if (in->size[k] < 3)
       in->size[k] = 1;
+    in->inverse[k] = period > 0.0 ? 1.0 / period : 0.0;
     in->width[k] = period > 0.0 ? period / (double)in->size[k] : reach;
     total *= in->size[k];
   }
@@ -104,20 +105,22 @@ static long long append(const cells *in, const points *of, long long cell, int i
     long long total, int *found, long long count)
 {
   enum { PART = 64 };
-  const long long end = cell + 2 <= total ? in->first[cell + 2] : of->count;
+  long long end = cell + 2 <= total ? in->first[cell + 2] : of->count;
+  while (end > in->first[cell + 1] && in->order[end - 1] >= i) /* in ascending order */
+    end--;
   for (long long begin = in->first[cell + 1]; begin < end; begin += PART) {
     const long long size = end - begin < PART ? end - begin : PART;
-    double square[PART] = {0.0};
+    double square[PART];
     for (int axis = 0; axis < of->components; axis++) {
-      const double *other = in->x[axis] + begin, period = of->lengths[axis], by = period > 0.0 ? 1.0 / period : 0.0;
+      const double *other = in->x[axis] + begin, period = of->lengths[axis], by = in->inverse[axis];
       for (long long k = 0; k < size; k++) {
         const double d = x[axis] - other[k], shortest = d - period * rint(d * by);
-        square[k] += shortest * shortest;
+        square[k] = (axis > 0 ? square[k] : 0.0) + shortest * shortest;
       }
     }
     for (long long k = 0; k < size; k++) {
       found[count] = in->order[begin + k];
-      count += (square[k] < reach * reach) & (found[count] < i);
+      count += square[k] < reach * reach;
     }
   }
   return count;
