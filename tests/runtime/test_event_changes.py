@@ -586,6 +586,46 @@ def test_lyapunov_exponent_of_the_stadium_billiard(point):
     assert abs(exponents[0] + exponents[3]) < 1e-10
 
 
+def test_periodic_orbit_of_a_ball_on_a_vibrating_table():
+    """Newton's method with derivatives through impacts converges to the exact motion of period one."""
+    e, amplitude = 0.8, 0.8
+    table = LagrangianSystem.from_text(
+        name="table",
+        coordinates=["y"],
+        lagrangian="y_dot**2/2 - (1 - A*sin(t))*y",
+        parameters={"A": amplitude},
+    )
+    stepper = compile_stepper(table, "svi:6", flags=FLAGS, events=impact("y", e))
+    speed = np.pi * (1 - e) / (1 + e)
+    phase = np.arccos(speed / amplitude)
+    flight = stepper.integrate([0.0], [np.pi - speed], t=phase, h=0.1, t_end=2 * np.pi)
+    exact, z = np.concatenate([flight.q[-1], flight.p[-1]]), np.array([3.5, -2.7])
+    for _ in range(6):
+        period = stepper.integrate(z[:1], z[1:], h=0.1, t_end=2 * np.pi)
+        z = z - np.linalg.solve(period.tangent()[-1] - np.eye(2), np.append(period.q[-1], period.p[-1]) - z)
+    assert len(period.events[0]) == 1
+    assert np.abs(z - exact).max() < 1e-13
+
+
+def test_fit_of_the_restitution():
+    """Gauss-Newton with derivatives by restitution and gravity finds the parameters of heights without noise."""
+    with pytest.warns(sc.SystemDefinitionWarning, match="'e' is not used"):
+        ball = LagrangianSystem.from_text(
+            name="ball", coordinates=["y"], lagrangian="y_dot**2/2 - g*y", parameters={"g": 1.0, "e": 0.8}
+        )
+    stepper, times = compile_stepper(ball, "svi:2", flags=FLAGS, events=impact("y", "e")), np.linspace(0.5, 6.3, 12)
+
+    def runs(x):
+        return [stepper.integrate([1.0], [0.0], h=0.1, t_end=t, parameters=dict(zip("ge", x))) for t in times]  # noqa: B905
+
+    heights, x = np.array([run.q[-1, 0] for run in runs([1.05, 0.77])]), np.array([1.0, 0.8])
+    for _ in range(8):
+        motions = runs(x)
+        jacobian = np.array([run.sensitivity().parameters[-1][0] for run in motions])
+        x = x - np.linalg.lstsq(jacobian, np.array([run.q[-1, 0] for run in motions]) - heights)[0]
+    assert np.abs(x - [1.05, 0.77]).max() < 1e-12
+
+
 def test_gravity_wedge_is_integrable_at_45_degrees_only():
     """Lehtihet & Miller, Physica D 21 (1986) 93: wedges of more than 45 degrees are chaotic."""
     falling = LagrangianSystem.from_text(name="wedge", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y")
