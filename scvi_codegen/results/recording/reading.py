@@ -18,7 +18,7 @@ from scvi_codegen.files.labelled_arrays import checked_units
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.results.recording.manifest import Chunk, chunk_paths, no_states, read_chunk, read_manifest
 from scvi_codegen.runtime.rotations.quantities import named_quantities
-from scvi_codegen.runtime.run.run_loop import first_step_size
+from scvi_codegen.runtime.run.run_loop import first_step_size, trajectory_of
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.quantities import quantities
 from scvi_codegen.runtime.trajectory.saved_states import checked_row
@@ -230,23 +230,10 @@ class RecordedRun:
         manifest, run = self.manifest, self._checkpointed_run
         taken = manifest.save_every * rows
         transformed = bool(manifest.interface.energy_parameter)
-        return Trajectory(
-            t=t,
-            q=q,
-            p=p,
-            iterations=iterations,
-            step_sizes=self._lengths(t, rows),
-            h=self.h,
-            plan=run.plan,
-            steps=run.steps,
-            rejected_steps=run.rejected_steps,
-            step_error=run.step_error,
-            worst_step_time=run.worst_step_time,
-            parameters=np.array(manifest.parameters),
-            stepper=run.stepper,
-            options=run.options,
-            tau=times_after(0.0, manifest.h, taken)[0] if transformed else None,
-        )
+        tau = times_after(0.0, manifest.h, taken)[0] if transformed else None
+        trajectory = trajectory_of(run, (t, q, p, iterations), self._lengths(t, rows), tau=tau)
+        trajectory.h = self.h
+        return trajectory
 
     def _lengths(self, t: Array, rows: NDArray[np.int64]) -> Array:
         """Return (n,) sizes of the steps after the states; NaN for an adaptive step whose end is not saved."""

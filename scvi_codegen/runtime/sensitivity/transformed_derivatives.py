@@ -9,7 +9,7 @@ nothing else.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -124,16 +124,4 @@ def time_of(states: SavedStates) -> PhysicalTime:
 
 
 def _before_last(states: SavedStates) -> SavedStates:
-    assert states.tau is not None
-    return SavedStates(
-        t=states.t[:-1],
-        q=states.q[:-1],
-        p=states.p[:-1],
-        step_sizes=states.step_sizes[:-1],
-        h=states.h,
-        parameters=states.parameters,
-        stepper=states.stepper,
-        plan=states.plan,
-        options=states.options,
-        tau=states.tau[:-1],
-    )
+    return replace(states, **{name: getattr(states, name)[:-1] for name in ("t", "q", "p", "step_sizes", "tau")})
