@@ -326,14 +326,15 @@ class Ensemble:
 
     def _adaptive_result(self) -> EnsembleTrajectory:
         lanes = [self.saved.get(j) or self._unfinished(j) for j in range(len(self))]
-        if self.t_eval is None:
-            t, times, rows = self._by_number(lanes)
-        else:
-            t, times = self.t_eval, None
-            rows = [slice(0, len(each.t)) for each in lanes]
-        q, p = np.full((2, len(t), len(self), self.stepper.dimension), np.nan)
-        for j, (each, row) in enumerate(zip(lanes, rows, strict=True)):
+        count = max(len(each.t) for each in lanes) if self.t_eval is None else len(self.t_eval)
+        t = np.arange(count, dtype=float) if self.t_eval is None else self.t_eval
+        times = np.full((count, len(lanes)), np.nan) if self.t_eval is None else None
+        q, p = np.full((2, count, len(self), self.stepper.dimension), np.nan)
+        for j, each in enumerate(lanes):
+            row = slice(0, len(each.t))
             q[row, j], p[row, j] = each.q, each.p
+            if times is not None:
+                times[row, j] = each.t
         return EnsembleTrajectory(
             t=t,
             times=times,
@@ -360,15 +361,6 @@ class Ensemble:
         last = np.searchsorted(forward * t[np.isfinite(t)], forward * np.array(ends), side="right").tolist()
         for (start, end), (first, until) in zip(pairwise([self.t0, *ends]), pairwise([0, *last]), strict=True):
             yield slice(first, until), slice(j, j + 1), partial(self.values_at, (start + end) / 2)
-
-    def _by_number(self, lanes: list[SavedLane]) -> tuple[Array, Array, list[slice]]:
-        """Return row numbers, (n, k) times padded with NaN, and the rows of each trajectory."""
-        rows = [slice(0, len(each.t)) for each in lanes]
-        count = max(row.stop for row in rows)
-        times = np.full((count, len(lanes)), np.nan)
-        for j, (each, row) in enumerate(zip(lanes, rows, strict=True)):
-            times[row, j] = each.t
-        return np.arange(count, dtype=float), times, rows
 
     def _unfinished(self, j: int) -> SavedLane:
         first = slice(0, 1 if self.t_eval is None else 0)
