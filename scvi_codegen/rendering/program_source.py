@@ -330,6 +330,7 @@ def with_fmu(
     by_velocity: bool,
     input_indices: Sequence[int],
     token: str,
+    events: Sequence[tuple[int, int, int]] = (),
 ) -> Source:
     """Return the source of an integrator with the functions of FMI.
 
@@ -339,8 +340,11 @@ def with_fmu(
         by_velocity: whether initial velocities are set instead of momenta.
         input_indices: index of the first parameter of each input.
         token: instantiation token of the model description.
+        events: of the source, which change the state: direction, number of the crossing that ends the simulation, and
+            1 if its crossings change the state.
     """
     context = {
+        "events": events,
         "interface": interface,
         "prefix": interface.prefix,
         "start": start,
@@ -358,4 +362,4 @@ def with_fmu(
         declarations="",
         support=included(code, support_text),
     )
-    return replace(source, beside=beside)
+    return replace(source, beside=replace(beside, beside=source.beside))

@@ -67,8 +67,8 @@ class Source:
 
     @property
     def sources(self) -> tuple[Source, ...]:
-        """Sources to compile: this one, and :attr:`beside`."""
-        return (self, self.beside) if self.beside else (self,)
+        """Sources to compile: this one, and those of :attr:`beside`."""
+        return (self, *self.beside.sources) if self.beside else (self,)
 
     def specialised(self) -> Source:
         """Return the source with support headers for it alone, without alternatives that it does not use."""

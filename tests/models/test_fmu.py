@@ -33,6 +33,7 @@ from scvi_codegen import (
 from scvi_codegen.cli import main
 from scvi_codegen.models.packages import fmu as fmu_module
 from scvi_codegen.native.building import PORTABLE_FLAGS, TARGETS
+from scvi_codegen.runtime.events.event import Event, impact
 
 H = 0.1
 STRICT = "-std=c99 -O1 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Wno-psabi -Werror -c".split()  # noqa: SIM905
@@ -102,6 +103,34 @@ def test_states_equal_those_of_the_stepper_bitwise(name, tmp_path):
         assert one.last == found[-1][0]
     expected = np.column_stack([run.t, run.q, run.velocity, run.p, run.energy()])[::3]
     assert_allclose(np.array(found), expected, rtol=0, atol=0)
+
+
+def test_impacts_within_communication_steps(tmp_path):
+    """States equal those of the stepper, also from a saved state; the crossing of x = -2 ends the simulation."""
+    system = LagrangianSystem.from_text(
+        name="ball", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - g*y", parameters={"g": 1.0}
+    )
+    walls = (impact("y", 0.8), Event("x - 3", then={"p_x": "-p_x"}), Event("x + 2", -1, terminal=1))
+    model = Model(system=system, method=SVI(4), q=(0.0, 1.0), velocity=(1.0, 0.0), h=H, steps=60, events=walls)
+    one = Slave(Fmu(generate_fmu(model, tmp_path / "ball.fmu"), tmp_path / "unpacked"))
+    assert one.start() == OK
+    run = model.stepper().integrate(model.q, velocity=model.velocity, h=H, steps=70)
+    for k in range(70):
+        if k == 30:
+            saved = one.saved_state()
+            assert one.step(k * H, H) == OK
+            assert one.call("SetFMUState", saved) == OK
+        assert one.step(k * H, H) == OK
+        row = np.flatnonzero(np.abs(run.t - (k + 1) * H) < 1e-9)[0]
+        assert_allclose(one.get("x", "y"), run.q[row], rtol=0, atol=1e-14)
+        assert_allclose(one.get("p_x", "p_y"), run.p[row], rtol=0, atol=1e-14)
+    assert [len(each) for each in run.events] == [4, 1, 0]
+    flags, last = [c_bool(True) for _ in range(3)], c_double(-1.0)
+    assert one.call("DoStep", c_double(70 * H), c_double(15 * H), c_bool(True), *map(byref, flags), byref(last)) == OK
+    assert [flag.value for flag in flags] == [False, True, False]
+    assert_allclose([last.value, *one.get("x")], [8.0, -2.0], rtol=0, atol=1e-13)
+    with pytest.raises(ModelFileError, match="must change the state"):
+        generate_fmu(replace(model, events=walls[2:]), tmp_path / "ended.fmu")
 
 
 def test_inputs_are_zero_order_hold_and_parameters_may_change(fmu):

@@ -28,7 +28,6 @@ from scvi_codegen.errors import (
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
-from scvi_codegen.models.packages.fmu import generate_fmu
 from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.pipeline import generate_source
 from scvi_codegen.runtime.core.stepper import Stepper
@@ -781,8 +780,6 @@ def test_model_files_contain_events(tmp_path):
     assert run.q[-1, 0] == pytest.approx(3.0 - 5.03, abs=1e-14)
     with pytest.raises(PackageError, match="has no events"):
         generate_package(model, tmp_path / "ball")
-    with pytest.raises(ModelFileError, match="FMU has no events"):
-        generate_fmu(model, tmp_path / "ball.fmu")
     with pytest.raises(ModelFileError, match=r"'were'.*did you mean 'where'"):
         parse_model(MODEL.replace("where", "were"))
 

@@ -229,12 +229,18 @@ def _check(platforms: tuple[str, ...]) -> None:
 
 def _texts(model: Model, prefix: str) -> tuple[Source, dict[str, bytes]]:
     """Return the source to compile, and the archive's text files by name."""
-    source, interface = generate_source(model.system, model.method, solver=model.solver, prefix=prefix)
+    events = model.events if any(event.changes_state for event in model.events) else ()
+    settings = [(event.direction, int(event.terminal), int(event.changes_state)) for event in events]
+    source, interface = generate_source(
+        model.system, model.method, solver=model.solver, prefix=prefix, events=events or None
+    )
     by_velocity = model.velocity is not None
     start = _start(model)
     indices = tuple(interface.parameters.index(f"{name}_{PARTS[0]}") for name in interface.inputs)
     token = _token(source.to_json(), interface, start)
-    source = with_fmu(source, interface, start, by_velocity=by_velocity, input_indices=indices, token=token)
+    source = with_fmu(
+        source, interface, start, by_velocity=by_velocity, input_indices=indices, token=token, events=settings
+    )
     texts = {
         DESCRIPTION: model_description(interface, start, by_velocity=by_velocity, token=token),
         **{f"sources/{name}": text for name, text in source.files.items()},
@@ -246,8 +252,8 @@ def _texts(model: Model, prefix: str) -> tuple[Source, dict[str, bytes]]:
 
 def _start(model: Model) -> ExampleRun:
     """Return the initial state, with velocities or momenta as in the model, and the step size."""
-    if model.events:
-        raise ModelFileError("an FMU has no events: omit them")
+    if any(event.terminal for event in model.events) and not any(event.changes_state for event in model.events):
+        raise ModelFileError("events of an FMU must change the state: omit terminal ones, and stop in the importer")
     if model.h is None or model.has_time_transformation:
         raise ModelFileError(
             "an FMU requires a fixed step size in time: give a step h (--step, [run] step), without a time "

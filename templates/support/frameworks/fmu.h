@@ -34,9 +34,26 @@ typedef struct {
   fmu_mode mode;
   bool behind; /* 1 if dependent values are out of date */
   double values[REFERENCES];
+#ifdef EVENT_SETTINGS
+  NAME(watch)
+  watch;
+#endif
   NAME(run)
   run;
 } fmu_state;
+
+#ifdef EVENT_SETTINGS
+enum { MOST_CHANGES = 256 };
+
+/* States and crossings of a call. */
+typedef struct {
+  double t[MOST_CHANGES], q[MOST_CHANGES * M], p[MOST_CHANGES * M], length[MOST_CHANGES];
+  int iterations[MOST_CHANGES];
+  long long number[MOST_CHANGES];
+  NAME(crossing)
+  found[MOST_CHANGES];
+} event_memory;
+#endif
 
 typedef struct {
   fmu_state now;
@@ -45,6 +62,9 @@ typedef struct {
   fmi3InstanceEnvironment environment;
   fmi3LogMessageCallback log;
   bool logs_discards;
+#ifdef EVENT_SETTINGS
+  event_memory memory;
+#endif
   double workspace[WORKSPACE];
 } fmu;
 
@@ -86,6 +106,9 @@ static void set_start(fmu_state *now)
 {
   memset(now, 0, sizeof *now);
   memcpy(now->token, TOKEN, sizeof TOKEN);
+#ifdef EVENT_SETTINGS
+  now->watch = (NAME(watch))EVENT_SETTINGS;
+#endif
   now->mode = INSTANTIATED;
   now->behind = true;
   now->values[TIME] = START_TIME;
@@ -334,6 +357,31 @@ static long long plan(NAME(run) * run, double end)
   return (long long)count;
 }
 
+/* Advances to the next communication point, or to the event that ends the simulation. */
+static int advance(fmu *one, double end, run_report *report)
+{
+  NAME(run) *const run = &one->now.run;
+  const double *parameters = one->now.values + FIRST_PARAMETER;
+  long long left = plan(run, end);
+#ifdef EVENT_SETTINGS
+  event_memory *const to = &one->memory;
+  while (left > 0 && !one->now.watch.ended && fabs(end - run->t) > slack_at(end)) {
+    long long filled;
+    const int status = NAME(advance_with_changes)(run, &one->now.watch, end, 0.0, left, parameters, NULL, MOST_CHANGES,
+        to->t, to->q, to->p, to->length, to->iterations, to->number, MOST_CHANGES, to->found, &filled, report,
+        one->workspace);
+    if (status != STATUS(OK) || report->steps == 0)
+      return status != STATUS(OK) ? status : STATUS(NOT_CONVERGED);
+    left -= report->steps;
+  }
+  return STATUS(OK);
+#else
+  double t, q[M], p[M];
+  int iterations;
+  return NAME(advance)(run, left, LLONG_MAX, parameters, NULL, &t, q, p, &iterations, report, one->workspace);
+#endif
+}
+
 FMI_EXPORT fmi3Status FMI(DoStep)(fmi3Instance instance, fmi3Float64 point, fmi3Float64 size, fmi3Boolean no_return,
     fmi3Boolean *event, fmi3Boolean *terminate, fmi3Boolean *early, fmi3Float64 *last)
 {
@@ -341,8 +389,11 @@ FMI_EXPORT fmi3Status FMI(DoStep)(fmi3Instance instance, fmi3Float64 point, fmi3
   run_memory *run = &one->now.run;
   NAME(report)
   report;
-  double *x = one->now.values, t, q[M], p[M];
-  int status, iterations;
+  double *x = one->now.values;
+  int status;
+#ifdef EVENT_SETTINGS
+  const NAME(watch) watched = one->now.watch;
+#endif
   (void)no_return;
   if (one->now.mode != STEP_MODE)
     return not_now(one, "fmi3DoStep");
@@ -351,10 +402,12 @@ FMI_EXPORT fmi3Status FMI(DoStep)(fmi3Instance instance, fmi3Float64 point, fmi3
   if (!(size > 0 && size / STEP < 1 / DBL_EPSILON))
     return failed(one, fmi3Error, "the communication step size %g must be positive, and less than 2^52 steps", size);
   one->before = *run;
-  status = NAME(advance)(run, plan(run, point + size), LLONG_MAX, x + FIRST_PARAMETER, NULL, &t, q, p, &iterations,
-      &report, one->workspace);
+  status = advance(one, point + size, &report);
   if (status != STATUS(OK)) {
     *run = one->before;
+#ifdef EVENT_SETTINGS
+    one->now.watch = watched;
+#endif
     *last = run->t;
     return failed(one, fmi3Discard, "the step at t = %g: %s", report.t, reason(status));
   }
@@ -363,6 +416,9 @@ FMI_EXPORT fmi3Status FMI(DoStep)(fmi3Instance instance, fmi3Float64 point, fmi3
   memcpy(x + MOMENTA, run->p, sizeof run->p);
   one->now.behind = true;
   *event = *terminate = *early = false;
+#ifdef EVENT_SETTINGS
+  *terminate = one->now.watch.ended;
+#endif
   return fmi3OK;
 }
 
