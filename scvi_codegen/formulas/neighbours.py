@@ -85,8 +85,8 @@ def parse_neighbours(
             )
         given = (*box, entry["cutoff"], entry.get("skin", f"({entry['cutoff']})/8"))
         lengths = [parse_expression(str(value), symbols) for value in given]
-        if any(length.is_number and not length > 0 for length in lengths):
-            raise SystemDefinitionError(f"the lengths of the neighbours '{name}' must be positive, not {given}")
+        if wrong := [str(length) for length in lengths if length.is_number and not length > 0]:
+            raise SystemDefinitionError(f"the lengths of the neighbours '{name}' must be positive, not {wrong[0]}")
         *periods, cutoff, skin = lengths
         results.append(Neighbours(name=name, array=array, box=tuple(periods), cutoff=cutoff, skin=skin))
     return tuple(results)

@@ -53,9 +53,9 @@ def forces(r: Any) -> Any:
     apart -= BOX * np.rint(apart / BOX)
     square = (apart**2).sum(axis=-1) + 1e3 * np.eye(len(r))
     s = np.maximum(1 - square**2 / CUT**4, 0.0)
-    slope = 4 * (-6 * square**-7 + 3 * square**-4) * s**4
-    slope -= 4 * (square**-6 - square**-3) * 8 * s**3 * square / CUT**4
-    return -(2 * slope[..., None] * apart).sum(axis=1)
+    derivative = 4 * (-6 * square**-7 + 3 * square**-4) * s**4
+    derivative -= 4 * (square**-6 - square**-3) * 8 * s**3 * square / CUT**4
+    return -(2 * derivative[..., None] * apart).sum(axis=1)
 
 
 def test_no_pair_is_missed_in_a_long_run() -> None:
@@ -169,7 +169,7 @@ def test_parameters_that_change_make_another_list() -> None:
     for skin in (0.01, None):
         run = stepper(skin=skin, pair=SOFT).start(r, velocity=v, h=0.001)
         run.advance(steps=2)
-        run.update(parameters={"box": 0.97 * BOX, "cut": 2.1})
+        run.update(parameters={"box": 0.97 * BOX, "cut": 2.05})
         run.advance(steps=2)
         runs.append(run.q["r"])
     assert runs[0] == pytest.approx(runs[1], abs=1e-12)
@@ -295,3 +295,10 @@ def test_a_list_of_another_name_and_of_no_pairs() -> None:
         )
     with pytest.raises(StateError, match="3"):
         stepper().integrate(np.zeros((4, 2)), h=0.1, steps=1)
+
+
+@pytest.mark.parametrize("lengths", [{"box": 1.9 * CUT}, {"box": -BOX}, {"cut": -1.0}])
+def test_lengths_without_a_list_end_the_run_with_the_remedy(lengths: dict[str, float]) -> None:
+    points = np.array([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0], [0.0, 1.1, 0.0]])
+    with pytest.raises(sc.StepFailedError, match="Lengths of 'near' must be positive, and periods"):
+        stepper().integrate(points, h=0.001, steps=1, parameters=lengths)

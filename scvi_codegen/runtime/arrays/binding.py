@@ -105,11 +105,12 @@ class ArrayBinding(Binding):
     @cached_property
     def failures(self) -> dict[str, tuple[str, str]]:
         """Messages of failed steps."""
-        failures = FAILURES_BY_SOLVER.get(self.interface.solver, FAILURES)
-        if (mesh := self.interface.layout.mesh) is None:
-            return failures
-        limit = f". The highest frequency of the mesh is at most {mesh.highest_frequency():.3g}: see its largest_step()"
-        return {word: (what, remedy + limit) for word, (what, remedy) in failures.items()}
+        failures, hint = FAILURES_BY_SOLVER.get(self.interface.solver, FAILURES), ""
+        if mesh := self.interface.layout.mesh:
+            hint = f". The highest frequency is at most {mesh.highest_frequency():.3g}: see largest_step() of the mesh"
+        if names := self.interface.layout.neighbours:
+            hint = f". Lengths of {', '.join(map(repr, names))} must be positive, and periods at least two cutoffs"
+        return {word: (what, remedy + hint) for word, (what, remedy) in failures.items()}
 
     def new(self, what: str) -> Any:
         """Return a run with its arrays, or the report of a call, as :meth:`Binding.new` does."""

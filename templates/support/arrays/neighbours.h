@@ -222,6 +222,9 @@ static void update_list(neighbours *list, const points *of, const double *q, con
   moved = farthest(of, list->at, X, groups, apart, width);
   if (!(cutoff > 0.0 && skin > 0.0 && moved < cutoff)) /* such a step is far too long */
     return;
+  for (int k = 0; k < of->components; k++)
+    if (of->lengths[k] != 0.0 && !(of->lengths[k] >= 2.0 * cutoff)) /* only the nearest image counts */
+      return;
   list->valid = half * skin > moved ? half * skin : moved;
   list->made++;
   list->failed = !make_list(list, of, list->at, cutoff + list->valid / half);
