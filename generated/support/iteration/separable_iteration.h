@@ -199,11 +199,6 @@ PASS void find_increments(const step_points *w, section here, number *dq, number
 #ifdef ARRAYS
 #define KEPT_FIRST(apart) 0
 
-static history history_in(const step_data *step)
-{
-  return history_of(step->run, OF_EACH * GROUPS * step->n, step->n);
-}
-
 static void prepare_iteration(const step_data *step, iteration_data *data)
 {
   prepare_step_size(step->h, data);
@@ -212,7 +207,7 @@ static void prepare_iteration(const step_data *step, iteration_data *data)
 
 static step_points points_in(const step_data *step, const iteration_data *data, history past)
 {
-  const step_points points = {step, data, (lanes *)step->run->work, past.now, step->n, step->scratch};
+  const step_points points = {step, data, step->work->X, past.now, step->n, step->work->inverse_size};
   return points;
 }
 

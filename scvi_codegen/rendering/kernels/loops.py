@@ -35,9 +35,9 @@ at the points, forces in this step and in two former ones.
 NEWTON_VECTORS = 4 + 17
 """Further vectors: residual, correction, products, and the basis of GMRES (templates/support/arrays/newton_gmres.h)."""
 FOURIER_VECTORS = 2
-"""Further vectors: scratch of Fourier transforms (templates/support/arrays/preconditioner.h)."""
-SCRATCH_VECTORS = 14
-"""Further vectors: inverse sizes, half steps (templates/support/step_size/observed_error.h), increments of a step."""
+"""Further vectors: Fourier transforms (templates/support/arrays/preconditioner.h)."""
+STEP_VECTORS = 14
+"""Further vectors: inverse sizes, half steps, increments of a step (templates/support/arrays/work_arrays.h)."""
 
 
 def loop_context(program: Program) -> dict[str, Any]:
@@ -67,8 +67,6 @@ def loop_context(program: Program) -> dict[str, Any]:
         "coordinates": " + ".join(map(product_text, program.layout.coordinates)),
         "fixed_point": _iteration_text(program),
         "work": _work(program),
-        "iteration_vectors": ITERATION_VECTORS,
-        "scratch_vectors": SCRATCH_VECTORS,
         "hot": "static",
         "waves": _lattice_context(program) if loops.reach else None,
         **_constraint_context(program, constrained),
@@ -82,7 +80,7 @@ def _work(program: Program) -> int:
     own = 2 * ITERATION_VECTORS if program.layout.momenta else ITERATION_VECTORS + bool(program.layout.velocities)
     linear = NEWTON_VECTORS + program.fixed_point.lanes if program.loops.products else 0
     waves = FOURIER_VECTORS * program.fixed_point.lanes + _roots_per_coordinate(program) if program.loops.reach else 0
-    return (own + linear) * program.fixed_point.lanes + waves + SCRATCH_VECTORS
+    return (own + linear) * program.fixed_point.lanes + waves + STEP_VECTORS
 
 
 def _iteration_text(program: Program) -> IterationSource | None:

@@ -15,12 +15,6 @@
 #define SUDDEN_GROWTH 1e20 /* of the largest coordinate in one iteration: a larger one changes the whole state */
 #define KEPT_FIRST(apart) ((apart) / 2) /* velocities follow forces */
 
-/* Work of a step: y, then rates. */
-static history history_in(const step_data *step)
-{
-  return history_of(step->run, 2 * GROUPS * step->n, 2 * step->n);
-}
-
 /* Positions or momenta: the state and the points; their rates, a table and weights; the largest size so far. */
 typedef struct {
   const double *start, *carry;
@@ -88,7 +82,7 @@ static int fixed_point(const step_data *step, const iteration_data *data, histor
 {
   const long long n = step->n;
   const section own = own_part(step);
-  lanes *X = (lanes *)step->run->work;
+  lanes *X = step->work->X;
   half_state q = {step->q0, step->carry_q, X, past.now + n, POSITION, POINT_END_POSITION, data->position_weight, 0.0};
   half_state p = {step->p0, step->carry_p, X + n, past.now, MOMENTUM, POINT_END_MOMENTUM, data->momentum_weight, 0.0};
   progress now = before_iterations();

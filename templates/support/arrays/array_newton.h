@@ -15,13 +15,11 @@
 typedef struct {
   const step_data *step;
   const run_memory *run;
-  const problem *given;
   const step_points *points;
+  const work_arrays *work;
   long long n, count; /* coordinates, and lanes of a vector over all points */
   section own; /* coordinates of this thread */
   double scale, state; /* of coordinates before they are squared, and their scaled size */
-  lanes *residual, *correction, *product, *forces, *inverse, *spare, *basis;
-  double *roots;
   int by_factors; /* 1 if the preconditioner is that of envelope.h */
   int by_fourier, tried; /* 1 if the inverses are those of the Fourier modes; number of preconditioners for which one
                         * cycle was not enough */
@@ -32,11 +30,11 @@ typedef struct {
 static void multiply(const linear_system *of, const lanes *x, lanes *y)
 {
   const long long n = of->n;
-  jacobian_times(of->step, of->points->X, x, of->forces);
+  jacobian_times(of->step, of->points->X, x, of->work->forces);
   for (long long i = of->own.first; i < of->own.end; i++) {
     const double unit = unit_of(of->points, i);
     for (int g = 0; g < GROUPS; g++)
-      y[g * n + i] = x[g * n + i] - unit * contribution_of_points(PRODUCT, g, &of->forces[i], n);
+      y[g * n + i] = x[g * n + i] - unit * contribution_of_points(PRODUCT, g, &of->work->forces[i], n);
   }
 }
 
@@ -46,7 +44,7 @@ static void apply_inverses(const linear_system *of, const lanes *x, lanes *y, se
   for (long long i = here.first; i < here.end; i++) {
     lanes all[GROUPS];
     for (int g = 0; g < GROUPS; g++)
-      all[g] = contribution_of_points(of->inverse + i * POINTS * GROUPS, g, x + i, of->n);
+      all[g] = contribution_of_points(of->work->inverse + i * POINTS * GROUPS, g, x + i, of->n);
     for (int g = 0; g < GROUPS; g++)
       y[g * of->n + i] = all[g];
   }
@@ -91,7 +89,7 @@ static void keep_inverse(linear_system *of, long long i, double derivative, doub
   for (int j = 0; j < POINTS; j++)
     for (int k = 0; k < POINTS; k++)
       inverse[j][k] *= by;
-  memcpy(of->inverse + i * POINTS * GROUPS, inverse, sizeof inverse);
+  memcpy(of->work->inverse + i * POINTS * GROUPS, inverse, sizeof inverse);
 }
 
 /* h^2 x / m of a coordinate, x averaged over the points. */
@@ -106,9 +104,9 @@ static double mean_derivative(const linear_system *of, const lanes *x, long long
 /* Inverts 1 - h^2 A F'_ii / m of every coordinate. */
 static void find_own_inverses(linear_system *of)
 {
-  jacobian_diagonal(of->step, of->points->X, of->forces);
+  jacobian_diagonal(of->step, of->points->X, of->work->forces);
   for (long long i = of->own.first; i < of->own.end; i++)
-    keep_inverse(of, i, mean_derivative(of, of->forces, i), 1.0);
+    keep_inverse(of, i, mean_derivative(of, of->work->forces, i), 1.0);
 }
 
 /* Vectors over all points of all coordinates; every thread computes its own part. */

@@ -73,7 +73,7 @@ static int run_workers(run_memory *run, const job *way, solver_report *report)
 }
 #endif
 
-/* Runs of array systems in arrays of the caller. Requires: perform_step of a solver, ERROR_POWER. */
+/* Runs of array systems in arrays of the caller. Requires: bind_work_arrays, perform_step of a solver, ERROR_POWER. */
 
 solver_options NAME(default_options)(void)
 {
@@ -102,19 +102,19 @@ static void store_state(run_memory *run, const job *way, solver_report *report, 
 
 static int take_steps(run_memory *run, const job *way, solver_report *report)
 {
-  const long long n = NAME(coordinates)(way->given);
+  const work_arrays work = bind_work_arrays(run, NAME(coordinates)(way->given));
   while (report->steps < way->steps) {
     const long long before = report->iterations;
     int status;
     report->t = run->t;
-    status = perform_step(run, way->given, n, way->options, report);
+    status = perform_step(run, way->given, &work, way->options, report);
     if (status != OK)
       return status;
     add_compensated(&run->t, &run->t_low, run->h, 0.0);
     run->iterations += report->iterations - before;
     run->step++;
     report->steps++;
-    store_state(run, way, report, n, 0);
+    store_state(run, way, report, work.n, 0);
   }
   return OK;
 }

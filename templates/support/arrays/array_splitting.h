@@ -8,10 +8,18 @@
  * momenta term by term, without an array of their own: a pass less over memory. Requires: arrays.h, add_forces, LEAPS,
  * CHUNK, the tables. */
 
-/* Parts of work: positions of the next kick, forces at the end of a step, increments of positions and momenta. */
+/* Workspace: positions of the next kick, forces at the end of a step, increments of positions and momenta. */
 typedef struct {
+  long long n; /* coordinates */
   double *X, *F, *dq, *dp;
-} parts_of_work;
+} work_arrays;
+
+static work_arrays bind_work_arrays(const run_memory *run, long long n)
+{
+  double *work = run->work;
+  const work_arrays of = {n, work, work + n, work + 2 * n, work + 3 * n};
+  return of;
+}
 
 /* Adds a drift to the increments; X are the positions afterwards. */
 static void drift_by(double by, const double *restrict inverse_mass, const double *restrict p,
@@ -23,15 +31,15 @@ static void drift_by(double by, const double *restrict inverse_mass, const doubl
   }
 }
 
-static int all_sums_finite(const run_memory *run, const parts_of_work *parts, long long n)
+static int all_sums_finite(const run_memory *run, const work_arrays *work)
 {
   sums all;
-  begin_sums(&all, run, n);
+  begin_sums(&all, run, work->n);
   while (next_block(&all)) {
     int faults = 0;
     for (long long i = all.here.first; i < all.here.end; i++) {
-      faults |= !is_finite(run->q[i] + parts->dq[i]);
-      faults |= !is_finite(run->p[i] + parts->dp[i]);
+      faults |= !is_finite(run->q[i] + work->dq[i]);
+      faults |= !is_finite(run->p[i] + work->dp[i]);
     }
     add_block(&all, faults, 0.0);
   }
@@ -46,46 +54,44 @@ static int ends_with_a_kick(void)
 }
 
 /* Kicks the momenta of this thread; stores forces that the next step can reuse. */
-static void kick_by(const run_memory *run, const problem *given, const parts_of_work *parts, int k, section own)
+static void kick_by(const run_memory *run, const problem *given, const work_arrays *work, int k, section own)
 {
   const double by = run->h * KICK[k], t = run->t + KICK_ABSCISSA[k] * run->h;
   const long long size = own.end - own.first;
   if (k == 0 && run->guess)
-    add_to(parts->dp + own.first, parts->F + own.first, by, size);
+    add_to(work->dp + own.first, work->F + own.first, by, size);
   else if (k == LEAPS - 1 && ends_with_a_kick()) {
-    memset(parts->F + own.first, 0, sizeof(double) * (size_t)size);
-    add_forces(run, given, parts->X, t, 1.0, parts->F);
-    add_to(parts->dp + own.first, parts->F + own.first, by, size);
+    memset(work->F + own.first, 0, sizeof(double) * (size_t)size);
+    add_forces(run, given, work->X, t, 1.0, work->F);
+    add_to(work->dp + own.first, work->F + own.first, by, size);
   } else
-    add_forces(run, given, parts->X, t, by, parts->dp);
+    add_forces(run, given, work->X, t, by, work->dp);
 }
 
 /* Performs a step. The increments start with the compensation terms of the state. */
-static int perform_step(run_memory *run, const problem *given, long long n, const solver_options *options,
+static int perform_step(run_memory *run, const problem *given, const work_arrays *work, const solver_options *options,
     solver_report *report)
 {
-  double *work = run->work;
-  const parts_of_work parts = {work, work + n, work + 2 * n, work + 3 * n};
-  const section own = mine(run, n);
+  const section own = mine(run, work->n);
   const size_t size = (size_t)(own.end - own.first);
   (void)options;
-  memcpy(parts.dq + own.first, run->carry_q + own.first, sizeof(double) * size);
-  memcpy(parts.dp + own.first, run->carry_p + own.first, sizeof(double) * size);
-  drift_by(0.0, run->inverse_mass, run->p, parts.dp, run->q, parts.dq, parts.X, own);
+  memcpy(work->dq + own.first, run->carry_q + own.first, sizeof(double) * size);
+  memcpy(work->dp + own.first, run->carry_p + own.first, sizeof(double) * size);
+  drift_by(0.0, run->inverse_mass, run->p, work->dp, run->q, work->dq, work->X, own);
   for (int k = 0; k < LEAPS; k++) {
     if (KICK[k] != 0.0)
-      kick_by(run, given, &parts, k, own);
+      kick_by(run, given, work, k, own);
     if (DRIFT[k] != 0.0)
-      drift_by(run->h * DRIFT[k], run->inverse_mass, run->p, parts.dp, run->q, parts.dq, parts.X, own);
+      drift_by(run->h * DRIFT[k], run->inverse_mass, run->p, work->dp, run->q, work->dq, work->X, own);
   }
   report->iterations++;
   run->error = NAN;
-  if (!all_sums_finite(run, &parts, n)) {
+  if (!all_sums_finite(run, work)) {
     run->guess = 0; /* the stored forces belong to no accepted state */
     return NOT_FINITE;
   }
-  add_all(run->q + own.first, parts.dq + own.first, run->carry_q + own.first, (long long)size);
-  add_all(run->p + own.first, parts.dp + own.first, run->carry_p + own.first, (long long)size);
+  add_all(run->q + own.first, work->dq + own.first, run->carry_q + own.first, (long long)size);
+  add_all(run->p + own.first, work->dp + own.first, run->carry_p + own.first, (long long)size);
   run->guess = ends_with_a_kick();
   return OK;
 }

@@ -7,7 +7,7 @@
 /* Runs of array systems whose steps are solved by iteration. Requires: prepare and solve of a solver,
  * observed_error.h. */
 
-static step_data step_of(const run_memory *run, const problem *given, long long n)
+static step_data step_of(const run_memory *run, const problem *given, const work_arrays *work)
 {
   const step_data step = {.t = run->t,
       .h = run->h,
@@ -15,17 +15,11 @@ static step_data step_of(const run_memory *run, const problem *given, long long 
       .p0 = run->p,
       .carry_q = run->carry_q,
       .carry_p = run->carry_p,
-      .scratch = run->work + (STATUS(WORK) - SCRATCH_VECTORS) * n,
       .run = run,
       .given = given,
-      .n = n};
+      .work = work,
+      .n = work->n};
   return step;
-}
-
-/* Increments of q, their low words and increments of p. */
-static double *increments_in(const step_data *step)
-{
-  return step->scratch + 11 * step->n;
 }
 
 /* Advances the state to the end of a solved step. */
@@ -40,20 +34,19 @@ static void continue_steps(run_memory *run, const step_data *step, const double 
 }
 
 /* Performs a step of the same size as the previous one. */
-static int perform_step(run_memory *run, const problem *given, long long n, const solver_options *options,
+static int perform_step(run_memory *run, const problem *given, const work_arrays *work, const solver_options *options,
     solver_report *report)
 {
-  step_data step = step_of(run, given, n);
-  double *const dq = increments_in(&step), *const dp = dq + 2 * n;
+  step_data step = step_of(run, given, work);
   solver_data data;
   int status;
   prepare(&step, &data);
-  status = solve(&step, &data, history_in(&step), &run->guess, dq, dp, options, report, NULL);
+  status = solve(&step, &data, history_in(&step), &run->guess, work->dq, work->dp, options, report, NULL);
   if (status != OK)
     return status;
-  status = observe_error(run, &step, &data, dq, dp, options, NULL);
+  status = observe_error(run, &step, &data, work->dq, work->dp, options, NULL);
   if (status == OK)
-    continue_steps(run, &step, dq, dp);
+    continue_steps(run, &step, work->dq, work->dp);
   else
     run->guess = 0;
   return status;

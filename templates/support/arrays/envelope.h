@@ -131,18 +131,18 @@ static void find_factors(linear_system *of)
 {
   const envelope all = envelope_of(of);
   const long long last = all.n - 1, entries = all.start[last] + last - all.first[last] + 1;
-  make_zero(of, of->product);
+  make_zero(of, of->work->product);
   wait_at_barrier(of->run);
   if (is_first_thread(of))
     memset(all.factor, 0, sizeof(complex_shifts) * (size_t)entries);
   for (int colour = 0; colour < all.width + all.apart; colour++) {
     if (is_first_thread(of))
-      set_columns(of, &all, colour, 1.0, of->product);
+      set_columns(of, &all, colour, 1.0, of->work->product);
     wait_at_barrier(of->run);
-    jacobian_times(of->step, of->points->X, of->product, of->forces);
+    jacobian_times(of->step, of->points->X, of->work->product, of->work->forces);
     if (is_first_thread(of)) {
-      keep_columns(of, &all, colour, of->forces);
-      set_columns(of, &all, colour, 0.0, of->product);
+      keep_columns(of, &all, colour, of->work->forces);
+      set_columns(of, &all, colour, 0.0, of->work->product);
     }
     wait_at_barrier(of->run);
   }

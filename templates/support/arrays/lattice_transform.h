@@ -18,7 +18,7 @@ typedef struct {
 
 /* exp(-2 pi i k / size), k = 0 .. size - 1, real and imaginary parts. */
 typedef struct {
-  const double *cosine, *sine;
+  double *cosine, *sine;
 } roots;
 
 /* An axis of a lattice: `outer` lines of `size` places with `inner` numbers each. */

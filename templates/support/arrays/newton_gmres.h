@@ -7,13 +7,10 @@
 #include "preconditioner.h"
 
 /* Restarted GMRES with right preconditioning (Y. Saad, Iterative Methods for Sparse Linear Systems, 2003, algorithm
- * 9.5) on vectors over all points of all coordinates. Requires: array_newton.h; linear_system with count, state,
- * basis, residual, correction and product; multiply, precondition and reconsider. */
+ * 9.5) on vectors over all points of all coordinates. Requires: array_newton.h; linear_system with count, state
+ * and work; multiply, precondition and reconsider. */
 
-enum {
-  BASIS = 16, /* basis vectors before a restart */
-  MOST_CYCLES = 30 /* then Newton's method continues with the correction so far */
-};
+enum { MOST_CYCLES = 30 }; /* then Newton's method continues with the correction so far */
 
 #define LINEAR_TOLERANCE 1e-6 /* relative residual: reduction per Newton iteration */
 #define LINEAR_GRAIN (DBL_EPSILON / 4) /* relative to the state: a smaller residual is rounding */
@@ -45,16 +42,16 @@ static double rotate(triangle *of, int k)
 static int build_basis(linear_system *of, triangle *all, double enough, solver_report *report)
 {
   for (int k = 0; k < BASIS; k++) {
-    const lanes *now = of->basis + k * of->count;
-    lanes *next = of->basis + (k + 1) * of->count;
+    const lanes *now = of->work->basis + k * of->count;
+    lanes *next = of->work->basis + (k + 1) * of->count;
     double left;
-    precondition(of, now, of->product);
-    multiply(of, of->product, next);
+    precondition(of, now, of->work->product);
+    multiply(of, of->work->product, next);
     report->products++;
     for (int j = 0; j <= k; j++) {
-      const double part = inner_product(of, of->basis + j * of->count, next);
+      const double part = inner_product(of, of->work->basis + j * of->count, next);
       all->column[k][j] = part;
-      add_multiple(of, next, -part, of->basis + j * of->count);
+      add_multiple(of, next, -part, of->work->basis + j * of->count);
     }
     all->column[k][k + 1] = sqrt(inner_product(of, next, next));
     if (all->column[k][k + 1] > 0.0)
@@ -69,7 +66,7 @@ static int build_basis(linear_system *of, triangle *all, double enough, solver_r
 /* Adds the solution in a basis of `size` vectors to the correction. */
 static void add_combination(linear_system *of, triangle *all, int size)
 {
-  lanes *sum = of->basis + size * of->count;
+  lanes *sum = of->work->basis + size * of->count;
   for (int k = size - 1; k >= 0; k--) {
     for (int j = k + 1; j < size; j++)
       all->rest[k] -= all->column[j][k] * all->rest[j];
@@ -77,9 +74,9 @@ static void add_combination(linear_system *of, triangle *all, int size)
   }
   make_zero(of, sum);
   for (int k = 0; k < size; k++)
-    add_multiple(of, sum, all->rest[k], of->basis + k * of->count);
-  precondition(of, sum, of->product);
-  add_multiple(of, of->correction, 1.0, of->product);
+    add_multiple(of, sum, all->rest[k], of->work->basis + k * of->count);
+  precondition(of, sum, of->work->product);
+  add_multiple(of, of->work->correction, 1.0, of->work->product);
 }
 
 /* Solves for the correction to LINEAR_TOLERANCE or LINEAR_GRAIN; returns the norm of the residual, which is larger if
@@ -87,23 +84,23 @@ static void add_combination(linear_system *of, triangle *all, int size)
  * left at that level is corrected by the inverses of the coordinates. */
 static double find_correction(linear_system *of, solver_report *report)
 {
-  const double size = sqrt(inner_product(of, of->residual, of->residual));
+  const double size = sqrt(inner_product(of, of->work->residual, of->work->residual));
   const double enough = larger(LINEAR_TOLERANCE * size, LINEAR_GRAIN * of->state);
   double last = size;
-  make_zero(of, of->correction);
+  make_zero(of, of->work->correction);
   for (int cycle = 0; cycle < MOST_CYCLES; cycle++) {
     triangle all = {.rest = {0.0}};
-    lanes *left = of->basis;
-    scale(of, left, 1.0, of->residual);
+    lanes *left = of->work->basis;
+    scale(of, left, 1.0, of->work->residual);
     if (cycle > 0) {
-      multiply(of, of->correction, of->product);
-      add_multiple(of, left, -1.0, of->product);
+      multiply(of, of->work->correction, of->work->product);
+      add_multiple(of, left, -1.0, of->work->product);
     }
     all.rest[0] = sqrt(inner_product(of, left, left));
     if (!(all.rest[0] > enough && all.rest[0] < INFINITY)) {
       if (enough > LINEAR_TOLERANCE * size && !of->by_fourier && !of->by_factors) {
-        apply_inverses(of, left, of->product, of->own);
-        add_multiple(of, of->correction, 1.0, of->product);
+        apply_inverses(of, left, of->work->product, of->own);
+        add_multiple(of, of->work->correction, 1.0, of->work->product);
       }
       return all.rest[0];
     }
@@ -124,30 +121,6 @@ static double find_correction(linear_system *of, solver_report *report)
                   * then GMRES solves the linear systems */
 #define UNSOLVED 1e-10 /* relative to the state: a larger residual is not due to rounding */
 
-/* Parts of work behind those of the fixed-point iteration. */
-static linear_system linear_of(const step_points *points)
-{
-  const long long count = GROUPS * points->n;
-  lanes *work = (lanes *)points->step->run->work + ITERATION_VECTORS * count;
-  const linear_system of = {.step = points->step,
-      .run = points->step->run,
-      .given = points->step->given,
-      .points = points,
-      .n = points->n,
-      .count = count,
-      .own = own_part(points->step),
-      .by_factors = points->step->run->pattern != NULL,
-      .residual = work,
-      .correction = work + count,
-      .product = work + 2 * count,
-      .forces = work + 3 * count,
-      .inverse = work + 4 * count,
-      .spare = work + (4 + POINTS) * count,
-      .basis = work + (4 + POINTS + SPARE_VECTORS) * count,
-      .roots = (double *)(work + (4 + POINTS + SPARE_VECTORS + BASIS + 1) * count)};
-  return of;
-}
-
 /* Residual: the change by one fixed-point iteration at the points with their forces, for the coordinates of this
  * thread. */
 static void find_residual(linear_system *of, const step_points *w)
@@ -157,7 +130,7 @@ static void find_residual(linear_system *of, const step_points *w)
     const double q = w->step->q0[i];
     for (int g = 0; g < GROUPS; g++) {
       const lanes sum = SUM_OF_FORCES(PRODUCT, w, g, i) + SUM_OF_FORCES(PRODUCT_LOW, w, g, i);
-      of->residual[g * w->n + i] = (q - w->X[g * w->n + i]) + DRIFT[g] * along.high +
+      of->work->residual[g * w->n + i] = (q - w->X[g * w->n + i]) + DRIFT[g] * along.high +
           (unit_of(w, i) * sum + low_words(w, g, along, i));
     }
   }
@@ -189,15 +162,15 @@ static void start_nearer(linear_system *of)
   const step_points *w = of->points;
   step_points rest = *w;
   double continued, at_rest;
-  rest.X = of->correction, rest.F = of->forces;
+  rest.X = of->work->correction, rest.F = of->work->forces;
   find_residual(of, w);
-  continued = inner_product(of, of->residual, of->residual);
+  continued = inner_product(of, of->work->residual, of->work->residual);
   for (int g = 0; g < GROUPS; g++)
     for (long long i = of->own.first; i < of->own.end; i++)
       rest.X[g * of->n + i] = lanes_of(w->step->q0[i]);
   forces(&rest);
   find_residual(of, &rest);
-  at_rest = inner_product(of, of->residual, of->residual);
+  at_rest = inner_product(of, of->work->residual, of->work->residual);
   if (continued <= at_rest)
     return;
   scale(of, w->X, 1.0, rest.X);
@@ -241,7 +214,14 @@ static int solve(const step_data *step, const solver_data *data, history past, l
     const solver_options *options, solver_report *report, double *workspace)
 {
   const step_points w = points_in(step, data, past);
-  linear_system of = linear_of(&w);
+  linear_system of = {.step = step,
+      .run = step->run,
+      .points = &w,
+      .work = step->work,
+      .n = step->n,
+      .count = GROUPS * step->n,
+      .own = own_part(step),
+      .by_factors = step->run->pattern != NULL};
   progress now = before_iterations();
   int status, slow = 0; /* iterations with the factors that reduced the change too little */
   (void)workspace;
@@ -258,12 +238,12 @@ static int solve(const step_data *step, const solver_data *data, history past, l
       find_inverses(&of);
     left = 0.0;
     if (of.by_factors && slow < 2)
-      precondition(&of, of.residual, of.correction);
+      precondition(&of, of.work->residual, of.work->correction);
     else
       left = find_correction(&of, report);
-    add_multiple(&of, w.X, 1.0, of.correction);
+    add_multiple(&of, w.X, 1.0, of.work->correction);
     forces(&w);
-    change = inner_product(&of, of.correction, of.correction);
+    change = inner_product(&of, of.work->correction, of.work->correction);
     of.state = sqrt(size_of_state(&of));
     size = options->absolute ? of.scale * of.scale : of.state * of.state;
     slow += k > 0 && relative_change(change, size) > larger(SLOW * now.last, PROGRESS_LEVEL);

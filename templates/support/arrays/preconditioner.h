@@ -99,10 +99,10 @@ static void probe_stencils(linear_system *of, const lattice *all, lanes *x, lane
         if (asked)
           set_probes(of, &probe, x);
         else
-          find_mean(of, &probe, of->forces, mean);
+          find_mean(of, &probe, of->work->forces, mean);
       }
     if (asked)
-      jacobian_times(of->step, of->points->X, x, of->forces); /* begins with a barrier */
+      jacobian_times(of->step, of->points->X, x, of->work->forces); /* begins with a barrier */
   }
   wait_at_barrier(of->run);
 }
@@ -131,16 +131,15 @@ static double off_diagonal_ratio(const linear_system *of, const lattice *all, co
  * diagonal in Fourier space (T. F. Chan, SIAM J. Sci. Stat. Comput. 9, 1988, 766). It is accurate if the couplings
  * are uniform and boundaries few; otherwise the diagonal of F' is used. */
 
-enum { SPARE_VECTORS = 2 }; /* of work */
 #define COUPLED 0.1 /* relative to the diagonal: weaker couplings do not justify the Fourier preconditioner */
 
 /* Describes the lattices and the location of their roots of unity; returns 0 if one cannot be transformed or is too
  * small for stencil probing. */
 static int find_lattices(const linear_system *of, lattice *all)
 {
-  double *next = of->roots;
+  double *next = of->work->roots;
   int sound = 1;
-  describe_lattices(of->given, all);
+  describe_lattices(of->step->given, all);
   for (lattice *one = all; one < all + LATTICES; one++)
     for (int a = 0; a < one->axes; a++) {
       const long long size = one->size[a];
@@ -155,21 +154,19 @@ static int find_lattices(const linear_system *of, lattice *all)
 /* exp(-2 pi i k / size) for all axes. */
 static void find_roots(const linear_system *of, const lattice *all)
 {
-  double *next = of->roots;
   for (const lattice *one = all; one < all + LATTICES; one++)
     for (int a = 0; a < one->axes; a++) {
       const long long size = one->size[a];
       const section own = share_of(of->run, size);
       for (long long k = own.first; k < own.end; k++) {
         const double angle = 6.283185307179586 * (double)k / (double)size;
-        next[k] = cos(angle);
-        next[size + k] = -sin(angle);
+        one->of_one[a].cosine[k] = cos(angle);
+        one->of_one[a].sine[k] = -sin(angle);
       }
-      next += 2 * size;
     }
 }
 
-/* Fourier transform along all axes of a lattice, in place in x; y is scratch. */
+/* Fourier transform along all axes of a lattice, in place in x; y is overwritten. */
 static void transform_lattice(const linear_system *of, const lattice *one, complex_lanes *x, complex_lanes *y)
 {
   long long inner = one->components, outer = positions_of(one);
@@ -188,18 +185,22 @@ static section modes_of(const linear_system *of, const lattice *one)
   return own;
 }
 
-/* Computes the inverses of the Fourier modes of the mean stencil; returns 0 if couplings are negligible. */
-static int invert_modes(linear_system *of, const lattice *all)
+/* Computes the inverses of the Fourier modes of the mean stencil; returns 0 if a lattice cannot be transformed or
+ * couplings are negligible. */
+static int invert_modes(linear_system *of)
 {
+  lattice all[LATTICES];
+  if (!find_lattices(of, all))
+    return 0;
   find_roots(of, all);
-  probe_stencils(of, all, of->basis + of->count, of->product);
-  if (off_diagonal_ratio(of, all, of->product) < COUPLED)
+  probe_stencils(of, all, of->work->basis + of->count, of->work->product);
+  if (off_diagonal_ratio(of, all, of->work->product) < COUPLED)
     return 0;
   wait_at_barrier(of->run);
-  make_zero(of, of->forces);
+  make_zero(of, of->work->forces);
   wait_at_barrier(of->run);
   for (const lattice *one = all; one < all + LATTICES; one++) {
-    complex_lanes x = {of->product, of->forces}, y = {of->spare, of->spare + of->count};
+    complex_lanes x = {of->work->product, of->work->forces}, y = {of->work->spare, of->work->spare + of->count};
     section own = modes_of(of, one);
     transform_lattice(of, one, &x, &y);
     for (; own.first < own.end; own.first++)
@@ -209,55 +210,49 @@ static int invert_modes(linear_system *of, const lattice *all)
   return 1;
 }
 
-/* Applies the inverses to the Fourier modes of a lattice and transforms back; the result is in the real parts. */
-static void apply_modes(const linear_system *of, const lattice *one, complex_lanes x, complex_lanes y)
+/* y = the inverses of the Fourier modes times x, by transforms; the result is in the real parts. */
+static void apply_modes(const linear_system *of, const lanes *x, lanes *y)
 {
-  const section own = modes_of(of, one);
-  complex_lanes turned, scratch;
-  transform_lattice(of, one, &x, &y);
-  apply_inverses(of, x.re, x.re, own);
-  apply_inverses(of, x.im, x.im, own);
+  lattice all[LATTICES];
+  find_lattices(of, all);
+  scale(of, y, 1.0, x);
+  make_zero(of, of->work->forces);
   wait_at_barrier(of->run);
-  turned.re = x.im, turned.im = x.re; /* inverse transform: real and imaginary parts exchanged */
-  scratch.re = y.im, scratch.im = y.re;
-  transform_lattice(of, one, &turned, &scratch);
+  for (const lattice *one = all; one < all + LATTICES; one++) {
+    const section own = modes_of(of, one);
+    complex_lanes modes = {y, of->work->forces}, spare = {of->work->spare, of->work->spare + of->count}, turned, other;
+    transform_lattice(of, one, &modes, &spare);
+    apply_inverses(of, modes.re, modes.re, own);
+    apply_inverses(of, modes.im, modes.im, own);
+    wait_at_barrier(of->run);
+    turned.re = modes.im, turned.im = modes.re; /* inverse transform: real and imaginary parts exchanged */
+    other.re = spare.im, other.im = spare.re;
+    transform_lattice(of, one, &turned, &other);
+  }
 }
+#else
+#define invert_modes(of) 0
+#define apply_modes(of, x, y) (void)0
+#endif
 
 static void precondition(const linear_system *of, const lanes *x, lanes *y)
 {
-  lattice all[LATTICES];
-  if (of->by_factors) {
+  if (of->by_factors)
     apply_factors(of, x, y);
-    return;
-  }
-  if (!of->by_fourier) {
+  else if (of->by_fourier)
+    apply_modes(of, x, y);
+  else
     apply_inverses(of, x, y, of->own);
-    return;
-  }
-  find_lattices(of, all);
-  scale(of, y, 1.0, x);
-  make_zero(of, of->forces);
-  wait_at_barrier(of->run);
-  for (const lattice *one = all; one < all + LATTICES; one++) {
-    const complex_lanes both = {y, of->forces}, scratch = {of->spare, of->spare + of->count};
-    apply_modes(of, one, both, scratch);
-  }
 }
 
 /* Computes the preconditioner, at the first points of a step the Fourier one if coordinates are coupled. */
 static void find_inverses(linear_system *of)
 {
-  lattice all[LATTICES];
   if (of->by_factors) {
     find_factors(of);
     return;
   }
-  if (of->tried == 0)
-    of->by_fourier = find_lattices(of, all);
-  if (of->by_fourier) {
-    find_lattices(of, all);
-    of->by_fourier = invert_modes(of, all);
-  }
+  of->by_fourier = (of->tried == 0 || of->by_fourier) && invert_modes(of);
   if (!of->by_fourier)
     find_own_inverses(of);
 }
@@ -266,8 +261,6 @@ static void find_inverses(linear_system *of)
  * diagonal for one cycle, then keeps the better one. */
 static void choose_preconditioner(linear_system *of, double left)
 {
-  if (of->by_factors)
-    return;
   if (of->tried == 0 && of->by_fourier) {
     of->tried = 1, of->left = left;
     of->by_fourier = 0;
@@ -279,31 +272,5 @@ static void choose_preconditioner(linear_system *of, double left)
       find_inverses(of);
   }
 }
-#else
-/* Preconditioner for Newton-GMRES from the diagonal of F'. Requires: array_newton.h. */
-
-enum { SPARE_VECTORS = 0 }; /* of work */
-
-static void precondition(const linear_system *of, const lanes *x, lanes *y)
-{
-  if (of->by_factors)
-    apply_factors(of, x, y);
-  else
-    apply_inverses(of, x, y, of->own);
-}
-
-static void find_inverses(linear_system *of)
-{
-  if (of->by_factors)
-    find_factors(of);
-  else
-    find_own_inverses(of);
-}
-
-static void choose_preconditioner(linear_system *of, double left)
-{
-  (void)of, (void)left; /* there is no alternative */
-}
-#endif
 
 #endif

@@ -15,35 +15,35 @@
 #endif
 #define NEAR_ENOUGH 1e-3 /* relative residual to which the linear system of a correction is solved */
 
-/* Parts of `work`: magnitudes for rounding errors; forces; increments of positions and momenta; constraint forces;
- * trial increments, and the positions they lead to, with the velocities behind them if forces depend on these. */
+/* Workspace: magnitudes for rounding errors; forces; increments of positions and momenta; constraint forces; trial
+ * increments, and the positions they lead to, with the velocities behind them if forces depend on these. */
 typedef struct {
+  long long n; /* coordinates */
   double *X, *F, *dq, *dp, *R, *D, *Y;
-} parts_of_work;
+} work_arrays;
 
-static parts_of_work divide(const run_memory *run, long long n)
+static work_arrays bind_work_arrays(const run_memory *run, long long n)
 {
   double *work = run->work;
-  const parts_of_work parts = {work, work + n, work + 2 * n, work + 3 * n, work + 4 * n, work + 5 * n, work + 6 * n};
-  return parts;
+  const work_arrays of = {n, work, work + n, work + 2 * n, work + 3 * n, work + 4 * n, work + 5 * n, work + 6 * n};
+  return of;
 }
 
 /* Data shared by the substeps. */
 typedef struct {
   run_memory *run;
   const problem *given;
-  parts_of_work parts;
+  const work_arrays *work;
   constraint_system held;
   long long n;
   const solver_options *options;
   solver_report *report;
 } constrained_run;
 
-static constrained_run constrained_run_of(run_memory *run, const problem *given, const solver_options *options,
-    solver_report *report)
+static constrained_run constrained_run_of(run_memory *run, const problem *given, const work_arrays *work,
+    const solver_options *options, solver_report *report)
 {
-  const long long n = NAME(coordinates)(given);
-  const constrained_run of = {run, given, divide(run, n), constraint_arrays(run, n), n, options, report};
+  const constrained_run of = {run, given, work, constraint_arrays(run, work->n), work->n, options, report};
   return of;
 }
 
@@ -60,7 +60,7 @@ static void compute_constraint_forces(const constraint_system *held, const doubl
 static void find_forces(const constrained_run *of, const double *X, const double *dp, double t, double *F)
 {
 #ifdef FORCES_OF_VELOCITIES
-  double *Y = of->parts.Y;
+  double *Y = of->work->Y;
   if (X != Y)
     memcpy(Y, X, sizeof(double) * (size_t)of->n);
   for (long long i = 0; i < of->n; i++)
@@ -76,7 +76,7 @@ static void find_forces(const constrained_run *of, const double *X, const double
 /* Computes forces, constraint derivatives and their matrix at the state. */
 static int begin(const constrained_run *of)
 {
-  find_forces(of, of->run->q, NULL, of->run->t, of->parts.F);
+  find_forces(of, of->run->q, NULL, of->run->t, of->work->F);
   evaluate_constraints(of->given, of->run->q, of->run->t, of->held.g, of->held.rate, of->held.derivative);
   return assemble(&of->held, of->run->inverse_mass) ? OK : SINGULAR;
 }
@@ -86,15 +86,15 @@ static int begin(const constrained_run *of)
 static double trial_increments(const constrained_run *of, double h)
 {
   const run_memory *run = of->run;
-  const parts_of_work *parts = &of->parts;
+  const work_arrays *work = of->work;
   double size = 0.0;
   for (long long i = 0; i < of->n; i++) {
-    const double p = run->p[i] + parts->dp[i], pushed = h / 2 * parts->R[i];
+    const double p = run->p[i] + work->dp[i], pushed = h / 2 * work->R[i];
     const double drift = h * (run->inverse_mass[i] * (p + pushed));
-    parts->D[i] = parts->dq[i] + drift;
-    parts->Y[i] = run->q[i] + parts->D[i];
-    parts->X[i] = fabs(run->q[i]) + fabs(h * run->inverse_mass[i]) * (fabs(p) + fabs(pushed));
-    size += parts->X[i] * parts->X[i];
+    work->D[i] = work->dq[i] + drift;
+    work->Y[i] = run->q[i] + work->D[i];
+    work->X[i] = fabs(run->q[i]) + fabs(h * run->inverse_mass[i]) * (fabs(p) + fabs(pushed));
+    size += work->X[i] * work->X[i];
   }
   return size;
 }
@@ -128,25 +128,25 @@ static int end_of_iteration(const progress *now, const constraint_system *held, 
 static int solve_positions(const constrained_run *of, double h, double t, double *size)
 {
   const constraint_system *held = &of->held;
-  const parts_of_work *parts = &of->parts;
+  const work_arrays *work = of->work;
   progress now = before_iterations();
-  compute_constraint_forces(held, held->lambda, parts->R, of->n);
+  compute_constraint_forces(held, held->lambda, work->R, of->n);
   for (int k = 0;; k++) {
     int status;
     double moved;
     *size = trial_increments(of, h);
-    evaluate_constraints(of->given, parts->Y, t, held->g, held->rate, held->next);
+    evaluate_constraints(of->given, work->Y, t, held->g, held->rate, held->next);
     for (long long k = 0; k < held->count; k++)
       held->right[k] = -2.0 / (h * h) * held->g[k];
-    compute_rounding(held, held->next, parts->X, 2.0 / (h * h));
+    compute_rounding(held, held->next, work->X, 2.0 / (h * h));
     if (now.status)
       return end_of_iteration(&now, held, of->report);
     status = solve_constraint_system(held, NEAR_ENOUGH, of->report);
     if (status != OK)
       return status;
     add_to(held->lambda, held->change, 1.0, held->count);
-    compute_constraint_forces(held, held->change, parts->F, of->n);
-    moved = h * h / 2 * (h * h / 2) * push(parts->R, parts->F, 1.0, of->run->inverse_mass, of->n);
+    compute_constraint_forces(held, held->change, work->F, of->n);
+    moved = h * h / 2 * (h * h / 2) * push(work->R, work->F, 1.0, of->run->inverse_mass, of->n);
     take_change(&now, relative_change(moved, of->options->absolute ? 1.0 : *size), of->options, k, of->report);
   }
 }
@@ -166,13 +166,13 @@ static void find_right(const constraint_system *held, const double *rate, const 
  * change. */
 static double update_forces(const constrained_run *of, double by, double t)
 {
-  const parts_of_work *parts = &of->parts;
-  find_forces(of, parts->Y, parts->dp, t, parts->R);
+  const work_arrays *work = of->work;
+  find_forces(of, work->Y, work->dp, t, work->R);
   for (long long i = 0; i < of->n; i++) {
-    parts->R[i] -= parts->F[i];
-    parts->F[i] += parts->R[i];
+    work->R[i] -= work->F[i];
+    work->F[i] += work->R[i];
   }
-  return push(parts->dp, parts->R, by, of->run->inverse_mass, of->n);
+  return push(work->dp, work->R, by, of->run->inverse_mass, of->n);
 }
 
 /* Projects the momenta onto G M^-1 p + g_t = 0 by constraint forces of weight `by`; the change of the velocities times
@@ -187,16 +187,16 @@ static int project_momenta(const constrained_run *of, double by, double unit, do
     int status;
     double moved = t && VELOCITY_FORCES ? update_forces(of, by, *t) : 0.0;
     for (long long i = 0; i < of->n; i++)
-      of->parts.D[i] = run->inverse_mass[i] * (run->p[i] + of->parts.dp[i]);
-    find_right(held, held->rate, of->parts.D, 1.0 / by);
-    compute_rounding(held, held->derivative, of->parts.X, 1.0 / by);
+      of->work->D[i] = run->inverse_mass[i] * (run->p[i] + of->work->dp[i]);
+    find_right(held, held->rate, of->work->D, 1.0 / by);
+    compute_rounding(held, held->derivative, of->work->X, 1.0 / by);
     if (now.status)
       return outcome(&now, of->report);
     status = solve_constraint_system(held, NEAR_ENOUGH, of->report);
     if (status != OK)
       return status;
-    compute_constraint_forces(held, held->change, of->parts.R, of->n);
-    moved += push(of->parts.dp, of->parts.R, by, run->inverse_mass, of->n);
+    compute_constraint_forces(held, held->change, of->work->R, of->n);
+    moved += push(of->work->dp, of->work->R, by, run->inverse_mass, of->n);
     moved *= unit * by * (unit * by);
     take_change(&now, relative_change(moved, of->options->absolute ? 1.0 : size), of->options, k, of->report);
   }
@@ -205,36 +205,37 @@ static int project_momenta(const constrained_run *of, double by, double unit, do
 /* Performs one substep of size h that ends at t. */
 static int constrained_substep(const constrained_run *of, double h, double t)
 {
-  const parts_of_work *parts = &of->parts;
+  const work_arrays *work = of->work;
   const constraint_system *held = &of->held;
   const run_memory *run = of->run;
   double size;
   int status;
-  add_to(parts->dp, parts->F, h / 2, of->n);
+  add_to(work->dp, work->F, h / 2, of->n);
   status = solve_positions(of, h, t, &size);
   if (status != OK)
     return status;
-  add_to(parts->dp, parts->R, h / 2, of->n);
-  memcpy(parts->dq, parts->D, sizeof(double) * (size_t)of->n);
+  add_to(work->dp, work->R, h / 2, of->n);
+  memcpy(work->dq, work->D, sizeof(double) * (size_t)of->n);
   memcpy(held->derivative, held->next, sizeof(double) * (size_t)held->entries);
   if (!assemble(held, run->inverse_mass))
     return SINGULAR;
-  find_forces(of, parts->Y, parts->dp, t, parts->F);
-  compute_constraint_forces(held, held->lambda, parts->R, of->n);
+  find_forces(of, work->Y, work->dp, t, work->F);
+  compute_constraint_forces(held, held->lambda, work->R, of->n);
   for (long long i = 0; i < of->n; i++) {
-    parts->dp[i] += h / 2 * (parts->F[i] + parts->R[i]);
-    parts->X[i] = run->inverse_mass[i] *
-        (fabs(run->p[i] + parts->dp[i]) + fabs(h / 2) * (fabs(parts->F[i]) + fabs(parts->R[i])));
+    work->dp[i] += h / 2 * (work->F[i] + work->R[i]);
+    work->X[i] = run->inverse_mass[i] *
+        (fabs(run->p[i] + work->dp[i]) + fabs(h / 2) * (fabs(work->F[i]) + fabs(work->R[i])));
   }
   return project_momenta(of, h / 2, h, size, &t);
 }
 
 /* Performs a step. The increments start with the compensation terms of the state; a failed step leaves the state
  * unchanged and discards the predictor. */
-static int perform_step(run_memory *run, const problem *given, long long n, const solver_options *options,
+static int perform_step(run_memory *run, const problem *given, const work_arrays *work, const solver_options *options,
     solver_report *report)
 {
-  const constrained_run of = constrained_run_of(run, given, options, report);
+  const constrained_run of = constrained_run_of(run, given, work, options, report);
+  const long long n = work->n;
   int status = OK;
   run->error = NAN;
   if (!run->guess) {
@@ -242,14 +243,14 @@ static int perform_step(run_memory *run, const problem *given, long long n, cons
     status = begin(&of);
   }
   run->guess = 0;
-  memcpy(of.parts.dq, run->carry_q, sizeof(double) * (size_t)n);
-  memcpy(of.parts.dp, run->carry_p, sizeof(double) * (size_t)n);
+  memcpy(of.work->dq, run->carry_q, sizeof(double) * (size_t)n);
+  memcpy(of.work->dp, run->carry_p, sizeof(double) * (size_t)n);
   for (int k = 0; status == OK && k < PARTS; k++)
     status = constrained_substep(&of, run->h * PART[k], run->t + run->h * PART_END[k]);
   if (status != OK)
     return status;
-  add_all(run->q, of.parts.dq, run->carry_q, n);
-  add_all(run->p, of.parts.dp, run->carry_p, n);
+  add_all(run->q, of.work->dq, run->carry_q, n);
+  add_all(run->p, of.work->dp, run->carry_p, n);
   run->guess = 1;
   return OK;
 }

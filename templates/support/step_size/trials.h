@@ -318,9 +318,10 @@ static int take_trials(run_memory *run, const job *way, solver_report *report)
   solver_options standard = NAME(default_options)();
   const solver_options *options = way->options ? way->options : &standard;
   trial now = {.at = {run->t, run->t_low, run->q, run->p, run->carry_q, run->carry_p}, .t_end = way->t_end};
-  now.step = step_of(run, way->given, NAME(coordinates)(way->given));
+  const work_arrays work = bind_work_arrays(run, NAME(coordinates)(way->given));
+  now.step = step_of(run, way->given, &work);
   now.step.h = 0.0;
-  now.dq = increments_in(&now.step), now.dp = now.dq + 2 * now.step.n;
+  now.dq = work.dq, now.dp = work.dp;
   begin_trials(run, &now, way->tolerance, &standard);
   run->direction = (way->t_end - run->t) - run->t_low < 0 ? -1 : 1;
   while (report->steps < way->steps && (run->t != way->t_end || run->t_low != 0.0)) {
