@@ -18,6 +18,7 @@ import pytest
 from click.testing import CliRunner, Result
 from samples import sample_named, stepper_for
 
+from scvi_codegen.benchmark.cases.robots import chain
 from scvi_codegen.cli import main
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import ModelFileError, StateError, StepFailedError
@@ -28,6 +29,7 @@ from scvi_codegen.models.problems import problem
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
+from scvi_codegen.runtime.ensemble.lanes import LaneBlock
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 
 pytestmark = pytest.mark.usefixtures("as_users_compile")
@@ -189,6 +191,27 @@ class TestFailures:
         others = stiffness["k"] == 1.0
         calm = stepper.integrate_ensemble(q, p, h=0.5, steps=50, save_every=7)
         assert np.abs(result.q[:, others] - calm.q[:, others]).max() < 1e-13
+
+    @pytest.mark.parametrize("h", [1e-2, 1e-4, 2e-14])
+    def test_lanes_converge_at_the_level_of_rounding(self, h: float):
+        """Changes below rounding are random, and relative to a velocity near 0 they exceed any fixed level."""
+        count, steps = 32, 64
+        stepper = compile_stepper(chain(4).system, "svi:2")
+        generator = np.random.default_rng(1)
+        q, v = generator.uniform(-1, 1, (count, 4)), generator.normal(size=(count, 4))
+        p = np.array([stepper.momentum(*each) for each in zip(q, v, strict=True)])
+        runs = Ensemble(stepper, q, p, h=h, steps=steps).common
+        assert runs is not None
+        make, width = runs.blocks()
+        for first in range(0, count, width):
+            block = make(first)
+            block.advance(steps)
+            assert isinstance(block, LaneBlock)
+            assert not block.left
+        for j in range(0, count, 5):
+            single = stepper.integrate(q[j], p[j], h=h, steps=steps)
+            np.testing.assert_allclose(runs.q[-1, j], single.q[-1], rtol=0, atol=1e-12)
+            np.testing.assert_allclose(runs.p[-1, j], single.p[-1], rtol=0, atol=1e-11)
 
     def test_block_without_active_trajectories_stops(self):
         stepper = stepper_for("relativistic-particle", SVI(5))

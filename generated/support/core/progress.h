@@ -1,18 +1,12 @@
 #ifndef SUPPORT_PROGRESS_H
 #define SUPPORT_PROGRESS_H
 
-#include "../iteration/convergence.h"
+#include "stagnation.h"
 #include "status_codes.h"
 #include "step.h"
 
-/* Termination of the iteration of one trajectory. Requires: convergence.h, step.h. */
-
-/* Progress of the iteration of a step: the first change, the last three; the change that was amplified by
- * AMPLIFICATION, if any, and the number of iterations since. */
-typedef struct {
-  double first, last, before, earlier, amplified;
-  int status, since;
-} progress;
+/* Termination of the iteration of one trajectory. Requires: stagnation.h, step.h. */
+typedef trajectory_progress progress;
 
 static inline progress before_iterations(void)
 {
@@ -36,42 +30,15 @@ static inline void take_change(progress *now, double change, const solver_option
   report->iterations++;
 }
 
-/* factor by which the last change is amplified; it has to decrease to about its former size */
-#define AMPLIFICATION 1e3
-#define AMPLIFIED_ITERATIONS 3 /* within so many iterations */
-#define ABOUT 16.0 /* a factor of four, squared */
-#define AMPLIFIED_LEVEL 1e-16 /* only changes below 1e-8 of the state are amplified */
-
-/* Decides whether an iteration that stagnates has converged; returns 1 if the last change has to be amplified. */
-static SELDOM int check_stagnation(progress *now, const solver_options *options, int k)
-{
-  if (now->amplified > 0.0) {
-    now->since++;
-    now->status = now->last <= ABOUT * now->amplified ? 1 : -(now->since == AMPLIFIED_ITERATIONS);
-    return 0;
-  }
-  if (options->absolute || !(now->last < AMPLIFIED_LEVEL) || k + AMPLIFIED_ITERATIONS >= options->max_iterations)
-    return 0;
-  now->amplified = now->last;
-  now->last = INFINITY;
-  now->status = 0;
-  return 1;
-}
-
-/* Returns 1 if the last change has to be amplified to test whether it decreases. If mass matrices are nearly singular,
- * rounding alone changes velocities by more than any fixed level; but slowly converging iterations stagnate there, too.
- * An amplified rounding error vanishes within an iteration or two, a slowly converging component does not. Since with
- * complex eigenvalues one iteration in two may reduce little, two are compared. */
 static inline int must_amplify(progress *now, const solver_options *options, int k)
 {
-  const int stagnated = now->last >= now->before && now->last >= STAGNATION * now->earlier;
-  if (now->status <= 0 && (now->amplified > 0.0 || stagnated)) {
-    progress seen = *now; /* so that `now` may stay in registers */
-    const int amplify = check_stagnation(&seen, options, k);
-    *now = seen;
-    return amplify;
-  }
-  return 0;
+  return is_to_amplify(now, options, k);
+}
+
+static inline double amplification(const progress *now)
+{
+  (void)now;
+  return AMPLIFICATION;
 }
 
 /* Status of the finished iteration. */

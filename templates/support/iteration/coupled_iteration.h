@@ -130,7 +130,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
     if (must_amplify(&now, options, k))
       for (int n = 0; n < GROUPS; n++)
         for (int i = 0; i < M; i++)
-          z[n][i] += AMPLIFICATION * r[n][i];
+          z[n][i] += amplification(&now) * r[n][i];
   }
   status = outcome(&now, report);
   if (status != OK)

@@ -109,7 +109,7 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
     if (must_amplify(&now, options, k))
       for (int n = 0; n < GROUPS; n++)
         for (int i = 0; i < M; i++)
-          z[n][i] += AMPLIFICATION * value[n][i];
+          z[n][i] += amplification(&now) * value[n][i];
   }
   status = outcome(&now, report);
   if (status != OK)

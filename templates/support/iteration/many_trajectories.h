@@ -2,10 +2,10 @@
 #define SUPPORT_MANY_TRAJECTORIES_H
 
 #include "../core/trajectories.h"
-#include "convergence.h"
+#include "../core/stagnation.h"
 
 /* Fixed-point iteration of many trajectories, which are SIMD lanes: predictor and termination. A step fails for single
- * trajectories, which become inactive, never for all. Requires: trajectories.h, convergence.h, and the tables
+ * trajectories, which become inactive, never for all. Requires: trajectories.h, stagnation.h, and the tables
  * LAST_ALONE, LAST, BEFORE, which extrapolate stored values into the next step. */
 
 /* Stored values at the points, of the last step and of the one before, which the next step overwrites. */
@@ -45,16 +45,18 @@ static inline int start_velocities(const step_data *step, lanes (*z)[M])
   return OK;
 }
 
-/* Progress of the iteration of a step. */
+/* Progress of the iteration of a step in every lane, as trajectory_progress. status: 1 converged, 0 undecided, -1
+ * failed in this iteration, -2 before; amplification: factor of the last change to be added, AMPLIFICATION or 0. */
 typedef struct {
-  lanes first, last, before;
+  lanes first, last, before, earlier, amplified, since, status, amplification;
   int pending;
 } progress;
 
 static inline progress before_iterations(void)
 {
-  const progress none = {lanes_of(0.0), lanes_of(INFINITY), lanes_of(INFINITY), 1};
-  return none;
+  const lanes none = lanes_of(INFINITY);
+  const progress now = {.last = none, .before = none, .earlier = none, .pending = 1};
+  return now;
 }
 
 static inline int needs_iteration(const progress *now)
@@ -62,37 +64,87 @@ static inline int needs_iteration(const progress *now)
   return now->pending;
 }
 
-/* Trajectories that converge too slowly or left the domain become inactive. */
+/* Each trajectory has the status of the first iteration that decided it; others may require more iterations. Changes at
+ * the level of rounding are random: those of many trajectories rarely meet the criterion in the same iteration. */
 static inline void take_change(progress *now, lanes change, const solver_options *options, int k, solver_report *report)
 {
   const lane_view after = {change}, last = {now->last}, before = {now->before};
+  lane_view status = {now->status}, active;
   const solver_options wanted = *options; /* a copy, which cannot alias what is written */
-  double *active = report->active;
   int pending = 0;
+  memcpy(active.lane, report->active, sizeof active);
   for (int j = 0; j < LANES; j++) {
-    const int status = iteration_status(after.lane[j], last.lane[j], before.lane[j], &wanted, k);
-    active[j] = status < 0 ? 0.0 : active[j];
-    pending += (active[j] > 0.0) & (status == 0);
+    const double found = iteration_status(after.lane[j], last.lane[j], before.lane[j], &wanted, k);
+    const double first = active.lane[j] > 0.0 ? found : -2.0;
+    status.lane[j] = status.lane[j] == 0.0 ? first : status.lane[j];
+    pending += status.lane[j] == 0.0;
   }
+  now->status = status.all;
   now->pending = pending > 0;
   now->first = k == 0 ? change : now->first;
+  now->earlier = now->before;
   now->before = now->last;
   now->last = change;
   report->iterations++;
 }
 
-/* Trajectories whose iteration stagnates are left to the solver of single trajectories. */
-static inline int must_amplify(const progress *now, const solver_options *options, int k)
+/* Decides about stagnation in the lanes that have not converged; returns 1 if changes have to be amplified. */
+static SELDOM int check_lanes(progress *now, const solver_options *options, int k)
 {
-  (void)now, (void)options, (void)k;
+  const lane_view before = {now->before}, earlier = {now->earlier};
+  lane_view last = {now->last}, amplified = {now->amplified}, since = {now->since}, status = {now->status};
+  lane_view factor = {lanes_of(0.0)};
+  int amplify = 0;
+  now->pending = 0;
+  for (int j = 0; j < LANES; j++)
+    if (status.lane[j] == 0.0 || status.lane[j] == -1.0) {
+      trajectory_progress seen = {0.0, last.lane[j], before.lane[j], earlier.lane[j], amplified.lane[j]};
+      int now_amplified;
+      seen.status = (int)status.lane[j];
+      seen.since = (int)since.lane[j];
+      now_amplified = is_to_amplify(&seen, options, k);
+      factor.lane[j] = now_amplified ? AMPLIFICATION : 0.0;
+      amplify |= now_amplified;
+      last.lane[j] = seen.last;
+      amplified.lane[j] = seen.amplified;
+      status.lane[j] = seen.status < 0 ? -2.0 : seen.status;
+      since.lane[j] = seen.since;
+      now->pending |= seen.status == 0;
+    }
+  now->last = last.all;
+  now->amplified = amplified.all;
+  now->since = since.all;
+  now->status = status.all;
+  now->amplification = factor.all;
+  return amplify;
+}
+
+static inline int must_amplify(progress *now, const solver_options *options, int k)
+{
+  const lane_view status = {now->status};
+  int undecided = 0;
+  for (int j = 0; j < LANES; j++)
+    undecided |= (status.lane[j] == 0.0) | (status.lane[j] == -1.0);
+  if (k > 1 && undecided) {
+    progress seen = *now; /* so that `now` may stay in registers */
+    const int amplify = check_lanes(&seen, options, k);
+    *now = seen;
+    return amplify;
+  }
   return 0;
 }
 
-#define AMPLIFICATION 0.0
+static inline lanes amplification(const progress *now)
+{
+  return now->amplification;
+}
 
+/* Trajectories that converge too slowly or left the domain become inactive. */
 static inline int outcome(const progress *now, const solver_report *report)
 {
-  (void)now, (void)report;
+  const lane_view status = {now->status};
+  for (int j = 0; j < LANES; j++)
+    report->active[j] = status.lane[j] < 0.0 ? 0.0 : report->active[j];
   return OK;
 }
 
