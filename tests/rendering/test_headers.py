@@ -69,6 +69,13 @@ def sources() -> tuple[Source, ...]:
     made.append(compile_stepper(problem("double-pendulum").system, SpectralCollocation(3)).source)
     body = LagrangianSystem.from_text("body", rotations={"R": "w"}, lagrangian="w_1**2 + w_2**2 + 2*w_3**2")
     made.append(compile_stepper(body, SVI(3)).source)
+    pair = "sum(i in N, q_dot[i]**2/2) - sum(i < j in near, (q[i] - q[j])**2)"
+    near = {"near": {"of": "q", "cutoff": 1.0}}
+    made.append(compile_stepper(LagrangianSystem.from_text("pair", ["q[N]"], pair, neighbours=near), "svi:1").source)
+    drift = compile_stepper(LagrangianSystem.from_text("drift", ["x", "y"], "x**3*y_dot - x**2 - y**2"), SVI(1))
+    made.append(drift.derivatives)
+    robot = Path(__file__).parents[1] / "mechanics" / "robots" / "figure.xml"
+    made.append(compile_stepper(LagrangianSystem.from_mjcf(robot), SVI(2)).source)
     made.append(with_casadi_flow(kepler.second_derivatives, 10, 5, second=True))
     made.append(with_flow_of_rows(kepler.derivatives))
     return (*made, *oscillator.source.sources)

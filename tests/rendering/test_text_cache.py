@@ -160,6 +160,7 @@ ARGUMENTS = {
     "constraints": [["q - r"], ["q_dot - r"], ["q", "r"]],
     "inputs": [["w", "u"], ["u"]],
     "tables": [["bonds[B, 2]"], ["bonds[B, 3]"]],
+    "neighbours": [{"near": {"of": "q", "cutoff": 1.0}}],
 }
 TEXT = {
     "name": "pair",
@@ -177,6 +178,7 @@ TEXT = {
     "constraints": [],
     "inputs": ["u", "w"],
     "tables": [],
+    "neighbours": None,
 }
 
 

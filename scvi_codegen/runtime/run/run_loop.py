@@ -268,5 +268,7 @@ def _differences(t: Array, *, whole: bool) -> Array:
 
 
 def first_step_size(plan: StepPlan, t: Array) -> float:
-    """Return the first step size between states of an adaptive run, or the direction of the run."""
+    """Return the first step size between states of an adaptive run, or the direction of the run; NaN without states."""
+    if len(t) == 0:
+        return math.nan
     return t.item(1) - t.item(0) if len(t) > 1 else plan.t_end - t.item(0)

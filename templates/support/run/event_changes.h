@@ -117,8 +117,8 @@ static void add_product(real a, real b, real *sum, real *low)
 }
 
 /* Correction of lambda by Newton's method for the energy equation of a quadratic kinetic energy divided by lambda,
- * n.v + g_t + (lambda / 2) n.(W n) = 0, evaluated in twice the precision: the rounding error of lambda has a mean that is
- * not zero, from which energy would drift over many impacts. v: velocities before the impact and changes W n. */
+ * n.v + g_t + (lambda / 2) n.(W n) = 0, evaluated in twice the precision: the rounding error of lambda has a mean
+ * that is not zero, from which energy would drift over many impacts. v, change: velocities before the impact, W n. */
 static real correct_impulse(const real *n, const real *v, const real *change, real lambda, real rate)
 {
   real sum = n[M], low = 0.0, bend = 0.0, bend_low = 0.0;
@@ -186,8 +186,8 @@ static int impact(const event_step *step, event_sample *at, const event_wall *wa
   return status == OK ? satisfy_constraints(step, at->t, at->q, at->p, 0) : status;
 }
 
-/* Sets the variables of a map to its values; velocities are set last, by their momenta. In index notation the values are
- * those of q and p. */
+/* Sets the variables of a map to its values; velocities are set last, by their momenta. In index notation the values
+ * are those of q and p. */
 static int apply_map(const event_step *step, int e, event_sample *at, const real *value)
 {
 #ifdef EVENTS_OF_ANY_SIZE
