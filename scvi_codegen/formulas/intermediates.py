@@ -115,7 +115,7 @@ def intermediate(expression: Expr) -> Expr:
 
 
 def separated(expressions: Sequence[Expr], variables: Collection[Symbol]) -> tuple[list[Expr], dict[Expr, Symbol]]:
-    """Return expressions as functions of variables and of new symbols, and the parts that these stand for.
+    """Return expressions as functions of variables and of new symbols, and the parts that these abbreviate.
 
     The parts are the largest ones that do not depend on the variables, and are no numbers: values that need not be
     computed again when only the variables change.

@@ -254,11 +254,11 @@ def first_order_system(fields: Mapping[str, Any]) -> FirstOrderSystem | None:
                 f"m*{velocities[0]}**2/2"
             )
     form = OneForm(name, lagrangian, coordinates, velocities, fields["time"])
-    kept = {each: fields[each] for each in ("name", "time", "parameters", "defaults", "inputs") if each in fields}
+    common = {each: fields[each] for each in ("name", "time", "parameters", "defaults", "inputs") if each in fields}
     inputs = fields.get("inputs", ())
     shown = format_expression(inputs_by_name(written_out(lagrangian), inputs))
     text = {"coordinates": [q.name for q in coordinates], "lagrangian": shown, **({"inputs": inputs} if inputs else {})}
-    return FirstOrderSystem(**kept, **first_order_form(form), definition=fields.get("definition") or text)
+    return FirstOrderSystem(**common, **first_order_form(form), definition=fields.get("definition") or text)
 
 
 def first_order_form(form: OneForm) -> dict[str, Any]:

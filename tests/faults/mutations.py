@@ -143,7 +143,7 @@ MUTATIONS = (
         partials(lambda k, derivative: sympy.S.Zero if k == 1 else derivative),
     ),
     function(
-        "the slope of H_p off",
+        "the derivative of H_p off",
         case("vortices/svi"),
         stage_groups,
         "_derivative_blocks",

@@ -48,9 +48,9 @@ def test_operators_satisfy_summation_by_parts(order):
     m = order // 2
     assert min(weights.min(), masses.min()) > 0
     for k in range(m + 1):
-        slope = k * x ** max(k - 1, 0)
+        derivative = k * x ** max(k - 1, 0)
         assert rows @ x**k == pytest.approx(k * between ** max(k - 1, 0), abs=1e-11)
-        by_parts = -masses * slope
+        by_parts = -masses * derivative
         by_parts[0] -= float(k == 0)
         by_parts[-1] += 1
         assert rows.T @ (weights * between**k) == pytest.approx(by_parts, abs=1e-11)

@@ -45,7 +45,7 @@ def test_string_with_a_mass_at_its_end_has_the_frequencies_of_the_transcendental
 
 
 def test_oscillator_on_a_spring_at_a_place_inside():
-    """Its force is the jump of the slope, w (cot w (1 - a) + cot w a) = k M w^2/(k - M w^2); elements end there."""
+    """Its force is the jump of u_x, w (cot w (1 - a) + cot w a) = k M w^2/(k - M w^2); an element ends there."""
     a, mass, k = 0.37, 0.3, 2.0
     w = brentq(lambda w: w * (1 / tan(w * (1 - a)) + 1 / tan(w * a)) - k * mass * w * w / (k - mass * w * w), 3.5, 4.2)
     system = string([{"x": "1 - 63/100", "lagrangian": "M*X_t**2/2 - k*(u - X)**2/2"}], scalars=["X"], M=mass, k=k)
@@ -65,7 +65,7 @@ def test_oscillator_on_a_spring_at_a_place_inside():
     ],
 )
 def test_spring_between_equidistant_points_is_of_first_order_and_on_elements_exact(method, options, bound):
-    """2 w tan(w pi) = k on a ring; the slope jumps at the spring."""
+    """2 w tan(w pi) = k on a ring; the derivative jumps at the spring."""
     k, a = 1.5, 1.0 + pi / 64
     w = brentq(lambda w: 2 * w * tan(w * pi) - k, 1e-3, 0.49)
     system = FieldSystem.from_text(

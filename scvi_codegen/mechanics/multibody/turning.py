@@ -34,7 +34,7 @@ def with_rotations(system: System) -> tuple[System, tuple[Rotation, ...]]:
         turned: Any = copy.deepcopy(system, {id(system.eom_method): system.eom_method})
         joints = [each for each in turned.joints if each.name in names]
         owners = {f: each.name for each in joints for f in (*each.coordinates, *each.speeds)}
-        kept = {owners[f] for f in _built_in(turned, owners)}
+        in_angles = {owners[f] for f in _built_in(turned, owners)}
         rotations = [_turn(each.child_interframe, each.parent_interframe, each.name) for each in joints]
         kinematics = {each for joint in joints for each in joint.kdes}
         for key in ("q_ind", "q_dep", "u_ind", "u_dep", "kdes"):
@@ -43,10 +43,10 @@ def with_rotations(system: System) -> tuple[System, tuple[Rotation, ...]]:
         for frame in _connected([turned.frame], "_dcm_dict"):
             frame._dcm_cache = dict(frame._dcm_dict)  # private: products of matrices, which contain the angles
         _forget(turned, owners)
-        kept |= {name for f, name in owners.items() if any(each.has(f) for each in _formulas(turned))}
-        if not kept:
+        in_angles |= {name for f, name in owners.items() if any(each.has(f) for each in _formulas(turned))}
+        if not in_angles:
             return turned, tuple(rotations)
-        names -= kept
+        names -= in_angles
 
 
 def _turn(frame: ReferenceFrame, base: ReferenceFrame, name: str) -> Rotation:

@@ -54,8 +54,8 @@ def pressure(states: Any, box: str | Sequence[str]) -> Any:
         scaled = np.array(states.parameters)
         scaled[places] *= scale
         potential.append(states.stepper._energy_parts(q * scale, p, t, scaled)[:, 1])
-    slope = (potential[0] - potential[1]).reshape(np.shape(kinetic)) / (2 * RELATIVE_STRAIN)
-    return (2 * kinetic - slope) / (len(lengths) * lengths.prod())
+    derivative = (potential[0] - potential[1]).reshape(np.shape(kinetic)) / (2 * RELATIVE_STRAIN)
+    return (2 * kinetic - derivative) / (len(lengths) * lengths.prod())
 
 
 @checks_arguments()
