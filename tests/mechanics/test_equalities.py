@@ -48,7 +48,6 @@ def named(values, letters="xyz"):
 @pytest.mark.parametrize(
     "equality",
     [
-        '<weld body1="rod" body2="box"/>',
         '<weld body1="box" body2="rod" active="true"/>',
         '<weld body1="rod" body2="box" relpose="0.1 0.2 -0.7 0.98383134 0.14869156 -0.01491892 0.09871239"/>',
     ],

@@ -575,6 +575,7 @@ def test_derivatives_are_those_of_the_computed_run(event, method, e, tolerance):
         assert np.abs(matrix.T @ FORM @ matrix - FORM).max() < 1e-10 * size
 
 
+@pytest.mark.full
 def test_lyapunov_exponent_of_the_stadium_billiard(point):
     """Benettin & Strelcyn, Phys. Rev. A 17 (1978) 773: 0.43 for a = R = 1."""
     run = point.integrate([0.1, 0.2], velocity=[0.8, 0.6], h=2.0, steps=4000, events=STADIUM)
@@ -625,6 +626,7 @@ def test_fit_of_the_restitution():
     assert np.abs(x - [1.05, 0.77]).max() < 1e-12
 
 
+@pytest.mark.full
 def test_gravity_wedge_is_integrable_at_45_degrees_only():
     """Lehtihet & Miller, Physica D 21 (1986) 93: wedges of more than 45 degrees are chaotic."""
     falling = LagrangianSystem.from_text(name="wedge", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y")
