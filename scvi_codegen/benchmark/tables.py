@@ -55,7 +55,7 @@ def run_drift(plan: Plan, report_activity: ReportActivity) -> ResultTable:
         rows=tuple(rows),
         remarks=(
             "first tenth, largest: largest error in the first tenth of the run, and in all of it; a random walk grows",
-            "by a factor of about 3; -: unstable. drift: slope of the fitted line times its length. uncertainty: its",
+            "by a factor of about 3; -: unstable. drift: change of a fitted line over the run. uncertainty: its",
             f"standard error, from the variance of the gains over {BLOCKS} blocks. h of heyoka: of the run it repeats.",
         ),
     )
@@ -99,11 +99,11 @@ def drift_row(chosen: Case, by: str, h: float, steps: int) -> dict[str, Any]:
 
 
 def fitted_rate(error: Array) -> tuple[float, float]:
-    """Return the slope of a line fitted to equidistant samples, times their length, and its standard error.
+    """Return the change over the run of a line fitted to equidistant samples, and its standard error.
 
     Round-off makes the energy a random walk, so the residuals of the fit are correlated and the usual error is too
     small. The increments of the walk are independent: the error is estimated from the variance of its gains over twenty
-    blocks, with the variance 6/5 of the slope of a walk of unit variance.
+    blocks, with the variance 6/5 of the fitted change of a walk of unit variance.
     """
     t = np.linspace(-0.5, 0.5, len(error))
     derivative = float(t @ error / (t @ t))

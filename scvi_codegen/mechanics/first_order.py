@@ -128,7 +128,7 @@ def is_first_order(lagrangian: Expr, velocities: Sequence[Symbol]) -> bool:
 
 @dataclass(frozen=True)
 class OneForm:
-    """One-form theta and function H of a Lagrangian that is linear in its velocities.
+    """The one-form theta and the function H of a Lagrangian that is linear in its velocities.
 
     Attributes:
         name: of the system, for messages.

@@ -190,8 +190,8 @@ def fitted_line(n: Array, errors: Array) -> Law | None:
     used = within(errors)
     if np.count_nonzero(used) < 3:
         return None
-    slope, offset = np.polyfit(n[used], np.log(errors[used]), 1)
-    return Law(float(np.exp(offset)), float(np.exp(slope)))
+    rate, offset = np.polyfit(n[used], np.log(errors[used]), 1)
+    return Law(float(np.exp(offset)), float(np.exp(rate)))
 
 
 @lru_cache(maxsize=512)

@@ -68,7 +68,7 @@ SIZES = [
 
 @pytest.mark.parametrize(("setting", "key", "expected"), SIZES)
 def test_errors_are_those_measured_by_other_programs(setting, key, expected):
-    """0 stands for round-off."""
+    """0 means round-off."""
     run = setting.run(key)
     for name, value in expected.items():
         assert abs(getattr(run, name)) == pytest.approx(value, rel=0.07, abs=1e-11 if name == "momentum" else 1e-14)
