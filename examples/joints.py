@@ -129,16 +129,7 @@ def winch() -> Mechanism:
         name="winch",
         coordinates=["a1", "a2", "y"],
         lagrangian="J1*a1_dot**2/2 + J2*a2_dot**2/2 + m*y_dot**2/2 - m*g*y + torque*a1",
-        parameters={
-            "J1": 0.02,
-            "J2": 0.3,
-            "m": 5.0,
-            "g": GRAVITY,
-            "torque": 3.0,
-            "r1": 0.1,
-            "r2": 0.4,
-            "drum": 0.15,
-        },
+        parameters={"J1": 0.02, "J2": 0.3, "m": 5.0, "g": GRAVITY, "torque": 3.0, "r1": 0.1, "r2": 0.4, "drum": 0.15},
         constraints=[belt("r1", "a1", "r2", "a2"), belt("drum", "a2", "1", "y")],
     )
     return Mechanism(system, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])

@@ -12,8 +12,6 @@
 Names are imported when they are first used, so code that only steps never imports SymPy.
 """
 
-from __future__ import annotations
-
 import importlib
 import re
 from pathlib import Path

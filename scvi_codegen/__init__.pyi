@@ -97,10 +97,10 @@ from scvi_codegen.pictures.arrays import plot_spectrum as plot_spectrum
 from scvi_codegen.pictures.attitudes import plot_attitude as plot_attitude
 from scvi_codegen.pictures.conserved import plot_energy as plot_energy
 from scvi_codegen.pictures.conserved import plot_momentum_maps as plot_momentum_maps
+from scvi_codegen.pictures.overview import plot_motion as plot_motion
+from scvi_codegen.pictures.overview import plot_phase as plot_phase
 from scvi_codegen.pictures.overview import plot_section as plot_section
 from scvi_codegen.pictures.overview import plot_trajectory as plot_trajectory
-from scvi_codegen.pictures.paths import plot_motion as plot_motion
-from scvi_codegen.pictures.paths import plot_phase as plot_phase
 from scvi_codegen.pipeline import generate_source as generate_source
 from scvi_codegen.results.recording import RecordedRun as RecordedRun
 from scvi_codegen.results.recording import load_run as load_run

@@ -83,8 +83,8 @@ def compile_stepper(
         sizes: whole numbers for the sizes of arrays, ``{"N": 8}``: the system of all entries q_0, q_1, .. is compiled,
             which has every feature. Without them arrays have the sizes that each run gives them: neither the length of
             the C source nor its compile time depends on the number of coordinates, and the solver is ``"fixed-point"``,
-            without fallback, or ``"newton"``, Newton-GMRES with Jacobian-vector products of the forces, preconditioned
-            by the diagonal of the Jacobian or, on lattices, by its circulant (Fourier) average. Methods are explicit,
+            without fallback, or ``"newton"``, with factors of the linear part of a step (meshes, chains, Hamiltonians)
+            or Newton-GMRES with the diagonal of the Jacobian or its circulant (Fourier) average. Methods are explicit,
             or have a fixed-point iteration over stage positions (SVI, SC, Runge-Kutta); others, and systems without
             such loops, are compiled with the sizes of each call, once.
         tables: with ``sizes``, index tables of shape (rows, columns) by name.
@@ -97,14 +97,9 @@ def compile_stepper(
         from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES
 
         check_kind(SYMMETRIES, symmetries, "symmetries")
+    mesh = getattr(system, "mesh", None)
     if sizes is not None or tables is not None:
-        from scvi_codegen.formulas.array_entries import is_indexed
-        from scvi_codegen.mechanics.arrays.elements import formula_at_sizes
-        from scvi_codegen.mechanics.arrays.rolling import unroll_sums
-
-        if isinstance(time_transformation, str) and is_indexed(time_transformation):
-            time_transformation = formula_at_sizes(cast(Any, system), time_transformation, sizes or {}, tables)
-        system = unroll_sums(system, sizes or {}, tables=tables)
+        system, time_transformation = _at_sizes(system, time_transformation, sizes or {}, tables)
     if known_sizes := not hasattr(system, "REQUIRES_SIZES"):
         method = as_method(method, system)
     else:
@@ -127,8 +122,22 @@ def compile_stepper(
         further: dict[str, Any] = {"events": as_events(events), "of_sizes": of_sizes, "reason": reason}
         return Stepper(source, interface, variants=variants, flags=flags, **further)
     source, interface = sources.integrator()
+    interface = replace(interface, layout=replace(interface.layout, mesh=mesh))
     cast(MechanicalSystem, system).store_key()
     return Stepper(source, interface, variants=variants, flags=flags, events=as_events(events))
+
+
+def _at_sizes(
+    system: Any, g: str | Expr | None, sizes: Mapping[str, int], tables: Mapping[str, ArrayLike] | None
+) -> tuple[Any, str | Expr | None]:
+    """Return a system of arrays and its time-rescaling function at known sizes."""
+    from scvi_codegen.formulas.array_entries import is_indexed
+    from scvi_codegen.mechanics.arrays.elements import formula_at_sizes
+    from scvi_codegen.mechanics.arrays.rolling import unroll_sums
+
+    if isinstance(g, str) and is_indexed(g):
+        g = formula_at_sizes(system, g, sizes, tables)
+    return unroll_sums(system, sizes, tables=tables), g
 
 
 class CachedSources:

@@ -1,8 +1,7 @@
 """Errors and warnings of the package. Each message names the symbol or value at fault and says what to do."""
 
-from __future__ import annotations
-
 import difflib
+import importlib
 import sys
 import warnings
 from collections.abc import Iterable
@@ -83,8 +82,8 @@ class MethodWarning(UserWarning):
 class SystemDefinitionWarning(UserWarning):
     """A definition that is probably a mistake: a parameter without effect, or a mass that its default makes negative.
 
-    The system can be compiled and run as it is written. Parameters that only events use are reported, too, since a
-    definition does not contain its events; add them to L to declare them used.
+    The system can be compiled and run as it is written. Parameters that only events use are reported by
+    definitions in Python, which do not contain the events; model files are examined with their events.
     """
 
 
@@ -127,6 +126,19 @@ class CacheWarning(UserWarning):
 
 class MissingLibraryError(ScviCodegenError, ImportError):
     """An optional library that is not installed; the message names the extra that provides it."""
+
+
+def missing(library: str, extra: str) -> MissingLibraryError:
+    """Return the error for a library that is not installed; ``extra`` provides it."""
+    return MissingLibraryError(f"this needs {library}, which is not installed: pip install 'scvi-codegen[{extra}]'")
+
+
+def imported(library: str, extra: str) -> Any:
+    """Import a library; raise MissingLibraryError, which names the extra, if it is not installed."""
+    try:
+        return importlib.import_module(library)
+    except ImportError as error:
+        raise missing(library, extra) from error
 
 
 class RecordingError(ScviCodegenError, OSError):

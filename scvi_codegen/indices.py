@@ -6,7 +6,10 @@
              | name "<" name "in" list                            i < j in near: pairs of a list of neighbours
     place    = whole number | size (+|-) whole number             0, N-1
              | index (+|-) whole number                           i, i+1
+             | index "-" index                                    j-i, of a pair i < j or of a convolution
              | table "[" index "," whole number "]"               bonds[b, 0]
+
+A convolution within a sum is ``sum(j in N, c[j-i]*q[j])``, in which differences of indices are modulo N.
 
 A size is a name, whose value follows from the arrays of a run, or a whole number. SymPy never sees an index: every
 *access* of an array (``q[i+1]``, ``m[bonds[b, 0]]``) is replaced by a separate symbol in the formula of a term, and
@@ -16,7 +19,7 @@ derivatives are taken with respect to these symbols.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any
 
@@ -80,6 +83,11 @@ class Array:
 
     def __str__(self) -> str:
         return f"{self.name}[{', '.join(map(str, self.axes))}]" if self.axes else self.name
+
+    @property
+    def entry(self) -> str:
+        """An entry with one index per axis, ``q[i, j]``, for messages."""
+        return f"{self.name}[{', '.join('ijklmn'[: len(self.axes)])}]"
 
     @property
     def elements(self) -> tuple[str, ...]:
@@ -146,6 +154,7 @@ class Place:
     Attributes:
         index: the loop index, or "".
         base: the constant position if there is no index; otherwise the offset added to the index.
+        minus: the smaller index of a pair, which is subtracted, or "".
         table, column: the index table whose row is the index, and its column; or "".
     """
 
@@ -153,27 +162,52 @@ class Place:
     base: Size = Size("")
     table: str = ""
     column: int = 0
+    minus: str = ""
 
     def __str__(self) -> str:
         if self.table:
             return f"{self.table}[{self.index}, {self.column}]"
+        if self.minus:
+            return f"{self.index}-{self.minus}"
         return offset_text(self.index, self.base.number) if self.index else str(self.base)
+
+
+@dataclass(frozen=True, slots=True)
+class Convolution:
+    """Sum along an axis of an array at each place i, sum_j c[j - i] x_j, with differences of indices modulo N.
+
+    Attributes:
+        axis: position of the axis.
+        coefficients: the array ``c[N]``.
+        index: name of j, for display.
+    """
+
+    axis: int
+    coefficients: Array
+    index: str = field(compare=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Access:
-    """Array access such as ``q[i+1, 0]``."""
+    """Array access such as ``q[i+1, 0]``, or an entry of convolutions of the array, the first one applied first."""
 
     array: Array
     places: tuple[Place, ...]
+    sums: tuple[Convolution, ...] = ()
 
     @property
     def indices(self) -> frozenset[str]:
         """Loop indices that occur in the access."""
-        return frozenset(each.index for each in self.places if each.index)
+        return frozenset(index for each in self.places for index in (each.index, each.minus) if index)
 
     def __str__(self) -> str:
-        return f"{self.array.name}[{', '.join(map(str, self.places))}]" if self.places else self.array.name
+        places, before = [*map(str, self.places)], ""
+        for each in reversed(self.sums):
+            (size,), at = each.coefficients.axes, places[each.axis]
+            before += f"sum({each.index} in {size}, {each.coefficients.name}[{each.index}-{at}]*"
+            places[each.axis] = each.index
+        entry = f"{self.array.name}[{', '.join(places)}]" if places else self.array.name
+        return before + entry + ")" * len(self.sums)
 
 
 @dataclass(frozen=True, slots=True)

@@ -58,7 +58,7 @@ from scvi_codegen.rendering.program_source import (
     workspace_size,
 )
 from scvi_codegen.rendering.source import ArrayLayout, Interface, Source
-from scvi_codegen.runtime.events.event import Event, EventLike, as_events
+from scvi_codegen.runtime.events.event import EventLike, as_events
 from scvi_codegen.validation import checks_arguments
 
 LONGEST_PREFIX = 64
@@ -178,7 +178,8 @@ def describe_arrays(
         continued=not (method.fractions or system.constraints),
         momentum_formulas=sites.momenta if sites else (),
         velocity_formulas=sites.velocities if sites else (),
-        couplings=system.potentials if solver == "newton" else (),
+        couplings=(*system.potentials, *system.applied_forces) if solver == "newton" else (),
+        symmetric=not (system.momenta or system.velocities),
         data=system.data,
         neighbours=tuple(near.name for near in system.neighbours),
         mesh=system.mesh,
@@ -259,11 +260,7 @@ class Sources:
         if self.of_arrays:
             return describe_arrays(self.system, self.method, prefix=self.prefix, solver=self.solver, sites=self.sites)
         return describe(
-            self.program(),
-            self.system,
-            self.method,
-            uses_fallback_library=self.uses_fallback_library,
-            g=self.g,
+            self.program(), self.system, self.method, uses_fallback_library=self.uses_fallback_library, g=self.g
         )
 
     def integrator(self, *, controlled: bool = True) -> tuple[Source, Interface]:
@@ -354,7 +351,12 @@ def generate_source(
     method = as_method(method, system)
     system = discretised_form(system, method)
     searched = as_events(events)
-    _check_embedded(embedded, solver, searched)
+    if embedded not in (None, *EMBEDDED):
+        raise MethodError(f"embedded must be {' or '.join(EMBEDDED)}, not {embedded!r}")
+    if embedded and solver == "fixed-point":
+        raise MethodError("solver='fixed-point' is unavailable with embedded: use 'newton' or 'explicit'")
+    if embedded == "single" and searched:
+        raise MethodError("events require double precision, in which they are located: use embedded='double'")
     program = program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None)
     g = time_transformation
     control = density_of(system, g) if g is not None else control_of(program) if controlled else None
@@ -362,12 +364,3 @@ def generate_source(
     interface = describe(program, system, method, g=g)
     complete = with_events(source, interface, searched) if searched else source
     return (complete.single_file() if amalgamate or embedded else complete), interface
-
-
-def _check_embedded(embedded: Embedded | None, solver: str, events: Sequence[Event]) -> None:
-    if embedded not in (None, *EMBEDDED):
-        raise MethodError(f"embedded must be {' or '.join(EMBEDDED)}, not {embedded!r}")
-    if embedded and solver == "fixed-point":
-        raise MethodError("solver='fixed-point' is unavailable with embedded: use 'newton' or 'explicit'")
-    if embedded == "single" and events:
-        raise MethodError("events require double precision, in which they are located: use embedded='double'")

@@ -1,7 +1,5 @@
 """Representations of objects for ``repr``: constructor-like or a summary, at most ``LONGEST`` characters."""
 
-from __future__ import annotations
-
 import numbers
 from collections.abc import Callable, Mapping
 from typing import Any

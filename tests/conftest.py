@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import hypothesis
 import programs
 import pytest
 from browsing import chromium
@@ -24,9 +25,14 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Lower the optimisation of compilers in most tests: the results of the C code do not depend on it."""
+    """Lower the optimisation of compilers in most tests, whose random examples are the same in every run.
+
+    The results of the C code do not depend on the optimisation. New examples are drawn with ``-m full`` or a seed.
+    """
     if config.option.markexpr == DEFAULT:
         os.environ.setdefault(FLAGS_VARIABLE, " ".join(UNOPTIMISED))
+        hypothesis.settings.register_profile("default", derandomize=config.getoption("hypothesis_seed", None) is None)
+        hypothesis.settings.load_profile("default")
 
 
 @pytest.hookimpl(tryfirst=True)

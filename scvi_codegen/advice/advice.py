@@ -194,13 +194,13 @@ def _advised(
     tolerance: float,
 ) -> tuple[float, Advice]:
     """Return the cost of a unit of time with the recommendation for one stepper, and the recommendation."""
-    start = stepper.start(q, state["p"], h=1.0, t=state["t"], parameters=state["parameters"]).q  # checks the arguments
+    start = stepper.start(q, state["p"], h=1.0, t=state["t"], parameters=state["parameters"])  # checks the arguments
     points = _points(method)
     most = min(max(FEWEST, NUMBERS // (points * stepper.dimension)), MOST)
     pilot = run_pilot(
-        partial(stepper.integrate, **state),
+        partial(stepper.integrate, **{**state, "p": start.p}),
         method,
-        start,
+        start.q,
         span,
         symplectic=symplectic,
         target_error=tolerance / SAFETY,

@@ -18,13 +18,12 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.methods import Method
+from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
-Array = NDArray[np.float64]
 Integrate = Callable[..., Trajectory]
 
 SAMPLES = 64
@@ -224,10 +223,7 @@ class Pilot:
         return [n for n in self.compared if n.bit_count() == 1 and self.final_quarter_error(n) < RESOLVED]
 
     def _errors(self, n: int) -> Array:
-        """Return the errors of a run at its samples relative to the finest run.
-
-        That run is not exact: errors are corrected by the factor 1 - (n/finest)^order (Richardson extrapolation).
-        """
+        """Return the errors of a run at its samples relative to the finest run, by Richardson extrapolation."""
         finest = self.good[-1]
         reference, positions = self.runs[finest].q, self.runs[n].q
         size = _rms(np.linalg.norm(reference[len(reference) // 2 :], axis=1)) or 1.0

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from sympy import Expr
 
 from scvi_codegen.advice.advice import advise
@@ -24,15 +24,15 @@ from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.representation import summary
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.core.validation import States
+from scvi_codegen.runtime.core.validation import Array, States
 from scvi_codegen.runtime.events.event import EventLike
+from scvi_codegen.runtime.rotations.states import homogeneous_state
 from scvi_codegen.runtime.run.global_error import checked_error
 from scvi_codegen.runtime.run.largest_step import accuracy_message, largest_step
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import checks_arguments, of
 
-Array = NDArray[np.float64]
 Solution: TypeAlias = Callable[[ArrayLike], Array]
 REACHED, EVENT, FAILED, MISSED = 0, 1, -1, -2
 DEFAULT_TOLERANCE = 1e-9
@@ -138,7 +138,7 @@ def solve_ivp(
         raise StateError("args are the parameters in order: give args or parameters, not both")
     parameters = parameters if args is None else args
     start, end = _span(t_span)
-    q, p0 = _halves(y0) if velocity is None else (y0, None)
+    q, p0 = (y0, None) if velocity is not None or isinstance(y0, Mapping) else _halves(y0)
     requested_times = None if t_eval is None else times_of_run(t_eval, start, end)
     if error is not None:
         others = {"time_transformation": time_transformation, "controller": controller}
@@ -150,24 +150,15 @@ def solve_ivp(
     else:
         known, parameters = unrolled_at(system, q, parameters)
     stepper, uncompiled = _stepper(known, method, (time_transformation, controller), request)
+    q, p0, velocity = homogeneous_state(stepper.interface, q, p0, velocity)
+    if p0 is None and velocity is None:
+        raise StateError("y0 contains positions by name: give velocity, too, or numbers for positions and momenta")
     p: Any = stepper._initial_momenta(q, p0, velocity, start, parameters)
     along: dict[str, Any] = {"t": start, "parameters": parameters, "options": options}
     plan = _plan(stepper, uncompiled, request, (q, p, end - start), along)
     settings = {**_steps(stepper, start, end, plan), **along, "events": events}
-    return _integrated(stepper, plan, (q, p), settings, requested_times, dense_output)
-
-
-def _integrated(
-    stepper: Stepper,
-    plan: _StepChoice,
-    initial: tuple[States, States],
-    settings: dict[str, Any],
-    requested_times: Array | None,
-    dense_output: bool,
-) -> OdeResult:
-    """Return the result of a run; one that fails ends before the step that failed."""
     try:
-        trajectory = stepper.integrate(*initial, **settings, t_eval=None if dense_output else requested_times)
+        trajectory = stepper.integrate(q, p, **settings, t_eval=None if dense_output else requested_times)
         status, message = _outcome(trajectory, plan)
     except StepFailedError as error:
         trajectory, status, message = Trajectory.before(error), FAILED, str(error)
@@ -230,7 +221,7 @@ def _plan(
         return _StepChoice(None, None, _unconfirmed, request.error)
     if request.h is not None:
         return _StepChoice(request.h, request.rtol)
-    if _is_time_transformed(stepper):
+    if stepper._has_tau:
         error = request.rtol or 0.0
         tau = largest_step(stepper, *motion, error, **along)
         return _StepChoice(tau, None, lambda run: accuracy_message(run.step_error, run.worst_step_time, error) or "")
@@ -267,18 +258,13 @@ def _refuse(arguments: Mapping[str, float | None]) -> None:
             raise StateError(f"solve_ivp has no {name}={value!r}: {ALTERNATIVES[name]}")
 
 
-def _is_time_transformed(stepper: Stepper) -> bool:
-    """Return True if the steps are of tau."""
-    return bool(stepper.interface.energy_parameter or stepper.interface.time_transformation)
-
-
 def _steps(stepper: Stepper, start: float, end: float, plan: _StepChoice) -> dict[str, Any]:
     """Return the arguments of :meth:`Stepper.integrate`: whole fixed steps that fill the span, or adaptive steps."""
     if plan.error is not None:
         return {"t_end": end, "error": plan.error}
     if plan.rtol is not None or plan.h is None:
         return {"h": plan.h, "t_end": end, "tolerance": plan.rtol}
-    if _is_time_transformed(stepper):
+    if stepper._has_tau:
         sign = 1.0 if stepper.interface.time_transformation else end - start
         return {"h": math.copysign(checked_step(plan.h), sign), "t_end": end}
     steps = max(1, math.ceil(abs((end - start) / checked_step(plan.h)) * (1.0 - 1e-12)))
@@ -330,9 +316,7 @@ def _span(t_span: Sequence[float]) -> tuple[float, float]:
     return start, end
 
 
-def _halves(y0: States) -> tuple[States, States | None]:
-    if isinstance(y0, Mapping):
-        raise StateError("y0 contains positions by name: give velocity, too, or numbers for positions and momenta")
+def _halves(y0: ArrayLike) -> tuple[Array, Array]:
     try:
         y = np.array(y0, dtype=float)
     except (TypeError, ValueError) as error:

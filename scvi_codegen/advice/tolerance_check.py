@@ -12,16 +12,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import ScviCodegenError, StateError
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import default_method
+from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 SECOND_RUN = 10_000
 """Steps that a second run may take in addition to four times those of the first."""
@@ -58,11 +56,7 @@ class _TooLongError(Exception):
 
 @without_accuracy_warnings()
 def known_digits(
-    system: MechanicalSystem,
-    trajectory: Trajectory,
-    *,
-    most: int,
-    inputs: Mapping[str, Any] | None = None,
+    system: MechanicalSystem, trajectory: Trajectory, *, most: int, inputs: Mapping[str, Any] | None = None
 ) -> Known | None:
     """Estimate the error of the last state of ``trajectory``, a trajectory of ``system`` with ``inputs``.
 
@@ -131,10 +125,7 @@ REMEDY = "use adaptive step size (t_end, --tolerance)"
 
 
 def missed_tolerance(
-    system: MechanicalSystem,
-    trajectory: Trajectory,
-    tolerance: float,
-    known: Known | None = None,
+    system: MechanicalSystem, trajectory: Trajectory, tolerance: float, known: Known | None = None
 ) -> str:
     """Return why the error at the end of a run exceeds ``tolerance``; ``""`` if there is no evidence for it.
 
@@ -153,17 +144,11 @@ def missed_tolerance(
         known = known_digits(system, trajectory, most=SECOND_RUN + 4 * trajectory.steps)
     if known is None or known.chaotic:
         return f"{doubt}; {REMEDY}" if doubt else ""
-    error = float(np.linalg.norm(known.q)) / (_late_size(trajectory) or 1.0)
+    error = float(np.linalg.norm(known.q)) / (float(np.linalg.norm(_final_error(np.abs(trajectory.q)))) or 1.0)
     if error <= SECOND_MARGIN * tolerance + SECOND_RUN_ERROR:
         return ""
     message = doubt or f"the tolerance {tolerance:g} is missed"
     return f"{message}: a second run with other steps differs by {error:.1e} at the end; {REMEDY}"
-
-
-def _late_size(trajectory: Trajectory) -> float:
-    """Return the size of the last states, whose errors a second run measures."""
-    late = trajectory.q[-max(1, len(trajectory.q) // 16) :]
-    return float(np.linalg.norm(np.maximum(np.abs(late[-1]), np.sqrt(np.mean(late**2, axis=0)))))
 
 
 def _worst_step(trajectory: Trajectory, tolerance: float) -> str:

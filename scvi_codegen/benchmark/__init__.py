@@ -4,7 +4,7 @@
                  large array systems; accelerations derived by hand, and final states in extended precision,
                  independent of the package's steppers (references)
     contenders/  functions from a case and a step size or tolerance to its final state: steppers of this package; peers:
-                 heyoka (taylor), REBOUND, CyRK, SciPy (peers), MuJoCo, Pinocchio (engines), OpenMM (arrays),
+                 heyoka (taylor), REBOUND, CyRK, SciPy (peers), MuJoCo, Pinocchio, Exudyn (engines), OpenMM (arrays),
                  PyDy (mechanisms), py-pde and spectral methods by hand (pdes)
     comparison   timing of all contenders of a case in turn, in one process
     sections     which contenders and which reference belong to a case
@@ -116,7 +116,7 @@ def benchmark(
     wanted = dict.fromkeys((*known, *(sections or SECTIONS)))
     for report in _reports(tuple(wanted), known, plan or Plan(), report_activity, show):
         if json_path is not None:
-            _write(report, json_path)
+            write_text(json_path, json.dumps(report.data(), indent=1, allow_nan=False) + "\n")
     if plot_path is not None and report.cases:
         from scvi_codegen.benchmark.plots import plot_curves
 
@@ -150,11 +150,6 @@ def _known(json_path: str) -> dict[str, Result]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StateError(f"{json_path} is not a report that can be resumed: {type(error).__name__}: {error}") from None
     return {each.name: each for each in results}
-
-
-def _write(report: Report, json_path: str) -> None:
-    text = json.dumps(report.data(), indent=1, allow_nan=False) + "\n"
-    write_text(json_path, text)
 
 
 def _reports(

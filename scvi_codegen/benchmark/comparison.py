@@ -4,23 +4,21 @@ Times are processor times of the process. Every contender steps in one thread an
 equals the wall time of an idle machine; on a busy one it excludes the time of other programs.
 """
 
+import importlib.util
 import statistics
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from scvi_codegen.benchmark.cases.references import Reference, reference, rms_error
 from scvi_codegen.benchmark.cases.unforced import STATES, Array, Case
-from scvi_codegen.benchmark.contenders.peers import PEERS, missing_module
+from scvi_codegen.benchmark.contenders.peers import PEERS
 from scvi_codegen.benchmark.report import CaseResult, Contender, Measurement
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.errors import ScviCodegenError
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
-
-Make = Callable[[], Iterable[Contender]]
-"""Function that returns contenders."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,14 +28,15 @@ class Race:
     Attributes:
         case: case to integrate, already with the span of the plan.
         ours: function that returns the contenders of this package.
-        peers: function of a peer's name and whether the run is quick that returns the contenders of a peer, by default
-            those of :data:`~scvi_codegen.benchmark.contenders.peers.PEERS`.
+        peers: functions of the case and whether the run is quick that return the contenders of a peer, by its name.
         ends: function that returns the final states of a case, from its velocities or from momenta.
     """
 
     case: Case
-    ours: Make
-    peers: Callable[[str, bool], Iterable[Contender] | None] | None = None
+    ours: Callable[[], Iterable[Contender]]
+    peers: Mapping[str, Callable[[Case, bool], Iterable[Contender]]] = field(
+        default_factory=lambda: {name: peer.contenders for name, peer in PEERS.items()}
+    )
     ends: Callable[[Case, Array | None], Reference] = reference
 
 
@@ -60,7 +59,7 @@ def run_race(build: Callable[[Plan], Race], plan: Plan, report_activity: ReportA
         name=name,
         span=chosen.case.span,
         dimension=chosen.case.dimension,
-        accuracy=exact.accuracy,
+        reference_accuracy=exact.accuracy,
         measurements=tuple(measure(contenders, reference_of, repeats=plan.rounds)),
         skipped=skipped,
     )
@@ -70,16 +69,15 @@ def _peer_contenders(
     chosen: Race, plan: Plan, skipped: dict[str, str], report_activity: ReportActivity
 ) -> Iterator[Contender]:
     for name in plan.peers:
-        if not PEERS[name].suits(chosen.case):
+        if name not in chosen.peers or not PEERS[name].suits(chosen.case):
             continue
-        missing = missing_module(PEERS[name])
+        missing = next((each for each in PEERS[name].modules if importlib.util.find_spec(each) is None), None)
         if missing is not None:
             skipped[name] = f"{missing} is not installed (pip install 'scvi-codegen[bench]')"
             continue
         report_activity(f"{chosen.case.name}: compiling {name}")
         try:
-            own = None if chosen.peers is None else chosen.peers(name, plan.quick)
-            yield from PEERS[name].contenders(chosen.case, plan.quick) if own is None else own
+            yield from chosen.peers[name](chosen.case, plan.quick)
         except PEER_ERRORS as error:
             skipped[name] = f"{type(error).__name__}: {error}"
 
@@ -116,10 +114,7 @@ class _Record:
 
 
 def measure(
-    contenders: Sequence[Contender],
-    reference_of: Callable[[Contender], Reference],
-    *,
-    repeats: int,
+    contenders: Sequence[Contender], reference_of: Callable[[Contender], Reference], *, repeats: int
 ) -> list[Measurement]:
     """Time all contenders alternately; a contender that fails is reported with the reason.
 
@@ -132,17 +127,13 @@ def measure(
     for number in range(repeats + 1):
         for record in records:
             if record.wants_more():
-                _attempt(record)
+                try:
+                    record.round()
+                except (*PEER_ERRORS, ScviCodegenError) as error:
+                    record.failure = f"{type(error).__name__}: {error}"
             if number == 0 and record.wants_more():
                 record.seconds.clear()  # caches were cold
     return [_summary(record, reference_of) for record in records]
-
-
-def _attempt(record: _Record) -> None:
-    try:
-        record.round()
-    except (*PEER_ERRORS, ScviCodegenError) as error:
-        record.failure = f"{type(error).__name__}: {error}"
 
 
 def _summary(record: _Record, reference_of: Callable[[Contender], Reference]) -> Measurement:

@@ -3,12 +3,11 @@
 import importlib.metadata
 import os
 import platform
-import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 
 from scvi_codegen.native.building import TUNED_FLAGS
-from scvi_codegen.native.compilers import find_compiler
+from scvi_codegen.native.compilers import compiler_title
 from scvi_codegen.version import __version__
 
 PACKAGES = ("numpy", "scipy", "sympy", "heyoka", "rebound", "CyRK", "numba", "pydy", "mujoco", "pin", "py-pde")
@@ -16,15 +15,13 @@ PACKAGES = ("numpy", "scipy", "sympy", "heyoka", "rebound", "CyRK", "numba", "py
 
 def machine() -> dict[str, str | dict[str, str]]:
     """Return processor, system, compiler and versions as plain data."""
-    compiler = find_compiler()
-    shown = subprocess.run([*compiler, "--version"], capture_output=True, text=True, timeout=60, check=False).stdout
     return {
         "processor": _processor(),
         "cores": str(os.cpu_count()),
         "load": ", ".join(f"{value:.2f}" for value in os.getloadavg()) if hasattr(os, "getloadavg") else "unknown",
         "system": platform.platform(),
         "python": platform.python_version(),
-        "compiler": shown.splitlines()[0] if shown else " ".join(compiler),
+        "compiler": compiler_title(),
         "flags": " ".join(TUNED_FLAGS),
         "versions": {"scvi-codegen": __version__, **dict(_versions(PACKAGES))},
     }

@@ -67,7 +67,7 @@ def _label_times(axes: Axes) -> None:
 
 
 def _draw_method(axes: Axes, result: CaseResult, method: str, color: str) -> Artist:
-    points = [each.point for each in result.measurements if each.method == method and not each.failure]
+    points = [each for each in result.measurements if each.method == method and not each.failure]
     x, y = [1e3 * point.seconds for point in points], [max(point.error, 1e-18) for point in points]
     width, marker = (2.0, "o") if method.startswith(OURS) else (1.0, "s")
     line: Artist = axes.plot(x, y, color=color, linewidth=width, marker=marker, markersize=4)[0]

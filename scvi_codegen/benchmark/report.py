@@ -34,7 +34,11 @@ class ResultTable:
     def text(self) -> str:
         """Return the table for the terminal."""
         header = [name.replace("_", " ") for name in self.columns]
-        cells = [[_cell(row.get(name), form) for name, form in self.columns.items()] for row in self.rows]
+        rows = [finite(dict(row)) for row in self.rows]
+        cells = [
+            ["-" if row.get(name) is None else format(row[name], form) for name, form in self.columns.items()]
+            for row in rows
+        ]
         widths = [max(map(len, column)) for column in zip(header, *cells, strict=True)]
         aligned = ("  ".join(map(str.ljust, row, widths)).rstrip() for row in (header, *cells))
         return "\n  ".join([f"{self.name}: {self.title}", *aligned, *self.remarks])
@@ -46,14 +50,7 @@ class ResultTable:
 
     def data(self) -> dict[str, Any]:
         """Return the table as data for JSON."""
-        rows = [finite(dict(row)) for row in self.rows]
-        return {
-            "name": self.name,
-            "title": self.title,
-            "columns": dict(self.columns),
-            "rows": rows,
-            "remarks": list(self.remarks),
-        }
+        return asdict(self) | {"rows": [finite(dict(row)) for row in self.rows], "remarks": [*self.remarks]}
 
 
 def finite(entries: dict[str, Any]) -> dict[str, Any]:
@@ -61,12 +58,6 @@ def finite(entries: dict[str, Any]) -> dict[str, Any]:
     return {
         key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in entries.items()
     }
-
-
-def _cell(value: Any, form: str) -> str:
-    if value is None or (isinstance(value, float) and not math.isfinite(value)):
-        return "-"
-    return format(value, form)
 
 
 FLOOR = 1e-13
@@ -114,12 +105,8 @@ def time_at(points: Iterable[Point], error: float) -> float | None:
     curve, wanted = frontier(points), max(error, FLOOR)
     if not curve or wanted < curve[-1].error:
         return None
-    if wanted >= curve[0].error:
-        return curve[0].seconds
-    after = next(n for n, point in enumerate(curve) if point.error <= wanted)
-    loose, tight = curve[after - 1], curve[after]
-    share = math.log(loose.error / wanted) / math.log(loose.error / max(tight.error, LEAST))
-    return loose.seconds * math.pow(tight.seconds / loose.seconds, share)
+    errors = -np.log([max(point.error, LEAST) for point in curve])
+    return float(np.exp(np.interp(-np.log(wanted), errors, np.log([point.seconds for point in curve]))))
 
 
 def common_error(one: Sequence[Point], other: Sequence[Point]) -> float | None:
@@ -168,7 +155,7 @@ class Contender:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Measurement:
+class Measurement(Point):
     """Result of one contender.
 
     Attributes:
@@ -184,21 +171,9 @@ class Measurement:
     setting: str
     options: str
     compile_seconds: float
-    seconds: float
     fastest: float
-    error: float
     repeats: int
     failure: str = ""
-
-    @property
-    def point(self) -> Point:
-        """Point on the work-precision curve."""
-        return Point(seconds=self.seconds, error=self.error)
-
-    @property
-    def fastest_point(self) -> Point:
-        """Point with the shortest time."""
-        return Point(seconds=self.fastest, error=self.error)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -207,7 +182,7 @@ class CaseResult:
 
     Attributes:
         name, span, dimension: as of the case.
-        accuracy: accuracy of its reference.
+        reference_accuracy: accuracy of its reference.
         measurements: all settings of all methods.
         skipped: methods that were left out, with the reason.
     """
@@ -215,7 +190,7 @@ class CaseResult:
     name: str
     span: float
     dimension: int
-    accuracy: float
+    reference_accuracy: float
     measurements: tuple[Measurement, ...]
     skipped: Mapping[str, str]
 
@@ -226,10 +201,10 @@ class CaseResult:
     def text(self) -> str:
         """Return the table for the terminal."""
         failures = [f"{each.method} {each.setting}: {each.failure}" for each in self.measurements if each.failure]
-        good = {row["method"]: finite(row) for row in rows(self)}
+        good = {row["method"]: row for row in rows(self)}
         return ResultTable(
             name=self.name,
-            title=f"T = {self.span:g}, m = {self.dimension} (reference accurate to {self.accuracy:.0e})",
+            title=f"T = {self.span:g}, m = {self.dimension} (reference accurate to {self.reference_accuracy:.0e})",
             columns=COLUMNS,
             rows=tuple(good.get(method, {"method": method, "setting": "failed"}) for method in self.methods()),
             remarks=(
@@ -245,26 +220,13 @@ class CaseResult:
         measurements: list[dict[str, Any]] = [
             {key: math.nan if value is None else value for key, value in each.items()} for each in data["measurements"]
         ]
-        return cls(
-            name=data["name"],
-            span=data["span"],
-            dimension=data["dimension"],
-            accuracy=data["reference_accuracy"],
-            measurements=tuple(Measurement(**entries) for entries in measurements),
-            skipped=data["skipped"],
-        )
+        named = {name: data[name] for name in ("name", "span", "dimension", "skipped", "reference_accuracy")}
+        return cls(**named, measurements=tuple(Measurement(**entries) for entries in measurements))
 
     def data(self) -> dict[str, Any]:
         """Return all measurements as data for ``json.dump``; numbers that are not finite are null."""
-        return {
-            "name": self.name,
-            "span": self.span,
-            "dimension": self.dimension,
-            "reference_accuracy": self.accuracy,
-            "skipped": dict(self.skipped),
-            "measurements": [finite(asdict(each)) for each in self.measurements],
-            "rows": [finite(row) for row in rows(self)],
-        }
+        measurements = [finite(asdict(each)) for each in self.measurements]
+        return asdict(self) | {"measurements": measurements, "rows": [finite(row) for row in rows(self)]}
 
 
 def rows(result: CaseResult) -> list[dict[str, Any]]:
@@ -285,8 +247,7 @@ def _row(result: CaseResult, method: str) -> dict[str, Any]:
     peers = [each for each in good if not each.method.startswith(OURS)]
     best = [each for each in peers if each.method.startswith(BASELINE)]
     default = [each for each in best if FAST not in each.method and each.setting == DEFAULT]
-    points = _points(own)
-    error = common_error(points, _points(best or own)) or math.inf
+    error = common_error(own, best or own) or math.inf
     reaching = [each for each in own if max(each.error, FLOOR) <= error]
     shown = min(reaching, key=lambda each: each.seconds) if reaching else min(own, key=lambda each: each.error)
     return {
@@ -295,19 +256,22 @@ def _row(result: CaseResult, method: str) -> dict[str, Any]:
         "time_ms": 1e3 * shown.seconds,
         "error": shown.error,
         "compile_s": shown.compile_seconds,
-        "default": _ratio(_points(default), points),
-        "best": _ratio(_points(best), points),
-        "peer": _ratio(_points(peers), points),
+        "default": _ratio(default, own),
+        "best": _ratio(best, own),
+        "peer": _ratio(peers, own),
         "at_error": error,
         "options": "" if method.startswith(OURS) else shown.options,
-        "seconds": time_at(points, error) or math.nan,
+        "seconds": time_at(own, error) or math.nan,
     }
 
 
 def ratios_at(result: CaseResult, error: float) -> tuple[str, dict[str, float]]:
     """Return the fastest method of this package at an error, and the times of all methods that reach it, in seconds."""
     good = [each for each in result.measurements if not each.failure]
-    curves = {method: [each.fastest_point for each in good if each.method == method] for method in result.methods()}
+    curves = {
+        method: [Point(seconds=each.fastest, error=each.error) for each in good if each.method == method]
+        for method in result.methods()
+    }
     times = {method: time_at(points, error) for method, points in curves.items()}
     reached = {method: seconds for method, seconds in times.items() if seconds is not None}
     return min((each for each in reached if each.startswith(OURS)), key=reached.__getitem__, default=""), reached
@@ -322,10 +286,6 @@ def _line_at(result: CaseResult, error: float) -> str:
     missing = [name for name in result.methods() if name not in times]
     never = f"; not reached: {', '.join(missing)}" if missing else ""
     return f"at {error:.0e}: {1e3 * times[ours]:.3g} ms by {ours}; others over it: {', '.join(others)}{never}"
-
-
-def _points(measurements: Sequence[Measurement]) -> list[Point]:
-    return [one.point for one in measurements]
 
 
 def _ratio(reference: Sequence[Point], points: Sequence[Point]) -> float | None:

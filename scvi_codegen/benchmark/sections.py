@@ -1,6 +1,6 @@
 """Sections of the benchmark that compare contenders at equal error: a case with its contenders and reference each."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 
@@ -16,6 +16,7 @@ from scvi_codegen.benchmark.cases.rotations import BODIES, FEW_BODIES, ROTATIONS
 from scvi_codegen.benchmark.cases.unforced import CASES, STATES, Case, case
 from scvi_codegen.benchmark.comparison import Race
 from scvi_codegen.benchmark.contenders.arrays import step_counts
+from scvi_codegen.benchmark.contenders.engines import mujoco_contenders
 from scvi_codegen.benchmark.contenders.mechanisms import LINKS, links
 from scvi_codegen.benchmark.contenders.ours import (
     adaptive_contenders,
@@ -24,6 +25,7 @@ from scvi_codegen.benchmark.contenders.ours import (
     our_ensembles,
     run_contenders,
 )
+from scvi_codegen.benchmark.contenders.peers import rebound_contenders
 from scvi_codegen.benchmark.contenders.taylor import heyoka_contenders, heyoka_ensembles
 from scvi_codegen.benchmark.report import Contender
 from scvi_codegen.benchmark.settings import Plan
@@ -49,10 +51,7 @@ def _single(make: Callable[[], Case], plan: Plan) -> Race:
 
 def _ensemble(few: Case, many: Case, plan: Plan) -> Race:
     """Return all trajectories at once in one thread; heyoka in its batch mode."""
-
-    def peers(name: str, quick: bool) -> Iterable[Contender] | None:
-        return heyoka_ensembles(many, quick) if name == "heyoka" else None if name == "mujoco" else ()
-
+    peers = {"heyoka": lambda _, quick: heyoka_ensembles(many, quick), "mujoco": mujoco_contenders}
     return Race(case=few, ours=partial(our_ensembles, many, quick=plan.quick), peers=peers)
 
 
@@ -78,20 +77,20 @@ def _tumbling(plan: Plan) -> Race:
 def _adaptive(name: str, plan: Plan) -> Race:
     """Return problems with close encounters, in all modes of this package."""
     chosen = _shortened(adaptive_case(name), plan)
-
-    def peers(peer: str, quick: bool) -> Iterable[Contender] | None:
-        return heyoka_contenders(chosen, True) if peer == "heyoka" else None if peer == "rebound" else ()
-
+    peers = {"heyoka": lambda case, _: heyoka_contenders(case, True), "rebound": rebound_contenders}
     return Race(case=chosen, ours=partial(adaptive_contenders, chosen, quick=plan.quick), peers=peers)
 
 
 def _rotation(name: str, plan: Plan) -> Race:
-    """Return a rigid body, at advised and at adaptive step sizes."""
+    """Return a rigid body, at advised and at adaptive step sizes, and by explicit splitting, exact without forces."""
     chosen = _shortened(ROTATIONS[name](), plan)
+    longest, halvings = (chosen.span, range(0, 13, 2)) if name == "free-top" else (1.0, range(6))
+    splitting: Counts = {Composition(8): step_counts(replace(chosen, step=longest), halvings)}
 
     def ours() -> list[Contender]:
         both = (our_contenders, adaptive_contenders)
-        return [contender for make in both for contender in make(chosen, quick=plan.quick)]
+        made = [contender for make in both for contender in make(chosen, quick=plan.quick)]
+        return [*made, *fixed_contenders(chosen, splitting)]
 
     return Race(case=chosen, ours=ours)
 
@@ -99,11 +98,7 @@ def _rotation(name: str, plan: Plan) -> Race:
 def _halved(
     make: Callable[[], Case], methods: Mapping[str | Method, range], exact: Mapping[str | Method, int], plan: Plan
 ) -> Race:
-    """Return a case by methods with the step size of the case halved repeatedly.
-
-    The reference is the final state by the first method of ``exact``, with that many halvings; its accuracy is the
-    distance from that by the second.
-    """
+    """Return a case with its step size halved repeatedly; reference and its accuracy: the methods of ``exact``."""
     chosen = _shortened(make(), plan)
 
     @cache

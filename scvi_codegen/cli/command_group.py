@@ -11,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
@@ -142,25 +143,10 @@ def _warnings_as_lines() -> Iterator[None]:
 
 def reporting(command: Command) -> Command:
     """Add the options ``--json`` and ``--quiet``, which :func:`tell` obeys, to a command."""
-    options = (
-        click.option(
-            *("--json", "as_json"),
-            is_flag=True,
-            expose_value=False,
-            callback=_begin_report,
-            help="Print one JSON document instead of text.",
-        ),
-        click.option(
-            *("--quiet", "quiet"),
-            is_flag=True,
-            expose_value=False,
-            callback=_be_quiet,
-            help="Print only errors and warnings; see the exit status.",
-        ),
-    )
-    for option in options:
-        command = option(command)
-    return command
+    flag = partial(click.option, is_flag=True, expose_value=False)
+    as_json = flag("--json", callback=_begin_report, help="Print one JSON document instead of text.")
+    quiet = flag("--quiet", callback=_be_quiet, help="Print only errors and warnings; see the exit status.")
+    return quiet(as_json(command))
 
 
 def _begin_report(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:

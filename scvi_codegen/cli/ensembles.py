@@ -99,6 +99,7 @@ def ensemble_summary(model: Model, outcome: EnsembleOutcome) -> str:
     """Return a summary of an ensemble in a few lines."""
     result = outcome.result
     steps = int(result.steps.sum())
+    counts = Counter(result.status.tolist())
     lines = [
         model.system.name,
         model.method.title,
@@ -106,7 +107,7 @@ def ensemble_summary(model: Model, outcome: EnsembleOutcome) -> str:
         f"{_describe_steps(model, result)} saved of each",
         f"{outcome.seconds:.3g} s, {duration(outcome.seconds / max(steps, 1))} per step of a trajectory; "
         f"prepared in {outcome.preparation:.2f} s",
-        ", ".join(f"{number} {status}" for status, number in _statuses(result)),
+        ", ".join(f"{number} {status}" for status, number in [("ok", counts.pop("ok", 0)), *sorted(counts.items())]),
     ]
     return "\n".join([*lines, *_failures(result), _energy_report(model, result), *momentum_report(result)])
 
@@ -117,12 +118,6 @@ def _describe_steps(model: Model, result: EnsembleTrajectory) -> str:
         return f"{steps} from t = {model.t:g} to t = {model.t + model.covered:g}; up to {len(result.t)} states"
     steps = f"{counted(int(result.steps.max()), 'step')} of {model.h:g}"
     return f"{steps} from t = {model.t:g}; {counted(len(result.t), 'state')}"
-
-
-def _statuses(result: EnsembleTrajectory) -> list[tuple[str, int]]:
-    """Return the number of trajectories for each status, completed ones first."""
-    counts = Counter(result.status.tolist())
-    return [("ok", counts.pop("ok", 0)), *sorted(counts.items())]
 
 
 def _failures(result: EnsembleTrajectory) -> Iterator[str]:

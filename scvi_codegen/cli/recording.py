@@ -13,7 +13,7 @@ import click
 import numpy as np
 
 from scvi_codegen.cli.reports import counted, duration
-from scvi_codegen.cli.running import conserved, final_state
+from scvi_codegen.cli.running import conserved, event_counts, final_state
 from scvi_codegen.cli.supervision import interruptions, progress_bar
 from scvi_codegen.errors import ModelFileError, StepFailedError
 from scvi_codegen.files import export
@@ -89,7 +89,8 @@ class RecordedOutcome:
         if steps:
             since = f" since step {self.first}" if self.first else ""
             lines.append(f"{self.seconds:.3g} s{since}, {duration(self.seconds / steps)} per step, including writing")
-        return "\n".join([*lines, *self._conserved(), *final_state(self.run.stepper.interface, self.run.q, self.run.p)])
+        end = final_state(self.run.stepper.interface, self.run.q, self.run.p)
+        return "\n".join([*lines, *self._conserved(), *event_counts(self.recorded.events), *end])
 
     def _conserved(self) -> list[str]:
         """Return lines on conserved quantities if the folder names a model that determines them."""
@@ -157,7 +158,7 @@ class Recording:
         if steps is not None and span is not None:
             raise click.UsageError("--span and --steps exclude each other")
         recorded = load_run(folder)
-        manifest, further = recorded.manifest, {}
+        manifest, further = recorded.manifest, dict[str, Any]()
         if manifest.plan and span is not None:
             further["t_end"] = manifest.t + math.copysign(span, manifest.plan.t_end - manifest.t)
         elif span is not None and manifest.interface.energy_parameter:
@@ -167,6 +168,8 @@ class Recording:
         elif span is not None:
             steps = whole_steps_in(span, manifest.h, manifest.t)
         plan = manifest.steps if steps is None else steps
+        if manifest.model is not None and (system := parse_model(manifest.model).array_system):
+            further["mesh"] = system.mesh
         return self._with_progress(resume_run, Path(folder), first=recorded.steps, steps=plan, **further)
 
     def _with_progress(

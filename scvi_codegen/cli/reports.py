@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.errors import MethodWarning, ScviCodegenError, StateError, warn
+from scvi_codegen.runtime.core.validation import Array
 
 if TYPE_CHECKING:
     from scvi_codegen.mechanics.system import MechanicalSystem
@@ -46,8 +46,6 @@ def table(rows: Sequence[Sequence[str]]) -> str:
         "  ".join(f"{cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
     )
 
-
-Array = NDArray[np.float64]
 
 MAX_LISTED = 12
 """Largest number of momentum maps that are listed one by one."""

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.events.event import Crossings
 from scvi_codegen.runtime.inputs.segments import with_final_state
 from scvi_codegen.runtime.run.accuracy import TOLERABLE_ERROR, without_accuracy_warnings
 from scvi_codegen.runtime.run.largest_step import accuracy_message
@@ -75,11 +76,14 @@ def integrate_model(model: Model, *, options: SolverOptions | None = None, threa
     began = time.perf_counter()
     run = model.start(options=options, threads=threads)
     preparation = time.perf_counter() - began
+    by_time = model.ends_at_time or bool(model.system.inputs)  # the number of steps is not known in advance
+    length = BAR_LENGTH if by_time else model.step_count
     began, stopped, failure, recorder = time.perf_counter(), False, None, _FileRecorder(model, run)
-    with interruptions() as caught, progress_bar(_length(model)) as show_progress:
+    with interruptions() as caught, progress_bar(length) as show_progress:
 
         def look(_: int) -> None:
-            show_progress(_reached(model, run))
+            reached = int(BAR_LENGTH * (run.t - model.t) / model.covered) if by_time else run.steps
+            show_progress(min(length, reached))
             check_run_memory(model, run.steps)
 
         def stop() -> bool:
@@ -150,21 +154,6 @@ def _missed(model: Model, trajectory: Trajectory) -> str | None:
     return accuracy_message(trajectory.step_error, trajectory.worst_step_time, allowed)
 
 
-def _length(model: Model) -> int:
-    """Return the length of the progress bar: the number of steps, or ``BAR_LENGTH`` for the time span."""
-    return BAR_LENGTH if _by_time(model) else model.step_count
-
-
-def _reached(model: Model, run: Run) -> int:
-    """Return the progress in units of :func:`_length`."""
-    return min(BAR_LENGTH, int(BAR_LENGTH * (run.t - model.t) / model.covered)) if _by_time(model) else run.steps
-
-
-def _by_time(model: Model) -> bool:
-    """Return True if the number of steps is not known in advance."""
-    return model.ends_at_time or bool(model.system.inputs)
-
-
 def summary(model: Model, outcome: RunOutcome, known: Known | None, balance: Balance | None = None) -> str:
     """Return a summary of a run in a few lines; shorter if no step was completed."""
     run, trajectory, method, arrays = outcome.run, outcome.trajectory, model.method, model.array_system
@@ -182,8 +171,15 @@ def summary(model: Model, outcome: RunOutcome, known: Known | None, balance: Bal
         with np.errstate(all="ignore"):
             lines += conserved(model, trajectory, balance)
         lines += worst_step(trajectory)
-    lines += [f"event {each.event.function}: {counted(len(each), 'crossing')}" for each in trajectory.events]
-    return "\n".join([*lines, *final_state(run.stepper.interface, *outcome.end[1:], known)])
+    return "\n".join(
+        [*lines, *event_counts(trajectory.events), *final_state(run.stepper.interface, *outcome.end[1:], known)]
+    )
+
+
+def event_counts(events: Iterable[Crossings]) -> Iterator[str]:
+    """Yield a line for each event with its number of crossings."""
+    for each in events:
+        yield f"event {each.event.function}: {counted(len(each), 'crossing')}"
 
 
 def _geometry(model: Model, run: Run) -> str:

@@ -78,11 +78,13 @@ def model_with_advised_step(model: Model, tolerance: float, *, options: SolverOp
     """
     if model.has_time_transformation:
         raise StateError("--advise is not available with a time transformation: use --tolerance (local error)")
+    stepper = model.stepper()
+    stepper._check_no_changes("--advise")
     advice = advise(
         model.system,
         model.method,
         model.q,
-        model.momenta(model.stepper()),
+        model.momenta(stepper),
         model.covered,
         tolerance,
         t=model.t,

@@ -3,10 +3,10 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from sympy import Expr, latex
+from sympy import latex
 
 from scvi_codegen.formulas.array_notation import latex_entry, latex_sums
-from scvi_codegen.ir.equations import ConstrainedSteps, FixedPointIteration, Splitting
+from scvi_codegen.ir.equations import FixedPointIteration, Splitting
 from scvi_codegen.ir.kernel import Number
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.program import lower
@@ -61,11 +61,9 @@ def _text(system: ArraySystem) -> Iterator[str]:
         yield from (f"    by {access}: {derivative}" for access, derivative in force_of(term, system.state).targets)
     if not system.momenta:
         yield "Masses:"
-        yield from (
-            f"  {_loops_text(mass.loops, formula)} at {access}"
-            for mass in system.masses
-            for access, formula in mass.targets
-        )
+        for mass in system.masses:
+            where = f"for {', '.join(map(str, mass.loops))}: " if mass.loops else ""
+            yield from (f"  {where}{formula} at {access}" for access, formula in mass.targets)
     if system.applied_forces:
         yield "Forces beside:"
         yield from (f"  {force}" for force in system.applied_forces)
@@ -78,10 +76,6 @@ def _text(system: ArraySystem) -> Iterator[str]:
     energy = () if system.changes_energy else ("energy",)
     conserved = (*energy, *(each.name for each in momentum_maps(system)))
     yield f"Conserved: {', '.join(conserved) or 'nothing that is known'}"
-
-
-def _loops_text(loops: Sequence[object], formula: Expr) -> str:
-    return f"for {', '.join(map(str, loops))}: {formula}" if loops else str(formula)
 
 
 def _latex(system: ArraySystem) -> Iterator[str]:
@@ -97,18 +91,14 @@ def _latex(system: ArraySystem) -> Iterator[str]:
 def _step(program: Program, method: Method) -> Iterator[str]:
     yield f"A step of h by {method.title}, from q, p to q', p', the same for every coordinate"
     if program.loops.constrained:
-        yield from _held(program.loops.constrained)
+        yield "(m its mass, F the force on it, G the Jacobian of the constraints g, q, p going on from part to part):"
+        for part in program.loops.constrained.parts:
+            yield f"  p = p + {_number(part)}*h/2 (F + G^T lambda),  q = q + {_number(part)}*h p/m  with  g(q) = 0"
+            yield f"  p = p + {_number(part)}*h/2 (F + G^T mu)  with  G p/m + g_t = 0"
     elif program.splitting:
         yield from _splitting(program.splitting)
     elif program.fixed_point:
         yield from (_separable if program.fixed_point.name == "separable" else _hamiltonian)(program.fixed_point)
-
-
-def _held(of: ConstrainedSteps) -> Iterator[str]:
-    yield "(m its mass, F the force on it, G the Jacobian of the constraints g, q, p going on from part to part):"
-    for part in of.parts:
-        yield f"  p = p + {_number(part)}*h/2 (F + G^T lambda),  q = q + {_number(part)}*h p/m  with  g(q) = 0"
-        yield f"  p = p + {_number(part)}*h/2 (F + G^T mu)  with  G p/m + g_t = 0"
 
 
 def _splitting(of: Splitting) -> Iterator[str]:

@@ -32,6 +32,7 @@ from scvi_codegen.formulas.intermediates import inner_of, written_out
 from scvi_codegen.formulas.translation import format_expression
 from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
 from scvi_codegen.mechanics.first_order import FirstOrderSystem
+from scvi_codegen.mechanics.rotations.axial import axial_turns
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, symmetries
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import as_method
@@ -134,7 +135,7 @@ class StepEquations:
     def _heading(self) -> Iterator[str]:
         q, p = self.state
         yield f"{self.system.name}: {self.method.title}"
-        yield from (each.description for each in self.system.rotations)
+        yield from (each.description for each in (*self.system.rotations, *axial_turns(self.system)[1]))
         yield f"{'H' if self.system.auxiliaries else 'L'} = {format_expression(self.system.formula)}"
         for g in self.system.constraints:
             yield f"0 = {format_expression(g)}"
@@ -304,11 +305,12 @@ class _Writer:
         weight = self._named(group.weight_names[n], group.weights[n]) * self._growth(group, n)
         for scatter in group.scatters:
             values = [result.xreplace(arguments) for result in scatter.results]
+            scale = sympy.Rational(str(scatter.scale))
             for r, power in enumerate(powers):
                 coefficient = self._entry(scatter.table, n, r)
                 if coefficient == 0:
                     continue
-                factor = weight * coefficient * self.step ** (scatter.power + power) * _fraction(scatter.scale)
+                factor = weight * coefficient * self.step ** (scatter.power + power) * scale
                 for i, value in enumerate(values):
                     rows[r][i].append(factor * value)
 
@@ -328,7 +330,7 @@ class _Writer:
         if any(self.system.time in result.free_symbols for result in group.results):
             replaced[self.system.time] = self.time + self._abscissa(group, n) * self.step
         for gather in group.gathers:
-            values = self._gathered(gather.table, n, power=gather.power, scale=_fraction(gather.scale))
+            values = self._gathered(gather.table, n, power=gather.power, scale=sympy.Rational(str(gather.scale)))
             replaced |= dict(zip(gather.arguments, values, strict=True))
         return replaced
 
@@ -365,10 +367,6 @@ def _rational(value: Number) -> sympy.Expr:
     """Return a coefficient of p_k or of the straight line: small dyadic numbers and node positions."""
     exact = sympy.nsimplify(sympy.Float(str(value), 30), rational=True, tolerance=sympy.Float("1e-25"))
     return exact if exact.q < 10**6 else sympy.Float(str(value), 17)
-
-
-def _fraction(value: object) -> sympy.Rational:
-    return sympy.Rational(str(value))
 
 
 def _with_radicals(derived: StepEquations) -> StepEquations:

@@ -76,7 +76,8 @@ def _position_form(
     q0, Q = sympy.Matrix(1, m, state[0]), sympy.Matrix(size, m, unknowns[: size * m])
     v0 = sympy.Matrix(1, m, unknowns[size * m :])
     operator = sympy.kronecker_product(A * A, sympy.eye(m))
-    left = operator * _vec(Q) + sympy.kronecker_product(a0, v0.T) + sympy.kronecker_product(A * a0, q0.T)
+    # vec(Q) of Definition 2.2: the rows of Q stacked on top of each other
+    left = operator * sympy.Matrix(list(Q)) + sympy.kronecker_product(a0, v0.T) + sympy.kronecker_product(A * a0, q0.T)
     V, E = A * Q + a0 * q0, forms_of(system).euler_lagrange
     residual = []
     for i, time in enumerate(times):
@@ -121,11 +122,6 @@ def _frozen_form(
         left=left.as_immutable(),
         residual=residual.as_immutable(),
     )
-
-
-def _vec(matrix: sympy.Matrix) -> sympy.Matrix:
-    """Return the rows stacked on top of each other (Definition 2.2)."""
-    return sympy.Matrix(list(matrix))
 
 
 def _at_node(

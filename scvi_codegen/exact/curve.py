@@ -34,14 +34,6 @@ def fixed(values: Array, exponent: int) -> Array:
     return np.array(shifted, dtype=object).reshape(values.shape)
 
 
-def fixed_product(matrix: Array, values: Array) -> Array:
-    """Return an integer ``matrix`` times numbers; accurate relative to the largest of them."""
-    exponent = int(mp.mag(largest(values) or mp.one))
-    products = matrix @ fixed(values, exponent)
-    numbers = [mp.ldexp(mp.mpf(product), exponent - 2 * BITS) for product in products.ravel()]
-    return np.array(numbers, dtype=object).reshape(products.shape)
-
-
 @dataclass(frozen=True, slots=True)
 class Grid:
     """Grid of n Gauss points in each of several equal pieces of [0, 1].
@@ -78,16 +70,14 @@ class Grid:
             row=np.tile(floats, pieces) / pieces,
         )
 
-    @property
-    def piece(self) -> Grid:
-        """Grid of a single piece."""
-        return Grid.of(len(self.weights), 1)
-
     def integrate(self, rates: Array, start: Array) -> tuple[Array, Array]:
         """Return the integral of ``rates`` with the initial value ``start``, at the points and at the end."""
         values = []
         for piece in np.split(rates, self.pieces):
-            moved = start + fixed_product(self.integrals, piece) / self.pieces
+            exponent = int(mp.mag(largest(piece) or mp.one))
+            products = self.integrals @ fixed(piece, exponent)
+            numbers = [mp.ldexp(mp.mpf(product), exponent - 2 * BITS) for product in products.ravel()]
+            moved = start + np.array(numbers, dtype=object).reshape(products.shape) / self.pieces
             values.append(moved[:-1])
             start = moved[-1]
         return np.concatenate(values), start
@@ -126,7 +116,9 @@ class Curve:
         """Return the solution of (2) with this initial position and velocity, computed piece after piece."""
         position, speed, coefficients, length = start, velocity, [], h / grid.pieces
         for index in range(grid.pieces):
-            first = cls(motion, grid.piece, t + index * length, length, position, speed, np.empty((0,)))
+            first = cls(
+                motion, Grid.of(len(grid.weights), 1), t + index * length, length, position, speed, np.empty((0,))
+            )
             curve = first._uniformly_accelerated()._solved(digits)
             coefficients.append(curve.z * grid.pieces)
             position, speed = curve.ends()[1], curve.end_velocities()[1]

@@ -110,11 +110,7 @@ class ExactMotion:
 
     @cached_property
     def _constraint_tape(self) -> Tape:
-        """Constraint Jacobian G, row by row; d/dt of the rates at constant v; the constraints; their rates.
-
-        A nonholonomic constraint contributes its derivatives with respect to v, 0 for the constraint, and itself as
-        rate.
-        """
+        """Constraint Jacobian G (dg/dv if nonholonomic); d/dt of the rates at constant v; constraints (0); rates."""
         q, v, t = self.system.coordinates, self.second, self.system.time
 
         def rate(f: sympy.Expr) -> sympy.Expr:
@@ -235,10 +231,8 @@ class ExactMotion:
 
     def residual(self, q: Numbers, v: Numbers, t: Number, a: Numbers) -> Numbers:
         """Return the (m,) Euler-Lagrange residual of a Lagrangian, d/dt dL/dv - dL/dq - f."""
-        m, values = len(q), self._values(self._right_hand_side, q, v, t)
-        derivatives = values[m:].reshape(m, 2 * m + 1)
-        residual: Numbers = derivatives[:, :m] @ a + derivatives[:, m : 2 * m] @ v + derivatives[:, 2 * m] - values[:m]
-        return residual
+        mass, applied = self._mass_and_applied(q, v, t)
+        return mass @ a - applied
 
     def residual_jacobian(self, q: Numbers, v: Numbers, t: Number, a: Numbers) -> Floats:
         """Return the (3, m, m) derivatives of the residual by position, velocity and acceleration, in doubles."""

@@ -26,7 +26,7 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise, paper_equations
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_structure import Velocities
-from scvi_codegen.methods.stage_system import StageGroup, StageSystem
+from scvi_codegen.methods.stage_system import StageGroup, StageSystem, straight
 from scvi_codegen.tables.precision import Number, mp
 
 DIGITS = 45
@@ -202,16 +202,7 @@ class DerivedStep:
     def _straight(self, known: _Known) -> Numbers:
         """Return the (unknowns,) initial guess: straight line with the initial velocity, 0 for other block sizes."""
         v = self.motion.velocity(known.q, known.p, known.t)
-        return np.concatenate(
-            [
-                known.q * block.straight[0]
-                + v * (block.straight[1] * known.h ** (1 - block.power))
-                + known.p * block.momentum
-                if block.size is None
-                else numbers([0] * block.size)
-                for block in self.stages.blocks
-            ]
-        )
+        return np.concatenate(straight(self.stages, known.q, v, known.p, known.h, mp.mpf))
 
     def _arguments(self, f: int, z: Numbers, known: _Known) -> Numbers:
         """Return the (points, arguments) of the kernel of a stage group."""

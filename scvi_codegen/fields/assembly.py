@@ -167,7 +167,7 @@ class Assembly:
                 yield self.over_points(f"({self.written(term, texts)})")
 
     def over_pairs(self, term: Expr) -> Iterator[str]:
-        """Yield the terms of Fourier axes: sums over pairs of points of quadratic terms, then the others."""
+        """Yield the terms of Fourier axes: sums over pairs of points of quadratic terms, then those of derivatives."""
         rest = term
         for name, (each, orders) in self.system.derivatives.items():
             factor = term.diff(symbol(name), 2)
@@ -175,36 +175,44 @@ class Assembly:
                 continue
             ((axis, order),) = orders.items()
             rest -= factor * symbol(name) ** 2 / 2
-            matrix, pair = f"pairs{order}_{axis}", f"i{axis}, j{axis}"
-            self.used[matrix] = (f"N{axis}, N{axis}", self.axes[axis].pairs[order - 1])
+            matrix, values = f"pairs{order}_{axis}", self.axes[axis].pairs[order - 1]
+            pair = f"i{axis}, j{axis}" if values.ndim == 2 else f"j{axis}-i{axis}"
+            self.used[matrix] = (", ".join([f"N{axis}"] * values.ndim), values)
             others = [a for a in self.axes if a != axis]
             loops = ", ".join([*(f"i{a} in N{a}" for a in others), f"i{axis} < j{axis} in N{axis}"])
             one, two = (self.at(each, {a: f"{letter if a == axis else 'i'}{a}" for a in self.axes}) for letter in "ij")
             factors = "*".join([f"({self.written(factor, {})})", *map(self.weight, others), f"{matrix}[{pair}]"])
             yield f"sum({loops}, {factors}*({one} - {two})**2/2)"
         if sympy.expand(rest) != 0:
-            yield self.over_points(f"({self.written(rest, self.dense_derivatives(rest))})")
+            yield self.over_points(f"({self.written(rest, self.fourier_derivatives(rest))})")
 
-    def dense_derivatives(self, term: Expr) -> dict[str, str]:
-        """Return the texts of fields and their derivatives at a point by dense matrices of Fourier derivatives."""
+    def fourier_derivatives(self, term: Expr) -> dict[str, str]:
+        """Return the texts of fields and their Fourier derivatives at a point, by convolutions or dense matrices."""
         here = {axis: f"i{axis}" for axis in self.axes}
         texts = {each: self.at(each, here) for each in self.system.variables} | self.at_points([*self.axes])
         for name, (each, orders) in self.system.derivatives.items():
             if symbol(name) not in term.free_symbols:
                 continue
-            if any(len(self.axes[axis].points) > MAX_UNROLLED_TERMS for axis in orders):
-                raise SystemDefinitionError(
-                    f'"fourier" with more than {MAX_UNROLLED_TERMS} points along an axis needs densities that are '
-                    f"quadratic in derivatives along one axis with constant factors, not {sympy.expand(term)}: use "
-                    'fewer points, "finite-differences" or "spectral-elements"'
-                )
-            text = self.at(each, {axis: f"j{axis}" if axis in orders else f"i{axis}" for axis in self.axes})
+            texts[name] = self.at(each, {axis: f"j{axis}" if axis in orders else f"i{axis}" for axis in self.axes})
             for axis, order in orders.items():
-                matrix, count = f"derivatives{order}_{axis}", len(self.axes[axis].points)
-                first = self.axes[axis].differentiated(np.eye(count), 0)
+                discretised, count = self.axes[axis], len(self.axes[axis].points)
+                if discretised.pairs[0].ndim == 1:
+                    self.used[f"derivative_{axis}"] = (f"N{axis}", discretised.rates)
+                    j, others = f"j{axis}", [f"k{axis}"] * (order - 1)
+                    for before, index in itertools.pairwise([j, *others, f"i{axis}"]):
+                        by = f"derivative_{axis}[{before}-{index}]"
+                        texts[name] = f"sum({before} in N{axis}, {by}*{texts[name]})"
+                    continue
+                if count > MAX_UNROLLED_TERMS:
+                    raise SystemDefinitionError(
+                        f"derivative=\"dense\" of more than {MAX_UNROLLED_TERMS} points of '{axis}' needs densities "
+                        "that are quadratic in derivatives along one axis with constant factors, not "
+                        f'{sympy.expand(term)}: use derivative="fft"'
+                    )
+                matrix = f"derivatives{order}_{axis}"
+                first = discretised.differentiated(np.eye(count), 0)
                 self.used[matrix] = (f"{count}, {count}", np.linalg.matrix_power(first, order))
-                text = f"sum(j{axis} in {count}, {matrix}[i{axis}, j{axis}]*{text})"
-            texts[name] = text
+                texts[name] = f"sum(j{axis} in {count}, {matrix}[i{axis}, j{axis}]*{texts[name]})"
         return texts
 
     def over_cells(self, key: tuple[str, ...], term: Expr) -> Iterator[str]:

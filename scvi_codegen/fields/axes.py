@@ -26,6 +26,8 @@ from scvi_codegen.validation import checked_count
 
 Array = NDArray[np.float64]
 
+LEAST_TRANSFORMED = 32
+"""Smallest even number of Fourier points that are transformed, half of the smallest odd one (measured)."""
 PERIODIC = "periodic"
 NATURAL = "natural"
 
@@ -128,8 +130,9 @@ class Axis:
         edges: of elements, their ends.
         stencil: number of points for the interpolation of values between equidistant points (differences).
         periodic: whether it has no ends.
-        pairs: (N, N) matrices K of the quadratic forms sum_(i<j) K_ij (u_i - u_j)^2/2 of int u_x^2/2 dx and int
-            u_xx^2/2 dx (Fourier).
+        pairs: coefficients of the quadratic forms sum_(i<j) K_ij (u_i - u_j)^2/2 of int u_x^2/2 dx and int u_xx^2/2 dx
+            (Fourier): (N, N) matrices K, or (N,) values c of K_ij = c[j-i] for fast Fourier transforms.
+        rates: (N,) coefficients c of the derivative sum_j c[j-i] u_j (Fourier).
         stiffness: upper bounds of int u_x^2 dx and int u_xx^2 dx by sum_i weights_i u_i^2.
     """
 
@@ -149,6 +152,7 @@ class Axis:
     stencil: int = 0
     periodic: bool = True
     pairs: tuple[Array, ...] = ()
+    rates: Array = field(default_factory=lambda: np.zeros(0))
     stiffness: tuple[float, ...] = ()
 
     def interpolation(self, at: float) -> dict[int, float]:
@@ -340,23 +344,37 @@ def _edges(
     )
 
 
-def fourier(name: str, start: float, end: float, points: int) -> Axis:
+def fourier(name: str, start: float, end: float, points: int, derivative: str | None = None) -> Axis:
     """Return a periodic axis of equidistant points with the derivatives of the trigonometric interpolant.
 
     int u_x^2 dx = sum_k L k^2 |c_k|^2 over the discrete Fourier coefficients c_k is the quadratic form u . K u with a
     circulant K whose rows have the sum 0, so that it is -sum_(i<j) K_ij (u_i - u_j)^2; likewise u_xx with k^4.
+
+    Args:
+        name, start, end: of the axis.
+        points: their number.
+        derivative: ``"fft"``, ``"dense"``, or ``None`` for fast Fourier transforms of many points.
     """
-    count = point_count_of(name, points, least=3, most=4096)
+    if derivative not in (None, "fft", "dense"):
+        raise SystemDefinitionError(f'derivative= of \'{name}\' is "fft" or "dense", not {derivative!r}')
+    count = point_count_of(name, points, least=3, most=4096 if derivative == "dense" else 16384)
+    transformed = count >= LEAST_TRANSFORMED * (1 + count % 2) if derivative is None else derivative == "fft"
     h = (end - start) / count
     k = 2 * np.pi * np.fft.fftfreq(count, h)
-    distance = np.abs(np.arange(count)[:, None] - np.arange(count))
-    rows = [np.fft.ifft(k ** (2 * power)).real * h for power in (1, 2)]
+    distance = np.abs(np.arange(1 if transformed else count)[:, None] - np.arange(count))
+    angle = np.pi * np.arange(1, (count + 1) // 2) / count
+    signs = np.where(np.arange(1, (count + 1) // 2) % 2, np.pi, -np.pi) / (end - start)
+    half = signs / (np.sin(angle) if count % 2 else np.tan(angle))  # Trefethen, Spectral Methods in MATLAB, chapter 3
+    spectra = (np.fft.ifft(k.astype(np.longdouble) ** (2 * power)).real * h for power in (1, 2))
+    rows = [each.astype(np.float64) for each in spectra]
+    matrices = (-row[np.minimum(distance, count - distance)] for row in rows)
     return Axis(
         name=name,
         points=start + h * np.arange(count, dtype=np.float64),
         weights=np.full(count, h),
         length=end - start,
-        pairs=tuple(-row[np.minimum(distance, count - distance)] for row in rows),
+        pairs=tuple(each[0] if transformed else each for each in matrices),
+        rates=np.concatenate([[0.0], half, np.zeros(1 - count % 2), -half[::-1]]),
         stiffness=tuple(float(np.abs(k).max()) ** (2 * power) for power in (1, 2)),
     )
 

@@ -49,7 +49,8 @@ class FieldDerivation:
             yield f"\n{name}"
             yield from (f"  {line}" for line in text.split("\n"))
         divergence = " + ".join(f"d/d{axis} J{axis}" for axis in self.field_system.space)
-        yield f"\nconservation laws, d/d{TIME} J{TIME} + {divergence} = 0"
+        found = f", d/d{TIME} J{TIME} + {divergence} = 0" if self.laws else ": none found"
+        yield f"\nconservation laws{found}{', the density is damped' * (self.field_system.dissipation != 0)}"
         for law in self.laws:
             yield f"  {law.name}: {law.symmetry}"
             yield f"    J{TIME} = {_written(law.density)}"

@@ -83,10 +83,7 @@ def _coefficients(offsets: Sequence[Number], count: int) -> list[Vector]:
 
 
 def _end_rows(row: Array) -> tuple[Array, Array, Array, float]:
-    """Return D of the first R = 2 m midpoints from R + m points, the weights W and M, and the largest D^T W D by M.
-
-    All for h = 1. The eigenvalue is that of a line with one end, with one percent added for its length.
-    """
+    """Return, for h = 1, D of the first 2 m midpoints, the weights W and M, and a bound of D^T W D by M (one end)."""
     m = len(row) // 2
     size, width = 2 * m, 3 * m
     interior = np.zeros((4 * width, 4 * width + m))

@@ -14,7 +14,6 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
-from random import Random
 
 import sympy
 from sympy import Add, Derivative, Expr, Function, S, Symbol
@@ -23,11 +22,9 @@ from sympy.core.function import AppliedUndef
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.fields.density import Density
 from scvi_codegen.formulas.symbols import TIME, symbol
+from scvi_codegen.mechanics.arrays.symmetry import sums_to_zero
 from scvi_codegen.representation import summary
 
-DRAWS = 3
-"""Arguments at which an expression is evaluated to decide whether it is zero identically."""
-DIGITS = 30
 Variation = dict[str, Expr]
 
 
@@ -90,7 +87,7 @@ class Variations:
             forces[each] = Add(*terms).doit()
         if not system.momenta:
             masses = {each: self.along(system.density.diff(symbol(f"{each}_{TIME}"), 2)) for each in system.fields}
-            return {each: sympy.expand(forces[each] / masses[each]) for each in system.fields}
+            return {each: shorter(forces[each] / masses[each]) for each in system.fields}
         pairs = [*zip(system.fields, system.momenta, strict=True)]
         rates = {u: u_t for u, p in pairs for u_t in [sympy.expand(self.values[symbol(f"{u}_{TIME}")] - forces[p])]}
         return rates | {p: sympy.expand(forces[u]) for u, p in pairs}
@@ -192,18 +189,16 @@ def derivative(formula: Expr, orders: Mapping[str, int]) -> Expr:
     return formula.diff(*((symbol(axis), order) for axis, order in orders.items()))
 
 
+def shorter(formula: Expr) -> Expr:
+    """Return an expression expanded, or factored if that halves its length."""
+    expanded, factored = sympy.expand(formula), sympy.factor(formula)
+    return factored if 2 * factored.count_ops() < expanded.count_ops() else expanded
+
+
 def vanishes(formula: Expr) -> bool:
     """Return whether an expression in functions and their derivatives is zero identically, by evaluation."""
-    if (expanded := sympy.expand(formula)) == 0:
-        return True
-    atoms = sorted(expanded.atoms(Derivative, AppliedUndef) | expanded.free_symbols, key=sympy.default_sort_key)
-    random = Random(0)
-    for _ in range(DRAWS):
-        values = {each: sympy.Float(random.uniform(0.3, 1.3), DIGITS) for each in atoms}
-        terms = [sympy.N(term.xreplace(values), DIGITS) for term in Add.make_args(expanded)]
-        if abs(complex(Add(*terms))) > 10.0 ** (10 - DIGITS) * max(abs(complex(each)) for each in terms):
-            return False
-    return True
+    plain = sympy.expand(formula).xreplace(names_of(formula))
+    return sums_to_zero(Add.make_args(plain), sorted(plain.free_symbols, key=str))
 
 
 def names_of(formula: Expr) -> dict[Expr, Symbol]:

@@ -234,10 +234,7 @@ class MeshSystem(Mesh):
 
 
 def _stability_limit(kicks: Sequence[Any], drifts: Sequence[Any]) -> float:
-    """Return the largest product of step size and frequency for which all smaller ones are stable.
-
-    A step of the oscillator q'' = -q is a product of shears of determinant 1; it is stable if its trace is at most 2.
-    """
+    """Return the largest product of step size and frequency with stable steps: products of shears with |trace| <= 2."""
     z = np.linspace(0.0, MOST_PHASE, 2**14 + 1)
     state = np.tile(np.eye(2), (len(z), 1, 1))
     for kick, drift in zip(kicks, drifts, strict=True):

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from math import isfinite
 from typing import Any
 
@@ -31,9 +30,10 @@ DISCRETISATIONS = {
     "spectral-elements": ("degree", "elements"),
     "legendre": ("degree",),
     "finite-differences": ("order", "points"),
-    "fourier": ("points",),
+    "fourier": ("points", "derivative"),
 }
 """Options by discretisation in space."""
+OPTIONAL = "derivative"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -99,8 +99,7 @@ class FieldSystem(Density):
         first_order = hamiltonian is not None
         for match in re.finditer(rf"\b({'|'.join((*fields, *momenta))})_((?:{'|'.join((*space, TIME))})+)\b", text):
             _check_derivative(match[0], match[1], [*space], parameters or {})
-        read = partial(parse_expression, text)
-        system = cls._of(name, fields, momenta, space, boundary, parameters, first_order, read)
+        system = cls._of(name, fields, momenta, space, boundary, parameters, first_order, text)
         for key, value in (("dissipation", dissipation), ("point_lagrangians", point_lagrangians)):
             if first_order and value:
                 raise SystemDefinitionError(f"'{name}' has a Hamiltonian density, which has no {key}=: omit it")
@@ -119,16 +118,23 @@ class FieldSystem(Density):
         name: str,
         fields: Sequence[Expr],
         space: Mapping[str, Sequence[Any]],
-        density: Expr,
+        density: Expr | None = None,
+        hamiltonian: Expr | None = None,
+        momenta: Sequence[Expr] = (),
         boundary: Mapping[str, Any] | None = None,
         parameters: Mapping[str, float] | None = None,
+        dissipation: Expr | None = None,
+        scalars: Sequence[Expr] = (),
+        point_lagrangians: Sequence[Mapping[str, Any]] = (),
     ) -> FieldSystem:
-        """Create the system from a SymPy expression in functions ``u(x, t)`` and their derivatives.
+        """Create the system from SymPy expressions in functions ``u(x, t)`` and their derivatives.
 
         Args:
             name, space, boundary, parameters: as of :meth:`from_text`.
-            fields: functions of the axes and of the time, ``Function("u")(x, t)``.
-            density: L.
+            fields, momenta: functions of the axes and of the time, ``Function("u")(x, t)``.
+            density, hamiltonian, dissipation: L, or in place of it H, and the Rayleigh density.
+            scalars: functions of the time, ``Function("X")(t)``.
+            point_lagrangians: as of :meth:`from_text`, with expressions in fields, scalars and their velocities.
 
         >>> from sympy import Function, symbols
         >>> x, t = symbols("x t")
@@ -137,28 +143,35 @@ class FieldSystem(Density):
         >>> FieldSystem.from_sympy(name="waves", fields=[u], space={"x": (0, 1)}, density=density)
         FieldSystem(name='waves', fields=('u',), space={'x': (0.0, 1.0)})
         """
-        names = [str(each.func) for each in fields]
+        for function in (*fields, *momenta, *scalars):
+            arguments = [TIME] if function in scalars else [*space, TIME]
+            if missing := set(arguments) - set(map(str, function.args)):
+                raise SystemDefinitionError(f"{function} must be a function of '{min(missing)}'")
 
-        def read(known: Mapping[str, Symbol]) -> Expr:
-            values: dict[Expr, Expr] = {}
-            for each, function in zip(names, fields, strict=True):
-                marks = {str(argument): argument for argument in function.args}
-                if missing := [axis for axis in (*space, TIME) if axis not in marks]:
-                    raise SystemDefinitionError(f"the field {function} must be a function of '{missing[0]}'")
-                values[function] = known[each]
-                values[function.diff(marks[TIME])] = known[f"{each}_{TIME}"]
-                for derived, (_, orders) in derivatives_of([each], [*space]).items():
-                    values[function.diff(*((marks[axis], order) for axis, order in orders.items()))] = known[derived]
-            formula = density.xreplace(values)
-            for each in density.atoms(sympy.Derivative) - set(values):
-                letters = "".join(str(name) * int(order) for name, order in each.variable_count)
-                _check_derivative(f"{each.expr.func}_{letters}", str(each.expr.func), [*space], {})
-            plain = {each: known[each.name] for each in formula.free_symbols if each.name in known}
-            if unknown := sorted(map(str, formula.free_symbols - set(plain))):
-                raise SystemDefinitionError(f"the density contains '{unknown[0]}'{closest(unknown[0], [*known])}")
-            return parse_expression(array_text(formula.xreplace(plain)), known)
+        def text(formula: Any) -> str | None:
+            values: dict[Expr, Expr] = {each: symbol(str(each.func)) for each in (*fields, *momenta, *scalars)}
+            for each in () if formula is None else formula.atoms(sympy.Derivative):
+                orders = {str(axis): int(order) for axis, order in each.variable_count}
+                letters = "".join(axis * orders.get(axis, 0) for axis in (*space, TIME))
+                values[each] = symbol(f"{each.expr.func}_{letters}")
+            return None if formula is None else array_text(formula.xreplace(values))
 
-        return cls._of(name, names, (), space, boundary, parameters, False, read)
+        return cls.from_text(
+            name,
+            [str(each.func) for each in fields],
+            space,
+            text(density),
+            hamiltonian=text(hamiltonian),
+            momenta=[str(each.func) for each in momenta],
+            boundary=boundary,
+            parameters=parameters,
+            dissipation=text(dissipation),
+            scalars=[str(each.func) for each in scalars],
+            point_lagrangians=[
+                {key: text(entry) if key == "lagrangian" else entry for key, entry in place.items()}
+                for place in point_lagrangians
+            ],
+        )
 
     @classmethod
     def _of(
@@ -170,7 +183,7 @@ class FieldSystem(Density):
         boundary: Mapping[str, Any] | None,
         parameters: Mapping[str, float] | None,
         first_order: bool,
-        read: Callable[[Mapping[str, Symbol]], Expr],
+        text: str,
     ) -> FieldSystem:
         values = {key: number(key, value) for key, value in (parameters or {}).items()}
         if not 1 <= len(space) <= MOST_AXES:
@@ -199,7 +212,7 @@ class FieldSystem(Density):
             boundary={axis: _boundary(axis, kinds.get(axis, natural), variables, prescribed) for axis in space},
             parameters=tuple(known[key] for key in values),
             defaults=tuple(values.values()),
-            density=read(known),
+            density=parse_expression(text, known),
         )
 
     def euler_lagrange(self) -> dict[str, Expr]:
@@ -240,8 +253,9 @@ class FieldSystem(Density):
         Args:
             method: ``"spectral-elements"`` with ``degree=`` and ``elements=``, the number of equal elements or their
                 ends; ``"legendre"``, one element of ``degree=``; ``"finite-differences"`` (periodic) with ``order=`` 2,
-                4, 6 or 8 and ``points=``; ``"fourier"`` (periodic; at most 64 points unless the density is quadratic in
-                the derivatives) with ``points=``.
+                4, 6 or 8 and ``points=``; ``"fourier"`` (periodic) with ``points=`` and optionally ``derivative=``,
+                ``"fft"`` or ``"dense"`` (at most 64 points unless the density is quadratic in the derivatives): fast
+                Fourier transforms or matrices, by default transforms of 32 points or more, of odd numbers 65.
             options: as above; a mapping gives each axis its own value, ``points={"x": 64, "y": 32}``.
 
         Raises:
@@ -254,18 +268,36 @@ class FieldSystem(Density):
         needed = DISCRETISATIONS[method]
         for name in options:
             if name not in needed:
-                raise SystemDefinitionError(f"'{method}' has no option '{name}'; it needs {' and '.join(needed)}")
+                raise SystemDefinitionError(f"'{method}' has no option '{name}'; it has {' and '.join(needed)}")
+        if method != "fourier":
+            self._check_canonical_pairs(method)
         axes = {}
         for axis in self.space:
             chosen = {}
             for name in needed:
                 value = options.get(name)
                 value = value.get(axis) if isinstance(value, Mapping) else value
-                if value is None:
+                if value is None and name != OPTIONAL:
                     raise SystemDefinitionError(f"'{method}' needs {name}= for the axis '{axis}'")
                 chosen[name] = value
             axes[axis] = self._axis(axis, method, chosen)
         return Assembly(self, axes).result({"method": method, **options})
+
+    def _check_canonical_pairs(self, method: str) -> None:
+        """Raise an error for a density of u = p + c q_x alone, without lower bound, as that of Korteweg-de Vries."""
+        for q, p in zip(self.fields, self.momenta, strict=bool(self.momenta)):
+            at_rest = {symbol(name): 0 for name in (*self.derivatives, *self.fields)}
+            potential = self.density.xreplace(at_rest).as_poly(symbol(p))
+            for axis in self.space:
+                by_q, by_p = (self.density.diff(symbol(name)) for name in (f"{q}_{axis}", p))
+                ratio = sympy.cancel(by_q / by_p) if by_q != 0 and by_p != 0 else sympy.S.Zero
+                alone = ratio != 0 and not ratio.free_symbols - set(self.parameters)
+                if alone and potential is not None and potential.degree() > 2 and potential.degree() % 2:
+                    raise SystemDefinitionError(
+                        f"the Hamiltonian density of '{self.name}' depends on {p} + ({ratio})*{q}_{axis} alone and has "
+                        f"no lower bound: with '{method}', whose derivatives are not exactly antisymmetric and equal "
+                        "at all points, errors grow until the run fails. Use 'fourier' with an odd number of points"
+                    )
 
     def _axis(self, axis: str, method: str, options: Mapping[str, Any]) -> Axis:
         start, end = self.space[axis]
@@ -283,7 +315,7 @@ class FieldSystem(Density):
                     f"'fourier' needs a periodic axis, and '{axis}' has ends: use \"spectral-elements\" or "
                     '"finite-differences"'
                 )
-            return fourier(axis, start, end, options["points"])
+            return fourier(axis, start, end, **options)
         second = any(
             orders.get(axis) == 2 and symbol(name) in self.density.free_symbols
             for name, (_, orders) in self.derivatives.items()
@@ -358,10 +390,7 @@ def _at_place(system: Density, scalars: Sequence[str], entry: Any) -> tuple[Mapp
 
 
 def _breaks(axis: str, start: float, end: float, elements: Any, places: Sequence[float]) -> Any:
-    """Return the ends of the elements, which contain some places.
-
-    Equal elements are divided at the places into parts with elements that are at most as long.
-    """
+    """Return the ends of the elements, including the places, at which equal elements are divided."""
     if np.ndim(elements) == 0:
         what = f"elements= of '{axis}' (a number of elements or their ends)"
         count = checked_count(elements, what, least=1, error=SystemDefinitionError)

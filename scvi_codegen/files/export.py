@@ -22,17 +22,9 @@ from typing import IO, TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import StateError
+from scvi_codegen.errors import StateError, imported, missing
 from scvi_codegen.files.atomic import replaced
-from scvi_codegen.files.labelled_arrays import (
-    CHUNK_BYTES,
-    Labelled,
-    NamedQuantity,
-    imported,
-    missing,
-    write_hdf5,
-    write_zarr,
-)
+from scvi_codegen.files.labelled_arrays import CHUNK_BYTES, Labelled, NamedQuantity, write_hdf5, write_zarr
 
 if TYPE_CHECKING:
     import pandas
@@ -64,6 +56,8 @@ Piece: TypeAlias = tuple[Array, Array, Array, NDArray[np.int32]]
 """Chunk of consecutive states: t (n,), q (n, m), p (n, m), iterations (n,)."""
 
 COLUMNS = ("t", "q", "p", "iterations")
+MOST_IN_TEXT = 100
+"""Largest number of parameters in the attributes of a file; more of them are an array with their names."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,8 +92,9 @@ class States:
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """Metadata: all fields except the states, as numbers and texts."""
-        return {**self.about, "h": self.h, "parameters": json.dumps(dict(self.parameters))}
+        """Metadata: all fields except the states and many parameters, as numbers and texts."""
+        many = len(self.parameters) > MOST_IN_TEXT
+        return {**self.about, "h": self.h} | ({} if many else {"parameters": json.dumps(dict(self.parameters))})
 
     def columns(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
         """Return shape and type of each array."""
@@ -112,6 +107,9 @@ class States:
         dimensions: dict[str, tuple[str, ...]] = {"t": ("t",), "coordinate": ("coordinate",)}
         dimensions |= {"q": ("t", "coordinate"), "p": ("t", "coordinate"), "iterations": ("t",)}
         whole = {"coordinate": np.array(self.coordinates)}
+        if len(self.parameters) > MOST_IN_TEXT:
+            dimensions |= {"parameter": ("parameter",), "parameters": ("parameter",)}
+            whole |= {"parameter": np.array([*self.parameters]), "parameters": np.array([*self.parameters.values()])}
         if self.quantities is not None:
             dimensions |= {"velocity": ("t", "coordinate"), "energy": ("t",)}
         if self.quantities is not None and self.maps:
@@ -156,7 +154,7 @@ def check_format(path: str | os.PathLike[str]) -> None:
         raise StateError(f"the format of a trajectory is the suffix of its file, one of {known}, not {str(path)!r}")
     library = LIBRARIES.get(suffix)
     if library is not None and importlib.util.find_spec(library) is None:
-        raise missing(library)
+        raise missing(library, "data")
 
 
 def write_states(states: States, path: str | os.PathLike[str]) -> None:
@@ -190,7 +188,7 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[Path], None]) -> 
 
 def to_dataframe(states: States) -> pandas.DataFrame:
     """Return one row per state, indexed by time, with the columns of a CSV file (:func:`_names`)."""
-    library = imported("pandas")
+    library = imported("pandas", "data")
     t, *columns = (np.concatenate(parts) for parts in zip(*map(tuple, _columns(states)), strict=True))
     frame: pandas.DataFrame = library.DataFrame(
         dict(zip(_names(states)[1:], columns, strict=True)), index=library.Index(t, name="t")
@@ -255,8 +253,7 @@ def _write_labelled(states: States, path: Path, *, write: Callable[[Labelled, Pa
 
 LABELLED = {".h5": write_hdf5, ".hdf5": write_hdf5, ".nc": write_hdf5, ".zarr": write_zarr}
 """Formats with named dimensions and units."""
-WRITERS: Mapping[str, Callable[[States, Path], None]] = {
-    ".npz": _write_npz,
-    ".csv": _write_csv,
-} | {suffix: partial(_write_labelled, write=write) for suffix, write in LABELLED.items()}
+WRITERS: Mapping[str, Callable[[States, Path], None]] = {".npz": _write_npz, ".csv": _write_csv} | {
+    suffix: partial(_write_labelled, write=write) for suffix, write in LABELLED.items()
+}
 LIBRARIES = {".h5": "h5netcdf", ".hdf5": "h5netcdf", ".nc": "h5netcdf", ".zarr": "zarr"}

@@ -7,7 +7,6 @@ Every variable has a ``long_name``, and ``units`` if given.
 from __future__ import annotations
 
 import errno
-import importlib
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import MissingLibraryError, StateError
+from scvi_codegen.errors import StateError, imported
 
 if TYPE_CHECKING:
     import xarray
@@ -138,7 +137,7 @@ def checked_units(units: Mapping[str, str] | None) -> dict[str, str]:
 
 def to_dataset(labelled: Labelled) -> xarray.Dataset:
     """Return an xarray Dataset in memory."""
-    library = imported("xarray")
+    library = imported("xarray", "data")
     parts = list(labelled.pieces())
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in labelled.along()} | dict(labelled.whole)
     variables = {
@@ -155,8 +154,8 @@ def write_hdf5(labelled: Labelled, path: Path) -> None:
     """Write a netCDF4 file; OSError if the disk is too full, since HDF5 itself crashes then."""
     if shutil.disk_usage(path.parent).free < labelled.size():
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-    texts = imported("h5py").string_dtype()
-    with imported("h5netcdf").File(path, "w") as file:
+    texts = imported("h5py", "data").string_dtype()
+    with imported("h5netcdf", "data").File(path, "w") as file:
         file.attrs.update(labelled.attributes)
         file.dimensions = labelled.sizes()
         for name, dimensions in labelled.dimensions.items():
@@ -171,7 +170,7 @@ def write_hdf5(labelled: Labelled, path: Path) -> None:
 
 def write_zarr(labelled: Labelled, path: Path) -> None:
     """Write a Zarr folder of format version 2, which all readers support."""
-    zarr = imported("zarr")
+    zarr = imported("zarr", "data")
     group = zarr.open_group(str(path), mode="w", zarr_format=2)
     group.attrs.update(labelled.attributes)
     for name, dimensions in labelled.dimensions.items():
@@ -199,16 +198,3 @@ def _fill(labelled: Labelled, arrays: Any) -> None:
         for name in labelled.along():
             arrays[name][first:last] = piece[name]
         first = last
-
-
-def imported(library: str) -> Any:
-    """Import a library; MissingLibraryError if it is not installed."""
-    try:
-        return importlib.import_module(library)
-    except ImportError as error:
-        raise missing(library) from error
-
-
-def missing(library: str) -> MissingLibraryError:
-    """Return the error for a missing library."""
-    return MissingLibraryError(f"this needs {library}, which is not installed: pip install 'scvi-codegen[data]'")

@@ -35,16 +35,6 @@ def read_toml(text: str) -> dict[str, Any]:
         raise ModelFileError("this is not a file of this program: lists or tables are nested too deeply") from None
     except ValueError as error:  # Python's limit for the digits of an integer
         raise ModelFileError(f"this is not TOML: a number is too long ({error})") from error
-    _check_whole_numbers(document)
-    return document
-
-
-def package_table(path: str) -> dict[str, Any]:
-    """Return the document in a file of this package, as ``"models/problems.toml"``."""
-    return tomllib.loads((PACKAGE / path).read_text(encoding="utf-8"))
-
-
-def _check_whole_numbers(document: dict[str, Any]) -> None:
     pending: list[Any] = [document]
     while pending:
         item = pending.pop()
@@ -54,3 +44,9 @@ def _check_whole_numbers(document: dict[str, Any]) -> None:
             pending.extend(item)
         elif isinstance(item, int) and item.bit_length() > MAX_BITS:
             raise ModelFileError(f"this is not TOML: a whole number has {item.bit_length()} bits, more than {MAX_BITS}")
+    return document
+
+
+def package_table(path: str) -> dict[str, Any]:
+    """Return the document in a file of this package, as ``"models/problems.toml"``."""
+    return tomllib.loads((PACKAGE / path).read_text(encoding="utf-8"))

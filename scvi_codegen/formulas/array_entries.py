@@ -114,8 +114,8 @@ class EntryRules:
                     by_coordinate.setdefault(self.entry(access, at, force.loops), []).append(formula.xreplace(rule))
         return by_coordinate
 
-    def entry(self, access: Access, at: Elements, loops: Sequence[Loop]) -> Symbol:
-        """Return the symbol of an array entry."""
+    def entry(self, access: Access, at: Elements, loops: Sequence[Loop]) -> Expr:
+        """Return the symbol of an array entry, or the sum of a convolution."""
         periods = {loop.index: loop.end.at(self.sizes) for loop in loops if loop.periodic}
         try:
             indices = tuple(_place(each, at, periods, self.sizes, self.tables) for each in access.places)
@@ -125,6 +125,16 @@ class EntryRules:
             raise SystemDefinitionError(
                 f"{access} has the index {list(indices)}, which is outside of {access.array}, at {dict(at)}"
             )
+        if access.sums:
+            *inner, last = access.sums
+            by, count = self.names[last.coefficients.name], access.array.shape(self.sizes)[last.axis]
+            terms = []
+            for k in range(count):
+                places = [*access.places]
+                places[last.axis] = Place(base=Size("", k))
+                factor = symbol(str(by[(k - indices[last.axis]) % count]))
+                terms.append(factor * self.entry(replace(access, places=tuple(places), sums=tuple(inner)), at, loops))
+            return Add(*terms)
         name = access.array.name
         if name in self.names:
             return symbol(str(self.names[name][indices]))
@@ -136,5 +146,5 @@ def _place(subscript: Place, at: Elements, periods: Mapping[str, int], sizes: Ma
         return int(tables[subscript.table][at[subscript.index], subscript.column])
     if not subscript.index:
         return subscript.base.at(sizes)
-    k = at[subscript.index] + subscript.base.number
+    k = at[subscript.index] + subscript.base.number - (at[subscript.minus] if subscript.minus else 0)
     return k % periods[subscript.index] if subscript.index in periods else k

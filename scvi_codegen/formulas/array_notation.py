@@ -48,10 +48,14 @@ def _sum(loop: Loop) -> str:
 
 
 def latex_entry(access: Access) -> str:
-    """Return an array entry with subscripts."""
-    name = access.array.name
+    """Return an array entry with subscripts, with the summation signs of its convolutions."""
+    name, places, before = access.array.name, [*map(_place, access.places)], ""
+    for each in reversed(access.sums):
+        before += rf"\sum_{{{each.index}}} {_letter(each.coefficients.name)}_{{{each.index}-{places[each.axis]}}} "
+        places[each.axis] = each.index
     letter = rf"\dot{{{_letter(name.removesuffix(DOT))}}}" if name.endswith(DOT) else _letter(name)
-    return f"{letter}_{{{', '.join(map(_place, access.places))}}}"
+    entry = f"{letter}_{{{', '.join(places)}}}"
+    return rf"\left({before}{entry}\right)" if before else entry
 
 
 def _letter(name: str) -> str:

@@ -50,7 +50,7 @@ def parse_constraint(
         parser.in_scope = {loop.index: loop for loop in loops}
     left, *right = map(parsed, parsers)
     if any(parser.sums for parser in parsers):
-        message = "a constraint must not contain a sum over a whole array: constraints couple few entries each"
+        message = "a formula with 'for', and a constraint, must not contain a sum over a whole array"
         raise ExpressionError(message, text, text.find("sum"))
     accesses = dict(chain(*(parser.accesses.items() for parser in parsers)))
     return term_of(loops, left - right[0] if right else left, accesses)
@@ -141,12 +141,10 @@ class _Target(ArrayParser):
             known = ", ".join(map(str, self.arrays.values()))
             self.refuse(f"a force must act on coordinates, {known}, not on '{token.text}'", token.column)
         array, bounds = self.arrays[token.text], dict[str, Size]()
-        if not array.axes:
-            return bounds
-        self.expect("[")
         for number, axis in enumerate(array.axes):
-            if number:
-                self.expect(",")
+            if not self.accept("," if number else "["):
+                some = f"write {array.entry} for all of them, or numbers as indices for some"
+                self.refuse(f"a force must act on entries of the array {array}: {some}", token.column)
             place = self.peek()
             if place.text in self.tables:
                 self.row(self.tables[self.take_name("a table").text], bounds)
@@ -154,7 +152,8 @@ class _Target(ArrayParser):
                 self.size()
             else:
                 self.index_along(axis, bounds)
-        self.expect("]")
+        if array.axes:
+            self.expect("]")
         return bounds
 
     def row(self, table: Array, bounds: dict[str, Size]) -> None:

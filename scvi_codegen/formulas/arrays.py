@@ -3,8 +3,8 @@
     L     = a sum of  [factor "*"] "sum" "(" loop ("," loop)* "," formula ")"  and of formulas without a sum
     atom  = .. | array "[" index ("," index)* "]" | "rotate_" k "(" rotation ["[" .. "]"] "," a "," b "," c ")"
 
-Loops and indices are those of :mod:`scvi_codegen.indices`. A sum within a sum must have integer bounds, and is
-unrolled: ``sum(k in 3, r_dot[i, k]**2)``.
+Loops and indices are those of :mod:`scvi_codegen.indices`. A sum within a sum has integer bounds, and is unrolled,
+``sum(k in 3, r_dot[i, k]**2)``, or is a convolution, ``sum(j in N, c[j-i]*q[j])``.
 """
 
 import re
@@ -15,6 +15,7 @@ from typing import TypeAlias
 from sympy import Add, Expr, S, Symbol
 
 from scvi_codegen.errors import ExpressionError, SystemDefinitionError, closest
+from scvi_codegen.formulas.convolutions import NESTED, convolution_of
 from scvi_codegen.formulas.grammar import Parser, Token, parsed
 from scvi_codegen.formulas.neighbours import Neighbours
 from scvi_codegen.formulas.symbols import check_name, symbol
@@ -211,6 +212,7 @@ class ArrayParser(_Indices):
         self.neighbours = {each.name: each for each in neighbours}
         self.in_scope: dict[str, Bound] = {}
         self.nested = 1
+        self.convolved: Loop | None = None
         self.accesses: dict[Symbol, Access] = {}
         self.sums: dict[Symbol, tuple[tuple[Loop, ...], Expr, int]] = {}
 
@@ -246,6 +248,8 @@ class ArrayParser(_Indices):
                 break
             loops += self.loop()
         inner = any(isinstance(bound, Loop) for bound in self.in_scope.values())
+        if inner and len(loops) == 1 and loops[0].end.name:
+            return self.convolution(loops[0], column)
         if inner or (self.sizes and all(not loop.first.name and not loop.end.name for loop in loops)):
             return self.written_out(loops, column)
         self.in_scope |= {loop.index: loop for loop in loops}
@@ -270,13 +274,21 @@ class ArrayParser(_Indices):
             del self.in_scope[loop.index]
         self.close()
 
+    def convolution(self, loop: Loop, column: int) -> Expr:
+        """Parse the summand of a convolution ``sum(j in N, c[j-i]*q[j])``, or of a sum of several."""
+        self.in_scope[loop.index] = self.convolved = loop
+        terms, formula = [], self.sum().expand()
+        self.end_of_sum([loop])
+        for term in Add.make_args(formula):
+            if (found := convolution_of(term, loop, self.accesses, self.in_scope)) is None:
+                self.refuse(NESTED, column)
+            terms.append(found[0] * self.slot(found[1]))
+        return Add(*terms)
+
     def written_out(self, loops: Sequence[Loop], column: int) -> Expr:
         """Unroll a sum with integer bounds: its formula is parsed once per value of the indices."""
         if any(loop.first.name or loop.end.name for loop in loops):
-            message = (
-                "a sum within a sum must have whole numbers as bounds; write sum(i in N, j in N, ..) for a double sum"
-            )
-            self.refuse(message, column)
+            self.refuse(NESTED, column)
         count = 1
         for loop in loops:
             length = max(0, loop.end.number - loop.first.number)
@@ -319,8 +331,7 @@ class ArrayParser(_Indices):
             if end.name and end.name not in self.sizes:
                 known = ", ".join(sorted({*self.sizes, *self.neighbours})) or "none"
                 self.refuse(
-                    f"'{end.name}' is not the size of an array{closest(end.name, self.sizes)} Sizes: {known}",
-                    column,
+                    f"'{end.name}' is not the size of an array{closest(end.name, self.sizes)} Sizes: {known}", column
                 )
         periodic = self.peek().text == "periodic"
         self.position += periodic
@@ -346,7 +357,7 @@ class ArrayParser(_Indices):
     def entry(self, array: Array, column: int) -> Expr:
         """Parse ``[indices]`` after the name of an array."""
         if array.axes and self.peek().text != "[":
-            self.refuse(f"'{array.name}' is an array: write {array}", column)
+            self.refuse(f"'{array.name}' is an array, {array}: write an entry, {array.entry}", column)
         indices = self.brackets(array, column) if array.axes else ()
         return self.slot(Access(array=array, places=indices))
 
@@ -410,9 +421,24 @@ class ArrayParser(_Indices):
             )
             self.refuse(f"{message} a whole number, N-1, i, i+1 or an entry of a table, bonds[b, 0]", token.column)
         self.position += 1
+        if self.peek().text == "-" and (other := self.in_scope.get(self.peek(1).text)) is not None:
+            self.position += 2
+            return self.difference(token, bound, self.tokens[self.position - 1].text, other)
         if isinstance(bound, int):
             return Place(base=Size("", bound + self.offset()))
         return Place(index=token.text, base=Size("", self.offset()))
+
+    def difference(self, token: Token, bound: Bound, subtracted: str, other: Bound) -> Place:
+        """Return the difference of two indices: of a pair i < j, or of whole numbers."""
+        if isinstance(bound, int) and isinstance(other, int):
+            return Place(base=Size("", bound - other))
+        if not isinstance(bound, Loop) or (bound.behind != subtracted and bound is not self.convolved):
+            self.refuse(
+                f"{token.text}-{subtracted} must be the difference of a pair: write c[j-i] in sum(i < j in N, ..), or "
+                "of a convolution: c[j-i]*q[j] in sum(i in N, .. sum(j in N, ..))",
+                token.column,
+            )
+        return Place(index=token.text, minus=subtracted)
 
     def entry_of_table(self) -> Place:
         """Parse the entry of an index table, ``bonds[b, 0]``."""
@@ -437,6 +463,8 @@ class ArrayParser(_Indices):
             return f"{base} is outside an axis of size {axis}" if below or above else ""
         loop = self.in_scope[subscript.index]
         assert isinstance(loop, Loop)
+        if subscript.minus:
+            return "" if loop.end == axis else f"{subscript} is at most {loop.end + -1}: the axis must be {loop.end}"
         if loop.periodic:
             whole = loop.is_whole and loop.end == axis
             return "" if whole else f"'{loop}' is not an index of a periodic axis of size {axis}"

@@ -54,7 +54,7 @@ class unit_step(Function):  # type: ignore[misc]  # noqa: N801
         return sympy.Integer(int(bool(x.evalf(50) >= 0))) if x.is_number and x.is_finite and x.is_real else None
 
     def _eval_power(self, exponent: Expr) -> Expr | None:
-        return self if exponent.is_positive else None
+        return self if exponent.is_positive else 1 / self if exponent.is_negative and exponent != -1 else None
 
     def fdiff(self, argindex: int = 1) -> Expr:
         """Return 0."""
@@ -258,17 +258,7 @@ def unsupported_part(expression: Expr) -> str | None:
     Rejected are other functions, floating-point numbers, non-finite or non-real constants, numbers of more than
     ``MAX_BITS`` bits and constant exponents beyond ``MAX_EXPONENT``.
     """
-    pending, seen = [expression], set()
-    while pending:
-        node = pending.pop()
-        if node in seen:
-            continue
-        seen.add(node)
-        problem = _node_problem(node)
-        if problem:
-            return problem
-        pending.extend(node.args)
-    return _constant_problem(expression)
+    return next(filter(None, map(_node_problem, parts(expression))), None) or _constant_problem(expression)
 
 
 def _node_problem(node: Any) -> str | None:
@@ -359,6 +349,12 @@ def gradient(expression: Expr, variables: Sequence[Symbol]) -> dict[int, Expr]:
     {0: 2*x*z, 2: x**2 + 1}
     """
     return dict(sorted(_accumulation(tuple(variables)).total(expression).items()))
+
+
+def gradient_tuple(expression: Expr, variables: Sequence[Symbol]) -> tuple[Expr, ...]:
+    """Return the first derivatives of ``expression`` by all variables, zeros included."""
+    derivatives = gradient(expression, variables)
+    return tuple(derivatives.get(k, S.Zero) for k in range(len(variables)))
 
 
 def jacobian(

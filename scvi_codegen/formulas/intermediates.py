@@ -80,7 +80,9 @@ class Intermediate(Expr):  # type: ignore[misc]  # SymPy is untyped
         return self.definition.diff(symbol) if symbol in self._free else S.Zero
 
     def _xreplace(self, rule: Any) -> tuple[Expr, bool]:
-        replaced = _replacements(rule)
+        if _LAST[0] != rule:
+            _LAST[:] = dict(rule), {}
+        replaced: dict[Intermediate, tuple[Expr, bool]] = _LAST[1]
         for each in intermediates(self):
             if each in rule:
                 replaced[each] = (rule[each], True)
@@ -91,15 +93,7 @@ class Intermediate(Expr):  # type: ignore[misc]  # SymPy is untyped
 
 
 _LAST: list[Any] = [{}, {}]
-"""The last rule of replacements, and the quantities that were replaced by it."""
-
-
-def _replacements(rule: Any) -> dict[Intermediate, tuple[Expr, bool]]:
-    """Return what was replaced by an equal rule immediately before."""
-    if _LAST[0] != rule:
-        _LAST[:] = dict(rule), {}
-    replaced: dict[Intermediate, tuple[Expr, bool]] = _LAST[1]
-    return replaced
+"""The last rule of replacements, and the quantities replaced by it, which an equal rule replaces next."""
 
 
 def intermediate(expression: Expr) -> Expr:

@@ -58,6 +58,15 @@ def _node_value(expression: Any, known: dict[Expr, Any]) -> Any:
     return getattr(np, f"arc{name[1:]}" if name.startswith("a") else name)(*arguments)
 
 
+def convolved(values: NDArray[Any], access: Access, arrays: Mapping[str, NDArray[Any]], sign: int = 1) -> Any:
+    """Return the convolutions of an array in an access, for ``sign`` -1 their transpose, by Fourier transforms."""
+    for each in access.sums[::sign]:
+        by = np.fft.fft(arrays[each.coefficients.name])
+        by = (np.conj(by) if sign == 1 else by).reshape(-1, *(1,) * (values.ndim - 1 - each.axis))
+        values = np.fft.ifft(by * np.fft.fft(values, axis=each.axis), axis=each.axis).real
+    return values
+
+
 class Elements:
     """Index values of all elements of loops, as arrays.
 
@@ -115,7 +124,9 @@ class Elements:
             arrays: arrays by name.
             numbers: values by symbol.
         """
-        known: dict[Expr, Any] = {slot: arrays[access.array.name][self.of(access)] for slot, access in slots}
+        known: dict[Expr, Any] = {
+            slot: convolved(arrays[access.array.name], access, arrays)[self.of(access)] for slot, access in slots
+        }
         entries = array_value(formula, {**known, **numbers})
         count = next((len(values) for values in self.index.values()), 1)
         return np.broadcast_to(entries, (count,)) if self.index else entries

@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.errors import SystemDefinitionError
@@ -102,14 +102,17 @@ def check_name(name: object) -> None:
         raise SystemDefinitionError(f"'{name}' is reserved in formulas: rename the symbol, for example to '{name}_'")
 
 
-def check_names(coordinates: Sequence[str], parameters: Sequence[str], momenta: Sequence[str] = ()) -> None:
+def check_names(
+    coordinates: Sequence[str], parameters: Sequence[str], momenta: Sequence[str] = (), entries: Iterable[str] = ()
+) -> None:
     """Raise :class:`SystemDefinitionError` for invalid names of a system, and for one name in two roles."""
-    if not coordinates:
+    described = [(name, "an entry of a rotation, direction or spin") for name in entries]
+    if not coordinates and not described:
         raise SystemDefinitionError("a system needs at least one coordinate: coordinates is empty")
     roles: dict[str, str] = {TIME: "time"}
     for name in (*coordinates, *momenta, *parameters):
         check_name(name)
-    described = [
+    described += [
         *((name, f"coordinate '{name}'") for name in coordinates),
         *((name + DOT, f"the velocity of '{name}'") for name in coordinates),
         *((name, f"momentum '{name}'") for name in momenta),

@@ -77,7 +77,10 @@ class Translation:
             self._velocity(coordinate, None if velocities is None else velocities[index])
         self.momenta = tuple(self._coordinate(momentum, "momentum") for momentum in momenta)
         self.parameters = tuple(self._parameter(parameter) for parameter in parameters)
-        self._add_named_functions((expression, *others), {*parameters, *inputs})
+        functions = parts_of_type(AppliedUndef, *(expression, *others)) - self.rules.keys()
+        for function in sorted(functions, key=str):
+            if function.func.__name__ in {*parameters, *inputs} and function.args == (self.user_time,):
+                self._add(function, identifier(function.func.__name__))
         for free in self.free:
             if free not in self.rules:
                 self._add(free, identifier(free.name))
@@ -139,13 +142,6 @@ class Translation:
             for free in self.free:
                 if free.name == coordinate.name + DOT:
                     self._add(free, name)
-
-    def _add_named_functions(self, expressions: Sequence[Expr], names: set[str]) -> None:
-        """Add the functions of time that have the name of a parameter or an input."""
-        functions = parts_of_type(AppliedUndef, *expressions) - self.rules.keys()
-        for function in sorted(functions, key=str):
-            if function.func.__name__ in names and function.args == (self.user_time,):
-                self._add(function, identifier(function.func.__name__))
 
     def _parameter(self, parameter: str) -> Symbol:
         name = identifier(parameter)

@@ -19,19 +19,19 @@ from typing import Any
 import sympy
 from sympy import Expr, Symbol
 
-from scvi_codegen.errors import ArgumentError, MethodError, StateError
+from scvi_codegen.errors import ArgumentError, MethodError, StateError, imported
 from scvi_codegen.formulas.expressions import CONSTANTS, FUNCTIONS
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.intermediates import written_out
 from scvi_codegen.formulas.symbols import PARTS, input_parameters, symbol
-from scvi_codegen.frameworks.flow import Flow, imported
+from scvi_codegen.frameworks.flow import Flow
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.forces import constraint_rates, holonomic_expressions
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.stage_system import StageGroup, StageSystem, Table
+from scvi_codegen.methods.stage_system import StageGroup, StageSystem, Table, straight
 from scvi_codegen.native import building
 from scvi_codegen.rendering.flow import casadi_name, with_casadi_flow
 from scvi_codegen.runtime.core.stepper import Stepper
@@ -235,16 +235,6 @@ def casadi_step(
     return _solved(ca, EndConditions(ca, system), stages, step) if solved else step
 
 
-def straight(stages: StageSystem, q: Any, v: Any, p: Any, h: Any) -> list[Any]:
-    """Return an initial guess of each block of unknowns: the straight line from (q, p) with velocity v."""
-    return [
-        float(block.straight[0]) * q + float(block.straight[1]) * h ** (1 - block.power) * v + block.momentum * p
-        if block.size is None
-        else 0 * q[: block.size]
-        for block in stages.blocks
-    ]
-
-
 def _solved(ca: Any, ends: EndConditions, stages: StageSystem, step: Any) -> Any:
     """Return the step with its equations solved, without the argument stages and the result residual."""
     symbols = dict(zip(ARGUMENTS, step.sx_in(), strict=True))
@@ -303,11 +293,7 @@ class _StageExpressions:
         return self._gathered(self.stages.end_position, 0, power=0, scale=1.0)
 
     def along(self, texts: Sequence[str]) -> tuple[Any, Any]:
-        """Return the values of formulas at the points of the quadrature, and its weights.
-
-        Raises:
-            MethodError: if the action is not a quadrature of L along a curve.
-        """
+        """Return values at the points of the quadrature, and weights; MethodError without quadrature along a curve."""
         system = self.system
         groups = [group for group in self.stages.stage_groups if group.in_action]
         known = {*system.coordinates, *system.velocities}

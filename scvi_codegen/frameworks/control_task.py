@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scvi_codegen.errors import MethodError, StateError, closest
-from scvi_codegen.frameworks.casadi import EndConditions, casadi_step, straight
+from scvi_codegen.frameworks.casadi import EndConditions, casadi_step
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.stage_system import straight
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.runtime.core.validation import Array
 
@@ -54,8 +55,11 @@ class NonlinearProgram:
         """Solve by IPOPT from initial values by name; return the solution and the solver's statistics."""
         program = {"x": self.x, "f": self.cost, "g": self.residual}
         solver = self.ca.nlpsol("program", "ipopt", program, {**QUIET, **options})
-        low, high = (self._vector(self._limits(side)) for side in (0, 1))
-        least, largest = (self._spread(side) for side in (1, 2))
+        limits = {name: self.limits.get(name, (-np.inf, np.inf)) for name in self.unknowns}
+        low, high = (self._vector({name: each[side] for name, each in limits.items()}) for side in (0, 1))
+        least, largest = (
+            np.concatenate([np.full(each[0].numel(), each[side]) for each in self.constraints]) for side in (1, 2)
+        )
         result = solver(x0=self._vector(first), lbx=low, ubx=high, lbg=least, ubg=largest)
         return result, solver.stats()
 
@@ -77,15 +81,9 @@ class NonlinearProgram:
         """Vector of all constraints."""
         return self.ca.veccat(*(expression for expression, _, _ in self.constraints))
 
-    def _limits(self, side: int) -> dict[str, Any]:
-        return {name: self.limits.get(name, (-np.inf, np.inf))[side] for name in self.unknowns}
-
     def _vector(self, values: Mapping[str, Any]) -> Array:
         parts = [np.broadcast_to(values[name], each.shape).ravel("F") for name, each in self.unknowns.items()]
         return np.concatenate(parts)
-
-    def _spread(self, side: int) -> Array:
-        return np.concatenate([np.full(each[0].numel(), each[side]) for each in self.constraints])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -178,7 +176,11 @@ class Task:
         """Return the nonlinear program; the step equations come first, as their multipliers are the costates."""
         ca, m, n, count = self.ca, self.system.dimension, self.steps, len(self.system.inputs)
         step = casadi_step(self.system, self.method, degree=self.degree, along=[self.cost, *self.between])
-        self._check_degree(step.size2_out("along"))
+        if self.degree >= (points := step.size2_out("along")):
+            raise MethodError(
+                f"inputs of degree {self.degree} have {self.degree + 1} coefficients per step, but the quadrature of "
+                f"{self.method.name} has {points} points: use degree {points - 1} or less, or more points"
+            )
         states, stages = ca.MX.sym("states", 2 * m, n + 1), ca.MX.sym("stages", step.size1_in("stages"), n)
         inputs, ends = ca.MX.sym("inputs", count, n * (self.degree + 1)), ca.MX.sym("velocities", m, 2)
         duration = ca.MX.sym("duration")
@@ -203,14 +205,6 @@ class Task:
             ],
             cost=ca.sum2(integrals[0, :]) + self.ends.formula(self.end_cost)(*last),
         )
-
-    def _check_degree(self, points: int) -> None:
-        """Raise MethodError unless the quadrature has more points than the degree of the inputs."""
-        if self.degree >= points:
-            raise MethodError(
-                f"inputs of degree {self.degree} have {self.degree + 1} coefficients per step, but the quadrature of "
-                f"{self.method.name} has {points} points: use degree {points - 1} or less, or more points"
-            )
 
     def _input_limits(self) -> tuple[Array, Array]:
         """Return least and largest values, a row for each input."""

@@ -6,7 +6,6 @@ have JVP, VJP, second derivatives and batches.
 
 from __future__ import annotations
 
-import importlib
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from scvi_codegen.errors import MissingLibraryError, StateError
+from scvi_codegen.errors import StateError, imported
 from scvi_codegen.native import building
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.rendering.flow import XLA_PARTS, XLA_SECOND_ORDER, with_flow_of_rows, with_xla_flow
@@ -50,6 +49,7 @@ class Flow:
         """
         stepper = stepper.known
         stepper._check_fixed_steps("a flow")
+        stepper._check_no_changes("a flow")
         steps = checked_count(steps, "steps", least=1)
         save_every = 0 if save_every is None else checked_count(save_every, "save_every", least=1)
         if save_every and steps % save_every:
@@ -103,16 +103,6 @@ class Flow:
         for name, value in (parameters or {}).items():
             values[parameter_index(interface, name)] = value
         return values
-
-
-def imported(library: str, extra: str) -> Any:
-    """Import a library; raise MissingLibraryError, which names the extra, if it is not installed."""
-    try:
-        return importlib.import_module(library)
-    except ImportError as error:
-        raise MissingLibraryError(
-            f"this needs {library}, which is not installed: pip install 'scvi-codegen[{extra}]'"
-        ) from error
 
 
 class ArrayFlow(Flow):
@@ -228,10 +218,10 @@ class JaxFlow(ArrayFlow):
 
     def _along(self, x: Any) -> Any:
         """Return the saved states; see :meth:`ArrayFlow._along`."""
-        from scvi_codegen.frameworks.jax_primitives import states_along
+        from scvi_codegen.frameworks.jax_primitives import STATES
 
         size = 2 * self.stepper.dimension
-        return states_along(x, target=self._target, steps=self.steps, save_every=self.spacing, size=size)
+        return STATES.bind(x, target=self._target, steps=self.steps, save_every=self.spacing, size=size)
 
     @cached_property
     def _target(self) -> str:

@@ -24,18 +24,6 @@ SECOND: dict[str, Callable[[], str]] = {}
 """Functions that return the target with second derivatives, by name of the target."""
 
 
-def states_along(x: Any, *, target: str, steps: int, save_every: int, size: int) -> Any:
-    """Return (.., n, size) states of ``steps`` steps from (.., k) numbers (q, p, parameters, t, h).
-
-    Args:
-        x: initial values.
-        target: name under which the C functions are registered, with the suffixes ``_states``, ``_push`` and ``_pull``.
-        steps, save_every: number of steps, and of steps between saved states.
-        size: 2m.
-    """
-    return STATES.bind(x, target=target, steps=steps, save_every=save_every, size=size)
-
-
 def _primitive(part: str, shape: Callable[..., tuple[int, ...]], batched: Callable[..., Any]) -> Primitive:
     """Return a primitive that XLA calls in C on CPUs; ``shape`` is that of its result."""
     primitive = Primitive(f"scvi_flow_{part}")
@@ -86,6 +74,8 @@ def _repeated(array: Any, count: int, axis_index: int) -> Any:
 
 
 STATES: Primitive = _primitive("states", lambda x, n, size: (*x[:-1], n, size), _states_batched)
+"""(.., n, size) states of ``steps`` steps from (.., k) numbers (q, p, parameters, t, h), size = 2m; ``target``: name
+under which the C functions are registered, with the suffixes ``_states``, ``_push`` and ``_pull``."""
 JVP: Primitive = _primitive("jvp", lambda _, v, n, size: (*v[:-1], n, size), _linear_batched(lambda: JVP))
 VJP: Primitive = _primitive("vjp", lambda x, w, *_: (*w[:-2], x[-1]), _linear_batched(lambda: VJP))
 VJP_DERIVATIVE: Primitive = _primitive("vjp_derivative", lambda x, w, v, *_: v, _linear_batched(lambda: VJP_DERIVATIVE))
@@ -152,10 +142,8 @@ def _vjp_derivative_transposed(
 
 
 ad.primitive_jvps[STATES] = _states_jvp
-ad.primitive_jvps[JVP], ad.primitive_jvps[VJP], ad.primitive_jvps[VJP_DERIVATIVE] = (
-    _jvp_jvp,
-    _vjp_jvp,
-    _vjp_derivative_jvp,
-)
+ad.primitive_jvps[JVP] = _jvp_jvp
+ad.primitive_jvps[VJP] = _vjp_jvp
+ad.primitive_jvps[VJP_DERIVATIVE] = _vjp_derivative_jvp
 ad.primitive_transposes[VJP_DERIVATIVE] = _vjp_derivative_transposed
 ad.primitive_transposes[JVP], ad.primitive_transposes[VJP] = _transposed(VJP), _transposed(JVP)

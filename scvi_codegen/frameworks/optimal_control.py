@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.errors import ControlError, MethodError, StateError
+from scvi_codegen.errors import ControlError, MethodError, StateError, imported
 from scvi_codegen.frameworks.casadi import own_parameters
 from scvi_codegen.frameworks.control_task import Conditions, ControlledMotion, Task, check_known, interval
-from scvi_codegen.frameworks.flow import imported
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
@@ -76,13 +75,17 @@ def optimal_control(
     E. Trelat, Discrete and Continuous Dynamical Systems 35 (2015) 4193.
     """
     ca = imported("casadi", "casadi")
-    _check_controllable(system)
+    if not system.inputs:
+        raise MethodError(f"'{system.name}' has no inputs: define it with inputs=[..] that its forces contain")
+    shortest, longest = interval("duration", duration)
+    if not 0 < shortest <= longest < np.inf:
+        raise StateError(f"duration must be a positive number, or two numbers (least, largest), not {duration}")
     task = Task(
         ca=ca,
         system=system,
         method=as_method(method, system),
         steps=checked_count(steps, "steps", least=1),
-        duration=_checked_duration(duration),
+        duration=(shortest, longest),
         start=start,
         end=end,
         cost=cost,
@@ -101,19 +104,6 @@ def optimal_control(
             motion,
         )
     return motion
-
-
-def _check_controllable(system: MechanicalSystem) -> None:
-    if not system.inputs:
-        raise MethodError(f"'{system.name}' has no inputs: define it with inputs=[..] that its forces contain")
-
-
-def _checked_duration(duration: float | tuple[float, float]) -> tuple[float, float]:
-    """Return the least and the largest duration."""
-    shortest, longest = interval("duration", duration)
-    if not 0 < shortest <= longest < np.inf:
-        raise StateError(f"duration must be a positive number, or two numbers (least, largest), not {duration}")
-    return shortest, longest
 
 
 def _parameter_values(system: MechanicalSystem, chosen: Mapping[str, float]) -> Array:

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import sympy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from scvi_codegen.errors import StateError, SystemDefinitionError
-from scvi_codegen.frameworks.flow import imported
+from scvi_codegen.errors import StateError, SystemDefinitionError, imported
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.native.arguments import checked_number, real_array
+from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.validation import checks_arguments, of
 
 AXES = "xyz"
@@ -21,8 +21,6 @@ NEWTON = ("basic", "compensated")
 """REBOUND's names of pairwise gravity by direct summation."""
 RELATIVE_TOLERANCE = 1e-11
 """Relative tolerance of the comparison of a Lagrangian with Newton's at random states."""
-
-Array = NDArray[np.float64]
 
 
 class GravitatingBodies(NamedTuple):
@@ -131,10 +129,7 @@ def _padded(value: ArrayLike, name: str, bodies: int, axes: int) -> Array:
 
 
 def _attraction(system: LagrangianSystem) -> tuple[int, float, list[float]]:
-    """Return the number of axes of a body, G and the masses; raise SystemDefinitionError for other Lagrangians.
-
-    They are fitted to L at random positions with unit velocities and at rest, and tested at other random states.
-    """
+    """Return the number of axes of a body, G and the masses; raise SystemDefinitionError for other Lagrangians."""
     known = {*system.coordinates, *system.velocities, *system.constants}
     forced = system.forces or system.inputs or system.constraints
     if not forced and system.lagrangian.free_symbols <= known:
@@ -152,7 +147,7 @@ def _attraction(system: LagrangianSystem) -> tuple[int, float, list[float]]:
 
 
 def _fitted(formula: Callable[[Array, Array], float], m: int, axes: int) -> tuple[float, Array]:
-    """Return G and the masses; G = 0 if L has another form."""
+    """Return G and the masses, fitted to L at random states and tested at others; G = 0 if L has another form."""
     positions, motions = np.random.default_rng(1).normal(size=(2, 4, m))
     rest = np.zeros(m)
     masses = np.array([2.0 * (formula(positions[0], v) - formula(positions[0], rest)) for v in np.eye(m)[::axes]])

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from scvi_codegen.errors import StateError
-from scvi_codegen.frameworks.flow import ArrayFlow, FlowOfRows, imported
+from scvi_codegen.errors import StateError, imported
+from scvi_codegen.frameworks.flow import ArrayFlow, FlowOfRows
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.validation import checks_arguments, of
 

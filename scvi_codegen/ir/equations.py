@@ -222,14 +222,15 @@ class FixedPointIteration:
         parts: support headers of its C, in order, after those of the meaning of a lane.
         macros: names and values of macros that these require.
         mass_entries: (i, j), i >= j, of the derivatives of the kernel that computes the mass, if any.
-        constant_mass: kernel of the masses if they are constant and diagonal.
+        constant_mass: kernel of the masses if they are constant and diagonal; of a Hamiltonian, of angles of turns.
         damping: kernel of the rate of a uniform damping, a function of the parameters, if there is one.
         predictor_matrix: table between the stored values and the predicted ones; empty if they are the same.
+        matrix: (points, points) table from the forces to the increments at the points, of velocities if the forces
+            depend on them; empty if positions and momenta have different ones.
         derivatives_part: support header of tangent and adjoint vectors by fixed-point iteration; ``""`` without one.
         serves_many: whether lanes may be trajectories.
         final_iterations: number of iterations after the one that converges.
         in_groups: whether its C supports several vectors for the points of a step, besides one.
-        exchanges: whether sums over the points exchange lanes (``templates/support/core/exchange.h``).
     """
 
     name: IterationName
@@ -247,11 +248,11 @@ class FixedPointIteration:
     constant_mass: Kernel | None = None
     damping: Kernel | None = None
     predictor_matrix: NumberTable = ()
+    matrix: NumberTable = ()
     derivatives_part: str = ""
     serves_many: bool = False
     final_iterations: int = 0
     in_groups: bool = True
-    exchanges: bool = False
 
     @property
     def tables(self) -> Iterator[IterationTable]:
@@ -297,9 +298,8 @@ class FixedPointIteration:
 
     @property
     def facts(self) -> Mapping[str, int]:
-        """Macros that its support headers require: those of its own, of exchanges and of a diagonal mass matrix."""
-        found = {"EXCHANGES": self.exchanges, "DIAGONAL_MASS": self.mass_entries and self.diagonal}
-        return {**dict(self.macros), **{name: 1 for name, holds in found.items() if holds}}
+        """Macros that its support headers require: those of its own, and of a diagonal mass matrix."""
+        return dict(self.macros) | ({"DIAGONAL_MASS": 1} if self.mass_entries and self.diagonal else {})
 
 
 def transposed(table: NumberTable, points: int) -> NumberTable:
@@ -320,6 +320,9 @@ class Splitting:
         force: L_q at (q, t).
         drift: the constant diagonal of M (no arguments), v = M^-1 p, or v = H_p at p.
         by_masses: True for M^-1 p.
+        bodies: of rigid bodies, whose quaternions turn in closed form, the index of the first component of the
+            quaternion and the axes j and k (:mod:`scvi_codegen.mechanics.splitting`).
+        turning: a_i, a_j - a_i and a_k - a_i of each body (no arguments), or ``None``.
     """
 
     kicks: tuple[Number, ...]
@@ -328,11 +331,13 @@ class Splitting:
     force: Kernel
     drift: Kernel
     by_masses: bool
+    bodies: tuple[tuple[int, ...], ...] = ()
+    turning: Kernel | None = None
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """Kernels of kicks and drifts."""
-        return (self.force, self.drift)
+        return (self.force, self.drift, *((self.turning,) if self.turning else ()))
 
     @property
     def acts(self) -> bool:

@@ -16,6 +16,7 @@ Numbers of a program are exact or have 50 digits; they are rounded once, when pr
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -134,19 +135,9 @@ class Kernel:
         return (self, *(each.kernel for each in self.sums))
 
     @property
-    def uses_arguments(self) -> bool:
-        """True if any ``u[i]`` occurs."""
-        return self.uses("u")
-
-    @property
     def uses_time(self) -> bool:
         """True if ``t`` occurs."""
         return self.uses("t")
-
-    @property
-    def uses_parameters(self) -> bool:
-        """True if any ``parameters[i]`` occurs."""
-        return self.uses("parameters")
 
     def uses(self, array: str) -> bool:
         """Return whether it reads or writes ``u``, ``t``, ``parameters``, ``value`` or ``derivative``."""
@@ -160,20 +151,18 @@ class Kernel:
 
     def operation_counts(self) -> dict[str, int]:
         """Return the number of operations by name, in alphabetical order."""
-        counts: dict[str, int] = {}
-        for expression in (*self.temporaries, *self.results):
-            _count(expression, counts)
+        every = subexpressions(*self.temporaries, *self.results)
+        counts = Counter(each.operator for each in every if isinstance(each, Operation))
         for each in self.sums:
-            added = {"+": each.kernel.values}
-            for operator, count in (*each.kernel.operation_counts().items(), *added.items()):
-                counts[operator] = counts.get(operator, 0) + count * each.rows
+            for operator, count in (*each.kernel.operation_counts().items(), ("+", each.kernel.values)):
+                counts[operator] += count * each.rows
         return dict(sorted(counts.items()))
 
     def statements(self) -> Iterator[tuple[str, int, Expression]]:
         """Yield ("w", "value" or "derivative", index, expression): each result right after its last temporary."""
         due: list[list[int]] = [[] for _ in range(len(self.temporaries) + 1)]
         for k, expression in enumerate(self.results):
-            due[1 + _last_temporary(expression)].append(k)
+            due[1 + max((load.index for load in loads(expression) if load.source == "w"), default=-1)].append(k)
         for k, ready in enumerate(due):
             if k > 0:
                 yield "w", k - 1, self.temporaries[k - 1]
@@ -199,6 +188,8 @@ class LoopedKernel:
         text: the formula.
         scalar: of a potential: L itself.
         along: number of reads, the last ones, that belong to a direction instead of the state.
+        circulant: axis of the reads if the term is f sum_(i<j) c[j-i] (x_i - x_j)^2 / 2 along it, or the product of its
+            Jacobian and a direction, or the diagonal of that; else ``None``.
         tables, columns: constant tables of indices, and constant arrays of numbers or parameters, by name.
     """
 
@@ -210,6 +201,7 @@ class LoopedKernel:
     text: str = ""
     scalar: Kernel | None = None
     along: int = 0
+    circulant: int | None = None
     tables: tuple[tuple[str, tuple[tuple[int, ...], ...]], ...] = ()
     columns: tuple[tuple[str, tuple[Constant | Load, ...]], ...] = ()
 
@@ -253,6 +245,16 @@ class LoopedKernel:
         return self.loops[0].end.number
 
 
+def subexpressions(*expressions: Expression) -> Iterator[Expression]:
+    """Yield every expression, with its subexpressions."""
+    pending = list(expressions)
+    while pending:
+        each = pending.pop()
+        yield each
+        if isinstance(each, Operation):
+            pending.extend(each.operands)
+
+
 def loads(expression: Expression) -> Iterator[Load]:
     """Yield the loads of an expression."""
     pending = [expression]
@@ -262,23 +264,6 @@ def loads(expression: Expression) -> Iterator[Load]:
             yield each
         elif isinstance(each, Operation):
             pending.extend(each.operands)
-
-
-def operations(expression: Expression) -> int:
-    """Return the number of operations of an expression."""
-    return 1 + sum(map(operations, expression.operands)) if isinstance(expression, Operation) else 0
-
-
-def _last_temporary(expression: Expression) -> int:
-    """Return the largest index of a temporary in an expression, -1 if there is none."""
-    return max((load.index for load in loads(expression) if load.source == "w"), default=-1)
-
-
-def _count(expression: Expression, counts: dict[str, int]) -> None:
-    if isinstance(expression, Operation):
-        counts[expression.operator] = counts.get(expression.operator, 0) + 1
-        for operand in expression.operands:
-            _count(operand, counts)
 
 
 LARGEST_PART = 1000
@@ -319,7 +304,8 @@ def parts(kernel: Kernel) -> tuple[Part, ...]:
     pieces = list(_parts_of_equal_size(tuple(kernel.statements())))
     if len(pieces) == 1:
         return (Part(name=kernel.name, statements=pieces[0]),)
-    last_use = {load.index: n for n, piece in enumerate(pieces) for load in _temporaries(piece)}
+    used = ((n, load) for n, piece in enumerate(pieces) for _, _, expression in piece for load in loads(expression))
+    last_use = {load.index: n for n, load in used if load.source == "w"}
     free: list[int] = []
     places: dict[int, int] = {}
     cut = []
@@ -344,7 +330,7 @@ def is_divided(kernels: Iterable[Kernel]) -> bool:
 
 def _parts_of_equal_size(statements: Sequence[Statement]) -> Iterator[tuple[Statement, ...]]:
     """Yield consecutive statements with about equal numbers of operations."""
-    sizes = [operations(expression) for _, _, expression in statements]
+    sizes = [sum(isinstance(x, Operation) for x in subexpressions(each)) for _, _, each in statements]
     whole = sum(sizes)
     count = max(1, -(-whole // LARGEST_PART))
     n, total, begin = 1, 0, 0
@@ -354,11 +340,6 @@ def _parts_of_equal_size(statements: Sequence[Statement]) -> Iterator[tuple[Stat
             yield tuple(statements[begin:end])
             n, begin = n + 1, end
     yield tuple(statements[begin:])
-
-
-def _temporaries(piece: Sequence[Statement]) -> Iterator[Load]:
-    """Return the loads of temporaries."""
-    return (load for _, _, expression in piece for load in loads(expression) if load.source == "w")
 
 
 def _with_kept(expression: Expression, places: dict[int, int]) -> Expression:

@@ -9,7 +9,7 @@ the same for every method and system, and is in the templates.
 
 from dataclasses import dataclass
 
-from scvi_codegen.indices import Array, ArrayDeclarations
+from scvi_codegen.indices import Array, ArrayDeclarations, Convolution
 from scvi_codegen.ir.equations import (
     ConstrainedSteps,
     Constraints,
@@ -76,11 +76,13 @@ class Layout(ArrayDeclarations):
 
     Attributes:
         velocities: on which forces depend, after the coordinates at the points.
+        sums: convolutions of the state, coordinates, momenta or velocities.
         parameters, defaults: names and default values of the numbers.
         inputs: index of the first of the five parameters of each tabulated input, by name.
     """
 
     velocities: tuple[Array, ...] = ()
+    sums: tuple[tuple[Convolution, ...], ...] = ()
     parameters: tuple[str, ...] = ()
     defaults: tuple[float, ...] = ()
     inputs: tuple[tuple[str, int], ...] = ()

@@ -45,12 +45,11 @@ def check_solver_of_arrays(
             "Runge-Kutta method"
         )
     iterated = isinstance(chosen, FixedPointIteration) and chosen.name in ("separable", "Hamiltonian")
-    plain = not (system.momenta or system.velocities or system.neighbours)
-    if solver == "newton" and not (loops.products and plain and iterated):
+    if solver == "newton" and (system.neighbours or not (loops.shifts and iterated)):
         raise SizesRequiredError(
-            "Newton's method for array systems requires a Lagrangian with a potential that is not linear, forces of "
-            "positions and time, no constraints, no lists of neighbours, and an implicit method: leave out "
-            "solver='newton'"
+            "Newton's method for array systems requires forces that are not constant, no constraints, no lists of "
+            "neighbours, and an implicit method (for a Hamiltonian and for forces of velocities one with the same "
+            "table for positions and momenta, as SVI and Gauss): leave out solver='newton'"
         )
     if not (iterated or isinstance(chosen, Splitting | ConstrainedSteps)):
         explicit = "" if system.momenta else ", Stoermer-Verlet or a composition"

@@ -37,12 +37,7 @@ from scvi_codegen.ir.kernel import LoopedKernel, lower_matrix, lower_vector
 from scvi_codegen.lowering.solvers.tables import velocity_tables
 from scvi_codegen.lowering.stage_groups import looped_kernel, system_kernel
 from scvi_codegen.mechanics.arrays.system import ArraySystem
-from scvi_codegen.mechanics.arrays.terms import (
-    constraint_gradient,
-    constraint_second_rate,
-    constraint_text,
-    entries_of,
-)
+from scvi_codegen.mechanics.arrays.terms import constraint_gradient, constraint_second_rate, constraint_text, entries_of
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.forces import (
     constraint_jacobian,
@@ -129,7 +124,7 @@ def lowered_constraints(system: MechanicalSystem) -> Constraints:
     """Return the kernels of the constraints of a system."""
     partials, rates = constraint_jacobian(system), constraint_rates(system)
     return Constraints(
-        formulas=tuple(map(system.text_of, system.constraints)),
+        formulas=system.constraint_texts,
         kernel=system_kernel(
             system,
             "constraints",

@@ -53,10 +53,8 @@ def control_of(program: Program) -> Control | None:
 
 def predictor_of(fixed_point: FixedPointIteration) -> AdaptivePredictor:
     """Return the predictor tables of a fixed-point iteration."""
-    points, ratios = (
-        _doubles(fixed_point.guess.abscissae),
-        [2.0 ** (change / LEVELS_PER_BINADE) for change in range(-REACH, REACH + 1)],
-    )
+    points = _doubles(fixed_point.guess.abscissae)
+    ratios = [2.0 ** (change / LEVELS_PER_BINADE) for change in range(-REACH, REACH + 1)]
     alone = _tables_by_ratio(fixed_point, ratios, points, min(len(points) - 1, DEGREE_OF_ONE), (1.0,))
     pairs = []
     for ratio in ratios:
@@ -79,14 +77,12 @@ def _tables_by_ratio(
     degree: int,
     ages: Sequence[float],
 ) -> list[list[NumberTable]]:
-    """Return, for each ratio of the next step size to the last, a table for each step that the sources belong to.
-
-    ``ages``: the ratio of the last step size to each of these, by which stored values h a are scaled.
-    """
+    """Return tables by ratio of the next step size to the last, and by step; ``ages``: last step size by theirs."""
     points = _doubles(fixed_point.guess.abscissae)
     through = tuple(map(_doubles, fixed_point.predictor_matrix))
     count = len(points)
-    rows = least_squares(sources, [1.0 + ratio * x for ratio in ratios for x in points], degree, _dot)
+    targets = [1.0 + ratio * x for ratio in ratios for x in points]
+    rows = least_squares(sources, targets, degree, lambda a, b: math.fsum(map(operator.mul, a, b)))
     tables = []
     for k, ratio in enumerate(ratios):
         scales = [ratio * age if fixed_point.kept is StoredValues.ACCELERATIONS else 1.0 for age in ages]
@@ -104,10 +100,6 @@ def _tables_by_ratio(
 
 def _doubles(numbers: Sequence[Number]) -> tuple[float, ...]:
     return tuple(map(float, numbers))
-
-
-def _dot(one: Sequence[float], other: Sequence[float]) -> float:
-    return math.fsum(map(operator.mul, one, other))
 
 
 def _padded(rows: list[list[float]], through: NumberTable, lanes: int) -> NumberTable:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 from sympy import Add, Expr, Mul, S, Symbol
 
-from scvi_codegen.formulas.expressions import gradient, jacobian
+from scvi_codegen.formulas.expressions import gradient, gradient_tuple, jacobian
 from scvi_codegen.ir.derivatives import Derivatives, InputDerivatives, PointDerivatives, TimeDerivatives
 from scvi_codegen.ir.equations import FixedPointIteration
 from scvi_codegen.ir.kernel import Kernel
@@ -92,9 +92,8 @@ def _energy_derivatives(system: MechanicalSystem) -> Kernel:
     """Return the kernel of the gradient of the energy E of a state: since K = rate (H - E) = 0, dE = dK / rate."""
     assert system.clock is not None
     m, energy = system.dimension, system.clock.energy
-    partials = gradient(system.formula, (*system.coordinates, *system.parameters))
     sign = 1 if system.auxiliaries else -1
-    by_others = [sign * partials.get(j, S.Zero) for j in range(m + len(system.parameters))]
+    by_others = [sign * x for x in gradient_tuple(system.formula, (*system.coordinates, *system.parameters))]
     by_others[m + system.parameters.index(energy)] = S.Zero
     by_p = forms_of(system).legendre if system.auxiliaries else system.velocities
     return system_kernel(
@@ -114,13 +113,13 @@ def _curvature(system: MechanicalSystem, group: StageGroup) -> Kernel | None:
     changes = [Symbol(f"change[{j}]", real=True) for j in range(len(depends))]
     entries = jacobian(group.results, depends)
     along = Add(*(Mul(multipliers[i], entry, changes[j]) for (i, j), entry in entries.items()))
-    partials = gradient(along, depends)
-    if not partials:
+    partials = gradient_tuple(along, depends)
+    if not any(partials):
         return None
     return system_kernel(
         system,
         f"{group.name}_curvature",
-        [partials.get(j, S.Zero) for j in range(len(depends))],
+        partials,
         of=(*group.arguments, *multipliers, *changes),
         purpose="Hessian-vector product of multipliers . results with a variation of all arguments.",
     )

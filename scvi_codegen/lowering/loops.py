@@ -1,14 +1,14 @@
 """Loops around kernels: the terms of systems of arrays, and the term groups of named coordinates."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import chain, islice
+from itertools import chain, combinations, islice, product
 
 from sympy import Add, Expr, S, Symbol, preorder_traversal
 
 from scvi_codegen.formulas.array_statements import ArrayForce
-from scvi_codegen.formulas.arrays import ArrayTerm
+from scvi_codegen.formulas.arrays import ArrayTerm, term_of
 from scvi_codegen.formulas.expressions import gradient
 from scvi_codegen.formulas.neighbours import MAX_COMPONENTS, Neighbours
 from scvi_codegen.indices import Access, Array, Place
@@ -28,14 +28,15 @@ LONG_FORMULA = 1000
 
 def looped_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, newton: bool) -> LoopedTerms:
     """Return the kernels of the terms of a system of arrays; ``newton``: with the Jacobian of the forces."""
-    potentials, arguments = system.potentials, (*system.state, *system.velocities)
-    products, diagonals = _jacobian(system) if newton else ((), ())
+    potentials = [part for term in system.potentials for part in _parts(system, term)]
+    arguments = (*system.state, *system.velocities)
+    products, diagonals = _jacobian(system, potentials) if newton else ((), ())
     masses = [
         (f"mass of {access}", mass, number) for number, mass in enumerate(system.masses) for access, _ in mass.targets
     ]
     return LoopedTerms(
         forces=(
-            *(_potential(system, term, number) for number, term in enumerate(potentials)),
+            *(_potential(system, *part, number) for number, part in enumerate(potentials)),
             *(
                 _added(system, f"force_{number}", force, arguments, f"forces {_shown(force)}", "Forces.")
                 for number, force in enumerate(system.applied_forces, len(potentials))
@@ -73,16 +74,41 @@ def _added(
     return looped_kernel(system, name, formulas, of, u, targets=targets, text=text, purpose=purpose)
 
 
-def _potential(system: ArraySystem, term: ArrayTerm, number: int) -> LoopedKernel:
-    """Return the derivatives of a term with respect to its coordinates and momenta, and the term itself."""
-    force = force_of(term, system.state)
-    signs = [-1 if access.array in system.momenta else 1 for access, _ in force.targets]  # of -H: -H_q and H_p
-    targets = tuple((access, sign * value) for sign, (access, value) in zip(signs, force.targets, strict=True))
+def _potential(system: ArraySystem, term: ArrayTerm, axis: int | None, number: int) -> LoopedKernel:
+    """Return the derivatives of a term by coordinates and momenta, and the term; ``axis``: of a circulant matrix."""
+    force = _signed(system, force_of(term, system.state))
     purpose = "Derivatives with respect to its coordinates."
-    looped = _added(system, f"force_{number}", replace(force, targets=targets), system.state, _shown(term), purpose)
+    looped = _added(system, f"force_{number}", force, system.state, _shown(term), purpose)
     u = entries_of(term, system.state)
     scalar = looped_kernel(system, f"term_{number}", [term.formula], term, u, text="", purpose="The term.")
-    return replace(looped, scalar=scalar.kernel)
+    return replace(looped, scalar=scalar.kernel, circulant=axis)
+
+
+def _parts(system: ArraySystem, term: ArrayTerm) -> Iterator[tuple[ArrayTerm, int | None]]:
+    """Yield the parts f sum_(i<j) c[j-i] (x_i - x_j)^2 / 2 of a term, f constant, with the axis of i; then the rest."""
+    whole = {Place(index=loop.index): loop.end for loop in term.loops if loop.is_whole and not loop.near}
+    accesses, rest = dict(term.slots), term.formula
+    coefficients = [slot for slot, access in term.slots if len(access.places) == 1 and access.places[0].minus]
+    for c, (x, y) in product(coefficients, combinations(entries_of(term, system.state), 2)):
+        one, two, factor = x[1], y[1], term.formula.diff(c, x[0], x[0])
+        axes = [k for k, places in enumerate(zip(one.places, two.places, strict=False)) if places[0] != places[1]]
+        alike = one.array == two.array and not (one.sums or two.sums)
+        covered = alike and {*one.places, *two.places} == {*whole} and len(whole) == len(term.loops)
+        sizes = tuple(whole.get(place) for place in one.places)
+        if covered and len(axes) == 1 and sizes == one.array.axes and factor and not factor.free_symbols & {*accesses}:
+            part = factor * c * (x[0] - y[0]) ** 2 / 2
+            rest -= part
+            yield term_of(term.loops, part, accesses), axes[0]
+    if rest is term.formula:
+        yield term, None
+    elif rest := rest.expand():
+        yield term_of(term.loops, rest, accesses), None
+
+
+def _signed(system: ArraySystem, force: ArrayForce) -> ArrayForce:
+    """Return the rates of a term of -H, -H_q and H_p; the forces of a Lagrangian are returned as they are."""
+    signed = ((access, -value if access.array in system.momenta else value) for access, value in force.targets)
+    return replace(force, targets=tuple(signed))
 
 
 def _shown(of: ArrayTerm | ArrayForce) -> str:
@@ -94,17 +120,25 @@ def _shown(of: ArrayTerm | ArrayForce) -> str:
     return f"a long formula of {', '.join(sorted({access.array.name for _, access in of.slots}))} for {loops}"
 
 
-def _jacobian(system: ArraySystem) -> tuple[tuple[LoopedKernel, ...], tuple[LoopedKernel, ...]]:
-    """Return the Jacobian of the forces times a direction, and its diagonal, by term groups."""
-    derived = [_derived(system, force, number) for number, force in enumerate(system.all_forces)]
+def _jacobian(
+    system: ArraySystem, potentials: Sequence[tuple[ArrayTerm, int | None]]
+) -> tuple[tuple[LoopedKernel, ...], tuple[LoopedKernel, ...]]:
+    """Return the Jacobian of the forces times a direction, by term groups; of forces of positions also its diagonal."""
+    forces = [(force_of(term, system.state), axis) for term, axis in potentials]
+    forces += [(force, None) for force in system.applied_forces]
+    derived = [_derived(system, *force, number) for number, force in enumerate(forces)]
     pairs = [pair for pair in derived if pair]
-    return tuple(product for product, _ in pairs), tuple(diagonal for _, diagonal in pairs)
+    diagonals = () if system.momenta or system.velocities else tuple(diagonal for _, diagonal in pairs)
+    return tuple(product for product, _ in pairs), diagonals
 
 
-def _derived(system: ArraySystem, force: ArrayForce, number: int) -> tuple[LoopedKernel, LoopedKernel] | None:
-    """Return the kernels of a force for :func:`_jacobian`; ``None`` if it does not depend on positions."""
-    force = replace(force, targets=tuple(pair for pair in force.targets if pair[1] != 0))
-    moving = entries_of(force, system.state)
+def _derived(
+    system: ArraySystem, force: ArrayForce, axis: int | None, number: int
+) -> tuple[LoopedKernel, LoopedKernel] | None:
+    """Return the kernels of a force for :func:`_jacobian`; ``None`` if it does not depend on the state."""
+    signed = _signed(system, force)
+    force = replace(force, targets=tuple(pair for pair in signed.targets if pair[1] != 0))
+    moving = entries_of(force, (*system.state, *system.velocities))
     u, w = [slot for slot, _ in moving], [Symbol(f"{slot.name} along", real=True) for slot, _ in moving]
     rows = [gradient(formula, u) for _, formula in force.targets]
     if not any(rows):
@@ -122,16 +156,16 @@ def _derived(system: ArraySystem, force: ArrayForce, number: int) -> tuple[Loope
         targets=[access for access, _ in force.targets],
         text=f"derivatives of {_shown(force)}",
     )
-    return (
-        looped(f"product_{number}", along, along=w, purpose="Jacobian of the forces times a direction."),
-        looped(f"diagonal_{number}", own, purpose="Diagonal of the Jacobian of the forces."),
-    )
+    jacobian = looped(f"product_{number}", along, along=w, purpose="Jacobian of the forces times a direction.")
+    diagonal = looped(f"diagonal_{number}", own, purpose="Diagonal of the Jacobian of the forces.")
+    return replace(jacobian, circulant=axis), replace(diagonal, circulant=axis)
 
 
 def with_sums(program: Program, of: SplitSystem) -> Program | None:
     """Return the program of ``of.rest`` with the forces and the energy of the term groups.
 
-    ``None`` if forces enter otherwise than as values of kernels: in Newton's method, in shooting.
+    ``None`` if forces enter otherwise than as values of kernels, in Newton's method and shooting, or if steps without
+    the forces of ``of.rest`` have no kicks.
     """
     rest, energy, sign = of.rest, program.quantities.energy, -1 if of.rest.auxiliaries else 1
     forces, terms = [], []
@@ -140,7 +174,7 @@ def with_sums(program: Program, of: SplitSystem) -> Program | None:
         forces.append(_over_terms(rest, f"pull_{number}", group, group.partials, ()))
         terms.append(_over_terms(rest, f"term_{number}", group, (sign * group.formula,), first))
     fixed_point, splitting = program.fixed_point and program.fixed_point.with_forces(tuple(forces)), program.splitting
-    if program.newton or energy is None or not (fixed_point or splitting):
+    if program.newton or energy is None or not (fixed_point or (splitting and any(splitting.kicks))):
         return None
     return replace(
         program,
@@ -178,10 +212,10 @@ def reach_of(arrays: Iterable[Array], term_groups: Iterable[LoopedKernel]) -> in
         term_groups: term groups of forces, with the coordinates that each depends on.
 
     Returns:
-        0 if no places are coupled, if an array is no lattice, or if a term group couples places by a table or all
-        pairs.
+        0 if no places are coupled, if an array is no lattice, or if a term group couples places by a table, all pairs
+        or a convolution.
     """
-    if not all(is_lattice(array) for array in arrays):
+    if not all(is_lattice(array) for array in arrays) or any(each.sums for one in term_groups for each in one.reads):
         return 0
     pairs = [
         (target, slot)
@@ -193,9 +227,8 @@ def reach_of(arrays: Iterable[Array], term_groups: Iterable[LoopedKernel]) -> in
     ]
     if not all(_same_loops(*pair) for pair in pairs):
         return 0
-    if not any(_distance(*pair) for pair in pairs if pair[0].array == pair[1].array):
-        return 0
-    return max(_distance(*pair) for pair in pairs)
+    own = any(_distance(*pair) for pair in pairs if pair[0].array == pair[1].array)
+    return max(_distance(*pair) for pair in pairs) if own else 0
 
 
 def is_lattice(array: Array) -> bool:
@@ -206,8 +239,7 @@ def is_lattice(array: Array) -> bool:
 
 def _same_loops(one: Access, other: Access) -> bool:
     """Return whether two entries have the same index on every axis that both have."""
-    pairs = list(zip(one.places, other.places, strict=False))
-    return not any(a.table or b.table or a.index != b.index for a, b in pairs)
+    return not any(a.table or b.table or a.index != b.index for a, b in zip(one.places, other.places, strict=False))
 
 
 def _distance(one: Access, other: Access) -> int:

@@ -14,7 +14,7 @@ import sympy
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.indices import Array
-from scvi_codegen.ir.equations import FixedPointIteration, LoweredStageGroup, Splitting
+from scvi_codegen.ir.equations import FixedPointIteration, Splitting
 from scvi_codegen.ir.kernel import Kernel, lower_matrix, lower_vector
 from scvi_codegen.ir.program import (
     FEW_UNKNOWNS,
@@ -46,7 +46,7 @@ from scvi_codegen.lowering.stage_groups import (
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.first_order import FirstOrderSystem, velocities_of_form
-from scvi_codegen.mechanics.legendre import equivalent_lagrangian
+from scvi_codegen.mechanics.splitting import kinetic_splitting
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, work_rates
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.constraints import END_VELOCITY
@@ -101,26 +101,23 @@ def check_solver(
 
 def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
     """Return the sequence of kicks and drifts, or ``None`` if the method is implicit."""
-    if not method.fractions or system.constraints:
+    if not method.fractions or system.constraints or isinstance(split := kinetic_splitting(system), str):
         return None
-    twin = equivalent_lagrangian(system)
-    by_masses = twin is not None and forms_of(twin).separable
-    if not by_masses and not forms_of(system).split:
-        return None
-    moved = twin if twin is not None and by_masses else system
-    forms = forms_of(moved)
-    kicks, drifts = kicks_and_drifts(method)
-    if by_masses:
-        drift = system_kernel(moved, "mass", forms.mass.values(), of=(), purpose="The constant masses.")
+    moved, (kicks, drifts) = split.system, kicks_and_drifts(method, split)
+    turning = system_kernel(moved, "turning", sum(split.rates, ()), of=(), purpose="a_i, a_j - a_i, a_k - a_i.")
+    if split.velocity:
+        drift = system_kernel(moved, "drift_velocity", split.velocity, of=moved.auxiliaries, purpose="H_p at u = p.")
     else:
-        drift = system_kernel(moved, "drift_velocity", forms.legendre, of=moved.auxiliaries, purpose="H_p at u = p.")
+        drift = system_kernel(moved, "mass", forms_of(moved).mass.values(), of=(), purpose="The constant masses.")
     return Splitting(
         kicks=lower_vector(kicks),
         drifts=lower_vector(drifts),
         abscissae=lower_vector(tuple(mp.fsum(drifts[:n]) for n in range(len(kicks)))),
-        force=system_kernel(moved, "force", forms.force, of=moved.coordinates, purpose="L_q at u = q."),
+        force=system_kernel(moved, "force", split.force, of=moved.coordinates, purpose="L_q at u = q."),
         drift=drift,
-        by_masses=by_masses,
+        by_masses=not split.velocity,
+        bodies=tuple((first, *axes) for first, _, *axes in split.bodies),
+        turning=turning if split.bodies else None,
     )
 
 
@@ -172,9 +169,8 @@ def lower(
     )
     if isinstance(system, ArraySystem):
         loops = looped_terms(system, constrained_steps(system, stages, method), newton=solver == "newton")
-        if loops.products and fixed_point and fixed_point.predictor_matrix:
-            tables = shift_tables(fixed_point.predictor_matrix, fixed_point.points, fixed_point.lanes)
-            loops = replace(loops, shifts=tables)
+        if loops.products and fixed_point and fixed_point.matrix:
+            loops = replace(loops, shifts=shift_tables(fixed_point.matrix, fixed_point.lanes))
         check_solver_of_arrays(system, method, solver, splitting or loops.constrained or fixed_point, loops)
         return program(loops=loops, polynomial_curves=bool(fixed_point and (fixed_point.points > 1 or not velocities)))
     check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else fixed_point)
@@ -196,7 +192,7 @@ def _layout(system: MechanicalSystem | ArraySystem) -> Layout:
     """Return the arrays and parameters of a system."""
     numbers = {"parameters": tuple(each.name for each in system.parameters), "defaults": system.defaults}
     if isinstance(system, ArraySystem):
-        kinds = ("coordinates", "momenta", "velocities", "fields", "tables", "sizes")
+        kinds = ("coordinates", "momenta", "velocities", "sums", "fields", "tables", "sizes")
         return Layout(**{kind: getattr(system, kind) for kind in kinds}, **numbers)
     return Layout(
         coordinates=tuple(Array(q.name, ()) for q in system.coordinates),
@@ -212,7 +208,8 @@ def _equations(
     m, sites = system.dimension, layout_of(stages, system.dimension)
     blocks, rows = [stages.blocks[b] for b in sites.columns[None]], [stages.rows[r] for r in sites.rows[None]]
     stage_groups = tuple(lowered_stage_group(system, group, sites) for group in stages.stage_groups) if newton else ()
-    coupled = [*forms_of(system).legendre_jacobian, *_coupled_coordinates(stage_groups)]
+    pairs = (pair for group in stage_groups for block in group.blocks for pair in block.entries)
+    coupled = [*forms_of(system).legendre_jacobian, *pairs]  # with a nonzero derivative
     order = bandwidth_ordering(coupled, sites.count)
     return StageEquations(
         sites=sites.count,
@@ -242,17 +239,30 @@ def _quantities(
     system: MechanicalSystem, method: Method, stages: StageSystem, symmetries: Sequence[Symmetry]
 ) -> Quantities:
     """Return the functions of the state that a run evaluates or integrates."""
+    name, purpose = ("hamiltonian", "H at u = (q, p).") if system.auxiliaries else ("lagrangian", "L at u = (q, v).")
+    forms, integrates = forms_of(system), any(group.in_action for group in stages.stage_groups)
     return Quantities(
-        legendre=_legendre_kernel(system),
+        legendre=system_kernel(
+            system,
+            "legendre",
+            forms.regular_legendre,
+            of=forms.legendre_arguments,
+            partials=forms.legendre_jacobian.values(),
+            purpose="Momenta theta and their derivatives by y at u = (q, y)."
+            if forms.one_form
+            else "H_p and H_pp at u = (q, p)."
+            if system.auxiliaries
+            else f"Momenta L_v {'' if forms.inverse_mass else 'and mass matrix L_vv '}at u = (q, v).",
+        ),
         inverse_legendre=_inverse_legendre_kernel(system),
-        mass_entries=tuple(forms_of(system).legendre_jacobian),
-        energy=_energy_kernel(system),
+        mass_entries=tuple(forms.legendre_jacobian),
+        energy=system_kernel(system, name, (system.formula,), of=forms.legendre_arguments, purpose=purpose),
         hamiltonian=bool(system.auxiliaries),
         momentum_maps=tuple(_momentum_map(each, method) for each in symmetries),
         momentum_kernel=_momentum_kernel(system, symmetries),
         first_order_rates=_rates_of_first_order(system),
         integrals=_integrals(system, method, stages),
-        work_and_impulses=_work_and_impulse_names(system, stages),
+        work_and_impulses=tuple(each.name for each in work_rates(system)) if integrates else (),
     )
 
 
@@ -262,10 +272,7 @@ def _momentum_map(symmetry: Symmetry, method: Method) -> MomentumMap:
 
 
 def _numbers(system: MechanicalSystem, method: Method, count: int) -> tuple[str, str, str]:
-    """Return the paper's equation numbers of the last ``count`` rows, of q1 and of p1.
-
-    The rows before these determine unknowns that occur in no other row.
-    """
+    """Return the paper's equation numbers of the last ``count`` rows, of q1 and of p1."""
     paper = method.paper_form(system)
     known = dict.fromkeys(row.number for row in paper.rows[-count:] if row.number[:1].isdigit())
     rows = ", ".join(f"({number})" for number in known)
@@ -336,28 +343,6 @@ def _integrals(system: MechanicalSystem, method: Method, stages: StageSystem) ->
     return Integrals(kernel=kernel, weights=lower_vector(stages.shape.weights))
 
 
-def _work_and_impulse_names(system: MechanicalSystem, stages: StageSystem) -> tuple[str, ...]:
-    """Return the names of work and impulses of forces, if the method integrates along a curve."""
-    integrates = any(group.in_action for group in stages.stage_groups)
-    return tuple(each.name for each in work_rates(system)) if integrates else ()
-
-
-def _legendre_kernel(system: MechanicalSystem) -> Kernel:
-    forms = forms_of(system)
-    return system_kernel(
-        system,
-        "legendre",
-        forms.regular_legendre,
-        of=forms.legendre_arguments,
-        partials=forms.legendre_jacobian.values(),
-        purpose="Momenta theta and their derivatives by y at u = (q, y)."
-        if forms.one_form
-        else "H_p and H_pp at u = (q, p)."
-        if system.auxiliaries
-        else f"Momenta L_v {'' if forms.inverse_mass else 'and mass matrix L_vv '}at u = (q, v).",
-    )
-
-
 def _inverse_legendre_kernel(system: MechanicalSystem) -> Kernel | None:
     """Return the kernel of the velocities at (q, p), ``None`` if they have no formula."""
     inverse, of = forms_of(system).inverse_mass, (*system.coordinates, *system.momentum_symbols)
@@ -374,13 +359,6 @@ def _rates_of_first_order(system: MechanicalSystem) -> Kernel | None:
     return system_kernel(system, "first_order_rates", rates, of=of, purpose="Velocities q' at u = (q, y).")
 
 
-def _energy_kernel(system: MechanicalSystem) -> Kernel:
-    """Return the kernel of the Lagrangian or Hamiltonian, which with the Legendre transform gives the energy."""
-    name, purpose = ("hamiltonian", "H at u = (q, p).") if system.auxiliaries else ("lagrangian", "L at u = (q, v).")
-    arguments = forms_of(system).legendre_arguments
-    return system_kernel(system, name, (system.formula,), of=arguments, purpose=purpose)
-
-
 def _momentum_kernel(system: MechanicalSystem, symmetries: Sequence[Symmetry]) -> Kernel | None:
     """Return the kernel of the momentum maps, then of the sums of the squares of their terms."""
     if not symmetries:
@@ -394,11 +372,6 @@ def _momentum_kernel(system: MechanicalSystem, symmetries: Sequence[Symmetry]) -
         of=(*symmetries[0].coordinates, *symmetries[0].momenta),
         purpose="Momentum maps at u = (q, p), then the sums of the squares of their terms.",
     )
-
-
-def _coupled_coordinates(stage_groups: Sequence[LoweredStageGroup]) -> list[tuple[int, int]]:
-    """Return the pairs of coordinates with a nonzero derivative."""
-    return [pair for group in stage_groups for block in group.blocks for pair in block.entries]
 
 
 def _notes(method: Method, system: MechanicalSystem, *, forced: bool) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from sympy import Expr, Symbol
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.array_statements import ArrayForce
 from scvi_codegen.formulas.arrays import ArrayTerm
-from scvi_codegen.formulas.expressions import evaluate, jacobian
+from scvi_codegen.formulas.expressions import Tape, jacobian
 from scvi_codegen.indices import Access
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.equations import DerivativeBlock, GatherLoop, LoweredStageGroup, ScatterLoop
@@ -159,7 +159,9 @@ def layout_of(stages: StageSystem, dimension: int) -> UnknownLayout:
     blocks, rows = [block.size for block in stages.blocks], [row.size for row in stages.rows]
     sizes = [None, *sorted({size for size in (*blocks, *rows) if size is not None})]
     numbers = [dimension if size is None else size for size in sizes]
-    columns, lines = ({size: _indices_of_size(size, each) for size in sizes} for each in (blocks, rows))
+    columns, lines = (
+        {size: tuple(k for k, each in enumerate(of) if each == size) for size in sizes} for of in (blocks, rows)
+    )
     if len({len(places) for group in (columns, lines) for places in group.values()}) > 1:
         counts = ", ".join(
             f"{len(columns[size])} blocks and {len(lines[size])} rows of {number}"
@@ -179,10 +181,6 @@ def _block_size(gather: Gather, sites: UnknownLayout) -> int | None:
 
 def _row_size(scatter: Scatter, sites: UnknownLayout) -> int | None:
     return sites.size(len(scatter.results), scatter.table, sites.rows)
-
-
-def _indices_of_size(size: int | None, sizes: Sequence[int | None]) -> tuple[int, ...]:
-    return tuple(place for place, each in enumerate(sizes) if each == size)
 
 
 Pairs = Iterable[tuple[int, int]]
@@ -352,13 +350,12 @@ def _check_symmetry(group: StageGroup, entries: Mapping[tuple[int, int], sympy.E
     for i, j in unlike[:MOST_PAIRS_COMPARED]:
         pair = entries[i, j], entries.get((j, i), sympy.S.Zero)
         symbols = sorted(pair[0].free_symbols | pair[1].free_symbols, key=str)
-        known = {symbol: mp.mpf(k + 3) / (k + 5) for k, symbol in enumerate(symbols)}
+        terms = [term for entry in pair for term in sympy.Add.make_args(entry)]
         try:
-            one, other = (evaluate(entry, known) for entry in pair)
-            size = sum(abs(evaluate(term, known)) for entry in pair for term in sympy.Add.make_args(entry))
+            one, other, *sizes = Tape([*pair, *terms], symbols)([mp.mpf(k + 3) / (k + 5) for k in range(len(symbols))])
         except ArithmeticError:
             continue
-        if abs(one - other) > LARGEST_DIFFERENCE * size:  # the terms may cancel
+        if abs(one - other) > LARGEST_DIFFERENCE * sum(map(abs, sizes)):  # the terms may cancel
             u = group.arguments
             raise MethodError(
                 f"the results of the stage group '{group.name}' are not the gradient of its scalar: the "

@@ -55,7 +55,7 @@ def warn_of_unused(
     kinds += [f"parameter '{each}'" for each in parameters if each not in used and each not in occurring]
     for kind in kinds:
         where = f"the {function}, the forces or the constraints of '{name}'"
-        warn(f"{kind} is not used in {where}; remove it or use it.", SystemDefinitionWarning)
+        warn(f"{kind} is not used in {where}; remove it, unless events use it.", SystemDefinitionWarning)
     return bool(kinds)
 
 
@@ -154,17 +154,13 @@ def _check_symbols(system: MechanicalSystem, what: str, arguments: Sequence[Symb
 def check_lagrangian(system: MechanicalSystem) -> None:
     """Raise :class:`SystemDefinitionError` for an invalid or singular Lagrangian, or invalid constraints."""
     check_definition(system, "Lagrangian", system.velocities, "a velocity")
-    _check_velocities(system)
-    _check_mass_matrix(system)
-    if system.constraints:
-        _check_constraints(system)
-
-
-def _check_velocities(system: MechanicalSystem) -> None:
     free = system.lagrangian.free_symbols
     missing = tuple(velocity for velocity in system.velocities if velocity not in free)
     if missing:
         raise SystemDefinitionError(_degenerate_message(system, missing, "does not occur in the Lagrangian"))
+    _check_mass_matrix(system)
+    if system.constraints:
+        _check_constraints(system)
 
 
 def _check_mass_matrix(system: MechanicalSystem) -> None:
@@ -225,7 +221,7 @@ def _degenerate_message(system: MechanicalSystem, velocities: Sequence[Symbol], 
 
 def _check_constraints(system: MechanicalSystem) -> None:
     """Raise :class:`SystemDefinitionError` for constraints that are dependent or nonlinear in velocities."""
-    names = list(map(system.text_of, system.constraints))
+    names = system.constraint_texts
     for name, g in zip(names, system.constraints, strict=True):
         if g.free_symbols.isdisjoint((*system.coordinates, *system.velocities)):
             raise SystemDefinitionError(

@@ -19,8 +19,9 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 from sympy import Expr, Matrix, Symbol
+from sympy.utilities.iterables import connected_components
 
-from scvi_codegen.formulas.expressions import Tape, gradient, hessian, jacobian
+from scvi_codegen.formulas.expressions import Tape, gradient_tuple, hessian, jacobian
 from scvi_codegen.formulas.intermediates import separated
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Number, mp
@@ -76,12 +77,12 @@ class Forms:
     @cached_property
     def momentum(self) -> tuple[Expr, ...]:
         """P = L_v, m expressions."""
-        return self._gradient_tuple(self.system.lagrangian, self.system.velocities)
+        return gradient_tuple(self.system.lagrangian, self.system.velocities)
 
     @cached_property
     def force(self) -> tuple[Expr, ...]:
         """L_q plus the generalised forces, m expressions."""
-        partials = self._gradient_tuple(self.system.lagrangian, self.system.coordinates)
+        partials = gradient_tuple(self.system.lagrangian, self.system.coordinates)
         return tuple(map(sympy.Add, partials, self.system.forces)) if self.system.forces else partials
 
     @cached_property
@@ -112,7 +113,7 @@ class Forms:
         energy = getattr(system, "dual_energy", sympy.S.Zero)
         if energy == 0 or system.constraints or system.damping != 0 or system.clock:
             return None
-        velocities = self._gradient_tuple(energy, momenta)
+        velocities = gradient_tuple(energy, momenta)
         point = next(sample_points(momenta, system.coordinates, system.constants))
         values = dict(zip(system.velocities, Tape(velocities, list(point))(list(point.values())), strict=True))
         again = Tape(self.momentum, [*point, *values])([*point.values(), *values.values()])
@@ -129,7 +130,7 @@ class Forms:
     @cached_property
     def constitutive(self) -> tuple[Expr, ...]:
         """Constitutive residual L_p = v - H_p, m expressions (paper (35f)); empty for a Lagrangian."""
-        return self._gradient_tuple(self.system.lagrangian, self.system.auxiliaries)
+        return gradient_tuple(self.system.lagrangian, self.system.auxiliaries)
 
     @cached_property
     def legendre_arguments(self) -> tuple[Symbol, ...]:
@@ -152,7 +153,7 @@ class Forms:
         """
         if not self.system.auxiliaries or self.one_form:
             return self.momentum
-        return self._gradient_tuple(self.system.formula, self.system.auxiliaries)
+        return gradient_tuple(self.system.formula, self.system.auxiliaries)
 
     @cached_property
     def regular_legendre(self) -> tuple[Expr, ...]:
@@ -160,7 +161,7 @@ class Forms:
         energy = getattr(self.system, "gauge", sympy.S.Zero)
         if energy == 0:
             return self.legendre
-        gauge = self._gradient_tuple(energy, self.system.auxiliaries)
+        gauge = gradient_tuple(energy, self.system.auxiliaries)
         return tuple(map(sympy.Add, self.legendre, gauge))
 
     @cached_property
@@ -254,21 +255,6 @@ class Forms:
         still = all(p.xreplace(at_rest) == 0 for p in self.momentum)
         return still and not jacobian(self.force, self.system.velocities)
 
-    @cached_property
-    def split(self) -> bool:
-        """True if H = T(p) + V(q, t), judged by the structure of its derivatives; forces may depend on q and t."""
-        system = self.system
-        if (
-            not system.auxiliaries
-            or self.one_form
-            or system.damping != 0
-            or system.time in set().union(*(v.free_symbols for v in self.legendre))
-        ):
-            return False
-        return not jacobian(self.legendre, system.coordinates) and not jacobian(
-            self.force, (*system.velocities, *system.auxiliaries)
-        )
-
     def rates(self, count: int) -> tuple[Expr, ...]:
         """Return dL/dt, .., d^count L/dt^count along a curve, in (q, v, t) and :func:`curve_rates`."""
         system = self.system
@@ -279,11 +265,6 @@ class Forms:
         for _ in range(count):
             derivatives_of_l.append(_along(derivatives_of_l[-1:], variables, rates)[0])
         return tuple(derivatives_of_l[1:])
-
-    @staticmethod
-    def _gradient_tuple(scalar: Expr, variables: Sequence[Symbol]) -> tuple[Expr, ...]:
-        partials = gradient(scalar, variables)
-        return tuple(partials.get(i, sympy.S.Zero) for i in range(len(variables)))
 
 
 @lru_cache(maxsize=64)
@@ -403,21 +384,7 @@ def _structural_rank(entries: Entries, size: int) -> int:
 
 def coupled_blocks(entries: Entries, size: int) -> list[list[int]]:
     """Return the connected components of the variables, coupled by non-zero entries, as lists of indices."""
-    neighbours: list[list[int]] = [[] for _ in range(size)]
-    for row, column in entries:
-        neighbours[row].append(column)
-    blocks, seen = [], [False] * size
-    for start in range(size):
-        block, pending = [], [start]
-        while pending:
-            index = pending.pop()
-            if not seen[index]:
-                seen[index] = True
-                block.append(index)
-                pending.extend(neighbours[index])
-        if block:
-            blocks.append(sorted(block))
-    return blocks
+    return [sorted(block) for block in connected_components((range(size), list(entries)))]
 
 
 def _regular(matrix: dict[tuple[int, int], Number], size: int) -> bool:

@@ -249,8 +249,8 @@ def first_order_system(fields: Mapping[str, Any]) -> FirstOrderSystem | None:
     for key, reason in UNSUPPORTED.items():
         if fields.get(key):
             raise SystemDefinitionError(
-                f"the Lagrangian of '{name}' is linear in the velocities (a first-order system), for which {key} is "
-                f"not supported: {reason}. Leave it out, or add the missing kinetic energy, such as "
+                f"the Lagrangian of '{name}' is linear in the velocities (a first-order system) and does not support "
+                f"{key}: {reason}. Leave it out, or add the missing kinetic energy, such as "
                 f"m*{velocities[0]}**2/2"
             )
     form = OneForm(name, lagrangian, coordinates, velocities, fields["time"])

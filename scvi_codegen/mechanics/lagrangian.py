@@ -60,10 +60,7 @@ class LagrangianSystem(MechanicalSystem):
 
         check_lagrangian(self)
 
-    @property
-    def auxiliaries(self) -> tuple[Symbol, ...]:
-        """Empty: a Lagrangian has no auxiliary variables."""
-        return ()
+    auxiliaries = ()
 
     @property
     def formula(self) -> Expr:

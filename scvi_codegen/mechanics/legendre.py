@@ -13,7 +13,7 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.expressions import evaluate, gradient, hessian, unsupported_part
+from scvi_codegen.formulas.expressions import evaluate, gradient, gradient_tuple, hessian, unsupported_part
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import input_formulas, symbol
 from scvi_codegen.mechanics.derived_expressions import coupled_blocks, forms_of, sample_points
@@ -156,20 +156,13 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
         )
     symbols = tuple(symbol(name) for name in names)
     hamiltonian = legendre_dual(system, system.velocities, symbols)
-    velocities = dict(zip(system.velocities, _gradient_tuple(hamiltonian, symbols), strict=True))
+    velocities = dict(zip(system.velocities, gradient_tuple(hamiltonian, symbols), strict=True))
     return HamiltonianSystem(
-        name=system.name,
-        coordinates=system.coordinates,
+        **system._common_fields,
         momenta=symbols,
-        time=system.time,
-        parameters=system.parameters,
-        defaults=system.defaults,
         hamiltonian=hamiltonian,
         clock=system.clock,
         forces=tuple(f.xreplace(velocities) for f in system.forces),
-        damping=system.damping,
-        inputs=system.inputs,
-        rotations=system.rotations,
     )
 
 
@@ -215,37 +208,21 @@ def _lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
             "Lagrangian: use the Hamiltonian, or a formula in coordinates only"
         )
     lagrangian = legendre_dual(system, system.momenta, system.velocities)
-    momenta = dict(zip(system.momenta, _gradient_tuple(lagrangian, system.velocities), strict=True))
+    momenta = dict(zip(system.momenta, gradient_tuple(lagrangian, system.velocities), strict=True))
     return LagrangianSystem(
-        name=system.name,
-        coordinates=system.coordinates,
-        time=system.time,
-        parameters=system.parameters,
-        defaults=system.defaults,
+        **system._common_fields,
         lagrangian=lagrangian,
         clock=system.clock,
         forces=tuple(f.xreplace(momenta) for f in system.forces),
-        damping=system.damping,
-        inputs=system.inputs,
     )
 
 
+@lru_cache(maxsize=64)
 def equivalent_lagrangian(system: MechanicalSystem) -> LagrangianSystem | None:
     """Return an equivalent Lagrangian system, possibly ``system`` itself; ``None`` if none is found."""
-    if isinstance(system, LagrangianSystem):
-        return system
-    plain = isinstance(system, HamiltonianSystem) and not forms_of(system).one_form
-    return _equivalent_lagrangian(system) if plain else None
-
-
-@lru_cache(maxsize=64)
-def _equivalent_lagrangian(system: HamiltonianSystem) -> LagrangianSystem | None:
+    if not isinstance(system, HamiltonianSystem) or forms_of(system).one_form:
+        return system if isinstance(system, LagrangianSystem) else None
     try:
         return _lagrangian_of(system)
     except SystemDefinitionError:
         return None
-
-
-def _gradient_tuple(f: Expr, variables: Sequence[Symbol]) -> tuple[Expr, ...]:
-    partials = gradient(f, variables)
-    return tuple(partials.get(i, sympy.S.Zero) for i in range(len(variables)))

@@ -1,6 +1,6 @@
 """Systems read from text or from SymPy expressions: the fields of Lagrangian and Hamiltonian systems."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import sympy
@@ -24,8 +24,7 @@ from scvi_codegen.mechanics.arrays.reading import arrays_from_sympy, arrays_from
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.definition_checks import warn_of_mistakes
 from scvi_codegen.mechanics.forces import constraints_of, damping_rate, dissipative_forces, forces_by_coordinate
-from scvi_codegen.mechanics.rotations.frames import rotations_of_frames
-from scvi_codegen.mechanics.rotations.points import forces_at_points
+from scvi_codegen.mechanics.rotations.points import forces_at_points, rotations_of_frames
 from scvi_codegen.mechanics.system import are_arrays
 
 Read = Callable[[Any], Expr]
@@ -54,7 +53,7 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
     momenta = default_momenta(ordinary) if momenta is None else tuple(momenta)
     momenta = (*momenta, *default_momenta(names.coordinates)) if of_momenta else momenta
     values = with_inputs(parameters or {}, inputs)
-    check_names(coordinates, (*values, *inputs, *names.symbols), momenta)
+    check_names(ordinary, (*values, *inputs), momenta, (*names.coordinates, *names.symbols))
     velocities = () if of_momenta else tuple(coordinate + DOT for coordinate in coordinates)
     symbols = {each: symbol(each) for each in (*coordinates, *velocities, *momenta, TIME, *values, *inputs)}
     symbols |= names.symbols
@@ -63,39 +62,68 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
     def read(text: str) -> Expr:
         return names.read(text, symbols).xreplace(driven)
 
-    variables = tuple(symbols[each] for each in coordinates)
-    conjugate = {"momenta": tuple(symbols[each] for each in momenta)} if of_momenta else {}
-    function = "hamiltonian" if of_momenta else "lagrangian"
-    constants = tuple(symbols[each] for each in values)
-    applied, friction = arguments["forces"], arguments.get("dissipation")
-    at_points = arguments.get("point_forces") or ()
-    if names.members or at_points:
-        torques, torques_space = (arguments.get(each) for each in TORQUES)
-        others = forces_at_points(at_points, ordinary, names.members, read)
-        forces: Any = names.forces_by_name(ordinary, read, applied, torques, torques_space, friction, others)
-        forces = forces if names.members else names.forces(forces, coordinates)
-    else:
-        forces = _forces(variables, applied, friction, read)
+    torques, points = (arguments.get("torques"), arguments.get("torques_space")), arguments.get("point_forces") or ()
+    forces = _acting(names, ordinary, read, arguments["forces"], torques, arguments.get("dissipation"), points)
     constraints = constraints_of(arguments["constraints"], read)
-    defined = dict(
+    function = "hamiltonian" if of_momenta else "lagrangian"
+    return _system(
+        cls,
+        names,
+        (function, read(arguments[function]), forces, constraints),
         name=arguments["name"],
-        coordinates=variables,
-        **conjugate,
-        **names.fields(function, read(arguments[function]), forces, constraints, coordinates, constants),
+        coordinates=coordinates,
+        momenta=momenta,
+        values=values,
         definition=definition_of(arguments) if names.members else {},
-        time=symbols[TIME],
-        parameters=constants,
-        defaults=tuple(number(each, value) for each, value in values.items()),
         damping=damping_rate(arguments["damping"], lambda formula: read(str(formula))),
         inputs=tuple(inputs),
     )
-    system = cls(**defined)
-    return system, _warned(system)
 
 
-def _warned(system: Any) -> bool:
-    """Warn of what is probably a mistake; true if any warning was issued."""
-    return warn_of_mistakes(system, getattr(system, "one_form", ()))
+def _system(
+    cls: Any,
+    names: RotationNames,
+    formulas: tuple[str, Expr, Any, Sequence[Expr]],
+    *,
+    coordinates: Sequence[str],
+    momenta: Sequence[str],
+    values: Mapping[str, Any],
+    **others: Any,
+) -> tuple[Any, bool]:
+    """Return a system of ``(function, formula, forces, constraints)``, and whether warnings were issued."""
+    parameters = tuple(map(symbol, values))
+    system = cls(
+        coordinates=tuple(map(symbol, coordinates)),
+        **({"momenta": tuple(map(symbol, momenta))} if formulas[0] == "hamiltonian" else {}),
+        **names.fields(*formulas, coordinates, parameters),
+        time=symbol(TIME),
+        parameters=parameters,
+        defaults=tuple(number(each, value) for each, value in values.items()),
+        **others,
+    )
+    return system, warn_of_mistakes(system, getattr(system, "one_form", ()))
+
+
+def _acting(
+    names: RotationNames,
+    ordinary: Sequence[str],
+    read: Read,
+    applied: Mapping[str, Any] | None,
+    torques: tuple[Any, Any],
+    dissipation: Any,
+    points: Sequence[Mapping[str, Any]] = (),
+) -> Any:
+    """Return the forces of a system and of its dissipation: by name with rotations, else on all coordinates."""
+    coordinates = (*ordinary, *names.coordinates)
+    if names.members or points:
+        others = forces_at_points(points, ordinary, names.members, read)
+        by_name = names.forces_by_name(ordinary, read, applied, *torques, dissipation, others)
+        return by_name if names.members else names.forces(by_name, coordinates)
+    forces = forces_by_coordinate(tuple(map(symbol, coordinates)), applied or {}, read)
+    if dissipation is None:
+        return forces
+    friction = dissipative_forces(read(dissipation), tuple(symbol(name + DOT) for name in coordinates))
+    return tuple(map(sympy.Add, forces, friction)) if forces else friction
 
 
 def system_from_sympy(
@@ -127,7 +155,12 @@ def system_from_sympy(
     if function == "Lagrangian" and are_arrays(each for each in coordinates if isinstance(each, str)):
         others = (velocities, forces, dissipation, damping, constraints, inputs, *turning.values())
         given = {"coordinates": list(coordinates), "parameters": parameters, "tables": tables, "neighbours": neighbours}
-        return _arrays_from_sympy(cls, formula, others, name=name, **given)
+        if any(others):
+            raise SystemDefinitionError(
+                "from_sympy reads Lagrangian, parameters, tables and neighbours of a system with arrays: give the rest "
+                "as text to from_text"
+            )
+        return _of_arrays(cls, arrays_from_sympy(formula, name=name, **given))
 
     def expression_of(value: Any, what: str) -> Expr:
         return sympy_expression(value, what).xreplace(of_frames)
@@ -147,7 +180,7 @@ def system_from_sympy(
     translation = Translation(
         formula,
         coordinates,
-        (*_flat(acted), *(() if friction is None else (friction,)), rate, *conditions),
+        (*sympy.flatten(acted), *(() if friction is None else (friction,)), rate, *conditions),
         velocities=velocities,
         momenta=momenta or (),
         time=time,
@@ -159,53 +192,28 @@ def system_from_sympy(
     def reader(what: str) -> Read:
         return lambda each: translation.apply(each, what).xreplace(driven)
 
-    by_symbol = {translation.rules.get(q, q): f for q, f in applied.items()}
-    variables = (*translation.coordinates, *map(symbol, names.coordinates))
-    conjugate = (*translation.momenta, *map(symbol, default_momenta(names.coordinates)))
+    by_name = {name_of_key(translation.rules.get(q, q)): f for q, f in applied.items()}
+    ordinary = [q.name for q in translation.coordinates]
     if names.members:
-        by_name, ordinary = (
-            {name_of_key(q): f for q, f in by_symbol.items()},
-            [q.name for q in translation.coordinates],
-        )
-        acting = names.forces_by_name(ordinary, reader("forces"), by_name, torques, torques_space, friction)
-    else:
-        acting = _forces(variables, by_symbol, friction, reader("forces"))
+        check_names(ordinary, tuple(constants), (), (*names.coordinates, *names.symbols))
+    acting = _acting(names, ordinary, reader("forces"), by_name, (torques, torques_space), friction)
     expression, conditions = reader(function)(formula), constraints_of(conditions, reader("constraints"))
-    parts = function.lower(), expression, acting, conditions, [q.name for q in variables]
-    defined = dict(
+    return _system(
+        cls,
+        names,
+        (function.lower(), expression, acting, conditions),
         name=name,
-        coordinates=variables,
-        **({} if momenta is None else {"momenta": conjugate}),
-        time=symbol(TIME),
-        parameters=translation.parameters,
-        defaults=tuple(number(parameter, value) for parameter, value in constants.items()),
-        **names.fields(*parts, translation.parameters),
+        coordinates=(*ordinary, *names.coordinates),
+        momenta=(*(p.name for p in translation.momenta), *default_momenta(names.coordinates)),
+        values=dict(zip((each.name for each in translation.parameters), constants.values(), strict=True)),
         damping=reader("damping")(rate),
         inputs=input_names,
-    )
-    system = cls(**defined)
-    _warned(system)
-    return system
-
-
-def _arrays_from_sympy(cls: Any, formula: Any, others: Iterable[Any], **arguments: Any) -> Any:
-    """Return the system of a Lagrangian with arrays; ``others`` are arguments that must be empty."""
-    if any(others):
-        raise SystemDefinitionError(
-            "from_sympy reads Lagrangian, parameters, tables and neighbours of a system with arrays: give the rest "
-            "as text to from_text"
-        )
-    return _of_arrays(cls, arrays_from_sympy(formula, **arguments))
+    )[0]
 
 
 def _components(force: Any, what: str, read: Callable[[Any, str], Expr]) -> Any:
     """Return a force as an expression, or its components as a tuple."""
     return tuple(read(f, what) for f in force) if isinstance(force, tuple | list) else read(force, what)
-
-
-def _flat(forces: Iterable[Any]) -> list[Expr]:
-    """Return expressions and the entries of tuples."""
-    return [each for force in forces for each in (force if isinstance(force, tuple) else (force,))]
 
 
 def default_momenta(coordinates: Sequence[str]) -> tuple[str, ...]:
@@ -224,14 +232,3 @@ def _named_parameters(parameters: Mapping[Any, float] | None) -> dict[str, float
     if len(by_name) < len(parameters or {}):
         raise SystemDefinitionError("two parameters have the same name: rename one of them")
     return by_name
-
-
-def _forces(
-    coordinates: tuple[Symbol, ...], applied: Mapping[Any, Any] | None, dissipation: Any, read: Read
-) -> tuple[Expr, ...]:
-    """Return the forces of a system plus those of its dissipation function."""
-    forces = forces_by_coordinate(coordinates, applied or {}, read)
-    if dissipation is None:
-        return forces
-    friction = dissipative_forces(read(dissipation), tuple(symbol(q.name + DOT) for q in coordinates))
-    return tuple(map(sympy.Add, forces, friction)) if forces else friction

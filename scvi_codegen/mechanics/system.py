@@ -84,10 +84,6 @@ class Deferred:
             store_text(("system", self._text), key)
             object.__setattr__(self, "_key", key)
 
-    def _argument(self, name: str) -> Any:
-        """Return an argument of ``from_text`` of a system whose key is in the cache."""
-        return json.loads(self._text)[1][name]
-
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
@@ -102,10 +98,7 @@ class Deferred:
 
 
 def _text_of(cls: type, arguments: Mapping[str, Any]) -> str | None:
-    """Return the class and the arguments as JSON, which differs for different systems; ``None`` if that is impossible.
-
-    Arrays and derived classes are not deferred.
-    """
+    """Return the class and the arguments as JSON; ``None`` for arrays, derived classes and other objects."""
     if cls.__module__.partition(".")[0] != __name__.partition(".")[0] or are_arrays(
         arguments["coordinates"], arguments["parameters"] or (), arguments["tables"]
     ):
@@ -212,7 +205,7 @@ class MechanicalSystem(Deferred, ABC):
     @property
     def constrained(self) -> bool:
         """True if there are constraints; reads no formulas."""
-        return bool(self._argument("constraints") if hasattr(self, "_key") else self.constraints)
+        return bool(json.loads(self._text)[1]["constraints"] if hasattr(self, "_key") else self.constraints)
 
     @property
     def dimension(self) -> int:
@@ -229,6 +222,12 @@ class MechanicalSystem(Deferred, ABC):
         """Symbols of the m momenta: for a Lagrangian ``p_`` and the coordinate, preceded by ``_`` if not unique."""
         taken = {symbol.name for symbol in (*self.coordinates, *self.velocities, *self.parameters)}
         return self.auxiliaries or tuple(symbol(_free(f"p_{q.name}", taken)) for q in self.coordinates)
+
+    @property
+    def _common_fields(self) -> dict[str, Any]:
+        """Fields that a Lagrangian and its Hamiltonian have in common, by name."""
+        names = "name", "coordinates", "time", "parameters", "defaults", "damping", "inputs", "rotations"
+        return {name: getattr(self, name) for name in names}
 
     @property
     def constants(self) -> dict[Symbol, float]:
@@ -278,6 +277,12 @@ class MechanicalSystem(Deferred, ABC):
 
         return format_expression(inputs_by_name(written_out(formula), self.inputs))
 
+    @property
+    def constraint_texts(self) -> tuple[str, ...]:
+        """Constraints g as text, in the names of the rotations and directions of a Lagrangian."""
+        reduced = getattr(self, "reduced", None)
+        return tuple(map(self.text_of, reduced.constraints if reduced else self.constraints))
+
     def with_parameters(self, **values: float) -> Self:
         """Return a copy of the system with other default values for the named parameters."""
         names = [parameter.name for parameter in self.parameters]
@@ -319,8 +324,8 @@ class MechanicalSystem(Deferred, ABC):
                 yield f"force on {q.name}", plain(self.text_of(force))
         if self.damping != 0:
             yield "damping", plain(self.text_of(self.damping))
-        for g in self.constraints:
-            yield "constraint", plain(f"{self.text_of(g)} = 0")
+        for g in self.constraint_texts:
+            yield "constraint", plain(f"{g} = 0")
 
 
 def _free(name: str, taken: set[str]) -> str:

@@ -13,9 +13,9 @@ from functools import lru_cache
 from itertools import compress, groupby, repeat
 from typing import TypeVar
 
-from sympy import Add, Expr, S, Symbol, factor_terms
+from sympy import Add, Expr, Symbol, factor_terms
 
-from scvi_codegen.formulas.expressions import gradient
+from scvi_codegen.formulas.expressions import gradient_tuple
 from scvi_codegen.formulas.intermediates import inner_of
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -54,8 +54,7 @@ class TermGroup:
     @property
     def partials(self) -> tuple[Expr, ...]:
         """Derivatives of the formula by ``slots``, with common factors extracted, since many share the rest."""
-        derivatives = gradient(self.formula, self.slots)
-        return tuple(factor_terms(derivatives.get(k, S.Zero)) for k in range(len(self.slots)))
+        return tuple(map(factor_terms, gradient_tuple(self.formula, self.slots)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,15 +194,7 @@ def similar_terms(
 
 @dataclass(slots=True)
 class _Leaves:
-    """Coordinates and constants of a term, numbered in the order in which they occur.
-
-    Attributes:
-        arrays: array and index of each coordinate and velocity.
-        names: parameters.
-        shapes: cache of the structure of formulas.
-        places: indices of the coordinates that occur, without repetitions.
-        constants: numbers and parameters that occur, without repetitions.
-    """
+    """Coordinates (places) and constants of a term, without repetitions, in the order in which they occur."""
 
     arrays: Mapping[Symbol, tuple[str, int]]
     names: set[Symbol]

@@ -100,7 +100,8 @@ def reparametrise(system: MechanicalSystem, time_transformation: str | Expr) -> 
             f"'{system.name}' has nonholonomic constraints, which a symplectic time transformation "
             f"does not support. Use adaptive steps (t_end=...), or {REVERSIBLE}"
         )
-    energy_symbol = _free_symbol(system)
+    taken = {symbol.name for symbol in (*system.coordinates, *system.auxiliaries, *system.parameters)}
+    energy_symbol = symbol(next(name for name in ENERGY_NAMES if name not in taken))
     rate = time_rescaling_function(system, time_transformation)
     named = replace(
         system,
@@ -161,11 +162,6 @@ def with_time_transformation(
 def _distributed(factor: Expr, total: Expr) -> Expr:
     """Return factor * total with the factor multiplied into every term, so that its powers combine."""
     return sympy.Add(*(factor * term for term in sympy.Add.make_args(total)))
-
-
-def _free_symbol(system: MechanicalSystem) -> Symbol:
-    taken = {symbol.name for symbol in (*system.coordinates, *system.auxiliaries, *system.parameters)}
-    return symbol(next(name for name in ENERGY_NAMES if name not in taken))
 
 
 MAX_SIMPLIFIED_OPERATIONS = 200

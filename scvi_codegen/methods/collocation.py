@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.method import Specification, degree_count, resolve_nodes
+from scvi_codegen.methods.method import NodalMethod, Specification, degree_count, resolve_nodes
 from scvi_codegen.methods.runge_kutta import RungeKutta, TableauMethod, check_form
 from scvi_codegen.representation import summary
 from scvi_codegen.tables import tableau as tableaux
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class SpectralCollocation(TableauMethod):
+class SpectralCollocation(TableauMethod, NodalMethod):
     """Spectral collocation (SC): (18) in position form, (21) in phase space. Neither symplectic nor reversible.
 
     Args:
@@ -42,12 +42,6 @@ class SpectralCollocation(TableauMethod):
         object.__setattr__(self, "degree", degree_count(self.degree, "the degree of spectral collocation"))
         check_form(self.form)
         object.__setattr__(self, "nodes", resolve_nodes(self.nodes, self.degree))
-
-    @property
-    def node_set(self) -> Nodes:
-        """Collocation nodes."""
-        assert isinstance(self.nodes, Nodes)
-        return self.nodes
 
     @property
     def tableau(self) -> Tableau:  # type: ignore[override]  # a property in place of a field

@@ -1,19 +1,21 @@
-"""Stoermer-Verlet, and its symmetric compositions for separable systems: explicit, symplectic, of order 8 and 10.
+"""Stoermer-Verlet, and its symmetric compositions for separable systems: explicit, symplectic, of order 4 to 10.
 
 A step of size h is s leapfrog steps of sizes gamma_1 h .. gamma_s h with sum gamma_k = 1, gamma_k = gamma_{s+1-k}:
 
     p += h (gamma_k + gamma_{k+1}) / 2 L_q(q),     q += h gamma_{k+1} M^-1 p,
 
 that is kicks and drifts in turn. Source: Hairer, Lubich & Wanner, Geometric Numerical Integration, V.3.2; coefficients
-of Kahan & Li, Math. Comp. 66 (1997), and Sofroniou & Spaletta, Optim. Methods Softw. 20 (2005).
+of Suzuki, Phys. Lett. A 146 (1990), Kahan & Li, Math. Comp. 66 (1997), and Sofroniou & Spaletta, Optim. Methods Softw.
+20 (2005).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from scvi_codegen.errors import MethodError
+from scvi_codegen.files.toml_text import package_table
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Exactness, Method, Specification
 from scvi_codegen.representation import summary
@@ -29,37 +31,8 @@ if TYPE_CHECKING:
 KICK_DRIFT_KICK, DRIFT_KICK_DRIFT = "kick-drift-kick", "drift-kick-drift"
 """Sequences of a leapfrog step: forces at both ends, shared between steps, or forces in the middle."""
 
-FIRST_HALVES = {
-    2: (),
-    8: (
-        "0.13020248308889008087881763",
-        "0.56116298177510838456196441",
-        "-0.38947496264484728640807860",
-        "0.15884190655515560089621075",
-        "-0.39590389413323757733623154",
-        "0.18453964097831570709183254",
-        "0.25837438768632204729397911",
-        "0.29501172360931029887096624",
-    ),
-    10: (
-        "0.07879572252168641926390768",
-        "0.31309610341510852776481247",
-        "0.02791838323507806610952027",
-        "-0.22959284159390709415121340",
-        "0.13096206107716486317465686",
-        "-0.26973340565451071434460973",
-        "0.07497334315589143566613711",
-        "0.11199342399981020488957508",
-        "0.36613344954622675119314812",
-        "-0.39910563013603589787862981",
-        "0.10308739852747107731580277",
-        "0.41143087395589023782070412",
-        "-0.00486636058313526176219566",
-        "-0.39203335370863990644808194",
-        "0.05194250296244964703718290",
-        "0.05066509075992449633587434",
-        "0.04967437063972987905456880",
-    ),
+FIRST_HALVES: dict[int, tuple[str, ...]] = {
+    int(order): tuple(gammas) for order, gammas in package_table("methods/compositions.toml").items()
 }
 """Coefficients gamma_1, gamma_2, .. before the middle one, which makes the sum 1; by order."""
 
@@ -69,9 +42,9 @@ class _Leapfrogs(Method):
 
     __slots__ = ()
     sequence: str
+    composition_order: int
 
-    def _check_sequence(self) -> None:
-        """Raise :class:`MethodError` for an unknown sequence."""
+    def __post_init__(self) -> None:
         if self.sequence not in (KICK_DRIFT_KICK, DRIFT_KICK_DRIFT):
             raise MethodError(f"sequence must be '{KICK_DRIFT_KICK}' or '{DRIFT_KICK_DRIFT}', not {self.sequence!r}")
 
@@ -86,14 +59,17 @@ class _Leapfrogs(Method):
         return self.sequence == DRIFT_KICK_DRIFT
 
     @property
-    def symmetric(self) -> bool:
-        """Always true."""
-        return True
+    def fractions(self) -> Vector:
+        """Fractions gamma_1 .. gamma_s of the step size, of shape (s,)."""
+        half = tuple(mp.mpf(x) for x in FIRST_HALVES[self.composition_order])
+        return (*half, 1 - 2 * mp.fsum(half), *reversed(half))
 
     @property
-    def symplectic(self) -> bool:
-        """Always true."""
-        return True
+    def order(self) -> int | None:
+        """Order of the composition, 2 for a single leapfrog step."""
+        return self.composition_order
+
+    symmetric = symplectic = True
 
     @property
     def exactness(self) -> Exactness:
@@ -116,7 +92,8 @@ class Composition(_Leapfrogs):
     """Symmetric composition of Stoermer-Verlet steps, for L = sum m_i v_i^2 / 2 - V(q, t) with constant masses.
 
     Args:
-        order: 2 (Stoermer-Verlet itself), 8 (17 stages, Kahan & Li) or 10 (35 stages, Sofroniou & Spaletta).
+        order: 2 (Stoermer-Verlet itself), 4 (5 stages, Suzuki), 6 and 8 (9 and 17, Kahan & Li) or 10 (35, Sofroniou &
+            Spaletta).
         sequence: of each step: ``"kick-drift-kick"`` or ``"drift-kick-drift"``.
 
     Raises:
@@ -126,30 +103,20 @@ class Composition(_Leapfrogs):
     composition_order: int
     sequence: str = KICK_DRIFT_KICK
 
+    implicit = False
     __repr__ = summary("composition_order", "sequence")
 
     def __post_init__(self) -> None:
-        self._check_sequence()
+        _Leapfrogs.__post_init__(self)
         order = checked_count(self.composition_order, "the order", least=2, error=MethodError)
         if order not in FIRST_HALVES:
-            raise MethodError(f"order must be 2, 8 or 10, not {order}")
+            raise MethodError(f"order must be 2, 4, 6, 8 or 10, not {order}")
         object.__setattr__(self, "composition_order", order)
 
     @classmethod
     def of(cls, order: int, sequence: str = KICK_DRIFT_KICK) -> Composition:
         """Return the composition of an order."""
         return cls(order, sequence)
-
-    @property
-    def implicit(self) -> bool:
-        """Always false."""
-        return False
-
-    @property
-    def fractions(self) -> Vector:
-        """Fractions gamma_1 .. gamma_s of the step size, of shape (s,)."""
-        half = tuple(mp.mpf(x) for x in FIRST_HALVES[self.composition_order])
-        return (*half, 1 - 2 * mp.fsum(half), *reversed(half))
 
     @property
     def name(self) -> str:
@@ -162,11 +129,6 @@ class Composition(_Leapfrogs):
         stages = len(self.fractions)
         return f"Composition of {stages} Stoermer-Verlet step{'s' * (stages > 1)}, order {self.composition_order}"
 
-    @property
-    def order(self) -> int | None:
-        """Order of the composition."""
-        return self.composition_order
-
     def specification(self) -> Specification:
         """See :meth:`Method.specification`."""
         return {"method": "composition", "order": self.composition_order, **self._named_sequence}
@@ -178,17 +140,16 @@ class StoermerVerlet(_Leapfrogs):
 
     For L = v^T M v / 2 - V(q, t) with constant M it is the leapfrog scheme, and the SVI of degree 1 with the
     trapezoidal rule; for H = T(p) + V(q, t) it is explicit, too; for other systems it is implicit. Source: Hairer,
-    Lubich & Wanner, Geometric Numerical Integration, II.2.
+    Lubich & Wanner, Geometric Numerical Integration, II.2. For rigid bodies it is explicit, too, with their free
+    rotation in place of the drift.
 
     Args:
         sequence: ``"kick-drift-kick"``, or ``"drift-kick-drift"``: for separable systems only, with forces at the
             middle of steps.
     """
 
+    composition_order: ClassVar[int] = 2  # type: ignore[misc]
     sequence: str = KICK_DRIFT_KICK
-
-    def __post_init__(self) -> None:
-        self._check_sequence()
 
     @property
     def name(self) -> str:
@@ -198,19 +159,8 @@ class StoermerVerlet(_Leapfrogs):
     @property
     def title(self) -> str:
         """Display title."""
-        if self.drifts_first:
-            return "Stoermer-Verlet (drift, kick, drift)"
-        return "Stoermer-Verlet (Lobatto IIIA-IIIB pair of two stages)"
-
-    @property
-    def order(self) -> int | None:
-        """Order 2."""
-        return 2
-
-    @property
-    def fractions(self) -> Vector:
-        """Fractions of a single leapfrog step: 1."""
-        return (mp.one,)
+        steps = "drift, kick, drift" if self.drifts_first else "Lobatto IIIA-IIIB pair of two stages"
+        return f"Stoermer-Verlet ({steps})"
 
     @property
     def parts(self) -> tuple[Part, ...]:
@@ -222,10 +172,11 @@ class StoermerVerlet(_Leapfrogs):
         return {"method": "stoermer-verlet", **self._named_sequence}
 
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
-        """Return the pair by its generating function, unknowns V_1, V_2; drift-kick-drift as leapfrog equations."""
+        """Return the pair by its generating function, unknowns V_1, V_2; explicit sequences as leapfrog equations."""
+        from scvi_codegen.mechanics.splitting import kinetic_splitting
         from scvi_codegen.methods.galerkin_stages import galerkin_system
 
-        if self.drifts_first:
+        if self.drifts_first or (system.rotations and not isinstance(kinetic_splitting(system), str)):
             return _Leapfrogs.stage_system(self, system)
         tableau = lobatto_iiia(2)
         return galerkin_system(

@@ -202,10 +202,7 @@ def _end(system: MechanicalSystem, stages: StageSystem, points: int) -> StageGro
 
 
 def _extrapolation(stages: StageSystem, abscissae: Vector) -> Matrix:
-    """Return the predictor: polynomials through the velocities of the curve and the final one; likewise multipliers.
-
-    The final velocity has the order of the step, those of the curve have not: it raises the order of the guess by one.
-    """
+    """Return the predictor by polynomials through multipliers, and velocities with the final one, of higher order."""
     blocks = stages.shape.blocks if isinstance(stages.shape, Velocities) else ()
     size, points, known = len(stages.blocks), len(abscissae), (*blocks, mp.one)
     if len(set(known)) <= size:

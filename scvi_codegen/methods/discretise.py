@@ -12,15 +12,18 @@ the method equals that of the Lagrangian, step for step: (35f) is the Legendre t
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import sympy
+from sympy import Add, Symbol
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.formulas.expressions import gradient
+from scvi_codegen.formulas.expressions import gradient_tuple
 from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, forms_of
 from scvi_codegen.mechanics.forces import nonholonomic_expressions
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.rotations.axial import Turn, axial_turns
 from scvi_codegen.mechanics.rotations.hamiltonian import hamiltonian_of_rotations
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.time_transformation import reparametrise
@@ -60,26 +63,8 @@ def discretise(system: MechanicalSystem, method: Method) -> StageSystem:
     Raises:
         MethodError: for a system that the method does not support.
     """
-    stages = method.stage_system(system)
+    stages = method.stage_system(axial_turns(system)[0])
     check_regular(method, system)
-    _check_damping(system, method, stages)
-    return _completed(system, stages, method.name)
-
-
-def paper_equations(system: MechanicalSystem, method: Method) -> StageSystem:
-    """Return the equations in the paper's notation. Raises as :func:`discretise`."""
-    check_regular(method, system)
-    return _completed(system, method.paper_form(system), method.name)
-
-
-def _completed(system: MechanicalSystem, stages: StageSystem, name: str) -> StageSystem:
-    """Add auxiliary variables, constraints and damping to the equations."""
-    completed = with_auxiliaries(system, stages)
-    completed = with_constraints(system, completed, name) if system.constraints else completed
-    return replace(completed, damping=system.damping)
-
-
-def _check_damping(system: MechanicalSystem, method: Method, stages: StageSystem) -> None:
     if system.damping != 0 and not isinstance(stages.shape, Velocities):
         raise MethodError(
             f"{method.name} does not support the damping of '{system.name}', which weights L_q and "
@@ -87,6 +72,64 @@ def _check_damping(system: MechanicalSystem, method: Method, stages: StageSystem
             'method supports damping as forces, "-gamma*p", but then areas do not shrink by exactly '
             "exp(-gamma h)"
         )
+    return _completed(system, stages, method)
+
+
+def paper_equations(system: MechanicalSystem, method: Method) -> StageSystem:
+    """Return the equations in the paper's notation. Raises as :func:`discretise`."""
+    check_regular(method, system)
+    return _completed(system, method.paper_form(axial_turns(system)[0]), method)
+
+
+def _completed(system: MechanicalSystem, stages: StageSystem, method: Method) -> StageSystem:
+    """Add auxiliary variables, constraints, damping, and the turns of axially symmetric bodies to the equations."""
+    system, turns = axial_turns(system)
+    completed = with_auxiliaries(system, stages)
+    completed = with_constraints(system, completed, method.name) if system.constraints else completed
+    completed = replace(completed, damping=system.damping)
+    return _turned(system, completed, turns) if turns else completed
+
+
+def _turned(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn]) -> StageSystem:
+    """Return the equations followed by turns of bodies: V is their change of q by h, P the momentum before them."""
+    q, size = system.coordinates, len(stages.rows)
+    u, v = (tuple(Symbol(f"{name}_{i}", real=True) for i in range(len(q))) for name in ("turn", "change"))
+    changes = [(turn.change(q, angle), turn.change(u, angle)) for turn in turns for angle in [turn.angle(q, u)]]
+    moved, pushed = (tuple(map(Add, *each)) for each in zip(*changes, strict=True))
+    one, minus, none = Table.constant(1, 1, 1), Table.constant(1, 1, -1), Table.constant(1, 1)
+    before, others = Table.joined(stages.end_position, none, none), Table.constant(1, size)
+    results = (tuple(a - b for a, b in zip(moved, v, strict=True)), (minus, none, none)), (pushed, (none, none, one))
+    group = StageGroup(
+        name="spin",
+        abscissae=(mp.one,),
+        gathers=(
+            Gather(arguments=q, table=before, power=0),
+            Gather(arguments=u, table=Table.joined(none, others, none, one), power=0),
+            Gather(arguments=v, table=Table.joined(none, others, one, none), power=0),
+        ),
+        scatters=tuple(
+            Scatter(results=each, table=Table.joined(others, *columns), power=-1)
+            for each, columns in (*results, (u, (none, minus, none)))
+        ),
+        computes="Changes of q and u = h p by turns about axes of symmetry, less v, and u",
+    )
+    still = (mp.zero, mp.zero)
+    spin = Block(name="V_spin", power=1, straight=still)
+    last = Row(number="P_spin", kind="IDEL", momentum=stages.end_momentum)
+    return replace(
+        stages,
+        blocks=(*stages.blocks, spin, Block(name="P_spin", power=1, straight=still, momentum=1, moves=False)),
+        rows=(*stages.rows, Row(number="V_spin", kind="stage", momentum=mp.zero), last),
+        stage_groups=(*(_reaching(each, size) for each in stages.stage_groups), group),
+        end_position=Table.joined(stages.end_position, one, none),
+        extrapolation=stages.extrapolation and _diagonal([stages.extrapolation, identity_matrix(2)]),
+    )
+
+
+def _reaching(group: StageGroup, size: int) -> StageGroup:
+    """Return a stage group that adds to the momentum before the turns what it adds to p1."""
+    wide, order = group.widened(2), [*range(size + 1), -1, -1]
+    return replace(wide, scatters=tuple(replace(each, table=each.table.columns(order)) for each in wide.scatters))
 
 
 def check_regular(method: Method, system: MechanicalSystem) -> None:
@@ -129,11 +172,12 @@ def with_auxiliaries(system: MechanicalSystem, stages: StageSystem) -> StageSyst
         return stages
     added = [(g, n) for g, group in enumerate(groups) for n in range(len(group.guess))]
     rows = (*stages.rows, *(Row(number="35f", kind="stage", momentum=mp.zero) for _ in added))
-    guesses = [group.guess for group in groups]
+    auxiliary = partial(Block, power=1, straight=(mp.zero, mp.zero), moves=False)
+    blocks = [auxiliary(name=f"{groups[g].name}_{n + 1}", momentum=int(groups[g].momenta)) for g, n in added]
     number_q, number_p = stages.end_numbers
     return replace(
         stages,
-        blocks=(*stages.blocks, *(_block(groups[g], n) for g, n in added)),
+        blocks=(*stages.blocks, *blocks),
         rows=tuple(replace(row, number=NUMBERS.get(row.number, row.number)) for row in rows),
         stage_groups=tuple(
             _extended(stage_group, [g for g, group in enumerate(groups) if group.stage_group == f], groups, added)
@@ -141,7 +185,7 @@ def with_auxiliaries(system: MechanicalSystem, stages: StageSystem) -> StageSyst
         ),
         end_position=Table.joined(stages.end_position, Table.constant(1, len(added))),
         end_numbers=(NUMBERS.get(number_q, number_q), NUMBERS.get(number_p, number_p)),
-        extrapolation=stages.extrapolation and _diagonal([stages.extrapolation, *guesses]),
+        extrapolation=stages.extrapolation and _diagonal([stages.extrapolation, *(group.guess for group in groups)]),
     )
 
 
@@ -158,23 +202,9 @@ def _groups(system: MechanicalSystem, f: int, stage_group: StageGroup) -> Iterat
         if free & set(symbols):
             momenta = symbols == system.auxiliaries
             name = BLOCK_NAMES[stage_group.name] if momenta else "nu"
-            results = _stationary(system, stage_group, symbols)
+            scalar = stage_group.scalar
+            results = forms_of(system).constitutive if scalar is None else gradient_tuple(scalar, symbols)
             yield _Group(stage_group=f, name=name, momenta=momenta, symbols=symbols, results=results, guess=guess)
-
-
-def _stationary(
-    system: MechanicalSystem, stage_group: StageGroup, symbols: Sequence[sympy.Symbol]
-) -> tuple[sympy.Expr, ...]:
-    """Return the equations of these symbols: the gradient of the group's scalar, or v - H_p if it has none."""
-    if stage_group.scalar is None:
-        return forms_of(system).constitutive
-    derivatives = gradient(stage_group.scalar, symbols)
-    return tuple(derivatives.get(i, sympy.S.Zero) for i in range(len(symbols)))
-
-
-def _block(group: _Group, n: int) -> Block:
-    straight = (mp.zero, mp.zero)
-    return Block(name=f"{group.name}_{n + 1}", power=1, straight=straight, momentum=int(group.momenta), moves=False)
 
 
 def _extended(
@@ -182,9 +212,8 @@ def _extended(
 ) -> StageGroup:
     """Return a stage group with the gathers and scatters of its ``numbers`` groups; columns of the others are 0."""
     points, rows = len(stage_group.abscissae), len(stage_group.scatters[0].table.entries[0]) - 1
-    none = Table.constant(points, len(added))
-    gathers = [replace(gather, table=Table.joined(gather.table, none)) for gather in stage_group.gathers]
-    scatters = [replace(scatter, table=_inserted(scatter.table, none, rows)) for scatter in stage_group.scatters]
+    wide = stage_group.widened(len(added))
+    gathers, scatters = [*wide.gathers], [*wide.scatters]
     known = Table.constant(points, len(stage_group.gathers[0].table.entries[0]))
     before, last = Table.constant(points, rows), Table.constant(points, 1)
     for g in numbers:
@@ -192,11 +221,6 @@ def _extended(
         gathers.append(Gather(arguments=groups[g].symbols, table=Table.joined(known, selection), power=-1))
         scatters.append(Scatter(results=groups[g].results, table=Table.joined(before, selection, last), power=0))
     return replace(stage_group, gathers=tuple(gathers), scatters=tuple(scatters))
-
-
-def _inserted(table: Table, columns: Table, at: int) -> Table:
-    """Insert ``columns`` before the last column of ``table``, that of p1."""
-    return Table.joined(table.columns(range(at)), columns, table.columns([at]))
 
 
 def _diagonal(blocks: Sequence[Matrix]) -> Matrix:

@@ -20,7 +20,7 @@ from scvi_codegen.errors import MethodError, MethodWarning, warn
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import (
     Exactness,
-    Method,
+    NodalMethod,
     Specification,
     degree_count,
     resolve_nodes,
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class SVI(Method):
+class SVI(NodalMethod):
     """Galerkin spectral variational integrator of a polynomial degree, with any quadrature.
 
     Symplectic, conserves the momentum maps of affine symmetries to round-off, of order 2s by default and
@@ -69,6 +69,7 @@ class SVI(Method):
     nodes: Nodes | str | None = None
     space: CurveSpace | str | None = None
 
+    symplectic = True
     __repr__ = summary("degree", "quadrature", "space")
 
     def __post_init__(self) -> None:
@@ -100,12 +101,6 @@ class SVI(Method):
         return self.curves.along(self.quadrature)
 
     @property
-    def node_set(self) -> Nodes:
-        """Nodes of the paper's parametrisation."""
-        assert isinstance(self.nodes, Nodes)
-        return self.nodes
-
-    @property
     def name(self) -> str:
         """Name ``svi-<degree>-<quadrature>[-<curves>]``."""
         suffix = [] if self.curves.nodal else [self.curves.name]
@@ -134,11 +129,6 @@ class SVI(Method):
     def symmetric(self) -> bool:
         """True if both the quadrature and the space of curves are symmetric."""
         return self.rule.symmetric and self.curves.symmetric
-
-    @property
-    def symplectic(self) -> bool:
-        """Always true."""
-        return True
 
     @property
     def needs_regular(self) -> bool:

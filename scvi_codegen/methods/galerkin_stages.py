@@ -203,17 +203,20 @@ def phase_space_system(system: MechanicalSystem, tableau: Tableau) -> StageSyste
     """Return (22) on Hamilton's equations, with momenta eliminated by p_i = L_v(q_i, V_i)."""
     size = len(tableau.b)
     gathers = curve_gathers(system, tableau.A, (identity_matrix(size),))
-    group = StageGroup(name="stage", abscissae=tableau.c, gathers=gathers, scatters=())
     b_column = Table(entries=tuple((x,) for x in tableau.b), names=tuple((f"b_{n + 1}",) for n in range(size)))
     return StageSystem(
         blocks=tuple(Block(name=f"V_{i}", power=1, straight=(mp.zero, mp.one)) for i in range(1, size + 1)),
         rows=tuple(Row(number="22", kind="stage", momentum=mp.one) for _ in range(size)),
         stage_groups=(
-            lagrangian_scatters(
-                group,
-                system,
-                Scatter(results=(), table=Table.joined(Table.named("a", tableau.A).transposed, b_column), power=1),
-                Scatter(results=(), table=Table.joined(Table.identity(size, -1), Table.constant(size, 1)), power=0),
+            StageGroup(
+                name="stage",
+                abscissae=tableau.c,
+                gathers=gathers,
+                scatters=lagrangian_scatters(
+                    system,
+                    Table.joined(Table.named("a", tableau.A).transposed, b_column),
+                    Table.joined(Table.identity(size, -1), Table.constant(size, 1)),
+                ),
             ),
         ),
         end_position=Table.joined(Table.constant(1, 1, 1), b_column.transposed),
@@ -232,14 +235,7 @@ def phase_space_system(system: MechanicalSystem, tableau: Tableau) -> StageSyste
     )
 
 
-def lagrangian_scatters(
-    group: StageGroup, system: MechanicalSystem, force_scatter: Scatter, momentum_scatter: Scatter
-) -> StageGroup:
-    """Return ``group`` with L_q and L_v as kernel results, which fill in the ``results`` of these scatters."""
-    return replace(
-        group,
-        scatters=(
-            replace(force_scatter, results=forms_of(system).force),
-            replace(momentum_scatter, results=forms_of(system).momentum),
-        ),
-    )
+def lagrangian_scatters(system: MechanicalSystem, force: Table, momentum: Table) -> tuple[Scatter, Scatter]:
+    """Return L_q and L_v as kernel results, scattered by these tables."""
+    forms = forms_of(system)
+    return Scatter(results=forms.force, table=force, power=1), Scatter(results=forms.momentum, table=momentum, power=0)

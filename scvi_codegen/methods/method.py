@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from scvi_codegen.display.cards import card, plain
 from scvi_codegen.errors import MethodError
@@ -117,10 +117,7 @@ class Method(ABC):
 
     @property
     def fractions(self) -> Vector:
-        """Fractions of h of the leapfrog steps that form a step for separable L; empty for other methods.
-
-        A method with fractions is explicit for separable L.
-        """
+        """Fractions of h of the leapfrog steps that form an explicit step for separable L; empty for other methods."""
         return ()
 
     @property
@@ -176,38 +173,46 @@ class Method(ABC):
         """Return the equations in the paper's notation."""
 
 
+Kind = TypeVar("Kind")
+
+
+class NodalMethod(Method):
+    """Method with the nodes of a polynomial, resolved when it is constructed."""
+
+    __slots__ = ()
+    nodes: Nodes | str | None
+
+    @property
+    def node_set(self) -> Nodes:
+        """Nodes of the curve of a step."""
+        assert isinstance(self.nodes, Nodes)
+        return self.nodes
+
+
+def _resolved(value: object, kind: type[Kind], by_name: Callable[[str], Kind], what: str, example: str) -> Kind:
+    """Return an object of a kind, or the one of a name."""
+    found = by_name(value) if isinstance(value, str) else value
+    if not isinstance(found, kind):
+        raise MethodError(f"{what} {kind.__name__}, or a name such as '{example}', not {found!r}")
+    return found
+
+
 def resolve_quadrature(quadrature: Quadrature | str | None, degree: int) -> Quadrature:
     """Return a quadrature from an object or a name; by default ``degree`` Gauss points."""
-    if quadrature is None:
-        return gauss_legendre(degree)
-    if isinstance(quadrature, str):
-        return quadrature_by_name(quadrature)
-    if not isinstance(quadrature, Quadrature):
-        raise MethodError(
-            f"quadrature must be a Quadrature, or a name such as 'gauss-legendre:{degree}', not {quadrature!r}"
-        )
-    return quadrature
+    rule = gauss_legendre(degree) if quadrature is None else quadrature
+    return _resolved(rule, Quadrature, quadrature_by_name, "quadrature must be a", f"gauss-legendre:{degree}")
 
 
 def resolve_space(space: CurveSpace | str | None) -> CurveSpace:
     """Return a space of trial curves from an object or a name; by default polynomials."""
-    if space is None:
-        return Polynomials()
-    if isinstance(space, str):
-        return space_by_name(space)
-    if not isinstance(space, CurveSpace):
-        raise MethodError(f"space must be a CurveSpace, or a name such as 'splines:2', not {space!r}")
-    return space
+    chosen = Polynomials() if space is None else space
+    return _resolved(chosen, CurveSpace, space_by_name, "space must be a", "splines:2")  # type: ignore[type-abstract]
 
 
 def resolve_nodes(nodes: Nodes | str | None, degree: int) -> Nodes:
     """Return nodes from an object or a name, checked to contain both ends; by default Chebyshev-Lobatto nodes."""
-    if nodes is None:
-        nodes = "chebyshev-lobatto"
-    if isinstance(nodes, str):
-        nodes = nodes_by_name(nodes, degree)
-    if not isinstance(nodes, Nodes):
-        raise MethodError(f"nodes must be Nodes, or a name such as 'chebyshev-lobatto', not {nodes!r}")
+    named, example = partial(nodes_by_name, degree=degree), "chebyshev-lobatto"
+    nodes = _resolved(example if nodes is None else nodes, Nodes, named, "nodes must be", example)
     if nodes.degree != degree:
         raise MethodError(
             f"nodes of degree {nodes.degree} do not match a curve of degree {degree}: give nodes of degree {degree}"

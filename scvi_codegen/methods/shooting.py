@@ -24,7 +24,7 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import (
     Exactness,
-    Method,
+    NodalMethod,
     Specification,
     degree_count,
     resolve_nodes,
@@ -46,7 +46,7 @@ COLLOCATION_TABLEAUX = ("gauss", "radau-iia", "lobatto-iiia", "chebyshev-gauss",
 
 
 @dataclass(frozen=True, slots=True)
-class SCVI(Method):
+class SCVI(NodalMethod):
     """Shooting-based spectral-collocation variational integrator.
 
     Args:
@@ -101,12 +101,6 @@ class SCVI(Method):
         """Quadrature of the action."""
         assert isinstance(self.quadrature, Quadrature)
         return self.quadrature
-
-    @property
-    def node_set(self) -> Nodes:
-        """Collocation nodes; unused with ``abscissae``."""
-        assert isinstance(self.nodes, Nodes)
-        return self.nodes
 
     @property
     def tableau(self) -> Tableau:

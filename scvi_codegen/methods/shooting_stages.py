@@ -25,7 +25,6 @@ from scvi_codegen.methods.stage_system import (
     Gather,
     Row,
     ScalarStageGroup,
-    Scatter,
     StageGroup,
     StageSystem,
     Table,
@@ -111,10 +110,7 @@ def _multiplier_group(system: MechanicalSystem, tableau: Tableau, *, rounded: bo
 
 
 def _curve(tableau: Tableau, rule: Quadrature) -> tuple[Matrix, tuple[Matrix, ...], Vector]:
-    """Return the polynomial through V_i = v0 + sum a_ij z_j at the points of ``rule``.
-
-    The result is the rows of q / h; of v and h^k d^k v/dt^k for each derivative of the rule; the row of q1 / h.
-    """
+    """Return rows of q/h, of v and h^k d^k v/dt^k of the rule, and of q1/h, for V_i = v0 + sum a_ij z_j."""
     curves, at = Polynomials(), rule.abscissae
     moved = tuple((mp.one, *line) for line in tableau.A)
     velocities = tuple(
@@ -137,23 +133,16 @@ def printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrat
         first, both = [(line[0],) for line in lines], [(line[0] + line[-1],) for line in lines]
         return Table.joined(Table.named(name, first), none, Table.named(name, both, column=2))
 
-    quadrature = lagrangian_scatters(
-        StageGroup(
-            name="quadrature",
-            abscissae=rule.abscissae,
-            weights=rule.unit_weights,
-            weight_names=tuple(f"w_{n}" for n in range(1, points + 1)),
-            gathers=curve_gathers(system, position_rows, velocities, names=("r", "u"), first=0),
-            scatters=(),
-        ),
-        system,
-        Scatter(results=(), table=first_and_sum("s1", values), power=1),
-        Scatter(results=(), table=first_and_sum("s2", derivative_values), power=0),
+    quadrature = StageGroup(
+        name="quadrature",
+        abscissae=rule.abscissae,
+        weights=rule.unit_weights,
+        weight_names=tuple(f"w_{n}" for n in range(1, points + 1)),
+        gathers=curve_gathers(system, position_rows, velocities, names=("r", "u"), first=0),
+        scatters=lagrangian_scatters(system, first_and_sum("s1", values), first_and_sum("s2", derivative_values)),
     )
     inner = Table.joined(Table.constant(size, 1), Table.identity(size), Table.constant(size, 1))
-    node = residual_group(
-        system, tableau.c, acceleration_gathers(system, tableau.A), Scatter(results=(), table=inner, power=1)
-    )
+    node = residual_group(system, tableau.c, acceleration_gathers(system, tableau.A), inner, power=1)
     return StageSystem(
         blocks=acceleration_unknowns(size),
         rows=(
@@ -173,9 +162,7 @@ def shooting_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> 
     """Return the stationarity of G = L_d + sum lambda_i . E_i in the paper's Q^1 .. Q^s, v0, lambda_1 .. lambda_s."""
     size = nodes.degree
     multiplier_gather = Gather(
-        arguments=multipliers(system),
-        table=Table.joined(Table.constant(size, 2 + size), Table.identity(size)),
-        power=0,
+        arguments=multipliers(system), table=Table.joined(Table.constant(size, 2 + size), Table.identity(size)), power=0
     )
     node = ScalarStageGroup(
         name="node",
@@ -213,12 +200,8 @@ def printed_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> S
         return Table.joined(none, table.columns([0]), table.columns([size]))
 
     quadrature = action.to_stage_group([ends(gather.table) for gather in action.gathers])
-    node = residual_group(
-        system,
-        nodes.abscissae[1:],
-        nodal_gathers(system, nodes),
-        Scatter(results=(), table=Table.joined(Table.identity(size), Table.constant(size, 2)), power=0),
-    )
+    inner = Table.joined(Table.identity(size), Table.constant(size, 2))
+    node = residual_group(system, nodes.abscissae[1:], nodal_gathers(system, nodes), inner)
     return StageSystem(
         blocks=nodal_blocks(nodes),
         rows=(

@@ -21,10 +21,11 @@ There are two parametrisations of the same method. The *paper's* has the positio
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import count
+from typing import Any
 
 import sympy
 
@@ -193,6 +194,14 @@ class StageGroup(StagePoints):
         """Results of the kernel, scatter after scatter."""
         return sum((scatter.results for scatter in self.scatters), ())
 
+    def widened(self, count: int) -> StageGroup:
+        """Return the group with columns of 0 for ``count`` further blocks, and for as many rows before that of p1."""
+        none, before = Table.constant(len(self.abscissae), count), range(len(self.scatters[0].table.entries[0]) - 1)
+        gathers = (replace(each, table=Table.joined(each.table, none)) for each in self.gathers)
+        tables = (Table.joined(x.table.columns(before), none, x.table.columns([-1])) for x in self.scatters)
+        scatters = (replace(each, table=table) for each, table in zip(self.scatters, tables, strict=True))
+        return replace(self, gathers=tuple(gathers), scatters=tuple(scatters))
+
 
 class Shape:
     """Base class of the structure used by matrix-free solvers: :mod:`scvi_codegen.methods.stage_structure`."""
@@ -261,12 +270,7 @@ class ScalarStageGroup(StagePoints):
     def to_stage_group(self, tables: Sequence[Table]) -> StageGroup:
         """Return the stage group with its gradient as kernel, scattered through ``tables`` (one per gather)."""
         scatters = tuple(
-            Scatter(
-                results=results,
-                table=table,
-                power=1 + self.power + gather.power,
-                scale=self.scale * gather.scale,
-            )
+            Scatter(results=results, table=table, power=1 + self.power + gather.power, scale=self.scale * gather.scale)
             for (gather, results), table in zip(self.derivatives(), tables, strict=True)
         )
         return StageGroup(
@@ -350,6 +354,16 @@ def stationary_nodal(
         end_momentum=mp.zero,
         end_numbers=end_numbers,
     )
+
+
+def straight(stages: StageSystem, q: Any, v: Any, p: Any, h: Any, number: Callable[[Any], Any] = float) -> list[Any]:
+    """Return an initial guess of each block of unknowns: the straight line from (q, p) with velocity v."""
+    return [
+        number(block.straight[0]) * q + number(block.straight[1]) * h ** (1 - block.power) * v + block.momentum * p
+        if block.size is None
+        else 0 * q[: block.size]
+        for block in stages.blocks
+    ]
 
 
 def unit_sum(weights: Sequence[Number]) -> Vector:

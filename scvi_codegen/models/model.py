@@ -59,7 +59,7 @@ class Model(TimeSpan):
         h, tolerance, error, span, steps, save_every, t, time_transformation: as of
             :class:`~scvi_codegen.models.time_span.TimeSpan`.
         inputs: by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as :meth:`Stepper.integrate` accepts
-            it; a run requires all inputs of the system.
+            it, or a number; a run requires all inputs of the system.
         fields: arrays of parameters by name, for array sizes known at run time; others keep their default value.
         tables: index tables of shape (rows, columns) by name, for array sizes known at run time.
         events: zero crossings that runs record, which may change the state.
@@ -76,7 +76,7 @@ class Model(TimeSpan):
     p: Any = None
     velocity: Any = None
     solver: str = "auto"
-    inputs: Mapping[str, InputTable] = field(default_factory=dict)
+    inputs: Mapping[str, InputTable | float] = field(default_factory=dict)
     fields: Mapping[str, Any] = field(default_factory=dict)
     tables: Mapping[str, Any] = field(default_factory=dict)
     events: tuple[Event, ...] = ()
@@ -171,7 +171,8 @@ class Model(TimeSpan):
         """Array sizes known at run time, by name; empty for a system of named coordinates."""
         if (system := self.array_system) is None:
             return {}
-        known = {**self.q, **self.fields, **self.tables}
+        of_rotations = {name: each.as_quat() for name, each in self.q.items() if hasattr(each, "as_quat")}
+        known = {**self.q, **self.fields, **self.tables, **of_rotations}
         arrays = [array for array in system.arrays if array.name in known]
         axes = [(array, np.shape(known[array.name])) for array in arrays]
         return {size.name: length for array, shape in axes for size, length in zip(array.axes, shape) if size.name}  # noqa: B905
@@ -189,9 +190,12 @@ class Model(TimeSpan):
         if (system := self.array_system) is None:
             return self
         known = unroll_sums(system, self.sizes, tables=self.tables, parameters=self.fields)
-        vectors = {name: _flat(system, getattr(self, name)) for name in STATE if getattr(self, name) is not None}
-        if len(vectors) == 1:
-            vectors["p" if system.momenta else "velocity"] = (0.0,) * len(vectors["q"])
+        vectors = {name: getattr(self, name) for name in STATE if getattr(self, name) is not None}
+        if not system.rotations:
+            order = [array.name for array in system.coordinates]
+            vectors = {key: [x for name in order for x in np.ravel(each[name])] for key, each in vectors.items()}
+        if len(vectors) == 1 and not any(each.declaration.startswith("spin") for each in known.rotations):
+            vectors["p" if known.auxiliaries else "velocity"] = (0.0,) * known.dimension
         changed: dict[str, Any] = {"fields": {}, "tables": {}, **vectors}
         return replace(self, system=known, **changed)
 
@@ -287,7 +291,7 @@ class Model(TimeSpan):
 
         return final_time(self.t, self.h, self.steps, None if self.span is None else self.t + self.covered)
 
-    def all_inputs(self) -> Mapping[str, InputTable]:
+    def all_inputs(self) -> Mapping[str, InputTable | float]:
         """Return the inputs; ModelFileError unless all inputs of the system are given."""
         for name in self.system.inputs:
             if name not in self.inputs:
@@ -378,11 +382,6 @@ class Model(TimeSpan):
         values = tuple(values)
         check_length(values, names, name)
         return tuple(real(value, f"{name}[{i}] ({names[i]})") for i, value in enumerate(values))
-
-
-def _flat(system: ArraySystem, state: Mapping[str, Any]) -> tuple[float, ...]:
-    """Return the entries of all coordinate arrays in order."""
-    return tuple(float(x) for array in system.coordinates for x in np.ravel(state[array.name]))
 
 
 def _equal(one: Any, other: Any) -> bool:

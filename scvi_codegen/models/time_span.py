@@ -87,7 +87,7 @@ class TimeSpan:
                 "the number of steps in tau for a time span is not known in advance: give steps (--steps)"
             )
         assert self.span is not None  # by construction
-        return steps_in(self.span, step)
+        return round(self.span / abs(step)) if is_whole(self.span, step) else math.ceil(self.span / abs(step))
 
     def whole_step_count(self) -> int:
         """Return the number of steps of a run that cannot end with a shorter step; see :func:`whole_steps_in`."""
@@ -139,11 +139,6 @@ def is_whole(span: float, h: float) -> bool:
 
     steps = span / abs(h)
     return round(steps) > 0 and abs(steps - round(steps)) <= WHOLE * max(1.0, steps)
-
-
-def steps_in(span: float, h: float) -> int:
-    """Return the number of steps in a span of which the last may be shorter."""
-    return round(span / abs(h)) if is_whole(span, h) else math.ceil(span / abs(h))
 
 
 def whole_steps_in(span: float, h: float, t: float) -> int:

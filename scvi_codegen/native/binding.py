@@ -100,10 +100,7 @@ class Binding:
         return hasattr(self._lib, f"{self._prefix}_{name}")
 
     def _with_fallback(self, function: Callable[..., Any], *changed: Any) -> Callable[..., Any]:
-        """Return the function; a call that requests the fallback is repeated with it, on the initial memory.
-
-        Its last argument is the workspace.
-        """
+        """Return the function of a workspace, called again on the initial memory if it requests the fallback."""
         memory = self._ffi.buffer(*changed) if changed else bytearray()
 
         def call(*arguments: Any) -> Any:
@@ -175,8 +172,7 @@ class Binding:
         if options is None or checked_options(options) is None:
             return self.null
         return self._ffi.new(
-            f"{self._prefix}_options *",
-            [options.tolerance, options.max_iterations, int(options.absolute)],
+            f"{self._prefix}_options *", [options.tolerance, options.max_iterations, int(options.absolute)]
         )
 
 

@@ -205,6 +205,8 @@ def fingerprint(source: Source, *, flags: tuple[str, ...]) -> str:
         BuildError: without a compiler.
     """
     compiler = find_compiler()
+    # whether any flag selects the instructions of this processor (-march, -mcpu, -mtune)
+    tuned = "=native" in " ".join((*compiler, *flags, os.environ.get(FLAGS_VARIABLE, "")))
     parts = [
         json.dumps([each.to_record() for each in source.sources]),
         json.dumps(compiler),
@@ -213,14 +215,9 @@ def fingerprint(source: Source, *, flags: tuple[str, ...]) -> str:
         os.environ.get(FLAGS_VARIABLE, ""),
         _cffi_backend.__version__,
         _commands(),
-        _processor() if _tuned(compiler, flags) else platform.machine(),
+        _processor() if tuned else platform.machine(),
     ]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
-
-
-def _tuned(compiler: tuple[str, ...], flags: tuple[str, ...]) -> bool:
-    """Return whether any flag selects the instructions of this processor (-march, -mcpu, -mtune)."""
-    return "=native" in " ".join((*compiler, *flags, os.environ.get(FLAGS_VARIABLE, "")))
 
 
 @cache

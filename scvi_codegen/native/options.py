@@ -92,14 +92,7 @@ def checked_options(options: SolverOptions | None) -> SolverOptions | None:
     return options
 
 
-def step_failure(
-    status: int,
-    report: Any,
-    *,
-    step: int,
-    h: float,
-    remark: str = "",
-) -> StepFailedError:
+def step_failure(status: int, report: Any, *, step: int, h: float, remark: str = "") -> StepFailedError:
     """Return the exception for a failed step: number, time, step size (0: adaptive), cause, remedy and a remark.
 
     The report may have messages of its own, ``failures``.

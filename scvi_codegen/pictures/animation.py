@@ -72,7 +72,14 @@ def shape_of(motion: DrawnMotion, positions: Callable[[Array], Array] | None = N
     """
     coordinates, m = motion.stepper.interface.coordinates, motion.q.shape[1]
     if positions is not None:
-        return _given(motion, positions)
+        tried = np.shape(positions(motion.q[:1]))
+        if len(tried) != 3 or tried[0] != 1 or tried[2] not in (2, 3):
+            raise StateError(f"positions(q) must have shape (n, k, 2) or (n, k, 3); for n = 1 it has {tried}")
+        return MovingPoints(
+            points=lambda q, p: np.asarray(positions(q), dtype=float),
+            labels=tuple("xyz"[: tried[2]]),
+            trails=tuple(range(tried[1])),
+        )
     if motion.stepper.interface.rotations:
         return _solids(motion)
     if result := bodies(coordinates):
@@ -97,17 +104,6 @@ def shape_of(motion: DrawnMotion, positions: Callable[[Array], Array] | None = N
         labels=("number of the coordinate", "q"),
         joined=True,
         equal=False,
-    )
-
-
-def _given(motion: DrawnMotion, positions: Callable[[Array], Array]) -> MovingPoints:
-    tried = np.shape(positions(motion.q[:1]))
-    if len(tried) != 3 or tried[0] != 1 or tried[2] not in (2, 3):
-        raise StateError(f"positions(q) must have shape (n, k, 2) or (n, k, 3); for n = 1 it has {tried}")
-    return MovingPoints(
-        points=lambda q, p: np.asarray(positions(q), dtype=float),
-        labels=tuple("xyz"[: tried[2]]),
-        trails=tuple(range(tried[1])),
     )
 
 
@@ -146,11 +142,8 @@ def _pendulum(lengths: Array, sign: float) -> MovingPoints:
 
 
 def _hanging(motion: DrawnMotion) -> float | None:
-    """Return 1 if the coordinates are angles of pendulums that hang at 0, -1 if they are upright there, else ``None``.
-
-    The potential energy must be that of weights, sum a_i (1 - cos q_i) with all a_i of one sign, and neighbours must be
-    coupled: the kinetic energy of two momenta must not be the sum of that of each.
-    """
+    """Return 1 if the coordinates are angles of pendulums that hang at 0, -1 if upright there, else ``None``."""
+    # V = sum a_i (1 - cos q_i), all a_i of one sign; T of two neighbouring momenta is not the sum of that of each.
     numbers, m = _numbers(motion.stepper.interface.coordinates), motion.q.shape[1]
     if m > MAX_RODS or (m > 1 and numbers is None):
         return None
@@ -307,7 +300,17 @@ class _Scene:
         self.drawn_points = shape.points(motion.q, motion.p)
         dimension = self.drawn_points.shape[2]
         self.axes: Axes = figure.add_subplot(projection="3d" if dimension == 3 else None)
-        self._set_limits(dimension)
+        flat = self.drawn_points.reshape(-1, dimension)
+        flat = flat[np.isfinite(flat).all(axis=1)]
+        low, high = flat.min(axis=0), flat.max(axis=0)
+        half = (high - low) / 2
+        if self.shape.equal:
+            half[:] = half.max()
+        half = np.where(half > 0.0, half, 1.0) * (1.0 + 2 * MARGIN)
+        for letter, label, middle, size in zip("xyz", self.shape.labels, (low + high) / 2, half, strict=False):
+            self.axes.set(**{f"{letter}lim": (middle - size, middle + size), f"{letter}label": label})
+        if self.shape.equal:
+            self.axes.set_aspect("equal")
         nothing: list[list[float]] = [[]] * dimension
         self.trails = [self.axes.plot(*nothing, color=color(k), linewidth=1.0, alpha=0.5)[0] for k in shape.trails]
         alone: list[Any] = [slice(None)] if shape.joined else list(range(self.drawn_points.shape[1]))
@@ -321,19 +324,6 @@ class _Scene:
         ]
         if shape.names:
             self.axes.legend(loc="upper right", fontsize=8)
-
-    def _set_limits(self, dimension: int) -> None:
-        flat = self.drawn_points.reshape(-1, dimension)
-        flat = flat[np.isfinite(flat).all(axis=1)]
-        low, high = flat.min(axis=0), flat.max(axis=0)
-        half = (high - low) / 2
-        if self.shape.equal:
-            half[:] = half.max()
-        half = np.where(half > 0.0, half, 1.0) * (1.0 + 2 * MARGIN)
-        for letter, label, middle, size in zip("xyz", self.shape.labels, (low + high) / 2, half, strict=False):
-            self.axes.set(**{f"{letter}lim": (middle - size, middle + size), f"{letter}label": label})
-        if self.shape.equal:
-            self.axes.set_aspect("equal")
 
     def show(self, frame: int) -> list[Any]:
         """Show the state of a frame, and its trails."""

@@ -59,7 +59,7 @@ def plot_arrays(
 
     Args:
         trajectory: result of :meth:`Stepper.integrate`.
-        path, ax: as of :func:`~scvi_codegen.pictures.paths.plot_motion`.
+        path, ax: as of :func:`~scvi_codegen.pictures.overview.plot_motion`.
         array: name of the array or field; by default the first.
         state: index of the state drawn of two indices.
 
@@ -112,11 +112,7 @@ def _draw_positions(drawn: Axes, values: NDArray[np.float64], name: str) -> None
 
 @checks_arguments(trajectory=ARRAYS, ax=CANVAS)
 def plot_spectrum(
-    trajectory: Any,
-    path: str | os.PathLike[str] | None = None,
-    *,
-    field: str | None = None,
-    ax: Axes | None = None,
+    trajectory: Any, path: str | os.PathLike[str] | None = None, *, field: str | None = None, ax: Axes | None = None
 ) -> Axes:
     """Draw the spectrum of a field on a mesh in the first and last state: squared amplitudes of the modes of each axis.
 

@@ -8,17 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.pictures.canvas import (
-    MOTION,
-    Array,
-    DrawnMotion,
-    check_plot_path,
-    color,
-    new_figure,
-    plain,
-    save,
-    style,
-)
+from scvi_codegen.pictures.canvas import MOTION, Array, DrawnMotion, color, panel, plain
 from scvi_codegen.validation import CANVAS, WHOLE, checks_arguments
 
 if TYPE_CHECKING:
@@ -66,10 +56,7 @@ def plot_attitude(
         raise StateError(f"axis must be 1, 2 or 3, not {axis}")
     if not (vectors := unit_vectors(trajectory, axis)):
         raise StateError(f"'{trajectory.stepper.interface.system}' has no rotation, direction or spin to draw")
-    if path is not None:
-        check_plot_path(path)
-    with style():
-        drawn = new_figure(path, (4.8, 4.8)).add_subplot(projection="3d") if ax is None else ax
+    with panel(path, ax, (4.8, 4.8), "3d") as drawn:
         for latitude in np.deg2rad(np.arange(-60, 90, 30)):
             radius, height = np.cos(latitude), np.full(len(CIRCLE), np.sin(latitude))
             drawn.plot(radius * np.cos(CIRCLE), radius * np.sin(CIRCLE), height, color="0.85", linewidth=0.5)
@@ -84,8 +71,6 @@ def plot_attitude(
         drawn.set(xlabel="x", ylabel="y", zlabel="z", title=plain(trajectory.stepper.interface.system))
         drawn.set_aspect("equal")
         drawn.legend(loc="upper right", fontsize=8)
-        if path is not None:
-            save(drawn.get_figure(root=True), path)
     return drawn
 
 

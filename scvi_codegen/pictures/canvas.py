@@ -82,13 +82,16 @@ def new_figure(path: str | os.PathLike[str] | None, size: tuple[float, float]) -
 
 @contextmanager
 def panel(
-    path: str | os.PathLike[str] | None, ax: Axes | None, size: tuple[float, float] = (5.6, 4.4)
+    path: str | os.PathLike[str] | None,
+    ax: Axes | None,
+    size: tuple[float, float] = (5.6, 4.4),
+    projection: str | None = None,
 ) -> Iterator[Axes]:
     """Yield the axes to draw on, ``ax`` or new ones; write the picture to ``path`` if there is one."""
     if path is not None:
         check_plot_path(path)
     with style():
-        drawn = new_figure(path, size).add_subplot() if ax is None else ax
+        drawn = new_figure(path, size).add_subplot(projection=projection) if ax is None else ax
         yield drawn
         if path is not None:
             save(drawn.get_figure(root=True), path)

@@ -70,10 +70,10 @@ def plot_energy(
 
     Args:
         trajectories: one or several trajectories, also of array systems.
-        path, ax: as of :func:`~scvi_codegen.pictures.paths.plot_motion`.
+        path, ax: as of :func:`~scvi_codegen.pictures.overview.plot_motion`.
 
     Raises:
-        StateError, PlotError: as :func:`~scvi_codegen.pictures.paths.plot_motion`.
+        StateError, PlotError: as :func:`~scvi_codegen.pictures.overview.plot_motion`.
     """
     with panel(path, ax) as drawn:
         draw_energy_error(drawn, several(trajectories)[0])
@@ -90,10 +90,10 @@ def plot_momentum_maps(
 
     Args:
         trajectory: trajectory of a system with symmetries.
-        path, ax: as of :func:`~scvi_codegen.pictures.paths.plot_motion`.
+        path, ax: as of :func:`~scvi_codegen.pictures.overview.plot_motion`.
 
     Raises:
-        StateError, PlotError: as :func:`~scvi_codegen.pictures.paths.plot_motion`; StateError without a symmetry.
+        StateError, PlotError: as :func:`~scvi_codegen.pictures.overview.plot_motion`; StateError without a symmetry.
     """
     names = trajectory.stepper.interface.map_names
     if not names:

@@ -2,18 +2,24 @@
 
 The attribute is a callable for the overview with a method for each kind of plot. Points of a Poincare section are those
 where a trajectory crosses a surface.
+
+Plots of paths: orbits of bodies, planes of two coordinates, phase planes, many coordinates over time.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from scvi_codegen.errors import StateError
-from scvi_codegen.mechanics.symmetry.sampling import bodies
+from scvi_codegen.mechanics.symmetry.sampling import AXES, bodies
 from scvi_codegen.pictures.arrays import plot_arrays, plot_spectrum
-from scvi_codegen.pictures.attitudes import plot_attitude
+from scvi_codegen.pictures.attitudes import draw_unit_vectors, plot_attitude
 from scvi_codegen.pictures.canvas import (
     COLORS,
     MOTION,
@@ -32,7 +38,6 @@ from scvi_codegen.pictures.canvas import (
     style,
 )
 from scvi_codegen.pictures.conserved import draw_energy_error, plot_energy, plot_momentum_maps
-from scvi_codegen.pictures.paths import draw_paths, path_panels, plot_motion, plot_phase
 from scvi_codegen.validation import CANVAS, NAMES, checks_arguments
 
 if TYPE_CHECKING:
@@ -60,22 +65,17 @@ def plot_trajectory(trajectory: DrawnMotion, path: str | os.PathLike[str] | None
     with style():
         figure = new_figure(path, (4.6 * count, 4.4))
         axes: tuple[Axes, ...] = tuple(figure.subplots(1, count))
-        _draw(trajectory, axes)
+        draw_paths(axes[:-1], trajectory)
+        draw_energy_error(axes[-1], trajectory)
+        named = len(bodies(trajectory.stepper.interface.coordinates))
+        if 1 < named <= len(COLORS):
+            figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=named)
+        for each in axes:
+            each.locator_params(axis="x", nbins=5)
+        figure.suptitle(plain(trajectory.stepper.interface.title), fontsize=11)
         if path is not None:
             save(figure, path)
     return axes
-
-
-def _draw(trajectory: DrawnMotion, axes: tuple[Axes, ...]) -> None:
-    interface, figure = trajectory.stepper.interface, axes[0].figure
-    draw_paths(axes[:-1], trajectory)
-    draw_energy_error(axes[-1], trajectory)
-    named = len(bodies(interface.coordinates))
-    if 1 < named <= len(COLORS):
-        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=named)
-    for each in axes:
-        each.locator_params(axis="x", nbins=5)
-    figure.suptitle(plain(interface.title), fontsize=11)
 
 
 FEW_POINTS = 2000
@@ -173,3 +173,145 @@ class Plots:
     def section(self, path: Path = None, *, axes: tuple[str, str], event: int = 0, ax: Axes | None = None) -> Axes:
         """Draw a Poincare section, as :func:`scvi_codegen.plot_section`."""
         return plot_section(self.trajectory, path, axes=axes, event=event, ax=ax)
+
+
+MAX_POINTS = 20_000
+MAX_CURVES = 6
+
+
+@checks_arguments(trajectory=MOTION, ax=CANVAS)
+def plot_motion(trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
+    """Draw the path of a trajectory: orbits, a plane of coordinates, a phase plane, or all coordinates over time.
+
+    Args:
+        trajectory: trajectory to draw.
+        path: file for the picture, .png or .svg; ``None`` to write none.
+        ax: axes to draw on; ``None`` for new ones.
+
+    Returns:
+        The axes.
+
+    Raises:
+        StateError: for another suffix.
+        PlotError: without matplotlib.
+    """
+    with panel(path, ax) as drawn:
+        draw_paths([drawn], trajectory)
+    return drawn
+
+
+@checks_arguments(trajectories=MOTIONS, ax=CANVAS, axes=NAMES)
+def plot_phase(
+    trajectories: Motions,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    axes: tuple[str, str] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw a phase portrait, a colour a trajectory.
+
+    Args:
+        trajectories: one or several trajectories of the same system.
+        path, ax: as of :func:`plot_motion`.
+        axes: two names of coordinates or momenta; by default the first coordinate and its momentum.
+
+    Raises:
+        StateError, PlotError: as :func:`plot_motion`; StateError also for an unknown name.
+    """
+    result = several(trajectories)
+    interface = result[0].stepper.interface
+    names = axes or (interface.coordinates[0], interface.momenta[0])
+    curves = [[column(interface, motion, name) for name in names] for motion in result]
+    with panel(path, ax) as drawn:
+        for number, (x, y) in enumerate(curves):
+            _draw_curve(drawn, x, y, color(number))
+        drawn.set(xlabel=names[0], ylabel=names[1], title=plain(f"{interface.system}: phase plane"))
+    return drawn
+
+
+def path_panels(motion: DrawnMotion) -> int:
+    """Return the number of panels of a path: two for rotations, motion in space and three to six coordinates."""
+    coordinates = motion.stepper.interface.coordinates
+    if motion.stepper.interface.rotations:
+        return 2
+    result = bodies(coordinates)
+    spatial = result and len(result[0].columns) == 3
+    return 2 if spatial or (not result and 3 <= len(coordinates) <= MAX_CURVES) else 1
+
+
+def draw_paths(panels: Sequence[Axes], motion: DrawnMotion) -> None:
+    """Draw the path into the panels.
+
+    One coordinate is drawn in the phase plane, bodies by their orbits, rotations by body axes, a few coordinates in
+    their first planes, many coordinates as one image over time.
+    """
+    coordinates = motion.stepper.interface.coordinates
+    result, m = bodies(coordinates), len(coordinates)
+    if motion.stepper.interface.rotations:
+        for drawn, plane in zip(panels, combinations(range(3), 2), strict=False):
+            draw_unit_vectors(drawn, motion, plane)
+    elif m == 1:
+        interface = motion.stepper.interface
+        _draw_curve(panels[0], motion.q[:, 0], motion.p[:, 0], color(0))
+        panels[0].set(xlabel=interface.coordinates[0], ylabel=interface.momenta[0], title="phase plane")
+    elif result:
+        for drawn, plane in zip(panels, combinations(range(3), 2), strict=False):
+            for number, body in enumerate(result):
+                x, y = (motion.q[:, body.columns[index]] for index in plane)
+                _draw_curve(drawn, x, y, color(number), body.name or None)
+            drawn.set(xlabel=AXES[plane[0]], ylabel=AXES[plane[1]], title="orbits" if len(result) > 1 else "orbit")
+            drawn.set_aspect("equal", adjustable="datalim")
+    elif m <= MAX_CURVES:
+        for drawn, plane in zip(panels, combinations(range(m), 2), strict=False):
+            _draw_plane(drawn, motion, plane)
+    else:
+        _draw_image(panels[0], motion)
+
+
+def _draw_plane(axes: Axes, motion: DrawnMotion, plane: tuple[int, int]) -> None:
+    x, y = (motion.q[:, index] for index in plane)
+    _draw_curve(axes, x, y, color(0))
+    names = [motion.stepper.interface.coordinates[index] for index in plane]
+    axes.set(xlabel=names[0], ylabel=names[1], title="configuration")
+    if 0.4 < _extent(x) / max(_extent(y), np.finfo(float).tiny) < 2.5:
+        axes.set_aspect("equal", adjustable="datalim")
+
+
+def _draw_curve(axes: Axes, x: Array, y: Array, color: str, label: str | None = None) -> None:
+    """Draw a curve with a ring at the first and a dot at the last state; points if steps are large."""
+    every = max(1, len(x) // MAX_POINTS)
+    x_drawn, y_drawn = x[::every], y[::every]
+    lengths = np.hypot(np.diff(x_drawn), np.diff(y_drawn))
+    if len(x_drawn) >= 200 and np.median(lengths) > 0.1 * max(_extent(x_drawn), _extent(y_drawn)):
+        axes.plot(x_drawn, y_drawn, ".", color=color, markersize=2.0, alpha=0.7)
+    else:
+        axes.plot(x_drawn, y_drawn, color=color, linewidth=0.8, alpha=0.8)
+    axes.plot(x[:1], y[:1], "o", color=color, markersize=5, fillstyle="none")
+    axes.plot(x[-1:], y[-1:], "o", color=color, markersize=5, label=label)
+
+
+def _extent(values: Array) -> float:
+    return float(np.ptp(values)) if len(values) else 0.0
+
+
+def _draw_image(axes: Axes, motion: DrawnMotion) -> None:
+    """Draw many coordinates as an image: one row each, colour for the value."""
+    every = max(1, len(motion.t) // 2000)
+    values = motion.q[::every].T
+    largest = float(np.abs(values).max()) or 1.0
+    first, last = sorted((float(motion.t[0]), float(motion.t[-1])))
+    span = (first, last if last > first else first + 1.0, 0.5, values.shape[0] + 0.5)
+    drawn = values if motion.h > 0 else values[:, ::-1]
+    image = axes.imshow(
+        drawn,
+        aspect="auto",
+        origin="lower",
+        extent=span,
+        cmap="RdBu_r",
+        vmin=-largest,
+        vmax=largest,
+        interpolation="none",
+    )
+    axes.grid(visible=False)
+    axes.set(xlabel="t", ylabel="coordinate", title="q over time")
+    axes.figure.colorbar(image, ax=axes, shrink=0.9)

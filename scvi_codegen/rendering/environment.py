@@ -9,19 +9,11 @@ from jinja2.runtime import Context
 
 from scvi_codegen.files.cache import template_folder
 from scvi_codegen.ir.kernel import Kernel, Number
-from scvi_codegen.rendering.kernels.functions import kernel_text, lane_kernel_text, lane_mass_text
+from scvi_codegen.rendering.kernels.functions import kernel_text, lane_kernel_text, lane_mass_text, power_of_h
 from scvi_codegen.rendering.kernels.printer import print_number
 from scvi_codegen.rendering.text import table, wrapped, wrapped_comment, wrapped_comment_lines, wrapped_prototypes
 
 Rows: TypeAlias = Sequence[Sequence[Number]]
-
-
-def _power_of_h(k: int) -> str:
-    """Return C source of h^k as a factor."""
-    product = " * ".join(["h"] * abs(k))
-    if k == 0:
-        return "1"
-    return product if k > 0 else f"1 / ({product})"
 
 
 @pass_context
@@ -52,11 +44,6 @@ def _rests(context: Context, rows: Rows) -> Rows:
     return [list(map(context["target"].rest, row)) for row in rows]
 
 
-def _integers(name: str, values: Sequence[int]) -> str:
-    """Return a table of integers; the name includes its size."""
-    return table(f"static const int {name}", list(map(str, values)))
-
-
 def _pairs(name: str, entries: Sequence[tuple[int, int]]) -> str:
     """Return a table of pairs of indices."""
     return table(f"static const int {name}[{len(entries)}][2]", [f"{{{i}, {j}}}" for i, j in entries])
@@ -79,10 +66,10 @@ def _lane_mass_text(context: Context, kernel: Kernel) -> str:
 
 
 FUNCTIONS: dict[str, Callable[..., str]] = {
-    "power_of_h": _power_of_h,
+    "power_of_h": power_of_h,
     "vector": _vector,
     "matrix": _matrix,
-    "integers": _integers,
+    "integers": lambda name, values: table(f"static const int {name}", list(map(str, values))),
     "pairs": _pairs,
 }
 FILTERS: dict[str, Callable[..., object]] = {

@@ -15,26 +15,27 @@ detected that the polynomials indicate; a function that oscillates faster within
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import accumulate
-from typing import Protocol, TypeAlias, cast
+from typing import Any, Protocol, TypeAlias, cast
 
 import sympy
 from sympy import Expr, Symbol
 from sympy.core.function import AppliedUndef
 
 from scvi_codegen.errors import EventError, SystemDefinitionError, closest
-from scvi_codegen.formulas.array_entries import formula_of_entries, is_indexed, momentum_arrays
+from scvi_codegen.formulas.array_entries import EntryRules, entry_names, formula_of_entries, is_indexed, momentum_arrays
 from scvi_codegen.formulas.arrays import parse_coordinate
 from scvi_codegen.formulas.expressions import evaluated, unsupported_part
-from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.rotations.arrays import entries_in_formulas
 from scvi_codegen.formulas.rotations.names import RotationNames
 from scvi_codegen.formulas.symbols import DOT, TIME, identifier, input_formulas, symbol
 from scvi_codegen.indices import Array
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Kernel, lower_matrix, lower_vector
+from scvi_codegen.rendering.array_events import array_events
 from scvi_codegen.rendering.program_source import EventSearch, render_events
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.tables.nodes import chebyshev_lobatto, to_unit
@@ -45,18 +46,19 @@ Formula: TypeAlias = "str | Expr | float"
 
 
 class SearchedEvent(Protocol):
-    """Event of a run; attributes as of :class:`~scvi_codegen.runtime.events.event.Event`."""
+    """Event with the attributes of :class:`~scvi_codegen.runtime.events.event.Event`, which is of a higher layer."""
 
     @property
-    def function(self) -> str | Expr: ...  # noqa: D102
+    def function(self) -> str | Expr: ...
     @property
-    def restitution(self) -> Formula | None: ...  # noqa: D102
+    def restitution(self) -> Formula | None: ...
     @property
-    def conditions(self) -> tuple[Formula, ...]: ...  # noqa: D102
+    def changes(self) -> tuple[tuple[str, Formula], ...]: ...
     @property
-    def changes(self) -> tuple[tuple[str, Formula], ...]: ...  # noqa: D102
+    def conditions(self) -> tuple[Formula, ...]: ...
     @property
-    def changes_state(self) -> bool: ...  # noqa: D102
+    def changes_state(self) -> bool: ...
+    def check_function(self, moving: Sequence[str], *, constant: bool) -> None: ...
 
 
 @lru_cache(maxsize=64)
@@ -71,8 +73,7 @@ def with_events(source: Source, interface: Interface, events: tuple[SearchedEven
         ExpressionError: for text outside the grammar, with its column.
         EventError: naming the invalid symbol or function, or what events that change the state do not support.
     """
-    formulas = None if interface.layout.coordinates else EventFormulas(interface, events)
-    return replace(source, beside=render_events(_search(interface, events, formulas, "_advance_to(" in source.header)))
+    return replace(source, beside=render_events(_search(interface, events, source.header)))
 
 
 class EventFormulas:
@@ -88,7 +89,7 @@ class EventFormulas:
 
     def __init__(self, interface: Interface, events: Sequence[SearchedEvent]) -> None:
         self.interface, self.events = interface, events
-        self._turning = RotationNames.of_declarations(interface.rotations)
+        self._turning = RotationNames.of_states(interface.rotations, _names(interface))
         self._known, self._arrays = self._turning.symbols | _names(interface), _arrays(interface)
         self.q = [symbol(name) for name in interface.coordinates]
         self.v = [symbol(name + DOT) for name in interface.coordinates]
@@ -97,18 +98,22 @@ class EventFormulas:
         self.p = [sympy.Dummy() if symbol(name) in taken else symbol(name) for name in interface.momenta]
         self.functions = [self._read(event.function, f"event function '{event.function}'") for event in events]
         for event, function in zip(events, self.functions, strict=True):
-            if not function.free_symbols:
-                raise EventError(
-                    f"the event function '{event.function}' is constant and never crosses zero: use a function of the "
-                    "state or of time"
-                )
+            if interface.variables and event.restitution is not None:
+                raise EventError(f"'{interface.system}' is a first-order system without impacts: write them in then=")
+            moving = sorted(free.name for free in function.free_symbols & {*self.p, *self.v})
+            event.check_function(moving, constant=not function.free_symbols)
         self.guards = [
             (number, self._read(condition, f"condition where='{condition}'"))
             for number, event in enumerate(events)
             for condition in event.conditions
         ]
         self.changes = [self._changes(*each) for each in zip(events, self.functions, strict=True)]
-        _check_changes(interface, events)
+        if interface.energy_parameter and any(event.changes_state for event in events):
+            raise EventError(
+                "events that change the state are impossible in transformed time, where the energy is the constant "
+                f"'{interface.energy_parameter}': compile the original system with time_transformation=.., or use "
+                "adaptive steps (t_end)"
+            )
 
     @property
     def arguments(self) -> tuple[Symbol, ...]:
@@ -122,21 +127,20 @@ class EventFormulas:
 
     def _read(self, formula: Formula, what: str) -> Expr:
         if isinstance(formula, str) and self._arrays and is_indexed(formula):
-            formula = formula_of_entries(formula, self._arrays, self._known)
-        expression = self._turning.in_coordinates(_expression(formula, self._known, what))
+            turning = entries_in_formulas(self._arrays, self._turning.members, {})
+            names = {array: entry_names(array, {}) for array in self._arrays if not array.name.endswith(DOT)} | turning
+            rules = EntryRules({}, {}, {array.name: each for array, each in names.items()})
+            formula = formula_of_entries(formula, (*self._arrays, *turning), self._known, rules=rules)
+        expression = self._turning.in_coordinates(_expression(formula, self._known, what, self._turning.read))
         return cast(Expr, expression.xreplace(input_formulas(self.interface.inputs, symbol(TIME))))
 
     def _changes(self, event: SearchedEvent, g: Expr) -> tuple[list[int], list[Expr]]:
         if event.restitution is not None:
-            if moving := sorted(free.name for free in g.free_symbols & {*self.p, *self.v}):
-                raise EventError(
-                    f"the wall '{event.function}' of an impact contains '{moving[0]}': a wall is a function of "
-                    "positions, time and parameters; write the change of the state with then="
-                )
             gradient = [sympy.diff(g, each) for each in (*self.q, symbol(TIME))]
             restitution = self._read(event.restitution, f"restitution '{event.restitution}'")
-            return [0] * (len(gradient) + 1), [*gradient, restitution]
-        variables = {each: k for k, each in enumerate(self.arguments)}
+            return [*range(len(self.q)), 0, 0], [*gradient, restitution]
+        settable = (*self.q, *self.p) if self.interface.variables else self.arguments
+        variables = {each: k for k, each in enumerate(settable)}
         named = {name: variables[each] for name, each in self._known.items() if each in variables}
         new = {
             str(self._read(name, "then=")) if "[" in name else name: self._read(value, f"value '{value}' of '{name}'")
@@ -150,35 +154,22 @@ class EventFormulas:
                     f"then={{'{name}': '{value}'}} of the event '{event.function}': '{name}' is not a coordinate, a "
                     f"momentum or a velocity{closest(name, named)} An event can set: {', '.join(named)}"
                 )
-        if any(index >= 2 * len(self.q) for index in indices) and any(
-            len(self.q) <= index < 2 * len(self.q) for index in indices
-        ):
-            raise EventError(
-                f"the event '{event.function}' sets momenta and velocities: set one or the other with then="
-            )
+        if {index // len(self.q) for index in indices} >= {1, 2}:
+            raise EventError(f"the event '{event.function}' sets momenta and velocities: set one or the other")
         return indices, [*new.values()]
 
     def _set_rates_of_rotations(self, new: dict[str, Expr]) -> None:
         """Replace new angular velocities or momenta of rotations by the derivatives or momenta of quaternions."""
         for member in self._turning.rotations:
-            if set(new).isdisjoint(rate.name for rate in member.rates):
-                continue
-            rates = [new.pop(rate.name, self._turning.values[rate]) for rate in member.rates]
-            p = member.forces(rates)  # p = 2 E(q) m / |q|^2 of the angular momentum m, q_dot = |q|^2 p / 4
-            size = sympy.Add(*(symbol(name) ** 2 for name in member.coordinates))
-            for name, value in zip(member.coordinates, p, strict=True):
-                new[f"p_{name}" if member.momentum else name + DOT] = value if member.momentum else value * size / 4
-
-
-def _check_changes(interface: Interface, events: Sequence[SearchedEvent]) -> None:
-    """Raise :class:`EventError` where changes of the state are not supported."""
-    changing = [event for event in events if event.changes_state]
-    if changing and interface.energy_parameter:
-        raise EventError(
-            f"the event '{changing[0].function}' changes the state, which is impossible in transformed time, where the "
-            f"energy is the constant '{interface.energy_parameter}': compile the original system with "
-            "time_transformation=.., or use adaptive steps (t_end)"
-        )
+            for symbols in dict.fromkeys((member.rates, member.momenta)):
+                if set(new).isdisjoint(each.name for each in symbols):
+                    continue
+                values = [new.pop(each.name, self._turning.values[each]) for each in symbols]
+                p = member.forces(values)  # p = 2 E(q) m / |q|^2 of the angular momentum m, q_dot = |q|^2 p / 4
+                size = sympy.Add(*(symbol(name) ** 2 for name in member.coordinates))
+                for name, value in zip(member.coordinates, p, strict=True):
+                    of_momentum = symbols == member.momenta
+                    new[f"p_{name}" if of_momentum else name + DOT] = value if of_momentum else value * size / 4
 
 
 def _arrays(interface: Interface) -> list[Array]:
@@ -191,23 +182,16 @@ def _arrays(interface: Interface) -> list[Array]:
 def _names(interface: Interface) -> dict[str, Symbol]:
     """Return the names that a function may use; coordinates and parameters precede default names of momenta."""
     velocities = [name + DOT for name in interface.coordinates]
-    return {
-        name: symbol(name)
-        for name in (
-            *interface.coordinates,
-            *velocities,
-            *interface.momenta,
-            TIME,
-            *interface.parameters,
-            *interface.inputs,
-        )
-    }
+    moving = *interface.coordinates, *velocities, *interface.momenta
+    return {name: symbol(name) for name in (*moving, TIME, *interface.parameters, *interface.inputs)}
 
 
-def _expression(formula: Formula, names: Mapping[str, Symbol], what: str) -> Expr:
+def _expression(
+    formula: Formula, names: Mapping[str, Symbol], what: str, read: Callable[[str, Mapping[str, Symbol]], Expr]
+) -> Expr:
     """Return one formula in canonical symbols."""
     if isinstance(formula, str | int | float):
-        found = parse_expression(str(formula), names)
+        found = read(str(formula), names)
     elif isinstance(formula, Expr):
         found = _translated(formula, what)
     else:
@@ -241,43 +225,36 @@ def _translated(function: Expr, what: str) -> Expr:
         raise EventError(f"in the {what}: {error}") from error
 
 
-def _search(
-    interface: Interface, events: Sequence[SearchedEvent], formulas: EventFormulas | None, controlled: bool
-) -> EventSearch:
-    """Return the data of the search: Chebyshev points of the second kind, and the inverse Vandermonde matrix."""
+def _search(interface: Interface, events: tuple[SearchedEvent, ...], header: str) -> EventSearch:
+    """Return the search: Chebyshev points of the second kind, inverse Vandermonde matrix; ``header`` of the steps."""
     points = chebyshev_lobatto(DEGREE).points
     inverse = mp.matrix([[x**k for k in range(DEGREE + 1)] for x in points]) ** -1
     coefficients = tuple(tuple(inverse[k, j] for j in range(DEGREE + 1)) for k in range(DEGREE + 1))
     search = EventSearch(
         prefix=interface.prefix,
-        dimension=0,
-        kernel=None,
-        uses_velocity=False,
+        dimension=interface.dimension,
         transformed=bool(interface.energy_parameter),
         constrained=bool(interface.constraints or interface.layout.constraints),
         nodes=lower_vector(to_unit(points)),
         coefficients=lower_matrix(coefficients),
         doubts=(0.5 ** (DEGREE - 2), 0.5 ** (DEGREE - 1)),
-        guards=None,
         guarded=tuple(number for number, event in enumerate(events) for _ in event.conditions),
-        changes=None,
-        changed=(0,) * any(event.changes_state for event in events),
-        first_values=(0,) * (len(events) + 1),
         impacts=tuple(int(event.restitution is not None) for event in events),
-        controlled=controlled,
+        controlled="_advance_to(" in header,
+        factored="*factors" in header,
     )
-    if formulas is None:
-        return search
+    if interface.layout.coordinates:
+        arrays, changed = array_events(interface, events), (0,) * any(event.changes_state for event in events)
+        known: dict[str, Any] = {"kernels": tuple(arrays.kernels), "changed": changed}
+        return replace(search, dimension=0, arrays=arrays, uses_velocity=arrays.uses_velocity, **known)
+    formulas = EventFormulas(interface, events)
     guards = [guard for _, guard in formulas.guards]
     values = [value for _, each in formulas.changes for value in each]
-    every = (*formulas.functions, *guards, *values)
+    every = {"event_functions": formulas.functions, "event_guards": guards, "event_changes": values}
     return replace(
         search,
-        dimension=interface.dimension,
-        kernel=formulas.kernel("event_functions", formulas.functions),
-        uses_velocity=any(value.free_symbols.intersection(formulas.v) for value in every),
-        guards=formulas.kernel("event_guards", guards) if guards else None,
-        changes=formulas.kernel("event_changes", values) if values else None,
+        kernels=tuple(formulas.kernel(name, each) for name, each in every.items() if each),
+        uses_velocity=any(value.free_symbols.intersection(formulas.v) for each in every.values() for value in each),
         changed=tuple(index for indices, _ in formulas.changes for index in indices),
         first_values=(0, *accumulate(len(each) for _, each in formulas.changes)),
     )

@@ -39,16 +39,13 @@ def with_flow_of_rows(derivatives: Source, *, second: bool = False) -> Source:
         second: whether to add second derivatives, ``<prefix>_hessian_rows``, which the source must have.
     """
     prefix = derivatives.prefix
-    shape, rest = (
-        "long long steps, long long every, int count, long long rows",
-        f"double *found, {prefix}_report *report",
-    )
+    shape = "long long steps, long long every, int count, long long rows"
+    rest = f"double *found, {prefix}_report *report"
     declared = f"int {prefix}_flow_rows(int part, {shape}, const double *x, const double *given, {rest});\n"
     if second:
         declared += f"int {prefix}_hessian_rows({shape}, const double *x, "
         declared += f"const double *partials, const double *changes, {rest});\n"
-    headers = ("flow", "rows_flow")
-    return _behind(derivatives, "\n", headers, declared, second=second)
+    return _behind(derivatives, "\n#define FLOW_OF_ROWS\n", ("flow",), declared, second=second)
 
 
 def casadi_name(prefix: str) -> str:

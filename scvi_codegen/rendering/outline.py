@@ -41,17 +41,12 @@ class Function:
 def functions_of(code: str) -> dict[str, Function]:
     """Return every function with a body, by name, in order; of preprocessor alternatives the first."""
     found: dict[str, re.Match[str]] = {}
-    for match in HEAD.finditer(_with_names(code)):
-        found.setdefault(match["name"], match)
-    return {name: _function(match, found) for name, match in found.items()}
-
-
-def _with_names(code: str) -> str:
-    """Return the source with the macros NAME (prefix of exported names), HOT and SELDOM in function heads replaced."""
     prefix, stored = re.search(r"^#define NAME\(word\) (\w+)##word", code, re.MULTILINE), HOT.search(code)
     text = re.sub(r"\bNAME\((\w+)\)", rf"{prefix[1]}\1", code) if prefix else code
     text = re.sub(r"^(static )?SELDOM ", r"\1", text, flags=re.MULTILINE)
-    return re.sub(r"^HOT ", f"{stored[1]} ", text, flags=re.MULTILINE) if stored else text
+    for match in HEAD.finditer(re.sub(r"^HOT ", f"{stored[1]} ", text, flags=re.MULTILINE) if stored else text):
+        found.setdefault(match["name"], match)
+    return {name: _function(match, found) for name, match in found.items()}
 
 
 def _function(match: re.Match[str], known: Mapping[str, re.Match[str]]) -> Function:

@@ -8,12 +8,13 @@ loops over the program's tables and the C that does not depend on it. Kernels ar
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Literal, TypeAlias, cast, get_args
+from typing import Any, Literal, TypeAlias, cast, get_args
 
 from scvi_codegen.ir.derivatives import Derivatives
-from scvi_codegen.ir.equations import Control, FixedPointIteration, StoredValues
+from scvi_codegen.ir.equations import Control, StoredValues
 from scvi_codegen.ir.kernel import Kernel, is_divided
 from scvi_codegen.ir.program import Program
+from scvi_codegen.rendering.array_events import ArrayEvents
 from scvi_codegen.rendering.environment import support_text, template_environment
 from scvi_codegen.rendering.kernels.functions import unrolled_equations
 from scvi_codegen.rendering.kernels.loops import loop_context
@@ -77,6 +78,7 @@ class ExampleRun:
         inputs: of a system that has any, if they are set; ``parameters`` has their values at the start.
         end: of a run with inputs.
         arrays: of a system whose array sizes are known at run time; ``outputs`` is then the number of steps.
+        events: of the run, also of its source.
     """
 
     q: tuple[float, ...]
@@ -93,6 +95,7 @@ class ExampleRun:
     inputs: tuple[ExampleInput, ...] = ()
     end: float = 0.0
     arrays: ExampleArrays | None = None
+    events: tuple[Any, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,43 +103,40 @@ class EventSearch:
     """Data of the search for zeros of functions of the state.
 
     Attributes:
-        prefix, dimension: of the integrator; 0 for arrays of run-time sizes, whose formulas the caller evaluates.
-        kernel: the functions at u = (q, p, v); ``None`` for arrays of run-time sizes.
-        uses_velocity: whether v occurs in them.
+        prefix, dimension: of the integrator; 0 for arrays of run-time sizes.
         transformed: whether time is, so that the integrator's velocities are dq/dtau.
         constrained: whether states satisfy constraints, also after changes.
         nodes: (d + 1,) fractions of a part of a step at which they are evaluated.
         coefficients: (d + 1, d + 1) from values there to coefficients of powers of x in [-1, 1].
         doubts: factors of the last two coefficients in the error estimate.
-        guards, guarded: conditions of crossings, and the index of the function of each.
-        changes: values of variables that crossings change; gradient and restitution of impacts.
-        changed: index among (q, p, v) of the variable of each of these values.
-        first_values: index of the first value of each function, and the number of values.
-        impacts: 1 for each function that is the wall of an impact, else 0.
+        guarded: index of the event of each condition of crossings.
+        impacts: 1 for each event that is the wall of an impact, else 0.
         controlled: whether the integrator has adaptive steps.
+        factored: whether its runs contain factors of the linear part of a step.
+        kernels: the functions at u = (q, p, v); conditions; values of variables that crossings change, gradient and
+            restitution of impacts. Of arrays of run-time sizes those of their functions.
+        uses_velocity: whether v occurs in the formulas.
+        changed: index among (q, p, v) of the variable of each value of the changes.
+        first_values: index of the first value of each function, and the number of values.
+        arrays: the functions of arrays of run-time sizes, which have no kernels of all coordinates.
     """
 
     prefix: str
     dimension: int
-    kernel: Kernel | None
-    uses_velocity: bool
     transformed: bool
     constrained: bool
     nodes: tuple[float, ...]
     coefficients: tuple[tuple[float, ...], ...]
     doubts: tuple[float, float]
-    guards: Kernel | None
     guarded: tuple[int, ...]
-    changes: Kernel | None
-    changed: tuple[int, ...]
-    first_values: tuple[int, ...]
     impacts: tuple[int, ...]
     controlled: bool
-
-    @property
-    def kernels(self) -> tuple[Kernel, ...]:
-        """Kernels of functions, conditions and changes."""
-        return tuple(kernel for kernel in (self.kernel, self.guards, self.changes) if kernel is not None)
+    factored: bool
+    kernels: tuple[Kernel, ...] = ()
+    uses_velocity: bool = False
+    changed: tuple[int, ...] = ()
+    first_values: tuple[int, ...] = ()
+    arrays: ArrayEvents | None = None
 
 
 def render(program: Program, control: Control | None = None, *, fallback: Fallback | None = None) -> Source:
@@ -189,7 +189,7 @@ def _control_context(program: Program, control: Control | None) -> dict[str, obj
     name = f"support/{program.prefix}_predictor.h"
     if not (control and control.predictor and program.fixed_point):
         return {"control": control, "own_headers": {}}
-    text = predictor_text(control.predictor, exchanges=program.fixed_point.exchanges)
+    text = predictor_text(control.predictor)
     return {"control": control, "own_headers": {name: text}}
 
 
@@ -311,15 +311,11 @@ def _lane_context(program: Program, beside: Sequence[Kernel]) -> dict[str, objec
     fixed_point = program.fixed_point
     if fixed_point is None:
         return {"fixed_point": None}
-    hot = "static inline __attribute__((always_inline))" if _size(fixed_point) <= LARGEST_INLINED else "static"
+    operations = sum(sum(kernel.operation_counts().values()) for kernel in fixed_point.kernels)
+    hot = "static inline __attribute__((always_inline))" if operations <= LARGEST_INLINED else "static"
     kernels = (*fixed_point.kernels, *beside)
     text = iteration_source(fixed_point, POINTS, kernels=kernels, changes=bool(beside))
     return {"fixed_point": text, "hot": hot}
-
-
-def _size(fixed_point: FixedPointIteration) -> int:
-    """Return the number of operations of all kernels on lanes."""
-    return sum(sum(kernel.operation_counts().values()) for kernel in fixed_point.kernels)
 
 
 def with_fmu(

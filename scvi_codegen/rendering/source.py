@@ -192,7 +192,8 @@ class ArrayLayout(ArrayDeclarations):
         continued: whether the predictor extrapolates previous steps instead of reusing the forces at their end.
         momentum_formulas, velocity_formulas: L_v in (q, v) and H_p in (q, p) of a Lagrangian that is integrated by its
             Hamiltonian (:class:`~scvi_codegen.formulas.array_statements.ArrayForce`).
-        couplings: terms of the potential energy, which couple the coordinates that occur in them.
+        couplings: terms of the potential energy and forces, which couple the coordinates that occur in them.
+        symmetric: whether the linear part of a step is symmetric: without momenta and forces of velocities.
         data: values of fields and tables by name for runs that pass none.
         neighbours: names of the lists of neighbours.
         mesh: of the fields of a density (:class:`~scvi_codegen.fields.mesh.Mesh`).
@@ -207,6 +208,7 @@ class ArrayLayout(ArrayDeclarations):
     momentum_formulas: tuple[Any, ...] = ()
     velocity_formulas: tuple[Any, ...] = ()
     couplings: tuple[Any, ...] = ()
+    symmetric: bool = True
     data: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
     neighbours: tuple[str, ...] = ()
     mesh: Any = field(default=None, compare=False, repr=False)

@@ -1,12 +1,6 @@
 """Catalogue of all experiments by name, in the paper's order; ``claims``, which judges the others, is last."""
 
-from scvi_codegen.reproduce import (
-    claims,
-    correction,
-    figures,
-    iterations,
-    refinement_figures,
-)
+from scvi_codegen.reproduce import claims, correction, figures, iterations, refinement_figures
 
 ORDER = """
     figure-1 figure-3 figure-4 figure-5 figure-6 figure-7 figure-8

@@ -20,16 +20,7 @@ from scvi_codegen.files.toml_text import package_table
 from scvi_codegen.methods import as_method, method_from_specification
 from scvi_codegen.reproduce.drawing import Panel, Picture, Series, largest_in_bins, thinned
 from scvi_codegen.reproduce.experiment import Comparison, Experiment, Result, comparison
-from scvi_codegen.reproduce.runs import (
-    EXACT,
-    MEASURES,
-    PERIOD,
-    SECTION_3,
-    MeasuredRun,
-    RunSetting,
-    Scheme,
-    system_of,
-)
+from scvi_codegen.reproduce.runs import EXACT, MEASURES, PERIOD, SECTION_3, MeasuredRun, RunSetting, Scheme, system_of
 
 Runs: TypeAlias = Mapping[str, MeasuredRun]
 View: TypeAlias = Callable[[Runs], Iterable[Panel]]
@@ -116,11 +107,7 @@ def _series(run: MeasuredRun, xs: ArrayLike, ys: ArrayLike, **style: str) -> Ser
 
 
 def plane(
-    *keys: str,
-    kind: str = "phase",
-    part: str = ":",
-    window: tuple[float, float] | None = None,
-    more: str = "",
+    *keys: str, kind: str = "phase", part: str = ":", window: tuple[float, float] | None = None, more: str = ""
 ) -> View:
     """Return the view of states over the exact curve, a panel for each run.
 

@@ -179,10 +179,8 @@ def _exact(r: MeasuredRun) -> tuple[Array, Array]:
 
 
 def _area_change(r: MeasuredRun) -> float:
-    """Return the area enclosed by the last fifth of the states relative to the first fifth, less 1.
-
-    The states must surround the origin. For n states the polygon is smaller than the curve by about (2 pi / n)^2 / 3.
-    """
+    """Return the area enclosed by the last fifth of the states relative to the first fifth, less 1."""
+    # States surround the origin. The polygon of n states is smaller than the curve by about (2 pi / n)^2 / 3.
     part = len(r.q) // 5
     first, last = (_enclosed_area(r.q[states, 0], r.p[states, 0]) for states in np.s_[:part, -part:])
     return last / first - 1.0

@@ -17,7 +17,7 @@ from operator import mul
 from scvi_codegen.errors import MethodError
 from scvi_codegen.tables.nodes import point_count, to_number
 from scvi_codegen.tables.precision import DIGITS, Matrix, Number, Vector, mp, settled
-from scvi_codegen.tables.quadrature import gauss_legendre, legendre_value
+from scvi_codegen.tables.quadrature import gauss_legendre
 
 GUESS_DEGREE = 8
 """Maximum degree of the predictor for the next step: row sums of the extrapolation grow 20-fold per degree."""
@@ -155,7 +155,7 @@ def legendre_functional(points: Vector, degree: int) -> Vector:
     rule = gauss_legendre((len(points) + degree) // 2 + 1)
     values = cardinal_values(points, rule.abscissae)
     weights = [
-        (2 * degree + 1) * w * legendre_value(degree, 2 * x - 1)
+        (2 * degree + 1) * w * mp.legendre(degree, 2 * x - 1)
         for x, w in zip(rule.abscissae, rule.unit_weights, strict=True)
     ]
     return tuple(mp.fdot(weights, column) for column in zip(*values, strict=True))

@@ -197,11 +197,6 @@ def chebyshev_gauss_points(count: int) -> Vector:
     return sines(range(1 - count, count, 2), 2 * count)
 
 
-def equispaced_points(count: int) -> Vector:
-    """Return ``count >= 2`` points from -1 to 1 with equal gaps."""
-    return tuple(mp.mpf(j) / (count - 1) for j in range(1 - count, count, 2))
-
-
 def nodes_of(name: str, degree: int, points: Callable[[int], Vector]) -> Nodes:
     """Return the family member of this degree, after checking the degree."""
     return Nodes(name=name, degree=degree, points=points(point_count(degree, "the degree", least=1) + 1))
@@ -234,41 +229,23 @@ def legendre_lobatto(degree: int) -> Nodes:
 @cached_family
 def equispaced(degree: int) -> Nodes:
     """Return nodes with equal gaps, both ends among them; interpolation on them is unstable beyond degree 10 or so."""
-    return nodes_of("equispaced", degree, equispaced_points)
+    return nodes_of(
+        "equispaced", degree, lambda count: tuple(mp.mpf(j) / (count - 1) for j in range(1 - count, count, 2))
+    )
 
 
-@cached_family
-def legendre_gauss(degree: int) -> Nodes:
-    """Return the degree + 1 roots of the Legendre polynomial P_{degree+1}: no end among them."""
-    return nodes_of("legendre-gauss", degree, legendre_gauss_points)
-
-
-@cached_family
-def chebyshev_gauss(degree: int) -> Nodes:
-    """Return the degree + 1 roots of the Chebyshev polynomial T_{degree+1}: no end among them."""
-    return nodes_of("chebyshev-gauss", degree, chebyshev_gauss_points)
-
-
-@cached_family
-def radau_left(degree: int) -> Nodes:
-    """Return the degree + 1 left Radau points: -1 among them, 1 not."""
-    return nodes_of("radau-left", degree, radau_left_points)
-
-
-@cached_family
-def radau_right(degree: int) -> Nodes:
-    """Return the degree + 1 right Radau points: 1 among them, -1 not."""
-    return nodes_of("radau-right", degree, radau_right_points)
-
-
+WITHOUT_BOTH_ENDS = {
+    "legendre-gauss": legendre_gauss_points,
+    "chebyshev-gauss": chebyshev_gauss_points,
+    "radau-left": radau_left_points,
+    "radau-right": radau_right_points,
+}
+"""Points of the families of degree + 1 nodes without -1 or 1, by name."""
 NODE_FAMILIES: Mapping[str, Callable[[int], Nodes]] = {
     "chebyshev-lobatto": chebyshev_lobatto,
     "legendre-lobatto": legendre_lobatto,
     "equispaced": equispaced,
-    "legendre-gauss": legendre_gauss,
-    "chebyshev-gauss": chebyshev_gauss,
-    "radau-left": radau_left,
-    "radau-right": radau_right,
+    **{name: cache(partial(nodes_of, name, points=points)) for name, points in WITHOUT_BOTH_ENDS.items()},
 }
 
 

@@ -155,18 +155,10 @@ def next_legendre(degree: int, points: Vector, values: Matrix, before: Matrix) -
     return tuple(lines)
 
 
-def legendre_value(degree: int, x: Number) -> Number:
-    """Return P_degree(x) by the three-term recurrence (Abramowitz & Stegun 22.7.10)."""
-    before, value = mp.zero, mp.one
-    for k in range(degree):
-        before, value = value, ((2 * k + 1) * x * value - k * before) / (k + 1)
-    return value
-
-
 def gauss_type(name: str, points: Vector, order: int, weight: Callable[[Number, Number], Number]) -> Quadrature:
     """Return the rule on ``points`` whose weights are a formula of x and P_{n-1}(x)^2, evaluated with guard digits."""
     with mp.workdps(DIGITS + GUARD):
-        weights = [weight(x, legendre_value(len(points) - 1, x) ** 2) for x in points]
+        weights = [weight(x, mp.legendre(len(points) - 1, x) ** 2) for x in points]
     return Quadrature(name=f"{name}:{len(points)}", points=points, weights=tuple(weights), order=order)
 
 

@@ -52,9 +52,9 @@ class CurveSpace(ABC):
         """Fitted frequency of the curves, in radians per step, or ``None``."""
         return None
 
-    @abstractmethod
     def dimension(self, degree: int) -> int:
-        """Return the number s of velocities that determine a curve."""
+        """Return the number s of velocities that determine a curve: the degree, unless it has pieces."""
+        return degree
 
     @abstractmethod
     def points(self, degree: int, rule: Quadrature) -> Vector:
@@ -76,28 +76,17 @@ class CurveSpace(ABC):
     def positions(self, points: Vector, at: Vector) -> Matrix:
         """Return the (len(at), s) integrals of the l_b from 0."""
 
-    @abstractmethod
     def order(self, degree: int) -> int | None:
         """Return the order of an SVI with a sufficiently accurate quadrature, or ``None`` if none is claimed."""
+        return 2 * degree
 
 
 @dataclass(frozen=True, slots=True)
 class Polynomials(CurveSpace):
     """Polynomials of the degree: the paper's spectral variational integrators."""
 
-    @property
-    def name(self) -> str:
-        """Name ``polynomials``."""
-        return "polynomials"
-
-    @property
-    def nodal(self) -> bool:
-        """Always true."""
-        return True
-
-    def dimension(self, degree: int) -> int:
-        """Return the degree."""
-        return degree
+    name = "polynomials"
+    nodal = True
 
     def points(self, degree: int, rule: Quadrature) -> Vector:
         """Return the quadrature points if there are as many as the degree, else Gauss points."""
@@ -114,10 +103,6 @@ class Polynomials(CurveSpace):
     def positions(self, points: Vector, at: Vector) -> Matrix:
         """See :meth:`CurveSpace.positions`."""
         return cardinal_integrals(points, at, 0)
-
-    def order(self, degree: int) -> int | None:
-        """Return twice the degree."""
-        return 2 * degree
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,10 +146,6 @@ class Trigonometric(CurveSpace):
         tail = "" if self.harmonics is None else f":{self.harmonics}"
         return f"trigonometric:{self.frequency!r}{tail}"
 
-    def dimension(self, degree: int) -> int:
-        """Return the degree."""
-        return degree
-
     def points(self, degree: int, rule: Quadrature) -> Vector:
         """Return Gauss points."""
         self._count(degree)
@@ -191,14 +172,10 @@ class Trigonometric(CurveSpace):
             "a smaller step size"
         )
 
-    def velocities(self, points: Vector, at: Vector, derivative: int = 0) -> Matrix:
-        """See :meth:`CurveSpace.velocities`."""
-        return self._cardinal(points, at, derivative)
-
     def positions(self, points: Vector, at: Vector) -> Matrix:
         """See :meth:`CurveSpace.positions`."""
-        start = self._cardinal(points, (mp.zero,), -1)[0]
-        return tuple(tuple(x - y for x, y in zip(line, start, strict=True)) for line in self._cardinal(points, at, -1))
+        start, *lines = self.velocities(points, (mp.zero, *at), -1)
+        return tuple(tuple(x - y for x, y in zip(line, start, strict=True)) for line in lines)
 
     def order(self, degree: int) -> int | None:
         """Return ``None``; the order would be twice the degree if the frequency per step decreased with h."""
@@ -213,8 +190,8 @@ class Trigonometric(CurveSpace):
             )
         return harmonics
 
-    def _cardinal(self, points: Vector, at: Vector, derivative: int) -> Matrix:
-        """Return cardinal combinations: the functions at ``at`` times their inverse at the points."""
+    def velocities(self, points: Vector, at: Vector, derivative: int = 0) -> Matrix:
+        """Return the functions at ``at`` times their inverse at the points; ``derivative`` -1 for integrals."""
         degree = len(points)
         with mp.workdps(DIGITS + GUARD_DIGITS):
             values_at_points = mp.matrix([self._functions(degree, c, 0) for c in points])
@@ -331,15 +308,9 @@ class Splines(CurveSpace):
             return _placed(values, first, len(points))
 
         whole = [over(k, end) for k, (_, end) in enumerate(self.ends)]
-        lines = []
-        for c in at:
-            k = self._piece(c)
-            lines.append(tuple(map(mp.fsum, zip(*whole[:k], over(k, c), strict=True))))
-        return tuple(lines)
-
-    def order(self, degree: int) -> int | None:
-        """Return twice the degree."""
-        return 2 * degree
+        pieces = map(self._piece, at)
+        sums = ((*whole[:k], over(k, c)) for k, c in zip(pieces, at, strict=True))
+        return tuple(tuple(map(mp.fsum, zip(*vectors, strict=True))) for vectors in sums)
 
     def _piece(self, c: Number) -> int:
         return sum(c >= a for a, _ in self.ends[1:])

@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, StepFailedError
@@ -28,12 +28,14 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.runtime.core.stepper import STEPPER, Stepper
-from scvi_codegen.runtime.core.validation import checked_vector
+from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.rotations.states import checked_pair
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.validation import TEXTS, checks_arguments
 from scvi_codegen.verification.certificate import Certificate, Check, Outcome, issued
 from scvi_codegen.verification.convergence import convergence_checks, identity_checks
 from scvi_codegen.verification.derivatives import derivative_checks, time_transformation_derivative_checks
+from scvi_codegen.verification.impacts import impact_checks
 from scvi_codegen.verification.roundoff import roundoff_checks
 from scvi_codegen.verification.stepping import predictor_checks, step_checks
 from scvi_codegen.verification.structure import largest_step, structure_checks
@@ -42,7 +44,6 @@ from scvi_codegen.verification.variable_steps import VariableSteps, at_fixed_ene
 
 __all__ = ["Certificate", "Check", "Outcome", "verify"]
 
-Array = NDArray[np.float64]
 
 SEEDS = range(20)
 """Seeds of the random states that are tried if no state is passed."""
@@ -128,36 +129,31 @@ def _certificate(
     tolerance: float | None,
 ) -> Certificate:
     """Return the certificate of a stepper, measured at a state."""
-    flags = stepper.flags
+    flags, watched, stepper = stepper.flags, stepper, stepper.with_events(())
     steps, single = stepper, at_fixed_energy(system, stepper.energy(start.q, start.p, start.t))
     if single is not system or stepper.interface.time_transformation:
         steps = compile_stepper(single, method, solver=solver, flags=flags)
     tested = SystemUnderTest(single, method, steps, _newton(single, method, steps, solver, flags), start)
     paced = steps is not stepper or tolerance is not None
-    runs_tested = VariableSteps(tested, stepper, _in_transformed_time(system), system, tolerance)
+    in_time = system.clock.plain if system.clock and system.clock.plain else system
+    runs = VariableSteps(tested, stepper, in_time, system, tolerance)
     checks = (
-        *(variable_step_checks(runs_tested) if paced else ()),
+        *(variable_step_checks(runs) if paced else ()),
         *step_checks(tested),
         *predictor_checks(tested),
         *(() if system.constraints else roundoff_checks(tested)),
         *structure_checks(tested),
         *derivative_checks(tested),
-        *(time_transformation_derivative_checks(runs_tested) if system.clock else ()),
+        *(time_transformation_derivative_checks(runs) if system.clock else ()),
         *convergence_checks(tested),
         *identity_checks(tested),
+        *impact_checks(tested, watched),
         largest_step(tested),
     )
     parameters = {name.name: value for name, value in single.constants.items()}
     return issued(
         stepper, start, began=began, system=single.name, method=method.name, parameters=parameters, checks=checks
     )
-
-
-def _in_transformed_time(system: MechanicalSystem) -> MechanicalSystem:
-    if system.clock is None:
-        return system
-    assert system.clock.plain is not None
-    return system.clock.plain
 
 
 def _newton(
@@ -176,7 +172,7 @@ def _initial_state(system: MechanicalSystem, stepper: Stepper, q: Any, p: Any, h
         raise StateError("only one of q and p was passed: give both, or neither")
     if q is None or p is None:
         return _random_state(system, stepper, h, t)
-    position, momentum = checked_vector(stepper.interface, q, "q"), checked_vector(stepper.interface, p, "p")
+    position, momentum = checked_pair(stepper.interface, q, p)
     if system.constraints:
         position, momentum = stepper.project(position, momentum, t=t)
     return State(position, momentum, t, h if h else _step(stepper, position, momentum, t))

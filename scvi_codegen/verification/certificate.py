@@ -1,7 +1,6 @@
 """Certificate: one check for each guaranteed property, with the measured number and its bound."""
 
 import hashlib
-import importlib.metadata
 import json
 import math
 import os
@@ -13,12 +12,13 @@ from enum import StrEnum
 from typing import Any, NamedTuple
 
 from scvi_codegen.display.cards import Html, card, grid, plain
-from scvi_codegen.errors import MethodError, StateError, StepFailedError, SystemDefinitionError
+from scvi_codegen.errors import EventError, MethodError, StateError, StepFailedError, SystemDefinitionError
 from scvi_codegen.files.atomic import write_text
 from scvi_codegen.native.announcements import announced
 from scvi_codegen.representation import summary
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.verification.system_under_test import State
+from scvi_codegen.version import __version__
 
 
 class Outcome(StrEnum):
@@ -87,7 +87,7 @@ def checked(name: str, statement: str, measure: Callable[[], Finding | None]) ->
         outcome, remark = Outcome.SATISFIED if finding.satisfied else Outcome.VIOLATED, finding.remark
     except ViolationError as fault:
         outcome, remark = Outcome.VIOLATED, str(fault)
-    except (StateError, StepFailedError, MethodError, SystemDefinitionError, ArithmeticError) as reason:
+    except (StateError, EventError, StepFailedError, MethodError, SystemDefinitionError, ArithmeticError) as reason:
         remark = str(reason)
     yield Check(
         name=name,
@@ -190,7 +190,7 @@ def issued(stepper: Stepper, state: State, *, began: float, **attributes: Any) -
     assert stepper.source is not None
     return Certificate(
         title=stepper.interface.title,
-        version=_installed_version(),
+        version=__version__,
         checksum=hashlib.sha256("".join(stepper.source.files.values()).encode()).hexdigest(),
         flags=stepper.flags,
         q=tuple(map(float, state.q)),
@@ -200,14 +200,6 @@ def issued(stepper: Stepper, state: State, *, began: float, **attributes: Any) -
         seconds=time.perf_counter() - began,
         **attributes,
     )
-
-
-def _installed_version() -> str:
-    """Return the installed version of this package."""
-    try:
-        return importlib.metadata.version("scvi-codegen")
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
 
 
 def _row(check: Check) -> tuple[Html, ...]:

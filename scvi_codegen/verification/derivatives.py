@@ -15,13 +15,12 @@ from scvi_codegen.exact.solution import exact_motion
 from scvi_codegen.exact.step import compiled_equations
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
 from scvi_codegen.tables.precision import Number, mp
 from scvi_codegen.verification.certificate import Check, Finding, checked
 from scvi_codegen.verification.system_under_test import State, SystemUnderTest
 from scvi_codegen.verification.variable_steps import VariableSteps
-
-Array = NDArray[np.float64]
 
 BOUND = 1e-10
 """Bound on relative differences of directional derivatives, and of products relative to their largest terms."""
@@ -35,22 +34,13 @@ MAX_HESSIAN_COORDINATES = 4
 
 @dataclass(frozen=True)
 class _Map:
-    """Step as a function of its arguments (q, p, parameters, t, h), at a state: compiled, and in 60 digits.
-
-    Attributes:
-        stepper: stepper with derivatives.
-        state: state and step size.
-        parameters: values of all parameters in order.
-        scales: sizes of the results.
-        outputs: indices of the results among the arguments.
-        end: results in 60 digits for arguments.
-    """
+    """Step as a function of its arguments (q, p, parameters, t, h), at a state: compiled, and in 60 digits."""
 
     stepper: Stepper
     state: State
     parameters: Array
-    scales: Array
-    outputs: NDArray[np.int_]
+    scales: Array  # sizes of the results
+    outputs: NDArray[np.int_]  # indices of the results among the arguments
     end: Callable[[list[Number]], Array]
 
     def direction(self, phase: float = 1.0) -> Array:
@@ -113,19 +103,19 @@ def _map_of(tested: SystemUnderTest, stepper: Stepper) -> _Map:
     return _Map(stepper, state, values, tested.scales(state), np.arange(2 * m), end)
 
 
-def _map_in_tau(runs_tested: VariableSteps) -> _Map:
+def _map_in_tau(runs: VariableSteps) -> _Map:
     """Return the step of tau from the first state at its energy; its results include the time."""
-    tested, m = runs_tested.tested, runs_tested.system.dimension
+    tested, m = runs.tested, runs.system.dimension
     state = tested.states[0]
 
     def end(arguments: list[Number]) -> Array:
-        step = compiled_equations(runs_tested.transformed, tested.method).with_parameters(arguments[2 * m : -2])
+        step = compiled_equations(runs.transformed, tested.method).with_parameters(arguments[2 * m : -2])
         q, p, h = arguments[:m], arguments[m : 2 * m], arguments[-1]
         result = step(q, p, h)
         return np.array([*result.q, *result.p, arguments[-2] + step.duration(result, q, p, h)], dtype=object)
 
-    values, scales = np.array(list(runs_tested.at_energy(state).values())), np.append(tested.scales(state), state.h)
-    return _Map(runs_tested.stepper, state, values, scales, np.asarray(runs_tested.stepper._output_indices), end)
+    values, scales = np.array(list(runs.at_energy(state).values())), np.append(tested.scales(state), state.h)
+    return _Map(runs.stepper, state, values, scales, np.asarray(runs.stepper._output_indices), end)
 
 
 def derivative_checks(tested: SystemUnderTest) -> Iterator[Check]:
@@ -160,7 +150,11 @@ def _second(tested: SystemUnderTest) -> Finding | None:
         return None
     step = _map_of(tested, tested.stepper)
     u, v, hessian = step.direction(), step.direction(2.3), _hessian(step)
-    exact = _second_derivative_by_differences(step, u, v)
+    weights = [mp.mpf(weight) for weight in _weights(step)]
+    total = mp.zero
+    for sign, other in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        total += sign * other * mp.fdot(weights, step.moved_end((sign * u + other * v) * WIDTH))
+    exact = float(total / (4 * WIDTH**2))
     size = np.abs(u) @ np.abs(hessian) @ np.abs(v)
     return Finding(float(abs(u @ hessian @ v - exact) / size) if size else 0.0, BOUND, "relative, along two directions")
 
@@ -205,38 +199,29 @@ def _hessian(step: _Map) -> Array:
     return hessian
 
 
-def _second_derivative_by_differences(step: _Map, u: Array, v: Array) -> float:
-    """Return the second derivative of the weighted sum along u and v, by differences in 60 digits."""
-    weights = [mp.mpf(weight) for weight in _weights(step)]
-    total = mp.zero
-    for sign, other in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-        total += sign * other * mp.fdot(weights, step.moved_end((sign * u + other * v) * WIDTH))
-    return float(total / (4 * WIDTH**2))
-
-
-def time_transformation_derivative_checks(runs_tested: VariableSteps) -> Iterator[Check]:
+def time_transformation_derivative_checks(runs: VariableSteps) -> Iterator[Check]:
     """Yield the checks along one direction in which all arguments change, among them the energy."""
     statement = "derivatives of a step of tau and of its duration are those of the equations (differences, 60 digits)"
-    yield from checked("derivatives in tau", statement, partial(_in_tau, runs_tested, _Map.derivative_error))
+    yield from checked("derivatives in tau", statement, partial(_in_tau, runs, _Map.derivative_error))
     statement = "derivatives of the energy of the start are those of its formula (60 digits)"
-    yield from checked("energy surface", statement, partial(_energy_derivative, runs_tested))
+    yield from checked("energy surface", statement, partial(_energy_derivative, runs))
     statement = "VJP is the transpose of JVP, times included"
-    yield from checked("adjoint in tau", statement, partial(_in_tau, runs_tested, _Map.transpose_error))
-    if is_symplectic(runs_tested.tested.method, runs_tested.transformed) and not runs_tested.transformed.constraints:
+    yield from checked("adjoint in tau", statement, partial(_in_tau, runs, _Map.transpose_error))
+    if is_symplectic(runs.tested.method, runs.transformed) and not runs.transformed.constraints:
         statement = "J^T Omega J = Omega, J the compiled Jacobian of a step of tau at fixed energy"
-        yield from checked("symplecticity in tau", statement, partial(_symplecticity, runs_tested))
+        yield from checked("symplecticity in tau", statement, partial(_symplecticity, runs))
 
 
-def _in_tau(runs_tested: VariableSteps, error: Callable[[_Map], float]) -> Finding:
-    return Finding(error(_map_in_tau(runs_tested)), BOUND, "relative, along one direction")
+def _in_tau(runs: VariableSteps, error: Callable[[_Map], float]) -> Finding:
+    return Finding(error(_map_in_tau(runs)), BOUND, "relative, along one direction")
 
 
-def _energy_derivative(runs_tested: VariableSteps) -> Finding:
+def _energy_derivative(runs: VariableSteps) -> Finding:
     """Compare the directional derivative of the energy of the state with differences; relative to its largest term."""
-    step = _map_in_tau(runs_tested)
+    step = _map_in_tau(runs)
     state, direction, m = step.state, step.direction(), len(step.state.q)
     terms = step.stepper._energy_gradient(state.q, state.p, step.parameters) * direction
-    motion, count = exact_motion(runs_tested.system), len(runs_tested.system.parameters)
+    motion, count = exact_motion(runs.system), len(runs.system.parameters)
     energies = []
     for sign in (1, -1):
         moved = step.arguments + direction * (sign * WIDTH)
@@ -246,11 +231,11 @@ def _energy_derivative(runs_tested: VariableSteps) -> Finding:
     return Finding(abs(float(terms.sum()) - exact) / float(np.abs(terms).max()), BOUND, "relative, along one direction")
 
 
-def _symplecticity(runs_tested: VariableSteps) -> Finding:
+def _symplecticity(runs: VariableSteps) -> Finding:
     """Return the defect of J^T Omega J = Omega, in units of the areas of pairs of coordinates."""
-    state = runs_tested.tested.states[0]
-    parameters, scales, m = runs_tested.at_energy(state), runs_tested.tested.scales(state), len(state.q)
-    J = runs_tested.stepper.jacobian(state.q, state.p, state.h, state.t, parameters) * scales / scales[:, np.newaxis]
+    state = runs.tested.states[0]
+    parameters, scales, m = runs.at_energy(state), runs.tested.scales(state), len(state.q)
+    J = runs.stepper.jacobian(state.q, state.p, state.h, state.t, parameters) * scales / scales[:, np.newaxis]
     omega = np.kron([[0, 1], [-1, 0]], np.eye(m)) * np.outer(scales, scales)
     areas = np.tile(scales[:m] * scales[m:], 2)
     largest = float(np.abs(J).max()) ** 2

@@ -12,24 +12,23 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.exact.solution import numbers
 from scvi_codegen.mechanics.derived_expressions import forms_of
+from scvi_codegen.mechanics.splitting import kinetic_splitting
 from scvi_codegen.methods import SCVI
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.lanes import LaneBlock
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, ViolationError, checked
 from scvi_codegen.verification.system_under_test import EPSILON, State, SystemUnderTest
-
-Array = NDArray[np.float64]
 
 ROUNDINGS = 16.0
 SHORT = 2.0**-40
@@ -45,6 +44,8 @@ SHORTER = 1 / 64
 COMPENSATED_STEPS = 3
 LANES = 3
 RUNS, SPREAD = 64, 0.02
+Invariant: TypeAlias = Callable[[Array, Array, float], tuple[Array, Array]]
+"""Conserved quantity as a function of (n, m) states and time: (n,) values and their sizes."""
 WORK, MIN_STEPS, MAX_STEPS = 2**14, 2**9, 2**13
 """Numbers of coordinates times steps, and bounds of the number of steps, of each run."""
 STUDENT = 7.0
@@ -79,8 +80,7 @@ def _compensated(tested: SystemUnderTest) -> bool:
 
 def _has_compensation(tested: SystemUnderTest) -> bool:
     """Return True if the method has fixed-point iterations or leapfrog steps, which use the compensation."""
-    forms = forms_of(tested.moved)
-    leaps = bool(tested.method.fractions) and (forms.separable or forms.split)
+    leaps = bool(tested.method.fractions) and not isinstance(kinetic_splitting(tested.moved), str)
     return leaps or tested.stepper.interface.has_fallback
 
 
@@ -182,23 +182,13 @@ def _lanes(tested: SystemUnderTest, starts: list[State], steps: int, carry: Arra
         yield np.concatenate([work.q[-1, lane], work.p[-1, lane]]), low[:, lane]
 
 
-@dataclass(frozen=True, slots=True)
-class _Invariant:
-    """Conserved quantity as a function of (n, m) states and time: (n,) values and their sizes."""
-
-    name: str
-    values: Callable[[Array, Array, float], tuple[Array, Array]]
-
-
-def _invariants(tested: SystemUnderTest) -> list[_Invariant]:
-    """Return the momentum maps that the method conserves, and the energy if its error per step is below round-off.
-
-    Empty unless coefficients have low words or there are none: otherwise increments are rounded, which may cause drift.
-    """
+def _invariants(tested: SystemUnderTest) -> dict[str, Invariant]:
+    """Return the momentum maps that the method conserves, and the energy if its error per step is below round-off."""
     stepper, parameters, method = tested.stepper, tested.parameters, tested.method
+    # Without low words of the coefficients increments are rounded, which may cause drift.
     exact_sums = _has_compensation(tested) and forms_of(tested.moved).separable and not isinstance(method, SCVI)
     if not (exact_sums and method.symplectic):
-        return []
+        return {}
 
     def map_values(k: int, q: Array, p: Array, t: float) -> tuple[Array, Array]:
         values, sizes = stepper._momentum_maps_and_sizes(q, p, t, parameters)
@@ -210,8 +200,8 @@ def _invariants(tested: SystemUnderTest) -> list[_Invariant]:
 
     described = stepper.interface
     exact = [k for k, conserved in enumerate(described.map_exact) if conserved]
-    result = [_Invariant(described.map_names[k], partial(map_values, k)) for k in exact]
-    return [*result, _Invariant("energy", energies)] if _keeps_energy(tested) else result
+    result: dict[str, Invariant] = {described.map_names[k]: partial(map_values, k) for k in exact}
+    return {**result, "energy": energies} if _keeps_energy(tested) else result
 
 
 def _keeps_energy(tested: SystemUnderTest) -> bool:
@@ -238,11 +228,6 @@ class _Walk:
     runs: int
 
     @property
-    def student(self) -> float:
-        """Student's t of the mean."""
-        return abs(self.mean) / math.hypot(self.spread, EPSILON / 4) * math.sqrt(self.runs)
-
-    @property
     def significant(self) -> float:
         """Significant part of the mean, in roundings per step."""
         return max(abs(self.mean) - STUDENT * self.spread / math.sqrt(self.runs), 0.0) / (EPSILON * self.steps)
@@ -262,14 +247,14 @@ def _walks(tested: SystemUnderTest, run: Callable[[Array, Array, int], tuple[Arr
     starts = initial.z + SPREAD * tested.scales(initial) * np.random.default_rng(0).uniform(-1.0, 1.0, (RUNS, 2 * m))
     steps = min(MAX_STEPS, max(MIN_STEPS, WORK // m))
     end = run(starts[:, :m], starts[:, m:], steps)
-    for invariant in invariants:
-        before, sizes = invariant.values(starts[:, :m], starts[:, m:], initial.t)
-        after, _ = invariant.values(*end, initial.t + steps * initial.h)
+    for name, invariant in invariants.items():
+        before, sizes = invariant(starts[:, :m], starts[:, m:], initial.t)
+        after, _ = invariant(*end, initial.t + steps * initial.h)
         changes = (after - before) / sizes
         changes = changes[np.isfinite(changes)]
         if len(changes) < RUNS // 2:
-            raise StateError(f"{invariant.name}: runs of {steps} steps failed")
-        yield _Walk(invariant.name, steps, float(np.mean(changes)), float(np.std(changes, ddof=1)), len(changes))
+            raise StateError(f"{name}: runs of {steps} steps failed")
+        yield _Walk(name, steps, float(np.mean(changes)), float(np.std(changes, ddof=1)), len(changes))
 
 
 def _runs(
@@ -287,7 +272,10 @@ def _runs(
 
 def _largest_student(walks: Iterator[_Walk]) -> Finding | None:
     """Return the largest Student's t."""
-    return max((Finding(walk.student, STUDENT, walk.remark) for walk in walks), default=None)
+    students = (
+        (abs(walk.mean) / math.hypot(walk.spread, EPSILON / 4) * math.sqrt(walk.runs), walk.remark) for walk in walks
+    )
+    return max((Finding(value, STUDENT, remark) for value, remark in students), default=None)
 
 
 def _drift(tested: SystemUnderTest) -> Finding | None:

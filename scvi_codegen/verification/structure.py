@@ -5,18 +5,16 @@ from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.exact.solution import numbers
 from scvi_codegen.methods.discretise import is_conformally_symplectic, is_symplectic
+from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.rotations.reduction import Reduction
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, checked, information
 from scvi_codegen.verification.system_under_test import EPSILON, Jacobian, State, SystemUnderTest
-
-Array = NDArray[np.float64]
 
 ROUNDINGS = 16.0
 SPREAD = 10.0
@@ -115,10 +113,7 @@ def _gauge_invariance(tested: SystemUnderTest) -> Finding:
 def _defect(
     around: Jacobian, tangents: Array, units: Array | float, shrunk: float, forms: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    """Return absolute values of J^T Omega J - Omega on pairs of tangents, and their noise, in units of areas.
-
-    ``shrunk`` is the factor exp(-gamma h) of Omega for a damped system, ``forms`` are Omega before and after the step.
-    """
+    """Return |J^T Omega J - exp(-gamma h) Omega| on pairs of tangents, and its noise, in units of areas."""
     before, omega = (form * np.outer(around.scales, around.scales) for form in forms)
     error = np.full_like(around.matrix, SPREAD * (around.uncertainty + EPSILON * ROUNDINGS))
     ends = around.matrix @ tangents
@@ -171,15 +166,10 @@ def _reversal(tested: SystemUnderTest) -> Finding:
     for _, state, rounding in tested.roundings():
         q, p = tested.step(state)
         back = State(q, p, state.t + state.h, -state.h)
-        noise = tested.rounding(back) + _propagated_back(tested, back, rounding)
+        around = tested.linearised(back)
+        noise = tested.rounding(back) + (rounding if around is None else around.propagated(rounding))
         worst = max(worst, float(np.max(np.abs(tested.ends(back) - state.z) / noise)))
     return Finding(worst, ROUNDINGS, "in units of rounding, 2 states")
-
-
-def _propagated_back(tested: SystemUnderTest, back: State, rounding: Array) -> Array:
-    """Return the bound on the rounding errors of the forward step after the backward step."""
-    around = tested.linearised(back)
-    return rounding if around is None else around.propagated(rounding)
 
 
 def _momentum(tested: SystemUnderTest, k: int) -> Finding:

@@ -6,20 +6,18 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.exact.solution import ExactMotion, exact_motion, numbers
 from scvi_codegen.formulas.expressions import Tape
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.time_transformation import time_rescaling_function
 from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, checked
 from scvi_codegen.verification.structure import ROUNDINGS, momentum_error
 from scvi_codegen.verification.system_under_test import EPSILON, State, SystemUnderTest
-
-Array = NDArray[np.float64]
 
 STEP_DIVISOR = 8
 """Ratio of the test's step size to the one at which times are measured, where the error is near round-off."""
@@ -83,11 +81,6 @@ class VariableSteps:
         """Exact motion in t."""
         return exact_motion(self.system.with_parameters(**self.parameters))
 
-    @cached_property
-    def motion_in_tau(self) -> ExactMotion:
-        """Exact motion in tau, at the energy of the first state."""
-        return exact_motion(self.tested.system.with_parameters(**self.at_energy(self.tested.states[0])))
-
     def run(self, **how: Any) -> Trajectory:
         """Integrate from the first state of the subject."""
         first = self.tested.states[0]
@@ -111,138 +104,123 @@ def at_fixed_energy(system: MechanicalSystem, energy: float) -> MechanicalSystem
     return replace(system, clock=None).with_parameters(**{system.clock.energy.name: energy})
 
 
-def variable_step_checks(runs_tested: VariableSteps) -> Iterator[Check]:
+def variable_step_checks(runs: VariableSteps) -> Iterator[Check]:
     """Yield all checks of this module."""
     for name, statement, measure in (
-        _time_transformation_checks(runs_tested)
-        if runs_tested.stepper.interface.energy_parameter
-        else _adaptive_checks(runs_tested)
+        _time_transformation_checks(runs) if runs.stepper.interface.energy_parameter else _adaptive_checks(runs)
     ):
-        yield from checked(name, statement, partial(measure, runs_tested))
+        yield from checked(name, statement, partial(measure, runs))
 
 
-def _time_transformation_checks(runs_tested: VariableSteps) -> Iterator[tuple[str, str, Any]]:
+def _time_transformation_checks(runs: VariableSteps) -> Iterator[tuple[str, str, Any]]:
     yield "steps of tau", "they equal steps of the transformed system at the energy of their state", _at_their_energy
     yield "time", "the error in t is of the size of the error in tau (60 digits)", _in_time
     yield "final time", "a run to t_end ends at t_end with an error of that size (60 digits)", _at_final_time
-    if runs_tested.tested.method.symmetric:
+    if runs.tested.method.symmetric:
         yield "reversal in tau", f"{THERE_AND_BACK} steps of h and of -h return to time and state", _there_and_back
 
 
-def _adaptive_checks(runs_tested: VariableSteps) -> Iterator[tuple[str, str, Any]]:
+def _adaptive_checks(runs: VariableSteps) -> Iterator[tuple[str, str, Any]]:
     yield "adaptive steps", "each equals a single step of the same size", _equal_single_steps
-    if runs_tested.stepper.interface.time_transformation:
+    if runs.stepper.interface.time_transformation:
         yield (
             "step density",
             "halving tau reduces the deviation from dt = g dtau at least 2.5-fold",
             _follow_step_density,
         )
-        if runs_tested.tested.method.symmetric:
+        if runs.tested.method.symmetric:
             yield "reversal of adaptive steps", "a run backward from its end returns to its start", _reversed
     else:
         yield "local error", "the median over adaptive steps is below the tolerance (60 digits)", _within_tolerance
-    described = runs_tested.stepper.interface
+    described = runs.stepper.interface
     for k, name in enumerate(described.map_names):
-        if runs_tested.tested.method.symplectic and described.map_exact[k]:
+        if runs.tested.method.symplectic and described.map_exact[k]:
             yield f"{name}, adaptive steps", "conserved at variable step size", partial(_conserved, k)
 
 
-def _at_their_energy(runs_tested: VariableSteps) -> Finding:
+def _at_their_energy(runs: VariableSteps) -> Finding:
     worst = 0.0
-    for _, state, rounding in runs_tested.tested.roundings():
-        result = runs_tested.stepper.step(state.q, state.p, state.h, state.t, runs_tested.parameters)
-        expected = runs_tested.tested.stepper.step(state.q, state.p, state.h, state.t, runs_tested.at_energy(state))
+    for _, state, rounding in runs.tested.roundings():
+        result = runs.stepper.step(state.q, state.p, state.h, state.t, runs.parameters)
+        expected = runs.tested.stepper.step(state.q, state.p, state.h, state.t, runs.at_energy(state))
         worst = max(worst, float(np.max(np.abs(np.concatenate(result) - np.concatenate(expected)) / rounding)))
     return Finding(worst, ROUNDINGS, "in units of rounding, 2 states")
 
 
-def _in_time(runs_tested: VariableSteps) -> Finding:
-    start = _shorter(runs_tested)
-    run = runs_tested.run(h=start.h, steps=1)
-    return _compared_with_exact(runs_tested, start, 1, run.q[1], run.p[1], mp.mpf(float(run.t[1])) - mp.mpf(start.t))
+def _in_time(runs: VariableSteps) -> Finding:
+    start = _shorter(runs)
+    run = runs.run(h=start.h, steps=1)
+    return _compared_with_exact(runs, start, 1, run.q[1], run.p[1], mp.mpf(float(run.t[1])) - mp.mpf(start.t))
 
 
-def _at_final_time(runs_tested: VariableSteps) -> Finding:
-    start, (whole, part) = _shorter(runs_tested), CUT
-    t = runs_tested.run(h=start.h, steps=whole + 1).t
+def _at_final_time(runs: VariableSteps) -> Finding:
+    start, (whole, part) = _shorter(runs), CUT
+    t = runs.run(h=start.h, steps=whole + 1).t
     end = float(t[whole] + part * (t[whole + 1] - t[whole]))
-    run = runs_tested.run(h=start.h, t_end=end)
+    run = runs.run(h=start.h, t_end=end)
     if run.t[-1] != end:
         return Finding(abs(run.t[-1] - end), 0.0, f"the run ends at t = {run.t[-1]!r}, not {end!r}")
-    return _compared_with_exact(runs_tested, start, whole + 1, run.q[-1], run.p[-1], mp.mpf(end) - mp.mpf(start.t))
+    return _compared_with_exact(runs, start, whole + 1, run.q[-1], run.p[-1], mp.mpf(end) - mp.mpf(start.t))
 
 
-def _shorter(runs_tested: VariableSteps) -> State:
-    first = runs_tested.tested.states[0]
+def _shorter(runs: VariableSteps) -> State:
+    first = runs.tested.states[0]
     return replace(first, h=first.h / STEP_DIVISOR)
 
 
-def _compared_with_exact(
-    runs_tested: VariableSteps, start: State, steps: int, q: Array, p: Array, span: Any
-) -> Finding:
+def _compared_with_exact(runs: VariableSteps, start: State, steps: int, q: Array, p: Array, span: Any) -> Finding:
     """Compare the state after a time ``span`` with the exact motion; the bound is the error of the steps in tau."""
-    first = np.concatenate(
-        runs_tested.tested.stepper.step(start.q, start.p, start.h, start.t, runs_tested.at_energy(start))
-    )
-    error = runs_tested.distance(runs_tested.motion_in_tau, start, mp.mpf(start.h), first)
-    bound = steps * (ERROR_RATIO * error + ROUNDINGS * runs_tested.rounding(start))
-    return Finding(
-        runs_tested.distance(runs_tested.motion, start, span, np.concatenate([q, p])),
-        bound,
-        f"relative, h = {start.h:g}",
-    )
+    first = np.concatenate(runs.tested.stepper.step(start.q, start.p, start.h, start.t, runs.at_energy(start)))
+    in_tau = exact_motion(runs.tested.system.with_parameters(**runs.at_energy(runs.tested.states[0])))
+    error = runs.distance(in_tau, start, mp.mpf(start.h), first)
+    bound = steps * (ERROR_RATIO * error + ROUNDINGS * runs.rounding(start))
+    return Finding(runs.distance(runs.motion, start, span, np.concatenate([q, p])), bound, f"relative, h = {start.h:g}")
 
 
-def _there_and_back(runs_tested: VariableSteps) -> Finding:
-    first = runs_tested.tested.states[0]
-    how: dict[str, Any] = {
-        "steps": THERE_AND_BACK,
-        "save_every": THERE_AND_BACK,
-        "parameters": runs_tested.at_energy(first),
-    }
-    there = runs_tested.stepper.integrate(first.q, first.p, h=first.h, t=first.t, **how)
-    back = runs_tested.stepper.integrate(there.q[-1], there.p[-1], h=-first.h, t=float(there.t[-1]), **how)
-    change = np.abs(np.concatenate([back.q[-1], back.p[-1]]) - first.z) / runs_tested.tested.rounding(first)
+def _there_and_back(runs: VariableSteps) -> Finding:
+    first = runs.tested.states[0]
+    how: dict[str, Any] = {"steps": THERE_AND_BACK, "save_every": THERE_AND_BACK, "parameters": runs.at_energy(first)}
+    there = runs.stepper.integrate(first.q, first.p, h=first.h, t=first.t, **how)
+    back = runs.stepper.integrate(there.q[-1], there.p[-1], h=-first.h, t=float(there.t[-1]), **how)
+    change = np.abs(np.concatenate([back.q[-1], back.p[-1]]) - first.z) / runs.tested.rounding(first)
     late = abs(float(back.t[-1]) - first.t) / (EPSILON * (abs(float(there.t[-1])) + abs(first.t)))
     return Finding(max(float(change.max()), late) / THERE_AND_BACK, ROUNDINGS, "in units of rounding per step")
 
 
-def _adaptive_run(runs_tested: VariableSteps, part: float = 1.0) -> Trajectory:
-    first = runs_tested.tested.states[0]
+def _adaptive_run(runs: VariableSteps, part: float = 1.0) -> Trajectory:
+    first = runs.tested.states[0]
     end = first.t + SPAN * first.h
-    if runs_tested.stepper.interface.time_transformation:
-        return runs_tested.run(h=part * runs_tested.tau, t_end=end)
-    return runs_tested.run(t_end=end, tolerance=runs_tested.tolerance or None)
+    if runs.stepper.interface.time_transformation:
+        return runs.run(h=part * runs.tau, t_end=end)
+    return runs.run(t_end=end, tolerance=runs.tolerance or None)
 
 
-def _steps_of(runs_tested: VariableSteps) -> Iterator[tuple[State, Array]]:
+def _steps_of(runs: VariableSteps) -> Iterator[tuple[State, Array]]:
     """Yield some steps of a run, including the first and the last: start with step size, and end."""
-    run = _adaptive_run(runs_tested)
+    run = _adaptive_run(runs)
     for k in np.unique(np.linspace(0, len(run) - 2, SAMPLED_STEPS).astype(int)):
         start = State(run.q[k], run.p[k], float(run.t[k]), float(run.t[k + 1] - run.t[k]))
         yield start, np.concatenate([run.q[k + 1], run.p[k + 1]])
 
 
-def _equal_single_steps(runs_tested: VariableSteps) -> Finding:
+def _equal_single_steps(runs: VariableSteps) -> Finding:
     worst = 0.0
-    for start, end in _steps_of(runs_tested):
-        unit = runs_tested.tested.rounding(start) + runs_tested.residual * runs_tested.tested.scales(start)
-        worst = max(worst, float(np.max(np.abs(runs_tested.tested.ends(start) - end) / unit)))
+    for start, end in _steps_of(runs):
+        unit = runs.tested.rounding(start) + runs.residual * runs.tested.scales(start)
+        worst = max(worst, float(np.max(np.abs(runs.tested.ends(start) - end) / unit)))
     return Finding(worst, ROUNDINGS, f"in units of residual and rounding, {SAMPLED_STEPS} steps")
 
 
-def _follow_step_density(runs_tested: VariableSteps) -> Finding:
-    difference = [
-        _density_deviation(runs_tested, _adaptive_run(runs_tested, part), part * runs_tested.tau) for part in (1.0, 0.5)
-    ]
-    remark = f"tau = {runs_tested.tau:.3g}: deviation {difference[0]:.1e}, then {difference[1]:.1e}"
+def _follow_step_density(runs: VariableSteps) -> Finding:
+    difference = [_density_deviation(runs, _adaptive_run(runs, part), part * runs.tau) for part in (1.0, 0.5)]
+    remark = f"tau = {runs.tau:.3g}: deviation {difference[0]:.1e}, then {difference[1]:.1e}"
     return Finding(difference[0] / difference[1], LEAST_REDUCTION, remark, at_least=True)
 
 
-def _density_deviation(runs_tested: VariableSteps, run: Trajectory, tau: float) -> float:
+def _density_deviation(runs: VariableSteps, run: Trajectory, tau: float) -> float:
     """Return the largest relative deviation of the steps from tau (g_k + g_{k+1}) / 2."""
-    system = runs_tested.motion.system
-    rate = time_rescaling_function(system, runs_tested.stepper.interface.time_transformation, in_time=True)
+    system = runs.motion.system
+    rate = time_rescaling_function(system, runs.stepper.interface.time_transformation, in_time=True)
     symbols = (*system.coordinates, *system.auxiliaries, system.time, *system.parameters)
     parameters = [mp.mpf(value) for value in system.defaults]
     tape, g = Tape([rate], symbols), []
@@ -252,31 +230,27 @@ def _density_deviation(runs_tested: VariableSteps, run: Trajectory, tau: float) 
     return float(np.max(np.abs(np.diff(run.t)[:-1] / wanted - 1)))
 
 
-def _reversed(runs_tested: VariableSteps) -> Finding:
+def _reversed(runs: VariableSteps) -> Finding:
     """Return the defect of a run restarted backward from its own saved step density."""
-    first, end = runs_tested.tested.states[0], float(_adaptive_run(runs_tested).t[-2])
-    run = runs_tested.stepper.start(
-        first.q, first.p, h=runs_tested.tau, t=first.t, t_end=end, parameters=runs_tested.parameters
-    )
+    first, end = runs.tested.states[0], float(_adaptive_run(runs).t[-2])
+    run = runs.stepper.start(first.q, first.p, h=runs.tau, t=first.t, t_end=end, parameters=runs.parameters)
     run.record()
-    back = runs_tested.stepper.from_checkpoint(
-        run.checkpoint(), h=runs_tested.tau, t_end=first.t, parameters=runs_tested.parameters
-    )
+    back = runs.stepper.from_checkpoint(run.checkpoint(), h=runs.tau, t_end=first.t, parameters=runs.parameters)
     back.record()
-    change = np.abs(np.concatenate([back.q, back.p]) - first.z) / runs_tested.tested.rounding(first)
+    change = np.abs(np.concatenate([back.q, back.p]) - first.z) / runs.tested.rounding(first)
     return Finding(float(change.max()) / run.steps, ROUNDINGS, f"in units of rounding per step, {run.steps} steps")
 
 
-def _within_tolerance(runs_tested: VariableSteps) -> Finding:
+def _within_tolerance(runs: VariableSteps) -> Finding:
     errors, rounding = [], 0.0
-    for start, end in _steps_of(runs_tested):
-        errors.append(runs_tested.distance(runs_tested.motion, start, mp.mpf(start.h), end))
-        rounding = max(rounding, ROUNDINGS * runs_tested.rounding(start))
+    for start, end in _steps_of(runs):
+        errors.append(runs.distance(runs.motion, start, mp.mpf(start.h), end))
+        rounding = max(rounding, ROUNDINGS * runs.rounding(start))
     remark = f"relative, {SAMPLED_STEPS} steps, largest {max(errors):.1e}"
-    return Finding(float(np.median(errors)), (runs_tested.tolerance or EPSILON) + rounding, remark)
+    return Finding(float(np.median(errors)), (runs.tolerance or EPSILON) + rounding, remark)
 
 
-def _conserved(k: int, runs_tested: VariableSteps) -> Finding:
-    run = _adaptive_run(runs_tested)
+def _conserved(k: int, runs: VariableSteps) -> Finding:
+    run = _adaptive_run(runs)
     result = momentum_error(run, k)
-    return result._replace(bound=result.bound + (len(run) - 1) * runs_tested.residual)
+    return result._replace(bound=result.bound + (len(run) - 1) * runs.residual)

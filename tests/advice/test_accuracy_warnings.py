@@ -65,6 +65,7 @@ class TestLongSteps:
         true = np.abs(run.q[k + 1] - better).max() / np.abs(better).max()
         assert true / 10 < run.step_error < 1e-3
 
+    @pytest.mark.sampled(3)
     @pytest.mark.filterwarnings("error")
     @pytest.mark.parametrize("method", ["svi:1", "svi:2", "scvi:2", "svi:3"])
     @pytest.mark.parametrize("h", [0.1, 0.02])
@@ -96,6 +97,7 @@ class TestLongSteps:
             going.record(1)
         assert 0.0 < going.step_error < 1e-3
 
+    @pytest.mark.sampled(2)
     @pytest.mark.parametrize("method", ["svi:1", "svi:2", "svi:3", "svi:4"])
     def test_impulse_misjudged_by_the_first_step_warns(self, method):
         """A flight goes on from it, whose way grows: the momentum is as wrong as ever."""
@@ -118,6 +120,7 @@ class TestLongSteps:
         with pytest.warns(sc.AccuracyWarning, match="h = 0.02 is too large: .* from t = 3.14 is"):
             stepper.integrate([1.95, 0.0], [0.0, math.sqrt(2 / 1.95 - 1)], h=0.02, steps=300)
 
+    @pytest.mark.sampled(2)
     @pytest.mark.filterwarnings("error")
     @pytest.mark.parametrize("solver", ["fixed-point", "newton"])
     @pytest.mark.parametrize("method", ["svi:2", "svi:3"])
@@ -139,6 +142,7 @@ class TestLongSteps:
 
 
 class TestAnotherRoot:
+    @pytest.mark.sampled(2)
     @pytest.mark.parametrize(
         ("name", "method", "h", "q", "p"),
         [
@@ -146,13 +150,7 @@ class TestAnotherRoot:
             ("cart-pole", sc.SCVI(3), 0.546, [0.8567033196555, -1.4329046594573], [-2.6947054154624, 0.4803669959440]),
             ("duffing", sc.SCVI(3), 0.574, [1.3148677025525], [1.3204047352462]),
             ("cart-pole", sc.SVI(8), -1.29, [-0.4553775197433, -1.9000272389824], [-0.9128980810847, 0.8228105556151]),
-            (
-                "henon-heiles",
-                sc.SVI(8),
-                2.51,
-                [-1.4422025976289, -0.2935955483372],
-                [-1.405773424083, 1.2936703707575],
-            ),
+            ("henon-heiles", sc.SVI(8), 2.51, [-1.4422025976289, -0.2935955483372], [-1.405773424083, 1.2936703707575]),
         ],
     )
     @pytest.mark.filterwarnings("error")

@@ -78,6 +78,7 @@ def assert_achieved(advice: Advice, error: float, tolerance: float) -> None:
 
 
 class TestAchievedErrors:
+    @pytest.mark.sampled(2)
     @pytest.mark.covering
     @pytest.mark.parametrize("tolerance", [1e-6, 1e-9, 1e-11])
     @pytest.mark.parametrize("eccentricity", [0.2, 0.5])
@@ -91,6 +92,7 @@ class TestAchievedErrors:
         error = achieved(system, advice, q, p, kepler_end(eccentricity, span), size)
         assert_achieved(advice, error, tolerance)
 
+    @pytest.mark.sampled(4)
     @pytest.mark.parametrize(
         ("method", "span", "tolerance"),
         [
@@ -123,6 +125,7 @@ class TestAchievedErrors:
         error = achieved(pendulum(), advice, q, p, pendulum_end(span), 1.5 / math.sqrt(2.0))
         assert_achieved(advice, error, tolerance)
 
+    @pytest.mark.sampled(2)
     @pytest.mark.parametrize(
         ("method", "tolerance"), [(SVI(8), 1e-6), (SVI(8), 1e-9), (SVI(8), 1e-11), (SVI(5), 1e-9)], ids=name
     )
@@ -163,6 +166,7 @@ def outer_reference(span: float) -> np.ndarray:
 
 
 class TestDegree:
+    @pytest.mark.sampled(1)
     @pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")  # two digits are wanted
     @pytest.mark.parametrize("tolerance", [1e-2, 1e-6, 1e-11])
     def test_degree_minimises_the_number_of_evaluations(self, tolerance: float):
@@ -175,6 +179,7 @@ class TestDegree:
         assert costs[4] > 1.8 * costs[8]
         assert achieved(system, advice, q, p, kepler_end(0.2, 200.0), 1.0) < tolerance
 
+    @pytest.mark.full
     def test_degree_choice_does_not_depend_on_timings(self, monkeypatch: pytest.MonkeyPatch):
         system, (q, p) = problem("kepler").system, kepler_start(0.2)
         times = iter(np.random.default_rng(1).uniform(0.0, 1e9, 10_000).cumsum())
@@ -229,6 +234,7 @@ class TestHonesty:
         assert 0.02 * advice.expected_error < error < 20.0 * advice.expected_error
         assert 0.1 < advice.h < 1.0  # shorter steps would be for nothing
 
+    @pytest.mark.sampled(2)
     @pytest.mark.parametrize("method", [SVI(8), StoermerVerlet()], ids=name)
     @pytest.mark.parametrize("span", [50.0, 1000.0])
     def test_chaos_is_reported_as_unpredictable(self, method: Method, span: float):

@@ -28,6 +28,7 @@ def test_every_case_has_eight_states_of_one_energy_scale():
         assert chosen.q.shape == chosen.velocity.shape == (8, chosen.dimension)
 
 
+@pytest.mark.sampled(1)
 @needs_extended
 @pytest.mark.parametrize("e", [0.0, 0.9, 0.999])
 def test_keplers_reference_returns_after_a_period(e):

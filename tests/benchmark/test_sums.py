@@ -77,16 +77,13 @@ def test_multibody_systems_are_measured_without_peers(make):
     assert 0.0 < min(each.error for each in result.measurements) < 1e-6
 
 
-def test_chains_move_in_mujoco_and_pinocchio_as_here():
+@pytest.mark.parametrize(("name", "setting"), [("mujoco", "h=0.01"), ("pinocchio", "h=0.01"), ("exudyn", "rtol=1e-06")])
+def test_chains_move_in_engines_as_here(name, setting):
+    pytest.importorskip(name, reason="extra bench")
     robot = chain(3)
-    exact = ours(robot, "svi:4", 200)
-    for name, peer, setting in (
-        ("mujoco", engines.mujoco_contenders, "h=0.01"),
-        ("pinocchio", engines.pinocchio_contenders, "h=0.01"),
-    ):
-        pytest.importorskip(name, reason="extra bench")
-        contender = next(each for each in peer(robot, quick=True) if each.setting == setting)
-        assert np.abs(end(contender) - exact).max() < 1e-6
+    contenders = getattr(engines, f"{name}_contenders")(robot, quick=True)
+    found = end(next(each for each in contenders if each.setting == setting))
+    assert np.abs(found - ours(robot, "svi:4", 200)).max() < 2e-6
 
 
 def test_closed_loops_in_mujoco_are_soft_unless_stiff():

@@ -71,6 +71,7 @@ def test_damping_and_inputs_have_a_work_balance():
     assert "energy balance |E - E0 - W|" in output_of(driven + inputs)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "changed",
     [

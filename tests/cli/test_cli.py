@@ -22,7 +22,7 @@ from click.shell_completion import ShellComplete
 from click.testing import CliRunner, Result
 
 from scvi_codegen.cli import ABOUT, main
-from scvi_codegen.cli.model_options import ModelOptions, read_model
+from scvi_codegen.cli.model_options import read_model
 from scvi_codegen.cli.reports import energy_report
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
@@ -33,9 +33,6 @@ from scvi_codegen.models.problems import PROBLEMS, problem
 pytestmark = pytest.mark.long
 
 COMMAND = shutil.which("scvi-codegen", path=str(Path(sys.executable).parent))
-NOTHING = ModelOptions(
-    **dict.fromkeys(ModelOptions.__dataclass_fields__) | {"parameter": ()}  # type: ignore[arg-type]
-)
 
 
 @pytest.fixture(autouse=True)
@@ -69,7 +66,7 @@ def arrays(path: str) -> dict[str, np.ndarray]:
 
 
 def chosen(name: str = "kepler", **choices: object) -> Model:
-    return read_model(name, replace(NOTHING, **choices))
+    return read_model(name, choices)
 
 
 class TestHelp:

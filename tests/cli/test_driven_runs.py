@@ -79,7 +79,16 @@ def test_inputs_of_the_command_line_replace_those_of_the_file(model):
     table = ([0.0, 1.0, 2.0, 3.0], [1.0, 0.0, 0.5, -1.0], "cubic")
     expected = compile_stepper(model.system, "svi:8").integrate(model.q, model.p, inputs={"u": table}, t_end=2.3)
     found = np.loadtxt("run.csv", delimiter=",", skiprows=1)
-    assert_allclose(found[-1, :3], [2.3, expected.q[-1, 0], expected.p[-1, 0]], atol=1e-12)
+    assert_allclose(found[-1, :3], [2.3, expected.q[-1, 0], expected.p[-1, 0]], rtol=0, atol=1e-12)
+
+
+def test_constant_of_the_command_line(model):
+    output_of("--input", "u=-2.5e-1", "-o", "run.npz")
+    expected = compile_stepper(model.system, model.method).integrate(
+        model.q, model.p, parameters={"u_0": -0.25}, h=0.1, steps=23
+    )
+    with np.load("run.npz") as file:
+        assert_allclose(file["q"][-1], expected.q[-1], rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +120,7 @@ def test_ensemble_of_runs_with_inputs(model):
     expected = [stepper.integrate([q], velocity=[v], **given) for q, v in ((0.1, 0.0), (0.2, 1.0), (0.3, -1.0))]
     with np.load("many.npz") as file:
         assert (file["t"] == expected[0].t).all()
-        assert_allclose(file["q"], np.stack([run.q for run in expected], axis=1), atol=2e-15)
+        assert_allclose(file["q"], np.stack([run.q for run in expected], axis=1), rtol=0, atol=2e-15)
     assert "3 trajectories of 24 steps of 0.1 from t = 0; 25 states saved of each" in text
     changes = max(np.abs(run.energy() - run.energy()[0]).max() for run in expected)
     assert f"it changed by {changes:.3g} at most" in text

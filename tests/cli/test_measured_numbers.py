@@ -151,6 +151,7 @@ def test_errors_of_bench_are_those_of_its_settings():
     assert checked >= 2
 
 
+@pytest.mark.full
 def test_energy_errors_of_the_paper_follow_from_methods_written_out():
     """Energy errors of Figs. 10 and 12, the settings of Tables 6 and 7, from the methods in NumPy."""
     output_of("reproduce", "figure-10", "figure-12", "--jobs", "1", "-o", "out")

@@ -143,11 +143,7 @@ momenta = ["r"]
 hamiltonian = "r**2*(1 + c*x**2)/(2*m) + k*x**2/2 + x*r/8"
 """,
         start="q = [0.75]\np = [0.5]\n",
-        rates=lambda t, q, p: (
-            p * (1 + C * q**2) / M + q / 8,
-            -C * q * p**2 / M - K * q - p / 8,
-            none(q),
-        ),
+        rates=lambda t, q, p: (p * (1 + C * q**2) / M + q / 8, -C * q * p**2 / M - K * q - p / 8, none(q)),
         energy=lambda t, q, p: column(p**2 * (1 + C * q**2) / (2 * M) + K * q**2 / 2 + q * p / 8),
         coordinates=("x",),
         method=("gauss:2", "gauss-2", 4),
@@ -415,6 +411,7 @@ def tau_fits(done: Done, h: float) -> bool:
     return bool(np.allclose(tau, done.kind.save_every * h, rtol=done.kind.tau, atol=0.0)) and varied
 
 
+@pytest.mark.sampled(5)
 def test_steps_of_tau_are_those_of_the_time_transformation(done):
     assert done.kind.tau == 0.0 or tau_fits(done, done.numbers["h"])
 
@@ -430,6 +427,7 @@ def balance_fits(done: Done, found: float) -> bool:
     return abs(found - largest(energy - energy[0] - run.work())) < 1e-14 and found > 0.0
 
 
+@pytest.mark.sampled(5)
 def test_every_field_of_the_json_is_correct(done):
     checks = expected_fields(done)
     assert done.numbers.keys() == checks.keys()
@@ -486,6 +484,7 @@ def energy_line(done: Done, line: str) -> None:
     assert float(found[2]) == pytest.approx(drift(done, abs(energy[0])), rel=0.06)
 
 
+@pytest.mark.sampled(5)
 def test_every_line_of_the_text_is_correct(done):
     lines = list(done.lines)
     first_lines(done, lines)

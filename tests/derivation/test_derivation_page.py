@@ -91,6 +91,7 @@ def compared(system: Any, method: Any) -> list[tuple[sympy.Expr, sympy.Expr]]:
 
 
 class TestEquations:
+    @pytest.mark.sampled(5)
     @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
     def test_rolled_sums_equal_unrolled_terms(self, method):
         assert all(abs(one - other) < 1e-18 for one, other in compared(tilted(), method))
@@ -162,6 +163,7 @@ class TestPage:
         assert re.findall(r"\((\d+)\)", part) == numbers
         assert part.count("\u2297") == {"position": 3, "phase-space": 4}[form]
 
+    @pytest.mark.sampled(5)
     @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
     def test_every_method_has_a_well_formed_self_contained_page(self, method):
         page = derivation_html(sc.problem("planar-pendulum").system, method)

@@ -153,6 +153,7 @@ def every_method_and_system():
             yield pytest.param(system, method, marks=marks, id=f"{method.name}-{system.name}")
 
 
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize(("system", "method"), [*every_method_and_system()])
 def test_closed_form_and_compiled_step_agree(system, method):
     stepper = compile_stepper(system, method)
@@ -162,6 +163,7 @@ def test_closed_form_and_compiled_step_agree(system, method):
     np.testing.assert_allclose(compiled[1], p1, rtol=1e-14, atol=4e-15)
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("system", SYSTEMS[:3], ids=lambda s: s.name)
 @pytest.mark.parametrize("form", ["position", "phase-space"])
 @pytest.mark.parametrize("degree", [1, 3])

@@ -312,10 +312,7 @@ class PrintedStep:
 
     def end(self, x: np.ndarray[Any, Any], *state: Any) -> tuple[Any, Any]:
         known = self.known(x, *state)
-        return (
-            value(self.ends["q"], known.__getitem__),
-            value(self.ends["p"], known.__getitem__) / known["growth"],
-        )
+        return (value(self.ends["q"], known.__getitem__), value(self.ends["p"], known.__getitem__) / known["growth"])
 
     def solved(self, *state: Any) -> np.ndarray[Any, Any]:
         """Newton's iteration with differences for derivatives, to 40 digits."""
@@ -417,6 +414,7 @@ def compiled_step(name: str) -> tuple[Any, Any]:
         return stepper.step([float(x) for x in q], [float(x) for x in p], h, t, PARAMETERS)
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("name", NAMES)
 def test_the_printed_stage_equations_are_those_of_the_step(name):
     assert (name in WITHOUT_STAGES) == (not any(entry.pair == "evaluate" for entry in made(name)[2].entries))
@@ -426,6 +424,7 @@ def test_the_printed_stage_equations_are_those_of_the_step(name):
         np.testing.assert_allclose(found.astype(float), expected, rtol=2e-14, atol=1e-15)
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", [name for name in NAMES if name.values[0] not in WITHOUT_STAGES])
 def test_printed_compiled_equations_are_those_of_the_step(name):
     step, x = solution(name, "evaluate")

@@ -235,6 +235,7 @@ def test_cards_escape_text():
     assert listed([]) == "none"
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("size", "scheme"), VIEWS)
 def test_displays_render_in_a_browser(browser, tmp_path, size, scheme):
     displays = "\n".join(display()._repr_html_() for display in DISPLAYED.values())

@@ -152,6 +152,7 @@ def test_mathml_evaluates_to_the_expression(expression):
     check_read_back(expression)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("name", "method", "radicals"), DERIVED, ids=lambda value: getattr(value, "name", str(value)))
 def test_derived_equations_survive_a_round_trip(name, method, radicals):
     derived = derive(problem(name).system, method, radicals=radicals)

@@ -123,6 +123,7 @@ def all_but(long):
     return [pytest.param(name, marks=[pytest.mark.full] if name == long else []) for name in CASES]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", all_but("double-pendulum"))
 def test_momenta_and_energy_are_the_derivatives_of_the_action(name):
     """dL_d = -p0 . dq0 + p1 . dq1 + (L - p1 . v1) dh, the Hamilton-Jacobi equation, by central differences."""
@@ -144,6 +145,7 @@ def test_momenta_and_energy_are_the_derivatives_of_the_action(name):
     assert abs(derivative - expected) < mp.mpf("1e-18")
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", all_but("pumped-cart-pole"))
 def test_flow_connects_its_end_points_and_is_reversible(name):
     system, q, v, h = CASES[name]
@@ -227,6 +229,7 @@ def test_errors_state_the_remedy(call, words):
         call()
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("method", "order"),
     [(SVI(2), 4), (SCVI(2), 4), (SCVI(3, "gauss-legendre:1"), 2), (SCVI(3), 6)],

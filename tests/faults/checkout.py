@@ -20,12 +20,13 @@ def copied(folder: Path) -> Path:
     return copy
 
 
-def run(copy: Path, *command: str, seconds: int = TOO_LONG) -> tuple[int, str]:
+def run(copy: Path, *command: str, seconds: int = TOO_LONG, **variables: str) -> tuple[int, str]:
     """The exit status and the last line that says something; status 1 of what works longer than so many seconds."""
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(copy), *(str(copy / name) for name in OF_TESTS)]),
         "SCVI_CODEGEN_CACHE": str(copy.parent / "cache"),
         "PYTHONDONTWRITEBYTECODE": "1",
+        **variables,
     }
     try:
         found = subprocess.run(

@@ -39,13 +39,7 @@ from scvi_codegen.lowering import stage_groups
 from scvi_codegen.lowering.solvers import curves, points
 from scvi_codegen.mechanics import derived_expressions as mechanics
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.methods import (
-    acceleration_stages,
-    composition,
-    leapfrog_stages,
-    shooting_stages,
-    stage_system,
-)
+from scvi_codegen.methods import acceleration_stages, composition, leapfrog_stages, shooting_stages, stage_system
 from scvi_codegen.rendering.kernels import printer as c_printer
 from scvi_codegen.tables import quadrature, tableau
 from scvi_codegen.tables.precision import mp
@@ -108,11 +102,7 @@ MUTATIONS = (
         lambda original: lambda self, x, n: original(self, x, n - 1 if n > 2 else n),
     ),
     function(
-        "r^-5 for r^-3",
-        case("kepler/svi-3"),
-        arithmetic,
-        "INVERSE_ROOTS",
-        lambda own: {**own, 3: "inverse_root_5"},
+        "r^-5 for r^-3", case("kepler/svi-3"), arithmetic, "INVERSE_ROOTS", lambda own: {**own, 3: "inverse_root_5"}
     ),
     function(
         "a power of h too much in a gather",
@@ -161,12 +151,7 @@ MUTATIONS = (
     ),
     text("a factor in a derivative", case("driven/svi"), r"3\.0 \*", "2.0 *", within="quadrature_slope"),
     text("h for h^2", case("driven/svi"), r"data->square = h \* h;", "data->square = h;"),
-    text(
-        "a run one step ahead in time",
-        case("driven/svi"),
-        r"step\.t = now\.t;",
-        "step.t = now.t + run->h;",
-    ),
+    text("a run one step ahead in time", case("driven/svi"), r"step\.t = now\.t;", "step.t = now.t + run->h;"),
     text("L added in the energy", case("driven/svi"), r"sum = -value\[0\];", "sum = value[0];"),
     text(
         "Newton's iteration accepts too early",

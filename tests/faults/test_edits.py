@@ -7,7 +7,10 @@ from pathlib import Path
 
 import pytest
 from checkout import ROOT, copied, run
+from samples import UNOPTIMISED
 from tiers import first_of_each
+
+from scvi_codegen.native.building import FLAGS_VARIABLE
 
 Edit = dict[str, str]
 
@@ -16,6 +19,8 @@ EDITS: list[Edit] = [
     for group, edits in tomllib.loads((ROOT / "tests/faults/edits.toml").read_text(encoding="utf-8")).items()
     for name, edit in edits.items()
 ]
+BOTH_TIERS = ("-m", "full or not full")
+QUICKLY = {FLAGS_VARIABLE: " ".join(UNOPTIMISED)}
 FAILED = 1
 STILLBORN = re.compile(r"BuildError|SyntaxError|NameError|ImportError|UndefinedError")
 """What is no notice: text that is none of C, Python or Jinja."""
@@ -45,10 +50,10 @@ def test_edits_find_their_source_lines() -> None:
 def test_every_edit_is_detected(edit: Edit, copy: Path) -> None:
     path = copy / edit["file"]
     text = path.read_text(encoding="utf-8")
-    pytest_alone = ("-m", "pytest", "-qx", "--tb=line", "-p", "no:cacheprovider", "-p", "no:xdist")
+    pytest_alone = ("-m", "pytest", "-qx", "--tb=line", "-p", "no:cacheprovider", "-p", "no:xdist", *BOTH_TIERS)
     path.write_text(text.replace(edit["old"], edit["new"]), encoding="utf-8")
     try:
-        status, words = run(copy, sys.executable, *pytest_alone, f"tests/{edit['test']}")
+        status, words = run(copy, sys.executable, *pytest_alone, f"tests/{edit['test']}", **QUICKLY)
     finally:
         path.write_text(text, encoding="utf-8")
     assert status == FAILED, f"{edit['test']} does not notice: {words}"

@@ -35,6 +35,7 @@ def integrated(field, options, start, *, method="svi:4", h=0.01, steps=10):
     return mesh, stepper.integrate({"u": start(*places)}, h=h, steps=steps)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.filterwarnings("ignore::scvi_codegen.AccuracyWarning")
 @pytest.mark.parametrize("ends", ENDS)
 def test_errors_of_beams_fall_exponentially_with_the_degree(ends):
@@ -80,11 +81,7 @@ def test_energy_of_a_nonlinear_density_is_its_quadrature():
 @pytest.mark.full
 def test_supported_plate():
     field = FieldSystem.from_text(
-        "plate",
-        ["u"],
-        {"x": (0, 1), "y": (0, 2)},
-        "u_t**2/2 - (u_xx + u_yy)**2/2",
-        boundary={"x": (0, 0), "y": (0, 0)},
+        "plate", ["u"], {"x": (0, 1), "y": (0, 2)}, "u_t**2/2 - (u_xx + u_yy)**2/2", boundary={"x": (0, 0), "y": (0, 0)}
     )
     shape = lambda x, y: sin(pi * x) * sin(pi * y / 2)  # noqa: E731
     mesh, run = integrated(field, {"degree": 6, "elements": 2}, shape)
@@ -93,6 +90,7 @@ def test_supported_plate():
     assert run.energy_error() < 1e-12
 
 
+@pytest.mark.full
 def test_solitary_wave_of_the_boussinesq_equation():
     """Soliton 6 k^2/cosh(k (x - c t))^2 of u_tt = (u - u^2 - u_xx)_xx in potential form, u = w_x."""
     c, k = 0.6, 0.4

@@ -61,6 +61,7 @@ def test_operators_satisfy_summation_by_parts(order):
     assert largest < axis.stiffness[0] < 1.03 * largest
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("order", [2, 4, 6, 8])
 @pytest.mark.parametrize(
     ("ends", "mode"), [((0, 0), lambda x: sin(pi * x)), (("natural", "natural"), lambda x: cos(pi * x))]

@@ -71,6 +71,7 @@ def test_errors_of_elements_fall_exponentially_with_the_degree():
     assert found[-1] < 1e-10
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("order", [2, 4, 6, 8])
 def test_differences_have_their_order(order):
     field = FieldSystem.from_text("ring", ["u"], {"x": (0, "2*pi")}, "u_t**2/2 - u_x**2/2", boundary={"x": "periodic"})
@@ -111,6 +112,7 @@ BOUNDARIES = {
 }
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("kind", BOUNDARIES)
 @pytest.mark.parametrize("elements", [2, [0, 0.3, 0.6, 1]])
 def test_boundaries_of_elements(kind, elements):
@@ -143,10 +145,7 @@ def test_two_coupled_fields(method, options, bound):
         boundary={"x": "periodic"},
         parameters={"k": 1.5},
     )
-    exact = {
-        "u": lambda x, t: sin(x - t) + sin(x) * cos(2 * t),
-        "v": lambda x, t: sin(x - t) - sin(x) * cos(2 * t),
-    }
+    exact = {"u": lambda x, t: sin(x - t) + sin(x) * cos(2 * t), "v": lambda x, t: sin(x - t) - sin(x) * cos(2 * t)}
     rates = dict.fromkeys("uv", lambda x, t: -cos(x - t))
     assert max(errors(field, method, options, exact, rates)) < bound
 
@@ -169,6 +168,7 @@ def test_waves_in_the_plane(method, options, bound):
     assert max(errors(field, method, options, exact)) < bound
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.covering
 @pytest.mark.parametrize(
     ("method", "options"),
@@ -273,6 +273,7 @@ def test_derivative_at_prescribed_ends_and_between_elements():
     assert mesh.derivative(x * (1 + x), "x") == pytest.approx(1 + 2 * x, abs=1e-12)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("field", "method", "options"),
     [
@@ -304,6 +305,36 @@ def test_equations_are_those_of_euler_and_lagrange():
     density = 2 * u.diff(t) ** 2 - u.diff(x, y) ** 2 / 2 - y * u.diff(x) ** 2 / 2 - u**4 / 4
     space = {"x": (0, 1), "y": (0, 1)}
     assert FieldSystem.from_sympy(name="plate", fields=[u], space=space, density=density) == field
+
+
+def test_sympy_expressions_of_momenta_damping_and_places_are_those_of_text():
+    x, t, k = sympy.symbols("x t k")
+    u, p, X = (sympy.Function(name)(*arguments) for name, *arguments in (("u", x, t), ("p", x, t), ("X", t)))
+    common = {"space": {"x": (0, 1)}, "parameters": {"k": 2.0}, "boundary": {"x": ("natural", 0)}}
+    text = FieldSystem.from_text("a", ["u"], hamiltonian="u_x**2/2 + p_x**2/2 + k*u*p", momenta=["p"], **common)
+    hamiltonian = u.diff(x) ** 2 / 2 + p.diff(x) ** 2 / 2 + k * u * p
+    assert FieldSystem.from_sympy(name="a", fields=[u], momenta=[p], hamiltonian=hamiltonian, **common) == text
+    place = "X_t**2/2 - k*(u - X)**2/2"
+    text = FieldSystem.from_text(
+        "b",
+        ["u"],
+        density="u_t**2/2",
+        dissipation="x*u_t**2",
+        scalars=["X"],
+        point_lagrangians=[{"x": "1/2", "lagrangian": place}],
+        **common,
+    )
+    symbolic = FieldSystem.from_sympy(
+        name="b",
+        fields=[u],
+        density=u.diff(t) ** 2 / 2,
+        dissipation=x * u.diff(t) ** 2,
+        scalars=[X],
+        point_lagrangians=[{"x": 0.5, "lagrangian": X.diff(t) ** 2 / 2 - k * (u - X) ** 2 / 2}],
+        **common,
+    )
+    assert symbolic == text
+    assert symbolic.derive().to_text().endswith("conservation laws: none found, the density is damped\n")
 
 
 def test_other_parameters_and_arrays_of_a_run_replace_those_of_the_mesh():
@@ -362,9 +393,9 @@ MESHES = {
     "number": ((3, {"points": 8}), "no discretisation '3'"),
     "breaks": (("spectral-elements", {"degree": 2, "elements": [0, 0.5, 0.4, 1]}), "must ascend"),
     "degree": (("spectral-elements", {"degree": 0, "elements": 3}), "at least 1"),
-    "not quadratic": (("fourier", {"points": 128}), "quadratic in derivatives"),
-    "variable": (("fourier", {"points": 128}), "constant factors"),
-    "oblique": (("fourier", {"points": 128}), "along one axis"),
+    "not quadratic": (("fourier", {"points": 128, "derivative": "dense"}), "quadratic in derivatives"),
+    "variable": (("fourier", {"points": 128, "derivative": "dense"}), "constant factors"),
+    "oblique": (("fourier", {"points": 128, "derivative": "dense"}), 'use derivative="fft"'),
 }
 DENSITIES = {
     "not quadratic": "u_t**2/2 - u_x**4/4 - u_x**2/2",
@@ -380,6 +411,20 @@ def test_meshes_that_do_not_suit_are_refused_by_name(problem):
     field = string(DENSITIES.get(problem, "u_t**2/2 - u_x**2/2"), boundary={"x": ends})
     with pytest.raises((SystemDefinitionError, sc.MethodError), match=message):
         field.discretise(method, **options)
+
+
+def test_korteweg_de_vries_needs_fourier_modes():
+    """Its density is one of u = q_x/2 + p alone, -u^3 has no lower bound; with u^4 all meshes serve."""
+    arguments = {"space": {"x": (0, 1)}, "fields": ["q"], "momenta": ["p"], "boundary": {"x": "periodic"}}
+    for power, refused in (("- (q_x/2 + p)**3", True), ("+ (q_x/2 + p)**4", False), ("- p**3", False)):
+        field = FieldSystem.from_text("kdv", hamiltonian=f"(q_xx/2 + p_x)**2/2 {power}", **arguments)
+        field.discretise("fourier", points=15)
+        for method, options in (("finite-differences", {"order": 2, "points": 9}), ("legendre", {"degree": 4})):
+            if refused:
+                with pytest.raises(SystemDefinitionError, match="Use 'fourier' with an odd number of points"):
+                    field.discretise(method, **options)
+            else:
+                field.discretise(method, **options)
 
 
 def test_wrong_shapes_and_axes_are_refused():

@@ -55,6 +55,7 @@ LAWS = {
 }  # fmt: skip
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("name", LAWS)
 def test_laws_found_hold_on_solutions(name):
     field, expected = LAWS[name]
@@ -129,6 +130,7 @@ def test_integral_of_the_energy_density_is_the_energy(boundary):
     assert mesh.conserved(run)["energy"] == pytest.approx(run.energy(), rel=1e-13)
 
 
+@pytest.mark.full
 def test_laws_of_elastic_waves_in_the_plane():
     mesh = lagrangian(SOLID, "uv", PLANE, boundary=PERIODIC).discretise("finite-differences", order=8, points=32)
     x, y = mesh.points.values()

@@ -60,6 +60,7 @@ SINE_GORDON = {
 }
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", SINE_GORDON)
 def test_sine_gordon_kink_and_collision(name):
     field, exact, (start, end) = SINE_GORDON[name]
@@ -87,12 +88,10 @@ def peregrine(x, t):
     return exp(1j * t) * (1 - 4 * (1 + 2j * t) / (1 + 4 * x * x + 4 * t * t))
 
 
+@pytest.mark.full
 def test_peregrine_breather_between_prescribed_ends():
     bulge = "4/(1 + 4*25 + 4*t**2)"
-    ends = {
-        "a": f"cos(t)*(1 - {bulge}) + sin(t)*2*t*{bulge}",
-        "b": f"sin(t)*(1 - {bulge}) - cos(t)*2*t*{bulge}",
-    }
+    ends = {"a": f"cos(t)*(1 - {bulge}) + sin(t)*2*t*{bulge}", "b": f"sin(t)*(1 - {bulge}) - cos(t)*2*t*{bulge}"}
     field = FieldSystem.from_text(
         "Peregrine",
         ["a"],
@@ -120,6 +119,7 @@ def solitons(x, t):
     return 2 * (second / tau - (first / tau) ** 2)
 
 
+@pytest.mark.full
 def test_korteweg_de_vries_solitons_collide():
     """The bracket {u(x), u(y)} = d/dx delta(x - y) is that of u = q_x/2 + p for canonical q and p; q_x/2 - p rests."""
     field = FieldSystem.from_text(
@@ -193,6 +193,7 @@ def test_maxwell_modes_of_a_cavity():
     assert np.ptp(run.energy()) < 1e-12
 
 
+@pytest.mark.full
 def test_elastic_waves_in_the_plane_have_two_speeds():
     field = FieldSystem.from_text(
         "solid",

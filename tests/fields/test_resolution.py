@@ -39,6 +39,34 @@ def test_runs_report_the_unresolved_part_and_warn_of_it(method, recwarn):
             stepper.integrate({"u": np.random.default_rng(0).normal(size=x.shape)}, h=0.01, steps=3)
 
 
+def test_recorded_pieces_and_ensembles_warn_of_unresolved_fields():
+    mesh = ring("u_t**2/2 - u_x**2/2").discretise("finite-differences", order=2, points=16)
+    stepper = sc.compile_stepper(mesh.system, "stoermer-verlet", flags=QUICK_FLAGS)
+    rough, smooth = (-1.0) ** np.arange(16), np.cos(mesh.points["x"])
+    run = stepper.start({"u": rough}, velocity={"u": 0 * rough}, h=0.01)
+    with pytest.warns(AccuracyWarning, match="does not resolve the fields: at t = "):
+        run.record(4)
+    members = np.stack([smooth, rough])
+    with pytest.warns(AccuracyWarning, match="does not resolve the fields: trajectory 1, at t = 0"):
+        stepper.integrate_ensemble({"u": members}, velocity={"u": 0 * members}, h=0.01, steps=4)
+
+
+@pytest.mark.full
+def test_recordings_report_the_unresolved_part_and_warn_of_it(tmp_path):
+    mesh = ring().discretise("fourier", points=6)
+    stepper = sc.compile_stepper(mesh.system, "stoermer-verlet", flags=QUICK_FLAGS)
+    start = {"u": np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])}
+    with pytest.warns(AccuracyWarning, match="does not resolve the fields: at t = 0"):
+        recorded = sc.record_run(stepper.start(start, h=0.01), tmp_path / "run", steps=4)
+    with pytest.warns(AccuracyWarning, match="does not resolve the fields"):
+        expected = stepper.with_sizes(Nx=6).integrate(start, {"u": np.zeros(6)}, h=0.01, steps=4).unresolved()
+    np.testing.assert_array_equal(recorded.unresolved(), expected)
+    loaded = sc.load_run(tmp_path / "run", mesh=mesh)
+    np.testing.assert_array_equal(loaded.unresolved(), expected)
+    with pytest.raises(MethodError, match=r"load_run\(folder, mesh=mesh\)"):
+        sc.load_run(tmp_path / "run").unresolved()
+
+
 def test_systems_without_a_mesh_report_no_resolution():
     chain = sc.LagrangianSystem.from_text("c", ["q[N]"], "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)")
     run = sc.compile_stepper(chain, "svi:2", flags=QUICK_FLAGS).integrate(np.ones(3), h=0.1, steps=2)
@@ -60,6 +88,7 @@ def test_explicit_steps_are_stable_up_to_the_largest_step(method):
     assert np.abs(unstable.q["u"]).max() > 1e3
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("points", [1, 2, 4, 8])
 def test_fixed_point_iterations_converge_up_to_the_largest_step(points):
     mesh, method = ring().discretise("fourier", points=32), f"svi:{points}"

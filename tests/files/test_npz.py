@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
+from scvi_codegen.files.export import States
 
 PARAMETERS = {"m": 1.0, "k": 1.0}
 GIVEN: dict[str, Any] = {"h": 0.05, "steps": 12, "t": 0.7, "save_every": 3}
@@ -91,3 +92,18 @@ def test_files_contain_the_result_and_its_description(made: Callable[[], Result]
             assert np.array_equal(file[name], values, equal_nan=np.asarray(values).dtype.kind == "f"), name
         assert {file[name].dtype for name in ("t", "q", "p")} == {np.dtype(float)}
         assert {*file} - {*expected} <= {"parameters"}  # of a run with inputs the last values of the inputs, too
+
+
+@pytest.mark.parametrize("count", [2, 200])
+def test_many_parameters_are_a_labelled_array(count):
+    """Few parameters are text in an attribute."""
+    parameters = {f"m_{k}": k / 2 for k in range(count)}
+    names = {"coordinates": ("x",), "momenta": ("p_x",)}
+    labelled = States(count=0, pieces=lambda: iter(()), **names, parameters=parameters, h=0.1, about={}).labelled()
+    if count == 2:
+        assert labelled.attributes == {"h": 0.1, "parameters": '{"m_0": 0.0, "m_1": 0.5}'}
+        assert set(labelled.whole) == {"coordinate"}
+    else:
+        assert labelled.attributes == {"h": 0.1}
+        assert dict(zip(labelled.whole["parameter"], labelled.whole["parameters"], strict=True)) == parameters
+        assert labelled.dimensions["parameters"] == ("parameter",)

@@ -56,7 +56,7 @@ def test_index_notation_is_parsed(text: str, read: list[str] | None) -> None:
         ("sum(i in M, q[i])", "'M' is not the size of an array"),
         ("sum(i in N, x[i])", "'x' is not an array"),
         ("sum(i in N, q[j])", "'j' is not an index"),
-        ("sum(i in N, q)", "'q' is an array: write q[N]"),
+        ("sum(i in N, q)", "'q' is an array, q[N]: write an entry, q[i]"),
         ("sum(i in N, i*q[i])", "'i' is an index, which may occur only in brackets"),
         ("N*sum(i in N, q[i])", "'N' is a size, which may occur only in brackets"),
         ("sum(b in B, bonds[b, 0])", "'bonds' is an index table"),

@@ -77,6 +77,7 @@ def test_order_is_preserved_up_to_the_smoothness_at_the_cut_off() -> None:
     assert order(1) < 2.5
 
 
+@pytest.mark.full
 def test_certificate() -> None:
     certificate = sc.verify(pair(6), "svi:2")
     assert certificate.passed, str(certificate)

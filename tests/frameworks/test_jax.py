@@ -43,10 +43,7 @@ def binary64():
 @cache
 def driven(method):
     system = LagrangianSystem.from_text(
-        name="driven",
-        coordinates=["x"],
-        lagrangian="m*x_dot**2/2 - k*x**4/4 + a*x*cos(w*t)",
-        parameters=SPECIAL,
+        name="driven", coordinates=["x"], lagrangian="m*x_dot**2/2 - k*x**4/4 + a*x*cos(w*t)", parameters=SPECIAL
     )
     return compile_stepper(system, method, flags=QUICK_FLAGS)
 

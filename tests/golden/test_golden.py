@@ -10,6 +10,7 @@ import pytest
 from golden_cells import CELLS, output, program, recorded
 
 
+@pytest.mark.sampled(22)
 @pytest.mark.parametrize("name", CELLS)
 def test_results_have_the_bits_of_the_recorded_source(name: str, tmp_path: Path) -> None:
     now, before = program(name), recorded()[name]

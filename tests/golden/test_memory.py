@@ -49,9 +49,9 @@ def with_exact_arrays(main: str, *, hamiltonian: bool) -> str:
     return main
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize(
-    "name",
-    [*FEW_UNKNOWNS, *(name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in CELLS)],
+    "name", [*FEW_UNKNOWNS, *(name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in CELLS)]
 )
 def test_runs_read_and_write_only_their_own_memory(name: str, tmp_path: Path) -> None:
     needs(SANITIZED[0])

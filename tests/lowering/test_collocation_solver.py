@@ -56,6 +56,7 @@ def test_more_points_than_lanes_use_newton(sample):
     assert fixed_point(system, SCVI(2, "gauss-legendre:33", variational=False)) is None
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", ["pumped-cart-pole", "relativistic-particle"])
 @pytest.mark.parametrize("method", [SpectralCollocation(8), RadauIA(3, form="position"), PRINTED[1]], **named)
 def test_run_equals_that_of_newton(sample, compiled, name, method):
@@ -66,6 +67,7 @@ def test_run_equals_that_of_newton(sample, compiled, name, method):
     assert difference(*runs) < 2e-13
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", [SVI(3), SCVI(2), SpectralCollocation(3), PRINTED[0]], **named)
 def test_start_from_rest_does_not_need_newton(sample, compiled, method):
     """Velocities that vanish are no measure of what is small."""

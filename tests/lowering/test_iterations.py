@@ -44,6 +44,7 @@ def stepper(name: str, solver: str) -> Stepper:
     return compile_stepper(case(name).system, case(name).method(), solver=solver, flags=QUICK_FLAGS)
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize(("name", "solver"), EXPECTED)
 def test_iteration_counts_are_those_recorded(name, solver):
     given, expected = case(name), EXPECTED[name, solver]

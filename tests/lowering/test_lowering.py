@@ -136,6 +136,7 @@ def test_reading_back_gives_the_original_to_fifty_digits(values, point):
 CATALOGUE = ["planar-pendulum", "duffing", "kepler", "double-pendulum", "spherical-pendulum", "relativistic-particle"]
 
 
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize("name", CATALOGUE)
 @pytest.mark.parametrize("method", [SVI(3), SCVI(2), SpectralCollocation(2), Gauss(2)], ids=lambda m: m.name)
 def test_kernels_have_the_values_and_derivatives_of_their_formulas(name, method):

@@ -28,6 +28,7 @@ def stop(steps: int) -> None:
     raise StoppedError
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("system", "method"), ITERATED, ids=[f"{system.name}-{method}" for system, method in ITERATED])
 def test_iterations_that_overflow_do_not_converge(system, method):
     stepper = sc.compile_stepper(system, method, solver="fixed-point", flags=QUICK_FLAGS)
@@ -50,5 +51,5 @@ def test_step_count_does_not_depend_on_scale(system, method):
     for size in (1e-290, 1e-200, 1e-150, 1e150, 1e200, 1e290):
         found = stepper.integrate(*(size * x for x in start), t_end=5.0, tolerance=1e-9)
         assert found.steps == expected.steps
-        np.testing.assert_allclose(found.q / size, expected.q, atol=1e-13)
+        np.testing.assert_allclose(found.q / size, expected.q, rtol=0, atol=1e-13)
         assert found.step_error == pytest.approx(expected.step_error, rel=1e-3)

@@ -44,6 +44,7 @@ def test_short_kernel_is_not_split():
     assert (part.name, part.statements) == ("k", tuple(whole.statements()))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.covering
 @pytest.mark.parametrize("solver", ["newton", "fixed-point"])
 @pytest.mark.parametrize("name", ["double-pendulum", "charged-particle", "fput-chain"])
@@ -66,6 +67,7 @@ def test_split_kernels_give_bitwise_equal_trajectories(name, solver, cut_after, 
         np.testing.assert_array_equal(many.q, many_cut.q)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("method", "solver"), [("svi:3", "newton"), ("svi:3", "fixed-point"), ("stoermer-verlet", "fixed-point")]
 )

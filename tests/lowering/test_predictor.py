@@ -37,6 +37,7 @@ def stepper(kind, method, degree):
     return sc.compile_stepper(system, method, solver="fixed-point"), [mass] * len(names)
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("degree", [3, 9], ids=["one vector of points", "several"])
 @pytest.mark.parametrize("kind", ENERGIES)
 def test_polynomial_motions_need_no_iterations_after_the_first_step(kind, degree):

@@ -72,6 +72,7 @@ CASES = [
 ]
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(("make", "method"), CASES)
 @pytest.mark.usefixtures("few")
 def test_steps_energies_and_ensembles_equal_those_of_unrolled_terms(make, method, monkeypatch):

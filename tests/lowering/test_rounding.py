@@ -14,7 +14,7 @@ from scvi_codegen.models.problems import problem
 from scvi_codegen.pipeline import generate_source, program_of
 from scvi_codegen.rendering.kernels.printer import DOUBLE, SINGLE
 from scvi_codegen.tables.basis import cardinal_derivatives, cardinal_integrals, next_step
-from scvi_codegen.tables.nodes import chebyshev_lobatto, legendre_gauss
+from scvi_codegen.tables.nodes import chebyshev_lobatto, nodes_by_name
 from scvi_codegen.tables.precision import mp
 
 DOUBLE_PENDULUM, KEPLER = (problem(name).system for name in ("double-pendulum", "kepler"))
@@ -74,7 +74,7 @@ def test_generated_tables_contain_no_spurious_zeros(system, method):
 
 @pytest.mark.parametrize("degree", [2, 3, 4, 6, 8])
 def test_tables_of_60_digits_have_exact_zeros(degree):
-    for nodes in (chebyshev_lobatto(degree), legendre_gauss(degree)):
+    for nodes in (chebyshev_lobatto(degree), nodes_by_name("legendre-gauss", degree)):
         c = nodes.abscissae
         for table in (cardinal_integrals(c, (*c, 1), 0), cardinal_derivatives(c, c), next_step(c)):
             assert all(entry == 0 or abs(entry) > mp.mpf(10) ** -40 for row in table for entry in row)

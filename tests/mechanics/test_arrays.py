@@ -270,6 +270,7 @@ def test_forces_are_unrolled() -> None:
         ({"forces": {"q[i]": "q[i+1]"}}, "i\\+1 is N at i = N-1"),
         ({"forces": {"q[N]": "1"}}, "is outside an axis"),
         ({"forces": {"q[i": "1"}}, "is expected here"),
+        ({"forces": {"q": "1"}}, r"must act on entries of the array q\[N\]: write q\[i\] for all of them"),
         ({"dissipation": "sum(i in N, q[i]**2)"}, "contains no velocity"),
     ],
 )

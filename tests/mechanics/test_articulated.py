@@ -47,6 +47,7 @@ def values(formulas, point):
     return Tape(list(formulas), list(point))(list(point.values()))
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("robot", ["figure.xml", "ball.xml", "arm.urdf", "chain"])
 def test_dual_energy_is_the_kinetic_energy_at_the_momenta_of_velocities(robot, tmp_path, always):
     if robot == "chain":
@@ -90,6 +91,7 @@ def test_small_trees_factorise_their_mass_matrices(tmp_path):
     assert forms_of(large).inverse_mass is not None
 
 
+@pytest.mark.full
 def test_operations_of_the_recursion_are_linear(tmp_path, always):
     counts = []
     for n in (8, 14, 20):
@@ -120,6 +122,7 @@ def test_separated_parts_do_not_depend_on_the_variables():
     assert intermediates(*solution)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("method", "solver", "options"), [
     ("svi:2", "fixed-point", {"h": 0.02, "steps": 50}),
     ("svi:2", "newton", {"h": 0.02, "steps": 50}),

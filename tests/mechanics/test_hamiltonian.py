@@ -178,6 +178,7 @@ def test_missing_legendre_transform_is_named() -> None:
 # Steps of regular Hamiltonians.
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", ["double-pendulum", "relativistic-particle"])
 @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
@@ -217,6 +218,7 @@ def test_compositions_accept_a_separable_hamiltonian(sample) -> None:
 # Singular Hamiltonians.
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("method", "error"),
     [
@@ -289,6 +291,7 @@ def test_point_vortices_agree_with_gauss_by_hand() -> None:
     assert np.abs(np.concatenate(stepper.step(entry.q, entry.p, h)) - expected).max() < ROUND_OFF
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("method", [SVI(6), Gauss(3), RadauIIA(3), StoermerVerlet()], ids=lambda method: method.name)
 @pytest.mark.parametrize("h", [0.1, -0.1])
 def test_both_solvers_give_the_same_step_without_a_lagrangian(method, h) -> None:

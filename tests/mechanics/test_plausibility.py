@@ -8,7 +8,7 @@ import sympy
 import scvi_codegen as sc
 from scvi_codegen.models.model_files.model_file import parse_model
 
-UNUSED = "is not used in the {}, the forces or the constraints of 'system'; remove it or use it."
+UNUSED = "is not used in the {}, the forces or the constraints of 'system'; remove it, unless events use it."
 x, v, k, m, z = sympy.symbols("x x_dot k m z")
 
 
@@ -135,3 +135,10 @@ span = 1.0
 )
 def test_a_model_file_is_examined_with_its_time_transformation(time_transformation, controller, count):
     assert len(messages(parse_model, FILE.format(time_transformation, controller))) == count
+
+
+@pytest.mark.parametrize("event", ["", "[[events]]\nfunction = 'q[0]'\nrestitution = 'k'"])
+def test_a_model_file_of_arrays_is_examined_with_its_events(event):
+    text = FILE.format("[sizes]\nN = 1", event).replace('"x"', '"q[N]"')
+    text = text.replace("x_dot**2/2 - x**2/2", "sum(i in N, q_dot[i]**2/2)").replace("span", "step = 0.1\nspan")
+    assert len(messages(parse_model, text)) == (not event)

@@ -58,6 +58,7 @@ def canonical(count):
 EXAMPLES = [bodies(4), bodies(12), lattice(5), lattice(13), damped(6), canonical(5)]
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("system", EXAMPLES, ids=lambda each: each.name)
 def test_rolled_system_has_equal_trajectories(system):
     found = sc.roll_sums(system)
@@ -169,6 +170,7 @@ def test_terms_without_coordinates_give_a_runnable_system(term):
     assert np.abs(own.energy() - other.energy()).max() < 1e-14
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", ["b", "q", "N", "at0", "B0", "q_dot", "c0_1", "p_q"])
 def test_parameter_names_differ_from_names_of_arrays_and_tables(name):
     written = lagrangian(["x", "y"], f"x_dot**2/2 + y_dot**2/2 - {name}*x**2/2 - 3*{name}*y**2/2", **{name: 1.3})

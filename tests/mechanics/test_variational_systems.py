@@ -61,6 +61,7 @@ def test_variable_masses_have_no_variational_equations():
     assert with_tangent_vectors(magnetic, 1) is None
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", [SVI(5), SVI(3, "gauss-lobatto:5"), Gauss(3)], ids=["svi", "other points", "gauss"])
 def test_tangents_by_iteration_are_the_derivative_of_the_computed_flow(method):
     """Steps commute with differentiation: the tangent map of the run, also of a Hamiltonian, and symplectic."""

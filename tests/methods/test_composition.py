@@ -16,6 +16,7 @@ DRIVEN = DUFFING.with_parameters(gamma=0.3, omega=1.3)
 STATES = {1: ([0.7], [0.4], 0.2), 2: ([0.7, -0.3], [0.3, 0.9], 0.15)}
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("system", [KEPLER, DRIVEN], ids=lambda s: s.name)
 @pytest.mark.parametrize("method", [StoermerVerlet(), Composition(2), Composition(8), Composition(10)])
 def test_explicit_and_newton_solvers_give_the_same_map(system, method):
@@ -40,7 +41,9 @@ def test_leapfrog_agrees_with_a_handwritten_step():
         np.testing.assert_allclose(np.ravel(step), [q1, p1], rtol=4e-16)
 
 
-@pytest.mark.parametrize(("system", "order"), [(DRIVEN, 2), (DRIVEN, 8), (KEPLER, 2), (KEPLER, 8), (KEPLER, 10)])
+@pytest.mark.parametrize(
+    ("system", "order"), [(DRIVEN, 2), (DRIVEN, 4), (DRIVEN, 6), (DRIVEN, 8), (KEPLER, 2), (KEPLER, 8), (KEPLER, 10)]
+)
 def test_order_is_the_claimed_one(system, order):
     q, p, span = ([0.7], [0.4], 4.0) if system is DRIVEN else ([1.0, 0.0], [0.0, 1.1], 8.0)
     reference = compile_stepper(system, SVI(8)).integrate(q, p, h=span / 400, steps=400).q[-1]
@@ -96,8 +99,8 @@ def test_momenta_at_rest_are_not_velocities():
 def test_unsupported_systems_are_rejected():
     with pytest.raises(MethodError, match="separable"):
         compile_stepper(DOUBLE_PENDULUM, Composition(8))
-    with pytest.raises(MethodError, match="order must be 2, 8 or 10"):
-        Composition(4)
+    with pytest.raises(MethodError, match="order must be 2, 4, 6, 8 or 10"):
+        Composition(5)
     with pytest.raises(MethodError, match="not explicit"):
         compile_stepper(DOUBLE_PENDULUM, StoermerVerlet(), solver="explicit")
 

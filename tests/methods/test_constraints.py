@@ -63,6 +63,7 @@ def swung():
     return float(run.q[-1, 0]), float(run.velocity[-1, 0])
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("s", [1, 2, 3, 4])
 def test_order_is_2s_and_constraints_hold_to_rounding(s, swung):
     stepper, errors = compile_stepper(rod(), lobatto(s)), []
@@ -89,8 +90,8 @@ def test_degree_1_is_rattle():
         p1 = half + h / 2 * np.array([0.0, -m * G])
         p1 -= q1 * (q1 @ p1) / (q1 @ q1)
         found = stepper.step(q, p, h)
-        assert_allclose(found[0], q1, atol=1e-15)
-        assert_allclose(found[1], p1, atol=1e-13)
+        assert_allclose(found[0], q1, rtol=0, atol=1e-15)
+        assert_allclose(found[1], p1, rtol=0, atol=1e-13)
         q, p = q1, p1
 
 
@@ -215,6 +216,7 @@ def test_constraints_that_depend_on_time_forces_and_coupled_masses():
     assert np.log2(errors[0] / errors[1]) == pytest.approx(4, abs=0.3)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("third", "message_text"),
     [
@@ -251,8 +253,8 @@ def test_initial_states_are_projected_or_rejected():
     with pytest.raises(StateError, match=r"-l\*\*2 \+ x\*\*2 \+ y\*\*2 is -1\.25, .*stepper\.project"):
         stepper.integrate([1.0, 0.0], [0.0, 0.0], h=0.1, steps=1)
     q, p = stepper.project([1.0, 0.0], [3.0, 4.0])
-    assert_allclose(q, [1.5, 0.0], atol=1e-15)
-    assert_allclose(p, [0.0, 4.0], atol=1e-15)
+    assert_allclose(q, [1.5, 0.0], rtol=0, atol=1e-15)
+    assert_allclose(p, [0.0, 4.0], rtol=0, atol=1e-15)
     with pytest.raises(StateError, match="projection onto the constraints failed"):
         stepper.project([0.0, 0.0])
     ensemble = stepper.integrate_ensemble([on_circle(0.3), on_circle(0.4)], np.zeros((2, 2)), h=0.1, steps=5)
@@ -341,7 +343,7 @@ def test_positions_do_not_follow_discontinuous_constraints():
         **given, inputs={"u": (times, [0.0, 0.0, 0.3])}, check_growth=True
     )  # begins again with the first u
     ends = [stepper.integrate(**given, inputs={"u": (times, [0.0, 0.0, 0.3])}, h=h).q[-1] for h in (0.05, 0.02, None)]
-    assert_allclose(ends[1:], ends[:1] * 2, atol=1e-9)
+    assert_allclose(ends[1:], ends[:1] * 2, rtol=0, atol=1e-9)
     jumping = {"u": (times, [0.0, 0.3, 0.3], "constant")}
     for h in (0.05, None):
         with pytest.raises(
@@ -482,3 +484,17 @@ def test_unsupported_combinations_with_constraints_are_rejected():
     free = LagrangianSystem.from_text(name="free", coordinates=["x"], lagrangian="x_dot**2/2")
     with pytest.raises(MethodError, match="no constraints"):
         compile_stepper(free, SVI(2)).multipliers([0.0], [1.0])
+
+
+def test_projected_momenta_have_admissible_velocities_for_any_kinetic_energy():
+    """Newton's method for the momentum needs several iterations where the kinetic energy is not quadratic."""
+    rod = LagrangianSystem.from_text(
+        name="quartic",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + y_dot**2)/2 + (x_dot**2 + y_dot**2)**2/8",
+        constraints=["(x - 3*sin(t)/10)**2 + y**2 - 1"],
+    )
+    stepper = compile_stepper(rod, "svi:1", flags=("-O1",))
+    for angle, momentum in ((0.2, [3.0, 1.0]), (1.4, [-1.0, 2.0]), (2.5, [0.5, -4.0])):
+        q, p = stepper.project([0.3 * np.sin(1.0) + np.cos(angle), np.sin(angle)], momentum, t=1.0)
+        assert np.abs(stepper.constraint_values(q, p, 1.0)).max() < 2e-15

@@ -11,12 +11,7 @@ from sympy.physics.mechanics import dynamicsymbols
 import scvi_codegen as sc
 
 NUMBERS = {"m": 1.0, "M": 0.4, "g": 9.81, "a": 1.0, "b": 2.0, "c": 1.5, "d": 2.0, "w": 2.0}
-CONSTRAINTS = [
-    "x1 = a*cos(w*t)",
-    "y1 = a*sin(w*t)",
-    "(x2 - x1)**2 + (y2 - y1)**2 = b**2",
-    "(x2 - d)**2 + y2**2 = c**2",
-]
+CONSTRAINTS = ["x1 = a*cos(w*t)", "y1 = a*sin(w*t)", "(x2 - x1)**2 + (y2 - y1)**2 = b**2", "(x2 - d)**2 + y2**2 = c**2"]
 LAGRANGIAN = "m*(x1_dot**2 + y1_dot**2)/2 + M*(x2_dot**2 + y2_dot**2)/2 - g*(m*y1 + M*y2)"
 NEAR = [1.0, 0.0, 1.94, 1.5]
 
@@ -49,6 +44,7 @@ def inverse_dynamics(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array(positions), np.array(multipliers)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", [sc.SVI(1, "gauss-lobatto:2"), "svi:3"])
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 def test_multipliers_are_the_forces_of_inverse_dynamics(method, solver):
@@ -95,10 +91,11 @@ def test_prescribed_velocities():
         "cart", ["a", "x"], lagrangian, parameters={"J": 1, "m": 2}, constraints=["x_dot = t", "a = x"]
     )
     run = sc.compile_stepper(cart, "svi:2").integrate([0, 0], velocity=[0, 0], h=0.1, steps=10)
-    assert_allclose(run.q[-1], [0.5, 0.5], atol=1e-14)
-    assert_allclose(run.multipliers(), [[3.0, 1.0]] * 11, atol=1e-12)
+    assert_allclose(run.q[-1], [0.5, 0.5], rtol=0, atol=1e-14)
+    assert_allclose(run.multipliers(), [[3.0, 1.0]] * 11, rtol=0, atol=1e-12)
 
 
+@pytest.mark.sampled(1)
 def test_certificate_and_tangents():
     system = sc.LagrangianSystem.from_text(
         "crank", ["x", "y"], "(x_dot**2 + y_dot**2)/2", constraints=["x = cos(t)", "y = sin(t)"]
@@ -135,3 +132,9 @@ def test_dead_points_are_named_with_the_rank(span):
 def test_overconstrained_systems_are_rejected():
     with pytest.raises(sc.SystemDefinitionError, match=r"3 constraints, but only 2 coordinates.*overconstrained"):
         sc.LagrangianSystem.from_text(**SLIDER, constraints=["x = t", "angle = t", "x = 3"])
+
+
+def test_impacts_are_impossible():
+    stepper = sc.compile_stepper(linkage(), "svi:1")
+    with pytest.raises(sc.EventError, match=r"changes of the state by 'x1' .* constraints leave no motion away"):
+        stepper.integrate(*stepper.project(NEAR), h=0.05, steps=80, events=sc.impact("x1"))

@@ -41,6 +41,7 @@ def by_accelerations(t, state):
     return [vx, vy, w, *found[:3]]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("s", "steps"), [(1, 20), (2, 10), (3, 10), (4, 5)])
 def test_the_order_is_2s_and_the_step_is_symmetric(s, steps):
     end = solve_ivp(by_accelerations, (0.0, 2.0), np.concatenate(START), method="DOP853", rtol=1e-13, atol=1e-14)
@@ -51,10 +52,10 @@ def test_the_order_is_2s_and_the_step_is_symmetric(s, steps):
         assert np.abs(run.constraint_values()).max() < 2e-15
     assert abs(np.log2(errors[0] / errors[1]) - 2 * s) < 0.3
     back = stepper.step(run.q[-1], run.p[-1], -run.h, 2.0)
-    assert_allclose(back, (run.q[-2], run.p[-2]), atol=2e-15)
+    assert_allclose(back, (run.q[-2], run.p[-2]), rtol=0, atol=2e-15)
     if s > 2:
         free = stepper.integrate(START[0], velocity=START[1], t_end=2.0)
-        assert_allclose(free.q[-1], end.y[:3, -1], atol=1e-11)
+        assert_allclose(free.q[-1], end.y[:3, -1], rtol=0, atol=1e-11)
 
 
 def test_chaplygin_sleigh_agrees_with_its_closed_form():
@@ -65,9 +66,9 @@ def test_chaplygin_sleigh_agrees_with_its_closed_form():
     stepper = compile_stepper(sleigh().with_parameters(k=0.0), lobatto(4))
     run = stepper.integrate([0.0, 0.0, 0.0], velocity=[0.0, 0.0, turning], h=0.25, steps=80)
     heading = 2 * turning / k * np.arctan(np.tanh(k * run.t / 2))
-    assert_allclose(run.q[:, 2], heading, atol=1e-10)
-    assert_allclose(run.velocity[:, 2], turning / np.cosh(k * run.t), atol=1e-10)
-    assert_allclose(np.hypot(*run.velocity.T[:2]), speed * np.tanh(k * run.t), atol=1e-10)
+    assert_allclose(run.q[:, 2], heading, rtol=0, atol=1e-10)
+    assert_allclose(run.velocity[:, 2], turning / np.cosh(k * run.t), rtol=0, atol=1e-10)
+    assert_allclose(np.hypot(*run.velocity.T[:2]), speed * np.tanh(k * run.t), rtol=0, atol=1e-10)
 
 
 def test_rolling_disk_moves_in_circles_and_conserves_free_momenta():
@@ -85,11 +86,11 @@ def test_rolling_disk_moves_in_circles_and_conserves_free_momenta():
     run = stepper.integrate(
         [0.0, 0.0, 0.3, 0.0], velocity=[2 * np.cos(0.3), 2 * np.sin(0.3), 0.7, 2.0], h=0.1, steps=200
     )
-    assert_allclose(run.q[:, 0], 2 / 0.7 * (np.sin(0.3 + 0.7 * run.t) - np.sin(0.3)), atol=2e-12)
+    assert_allclose(run.q[:, 0], 2 / 0.7 * (np.sin(0.3 + 0.7 * run.t) - np.sin(0.3)), rtol=0, atol=1e-11)
     saved = names.index("momentum of a")
     assert np.abs(run.momentum_errors()[:, saved]).max() < 1e-15
     centripetal = -np.sin(run.q[:, 2]) * 2 * 0.7, np.cos(run.q[:, 2]) * 2 * 0.7
-    assert_allclose(run.multipliers().T, centripetal, atol=1e-11)
+    assert_allclose(run.multipliers().T, centripetal, rtol=0, atol=1e-11)
 
 
 def test_energy_does_not_drift():
@@ -128,7 +129,7 @@ def test_holonomic_and_moving_nonholonomic_constraints_combine():
     other = compile_stepper(plane, lobatto(4)).integrate(
         [x, 0.0, 0.6], velocity=[v * np.cos(0.6), v * np.sin(0.6), 0.4], h=0.02, steps=100
     )
-    assert_allclose(one.q[:, [0, 1, 3]], other.q, atol=1e-12)
+    assert_allclose(one.q[:, [0, 1, 3]], other.q, rtol=0, atol=1e-12)
     assert np.abs(one.constraint_values()).max() < 2e-15
     dragged = LagrangianSystem.from_text(
         coordinates=["x", "y", "a"],
@@ -138,8 +139,8 @@ def test_holonomic_and_moving_nonholonomic_constraints_combine():
     )
     assert dragged.changes_energy == "constraints do work"
     run = compile_stepper(dragged, lobatto(3)).integrate([0, 0, 0], velocity=[1, 0, 0], h=0.1, steps=30)
-    assert_allclose(run.q[:, 0], np.sin(run.t), atol=1e-9)
-    assert_allclose(run.multipliers()[:, 0], -np.sin(run.t), atol=1e-13)
+    assert_allclose(run.q[:, 0], np.sin(run.t), rtol=0, atol=1e-9)
+    assert_allclose(run.multipliers()[:, 0], -np.sin(run.t), rtol=0, atol=1e-13)
 
 
 def test_nonholonomic_constraints_from_sympy_mechanics():
@@ -177,7 +178,7 @@ def test_invalid_nonholonomic_constraints_are_rejected():
         stepper.integrate([0.0, 0.0, 0.5], velocity=[1.0, 1.0, 0.0], h=0.1, steps=1)
     q, p = stepper.project([0.0, 0.0, 0.5], velocity=[1.0, 1.0, 0.0])
     assert np.abs(stepper.constraint_values(q, p)[1]).max() < 1e-15
-    assert_allclose(q, [0.0, 0.0, 0.5], atol=0.0)
+    assert_allclose(q, [0.0, 0.0, 0.5], rtol=0, atol=0.0)
 
 
 def test_derivation_shows_nonholonomic_constraints():

@@ -59,6 +59,7 @@ def test_a_step_is_a_leapfrog_step(sequence, make):
     assert np.abs(run.p[-1] - p).max() < 1e-13
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("system", [RELATIVISTIC, DUFFING], ids=["hamiltonian", "lagrangian"])
 @pytest.mark.parametrize("sequence", ["kick-drift-kick", DRIFTS_FIRST])
 @pytest.mark.parametrize("make", [StoermerVerlet, lambda sequence: Composition(8, sequence)], ids=["verlet", "eight"])

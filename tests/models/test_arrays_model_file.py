@@ -92,16 +92,9 @@ def test_solver_is_read_from_the_file(net: Path) -> None:
     assert sc.load_model(net.with_name("again.toml")).solver == "newton"
 
 
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("[parameters]", '[forces]\n"r[i, a]" = "-r_dot[i, a]"\n\n[parameters]'),
-        ('"svi:2"', '"stoermer-verlet"'),
-    ],
-)
-def test_newton_that_requires_known_sizes_runs_with_those_of_the_model(net: Path, old: str, new: str) -> None:
+def test_newton_that_requires_known_sizes_runs_with_those_of_the_model(net: Path) -> None:
     """Its states are those of the other solver; C for arrays of any size is refused."""
-    net.write_text(net.read_text().replace(old, new, 1))
+    net.write_text(net.read_text().replace('"svi:2"', '"stoermer-verlet"', 1))
     model = sc.load_model(net, {"method": {"solver": "newton"}})
     other = sc.load_model(net)
     assert np.abs(model.integrate().q["r"] - other.integrate().q["r"]).max() < 1e-14
@@ -159,7 +152,7 @@ def test_index_has_one_meaning() -> None:
         ("steps = 4", "", "span"),
         ("step = 0.1", "", "has steps but no step"),
         ("step = 0.1\nsteps = 4", "tolerance = 2.0\nspan = 1.0", "must be positive and below 1"),
-        ("[sizes]", "[inputs]\nu = 1\n\n[sizes]", r"\[inputs\] u must be a table"),
+        ("[sizes]", "[inputs]\nu = [1]\n\n[sizes]", r"\[inputs\] u must be .*a table"),
     ],
 )
 def test_invalid_files_are_rejected(net: Path, old: str, new: str, message: str) -> None:
@@ -226,10 +219,10 @@ def test_long_arrays_are_written_to_tables(tmp_path: Path) -> None:
     path.write_text(
         f'{text}[parameters]\n"m[N]" = "1 + i/N"\n[initial]\nq = "sin(i/7)/3"\n[run]\nstep = 0.1\nsteps = 2\n'
     )
-    model = sc.load_model(path, {"sizes": {"N": 60_000}, "method": {"method": "svi:2"}})
+    model = sc.load_model(path, {"sizes": {"N": 12_000}, "method": {"method": "svi:2"}})
     sc.save_model(model, tmp_path / "again.toml")
     assert (tmp_path / "again.toml").stat().st_size < 1000
-    assert (tmp_path / "again_q.csv").stat().st_size > 10**6
+    assert (tmp_path / "again_q.csv").stat().st_size > 200_000
     assert sc.load_model(tmp_path / "again.toml") == model
     folder = sc.generate_package(model, tmp_path / "ring_svi")
     assert sc.load_model(folder / "model.toml") == model

@@ -98,6 +98,7 @@ steps = 5
 """
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("text", [STRING, SCHROEDINGER, PLANE, OSCILLATOR])
 @pytest.mark.filterwarnings("ignore::scvi_codegen.AccuracyWarning")
 def test_file_is_read_back_with_equal_bits(text):

@@ -62,10 +62,7 @@ def pushed(**given):
 def rod():
     """A mass on a rod, in Cartesian coordinates."""
     system = LagrangianSystem.from_text(
-        name="rod",
-        coordinates=["x", "y"],
-        lagrangian="(x_dot**2 + y_dot**2)/2 - y",
-        constraints=["x**2 + y**2 = 1"],
+        name="rod", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"]
     )
     return Model(system=system, method=SVI(2, "gauss-lobatto:3"), q=(1.0, 0.0), velocity=(0.0, 0.2), h=H, steps=10)
 
@@ -88,6 +85,7 @@ MODELS = {
 }
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", MODELS)
 def test_states_equal_those_of_the_stepper_bitwise(name, tmp_path):
     model = MODELS[name]()
@@ -105,13 +103,55 @@ def test_states_equal_those_of_the_stepper_bitwise(name, tmp_path):
     assert_allclose(np.array(found), expected, rtol=0, atol=0)
 
 
+def check_event_mode(fmu, model, run):
+    """Steps end at changes of the state, which appear when the discrete states are updated in event mode."""
+    assert fmu.description.find("CoSimulation").get("hasEventMode") == "true"
+    names, wanted = ("t", "x", "y", "p_x", "p_y"), np.sort(np.concatenate([each.t for each in run.events]))
+    one = Slave(fmu, events=True, early=True)
+    assert one.start() == OK
+    assert one.call("DoStep", c_double(0.0), c_double(H), c_bool(True), *[None] * 4) == ERROR
+    assert one.update_discrete_states() == (False, False)
+    assert one.call("EnterStepMode") == OK
+    met, t = [], 0.0
+    while t < 7.0:
+        if len(met) == 2:
+            saved = one.saved_state()
+            assert one.do_step(t, 1.0)[0] == OK
+            assert one.call("SetFMUState", saved) == OK
+        end = np.floor(t + 1.0 + 1e-9)
+        status, event, terminate, early = one.do_step(t, end - t)
+        assert (status, terminate, early) == (OK, False, one.last < end - 1e-9)
+        t = one.last
+        if event:
+            (crossings,) = [each for each in run.events if (abs(each.t - t) < 1e-12).any()]
+            (at,) = np.flatnonzero(abs(crossings.t - t) < 1e-12)
+            row = np.flatnonzero(run.t == crossings.t[at])[-1]
+            assert one.call("EnterEventMode") == OK
+            before = one.get(*names)
+            assert_allclose(before, [t, *crossings.q[at], *crossings.p[at]], rtol=0, atol=1e-13)
+            assert one.update_discrete_states() == (True, False)
+            assert_allclose(one.get(*names), [t, *run.q[row], *run.p[row]], rtol=0, atol=1e-13)
+            assert before != one.get(*names)
+            assert one.update_discrete_states() == (False, False)
+            assert one.call("EnterStepMode") == OK
+            met.append(t)
+        else:
+            row = np.flatnonzero(abs(run.t - t) < 1e-9)[-1]
+            assert_allclose(one.get(*names), [t, *run.q[row], *run.p[row]], rtol=0, atol=1e-13)
+    assert_allclose(met, wanted, rtol=0, atol=1e-13)
+    assert one.do_step(7.0, 15.0)[:4] == (OK, True, False, True)  # the crossing of x = -2 ends the simulation
+    assert_allclose([one.last, *one.get("x")], [8.0, -2.0], rtol=0, atol=1e-13)
+    assert one.call("EnterEventMode") == OK
+    assert one.update_discrete_states() == (True, True)
+
+
 def test_impacts_within_communication_steps(tmp_path):
     """States equal those of the stepper, also from a saved state; the crossing of x = -2 ends the simulation."""
     system = LagrangianSystem.from_text(
-        name="ball", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - g*y", parameters={"g": 1.0}
+        name="ball", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - g*y - y**4/40", parameters={"g": 1.0}
     )
     walls = (impact("y", 0.8), Event("x - 3", then={"p_x": "-p_x"}), Event("x + 2", -1, terminal=1))
-    model = Model(system=system, method=SVI(4), q=(0.0, 1.0), velocity=(1.0, 0.0), h=H, steps=60, events=walls)
+    model = Model(system=system, method=SVI(2), q=(0.0, 1.0), velocity=(1.0, 0.0), h=H, steps=60, events=walls)
     one = Slave(Fmu(generate_fmu(model, tmp_path / "ball.fmu"), tmp_path / "unpacked"))
     assert one.start() == OK
     run = model.stepper().integrate(model.q, velocity=model.velocity, h=H, steps=70)
@@ -125,10 +165,9 @@ def test_impacts_within_communication_steps(tmp_path):
         assert_allclose(one.get("x", "y"), run.q[row], rtol=0, atol=1e-14)
         assert_allclose(one.get("p_x", "p_y"), run.p[row], rtol=0, atol=1e-14)
     assert [len(each) for each in run.events] == [4, 1, 0]
-    flags, last = [c_bool(True) for _ in range(3)], c_double(-1.0)
-    assert one.call("DoStep", c_double(70 * H), c_double(15 * H), c_bool(True), *map(byref, flags), byref(last)) == OK
-    assert [flag.value for flag in flags] == [False, True, False]
-    assert_allclose([last.value, *one.get("x")], [8.0, -2.0], rtol=0, atol=1e-13)
+    assert one.do_step(70 * H, 15 * H) == (OK, False, True, False)
+    assert_allclose([one.last, *one.get("x")], [8.0, -2.0], rtol=0, atol=1e-13)
+    check_event_mode(one.fmu, model, run)
     with pytest.raises(ModelFileError, match="must change the state"):
         generate_fmu(replace(model, events=walls[2:]), tmp_path / "ended.fmu")
 
@@ -338,7 +377,7 @@ def test_initial_states_far_off_their_constraints_are_rejected(tmp_path):
 def test_description_has_the_elements_required_by_the_standard(fmu):
     root = fmu.description
     assert [part.tag for part in root] == [
-        *("CoSimulation", "LogCategories", "DefaultExperiment", "ModelVariables", "ModelStructure"),
+        *("CoSimulation", "LogCategories", "DefaultExperiment", "ModelVariables", "ModelStructure")
     ]
     assert root.get("modelName") == 'pushed pendulum <&> "friends"'
     assert (root.get("fmiVersion"), root.find("CoSimulation").get("modelIdentifier")) == ("3.0", "pushed")

@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from scvi_codegen import LagrangianSystem, Model, ModelFileError, compile_stepper, load_model, save_model
-from scvi_codegen.models.model_files.input_tables import InputTable
+from scvi_codegen.models.model_files.input_tables import InputTable, tables_of_example
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 
 MODEL = """
@@ -62,6 +62,22 @@ def test_model_with_inputs_equals_integrate(file, monkeypatch, tmp_path):
     for steps in model.segments(run):
         run.advance(steps)
     assert (run.t, run.q[0], run.p[0]) == (expected.t[-1], expected.q[-1, 0], expected.p[-1, 0])
+
+
+def test_constants(file):
+    file.write_text(MODEL.replace('{ file = "tables/u.csv", kind = "cubic" }', "0.5"))
+    model = load_model(file)
+    assert model.inputs["u"] == 0.5
+    assert parse_model(dump_model(model)) == model
+    stepper = compile_stepper(model.system, model.method)
+    expected = stepper.integrate([0.3], velocity=[0.1], inputs=dict(model.inputs), h=0.1, t_end=2.3)
+    table = stepper.integrate(
+        [0.3], velocity=[0.1], inputs=dict(model.inputs) | {"u": ((0, 9), (0.5, 0.5))}, h=0.1, t_end=2.3
+    )
+    assert_allclose(expected.q, table.q, rtol=0, atol=1e-14)
+    inputs, parameters = tables_of_example(model.system, model.inputs, (0.0, 2.3))
+    assert inputs[0].coefficients == ((0.5, 0.0, 0.0, 0.0),)
+    assert dict(zip(stepper.parameters, parameters, strict=True))["u_0"] == 0.5
 
 
 def test_momenta_use_the_inputs_at_the_start():
@@ -167,7 +183,7 @@ def test_unreadable_file_is_reported(file):
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
-        ("3.0", "must be a table"),
+        ('"a"', "must be a number or a table"),
         ('{ file = "u.csv", values = [1.0] }', "must have either file, or t and values"),
         ('{ kind = "linear" }', "must have either file, or t and values"),
         ("{ t = [0.0, 1.0] }", "u values must be a list of numbers"),
@@ -191,7 +207,7 @@ def test_names_that_are_not_inputs_are_rejected():
         )
     system = LagrangianSystem.from_text(name="s", coordinates=["q"], lagrangian="q_dot**2/2 + u*q", inputs=["u"])
     given = {"system": system, "method": "svi:2", "q": (0.0,), "p": (0.0,), "h": 0.1, "span": 1.0}
-    with pytest.raises(ModelFileError, match="must be a table"):
+    with pytest.raises(ModelFileError, match="the input 'u' is a Python function"):
         Model(**given, inputs={"u": np.sin})
     model = Model(**given)
     with pytest.raises(ModelFileError, match=r"the input u is not set: .*--input u=FILE"):

@@ -122,6 +122,7 @@ def test_run_continues_from_a_folder(shaken: Path, tmp_path: Path) -> None:
     assert np.abs(sc.load_run(folder)[-1:].q - exact.q[-1]).max() < 1e-9
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("tolerance", [0.0, 1e-8])
 def test_largest_step_satisfies_the_tolerance_and_a_larger_one_does_not(unit: float, tolerance: float) -> None:

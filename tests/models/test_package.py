@@ -81,6 +81,7 @@ def test_equal_models_give_equal_bytes(pendulum, tmp_path):
         assert path.read_bytes() == (two / path.relative_to(one)).read_bytes()
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["planar-pendulum", "kepler", "spherical-pendulum"])
 def test_package_steps_as_the_compiled_system_without_sympy(name, tmp_path):
     model = model_of(name, method=Gauss(2))
@@ -110,6 +111,7 @@ def test_generated_c_is_compiled_unchanged(pendulum, tmp_path):
         load_package(folder)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize(
@@ -188,6 +190,7 @@ vortex_pairs.toml
 """
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("words", KINDS.strip().splitlines())
 def test_every_kind_of_folder_is_built_without_a_warning(words, tmp_path):
     """The generated Makefile builds each folder with the C compiler of the system."""
@@ -226,6 +229,7 @@ def test_other_files_remain_and_generated_files_are_replaced(pendulum, tmp_path)
     assert load_model(folder / "model.toml").method == SVI(2)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ["main.c", "pendulum_svi.c", "__init__.py", "README.md", "interface.json"])
 def test_foreign_and_edited_files_require_force(pendulum, tmp_path, name):
     folder = tmp_path / "pendulum_svi"

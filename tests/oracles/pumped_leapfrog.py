@@ -8,10 +8,7 @@ from scvi_codegen import LagrangianSystem, StoermerVerlet, compile_stepper
 STEP_INPUTS = ("x", "y", "p_x", "p_y", "m", "k", "a", "w", "t", "h")
 DEFAULTS = {"m": 1.0, "k": 1.0, "a": 0.0, "w": 1.0}
 ROWS = np.array(
-    [
-        [0.4, -0.3, 0.2, 0.5, 1.7, 0.8, 0.6, 1.3, 2.5, 0.04],
-        [-0.1, 0.6, 0.3, -0.2, 0.9, 1.9, -0.7, 2.1, -3.1, -0.05],
-    ]
+    [[0.4, -0.3, 0.2, 0.5, 1.7, 0.8, 0.6, 1.3, 2.5, 0.04], [-0.1, 0.6, 0.3, -0.2, 0.9, 1.9, -0.7, 2.1, -3.1, -0.05]]
 )
 STEPS, EVERY = 150, 50
 """Three segments of at most 64 steps; no saved state is at their ends."""

@@ -41,6 +41,7 @@ class TestShapes:
         (places,) = shape_of(run).points(np.array([[0.0]]), np.zeros((1, 1)))
         assert np.allclose(places, [[0.0, 0.0], [0.0, 3.0]])
 
+    @pytest.mark.sampled(2)
     @pytest.mark.parametrize(
         ("lagrangian", "coordinates"),
         [
@@ -95,6 +96,7 @@ class TestFilm:
             assert np.allclose(rods, np.stack([[0, *x], [0, *-np.cumsum(np.cos(run.q[frame]))]], axis=1))
             assert axes.get_title() == f"double pendulum, t = {run.t[frame]:.6g}"
 
+    @pytest.mark.sampled(2)
     @pytest.mark.parametrize("name", ["charged-particle", "fput-chain", "planar-pendulum", "outer-solar-system"])
     def test_animation_has_a_notebook_display(self, name):
         shown = run_of(name, 3).animate(seconds=0.2)._repr_html_()

@@ -17,8 +17,7 @@ from scvi_codegen.models.model import Model
 from scvi_codegen.models.problems import problem
 from scvi_codegen.pictures.canvas import check_plot_path
 from scvi_codegen.pictures.conserved import largest_in_bins, plot_energy, plot_momentum_maps
-from scvi_codegen.pictures.overview import plot_section, plot_trajectory
-from scvi_codegen.pictures.paths import plot_motion, plot_phase
+from scvi_codegen.pictures.overview import plot_motion, plot_phase, plot_section, plot_trajectory
 from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
@@ -49,6 +48,7 @@ def test_equal_trajectories_give_equal_bytes(kepler, tmp_path, suffix):
     assert one.read_bytes().startswith(b"\x89PNG" if suffix == ".png" else b"<?xml")
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("name", "titles"),
     [
@@ -71,6 +71,7 @@ def test_bodies_are_named_in_the_legend():
     assert labels == ["sun", "jupiter", "saturn", "uranus", "neptune", "pluto"]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ["kepler", "planar-pendulum", "fput-chain:12"])
 @pytest.mark.parametrize("steps", [0, 1])
 def test_a_single_state_can_be_drawn(name, steps, tmp_path):
@@ -127,7 +128,7 @@ def test_failed_picture_leaves_no_file(kepler, tmp_path, monkeypatch):
     def fail(trajectory: Trajectory, axes: object) -> None:
         raise RuntimeError("no picture")
 
-    monkeypatch.setattr("scvi_codegen.pictures.overview._draw", fail)
+    monkeypatch.setattr("scvi_codegen.pictures.overview.draw_energy_error", fail)
     with pytest.raises(RuntimeError, match="no picture"):
         plot_trajectory(kepler, tmp_path / "orbit.png")
     assert list(tmp_path.iterdir()) == []

@@ -25,14 +25,7 @@ pytestmark = pytest.mark.long
 
 SEPARABLE = ("planar-pendulum", "kepler")
 COUPLED = ("double-pendulum", "cart-pole")
-SYSTEMS = (
-    *SEPARABLE,
-    *COUPLED,
-    "charged-particle",
-    "driven-duffing",
-    "pumped-cart-pole",
-    "relativistic-particle",
-)
+SYSTEMS = (*SEPARABLE, *COUPLED, "charged-particle", "driven-duffing", "pumped-cart-pole", "relativistic-particle")
 FEW = (
     SVI(2, "gauss-legendre:3"),
     SCVI(3),
@@ -98,6 +91,7 @@ def check(sample, compiled, name, method, *, h=H, t=T, **how):
     assert relative(compiled(name, method, **how).step(q, p, h, t), case.oracle(method, q, p, h, t)) < TOLERANCE
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", SYSTEMS)
 @pytest.mark.parametrize("method", FEW, ids=lambda method: method.name)
@@ -125,12 +119,14 @@ SOLVED_BOTH_WAYS = (
 )
 
 
+@pytest.mark.sampled(12)
 @pytest.mark.parametrize("solver", ["newton", "fixed-point"])
 @pytest.mark.parametrize(("name", "method"), SOLVED_BOTH_WAYS, ids=lambda value: getattr(value, "name", value))
 def test_both_solvers_agree_with_the_oracle(sample, compiled, name, method, solver):
     check(sample, compiled, name, method, solver=solver)
 
 
+@pytest.mark.sampled(18)
 @pytest.mark.parametrize("method", first_of_each(MANY, family), ids=lambda method: method.name)
 def test_every_family_of_methods_agrees_with_the_oracle(sample, compiled, method):
     """The Lagrangian is coupled, has masses depending on angle and time, and velocity-dependent terms."""

@@ -82,6 +82,7 @@ def test_different_flags_give_a_different_build(tmp_path, monkeypatch):
         compile_stepper(problem("harmonic-oscillator").system, StoermerVerlet())
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["kepler", "double-pendulum", "charged-particle"])
 def test_portable_flags_are_bitwise_reproducible(tmp_path, monkeypatch, name):
     """Different compilers, one libm: the same numbers; the tuned build differs by roundings."""

@@ -67,11 +67,7 @@ def refused(act: Callable[[], Any]) -> sc.ScviCodegenError | None:
 @cache
 def system() -> sc.LagrangianSystem:
     return sc.LagrangianSystem.from_text(
-        name="swing",
-        coordinates=["q"],
-        lagrangian="q_dot**2/2 - w*q**2/2 + u*q",
-        parameters={"w": 1.0},
-        inputs=["u"],
+        name="swing", coordinates=["q"], lagrangian="q_dot**2/2 - w*q**2/2 + u*q", parameters={"w": 1.0}, inputs=["u"]
     )
 
 

@@ -48,6 +48,7 @@ def damped(lagrangian=L, **extra):
     )
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.covering
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 @pytest.mark.parametrize(
@@ -106,6 +107,7 @@ def rates(t, z):
     return [v, w, *np.linalg.solve(mass, right)]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("method", "order", "counts"),
     [

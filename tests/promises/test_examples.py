@@ -95,6 +95,7 @@ def test_every_example_is_tested():
     assert {path.stem for path in EXAMPLES.glob("*.toml")} == {*ENERGY_ERRORS, "shaken_tower", "fput_ring"}
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ENERGY_ERRORS)
 def test_model_files_run_and_conserve_energy(name, tmp_path):
     output = tmp_path / "run.npz"

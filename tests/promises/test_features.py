@@ -30,6 +30,7 @@ def test_table_lists_the_features_that_are_tested():
     assert {cell for row in TABLE.values() for cell in row.values()} == {"yes", "no"}
 
 
+@pytest.mark.sampled(24)
 @pytest.mark.covering(times=1)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("feature", FEATURES)

@@ -289,6 +289,7 @@ def check_oscillator(stepper: Stepper, random: Random) -> bool:
     return True
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("solver", ["auto", "newton", "fixed-point"])
 @pytest.mark.parametrize("kind", ["lagrangian", "hamiltonian"])
 def test_oscillator_of_any_size_with_any_step_is_correct_or_rejected(kind, solver, request):
@@ -347,6 +348,7 @@ def check_nonlinear(name: str, method: Any, random: Random) -> bool:
     return len(found) == 2
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(("name", "method"), NONLINEAR, ids=lambda value: str(getattr(value, "name", value)))
 def test_any_state_gives_a_finite_step_or_is_rejected(name, method):
     random = Random(7)

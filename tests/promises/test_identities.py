@@ -44,6 +44,7 @@ def compiled_map(sample, compiled, name, method, h=H):
 # 1. SVI depends on degree and quadrature only.
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", ANY)
 def test_svi_does_not_depend_on_its_nodes(sample, compiled, name):
     c, w = oracle.rule("gauss-legendre:4")
@@ -85,6 +86,7 @@ def test_svi_with_as_many_gauss_points_as_its_degree_is_gauss_collocation(sample
     assert distance(compiled_map(sample, compiled, name, CollocationRK(c.astype(float).tolist())), expected) < ROUND_OFF
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ANY)
 def test_additional_gauss_point_changes_the_map(sample, compiled, name):
     two, three = (compiled_map(sample, compiled, name, SVI(2, f"gauss-legendre:{g}")) for g in (2, 3))
@@ -110,6 +112,7 @@ def test_constant_mass_additional_lobatto_point_is_the_next_pair(sample, compile
     assert distance(compiled_map(sample, compiled, name, SVI(s, f"gauss-lobatto:{s + 1}")), expected) < ROUND_OFF
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["double-pendulum", "charged-particle", "pumped-cart-pole"])
 def test_other_lagrangians_additional_lobatto_point_is_not_the_next_pair(sample, compiled, name):
     differences = [
@@ -197,6 +200,7 @@ def test_spectral_collocation_is_collocation_runge_kutta_on_its_later_nodes(samp
     assert distance(compiled_map(sample, compiled, name, SpectralCollocation(s, form=form)), by_nodes) < ROUND_OFF
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("name", "same"), [("kepler", True), ("charged-particle", False)])
 def test_position_and_phase_space_form_agree_only_for_constant_mass(sample, compiled, name, same):
     """A vector potential is enough to part them: p is not a constant multiple of v."""
@@ -263,6 +267,7 @@ def with_gauge(name, order):
     )
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("method", "order", "exact"),
     [

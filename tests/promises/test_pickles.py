@@ -49,17 +49,18 @@ def test_every_option_of_a_stepper_is_in_the_table() -> None:
     assert options - {"sizes", "tables"} == set(STEPPERS) - {""}  # these two replace the system
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("option", STEPPERS)
 def test_pickled_stepper_is_equal(option: str) -> None:
     own = stepper(option)
     made = {
-        "changes": own._variational_source(2),
+        "changes": own._variants["changes 2"],
         "second_derivatives": own.second_derivatives,
     }  # which go if asked for
     for copy in (copied(own), copied(copied(own))):
         saved = ("title", "interface", "flags", "events", "source", "ensemble", "fallback", "derivatives")
         assert [name for name in saved if getattr(copy, name) != getattr(own, name)] == []
-        assert {"changes": copy._variational_source(2), "second_derivatives": copy.second_derivatives} == made
+        assert {"changes": copy._variants["changes 2"], "second_derivatives": copy.second_derivatives} == made
         plan: dict[str, Any] = {"h": 0.2, "t_end": 0.5} if option == "time_transformation" else {"h": H, "steps": STEPS}
         runs = [each.integrate(Q, P, **plan) for each in (own, copy)]
         assert_same(*runs)

@@ -60,6 +60,7 @@ def newhall_accelerations(gm, x, v, c):
     return newton + extra / c**2
 
 
+@pytest.mark.full
 def test_bodies_move_as_einstein_infeld_and_hoffmann_found(example):
     """The residual of the closed-form accelerations in the equations of L is of the next order, 1/c^4."""
     system = relativistic(example, MASSES, 1.0)
@@ -117,6 +118,7 @@ def advance(example, masses, c, a, e, orbits):
     return np.arctan2(y, x) / count, 6.0 * np.pi * total / (c**2 * a * (1.0 - e**2))
 
 
+@pytest.mark.full
 def test_perihelia_advance_by_the_formula_and_its_error_is_of_the_next_order(example):
     errors = []
     for c in (100.0, 200.0):

@@ -86,6 +86,7 @@ ON_SYSTEMS = (
 )
 
 
+@pytest.mark.sampled(10)
 @pytest.mark.parametrize(("name", "method"), ON_SYSTEMS, ids=lambda value: getattr(value, "name", value))
 def test_symplectic_methods_preserve_the_two_form(sample, compiled, name, method):
     q, p = sample(name).state
@@ -99,16 +100,12 @@ def test_forced_time_dependent_systems_preserve_the_two_form(sample, compiled, m
     assert symplecticity_defect(compiled("pumped-cart-pole", method), q, p, 0.15, 0.4) < FINITE_DIFFERENCES
 
 
-PRINTED = {
-    (2, 2): (0.0, 0.0),
-    (3, 2): (4.6e-2, -2.3e-2),
-    (5, 4): (6.6e-4, 6.7e-5),
-    (9, 7): (1.0e-7, -1.2e-9),
-}
+PRINTED = {(2, 2): (0.0, 0.0), (3, 2): (4.6e-2, -2.3e-2), (5, 4): (6.6e-4, 6.7e-5), (9, 7): (1.0e-7, -1.2e-9)}
 """(points, quadrature points) -> (defect, change of angular momentum) of one Kepler step of the printed equations."""
 KEPLER = np.array([0.3, 0.8]), np.array([-1.1, 0.4])
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("size", "expected"), PRINTED.items())
 def test_printed_shooting_equations_are_not_symplectic_but_variational_ones_are(compiled, size, expected):
     points, count = size
@@ -155,6 +152,7 @@ METHODS = (
 )
 
 
+@pytest.mark.sampled(20)
 @pytest.mark.parametrize("name", ["pumped-cart-pole", pytest.param("double-pendulum", marks=pytest.mark.full)])
 @pytest.mark.parametrize("method", first_of_each(METHODS, family), ids=lambda method: method.name)
 def test_claims_of_symmetry_and_symplecticity_agree_with_measurement(sample, compiled, method, name):
@@ -195,6 +193,7 @@ def test_newton_solver_conserves_angular_momentum_to_round_off(compiled):
     assert np.abs(L - L[0]).max() < 2e-14
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", VARIATIONAL, ids=lambda method: method.name)
 def test_spherical_pendulum_conserves_azimuthal_momentum_exactly(sample, compiled, method):
     q, p = sample("spherical-pendulum").state
@@ -257,6 +256,7 @@ DRIFTLESS = (SVI(3), SVI(3, "gauss-legendre:4"), SCVI(3), StoermerVerlet())
 DRIFTING = (SpectralCollocation(3), RadauIIA(3), SCVI(3, variational=False))
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("method", DRIFTLESS, ids=lambda method: method.name)
 @pytest.mark.parametrize("name", ["planar-pendulum", "henon-heiles"])
 def test_symplectic_methods_show_no_energy_drift(sample, compiled, name, method):

@@ -5,10 +5,7 @@ import pytest
 import scvi_codegen as sc
 
 ROD = sc.LagrangianSystem.from_text(
-    name="rod",
-    coordinates=["x", "y"],
-    lagrangian="(x_dot**2 + y_dot**2)/2 - y",
-    constraints=["x**2 + y**2 - 1"],
+    name="rod", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 - 1"]
 )
 
 

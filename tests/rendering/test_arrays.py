@@ -63,6 +63,7 @@ def rendered(name: str, method: str, *, newton: bool = False) -> Source:
     return render(program, control)
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize(
     ("name", "method"),
     [(name, method) for name in FORMULAS for method in ("svi:4", "stoermer-verlet") if (name, method) != EXPLICIT],
@@ -72,7 +73,8 @@ def test_generated_code_is_strict_c(name: str, method: str, tmp_path: Path) -> N
     check_strict(rendered(name, method), tmp_path)
 
 
-@pytest.mark.parametrize("name", ["bodies", "all forms", "lattices"])
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("name", ["bodies", "all forms", "lattices", "hamiltonian", "damped"])
 def test_newton_iteration_is_strict_c(name: str, tmp_path: Path) -> None:
     """Newton's iteration compiles as strict C."""
     check_strict(rendered(name, "svi:4", newton=True), tmp_path)

@@ -136,6 +136,7 @@ def share_of(method: str, share: int) -> list[Source]:
     return [source for source, _ in generated(method).values()][share::SHARES]
 
 
+@pytest.mark.sampled(8)
 @pytest.mark.covering
 @pytest.mark.parametrize("share", range(SHARES))
 @pytest.mark.parametrize("method", METHODS)
@@ -148,6 +149,7 @@ def test_code_compiles_without_warnings(method, share, tmp_path):
             check_symbols(Path(file).stem, tmp_path)
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.covering
 @pytest.mark.parametrize("share", range(SHARES))
 @pytest.mark.parametrize("method", METHODS)
@@ -212,6 +214,7 @@ def test_headers_compile_as_c_plus_plus(tmp_path):
     run([str(tmp_path / "main")], tmp_path)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.covering
 @pytest.mark.parametrize("solver", ["newton", "fixed-point"])
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
@@ -224,6 +227,7 @@ def test_either_solver_alone_compiles_without_warnings(compiler, solver, tmp_pat
     run([needs(compiler), *C99, "-c", *files], tmp_path)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", ["double-pendulum", "driven-duffing", "driven Hamiltonian"])
 @pytest.mark.parametrize("method", TUNED, ids=lambda method: method.name)
@@ -336,6 +340,7 @@ TITLES = [
 ]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("title", TITLES)
 def test_title_cannot_end_its_comment(title, tmp_path):
     system = named_system(["a", "b", "c"], name=title)
@@ -345,6 +350,7 @@ def test_title_cannot_end_its_comment(title, tmp_path):
     run([needs("gcc"), *C99, "-c", file], tmp_path)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("prefix", ["fabs", "errno", "NULL", "main", "newton", "step", "int", "m", "b"])
 def test_reserved_prefixes_of_c_are_valid(prefix, tmp_path):
     source, _ = generate_source(bare_oscillator(), SVI(2), prefix=prefix)
@@ -445,6 +451,7 @@ SANITIZERS = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.covering
 @SANITIZERS
 @pytest.mark.parametrize("method", BRIEFLY)
@@ -453,6 +460,7 @@ def test_method_families_pass_the_sanitizers(command, method, tmp_path):
     check_sanitized([generated(method)["pumped-cart-pole"]], command, tmp_path)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.covering
 @SANITIZERS
 @pytest.mark.parametrize(

@@ -29,6 +29,7 @@ CASES = {
 }
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.covering
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 @pytest.mark.parametrize("second", [False, True])

@@ -150,6 +150,7 @@ def test_board_and_host_give_equal_numbers(case, name, tmp_path):
     np.testing.assert_allclose(found, expected, rtol=0, atol=300 * unit * np.abs(expected).max())
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("case", CASES)
 def test_double_precision_equals_the_compiled_stepper_and_single_is_close(case, tmp_path):
     name, method = CASES[case]

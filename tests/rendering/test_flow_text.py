@@ -32,6 +32,7 @@ def compile_with(compiler, flags, source, folder):
     assert found.returncode == 0, found.stderr
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.covering
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 @pytest.mark.parametrize("name", CASES)
@@ -43,10 +44,7 @@ def test_flows_compile_without_warnings(name, compiler, tmp_path):
 
 def test_flows_of_batches_compile_without_warnings(tmp_path):
     stepper = compile_stepper(*CASES["kepler"])
-    for source in (
-        with_flow_of_rows(stepper.derivatives),
-        with_flow_of_rows(stepper.second_derivatives, second=True),
-    ):
+    for source in (with_flow_of_rows(stepper.derivatives), with_flow_of_rows(stepper.second_derivatives, second=True)):
         check_style(source.amalgamated().code)
         compile_with("gcc", ["-Wno-missing-prototypes"], source.amalgamated(), tmp_path)
 

@@ -44,12 +44,13 @@ CELLS = (
     "swings",
 )
 GENERATED = (
-    r"core/|newton/stages|newton/band|arrays/arrays|arrays/lattice_transform|derivatives/linear|mechanics/damping"
+    r"core/|newton/stages|newton/band|arrays/(?:arrays|lattice_transform|circulant)|derivatives/linear"
+    r"|mechanics/damping"
 )
 """Headers with types that the generated part uses."""
 CHOSEN = (
     r"iteration/\w*(?:_iteration|trajectory|trajectories|_solver|splitting)|newton/newton_solver"
-    r"|newton/library_fallback|arrays/array_hamiltonian_iteration|arrays/newton_gmres"
+    r"|newton/library_fallback|arrays/array_hamiltonian_iteration|arrays/(?:newton_gmres|second_order_points)"
     r"|derivatives/(?:separable|coupled)_derivatives|step_size/(?:trials|density)"
 )
 """Headers of which a source chooses one of several with the same functions."""
@@ -68,8 +69,11 @@ def sources() -> tuple[Source, ...]:
     oscillator = compile_stepper(problem("harmonic-oscillator").system, SVI(1), events=[impact("q", where="t > 0")])
     made.append(compile_stepper(problem("double-pendulum").system, SpectralCollocation(3)).source)
     body = LagrangianSystem.from_text("body", rotations={"R": "w"}, lagrangian="w_1**2 + w_2**2 + 2*w_3**2")
-    made.append(compile_stepper(body, SVI(3)).source)
+    made += [compile_stepper(body, method).source for method in (SVI(3), "stoermer-verlet")]
     pair = "sum(i in N, q_dot[i]**2/2) - sum(i < j in near, (q[i] - q[j])**2)"
+    ring = "sum(i in N, q_dot[i]**2/2) - sum(i < j in N, c[j-i]*(q[i] - q[j])**2)"
+    circulant = LagrangianSystem.from_text("ring", ["q[N]"], ring, parameters={"c[N]": 1.0})
+    made.append(compile_stepper(circulant, "svi:1").source)
     near = {"near": {"of": "q", "cutoff": 1.0}}
     made.append(compile_stepper(LagrangianSystem.from_text("pair", ["q[N]"], pair, neighbours=near), "svi:1").source)
     drift = compile_stepper(LagrangianSystem.from_text("drift", ["x", "y"], "x**3*y_dot - x**2 - y**2"), SVI(1))

@@ -149,6 +149,7 @@ int main(void)
 """
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("solver", ["fixed-point", "newton"])
 @pytest.mark.parametrize(
     "system", [problem("harmonic-oscillator").system, problem("kepler").system], ids=lambda system: system.name

@@ -92,15 +92,7 @@ def keys(change: dict, **options) -> tuple[str, ...]:
     }
     system = sc.LagrangianSystem.from_text(**{**given, **change})
     found = compiler.CachedSources(
-        system,
-        **{
-            "method": sc.SVI(2),
-            "solver": "auto",
-            "prefix": None,
-            "symmetries": (),
-            "g": None,
-            **options,
-        },
+        system, **{"method": sc.SVI(2), "solver": "auto", "prefix": None, "symmetries": (), "g": None, **options}
     )
     return found.key
 
@@ -232,6 +224,7 @@ def test_text_with_warnings_is_always_read(made):
         sc.compile_stepper(system, "svi:2")
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "make",
     [

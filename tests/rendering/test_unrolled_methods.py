@@ -45,6 +45,7 @@ def both(case, monkeypatch, flags):
     return steppers
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("case", CASES)
 def test_unrolled_and_tabulated_methods_are_equal(case, monkeypatch):
     m = CASES[case][0].dimension

@@ -27,6 +27,7 @@ void check(const double *x, double *y)
 """
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("flags", ["-march=native -O2", "-O2"])
 @pytest.mark.parametrize("k", [1, 3, 5, 7])
@@ -55,6 +56,7 @@ def test_inverse_roots_are_right_to_two_units(tmp_path, k, flags):
 SHORT, LONG = ("-O1", "-march=x86-64"), ("-O1", "-march=native")
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the lengths of vectors of other processors are not chosen")
 @pytest.mark.parametrize(
     ("name", "method"),
@@ -77,9 +79,10 @@ def test_points_use_the_vectors_that_registers_allow(name, method):
     assert np.abs(ends[0] - ends[1]).max() < 1e-13 * np.abs(ends[1]).max()
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the lengths of vectors of other processors are not chosen")
 @pytest.mark.parametrize("points", [2, 3, 8, 10])
-def test_sums_by_exchanged_lanes_are_the_same_in_vectors_of_any_length(points):
+def test_sums_over_points_are_the_same_in_vectors_of_any_length(points):
     top = sc.LagrangianSystem.from_text(
         "top", rotations={"R": "w"}, lagrangian="(w_1**2 + 2*w_2**2 + 3*w_3**2)/2 - R_33 - R_12"
     )

@@ -9,10 +9,7 @@ from scvi_codegen.reproduce.claims import CLAIMS, EVIDENCE
 from scvi_codegen.reproduce.experiment import Verdict
 from scvi_codegen.reproduce.runner import Failure, run_experiments
 
-PAPER = {
-    *(f"figure-{n}" for n in range(1, 31) if n != 2),
-    *("table-8", "table-9", "claims", "correction"),
-}
+PAPER = {*(f"figure-{n}" for n in range(1, 31) if n != 2), *("table-8", "table-9", "claims", "correction")}
 
 
 def test_every_numerical_figure_and_table_is_there() -> None:

@@ -29,6 +29,7 @@ FIGURES = {f"figure-{n}": EXPERIMENTS[f"figure-{n}"] for n in (1, *range(3, 6), 
 IN_PART = {"figure-1", "figure-3", "figure-4", "figure-27", "figure-29"}
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.long
 @pytest.mark.parametrize("name", FIGURES)
 def test_results_are_complete(name):
@@ -178,6 +179,7 @@ def test_missing_term_lowers_the_order(degree):
     assert full.order == pytest.approx(2 * degree, abs=0.2)
 
 
+@pytest.mark.full
 @pytest.mark.long
 def test_the_correction_distinguishes_the_printed_form_from_the_full_one():
     found = EXPERIMENTS["correction"].result({})

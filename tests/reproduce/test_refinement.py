@@ -52,6 +52,7 @@ ORDERS = [
 """Powers of h by scheme for N = 2, 4, 6 and each quantity; on the circle q1 has the lines that the paper draws."""
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("case", "quantities", "expected"), ORDERS)
 def test_convergence_orders_of_the_local_error(case, quantities, expected):
     for scheme, powers in expected.items():
@@ -113,6 +114,7 @@ COARSE = {
 """Whole, these take many compilations and solutions in 60 digits."""
 
 
+@pytest.mark.full
 def test_figures_have_the_papers_lines_and_verdicts_can_fail():
     found = {number: refinement(f"figure-{number}", "title", study).result({}) for number, study in COARSE.items()}
     assert {number: result.verdict for number, result in found.items()} == {

@@ -225,6 +225,7 @@ class TestCommand:
         text = Path("all.html").read_text(encoding="utf-8")
         assert text.index('<section id="section-3.1"') < text.index('<section id="figure-4"')
 
+    @pytest.mark.full
     def test_violated_claim_is_not_a_failure(self):
         assert invoke("figure-4").exit_code == 0
         assert Path("reproduced/figure-4.txt").is_file()

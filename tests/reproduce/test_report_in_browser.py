@@ -5,13 +5,7 @@ from typing import Any
 
 import pytest
 import toy_experiments
-from browsing import (
-    UNREADABLE,
-    VIEWS,
-    assert_it_asks_for_nothing,
-    assert_nothing_sticks_out,
-    opened,
-)
+from browsing import UNREADABLE, VIEWS, assert_it_asks_for_nothing, assert_nothing_sticks_out, opened
 from toy_experiments import GOOD
 
 from scvi_codegen.reproduce.experiment import Result
@@ -35,6 +29,7 @@ def view(
 
 
 class TestInABrowser:
+    @pytest.mark.sampled(2)
     def test_page_loads_nothing_and_logs_no_error(self, view):
         assert_it_asks_for_nothing(view)
 

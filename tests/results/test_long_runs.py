@@ -141,6 +141,7 @@ def test_full_disk_loses_nothing_and_the_run_continues_later(kepler, small_disk)
     assert digests("a.run") == digests("whole.run")
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("suffix", ["npz", "csv", "h5", "zarr"])
 def test_failed_write_preserves_the_old_file(kepler, small_disk, suffix):
     pytest.importorskip({"h5": "h5netcdf", "zarr": "zarr"}.get(suffix, "numpy"))

@@ -53,6 +53,7 @@ class TestRecording:
         found = recorded(kepler, 1001, rows=100)
         assert [len(piece) for piece in found.pieces()] == [100] * 10 + [2]
 
+    @pytest.mark.sampled(3)
     @pytest.mark.parametrize("method", [SVI(4), Gauss(2), StoermerVerlet()], ids=lambda method: method.name)
     @pytest.mark.parametrize("save_every", [1, 40, 400])
     def test_interrupted_run_is_bytewise_equal(self, compiled, method, save_every):

@@ -58,7 +58,7 @@ def test_body_momenta_are_measurements(stepper, true):
     names = ["p_R_1", "p_R_2", "p_R_3", "R_31", "R_32", "R_33"]
     with pytest.raises(sc.FitError, match="do not determine"):  # attitudes about the vertical
         fitted(stepper, true, measured, names)
-    with pytest.raises(StateError, match=r"'omega_1' cannot be observed, only coordinates, momenta, R_11, p_R_1"):
+    with pytest.raises(StateError, match=r"'omega_1' cannot be observed. Possible: R_w, .*, R_33, p_R_1"):
         fitted(stepper, true, measured[:, :1], ["omega_1"])
     fit = fitted(stepper, true, np.hstack([measured, true.rotation()[::2, :1, 0]]), [*names, "R_11"])
     assert max(abs(fit.parameters[name] - value) for name, value in TRUE.items()) < 1e-8
@@ -75,4 +75,4 @@ def test_spins_are_fitted_without_their_phase():
     run = stepper.integrate({"a": [1, 0, 0], "b": [0, 0.6, 0.8]}, h=0.05, steps=80, parameters={"J": 1.1, "f": 0.6})
     measured, names = np.hstack([run.spin("a"), run.spin("b")]), [f"{s}_{k}" for s in "ab" for k in (1, 2, 3)]
     fit = sc.fit(stepper, run.t, measured, q={"a": [1, 0.1, 0], "b": [0, 0.7, 0.7]}, h=0.05, observed=names)
-    np.testing.assert_allclose([fit.parameters["J"], fit.parameters["f"]], [1.1, 0.6], atol=1e-8)
+    np.testing.assert_allclose([fit.parameters["J"], fit.parameters["f"]], [1.1, 0.6], rtol=0, atol=1e-8)

@@ -72,7 +72,7 @@ def test_a_file_with_rotations_runs_as_the_system_built_in_python():
         h=0.05,
         steps=20,
     )
-    np.testing.assert_allclose(model.integrate().q, run.q, atol=1e-15)
+    np.testing.assert_allclose(model.integrate().q, run.q, rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("text", [TOP, SPINS], ids=["rotation", "spins"])
@@ -91,6 +91,11 @@ def test_the_command_line_runs_a_file_with_rotations(tmp_path):
         main(["run", str(path), "-o", str(tmp_path / "out.csv")])
     assert ended.value.code == 0
     assert "R_w" in (tmp_path / "out.csv").read_text()
+
+
+def test_torques_in_the_section_of_the_system_are_located():
+    with pytest.raises(ModelFileError, match=r"'torques' in \[system\]; there is a section \[torques\]"):
+        parse_model(TOP.replace("[torques]\nR", "torques.R"))
 
 
 def test_an_unknown_rotation_in_the_initial_state_is_named():
@@ -130,7 +135,7 @@ def test_models_in_python_take_attitudes(attitude):
     )
     run = model.integrate()
     assert np.abs(run.rotation()[0] - MATRIX).max() < 1e-15
-    np.testing.assert_allclose(run.angular_velocity()[0], [0.1, 0.0, 2.0], atol=1e-15)
+    np.testing.assert_allclose(run.angular_velocity()[0], [0.1, 0.0, 2.0], rtol=0, atol=1e-15)
     assert np.array_equal(parse_model(dump_model(model)).integrate().q, run.q)
     with pytest.raises(ModelFileError, match="the matrix of 'R' is not a rotation"):
         sc.Model(

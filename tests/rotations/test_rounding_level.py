@@ -28,6 +28,7 @@ MOST_AFTER_ROUNDING = 5.0
 """Iterations from changes of 1e-14 to the end: three to the unit roundoff, and two in which changes stop decreasing."""
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.filterwarnings("ignore::scvi_codegen.AccuracyWarning")
 @pytest.mark.parametrize("name", CASES)
 def test_steps_are_those_of_newtons_method_without_iterations_at_the_rounding_level(name):

@@ -94,6 +94,7 @@ CASES = {
 }
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.covering
 @pytest.mark.parametrize("method", ["svi:4", "gauss:2", "sc:5", "svi:9", "stoermer-verlet", "composition:8"])
 @pytest.mark.parametrize("name", CASES)
@@ -158,9 +159,7 @@ def test_one_library_is_used_for_every_size(count: int) -> None:
     """A ring of coupled oscillators against its normal modes; momentum to round-off."""
     stepper = sc.compile_stepper(
         sc.LagrangianSystem.from_text(
-            name="ring",
-            coordinates=["q[N]"],
-            lagrangian=f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**2/2)",
+            name="ring", coordinates=["q[N]"], lagrangian=f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**2/2)"
         ),
         "svi:6",
     )
@@ -388,6 +387,7 @@ def test_index_out_of_range_of_a_table_is_rejected() -> None:
         sc.unroll_sums(system, {"N": 5, "B": 1}, tables={"bonds": [[0, 1]]})
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(("method", "most"), [("svi:1", 1.3), ("svi:2", 1.6), ("svi:4", 2.2), ("svi:8", 3.4)])
 @pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
 def test_fixed_point_converges_up_to_the_documented_step_size(form: str, method: str, most: float) -> None:
@@ -511,10 +511,7 @@ def test_uniform_damping_has_the_exact_rate() -> None:
 def test_table_with_one_axis() -> None:
     """Springs at some places only."""
     pinned = sc.LagrangianSystem.from_text(
-        name="pinned",
-        coordinates=["q[N]"],
-        tables=["pins[P]"],
-        lagrangian=f"{KINETIC} - sum(p in P, q[pins[p]]**2/2)",
+        name="pinned", coordinates=["q[N]"], tables=["pins[P]"], lagrangian=f"{KINETIC} - sum(p in P, q[pins[p]]**2/2)"
     )
     run = sc.compile_stepper(pinned, "svi:6").integrate(np.ones(4), h=0.1, steps=10, tables={"pins": [1, 3]})
     assert run.q["q"][-1] == pytest.approx([1, np.cos(1), 1, np.cos(1)], abs=1e-12)

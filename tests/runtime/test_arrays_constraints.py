@@ -81,10 +81,7 @@ def test_steps_states_and_multipliers_equal_those_of_the_unrolled_system(stepper
 def with_fields(data, count):
     """Arrays of parameters in full."""
     parameters = data["parameters"]
-    return {
-        "tables": data["tables"],
-        "parameters": {"l": np.full(count, parameters["l"]), "m": parameters["m"]},
-    }
+    return {"tables": data["tables"], "parameters": {"l": np.full(count, parameters["l"]), "m": parameters["m"]}}
 
 
 @pytest.mark.parametrize("count", [30, 2000])
@@ -204,9 +201,7 @@ def test_time_dependent_constraints_are_satisfied():
     stepper = sc.compile_stepper(shaken, "composition:8")
     run = stepper.integrate([[0.0, -1.0]], velocity=[[0.3, 0.0]], h=0.02, steps=100, save_every=100)
     angle = sc.LagrangianSystem.from_text(
-        name="angle",
-        coordinates=["a"],
-        lagrangian="((a_dot*cos(a) + 3*cos(3*t)/10)**2 + (a_dot*sin(a))**2)/2 + cos(a)",
+        name="angle", coordinates=["a"], lagrangian="((a_dot*cos(a) + 3*cos(3*t)/10)**2 + (a_dot*sin(a))**2)/2 + cos(a)"
     )
     exact = sc.compile_stepper(angle, "svi:8").integrate([0.0], velocity=[0.0], h=0.05, steps=40)
     place = [np.sin(6.0) / 10 + np.sin(exact.q[-1, 0]), -np.cos(exact.q[-1, 0])]

@@ -34,6 +34,7 @@ def molecules():
     )
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("method", ["svi:2", "svi:4", "svi:8", "gauss:3"])
 @pytest.mark.parametrize(("strength", "h"), [(1.0, 0.1), (400.0, 0.5), (1e4, 0.5)])

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS
 from scipy.integrate import solve_ivp
 
@@ -48,6 +49,14 @@ def test_sizes_known_and_at_run_time_agree(at_run_time, known):
         assert np.abs(values - first.q[name]).max() < 1e-14
     for name, values in known.arrays(second.p).items():
         assert np.abs(values - first.p[name]).max() < 1e-13
+
+
+def test_ensembles_start_at_rest(at_run_time, known):
+    starts = {"x": [0.3, 0.1], "q": [Q0["q"], -Q0["q"]]}
+    for arguments in (GIVEN, {"t_end": 4.0, "parameters": {"m": MASSES}}):
+        found = at_run_time.integrate_ensemble(starts, threads=2, **arguments)
+        expected = known.integrate_ensemble(starts, velocity=np.zeros((2, 6)), **arguments)
+        assert_allclose(found.ends[1], expected.ends[1], rtol=0, atol=1e-13)
 
 
 def test_threads_do_not_change_single_coordinates(at_run_time):

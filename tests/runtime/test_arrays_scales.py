@@ -48,6 +48,7 @@ def run_of(method, solver, h, scale):
 EACH = [(*way, h) for way, counts in WAYS.items() for h in counts]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("method", "solver", "h"), EACH)
 def test_linear_system_is_scale_invariant(method, solver, h):
     one, small = run_of(method, solver, h, 1.0), run_of(method, solver, h, SMALL)
@@ -61,6 +62,7 @@ def test_iteration_counts_are_those_recorded(method, solver, h):
     assert run_of(method, solver, h, 1.0).iterations == pytest.approx(WAYS[method, solver][h], rel=0.02, abs=2)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(("method", "solver"), WAYS)
 @pytest.mark.parametrize("force", [0.0, 2.0**-90])
 def test_forces_from_rest_at_the_origin_are_scale_invariant(method, solver, force):

@@ -21,8 +21,8 @@ from scvi_codegen import (
     compile_stepper,
     problem,
 )
+from scvi_codegen.runtime.chaos.ensemble import TRAJECTORIES_TOGETHER
 from scvi_codegen.runtime.chaos.growth import SERIES
-from scvi_codegen.runtime.chaos.tangent_lanes import TRAJECTORIES_TOGETHER
 from scvi_codegen.runtime.chaos.tangent_propagation import InitialTangents
 
 REGULAR, CHAOTIC = ((0.0, 0.0), (0.5, 0.0)), ((0.0, -0.25), (0.42, 0.0))
@@ -69,7 +69,7 @@ def test_a_saddle_has_the_exponents_of_its_linear_motion():
         name="saddle", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2 + 0.09*x**2 - 4*y**2)/2"
     )
     run = compile_stepper(saddle, Gauss(4)).integrate([0.0, 0.1], [0.0, 0.0], h=0.1, steps=4000)
-    assert_allclose(run.lyapunov_exponents(), [0.3, 0.0, 0.0, -0.3], atol=1e-2)
+    assert_allclose(run.lyapunov_exponents(), [0.3, 0.0, 0.0, -0.3], rtol=0, atol=1e-2)
     deviations = run.chaos_indicators()
     assert deviations.log_gali(2)[-1] < -110.0
     assert derivative(run.t[2000:], deviations.log_gali(2)[2000:]) == pytest.approx(-0.3, rel=1e-3)
@@ -84,11 +84,11 @@ def test_tangent_vectors_of_a_free_particle_grow_as_in_closed_form():
     run = compile_stepper(free, SVI(2)).integrate([0.0], [1.0], h=0.01, steps=2000)
     found, t = run.chaos_indicators(directions=[3.0, 4.0]), run.t
     lengths = np.log(np.hypot(0.6 + 0.8 * t, 0.8))
-    assert_allclose(found.log_norms[:, 0], lengths, atol=1e-13)
-    assert_allclose(found.fli(), np.maximum.accumulate(lengths), atol=1e-13)
+    assert_allclose(found.log_norms[:, 0], lengths, rtol=0, atol=1e-13)
+    assert_allclose(found.fli(), np.maximum.accumulate(lengths), rtol=0, atol=1e-13)
     areas = np.append(0.0, np.cumsum(np.diff(t) * (lengths[1:] + lengths[:-1]) / 2))
     rates = 2.0 * (lengths[1:] - areas[1:] / t[1:])
-    assert_allclose(found.rates[1:, 0], rates, atol=1e-12)
+    assert_allclose(found.rates[1:, 0], rates, rtol=0, atol=1e-12)
     assert found.megno()[-1] == pytest.approx(np.trapezoid(np.append(0.0, rates), t) / t[-1], abs=1e-12)
 
 
@@ -97,7 +97,7 @@ def test_indicators_are_those_of_the_variational_equations(galaxy):
     run = compile_stepper(problem("henon-heiles").system, SVI(6)).integrate(*CHAOTIC, h=0.02, steps=2500)
     found = run.chaos_indicators(3)
     changes = InitialTangents.checked(run.stepper, 3, None).at(run.q[0], run.p[0], 0.02, 0.0, run.parameters, None)
-    assert_allclose(changes.T @ changes, np.eye(3), atol=1e-14)
+    assert_allclose(changes.T @ changes, np.eye(3), rtol=0, atol=1e-14)
 
     def motion(t, z):
         x, y, v = z[0], z[1], z[4:16].reshape(4, 3)
@@ -111,7 +111,7 @@ def test_indicators_are_those_of_the_variational_equations(galaxy):
     ends = solve_ivp(motion, (0, 50.0), start, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
     moved = ends[4:16].reshape(4, 3)
     sizes = np.linalg.norm(moved, axis=0)
-    assert_allclose(found.log_norms[-1], np.log(sizes), atol=1e-7)
+    assert_allclose(found.log_norms[-1], np.log(sizes), rtol=0, atol=1e-7)
     assert found.gali(3)[-1] == pytest.approx(np.prod(np.linalg.svd(moved / sizes)[1]), rel=1e-5)
     one, other = (moved / sizes).T[:2]
     smaller = min(np.linalg.norm(one + other), np.linalg.norm(one - other))
@@ -126,7 +126,7 @@ def test_regular_and_chaotic_trajectories_are_distinguished(galaxy):
     assert regular.megno()[-1] == pytest.approx(2.0, abs=0.1)
     late, found = slice(1000, None), regular.chaos_indicators()
     powers = [derivative(np.log(regular.t[late]), found.log_gali(k)[late]) for k in (2, 3, 4)]
-    assert_allclose(powers, [0.0, -2.0, -4.0], atol=0.3)
+    assert_allclose(powers, [0.0, -2.0, -4.0], rtol=0, atol=0.3)
     assert derivative(np.log(regular.t[late]), found.fli()[late]) == pytest.approx(1.0, abs=0.2)
     assert regular.gali(2).min() > 0.05
     found, t = chaotic.chaos_indicators(), chaotic.t[-1]
@@ -178,10 +178,7 @@ def test_friction_moves_the_middle_of_the_spectrum():
 def test_constraints_reduce_the_number_of_tangent_vectors():
     """A pendulum of rods: two changes, those of the angle."""
     rod = LagrangianSystem.from_text(
-        name="rod",
-        coordinates=["x", "y"],
-        lagrangian="(x_dot**2 + y_dot**2)/2 - y",
-        constraints=["x**2 + y**2 = 1"],
+        name="rod", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"]
     )
     run = compile_stepper(rod, SVI(4, "gauss-lobatto:5")).integrate([1.0, 0.0], [0.0, 0.0], h=0.1, steps=4000)
     exponents = run.lyapunov_exponents()
@@ -211,7 +208,7 @@ def test_ensembles_are_the_same_as_runs(galaxy):
         assert_array_equal(found.t, alone.t)
         assert_allclose(found.log_norms[:, j], alone.log_norms, rtol=1e-5)
         assert_allclose(found.megno()[:, j], alone.megno(), rtol=1e-5)
-        assert_allclose(found.lyapunov_exponents()[1:, j], alone.lyapunov_exponents()[1:], atol=1e-6)
+        assert_allclose(found.lyapunov_exponents()[1:, j], alone.lyapunov_exponents()[1:], rtol=0, atol=1e-6)
         assert_allclose(found.log_gali(3)[:, j], alone.log_gali(3), rtol=1e-5, atol=1e-9)
     last = galaxy.chaos_indicators_ensemble(q[:2], p[:2], h=0.2, steps=3000, count=1, threads=1)
     assert_array_equal(
@@ -223,13 +220,13 @@ def test_ensembles_are_the_same_as_runs(galaxy):
 def by_derivatives(stepper):
     """Compute the indicators without code for lanes: each trajectory is followed separately."""
     alone = pickle.loads(pickle.dumps(stepper))
-    assert alone._variational_source(1) is None
+    assert alone._variants["changes 1"] is None
     return alone
 
 
 def same(found, other, within):
     for name in SERIES:
-        assert_allclose(getattr(found, name), getattr(other, name), atol=within)
+        assert_allclose(getattr(found, name), getattr(other, name), rtol=0, atol=within)
     assert_array_equal(found.status, other.status)
 
 
@@ -246,6 +243,7 @@ OPEN = HamiltonianSystem.from_text(
 )
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("system", "method", "options"),
     [
@@ -263,7 +261,7 @@ def test_lanes_have_the_derivatives_of_the_steps(system, method, options):
     alone = by_derivatives(stepper)
     options = {"h": 0.1, "steps": 120, "save_every": 40} | options
     found = stepper.chaos_indicators_ensemble(*start, **options)
-    assert stepper._variational_source(found.log_norms.shape[-1]) is not None
+    assert stepper._variants[f"changes {found.log_norms.shape[-1]}"] is not None
     same(found, alone.chaos_indicators_ensemble(*start, **options), 1e-12)
 
 
@@ -273,8 +271,8 @@ def test_fast_growing_tangent_vectors_in_lanes_use_shorter_segments():
     stepper, start = compile_stepper(saddle, SVI(6)), ([[1e-3], [0.0]], [[0.0], [2e-3]])
     alone = by_derivatives(stepper)
     found = stepper.chaos_indicators_ensemble(*start, h=0.1, steps=300, save_every=100)
-    assert_allclose(found.log_r_diagonal.sum(axis=-1), 0.0, atol=1e-10)
-    assert_allclose(found.lyapunov_exponents()[-1], [[10.0, -10.0]] * 2, atol=0.05)
+    assert_allclose(found.log_r_diagonal.sum(axis=-1), 0.0, rtol=0, atol=1e-10)
+    assert_allclose(found.lyapunov_exponents()[-1], [[10.0, -10.0]] * 2, rtol=0, atol=0.05)
     same(found, alone.chaos_indicators_ensemble(*start, h=0.1, steps=300, save_every=100), 1e-10)
 
 
@@ -313,7 +311,7 @@ def test_more_trajectories_than_one_batch_are_distinguished(galaxy):
     assert_array_equal(both[0].log_norms, both[1].log_norms)
     for j in (0, TRAJECTORIES_TOGETHER - 1, TRAJECTORIES_TOGETHER, TRAJECTORIES_TOGETHER + 4):
         alone = galaxy.integrate(start[0][j], start[1][j], h=0.2, steps=40).chaos_indicators(1)
-        assert_allclose(both[0].log_norms[-1, j], alone.log_norms[-1], atol=1e-13)
+        assert_allclose(both[0].log_norms[-1, j], alone.log_norms[-1], rtol=0, atol=1e-13)
 
 
 def test_last_step_of_an_event_run_is_not_changed(galaxy):
@@ -382,7 +380,7 @@ def test_regular_and_chaotic_planets_agree_with_rebound():
         known.init_megno(seed=1)
         known.integrate(span)
         if regular:
-            assert_allclose([found, known.megno()], 2.0, atol=0.05)
+            assert_allclose([found, known.megno()], 2.0, rtol=0, atol=0.05)
         else:
             assert min(found, known.megno()) > 6.0
 

@@ -68,6 +68,7 @@ def products_of(stepper, q, h, *, steps=1, **given):
     return report.products
 
 
+@pytest.mark.sampled(9)
 @pytest.mark.parametrize("size", [8, 12, 13, 34, 60, 77, 169, 500, 1001])
 @pytest.mark.parametrize("method", ["svi:2", "svi:4", "gauss:3"])
 def test_fourier_modes_of_a_linear_ring_decouple(size, method):
@@ -96,12 +97,14 @@ def test_each_array_has_its_circulant_preconditioner():
     assert products_of(stepper, start, 1.0) <= 3
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("name", "shape", "most"), COUNTS)
 def test_boundaries_and_amplitudes_need_few_products(name, shape, most):
     """The diagonal alone gives all of these up."""
     assert products_of(stepper_of(name), smooth(shape), 1.0, steps=3, parameters={"k": 1e4}) <= 3 * most
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", LATTICES)
 @pytest.mark.parametrize("k", [1e2, 1e5])
@@ -129,6 +132,7 @@ def test_corrections_are_accurate_in_badly_scaled_systems(name):
         run.advance(1)
 
 
+@pytest.mark.full
 def test_results_do_not_depend_on_the_number_of_threads():
     ends = []
     for threads in (1, 2, 3):

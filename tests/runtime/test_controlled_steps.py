@@ -486,6 +486,7 @@ def far_away():
 WAYS = ["adaptive", "reversible", "clocked", "driven", "driven, adaptive", "indexed"]
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("span", [2.0, -2.0])
 def test_runs_end_at_t_end_including_the_low_word_of_time(far_away, way, span):

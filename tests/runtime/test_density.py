@@ -46,6 +46,7 @@ def by_hand(stepper, q, p, tau, steps, rate, control):
     return np.array(states)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("method", [SVI(3), SCVI(2), Gauss(2), StoermerVerlet()], ids=lambda method: method.name)
 @pytest.mark.parametrize("solver", ["auto", "newton"])

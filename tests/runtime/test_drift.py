@@ -28,6 +28,7 @@ def test_energy_does_not_drift(eccentricity, h, flags):
     assert abs(energy / energy[0] - 1).max() < 3e-13
 
 
+@pytest.mark.full
 def test_ensembles_do_not_drift():
     stepper = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(8))
     q, p = start(0.2)

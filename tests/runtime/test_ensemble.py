@@ -66,6 +66,7 @@ def assert_equals_single_runs(
 
 
 class TestEqualsSingleTrajectories:
+    @pytest.mark.sampled(2)
     @pytest.mark.covering
     @pytest.mark.parametrize("kind", KINDS)
     @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
@@ -192,9 +193,12 @@ class TestFailures:
         calm = stepper.integrate_ensemble(q, p, h=0.5, steps=50, save_every=7)
         assert np.abs(result.q[:, others] - calm.q[:, others]).max() < 1e-13
 
-    @pytest.mark.parametrize("h", [1e-2, 1e-4, 2e-14])
-    def test_lanes_converge_at_the_level_of_rounding(self, h: float):
-        """Changes below rounding are random, and relative to a velocity near 0 they exceed any fixed level."""
+    @pytest.mark.parametrize("h", [6e-2, 1e-2, 1e-4, 2e-14])
+    def test_lanes_converge_as_single_runs(self, h: float):
+        """Slowly, with steps repeated from another predictor, and at the level of rounding.
+
+        Changes below rounding are random, and relative to a velocity near 0 they exceed any fixed level.
+        """
         count, steps = 32, 64
         stepper = compile_stepper(chain(4).system, "svi:2")
         generator = np.random.default_rng(1)
@@ -432,19 +436,11 @@ class TestEnsembleFiles:
             ("a.toml", "[grid]\nq1 = ['x']", r"\[grid\] q1 must be a number, not 'x'"),
             ("a.toml", "[grid]\nq1 = nan", r"\[grid\] q1 is nan: it must be a finite number"),
             ("a.toml", "[grid]\nq1 = {from = 1, to = 2}", "must have from, to and count, not from, to"),
-            (
-                "a.toml",
-                "[grid]\nq1 = {from = 1, to = 2, count = 0}",
-                "count must be at least 1, not 0",
-            ),
+            ("a.toml", "[grid]\nq1 = {from = 1, to = 2, count = 0}", "count must be at least 1, not 0"),
             ("a.toml", "[grid]\nq1_dot = 1\np_q2 = 1", "both velocities and momenta"),
             ("a.csv", "q1,q2\n", "a header of names and at least one line of numbers"),
             ("a.csv", "q1,q1\n1,2", "the column 'q1' occurs twice"),
-            (
-                "a.toml",
-                "[grid]\nq1 = {from = 1, to = 2, count = 1000000000}",
-                "at most 100000000, not 1000000000",
-            ),
+            ("a.toml", "[grid]\nq1 = {from = 1, to = 2, count = 1000000000}", "at most 100000000, not 1000000000"),
             (
                 "a.toml",
                 "[grid]\nq1 = {from = 1, to = 2, count = 30000}\nq2 = {from = 1, to = 2, count = 30000}",

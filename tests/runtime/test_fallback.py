@@ -56,6 +56,7 @@ def outcome(stepper, start, h, **more):
     return [*(x.tolist() for x in (run.t, run.q, run.p, run.iterations)), status, events]
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.filterwarnings("ignore::scvi_codegen.AccuracyWarning")
 @each_method
 @pytest.mark.parametrize("h", [0.02, LONG, 0.3])
@@ -121,6 +122,7 @@ def test_recorded_run_continues_with_its_fallback(start, tmp_path):
     assert np.array_equal(whole.iterations, expected.iterations)
 
 
+@pytest.mark.full
 def test_low_words_do_not_depend_on_the_split_of_a_run():
     """Low words of fixed-point and Newton steps are separate, for one call as for many."""
     stepper = compile_stepper(problem("kepler").system, SVI(4), flags=PORTABLE_FLAGS)

@@ -107,7 +107,7 @@ def test_several_quantities_with_gaps_and_individual_noise():
     sizes = [NOISE, np.sqrt(82.0) * NOISE]
     found = fit(oscillator(), TIMES, both, observed=["x", "p_x"], deviations=sizes, unknown=SOME, **GUESS)
     alone = fit(oscillator(), TIMES, both[:, 0], deviations=NOISE, unknown=SOME, **GUESS)
-    assert_allclose(found.values, alone.values, atol=4 * np.sqrt(np.diag(alone.covariance)).max())
+    assert_allclose(found.values, alone.values, rtol=0, atol=4 * np.sqrt(np.diag(alone.covariance)).max())
     assert (np.diag(found.covariance) < np.diag(alone.covariance)).all()
     assert np.isnan(found.residuals[::7, 0]).all()
     assert found.deviations.tolist() == sizes
@@ -172,10 +172,7 @@ def test_two_measurements_do_not_determine_five_unknowns():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            {"parameters": ["m", "beta"]},
-            r"must be values, as \{'m': 1.0\}, not names: .* in unknown=\['m', 'beta'\]",
-        ),
+        ({"parameters": ["m", "beta"]}, r"must be values, as \{'m': 1.0\}, not names: .* in unknown=\['m', 'beta'\]"),
         ({"unknown": ["alfa"]}, "no parameter 'alfa' to estimate; did you mean 'alpha'"),
         ({"observed": ["v"]}, "'v' cannot be observed"),
         ({"observed": ["x", "p_x"]}, r"measured must have shape \(150, 2\) for x, p_x, not \(150,\)"),
@@ -185,10 +182,7 @@ def test_two_measurements_do_not_determine_five_unknowns():
         ({"fit_initial_state": False, "velocity": None, "p": [0.0], "unknown": []}, "nothing to estimate"),
         ({"bounds": {"k": (0, 1)}}, "bounds name 'k', which is not an unknown"),
         ({"bounds": {"delta": (0.0, 0.1)}}, r"guess of delta, 0.3, is not between its bounds \(0.0, 0.1\)"),
-        (
-            {"bounds": {"delta": (np.nan, 1.0)}},
-            "the bounds of delta must be .lower, upper., infinite for no bound",
-        ),
+        ({"bounds": {"delta": (np.nan, 1.0)}}, "the bounds of delta must be .lower, upper., infinite for no bound"),
         ({"unknown": ["alpha", "alpha"]}, "unknown names 'alpha' twice"),
         ({"observed": ["x", "x"]}, "observed names 'x' twice"),
         ({"deviations": np.inf}, "deviations must be a positive number"),
@@ -203,10 +197,7 @@ def test_invalid_arguments_are_named(options, message):
 def test_biased_parameters_warn_of_too_long_steps():
     """With large second-order steps, estimates are off by twelve standard errors, which is reported."""
     soft = LagrangianSystem.from_text(
-        name="hard",
-        coordinates=["x"],
-        lagrangian="x_dot**2/2 - a*x**2/2 - b*x**4/4",
-        parameters={"a": 1.0, "b": 1.0},
+        name="hard", coordinates=["x"], lagrangian="x_dot**2/2 - a*x**2/2 - b*x**4/4", parameters={"a": 1.0, "b": 1.0}
     )
     times = np.linspace(0.0, 20.0, 101)
     exact = compile_stepper(soft, SVI(8), flags=QUICK_FLAGS).integrate([1.0], [0.0], h=0.1, steps=200, save_every=2)
@@ -226,7 +217,7 @@ def test_initial_guess_with_failing_runs_is_accepted():
     stepper = compile_stepper(soft, SVI(4), flags=QUICK_FLAGS)
     run = stepper.integrate([0.9], [0.0], h=0.1, steps=100)
     found = fit(stepper, run.t, run.q[:, 0], q=[0.8], p=[0.0], h=0.1, parameters={"a": 1.2})
-    assert_allclose(found.values, [1.0, 0.9, 0.0], atol=1e-9)
+    assert_allclose(found.values, [1.0, 0.9, 0.0], rtol=0, atol=1e-9)
     with pytest.raises(StepFailedError):
         fit(stepper, run.t, run.q[:, 0], q=[2.0], p=[0.0], h=0.1)
 
@@ -327,7 +318,7 @@ def test_segments_and_single_shooting_agree():
     assert_allclose(parts.covariance, whole.covariance, rtol=1e-4, atol=1e-6 * np.abs(whole.covariance).max())
     assert whole.jumps.shape == (0, 2)
     momenta = fit(oscillator(), TIMES, recorded(1)[1], observed=["p_x"], segments=3, **known)  # no coordinate measured
-    assert_allclose(momenta.values[:3], [TRUE[name] for name in SOME], atol=0.05)
+    assert_allclose(momenta.values[:3], [TRUE[name] for name in SOME], rtol=0, atol=0.05)
 
 
 def test_segments_with_known_start_and_inputs():
@@ -401,6 +392,7 @@ def kepler():
     return compile_stepper(system, SVI(8), flags=QUICK_FLAGS)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("length", "time", "segments"), [(1.0, 1.0, 1), (1e6, 1e-6, 1), (1e-6, 1e6, 3), (1e6, 1e6, 1), (1e-6, 1e-6, 3)]
 )
@@ -415,7 +407,7 @@ def test_diagnosis_does_not_depend_on_units(length, time, segments):
     with warnings.catch_warnings():
         warnings.simplefilter("error", AccuracyWarning)
         found = fit(kepler(), t, q, parameters=[1.01 * mu, 0.99 * k], **guess)
-    assert_allclose(found.values / units, true, atol=1e-8)
+    assert_allclose(found.values / units, true, rtol=0, atol=1e-8)
     with pytest.raises(FitError, match=r"do not determine (k|z|p_z)"):
         fit(kepler(), t, q[:, :2], observed=["x", "y"], parameters=[1.01 * mu, k], **guess)
 

@@ -46,6 +46,7 @@ def numbers_of(gradient):
 QUICK = ("whirl", "tangle", "rubbed, several vectors of points")
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in CASES]
 )

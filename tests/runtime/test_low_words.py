@@ -145,6 +145,7 @@ class Begun:
         return float(momentum - first), float(places - begun - first * (self.time() - t))
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("name", CASES)
 def test_sums_of_high_and_low_words_are_exact(name: str) -> None:
     own = Begun(name)
@@ -190,6 +191,7 @@ def test_constraints_hold_for_the_sum_of_high_and_low_words(name: str) -> None:
     assert abs((x - y) ** 2 + w**2 - 1) < 1e-14
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("lengths", ["h", "tolerance", "time_transformation"])
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["forward", "back"])
 def test_last_step_ends_at_the_sum_of_both_words_of_time(lengths: str, sign: float) -> None:

@@ -58,6 +58,7 @@ def forces(r: Any) -> Any:
     return -(2 * derivative[..., None] * apart).sum(axis=1)
 
 
+@pytest.mark.full
 def test_no_pair_is_missed_in_a_long_run() -> None:
     """The particles travel through several boxes; a run that missed a pair once would be elsewhere."""
     r, v = start()
@@ -74,6 +75,7 @@ def test_no_pair_is_missed_in_a_long_run() -> None:
     assert abs(run.momentum_maps()).max() < 1e-11
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", ["stoermer-verlet", "composition:8", "svi:2"])
 def test_no_bit_depends_on_skin_and_interruptions(method: str) -> None:
     r, v = start()
@@ -148,6 +150,7 @@ def of_other_kind(kind: str, near: str) -> Any:
     return sc.LagrangianSystem.from_text(**given, lagrangian=lagrangian, dissipation=friction)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("kind", "method"), [("hamiltonian", "svi:2"), ("bonds", "stoermer-verlet"), ("friction", "svi:2")]
 )
@@ -175,6 +178,7 @@ def test_parameters_that_change_make_another_list() -> None:
     assert runs[0] == pytest.approx(runs[1], abs=1e-12)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("box", [None, "5", ["5", "L"], ["9", "4*L"]])
 def test_boxes_of_other_shapes_and_none(box: Any) -> None:
     """In two dimensions, with an offset in the state, cells of any number per axis, and values of each particle."""
@@ -226,14 +230,7 @@ def test_programs_of_packages_make_their_lists(sanitizer: str, tmp_path: Path) -
     """With three threads and the compiler's sanitizers, from the same start to the same bits."""
     needs("setarch")
     r, v = start(3.0, side=7)
-    model = sc.Model(
-        system=liquid(0.1, SOFT),
-        q={"r": r},
-        velocity={"r": v},
-        h=0.02,
-        method=sc.SVI(2),
-        span=0.1,
-    )
+    model = sc.Model(system=liquid(0.1, SOFT), q={"r": r}, velocity={"r": v}, h=0.02, method=sc.SVI(2), span=0.1)
     folder = sc.generate_package(model, tmp_path / "soft")
     flags = ["-std=c99", "-O1", "-ffp-contract=off", f"-fsanitize={sanitizer}", "-DSCVI_THREADS", "-pthread"]
     command = [*find_compiler(), *flags, "-Wno-psabi", "main.c", "soft.c", "-lm", "-o", "main"]

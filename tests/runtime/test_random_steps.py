@@ -46,6 +46,7 @@ def check(name, method, solver, steps):
     return found
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.full] if name in REDUNDANT else []) for name in QUICK]
 )
@@ -192,10 +193,7 @@ def test_comparison_with_half_steps_does_not_change_an_array_run(solver, steps):
 def test_spurious_solutions_are_recognised_in_every_unit_of_mass():
     """Newton's iteration takes the place of a fixed-point iteration that fails in steps of about a period."""
     quartic = sc.LagrangianSystem.from_text(
-        name="quartic",
-        coordinates=["x"],
-        lagrangian="m*(x_dot**2/2 - x**2/2 - x**4/4)",
-        parameters={"m": 1.0},
+        name="quartic", coordinates=["x"], lagrangian="m*(x_dot**2/2 - x**2/2 - x**4/4)", parameters={"m": 1.0}
     )
     stepper, random = sc.compile_stepper(quartic, sc.SVI(2), flags=("-O0",)), np.random.default_rng(5)
 

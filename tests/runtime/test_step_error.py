@@ -43,6 +43,7 @@ def check_all_phases(system, method, solver="auto"):
     assert np.all(achieved[resolved] < 5.0 * estimated[resolved])
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("method", [sc.SVI(4), pytest.param(sc.SVI(6), marks=pytest.mark.full)])
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_error_estimate_is_independent_of_the_phase(name, method):

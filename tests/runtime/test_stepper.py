@@ -130,6 +130,7 @@ def test_symmetric_method_returns_along_its_trajectory(sample, compiled, method)
 # Saving and restoring.
 
 
+@pytest.mark.sampled(2)
 @each_method
 def test_restored_run_continues_bitwise(sample, compiled, method):
     stepper, state = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
@@ -444,6 +445,7 @@ def test_step_is_the_plus_transform_after_the_inverse_of_the_minus_transform(sam
     assert plus[1] == pytest.approx(p1, abs=1e-13)
 
 
+@pytest.mark.sampled(2)
 @each_action
 def test_momenta_are_derivatives_of_the_discrete_lagrangian(sample, compiled, method):
     name = "pumped-cart-pole"
@@ -478,6 +480,7 @@ def test_the_discrete_lagrangian_is_the_quadrature_along_the_oracles_curve(sampl
     assert found == pytest.approx(float(along(middle)), abs=1e-14)
 
 
+@pytest.mark.sampled(2)
 @each_action
 def test_the_discrete_lagrangian_approximates_the_action_of_the_trajectory(compiled, method):
     """The oscillator released from rest, whose action over one step is known: -sin(2 h) / 4."""
@@ -550,6 +553,7 @@ def test_a_stepper_shows_system_and_method(kepler):
     assert kepler.dimension == 2
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", ["double-pendulum", "relativistic-particle", "planar-pendulum", "harmonic-oscillator"])
 @pytest.mark.parametrize("method", [SVI(8), SVI(4, "gauss-legendre:6"), SCVI(4)], ids=lambda method: method.name)

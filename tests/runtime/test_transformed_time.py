@@ -52,6 +52,7 @@ def kepler_time(q: Any) -> Any:
 WAYS = [(form, solver) for form in FORMS for solver in ("auto", "newton")]
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(("form", "solver"), WAYS)
 def test_time_satisfies_keplers_equation(form: str, solver: str) -> None:
     run = stepper(form, solver).integrate(*START, h=0.1, steps=300)
@@ -62,6 +63,7 @@ def test_time_satisfies_keplers_equation(form: str, solver: str) -> None:
     assert np.array_equal(run.tau, 0.1 * np.arange(301)) or np.abs(run.tau - 0.1 * np.arange(301)).max() < 1e-14
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("form", ["L", "K"])
@@ -174,6 +176,7 @@ def test_dense_output_is_in_physical_time() -> None:
     assert np.array_equal(p, seldom.p[3])
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("form", FORMS)
 def test_events_are_located_in_physical_time(form: str) -> None:
     run = stepper(form).integrate(*START, h=0.1, t_end=10.0, events=["y", "t - 4", "x_dot"])
@@ -188,6 +191,7 @@ def test_events_are_located_in_physical_time(form: str) -> None:
     assert 0.0 < ended.tau[-1] - ended.tau[-2] < 0.1
 
 
+@pytest.mark.full
 def test_event_functions_receive_physical_velocities() -> None:
     """The radial speed is largest, e/sqrt(1 - e^2), at the ends of the latus rectum."""
     functions = "(x*x_dot + y*y_dot)/sqrt(x**2 + y**2) - 2"

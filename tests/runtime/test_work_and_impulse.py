@@ -14,6 +14,7 @@ from scvi_codegen import (
     StateError,
     StoermerVerlet,
     compile_stepper,
+    impact,
 )
 
 DRAG = {"x": "-c*x_dot*sqrt(x_dot**2 + y_dot**2) + w*cos(3*t)", "y": "-c*y_dot*sqrt(x_dot**2 + y_dot**2)"}
@@ -93,6 +94,16 @@ def test_work_balance_with_dense_output_and_adaptive_steps(thrown):
     assert np.abs(free.energy() - free.energy()[0] - free.work()).max() < 1e-12
     with pytest.raises(StateError, match="save_every=1"):
         stepper.integrate(*start, t_end=2.0, t_eval=[0.3, 1.1]).work()
+
+
+@pytest.mark.parametrize("plan", [{"h": 0.05}, {}])
+def test_work_balance_with_impacts(thrown, plan):
+    """Steps end in the states before impacts, which conserve the energy."""
+    run = compile_stepper(thrown, SVI(6)).integrate([1.0, 0.0], [0.0, 1.1], t_end=6.0, events=impact("x + 1/5"), **plan)
+    assert len(run.events[0]) > 1
+    assert np.abs(run.energy() - run.energy()[0] - run.work()).max() < 1e-9
+    with pytest.raises(StateError, match="states after changes by events"):
+        run.stepper.integrate([1.0, 0.0], [0.0, 1.1], h=0.05, t_end=6.0, save_every=7).work()
 
 
 def test_unsupported_systems_have_no_work_balance(thrown):

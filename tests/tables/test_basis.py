@@ -21,7 +21,7 @@ from scvi_codegen.tables.basis import (
 )
 from scvi_codegen.tables.nodes import chebyshev_lobatto, equispaced, legendre_lobatto
 from scvi_codegen.tables.precision import Matrix, Vector, mp
-from scvi_codegen.tables.quadrature import gauss_legendre, legendre_value
+from scvi_codegen.tables.quadrature import gauss_legendre
 
 FIFTY_DIGITS = mp.mpf("1e-50")
 
@@ -170,7 +170,7 @@ def test_invalid_requests_are_rejected(call: object, message: str) -> None:
 @pytest.mark.parametrize("nodes", [lambda n: gauss_legendre(n).abscissae, lambda n: [Fraction(k, n) for k in range(n)]])
 def test_coefficients_of_legendre_polynomials_are_one_and_zero(count, nodes):
     points = tuple(mp.mpf(c) if not isinstance(c, Fraction) else number(c) for c in nodes(count))
-    values = {k: [legendre_value(k, 2 * c - 1) for c in points] for k in range(count)}
+    values = {k: [mp.legendre(k, 2 * c - 1) for c in points] for k in range(count)}
     for degree in range(count):
         functional = legendre_functional(points, degree)
         for k, own in values.items():

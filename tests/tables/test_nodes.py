@@ -15,18 +15,17 @@ from scvi_codegen.tables.closed_forms import exact_points
 from scvi_codegen.tables.nodes import (
     NODE_FAMILIES,
     Nodes,
-    chebyshev_gauss,
     chebyshev_lobatto,
     equispaced,
-    legendre_gauss,
     legendre_lobatto,
     nodes_by_name,
-    radau_left,
-    radau_right,
     to_number,
 )
 from scvi_codegen.tables.precision import mp
 
+chebyshev_gauss, legendre_gauss, radau_left, radau_right = (
+    NODE_FAMILIES[name] for name in ("chebyshev-gauss", "legendre-gauss", "radau-left", "radau-right")
+)
 DEGREES = [1, 2, 3, 4, 5, 8, 13, 30, 47]
 FIFTY_DIGITS = mp.mpf("1e-50")
 

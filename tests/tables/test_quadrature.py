@@ -70,6 +70,7 @@ def test_names_read_back_and_the_unit_interval_is_the_same_rule(rule: Quadrature
     assert rule.symmetric == ("radau" not in rule.name)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("n", [1, 2, 3, 8, 21, 64])
 def test_gauss_rules_agree_with_numpy_and_scipy(n: int) -> None:
     jacobi = scipy.special.roots_jacobi

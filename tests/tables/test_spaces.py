@@ -108,6 +108,7 @@ def test_too_few_points_for_the_intervals_warn() -> None:
 # Exactness and order.
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("degree", [2, 3, 4, 5])
 @pytest.mark.parametrize("turn", [0.1, 1.0, 3.0])
@@ -130,6 +131,7 @@ ORDERS = (
 )
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize(("method", "order"), ORDERS, ids=lambda value: getattr(value, "name", value))
 def test_order_of_methods_on_other_spaces(method: SVI, order: int) -> None:
     system, start = problem("planar-pendulum").system, ([1.0], [0.3])
@@ -160,6 +162,7 @@ STRUCTURED = (
 )
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.covering
 @pytest.mark.parametrize("method", STRUCTURED, ids=lambda method: method.name)
 @pytest.mark.parametrize("solver", ["newton", "auto"])
@@ -236,6 +239,7 @@ def test_hermite_rules_by_name() -> None:
 # Where each wins.
 
 
+@pytest.mark.full
 def test_trigonometric_curves_are_more_accurate_on_a_perturbed_oscillator() -> None:
     """Henon-Heiles at small energy, one step a radian: a thousandth of the error of polynomials of the same degree."""
     system, start = problem("henon-heiles").system, ([0.05, 0.02], [0.03, 0.06])
@@ -247,6 +251,7 @@ def test_trigonometric_curves_are_more_accurate_on_a_perturbed_oscillator() -> N
     assert errors[0] < 1e-9 < 1e-7 < errors[1]
 
 
+@pytest.mark.full
 def test_splines_are_more_accurate_where_a_force_has_a_kink() -> None:
     """A triangular wave drives a pendulum; its kinks lie in the middle of the steps, where the splines have theirs."""
     system = LagrangianSystem.from_text(
@@ -261,6 +266,7 @@ def test_splines_are_more_accurate_where_a_force_has_a_kink() -> None:
     assert errors[0] < errors[1] / 1e4
 
 
+@pytest.mark.full
 def test_hermite_is_more_accurate_with_two_points_per_step() -> None:
     """With L at the ends of a step only, derivatives along the curve give order 8 instead of 2."""
     system, start = problem("planar-pendulum").system, ([1.0], [0.0])

@@ -10,11 +10,7 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 
-ENDS = {
-    "named coordinates": ("x", "y", "z"),
-    "known sizes": ("x", "q[2]"),
-    "run-time sizes": ("x", "q[N]"),
-}
+ENDS = {"named coordinates": ("x", "y", "z"), "known sizes": ("x", "q[2]"), "run-time sizes": ("x", "q[N]")}
 KINDS = tuple(ENDS)
 Q = {"named coordinates": {"x": 0.3, "y": 0.1, "z": -0.2}}
 

@@ -26,13 +26,15 @@ class Fmu:
 class Slave:
     """An instance; calls give their status, ``log`` is what it logged."""
 
-    def __init__(self, fmu: Fmu, *, token: bytes | None = None, events: bool = False, logging: bool = True) -> None:
+    def __init__(
+        self, fmu: Fmu, *, token: bytes | None = None, events: bool = False, early: bool = False, logging: bool = True
+    ) -> None:
         self.fmu, self.log = fmu, []
         self._log = LOG(lambda _, status, category, message: self.log.append((status, category, message.decode())))
         instantiate = fmu.library.fmi3InstantiateCoSimulation
         instantiate.restype = c_void_p
         token = fmu.token if token is None else token
-        flags = (c_bool(False), c_bool(logging), c_bool(events), c_bool(False))
+        flags = (c_bool(False), c_bool(logging), c_bool(events), c_bool(early))
         self.one = c_void_p(instantiate(b"one", token, None, *flags, None, c_size_t(0), None, self._log, None))
 
     def call(self, name: str, *arguments: object) -> int:
@@ -45,12 +47,26 @@ class Slave:
         )
         return status or self.set(**values) or self.call("ExitInitializationMode")
 
-    def step(self, t: float, size: float) -> int:
+    def do_step(self, t: float, size: float) -> tuple[int, bool, bool, bool]:
+        """Status; whether an event occurred, whether the simulation ends, and whether the step ended early."""
         flags, last = [c_bool(True) for _ in range(3)], c_double(-1.0)
         status = self.call("DoStep", c_double(t), c_double(size), c_bool(True), *map(byref, flags), byref(last))
         self.last = last.value
-        assert status != OK or not any(flag.value for flag in flags)
+        event, terminate, early = (flag.value for flag in flags)
+        return status, event, terminate, early
+
+    def step(self, t: float, size: float) -> int:
+        status, *flags = self.do_step(t, size)
+        assert status != OK or not any(flags)
         return status
+
+    def update_discrete_states(self) -> tuple[bool, bool]:
+        """Whether the state changed, and whether the simulation ends."""
+        flags, time = [c_bool(True) for _ in range(5)], c_double()
+        assert self.call("UpdateDiscreteStates", *map(byref, flags), byref(time)) == OK
+        again, terminate, nominals, states, defined = (flag.value for flag in flags)
+        assert [again, nominals, defined] == [False, False, False]
+        return states, terminate
 
     def set(self, **values: float) -> int:
         return self._variables("SetFloat64", values, (c_double * len(values))(*values.values()))

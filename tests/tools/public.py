@@ -109,10 +109,7 @@ def _model_files() -> Iterator[str]:
 def _headers() -> Iterator[str]:
     """Names in generated headers: of a free motion, a held one, one with an input, and one in a time of its own."""
     kepler = scvi_codegen.problem("kepler").system
-    given: tuple[dict[str, Any], ...] = (
-        {"constraints": ["x**2 + y**2 = 1"]},
-        {"forces": {"x": "u"}, "inputs": ["u"]},
-    )
+    given: tuple[dict[str, Any], ...] = ({"constraints": ["x**2 + y**2 = 1"]}, {"forces": {"x": "u"}, "inputs": ["u"]})
     falling = "(x_dot**2 + y_dot**2)/2 - y"
     others = [
         scvi_codegen.LagrangianSystem.from_text(name="falling", coordinates=["x", "y"], lagrangian=falling, **more)

@@ -2,6 +2,7 @@
 
 ``@pytest.mark.covering`` on a test with several parametrised arguments keeps few of their combinations, so that each
 value of each argument is in one; ``@pytest.mark.covering(2)`` so that each is in two (where there are as many).
+``@pytest.mark.sampled(n)`` keeps n of the cases of a test, evenly spaced in the order of their names.
 ``first_of_each`` does the like for one argument, by what its values have in common. ``pytest.mark.long`` on a file
 begins it before others, so that no process waits for another at the end.
 """
@@ -38,11 +39,14 @@ def cover(combinations: Sequence[Combination], times: int = 1) -> set[Combinatio
 
 
 def mark_the_rest_full(items: Iterable[pytest.Item]) -> None:
-    """Mark tests with ``covering`` that the default tier does not need as tests of the full tier."""
+    """Mark tests with ``covering`` or ``sampled`` that the default tier does not need as tests of the full tier."""
+    cases: defaultdict[tuple[str, str], list[pytest.Item]] = defaultdict(list)
     tests: defaultdict[tuple[str, str], list[pytest.Function]] = defaultdict(list)
     for item in sorted(items, key=lambda item: item.nodeid):  # in one order, however they are shuffled
         if isinstance(item, pytest.Function) and item.get_closest_marker("covering"):
             tests[str(item.path), item.originalname].append(item)
+        if isinstance(item, pytest.Function) and item.get_closest_marker("sampled"):
+            cases[str(item.path), item.originalname].append(item)
     for found in tests.values():
         combinations = [tuple((name, id(value)) for name, value in item.callspec.params.items()) for item in found]
         (marker,) = found[0].iter_markers("covering")
@@ -50,6 +54,12 @@ def mark_the_rest_full(items: Iterable[pytest.Item]) -> None:
         for item, combination in zip(found, combinations, strict=True):
             if combination not in saved:
                 item.add_marker(pytest.mark.full)
+    for all_cases in cases.values():
+        wanted = next(all_cases[0].iter_markers("sampled")).args[0]
+        short = [item for item in all_cases if not item.get_closest_marker("full")]
+        saved_cases = {short[k * len(short) // wanted] for k in range(min(wanted, len(short)))}
+        for item in set(short) - saved_cases:
+            item.add_marker(pytest.mark.full)
 
 
 def long_ones_first(items: list[pytest.Item]) -> None:

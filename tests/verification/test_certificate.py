@@ -52,6 +52,7 @@ def caught(mutation: Mutation) -> tuple[Check, ...]:
     return certified(mutation.case, mutation.apply, edits_text=mutation.edits_text).violated
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("mutation", [one for one in MUTATIONS if one.name in QUICK], ids=lambda one: one.name)
 def test_planted_fault_is_detected(mutation: Mutation) -> None:
     assert caught(mutation)
@@ -87,6 +88,7 @@ def test_unmodified_systems_pass(name: str) -> None:
     assert "stage equations" in {check.name for check in certificate.checks if check.outcome is Outcome.SATISFIED}
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "name", ["wire/lobatto-svi", "sleigh/lobatto-svi", pytest.param("linkage/lobatto-svi", marks=pytest.mark.full)]
 )
@@ -138,6 +140,7 @@ def test_missing_state_is_generated() -> None:
         verify(problem("planar-pendulum").system, Gauss(2), [0.1], flags=QUICK_FLAGS)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", [SVI(2), Gauss(2)], ids=lambda method: method.name)
 def test_inputs_are_certified_at_small_values(method) -> None:
     """Nobody gives any: their parts are moved off 0 as all parameters are."""

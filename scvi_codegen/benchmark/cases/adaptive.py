@@ -7,8 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from scvi_codegen.benchmark.cases.unforced import Case, case, gravitating, kepler_case, rotated, scaled
-from scvi_codegen.models.problems import problem
+from scvi_codegen.benchmark.cases.unforced import Case, case, gravitating, kepler_case, outer_planets, rotated, scaled
 
 ECCENTRICITIES = (0.0, 0.2, 0.5, 0.9, 0.99, 0.999)
 KEPLER_SPAN = 2000.0
@@ -59,23 +58,13 @@ def _figure_eight_case() -> Case:
 
 def _solar_case(name: str, body: Mapping[str, float], span: float, *, part: float) -> Case:
     """Return the outer solar system with a body on an ellipse, started at perihelion (part 1) or aphelion (-1)."""
-    outer = problem("outer-solar-system")
-    assert outer.velocity is not None
-    values = dict(zip(map(str, outer.system.parameters), outer.system.defaults, strict=True))
-    masses = [value for key, value in values.items() if key.startswith("m_")]
-    sun, sun_velocity = np.array(outer.q[:3]), np.array(outer.velocity[:3])
-    e, mu = part * body["eccentricity"], values["G"] * masses[0]
+    masses, positions, velocities, gravity = outer_planets()
+    e, mu = part * body["eccentricity"], gravity * masses[0]
     distance, speed = body["axis"] * (1.0 - e), math.sqrt(mu * (1.0 + e) / (1.0 - e) / body["axis"])
     tilt = math.cos(body["inclination"]), math.sin(body["inclination"])
-    position, velocity = sun + np.array([distance, 0.0, 0.0]), sun_velocity + speed * np.array([0.0, *tilt])
-    return gravitating(
-        [*masses, body["mass"]],
-        [*outer.q, *position],
-        [*outer.velocity, *velocity],
-        name=name,
-        gravity=values["G"],
-        span=span,
-    )
+    position, velocity = positions[:3] + np.array([distance, 0.0, 0.0]), velocities[:3] + speed * np.array([0.0, *tilt])
+    state = [*masses, body["mass"]], [*positions, *position], [*velocities, *velocity]
+    return gravitating(*state, name=name, gravity=gravity, span=span)
 
 
 ADAPTIVE_CASES: Mapping[str, Callable[[], Case]] = {

@@ -34,7 +34,7 @@ class FieldCase:
         field: density.
         span: duration.
         exact: function from points and time to the field and its rate, or to real and imaginary part.
-        settings: (discretisation, options, methods in time, numbers of steps) of this package.
+        settings: (discretisation, options, methods in time, numbers of steps, solver) of this package.
         pde: right-hand sides for py-pde; of a complex field one.
     """
 
@@ -42,7 +42,7 @@ class FieldCase:
     field: FieldSystem
     span: float
     exact: Callable[[Points, float], tuple[Array, Array]]
-    settings: Sequence[tuple[str, Mapping[str, Any], Sequence[str], Sequence[int]]]
+    settings: Sequence[tuple[str, Mapping[str, Any], Sequence[str], Sequence[int], str]]
     pde: Mapping[str, str]
 
     @property
@@ -55,13 +55,7 @@ class FieldCase:
         zero = np.zeros((1, 1))
         system: Any = self.field
         return Case(
-            name=f"fields:{self.name}",
-            system=system,
-            q=zero,
-            velocity=zero,
-            span=self.span,
-            step=1.0,
-            field=self,
+            name=f"fields:{self.name}", system=system, q=zero, velocity=zero, span=self.span, step=1.0, field=self
         )
 
     def error(self, points: Points, final: Array) -> float:
@@ -72,14 +66,14 @@ class FieldCase:
 
 def our_fields(case: FieldCase, quick: bool) -> Iterator[Contender]:
     """Yield contenders of this package on every mesh of a case."""
-    for kind, options, methods, counts in case.settings[: 1 if quick else None]:
+    for kind, options, methods, counts, solver in case.settings[: 1 if quick else None]:
         mesh = case.field.discretise(kind, **options)
         for method in methods:
-            stepper, seconds = compiled(mesh.system, method)
+            stepper, seconds = compiled(mesh.system, method, solver)
             for steps in counts[: 2 if quick else None]:
                 size = ", ".join(f"{key} {value}" for key, value in options.items())
                 yield Contender(
-                    method=f"{OURS} {kind} {method}",
+                    method=f"{OURS} {kind} {method}{' factors' if solver == 'newton' else ''}",
                     setting=f"{size}, {steps} steps",
                     options="",
                     compile_seconds=seconds,
@@ -112,8 +106,9 @@ def _case(name: str, exact: Callable[[Points, float], tuple[Array, Array]]) -> F
     settings = []
     for options in table["settings"]:
         kind, methods, steps = (options.pop(key) for key in ("kind", "methods", "steps"))
+        solver = options.pop("solver", "auto")
         size = "elements" if "elements" in options else "points"
-        settings += [(kind, {**options, size: count}, methods, steps) for count in options.pop(size)]
+        settings += [(kind, {**options, size: count}, methods, steps, solver) for count in options.pop(size)]
     definition = table["field"]
     definition["space"] = {axis: tuple(ends) for axis, ends in definition["space"].items()}
     field = FieldSystem.from_text(**definition)
@@ -158,9 +153,5 @@ def schroedinger() -> FieldCase:
     return _case("schroedinger", exact)
 
 
-FIELDS: Mapping[str, Callable[[], FieldCase]] = {
-    "breather": breather,
-    "wave-2d": wave,
-    "schroedinger": schroedinger,
-}
+FIELDS: Mapping[str, Callable[[], FieldCase]] = {"breather": breather, "wave-2d": wave, "schroedinger": schroedinger}
 """Functions that build a case, by the name after ``fields:``."""

@@ -7,7 +7,8 @@ those of the positions of its two masses.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,15 @@ ROD = '<inertial pos="0 0 -0.5" mass="1" diaginertia="0.0833 0.0833 0.01"/>'
 LIMB = '<inertial pos="0 0 -0.1" mass="{}" diaginertia="0.005 0.005 0.001"/>'
 
 
+@contextmanager
+def model_file(mjcf: str) -> Iterator[Path]:
+    """Write a model of MuJoCo to a file, for readers of files."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.xml"
+        path.write_text(mjcf, encoding="utf-8")
+        yield path
+
+
 def _model(bodies: str, others: str = "") -> str:
     return f'<mujoco><option gravity="0 0 {-GRAVITY}"/><worldbody>{bodies}</worldbody>{others}</mujoco>'
 
@@ -32,9 +42,7 @@ def _model(bodies: str, others: str = "") -> str:
 def _case(name: str, mjcf: str, q: Sequence[float], velocity: Sequence[float], span: float, **others: Any) -> Case:
     system = others.pop("system", None)
     if system is None:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "model.xml"
-            path.write_text(mjcf, encoding="utf-8")
+        with model_file(mjcf) as path:
             system = LagrangianSystem.from_mjcf(path, name=name)
     return Case(
         name=f"robots:{name}",

@@ -23,19 +23,24 @@ BODIES, FEW_BODIES = 1000, 24
 SEED = 20261123
 
 
+def moments(of: Mapping[str, Any]) -> list[Any]:
+    """Return the principal moments of inertia; that of the second axis is the first one for a symmetric body."""
+    return [of["A"], of.get("B", of["A"]), of["C"]]
+
+
 def attitude_rates(q: Vector, w: Vector, of: Mapping[str, Any], torque: Vector = ()) -> list[Any]:
     """Return q' = q w / 2, a quaternion product, and Euler's equations I w' = (I w) x w + torque, 0 where absent."""
-    a, b, c = of["A"], of["B"], of["C"]
+    a, b, c = moments(of)
     turning = [
         -0.5 * (q[1] * w[0] + q[2] * w[1] + q[3] * w[2]),
         0.5 * (q[0] * w[0] + q[2] * w[2] - q[3] * w[1]),
         0.5 * (q[0] * w[1] + q[3] * w[0] - q[1] * w[2]),
         0.5 * (q[0] * w[2] + q[1] * w[1] - q[2] * w[0]),
     ]
-    moments = [(b - c) * (w[1] * w[2]), (c - a) * (w[2] * w[0]), (a - b) * (w[0] * w[1])]
+    torques = [(b - c) * (w[1] * w[2]), (c - a) * (w[2] * w[0]), (a - b) * (w[0] * w[1])]
     for k, each in enumerate(torque):
-        moments[k] = moments[k] + each
-    return [*turning, *(moment / inertia for moment, inertia in zip(moments, (a, b, c), strict=True))]
+        torques[k] = torques[k] + each
+    return [*turning, *(each / inertia for each, inertia in zip(torques, (a, b, c), strict=True))]
 
 
 def matrix(q: Vector) -> list[list[Any]]:
@@ -99,7 +104,7 @@ def rotation_case(name: str, rates: Callable[..., list[Any]]) -> Case:
         span=table["span"],
         step=table["step"],
         fine=table["step"],
-        velocity_of=partial(_velocities, positions, [table["system"]["parameters"][name] for name in "ABC"]),
+        velocity_of=partial(_velocities, positions, moments(table["system"]["parameters"])),
     )
 
 

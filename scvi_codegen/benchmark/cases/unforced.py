@@ -310,13 +310,18 @@ def gravitating(masses: Sequence[float], q: Sequence[float], velocity: Sequence[
     )
 
 
-def _outer_solar_system() -> Case:
+def outer_planets() -> tuple[list[float], Sequence[float], Sequence[float], float]:
+    """Return masses, positions and velocities of the Sun and the outer planets, and the constant of gravity."""
     entry = problem("outer-solar-system")
     assert entry.velocity is not None
-    values = dict(zip((str(symbol) for symbol in entry.system.parameters), entry.system.defaults, strict=True))
-    masses = [value for name, value in values.items() if name.startswith("m_")]
-    how: dict[str, Any] = {"name": entry.name, "gravity": values["G"], "span": entry.span, "step": 500.0, "fine": 256.0}
-    return gravitating(masses, entry.q, entry.velocity, **how)
+    values = dict(zip(map(str, entry.system.parameters), entry.system.defaults, strict=True))
+    return [values[name] for name in values if name.startswith("m_")], entry.q, entry.velocity, values["G"]
+
+
+def _outer_solar_system() -> Case:
+    *state, gravity = outer_planets()
+    span = problem("outer-solar-system").span
+    return gravitating(*state, name="outer-solar-system", gravity=gravity, span=span, step=500.0, fine=256.0)
 
 
 def _chain_case(n: int, *, step: float, fine: float) -> Case:

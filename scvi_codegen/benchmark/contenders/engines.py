@@ -1,26 +1,29 @@
-"""Contenders of multibody programs for cases that have a model of MuJoCo: MuJoCo's integrators, and Pinocchio."""
+"""Contenders of multibody programs for cases that have a model of MuJoCo: MuJoCo, Pinocchio, Exudyn."""
 
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from scvi_codegen.benchmark.cases.robots import model_file
 from scvi_codegen.benchmark.cases.unforced import Array, Case
 from scvi_codegen.benchmark.contenders.arrays import step_counts
 from scvi_codegen.benchmark.contenders.dop853 import LOOSE, dop853, start_of
 from scvi_codegen.benchmark.report import Contender
+from scvi_codegen.mechanics.multibody.trees.energies import Tree
+from scvi_codegen.mechanics.multibody.trees.mjcf import links_of_mjcf
 
 LARGEST_STEP, HALVINGS = 0.02, 6
 """Largest step size, ten times MuJoCo's default, and number of step sizes, each half of the one before."""
 STIFF = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Impedance of stiff equality constraints."""
 INTEGRATORS = ("RK4", "implicitfast", "Euler")
+EXUDYN_HALVINGS = {"RK44": 7, "RK67": 6, "GeneralizedAlpha": 6}
+"""Number of step sizes, from that of the case on, each half of the one before."""
 
 
 def mujoco_contenders(case: Case, quick: bool) -> Iterator[Contender]:
@@ -131,11 +134,8 @@ def pinocchio_contenders(case: Case, quick: bool) -> Iterator[Contender]:
     """
     import pinocchio
 
-    assert case.mjcf is not None
     began = time.perf_counter()
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "model.xml"
-        path.write_text(case.mjcf, encoding="utf-8")
+    with model_file(case.mjcf or "") as path:
         made = pinocchio.buildModelFromMJCF(str(path))
     model = made[0] if isinstance(made, tuple) else made
     data, pool, m = model.createData(), pinocchio.ModelPool(model, 1), case.dimension
@@ -168,6 +168,60 @@ def pinocchio_contenders(case: Case, quick: bool) -> Iterator[Contender]:
         name, setting = "Pinocchio aba, RK4 (bound)", f"h={case.span / steps:.4g}"
         yield Contender(name, setting, "4 aba a step in C++", seconds, partial(timed, steps), starts=starts)
     yield from dop853("aba from Python", seconds, case, quick, rates, LOOSE, "Pinocchio DOP853")
+
+
+def exudyn_contenders(case: Case, quick: bool) -> Iterator[Contender]:
+    """Yield adaptive DOPRI5, explicit Runge-Kutta methods, and generalised alpha without numerical damping."""
+    with model_file(case.mjcf or "") as path:
+        _, links, gravity, _ = links_of_mjcf(path)
+    settings = [("DOPRI5", value, f"rtol={value:.0e}") for value in LOOSE[: 2 if quick else None]]
+    for name, most in EXUDYN_HALVINGS.items():
+        counts = step_counts(case, range(2 if quick else most))
+        settings += [(name, steps, f"h={case.span / steps:.4g}") for steps in counts]
+    for name, value, setting in settings:
+        prepare = partial(_exudyn_preparation, case, Tree(links, gravity), gravity, name, value)
+        yield Contender(f"Exudyn {name}", setting, "kinematic tree", 0.0, prepare, starts=len(case.q))
+
+
+def _exudyn_preparation(
+    case: Case, tree: Tree, gravity: Array, name: str, value: float, index: int
+) -> Callable[[], Array]:
+    """Return a run of an integrator with a number of steps, or of DOPRI5 with a tolerance."""
+    import exudyn
+    from exudyn.itemInterface import NodeGenericODE2, ObjectKinematicTree
+
+    exudyn.config.printToConsole = False
+    joints, inertias = [each.joint for each in tree.links], [each.inertia for each in tree.links]
+    names = [str(each) for each in case.system.coordinates]
+    places = [names.index(each.name) for each in joints]
+    q, v = (part[index][places].tolist() for part in (case.q, case.velocity))
+    types = {"hinge": exudyn.JointType.RevoluteZ, "slide": exudyn.JointType.PrismaticZ}
+    mbs = exudyn.SystemContainer().AddSystem()
+    model = ObjectKinematicTree(
+        nodeNumber=mbs.AddNode(NodeGenericODE2("", [0.0] * len(q), q, v, len(q))),
+        gravity=gravity.tolist(),
+        jointTypes=[types[each.kind] for each in joints],
+        linkParents=[each.parent for each in tree.links],
+        jointTransformations=exudyn.Matrix3DList([each.pose.rotation for each in joints]),
+        jointOffsets=exudyn.Vector3DList([each.pose.position for each in joints]),
+        linkInertiasCOM=exudyn.Matrix3DList([each.matrix for each in inertias]),
+        linkCOMs=exudyn.Vector3DList([each.center for each in inertias]),
+        linkMasses=[each.mass for each in inertias],
+    )
+    mbs.AddObject(model)
+    mbs.Assemble()
+    settings, solver = exudyn.SimulationSettings(), getattr(exudyn.DynamicSolverType, name)
+    settings.solution.file.write, method = False, settings.timeIntegration
+    method.endTime, method.generalizedAlpha.spectralRadius = case.span, 1.0
+    method.automaticStepSize, method.numberOfSteps = (True, 10) if value < 1 else (False, value)
+    method.relativeTolerance = method.absoluteTolerance = value
+
+    def integrate() -> Array:
+        if not mbs.SolveDynamic(settings, solverType=solver):
+            raise ArithmeticError("Exudyn's solver failed")
+        return np.asarray(mbs.systemData.GetODE2Coordinates())[np.argsort(places)]
+
+    return integrate
 
 
 @contextmanager

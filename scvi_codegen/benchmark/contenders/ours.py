@@ -132,14 +132,14 @@ def advised_counts(case: Case, method: Method, momentum: Array, *, quick: bool) 
     return counts
 
 
-def compiled(system: Any, method: str | Method) -> tuple[Any, float]:
+def compiled(system: Any, method: str | Method, solver: str = "auto") -> tuple[Any, float]:
     """Return the stepper, and the seconds to compile it with an empty cache and a new name."""
     with (
         tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder,
         set_variable(building.CACHE_VARIABLE, folder),
     ):
         began = time.perf_counter()
-        stepper = compile_stepper(system, method, prefix=f"bench_{next(_builds)}")
+        stepper = compile_stepper(system, method, solver=solver, prefix=f"bench_{next(_builds)}")
         return stepper, time.perf_counter() - began
 
 

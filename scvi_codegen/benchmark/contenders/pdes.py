@@ -1,7 +1,7 @@
 """Peers for partial differential equations: py-pde, split steps with SciPy's FFT by hand, and differences in Numba."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -22,15 +22,15 @@ LARGEST = {1: 2048, 2: 512}
 """Most points of an axis by the number of axes."""
 
 
-def composed(order: int) -> tuple[list[float], list[float]]:
+def composed(order: int) -> tuple[Array, Array]:
     """Return kicks and drifts of leapfrog, Suzuki's composition of order 4 or that of this package of order 8."""
     if order != 4:
         kicks, drifts = kicks_and_drifts(Composition(order))
-        return [float(x) for x in kicks], [float(x) for x in drifts]
+        return np.array(kicks, dtype=float), np.array(drifts, dtype=float)
     p = 1.0 / (4.0 - 4.0 ** (1 / 3))
     parts = [p, p, 1.0 - 4.0 * p, p, p]
     halves = [(one + other) / 2 for one, other in zip([0.0, *parts], [*parts, 0.0], strict=True)]
-    return halves, [*parts, 0.0]
+    return np.array(halves), np.array([*parts, 0.0])
 
 
 def _axes(field: Any, count: int) -> list[Array]:
@@ -93,13 +93,20 @@ def fft_contenders(case: Case, quick: bool) -> Iterator[Contender]:
     field = case.field
     if field.name == "wave-2d":
         return
+    yield from _by_composition(field, quick, "FFT split steps", MODES, 0.0, partial(_split_steps, field))
+
+
+def _by_composition(
+    field: Any, quick: bool, name: str, counts: Sequence[int], seconds: float, prepare: Callable[..., Any]
+) -> Iterator[Contender]:
+    """Yield compositions of order 2, 4 and 8; ``prepare``: function of axes, kicks and drifts, number of steps."""
     for order in (2, 4, 8):
-        for count in MODES[: 1 if quick else None]:
+        for count in counts[: 1 if quick else None]:
             axes = _axes(field, count)
-            for steps in STEPS[: 2 if quick else None]:
-                names = (f"FFT split steps, order {order}", f"{count} points, {steps} steps")
-                prepare = partial(_split_steps, field, axes, composed(order), steps)
-                yield _contender(field, _points(axes), names, 0.0, prepare)
+            for steps in STEPS[: 2 if quick else None] if count <= LARGEST[len(axes)] else ():
+                names = (f"{name}, order {order}", f"{count} points, {steps} steps")
+                prepared = partial(prepare, axes, composed(order), steps)
+                yield _contender(field, _points(axes), names, seconds, prepared)
 
 
 def _split_steps(field: Any, axes: list[Array], composition: Any, steps: int) -> Callable[[], Any]:
@@ -150,7 +157,7 @@ def numba_contenders(case: Case, quick: bool) -> Iterator[Contender]:
     advance = _numba_waves(nonlinear=field.name == "breather")
     seconds = time.perf_counter() - began
 
-    def prepare(axes: list[Array], composition: list[Array], steps: int) -> Callable[[], Any]:
+    def prepare(axes: list[Array], composition: Any, steps: int) -> Callable[[], Any]:
         u, v = (np.array(np.atleast_2d(part)) for part in field.exact(_points(axes), 0.0))
 
         def integrate() -> Callable[[], Array]:
@@ -159,13 +166,7 @@ def numba_contenders(case: Case, quick: bool) -> Iterator[Contender]:
 
         return integrate
 
-    for order in (2, 4, 8):
-        composition = [np.array(each) for each in composed(order)]
-        for count in (64, 128, 256, 512)[: 1 if quick else None]:
-            axes = _axes(field, count)
-            for steps in STEPS[: 2 if quick else None] if count <= LARGEST[len(axes)] else ():
-                names = (f"Numba differences, order {order}", f"{count} points, {steps} steps")
-                yield _contender(field, _points(axes), names, seconds, partial(prepare, axes, composition, steps))
+    yield from _by_composition(field, quick, "Numba differences", (64, 128, 256, 512), seconds, prepare)
 
 
 def _numba_waves(*, nonlinear: bool) -> Any:

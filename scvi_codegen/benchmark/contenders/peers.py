@@ -2,7 +2,7 @@
 
 heyoka      adaptive Taylor series, compiled by LLVM: see :mod:`.taylor`.
 rebound     IAS15, for gravitating bodies, with its default step control.
-mujoco      its integrators, and Pinocchio, for multibody systems: see :mod:`.engines`.
+mujoco      its integrators, Pinocchio and Exudyn, for multibody systems: see :mod:`.engines`.
 cyrk        DOP853 in C++ (CyRK), right-hand side compiled by Numba.
 scipy       ``solve_ivp`` with DOP853, right-hand side compiled by Numba if it is there, else plain Python.
 """
@@ -20,16 +20,17 @@ import numpy as np
 from scvi_codegen.benchmark.cases.unforced import Array, Case
 from scvi_codegen.benchmark.contenders import arrays, pdes
 from scvi_codegen.benchmark.contenders.dop853 import absolute_tolerance, by_tolerance, dop853, start_of
-from scvi_codegen.benchmark.contenders.engines import mujoco_contenders, pinocchio_contenders
+from scvi_codegen.benchmark.contenders.engines import exudyn_contenders, mujoco_contenders, pinocchio_contenders
 from scvi_codegen.benchmark.contenders.mechanisms import by_lambdify, by_pydy, kane_contenders
 from scvi_codegen.benchmark.contenders.taylor import heyoka_contenders
 from scvi_codegen.benchmark.contenders.tracing import rates_text
 from scvi_codegen.benchmark.report import Contender
 
 IAS15_EPSILONS = (1e-9, 1e-6, 1e-4)
+"""Accuracies of IAS15, the default first."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Peer:
     """Library to compare with.
 
@@ -44,20 +45,11 @@ class Peer:
     suits: Callable[[Case], bool]
 
 
-def missing_module(peer: Peer) -> str | None:
-    """Return the first module that is not installed."""
-    return next((name for name in peer.modules if importlib.util.find_spec(name) is None), None)
-
-
-def _rebound(case: Case, quick: bool) -> Iterator[Contender]:
+def rebound_contenders(case: Case, quick: bool) -> Iterator[Contender]:
     """Yield IAS15 with its default step control (PRS23); for many bodies also leapfrog."""
-    settings: list[tuple[str, str, dict[str, float]]] = [
-        (
-            "IAS15",
-            f"epsilon={epsilon:.0e}" + (" (default)" if epsilon == IAS15_EPSILONS[0] else ""),
-            {"epsilon": epsilon},
-        )
-        for epsilon in IAS15_EPSILONS[: 1 if quick else None]
+    epsilons = IAS15_EPSILONS[:1] if quick else IAS15_EPSILONS
+    settings = [
+        ("IAS15", f"epsilon={each:.0e}{' (default)' * (each == epsilons[0])}", {"epsilon": each}) for each in epsilons
     ]
     if case.arrays is not None:
         counts = arrays.step_counts(case, range(2, 4 if quick else 12))
@@ -153,40 +145,40 @@ def _scipy(case: Case, quick: bool) -> Iterator[Contender]:
     yield from dop853(options, time.perf_counter() - began, case, quick, rates)
 
 
-def _solvable(case: Case) -> bool:
+def _has_formulations(case: Case) -> bool:
     return bool(case.formulations)
 
 
-def _field(case: Case) -> bool:
-    return case.field is not None
-
-
-def _kane(case: Case) -> bool:
+def _is_mechanism(case: Case) -> bool:
     return case.name.startswith("mechanisms")
 
 
-def _by_hand(case: Case) -> bool:
-    return case.arrays is not None and case.arrays.by_hand is not None
+def _is_field(case: Case) -> bool:
+    return case.field is not None
 
 
+def _is_tree(case: Case) -> bool:
+    return case.mjcf is not None and not case.system.rotations and not case.system.constraints
+
+
+BY_LAMBDIFY, BY_PYDY = (
+    partial(kane_contenders, f"{name} DOP853", make) for name, make in (("lambdify", by_lambdify), ("PyDy", by_pydy))
+)
 PEERS = {
-    "heyoka": Peer(modules=("heyoka",), contenders=heyoka_contenders, suits=_solvable),
-    "rebound": Peer(modules=("rebound",), contenders=_rebound, suits=lambda case: case.bodies is not None),
-    "mujoco": Peer(modules=("mujoco",), contenders=mujoco_contenders, suits=lambda case: case.mjcf is not None),
-    "pinocchio": Peer(
-        modules=("pinocchio",),
-        contenders=pinocchio_contenders,
-        suits=lambda case: case.mjcf is not None and case.size == 2 * case.dimension and not case.system.constraints,
-    ),
-    "cyrk": Peer(modules=("CyRK", "numba"), contenders=_cyrk, suits=_solvable),
-    "scipy": Peer(modules=("scipy",), contenders=_scipy, suits=_solvable),
-    "py-pde": Peer(modules=("pde", "numba"), contenders=pdes.pde_contenders, suits=_field),
-    "fft": Peer(modules=("scipy",), contenders=pdes.fft_contenders, suits=_field),
-    "numba": Peer(modules=("numba",), contenders=pdes.numba_contenders, suits=_field),
-    "hand": Peer(modules=(), contenders=arrays.by_hand_contenders, suits=_by_hand),
-    "lambdify": Peer(modules=(), contenders=partial(kane_contenders, "lambdify DOP853", by_lambdify), suits=_kane),
-    "pydy": Peer(modules=("pydy",), contenders=partial(kane_contenders, "PyDy DOP853", by_pydy), suits=_kane),
-    "openmm": Peer(modules=("openmm",), contenders=arrays.openmm_contenders, suits=lambda case: "atoms" in case.name),
+    "heyoka": Peer(("heyoka",), heyoka_contenders, _has_formulations),
+    "rebound": Peer(("rebound",), rebound_contenders, lambda case: case.bodies is not None),
+    "mujoco": Peer(("mujoco",), mujoco_contenders, lambda case: case.mjcf is not None),
+    "pinocchio": Peer(("pinocchio",), pinocchio_contenders, _is_tree),
+    "exudyn": Peer(("exudyn",), exudyn_contenders, _is_tree),
+    "cyrk": Peer(("CyRK", "numba"), _cyrk, _has_formulations),
+    "scipy": Peer(("scipy",), _scipy, _has_formulations),
+    "py-pde": Peer(("pde", "numba"), pdes.pde_contenders, _is_field),
+    "fft": Peer(("scipy",), pdes.fft_contenders, _is_field),
+    "numba": Peer(("numba",), pdes.numba_contenders, _is_field),
+    "hand": Peer((), arrays.by_hand_contenders, lambda case: bool(case.arrays and case.arrays.by_hand)),
+    "lambdify": Peer((), BY_LAMBDIFY, _is_mechanism),
+    "pydy": Peer(("pydy",), BY_PYDY, _is_mechanism),
+    "openmm": Peer(("openmm",), arrays.openmm_contenders, lambda case: "atoms" in case.name),
 }
 """Peers by the name on the command line, the fastest first; "hand", "fft" and "numba" are programs
 written by hand: C for lattices, split steps with FFT and loops in Numba for fields."""

@@ -44,8 +44,7 @@ masses (5 rods take minutes); without; unrolled code compiles within a minute.""
 def heyoka_contenders(case: Case, quick: bool) -> Iterator[Contender]:
     """Yield the curves ``heyoka``, ``heyoka fast_math`` and ``heyoka.lagrangian``."""
     variants = list(_variants(case))
-    for fast in (False, True):
-        yield from _curve([variant.allowing(fast) for variant in variants], case, _tolerances(case, quick))
+    yield from _two_curves(variants, case, quick)
     from_lagrangian = [replace(variant, curve=LAGRANGIAN) for variant in variants if variant.name == LAGRANGIAN]
     yield from _curve(from_lagrangian, case, FEW_TOLERANCES)
 
@@ -53,14 +52,15 @@ def heyoka_contenders(case: Case, quick: bool) -> Iterator[Contender]:
 def heyoka_ensembles(case: Case, quick: bool) -> Iterator[Contender]:
     """Yield the curves ``heyoka batch`` and ``heyoka batch fast_math``."""
     variants = [replace(variant, curve="heyoka batch") for variant in _variants(case) if not variant.compact]
+    return _two_curves(variants, case, quick)
+
+
+def _two_curves(variants: list[_Taylor], case: Case, quick: bool) -> Iterator[Contender]:
+    """Yield the curves without and with ``fast_math``."""
+    tolerances: Sequence[float] = FEW_TOLERANCES if quick or case.dimension > LARGEST_QUICK else TOLERANCES
+    tolerances = FEWEST_TOLERANCES if case.dimension > LARGEST_LAGRANGIAN else tolerances
     for fast in (False, True):
-        yield from _curve([variant.allowing(fast) for variant in variants], case, _tolerances(case, quick))
-
-
-def _tolerances(case: Case, quick: bool) -> tuple[float, ...]:
-    if case.dimension > LARGEST_LAGRANGIAN:
-        return FEWEST_TOLERANCES
-    return FEW_TOLERANCES if quick or case.dimension > LARGEST_QUICK else TOLERANCES
+        yield from _curve([replace(variant, fast=fast) for variant in variants], case, tolerances)
 
 
 def heyoka_states(case: Case, times: Array) -> Array:
@@ -86,9 +86,6 @@ class _Taylor:
     compact: bool
     fast: bool = False
     curve: str = "heyoka"
-
-    def allowing(self, fast: bool) -> _Taylor:
-        return replace(self, fast=fast)
 
     def integrator(self, tolerance: float, batch: int = 0) -> tuple[Any, float]:
         """Compile anew; return the integrator and the seconds, for ``batch`` trajectories at once unless 0."""
@@ -159,8 +156,10 @@ class _Taylor:
 
 
 def _variants(case: Case) -> Iterator[_Taylor]:
+    m = case.dimension
+    modes = (True,) if m > LARGEST_UNROLLED else (False, True) if m > LARGEST_SMALL else (False,)
     for name, equations, formulation in _formulations(case):
-        for compact in _compact_modes(case):
+        for compact in modes:
             yield _Taylor(name=name, equations=equations, formulation=formulation, compact=compact)
 
 
@@ -172,12 +171,6 @@ def _curve(variants: list[_Taylor], case: Case, tolerances: Sequence[float]) -> 
         best = int(np.argmin(seconds))
         yield made[best]
         yield from (variants[best].contender(case, tolerance) for tolerance in tolerances[1:])
-
-
-def _compact_modes(case: Case) -> tuple[bool, ...]:
-    if case.dimension > LARGEST_UNROLLED:
-        return (True,)
-    return (False, True) if case.dimension > LARGEST_SMALL else (False,)
 
 
 def _formulations(case: Case) -> Iterator[tuple[str, list[Any], Formulation]]:

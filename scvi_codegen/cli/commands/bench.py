@@ -37,7 +37,7 @@ def bench(
       ensemble:planar-pendulum, :kepler:0.2, :outer-solar-system            64 trajectories at once
       adaptive:kepler:0.9, ..   adaptive and fixed step size; heyoka and IAS15
       rotations:free-top, :heavy-top, :dumbbell, :bodies                    rigid bodies; heyoka, MuJoCo
-      robots:chain:2, :5, :10, :30, :quadruped, :four-bar                   multibody systems; MuJoCo, Pinocchio
+      robots:chain:2, :5, :10, :30, :quadruped, :four-bar                   multibody systems; MuJoCo, Pinocchio, Exudyn
       mechanisms:2, :5, :10, :20                                            SymPy mechanisms; lambdify and PyDy
       fields:breather, :wave-2d, :schroedinger                              partial differential equations; py-pde
       lattices:ring:1000, ..    array systems; C by hand, REBOUND, OpenMM

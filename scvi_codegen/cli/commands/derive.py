@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from scvi_codegen.cli.command_group import check_writable, emit, reporting
-from scvi_codegen.cli.model_options import ModelOptions, model_arguments, read_model, with_known_sizes
+from scvi_codegen.cli.model_options import model_arguments, read_model, with_known_sizes
 from scvi_codegen.derivation import Start, derivation_html
 from scvi_codegen.derivation.equations import StepEquations
 from scvi_codegen.derivation.equations import derive as derive_equations
@@ -43,22 +43,21 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
         if latex or radicals or output is not None:
             raise click.UsageError("--html excludes --latex, --radicals and -o")
         check_writable(Path(html), "'--html'")
-    model = read_model(model_name, ModelOptions(**choices))
+    model = read_model(model_name, choices)
     about = {"system": model.system.name, "method": model.method.name}
     if html is not None or radicals:
         model = with_known_sizes(model, "--html" if html is not None else "--radicals")
     if html is not None:
         h = model.first_step(model.stepper()) if model.h is None else model.step
         start = Start(q=model.q, velocity=model.velocity, p=model.p, h=h, t=model.t)
-        emit(derivation_html(model.system, model.method, start=start), html, **about)
+        emit(derivation_html(model.system, model.method, start=start, events=model.events), html, **about)
         return
     equations = derive_equations(model.system, model.method, radicals=radicals)
     text = equations.to_latex() if latex else equations.to_text()
     if not latex and model.array_system is not None and model.array_system.mesh is not None:
         text = f"{derivation_of(model.array_system.mesh.field_system, model.array_system).to_text()}\n{text}"
     if not latex and model.events:
-        names = ([*map(str, each)] for each in (model.system.coordinates, model.system.parameters))
-        text += f"\n{events_text(model.events, *names)}\n"
+        text += f"\n{events_text(model.events, model.system)}\n"
     formulas = _formulas(equations) if isinstance(equations, StepEquations) else {}
     emit(text, output, **about, **formulas, text=text)
 

@@ -5,13 +5,7 @@ from typing import Any
 import click
 
 from scvi_codegen.cli.command_group import reporting, tell
-from scvi_codegen.cli.model_options import (
-    SOLVER_OPTION,
-    ModelOptions,
-    model_arguments,
-    read_model,
-    with_known_sizes,
-)
+from scvi_codegen.cli.model_options import SOLVER_OPTION, model_arguments, read_model, with_known_sizes
 from scvi_codegen.models.packages.fmu import generate_fmu
 from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.native.building import TARGETS
@@ -71,7 +65,7 @@ def generate(
       make -C pendulum_svi run
       python -c "import pendulum_svi; print(pendulum_svi.stepper.step([0.5], [0.0], 0.1))"
     """
-    model = read_model(model_name, ModelOptions(**choices))
+    model = read_model(model_name, choices)
     if fmu and (embedded or single_file):
         raise click.UsageError("--fmu excludes --embedded and --single-file")
     if platforms and not fmu:

@@ -47,13 +47,14 @@ def _entries_of(name: str) -> Iterator[dict[str, Any]]:
     """Yield the properties of an example of a method, and of the printed form of the paper if there is one."""
     variants: list[dict[str, Any]] = [{}, {"variational": False}] if "variational" in ARGUMENTS[name] else [{}]
     for variant in variants:
-        arguments = {**_example(name), **variant}
+        arguments = {**EXAMPLES.get(name, {"stages": EXAMPLE_STAGES} if "stages" in ARGUMENTS[name] else {}), **variant}
         method = method_from_specification({"method": name, **arguments})
+        size = size_of(name)
         yield {
             "name": name,
             "arguments": list(ARGUMENTS[name]),
             "number": size_of(name),
-            "example": _spelled(name, arguments),
+            "example": (f"{name}:{arguments[size]}" if size and size in arguments else name),
             "options": _options(arguments),
             "order": method.order,
             "symplectic": method.symplectic,
@@ -111,16 +112,6 @@ def _entries(A: Sequence[Expressions], b: Expressions, c: Expressions) -> Iterat
     yield from (f"c_{i} = {x}" for i, x in enumerate(c, 1))
     yield from (f"a_{i},{j} = {x}" for i, line in enumerate(A, 1) for j, x in enumerate(line, 1))
     yield from (f"b_{j} = {x}" for j, x in enumerate(b, 1))
-
-
-def _example(name: str) -> Mapping[str, Any]:
-    return EXAMPLES.get(name, {"stages": EXAMPLE_STAGES} if "stages" in ARGUMENTS[name] else {})
-
-
-def _spelled(name: str, arguments: Mapping[str, Any]) -> str:
-    """Return a method as ``--method`` accepts it."""
-    size = size_of(name)
-    return f"{name}:{arguments[size]}" if size and size in arguments else name
 
 
 def _options(arguments: Mapping[str, Any]) -> list[str]:

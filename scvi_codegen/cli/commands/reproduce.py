@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import click
 
@@ -23,9 +23,10 @@ from scvi_codegen.files.atomic import write_text
 from scvi_codegen.pictures.canvas import check_plot_path
 from scvi_codegen.reproduce.experiment import Experiment, Result
 from scvi_codegen.reproduce.report import report_html, tally, write_result
-from scvi_codegen.reproduce.runner import CATALOGUE, Failure, catalogue, run_experiments, with_needs
+from scvi_codegen.reproduce.runner import CATALOGUE, Failure, Watch, catalogue, run_experiments, with_needs
 
 EVERYTHING = "all"
+Report: TypeAlias = Callable[[str], None]
 SHOWN_NAMES = 40
 """Largest number of characters of the names next to the progress bar."""
 
@@ -134,7 +135,7 @@ def reproduce_experiments(
     jobs: int | None,
     *,
     module: str = CATALOGUE,
-    report: Callable[[str], None] = click.echo,
+    report: Report = click.echo,
 ) -> Reproduction:
     """Run experiments and those they depend on; write the files of each result, and the page at the end.
 
@@ -152,11 +153,11 @@ def reproduce_experiments(
     done, width = Reproduction(), max(map(len, chosen), default=0)
     try:
         with (
-            _progress(len(chosen), report) as progress,
-            closing(run_experiments(chosen, jobs, module=module, watch=progress.show)) as outcomes,
+            _progress(len(chosen), report) as (show, report_above),
+            closing(run_experiments(chosen, jobs, module=module, watch=show)) as outcomes,
         ):
             for outcome in outcomes:
-                progress.report(f"{outcome.name:{width}}  {_add(done, outcome, folder)}")
+                report_above(f"{outcome.name:{width}}  {_add(done, outcome, folder)}")
         if html is not None:
             write_text(html, report_html(sorted(done.results, key=lambda r: list(experiments).index(r.name))))
             done.files.append(html)
@@ -179,19 +180,11 @@ def _add(done: Reproduction, outcome: Result | Failure, folder: Path) -> str:
     return f"{outcome.verdict.value:13}  {outcome.title}"
 
 
-@dataclass(frozen=True, slots=True)
-class _Progress:
-    """Progress bar of experiments: ``show`` shows the running ones, ``report`` prints a line and counts one."""
-
-    show: Callable[[Sequence[str]], None]
-    report: Callable[[str], None]
-
-
 @contextmanager
-def _progress(length: int, report: Callable[[str], None]) -> Iterator[_Progress]:
-    """Show a bar on stderr if that is a terminal, with the printed lines above it."""
+def _progress(length: int, report: Report) -> Iterator[tuple[Watch, Report]]:
+    """Show a bar on stderr if that is a terminal; yield functions that show names, and print a line above it."""
     if not sys.stderr.isatty() or not length or is_quiet():
-        yield _Progress(lambda names: None, report)
+        yield lambda names: None, report
         return
 
     def show(names: Sequence[str]) -> None:
@@ -207,4 +200,4 @@ def _progress(length: int, report: Callable[[str], None]) -> Iterator[_Progress]
     with click.progressbar(
         length=length, label="reproducing", show_eta=False, item_show_func=lambda item: item, file=sys.stderr
     ) as bar:
-        yield _Progress(show, report_above)
+        yield show, report_above

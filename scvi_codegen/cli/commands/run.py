@@ -10,13 +10,7 @@ from scvi_codegen.advice.tolerance_check import missed_tolerance
 from scvi_codegen.cli.command_group import FAILURE, INTERRUPTED, CommandFailure, check_writable, reporting, tell
 from scvi_codegen.cli.ensembles import ensemble_summary, integrate_states
 from scvi_codegen.cli.json_documents import ensemble_numbers, failure_text, recorded_numbers, run_numbers
-from scvi_codegen.cli.model_options import (
-    SOLVER_OPTION,
-    ModelOptions,
-    model_arguments,
-    read_model,
-    with_known_sizes,
-)
+from scvi_codegen.cli.model_options import SOLVER_OPTION, model_arguments, read_model, with_known_sizes
 from scvi_codegen.cli.recording import RecordedOutcome, Recording, check_format, check_resumed, is_run_folder
 from scvi_codegen.cli.reports import energy_balance
 from scvi_codegen.cli.running import RunOutcome, integrate_model, known_at_end, summary
@@ -49,7 +43,7 @@ An array model (array coordinates, q[N]) takes sizes from its arrays, [sizes] or
 index and time. With --ensemble, --advise, --time-transformation, and a folder as output, it is compiled for its sizes.
 
 A system with inputs (measured or commanded signals) takes their values from the section [inputs] of its file or from
---input: a table with columns t and value. Steps end at breakpoints of the inputs.
+--input: a table with columns t and value, or a number. Steps end at breakpoints of the inputs.
 
 With --ensemble MODEL is run from many initial states. A grid has one section; every combination is run:
 
@@ -92,10 +86,7 @@ Examples:
 )
 @click.option("--resume", type=click.Path(), metavar="FOLDER", help="Continue the run in a folder (without MODEL).")
 @click.option(
-    "--checkpoint",
-    type=float,
-    metavar="SECONDS",
-    help="Longest time between checkpoints of a run in a folder [10].",
+    "--checkpoint", type=float, metavar="SECONDS", help="Longest time between checkpoints of a run in a folder [10]."
 )
 @click.option("--checkpoint-steps", type=int, metavar="N", help="Most steps between checkpoints.")
 @click.option("--certificate", type=click.Path(), metavar="FILE", help="JSON file to store in the folder.")
@@ -162,7 +153,7 @@ def run(
     _check_outputs(output, plot, ensemble)
     wanted = {"tolerance": tolerance, "error": error, "advise": advise}
     _check_combination(choices, plot=plot, ensemble=ensemble, wanted=wanted, folder=output if recorded else None)
-    model = read_model(model_name, ModelOptions(**choices))
+    model = read_model(model_name, choices)
     arguments = {"tolerance": solver_tolerance, "max_iterations": max_iterations}
     chosen: dict[str, Any] = {key: value for key, value in arguments.items() if value is not None}
     options = SolverOptions(**chosen) if chosen else None
@@ -217,7 +208,6 @@ def _check_outputs(output: str | None, plot: str | None, ensemble: str | None) -
         check_writable(Path(output), "'-o'")
     if plot is not None:
         check_writable(Path(plot), "'--plot'")
-    if plot is not None:
         check_plot_path(plot)
 
 

@@ -11,9 +11,10 @@ from scvi_codegen.cli.command_group import FAILURE, CommandFailure, check_writab
 from scvi_codegen.cli.model_options import (
     METHOD_CHOICES,
     SOLVER_OPTION,
-    ModelOptions,
+    Choices,
     model_arguments,
     read_model,
+    sections_of,
     with_known_sizes,
 )
 from scvi_codegen.errors import PackageError
@@ -49,7 +50,7 @@ def verify(model_name: str, output: str | None, **choices: Any) -> None:
     path = _certificate_path(model_name) if output is None else Path(output)
     if path is not None:
         check_writable(path, "'-o'")
-    certificate = _verified(model_name, ModelOptions(**choices))
+    certificate = _verified(model_name, choices)
     tell(certificate.to_text(), nl=False, **json.loads(certificate.to_json()))
     if path is not None:
         certificate.save(path)
@@ -58,26 +59,21 @@ def verify(model_name: str, output: str | None, **choices: Any) -> None:
         raise CommandFailure(f"violated: {', '.join(check.name for check in certificate.violated)}", FAILURE)
 
 
-def _verified(name: str, choices: ModelOptions) -> Certificate:
-    """Return the certificate of a model file, a system of the catalogue or a generated folder.
-
-    Raises:
-        click.UsageError: for a folder with another method or solver than it was generated with.
-        ScviCodegenError: as reading and building the model do.
-    """
+def _verified(name: str, choices: Choices) -> Certificate:
+    """Return the certificate of a model file, a system of the catalogue or a generated folder."""
     folder = Path(name)
     if not folder.is_dir():
         model = read_model(name, choices)
         if model.array_system is not None and (model.h is None or model.array_system.constraints):
             model = with_known_sizes(model, "verify (adaptive steps, constraints)")
         return _certificate(model, model.stepper())
-    if choices.solver != "auto" or any(getattr(choices, choice) is not None for choice in METHOD_CHOICES):
+    if choices["solver"] != "auto" or any(choices[choice] is not None for choice in METHOD_CHOICES):
         raise click.UsageError(f"'{name}' is a generated folder: its method and solver are those it was generated with")
     if not (folder / MODEL_FILE).is_file():
         raise PackageError(
             f"{folder} has no {MODEL_FILE}, which defines its guaranteed properties: generate it from a model"
         )
-    return _certificate(load_model(folder / MODEL_FILE, choices.sections()), load_package(folder))
+    return _certificate(load_model(folder / MODEL_FILE, sections_of(choices)), load_package(folder))
 
 
 def _certificate(model: Model, stepper: Stepper) -> Certificate:
@@ -90,10 +86,7 @@ def _certificate(model: Model, stepper: Stepper) -> Certificate:
 
 
 def _certificate_path(name: str) -> Path | None:
-    """Return the default path of the certificate: in the generated folder, or next to the model file.
-
-    ``None`` for a system of the catalogue.
-    """
+    """Return the default path of the certificate, in the folder or next to the model file; else ``None``."""
     path = Path(name)
     if path.is_dir():
         return path / CERTIFICATE_FILE

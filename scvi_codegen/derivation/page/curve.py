@@ -13,15 +13,7 @@ from sympy import Function, Identity, KroneckerProduct, MatrixSymbol, Symbol
 from scvi_codegen.derivation.notation import TableEntry
 from scvi_codegen.display.number_tables import Part, decimal, number_table, positions, short
 from scvi_codegen.display.page.blocks import Cell, Content, Drawing, Formula, Paragraph, Section, TableBlock
-from scvi_codegen.methods import (
-    SCVI,
-    SVI,
-    Composition,
-    Method,
-    RungeKutta,
-    SpectralCollocation,
-    StoermerVerlet,
-)
+from scvi_codegen.methods import SCVI, SVI, Composition, Method, RungeKutta, SpectralCollocation, StoermerVerlet
 from scvi_codegen.tables.precision import Vector
 from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.tableau import Tableau

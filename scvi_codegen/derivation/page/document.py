@@ -1,7 +1,8 @@
 """Sections of the page, in order, and the page."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
+from scvi_codegen.derivation.events import events_text
 from scvi_codegen.derivation.notation import table_entries
 from scvi_codegen.derivation.page.curve import curve_section, tables_section
 from scvi_codegen.derivation.page.jacobian import Start, jacobian_section
@@ -14,7 +15,7 @@ from scvi_codegen.derivation.page.stage_equations import (
     stage_section,
     system_section,
 )
-from scvi_codegen.display.page.blocks import Section
+from scvi_codegen.display.page.blocks import Listing, Section
 from scvi_codegen.display.page.environment import page_template, style_sheet
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import check_regular, paper_equations
@@ -22,27 +23,32 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.pipeline import c_identifier, program_of
 from scvi_codegen.rendering.outline import functions_of
 from scvi_codegen.rendering.program_source import render
+from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.version import __version__
 
 
-def derivation_html(system: MechanicalSystem, method: Method, *, start: Start | None = None) -> str:
+def derivation_html(
+    system: MechanicalSystem, method: Method, *, start: Start | None = None, events: Sequence[Event] = ()
+) -> str:
     """Return the derivation of ``method`` for ``system`` as a self-contained page of HTML.
 
     Args:
         system: the mechanical system.
         method: its discretisation.
         start: of a step, at whose initial guess the entries of the Jacobian are evaluated.
+        events: of runs, which may change the state.
 
     Raises:
         MethodError: for a system that the method does not support.
     """
     check_regular(method, system)
+    more = [Section(name="events", title="Events", contents=(Listing(events_text(events, system)),))] if events else []
     return page_template("derivation.html.jinja").render(
         title=f"{system.name}: {method.title}",
         body_class="derivation",
         system=system,
         method=method,
-        sections=list(_sections(system, method, start)),
+        sections=[*_sections(system, method, start), *more],
         css=style_sheet("page.css", "derivation.css"),
         version=__version__,
     )

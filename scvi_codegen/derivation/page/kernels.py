@@ -117,9 +117,9 @@ def _pair(
         )
     )
     left: list[Content] = [Paragraph(COUNTS.sub("", function.comment))] if function.comment else []
-    if kernel.uses_arguments:
+    if kernel.uses("u"):
         left.append(Formula(sympy.Tuple(*kernel.symbols).xreplace(names), Symbol("u")))
-    if kernel.uses_parameters:
+    if kernel.uses("parameters"):
         left.append(Formula(sympy.Tuple(*map(Symbol, program.layout.parameters)), Symbol("parameters")))
     left += [*formulas(values, "value"), *formulas(partials, "derivative")]
     title = f"{kernel.name}({', '.join(function.arguments)})"
@@ -167,24 +167,20 @@ def _function_pair(function: Function, start: str, all_formulas: Iterator[Conten
 def _formulas(name: str, system: MechanicalSystem, stages: StageSystem, program: Program) -> Iterator[Content]:
     """Yield the equations that a function computes, if any."""
     if name == "evaluate":
-        yield from _compiled(system, stages)
+        yield Paragraph(
+            "The stage equations as they are compiled: unknowns are velocities or accelerations times h in place of "
+            "positions, whose differences would lose digits."
+        )
+        yield from stage_group_contents(system, stages)
+        for _, formula in row_formulas(system, stages):
+            yield formula
+        yield from end_formulas(system, stages)
     elif name == "newton":
         yield from _newton()
     elif name in ("fixed_point", "iterate") and program.fixed_point is not None:
         yield from ITERATIONS[program.fixed_point.name]
     elif name == "gather":
         yield Formula(sympy.Sum(Symbol("table_j_n") * Symbol("z_j"), (j, 1, Symbol("B"))), Symbol("u_n"))
-
-
-def _compiled(system: MechanicalSystem, stages: StageSystem) -> Iterator[Content]:
-    yield Paragraph(
-        "The stage equations as they are compiled: unknowns are velocities or accelerations times h in place of "
-        "positions, whose differences would lose digits."
-    )
-    yield from stage_group_contents(system, stages)
-    for _, formula in row_formulas(system, stages):
-        yield formula
-    yield from end_formulas(system, stages)
 
 
 def _newton() -> Iterator[Content]:

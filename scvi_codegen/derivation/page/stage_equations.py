@@ -13,7 +13,7 @@ from scvi_codegen.derivation.equations import StepEquations, derive
 from scvi_codegen.derivation.notation import Equation
 from scvi_codegen.derivation.page.sums import end_formulas, gather_formulas, meaning, row_formulas
 from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section, TableBlock, formulas, operations
-from scvi_codegen.formulas.expressions import gradient
+from scvi_codegen.formulas.expressions import gradient_tuple
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.forces import with_constraint_forces
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -33,10 +33,7 @@ def system_section(system: MechanicalSystem) -> Section:
     ]
     if system.forces:
         applied = [Formula(f, Symbol(f"f_{q.name}")) for q, f in zip(system.coordinates, system.forces, strict=True)]
-        contents += [
-            Paragraph("Generalised forces f; below, L_q means L_q + f:"),
-            *formulas(applied, "force"),
-        ]
+        contents += [Paragraph("Generalised forces f; below, L_q means L_q + f:"), *formulas(applied, "force")]
     if system.damping != 0:
         contents += [
             Paragraph(
@@ -82,8 +79,8 @@ def _euler_lagrange(system: MechanicalSystem) -> Iterator[Content]:
 
 
 def _hamilton(system: MechanicalSystem) -> Iterator[Content]:
-    by_momenta = gradient(system.formula, system.auxiliaries)
-    rates = [Formula(by_momenta.get(i, sympy.S.Zero), velocity, "19a") for i, velocity in enumerate(system.velocities)]
+    by_momenta = gradient_tuple(system.formula, system.auxiliaries)
+    rates = [Formula(rate, velocity, "19a") for rate, velocity in zip(by_momenta, system.velocities, strict=True)]
     kicks = [
         Formula(force, Symbol(f"{p.name}_dot"), "19b")
         for p, force in zip(system.auxiliaries, forms_of(system).momentum_rate, strict=True)

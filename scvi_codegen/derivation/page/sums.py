@@ -285,19 +285,12 @@ class _Part:
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """A row of the equations, or the line of p_(k+1).
+    """A row of the equations, or the line of p_(k+1)."""
 
-    Attributes:
-        momentum: coefficient of p_k: a number, or the column of q_(k+1) whose entry it is.
-        parts: contributions of the scatters.
-        kind: number and kind of the row, without its own index.
-        base: the index in which it differs from rows of the same pattern.
-    """
-
-    momentum: sympy.Expr | Column
+    momentum: sympy.Expr | Column  # coefficient of p_k: a number, or the column of q_(k+1) whose entry it is
     parts: tuple[_Part, ...]
-    kind: tuple[str, ...]
-    base: int | None
+    kind: tuple[str, ...]  # number and kind of the row, without its own index
+    base: int | None  # the index in which it differs from rows of the same pattern
 
     @classmethod
     def of(cls, system: MechanicalSystem, stages: StageSystem, r: int) -> _Line:

@@ -138,20 +138,12 @@ def _environment() -> Environment:
         "cell": cell,
         "column_heading": column_heading,
         "column": column_class,
-        "equation": _equation,
+        "equation": lambda formula: Markup(" ".join(mathml_terms(formula.right, formula.left))),
         "c_text": _c_text,
         "markup": Markup,
     }
-    environment.tests |= {name: _is_a(kind) for name, kind in KINDS.items()}
+    environment.tests |= {name: lambda block, kind=kind: isinstance(block, kind) for name, kind in KINDS.items()}
     return environment
-
-
-def _is_a(kind: type) -> Callable[[object], bool]:
-    return lambda block: isinstance(block, kind)
-
-
-def _equation(formula: blocks.Formula) -> Markup:
-    return Markup(" ".join(mathml_terms(formula.right, formula.left)))
 
 
 def _c_text(text: str) -> Markup:

@@ -1,6 +1,6 @@
 """Arrays of rotations, directions and spins in formulas in index notation: ``R_33[i]``, ``omega_1[i]``, ``n_3[i]``."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -87,6 +87,26 @@ def member_arrays(
     return tuple(members)
 
 
+def entries_in_formulas(
+    arrays: Iterable[Array], members: Iterable[Homogeneous], sizes: Mapping[str, int]
+) -> dict[Array, NDArray[np.str_]]:
+    """Return the arrays ``R_11`` to ``R_33``, ``omega_1``, .. of those arrays whose entries ``R_0``, .. are members.
+
+    The values are the names of their entries, ``R_0_11``, ...
+    """
+    by_name, found = {member.name: member for member in members}, dict[Array, NDArray[np.str_]]()
+    for array in arrays:
+        first = "_0" * (len(array.axes) - 1)
+        member = by_name.get(array.name + first)
+        if first and member is not None:
+            if isinstance(member, Rotation):
+                member = replace(member, rate=member.rate.removesuffix(first))
+            turning = MemberArray(replace(member, name=array.name), array.axes[:-1])
+            names = turning.names(sizes)
+            found |= {each: names[each.name] for each in turning.formulas}
+    return found
+
+
 def torque_components(
     members: Sequence[MemberArray], target: str, formulas: Sequence[str], *, in_space: bool
 ) -> Iterator[tuple[str, str, tuple[Array, ...]]]:
@@ -98,6 +118,8 @@ def torque_components(
             f"the torque on '{target}' must have three components and act on a rotation or a direction"
             f"{closest(name, known)}"
         )
+    if known[name].axes and not bracket:
+        raise SystemDefinitionError(f"'{name}' is an array: write the torque on each of them as '{name}[i]'")
     arrays = known[name].torques(in_space=in_space)
     for array, formula in zip(arrays, formulas, strict=True):
         yield f"{array.name}{bracket}{place}", formula, arrays

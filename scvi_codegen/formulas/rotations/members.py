@@ -75,6 +75,11 @@ class Rotation:
         """Symbols of the angular velocity in formulas."""
         return tuple(symbol(f"{self.rate}_{axis}") for axis in AXES)
 
+    @property
+    def momenta(self) -> tuple[Symbol, ...]:
+        """Symbols of the angular momentum in the body frame, in formulas of states."""
+        return self.rates if self.momentum else tuple(symbol(f"p_{self.name}_{axis}") for axis in AXES)
+
     def values(self) -> dict[Symbol, Expr]:
         """Return matrix and rates by symbol, as functions of the quaternion and its velocity or momentum."""
         q, v = _vectors(self.coordinates)
@@ -82,10 +87,8 @@ class Rotation:
             rates = Matrix(self.body_momentum(momenta_of(self.coordinates)))
         else:
             rates = 2 * rates_matrix(q).T * v / Add(*(each**2 for each in q))
-        return self._matrix(q) | dict(zip(self.rates, rates, strict=True))
-
-    def _matrix(self, q: Matrix) -> dict[Symbol, Expr]:
-        return dict(zip(self.entries, matrix_of(q) / Add(*(each**2 for each in q)), strict=True))
+        matrix = matrix_of(q) / Add(*(each**2 for each in q))
+        return dict(zip((*self.entries, *self.rates), (*matrix, *rates), strict=True))
 
     def scaling(self) -> Expr:
         """Return the rate of the scaling of the quaternion, 2 q . q_dot/|q|^2."""
@@ -104,19 +107,25 @@ class Rotation:
 
 
 @dataclass(frozen=True, slots=True)
-class Direction:
-    """Unit vector, written as a vector of any length.
-
-    Attributes:
-        name: name of the vector in formulas, ``n`` of ``n_1`` to ``n_3``, with velocities ``n_1_dot`` to ``n_3_dot``.
-    """
+class _Vector:
+    """Vector with three components in formulas: ``n_1`` to ``n_3`` for the name ``n``."""
 
     name: str
 
     @property
     def declaration(self) -> str:
-        """Kind and names in one line."""
-        return f"direction {self.name}"
+        """Kind and name in one line."""
+        return f"{type(self).__name__.lower()} {self.name}"
+
+    @property
+    def entries(self) -> tuple[Symbol, ...]:
+        """Symbols of the components in formulas."""
+        return tuple(symbol(f"{self.name}_{axis}") for axis in AXES)
+
+
+@dataclass(frozen=True, slots=True)
+class Direction(_Vector):
+    """Unit vector, written as a vector of any length, with velocities ``n_1_dot`` to ``n_3_dot`` in formulas."""
 
     @property
     def description(self) -> str:
@@ -129,11 +138,6 @@ class Direction:
         return tuple(f"{self.name}_{letter}" for letter in "xyz")
 
     @property
-    def entries(self) -> tuple[Symbol, ...]:
-        """Symbols of the unit vector in formulas."""
-        return tuple(symbol(f"{self.name}_{axis}") for axis in AXES)
-
-    @property
     def rates(self) -> tuple[Symbol, ...]:
         """Symbols of the velocity of the unit vector in formulas."""
         return tuple(symbol(each.name + DOT) for each in self.entries)
@@ -141,11 +145,8 @@ class Direction:
     def values(self) -> dict[Symbol, Expr]:
         """Return the unit vector and its velocity by symbol, as functions of the vector and its velocity."""
         r, v = _vectors(self.coordinates)
-        length = sympy.sqrt(Add(*(each**2 for each in r)))
-        n = r / length
-        along = Add(*(a * b for a, b in zip(n, v, strict=True)))
-        moving = (v - n * along) / length
-        return dict(zip(self.entries, n, strict=True)) | dict(zip(self.rates, moving, strict=True))
+        n = r / sympy.sqrt(Add(*(each**2 for each in r)))
+        return dict(zip(self.entries, n, strict=True)) | dict(zip(self.rates, self.forces(v), strict=True))
 
     def scaling(self) -> Expr:
         """Return the rate of the scaling of the vector, r . r_dot/|r|^2."""
@@ -162,7 +163,7 @@ class Direction:
 
 
 @dataclass(frozen=True, slots=True)
-class Spin:
+class Spin(_Vector):
     """Spin s of constant length with the brackets {s_1, s_2} = s_3 and cyclic, in two pairs of canonical variables.
 
     With the complex numbers a = q_1 + i p_1 and b = q_2 + i p_2 (Hopf map)
@@ -170,17 +171,7 @@ class Spin:
         s_1 + i s_2 = conj(a) b/2,    s_3 = (|a|^2 - |b|^2)/4,    |s| = (|a|^2 + |b|^2)/4,
 
     whose common phase is gauge. |s| is a quadratic invariant of every Hamiltonian H(s), kept by symplectic methods.
-
-    Attributes:
-        name: name of the spin in formulas, ``s`` of ``s_1`` to ``s_3``.
     """
-
-    name: str
-
-    @property
-    def declaration(self) -> str:
-        """Kind and names in one line."""
-        return f"spin {self.name}"
 
     @property
     def description(self) -> str:
@@ -196,15 +187,7 @@ class Spin:
         """Names of the two canonical coordinates."""
         return f"{self.name}_a", f"{self.name}_b"
 
-    @property
-    def entries(self) -> tuple[Symbol, ...]:
-        """Symbols of the components in formulas."""
-        return tuple(symbol(f"{self.name}_{axis}") for axis in AXES)
-
-    @property
-    def rates(self) -> tuple[Symbol, ...]:
-        """Empty: the equations of a spin are of first order."""
-        return ()
+    rates = ()  # the equations of a spin are of first order
 
     def values(self) -> dict[Symbol, Expr]:
         """Return the components by symbol, as functions of the canonical variables."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,15 +72,24 @@ class RotationNames:
         return cls((*rotating, *map(Direction, pointing), *map(Spin, spinning)))
 
     @classmethod
-    def of_declarations(cls, declarations: Sequence[str]) -> RotationNames:
-        """Return the names of members declared as :attr:`Rotation.declaration` is."""
+    def of_states(cls, declarations: Sequence[str], taken: Collection[str]) -> RotationNames:
+        """Return the names in formulas of states, with body momenta of names that are not taken."""
+        names = cls(cls.members_of(declarations))
+        for each in names.rotations:
+            momenta = each.body_momentum(momenta_of(each.coordinates))
+            names.values |= {name: p for name, p in zip(each.momenta, momenta, strict=True) if name.name not in taken}
+        return names
+
+    @staticmethod
+    def members_of(declarations: Sequence[str]) -> list[Homogeneous]:
+        """Return members declared as :attr:`Rotation.declaration` is."""
         members: list[Homogeneous] = []
         for kind, name, *rest in map(str.split, declarations):
             if kind == "rotation":
                 members.append(Rotation(name, rest[0], momentum=len(rest) > 1))
             else:
                 members.append(Direction(name) if kind == "direction" else Spin(name))
-        return cls(members)
+        return members
 
     @property
     def rotations(self) -> tuple[Rotation, ...]:
@@ -150,8 +159,9 @@ class RotationNames:
         ):
             for name, formulas in (by_name or {}).items():
                 if name not in known:
+                    hint = f": write torques={{'{name}': [..]}}." if name in rotating else closest(name, known)
                     raise SystemDefinitionError(
-                        f"there is a {what} on '{name}'{closest(name, known)} Possible: {', '.join(known) or 'none'}"
+                        f"there is a {what} on '{name}'{hint} Possible: {', '.join(known) or 'none'}"
                     )
                 texts = [formulas] if isinstance(formulas, str | Expr) else list(formulas)
                 if len(texts) != (1 if name in coordinates else len(AXES)):

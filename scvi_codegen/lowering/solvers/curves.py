@@ -22,9 +22,11 @@ multipliers) makes it converge twice as fast as a simultaneous update. The equat
 ``methods/shooting.py`` in these unknowns.
 """
 
+import operator
+
 from sympy import S
 
-from scvi_codegen.formulas.expressions import gradient
+from scvi_codegen.formulas.expressions import gradient_tuple
 from scvi_codegen.ir.equations import FixedPointIteration, IterationName, IterationTable, StoredValues
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.lowering.solvers.tables import (
@@ -188,12 +190,12 @@ def _node_kernel(system: MechanicalSystem) -> Kernel:
 def _residual_kernel(system: MechanicalSystem) -> Kernel:
     """Return the kernel of E, (m . E)_q, (m . E)_v and the lower triangle of the mass."""
     forms, state = forms_of(system), (*system.coordinates, *system.velocities)
-    partials = gradient(forms.multiplied_residual, state)
+    partials = gradient_tuple(forms.multiplied_residual, state)
     adjoint = sum(forms.multiplied_forces[:2], ()) or (S.Zero,) * len(state)
     return system_kernel(
         system,
         "node_lanes",
-        (*forms.euler_lagrange, *(partials.get(i, S.Zero) + force for i, force in enumerate(adjoint))),
+        (*forms.euler_lagrange, *map(operator.add, partials, adjoint)),
         of=(*state, *accelerations(system), *multipliers(system)),
         partials=forms.lower_mass.values(),
         purpose="E, (m . E)_q, (m . E)_v and the lower triangle of L_vv at all nodes, u = (q, v, a, m).",

@@ -21,7 +21,8 @@ they matter: in the last evaluation of the points and in the increments.
 computes forces, momenta, velocities and positions in turn, each from the latest of the others (Gauss-Seidel). Its
 convergence rate is h^2 if H = T(p) + V(q), and h at worst. H need not be regular. Rotations share most operations of
 forces and velocities and have the rate h either way: both are evaluated at once (Jacobi), in a fifth more iterations
-with half the latency. Sums over the points then exchange lanes, and kernels add terms in pairs.
+with half the latency; kernels then add terms in pairs. Turns of axially symmetric bodies follow the iteration, and turn
+its predictor (:mod:`scvi_codegen.mechanics.rotations.axial`).
 
 **Any regular Lagrangian.** Velocities are corrected by the mass matrix at each point: the equations are L_v(q_n, V_n) =
 P_n. If the points are not those of the velocities (an SVI with another quadrature), the s velocities z_b give V_n =
@@ -36,12 +37,13 @@ once and used in stages and updates alike, and A_nj / w_j = 1 - mu_jn, exact sin
 rounded map still has a generating function: its energy error does not drift.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import sympy
-from sympy import Expr
+from sympy import Add, Expr, Symbol
 
 from scvi_codegen.formulas.expressions import jacobian
 from scvi_codegen.formulas.intermediates import inner_of
@@ -62,6 +64,8 @@ from scvi_codegen.lowering.solvers.tables import (
 from scvi_codegen.lowering.stage_groups import damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.rotations.axial import Turn, axial_turns
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_structure import Accelerations, Velocities
 from scvi_codegen.tables.basis import matrix_product, transpose
 from scvi_codegen.tables.precision import Matrix, Vector, mp
@@ -94,7 +98,9 @@ def _separable(system: LagrangianSystem, tables: VelocityTables, *, velocities: 
     end_position = matrix_product((tables.end_position,), tables.momentum)[0]
     highest = min(points, len(tables.blocks)) - 1
     at_points = matrix_product(tables.velocity, tables.momentum) if tables.velocity else tables.momentum
-    forms, padded = forms_of(system), pad_matrix(product, lanes)
+    forms, padded, matrix = forms_of(system), pad_matrix(product, lanes), product
+    if velocities:
+        matrix = at_points if _nearly_equal(matrix_product(at_points, at_points), product) else ()
     return FixedPointIteration(
         name="separable",
         points=points,
@@ -117,6 +123,7 @@ def _separable(system: LagrangianSystem, tables: VelocityTables, *, velocities: 
         parts=("separable_iteration",),
         constant_mass=system_kernel(system, "mass", forms.mass.values(), of=(), purpose="The constant masses."),
         predictor_matrix=padded,
+        matrix=matrix,
         derivatives_part="" if velocities else "separable_derivatives",
         serves_many=True,
         final_iterations=1,  # the final one, with double-double coefficients
@@ -156,7 +163,7 @@ def _point_iteration(
 
 def hamiltonian_iteration(problem: StepProblem) -> FixedPointIteration | None:
     """Return the fixed-point iteration of a Hamiltonian; ``None`` with too many or other points than velocities."""
-    system = problem.system
+    system, turns = axial_turns(problem.system)
     tables = velocity_tables(problem.shape) if system.auxiliaries else None
     if tables is None or tables.velocity or system.damping != 0:
         return None
@@ -177,15 +184,40 @@ def hamiltonian_iteration(problem: StepProblem) -> FixedPointIteration | None:
             if joint
             else None,
             integrand_kernel(system, "integrand_lanes", of),
+            _turn_kernel(system, turns, lanes=True),
         ),
+        constant_mass=_turn_kernel(system, turns, lanes=False),
         forces=() if joint else ("force_lanes",),
         stored=4 * lanes,
         parts=("point_weights", "hamiltonian_iteration"),
-        macros=(("JOINT_RATES", 1),) if joint else (),
-        exchanges=turning,
+        macros=((("JOINT_RATES", 1),) if joint else ()) + ((("TURNS", len(turns)),) if turns else ()),
+        matrix=tables.position if _nearly_equal(tables.position, tables.momentum) else (),
     )
 
 
+def _turn_kernel(system: MechanicalSystem, turns: Sequence[Turn], *, lanes: bool) -> Kernel | None:
+    """Return the kernel of the angles of turns that end a step, or of turns of vectors; ``None`` without turns."""
+    q, p = (tuple(Symbol(f"{name}_{i}", real=True) for i in range(system.dimension)) for name in "qp")
+    if not turns:
+        return None
+    if not lanes:
+        purpose = "(cos a - 1, sin a) of the turns by a = kappa h Pi_k/2 after a step, u = (q, h p)."
+        return system_kernel(
+            system, "angles", sum((turn.angle(q, p) for turn in turns), ()), of=(*q, *p), purpose=purpose
+        )
+    angles = [tuple(Symbol(f"{name}_{k}", real=True) for name in ("cosine", "sine")) for k in range(len(turns))]
+    changes = ((*t.change(q, angle), *t.change(p, angle)) for t, angle in zip(turns, angles, strict=True))
+    purpose = "Changes of vectors q and p by the turns, u = (q, p, angles)."
+    return system_kernel(system, "turn_lanes", map(Add, *changes), of=(*q, *p, *sum(angles, ())), purpose=purpose)
+
+
+def _nearly_equal(one: Matrix, other: Matrix) -> bool:
+    """Return whether two tables of a method are equal up to rounding: those of an SVI are rounded to be adjoint."""
+    return all(abs(x - y) < EPSILON for x, y in zip(chain(*one), chain(*other), strict=True))
+
+
+EPSILON = 1e-14
+"""Largest difference of tables that rounding explains."""
 FRACTION_BITS = 51
 MOST_LINEARISED = 8
 """Largest number of coordinates with linearised forces; beyond, their derivatives cost more than they save."""
@@ -264,10 +296,7 @@ def _solution_kernel(system: LagrangianSystem) -> Kernel | None:
 
 
 def _linearised_forces(system: LagrangianSystem) -> tuple[Expr, ...]:
-    """Return F_q, F_v and L_vq by rows, with their zeros, for few coordinates with position-dependent masses.
-
-    Nothing for other systems, whose iterations converge quickly.
-    """
+    """Return F_q, F_v and L_vq by rows, for few coordinates with position-dependent masses; else nothing."""
     forms, m, zero = forms_of(system), system.dimension, sympy.Integer(0)
     if m > MOST_LINEARISED or not any(
         entry.free_symbols & {*system.coordinates} for entry in forms.lower_mass.values()

@@ -32,7 +32,14 @@ from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_structure import Velocities
 from scvi_codegen.methods.stage_system import Shape
-from scvi_codegen.tables.basis import continuation, extrapolation, legendre_functional, matrix_product, transpose
+from scvi_codegen.tables.basis import (
+    continuation,
+    extrapolation,
+    identity_matrix,
+    legendre_functional,
+    matrix_product,
+    transpose,
+)
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
 
@@ -45,10 +52,7 @@ class StepProblem:
 
     @property
     def lagrangian(self) -> LagrangianSystem | None:
-        """The system itself, or for a Hamiltonian that of its Lagrangian, if one is found.
-
-        Both have the same step (35f).
-        """
+        """The system itself, or for a Hamiltonian its Lagrangian system with the same step (35f), if one is found."""
         return equivalent_lagrangian(self.system)
 
 
@@ -74,7 +78,8 @@ def lane_count(points: int) -> int:
 
 def pad_matrix(entries: Matrix, lanes: int) -> NumberTable:
     """Return the padded table: rows beyond the last repeat it, columns beyond are zero."""
-    return lower_matrix(_wide(entries, lanes))
+    wide = tuple(_longer(line, lanes) for line in entries)
+    return lower_matrix((*wide, *(wide[-1],) * (lanes - len(wide))))
 
 
 def pad_vector(entries: Vector, lanes: int, *, repeat: bool = False) -> tuple[Number, ...]:
@@ -82,10 +87,10 @@ def pad_vector(entries: Vector, lanes: int, *, repeat: bool = False) -> tuple[Nu
     return lower_vector(_longer(entries, lanes, repeat=repeat))
 
 
-def shift_tables(matrix: NumberTable, points: int, lanes: int) -> ShiftTables:
-    """Return the eigenvectors of the matrix of a step, whose padded rows repeat the last one."""
-    square = mp.matrix([row[:points] for row in matrix[:points]])
-    values, vectors = mp.eig(square)
+def shift_tables(matrix: NumberTable, lanes: int) -> ShiftTables:
+    """Return the eigenvectors of the matrix of a step, whose rows are padded by repeating the last one."""
+    points = len(matrix)
+    values, vectors = mp.eig(mp.matrix(matrix))
     inverse = mp.inverse(vectors)
     real = [abs(mp.im(value)) < REAL * abs(value) for value in values]
     kept = [k for k, value in enumerate(values) if real[k] or mp.im(value) > 0]
@@ -132,11 +137,6 @@ def predictor_tables_of(
         last=last,
         before=before,
     )
-
-
-def _wide(entries: Matrix, lanes: int) -> Matrix:
-    wide = tuple(_longer(line, lanes) for line in entries)
-    return (*wide, *(wide[-1],) * (lanes - len(wide)))
 
 
 def _longer(entries: Vector, lanes: int, *, repeat: bool = False) -> Vector:
@@ -214,7 +214,7 @@ def _variational_tables(shape: Velocities) -> VelocityTables | None:
         return None
     rest = tuple(tuple(b - x for x in column) for b, column in zip(beta, transpose(shape.position), strict=True))
     projection: Matrix = ()
-    if _is_identity(shape.velocity):
+    if shape.velocity == identity_matrix(len(shape.velocity)):
         adjoint: Matrix = tuple(tuple(x / b for x in line) for b, line in zip(beta, rest, strict=True))
     else:
         inverse = _inverse_stiffness(shape.velocity, weights)
@@ -233,11 +233,6 @@ def _variational_tables(shape: Velocities) -> VelocityTables | None:
         projection=projection,
         variational=True,
     )
-
-
-def _is_identity(entries: Matrix) -> bool:
-    square = len(entries) == len(entries[0])
-    return square and all(x == int(n == b) for n, line in enumerate(entries) for b, x in enumerate(line))
 
 
 def _inverse_stiffness(velocity: Matrix, weights: Vector) -> Matrix | None:

@@ -14,7 +14,7 @@ from sympy import Add, Expr, S, Symbol
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.array_statements import ArrayForce
 from scvi_codegen.formulas.arrays import ArrayTerm, term_of
-from scvi_codegen.formulas.expressions import gradient, hessian
+from scvi_codegen.formulas.expressions import gradient_tuple, hessian
 from scvi_codegen.formulas.symbols import DOT, symbol
 from scvi_codegen.indices import Access, Array
 from scvi_codegen.mechanics.arrays.system import ArrayHamiltonian, ArraySystem
@@ -135,11 +135,11 @@ def _transformed(group: ArrayTerm, moving: dict[str, Array]) -> tuple[ArrayTerm,
     v = [slot for slot, _ in pairs]
     p_accesses = [replace(access, array=moving[access.array.name]) for _, access in pairs]
     p = [symbol(str(access)) for access in p_accesses]
-    entries, derivatives = hessian(group.formula, v), gradient(group.formula, v)
+    entries, derivatives = hessian(group.formula, v), gradient_tuple(group.formula, v)
     if any(entry.free_symbols & set(v) for entry in entries.values()):
         return None
     at_rest = dict.fromkeys(v, S.Zero)
-    shifted = [each - derivatives.get(k, S.Zero).xreplace(at_rest) for k, each in enumerate(p)]
+    shifted = [each - rate.xreplace(at_rest) for each, rate in zip(p, derivatives, strict=True)]
     blocks = coupled_blocks(entries, len(v))
     if any(len(block) == 1 and (block[0], block[0]) not in entries for block in blocks):
         return None
@@ -148,11 +148,10 @@ def _transformed(group: ArrayTerm, moving: dict[str, Array]) -> tuple[ArrayTerm,
     except SystemDefinitionError:  # too large a block
         return None
     accesses = {**dict(group.slots), **dict(zip(p, p_accesses, strict=True))}
-    rates = gradient(energy, p)
     return (
         term_of(group.loops, energy, accesses),
-        _gradient(group, p_accesses, [derivatives.get(k, S.Zero) for k in range(len(v))], accesses),
-        _gradient(group, [access for _, access in pairs], [rates.get(k, S.Zero) for k in range(len(p))], accesses),
+        _gradient(group, p_accesses, derivatives, accesses),
+        _gradient(group, [access for _, access in pairs], gradient_tuple(energy, p), accesses),
     )
 
 

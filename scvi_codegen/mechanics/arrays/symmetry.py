@@ -7,6 +7,8 @@ coordinates.
 
 import random
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations
 from typing import TypeAlias
 
 from sympy import Add, Expr, S, Symbol
@@ -49,34 +51,29 @@ def _maps(system: ArraySystem, array: Array) -> Iterator[ArrayMap]:
     last, forces = array.axes[-1] if array.axes else Size("", 0), list(_forces(system))
     components: Sequence[int | None] = range(last.number) if array.axes and not last.name else [None]
     for component in components:
-        if all(_is_zero(*_shift(system, each, array, component)) for each in forces):
+        if all(sums_to_zero(*_shift(system, each, array, component)) for each in forces):
             yield ArrayMap(array.name, component)
-    if system.momenta and all(_is_zero(*_phase(system, each, array)) for each in forces):
+    if system.momenta and all(sums_to_zero(*_phase(system, each, array)) for each in forces):
         yield ArrayMap(array.name, None, phase=True)
     if not last.name and last.number <= MAX_ROTATED_COMPONENTS:
-        for a in range(last.number):
-            for b in range(a + 1, last.number):
-                turned = all(_is_zero(*_turn(system, each, array, (a, b))) for each in forces)
-                if turned and _same_masses(system, array, a, b):
-                    yield ArrayMap(array.name, a, b)
+        for a, b in combinations(range(last.number), 2):
+            turned = all(sums_to_zero(*_turn(system, each, array, (a, b))) for each in forces)
+            if turned and _same_masses(system, array, a, b):
+                yield ArrayMap(array.name, a, b)
 
 
 def _component(access: Access, array: Array, component: int | None) -> bool:
     if access.array != array:
         return False
-    return component is None or access.places[-1] == _whole(component)
-
-
-def _whole(component: int) -> Place:
-    subscript = Place()
-    return Place(base=subscript.base + component)
+    return component is None or access.places[-1] == Place(base=Size("", component))
 
 
 def _shift(
     system: ArraySystem, force: ArrayForce, array: Array, component: int | None
 ) -> tuple[list[Expr], list[Symbol]]:
-    parts = [derivative for access, derivative in force.targets if _component(access, array, component)]
-    return parts, _symbols(system, force)
+    moved = [pair for pair in force.targets if _component(pair[0], array, component)]
+    by = {slot: symbol(f"{slot} shift") for slot, _ in moved if slot.sums}  # the sums of any coefficients
+    return [derivative * by.get(slot, S.One) for slot, derivative in moved], [*_symbols(system, force), *by.values()]
 
 
 def _turn(
@@ -84,9 +81,8 @@ def _turn(
 ) -> tuple[list[Expr], list[Symbol]]:
     """Return the terms of sum x_a dl/dx_b - x_b dl/dx_a, for the array and its momenta."""
     (a, b), arrays = plane, [array, *_conjugate(system, array)]
-    pairs = [
-        ((each, _whole(to)), (each, _whole(by)), sign) for each in arrays for to, by, sign in ((b, a, 1), (a, b, -1))
-    ]
+    one, two = Place(base=Size("", a)), Place(base=Size("", b))
+    pairs = [((x, to), (x, by), sign) for x in arrays for to, by, sign in ((two, one, 1), (one, two, -1))]
     return _rotated_terms(system, force, pairs)
 
 
@@ -119,7 +115,7 @@ def _rotated_terms(
             if access.array != array or (last is not None and access.places[-1] != last):
                 continue
             indices = access.places if by is None else (*access.places[:-1], by)
-            partner = symbol(str(Access(array=other, places=indices)))
+            partner = symbol(str(replace(access, array=other, places=indices)))
             known += [] if partner in known else [partner]
             parts.append(sign * partner * derivative)
     return parts, known
@@ -129,7 +125,7 @@ def _symbols(system: ArraySystem, force: ArrayForce) -> list[Symbol]:
     return [*(slot for slot, _ in force.slots), *system.parameters, system.time]
 
 
-def _is_zero(parts: Sequence[Expr], symbols: Sequence[Symbol]) -> bool:
+def sums_to_zero(parts: Sequence[Expr], symbols: Sequence[Symbol]) -> bool:
     """Return whether the sum of the parts is 0 at all sampled points, of which at least ``SAMPLES`` are required."""
     if Add(*parts) == 0:
         return True

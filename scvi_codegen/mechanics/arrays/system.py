@@ -11,7 +11,7 @@ may differ between elements, or quadratic in the velocities of each element
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any, ClassVar
@@ -27,7 +27,7 @@ from scvi_codegen.formulas.expressions import hessian, unsupported_part
 from scvi_codegen.formulas.neighbours import Neighbours
 from scvi_codegen.formulas.rotations.arrays import MemberArray
 from scvi_codegen.formulas.symbols import DOT, check_names, input_formulas, symbol
-from scvi_codegen.indices import SIZES_REQUIRED, Access, Array, Loop
+from scvi_codegen.indices import SIZES_REQUIRED, Access, Array, Convolution, Loop
 from scvi_codegen.mechanics.arrays.terms import (
     check_constraint,
     constraint_text,
@@ -139,6 +139,12 @@ class ArraySystem:
                 check_constraint(term, self.coordinates, self.fields, inputs)
             if self.damping != 0 and self.momenta:
                 raise SizesRequiredError("damping of a Hamiltonian requires known sizes: write it as forces")
+            moving = (*self.state, *self.velocities)
+            if still := [each for each, _ in self.accesses if each.sums and each.array not in moving]:
+                raise SizesRequiredError(
+                    f"'{still[0]}' is a convolution of parameters, not of coordinates or momenta: declare its values "
+                    "as an array of parameters"
+                )
             for array in self.coordinates:
                 if len(array.axes) > 1 and any(not axis.name for axis in array.axes[:-1]):
                     raise SizesRequiredError(f"of the axes of {array} only the last may be a number: name the others")
@@ -179,6 +185,11 @@ class ArraySystem:
         slots += [(access, force.loops) for force in self.applied_forces for _, access in force.slots]
         slots += [(access, term.loops) for term in self.constraints for _, access in term.slots]
         return (*slots, *((access, force.loops) for force in self.applied_forces for access, _ in force.targets))
+
+    @property
+    def sums(self) -> tuple[tuple[Convolution, ...], ...]:
+        """Convolutions of the state, each once."""
+        return tuple(dict.fromkeys(access.sums for access, _ in self.accesses if access.sums))
 
     @property
     def changes_energy(self) -> str:
@@ -276,12 +287,16 @@ class ArraySystem:
         """Arrays of coordinates by the names of their velocities."""
         return {} if self.momenta else {array.name + DOT: array for array in self.coordinates}
 
-    def warn_of_mistakes(self) -> None:
-        """Warn of parameters and inputs that occur in no formula, and of negative masses."""
+    def warn_of_mistakes(self, others: Iterable[Symbol] = ()) -> None:
+        """Warn of parameters and inputs that occur in no formula and not among ``others``, and of negative masses."""
         terms = [*self.terms, *self.constraints]
         formulas = [term.formula for term in terms] + [f for force in self.forces for _, f in force.targets]
         formulas.append(self.damping)
-        used = {symbol(access.array.name) for access, _ in self.accesses}.union(*(f.free_symbols for f in formulas))
+        used = {symbol(access.array.name) for access, _ in self.accesses}.union(
+            *(f.free_symbols for f in formulas),
+            (symbol(each.coefficients.name) for sums in self.sums for each in sums),
+            others,
+        )
         scalars = {symbol(array.name): value for array, value in zip(self.fields, self.field_defaults, strict=True)}
         values = scalars | dict(zip(self.parameters, self.defaults, strict=True))
         warn_of_unused(self.name, self.function, values, self.inputs, used)

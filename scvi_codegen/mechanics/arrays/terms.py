@@ -22,7 +22,7 @@ from sympy import Add, Expr, S, Symbol
 from scvi_codegen.errors import SizesRequiredError, SystemDefinitionError
 from scvi_codegen.formulas.array_statements import ArrayForce
 from scvi_codegen.formulas.arrays import ArrayTerm, parse_array, parse_coordinate
-from scvi_codegen.formulas.expressions import gradient, unsupported_part
+from scvi_codegen.formulas.expressions import gradient, gradient_tuple, unsupported_part
 from scvi_codegen.formulas.symbols import DOT, symbol
 from scvi_codegen.indices import Access, Array, Size
 
@@ -33,8 +33,8 @@ Term = TypeVar("Term", ArrayTerm, ArrayForce)
 def force_of(term: ArrayTerm, state: tuple[Array, ...]) -> ArrayForce:
     """Return the derivatives of a term with respect to its entries of the state."""
     moving = entries_of(term, state)
-    partials = gradient(term.formula, [slot for slot, _ in moving])
-    targets = tuple((access, partials.get(k, S.Zero)) for k, (_, access) in enumerate(moving))
+    partials = gradient_tuple(term.formula, [slot for slot, _ in moving])
+    targets = tuple((access, partial) for (_, access), partial in zip(moving, partials, strict=True))
     return ArrayForce(loops=term.loops, slots=term.slots, targets=targets)
 
 
@@ -69,9 +69,8 @@ def friction_of(mass: ArrayForce, rate: Expr) -> ArrayForce:
 def masses_of(term: ArrayTerm, velocities: Mapping[str, Array]) -> tuple[ArrayForce, ...]:
     """Return the mass contributions of a term, one per velocity."""
     known, masses, symbols = dict(term.slots), [], velocity_symbols(term, velocities)
-    derivatives = gradient(term.formula, symbols)
-    for k, v in enumerate(symbols):
-        mass = derivatives.get(k, S.Zero).diff(v)
+    for v, derivative in zip(symbols, gradient_tuple(term.formula, symbols), strict=True):
+        mass = derivative.diff(v)
         free = mass.free_symbols
         slots = tuple(pair for pair in term.slots if pair[0] in free)
         access = replace(known[v], array=velocities[known[v].array.name])
@@ -89,10 +88,10 @@ def has_constant_mass(term: ArrayTerm, coordinates: tuple[Array, ...], time: Sym
     """Return whether velocities occur as m v**2/2 with a constant m."""
     velocities = {array.name + DOT: array for array in coordinates}
     varies = {slot for slot, access in term.slots if access.array.name in velocities or access.array in coordinates}
-    slots = velocity_symbols(term, velocities)
-    derivatives = gradient(term.formula, slots)
-    for k, v in enumerate(slots):
-        derivative = derivatives.get(k, S.Zero)
+    slots, known = velocity_symbols(term, velocities), dict(term.slots)
+    if any(known[v].sums for v in slots):
+        return False
+    for v, derivative in zip(slots, gradient_tuple(term.formula, slots), strict=True):
         mass = derivative.diff(v)
         if mass.free_symbols & (varies | {time}) or sympy.expand(derivative - mass * v) != 0:
             return False
@@ -100,12 +99,7 @@ def has_constant_mass(term: ArrayTerm, coordinates: tuple[Array, ...], time: Sym
 
 
 def terms_at_rest(
-    terms: Sequence[ArrayTerm],
-    velocities: Mapping[str, Array],
-    state: Sequence[Array],
-    *,
-    negative: bool,
-    moving: bool,
+    terms: Sequence[ArrayTerm], velocities: Mapping[str, Array], state: Sequence[Array], *, negative: bool, moving: bool
 ) -> tuple[ArrayTerm, ...]:
     """Return the non-zero terms at zero velocity that depend on the state, or those that do not.
 
@@ -153,6 +147,8 @@ def check_constraint(term: ArrayTerm, coordinates: Sequence[Array], fields: Sequ
             f"the constraint '{shown}' contains the velocity {name}: constraints of array systems "
             "must be holonomic (coordinates and time only)"
         )
+    if any(access.sums for _, access in term.slots):
+        raise SizesRequiredError(f"the constraint '{shown}' contains a convolution")
     if not entries_of(term, coordinates):
         raise SystemDefinitionError(
             f"the constraint '{shown}' contains no coordinate: remove it, or write the condition in terms "
@@ -167,9 +163,7 @@ def check_constraint(term: ArrayTerm, coordinates: Sequence[Array], fields: Sequ
 
 def constraint_gradient(term: ArrayTerm, coordinates: Sequence[Array], time: Symbol) -> tuple[Expr, ...]:
     """Return the row of G of one element, by its coordinates, followed by g_t."""
-    variables = [*(slot for slot, _ in entries_of(term, coordinates)), time]
-    derivatives = gradient(term.formula, variables)
-    return tuple(derivatives.get(k, S.Zero) for k in range(len(variables)))
+    return gradient_tuple(term.formula, [*(slot for slot, _ in entries_of(term, coordinates)), time])
 
 
 def constraint_second_rate(

@@ -78,7 +78,7 @@ def potential_of(forces: Sequence[Expr], coordinates: Sequence[Symbol]) -> Expr 
 
 def _antiderivative(expression: Expr, q: Symbol) -> Expr | None:
     """Return the antiderivative with respect to ``q``, or ``None`` if no rule applies."""
-    powers = [power for power in expression.atoms(Pow) if _is_steep(power, q)]
+    powers = [x for x in expression.atoms(Pow) if x.base.has(q) and not (x.exp.is_Integer and x.exp.is_positive)]
     bases = {power.base: Dummy(positive=True) for power in powers}
     hidden = expression.xreplace({power: bases[power.base] ** power.exp for power in powers})
     coefficients: dict[Expr, Expr] = {}
@@ -92,11 +92,6 @@ def _antiderivative(expression: Expr, q: Symbol) -> Expr | None:
     if plain.has(sympy.Integral) or None in parts:
         return None
     return Add(plain, *parts)
-
-
-def _is_steep(power: Expr, q: Symbol) -> bool:
-    """Return whether ``power`` of a function of ``q`` has an exponent other than a positive integer."""
-    return bool(power.base.has(q) and not (power.exp.is_Integer and power.exp.is_positive))
 
 
 def _by_chain_rule(factor: Expr, power: Expr, behind: dict[Symbol, Expr], q: Symbol) -> Expr | None:
@@ -143,16 +138,11 @@ def _motions(body: Any, frame: ReferenceFrame, variables: Variables) -> Iterator
     mass = variables.read(body.mass) * sympy.eye(3)
     yield BodyMotion(_components(body, body.masscenter.vel(frame), frame, variables), mass, (sympy.S.Zero,) * 3)
     if hasattr(body, "central_inertia"):
-        axes = _frame_of(body.central_inertia, body.frame)
+        frames = {basis for _, *vectors in body.central_inertia.args for each in vectors for _, basis in each.args}
+        axes = frames.pop() if len(frames) == 1 else body.frame  # of round bodies another one
         inertia = body.central_inertia.to_matrix(axes).applyfunc(variables.read)
         rates = _components(body, body.frame.ang_vel_in(frame), axes, variables)
         yield BodyMotion(rates, inertia, _components(body, axes.ang_vel_in(frame), axes, variables))
-
-
-def _frame_of(inertia: Any, frame: ReferenceFrame) -> ReferenceFrame:
-    """Return the frame in which an inertia is written (it may differ from ``frame`` for round bodies)."""
-    frames = {basis for _, *vectors in inertia.args for vector in vectors for _, basis in vector.args}
-    return frames.pop() if len(frames) == 1 else frame
 
 
 def _components(subject: Any, vector: Any, frame: ReferenceFrame, variables: Variables) -> tuple[Expr, ...]:

@@ -15,7 +15,7 @@ from functools import lru_cache
 import sympy
 from sympy import Add, Expr, Matrix, S, Symbol
 
-from scvi_codegen.formulas.expressions import gradient, hessian
+from scvi_codegen.formulas.expressions import gradient_tuple, hessian
 from scvi_codegen.formulas.rotations.names import RotationNames
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.derived_expressions import coupled_blocks
@@ -39,11 +39,11 @@ def hamiltonian_of_rotations(system: LagrangianSystem) -> HamiltonianSystem | No
         return None
     momenta = {q: symbol(f"p_{q.name}") for q in system.coordinates}
     at_rest = dict.fromkeys(u, S.Zero)
-    linear = gradient(reduced.lagrangian, u)
+    linear = gradient_tuple(reduced.lagrangian, u)
     mu = [momenta[q] for q in ordinary]
     for each in names.rotations:
         mu += each.body_momentum(tuple(momenta[symbol(name)] for name in each.coordinates))
-    rest = Matrix([m - linear.get(i, S.Zero).xreplace(at_rest) for i, m in enumerate(mu)])
+    rest = Matrix([m - rate.xreplace(at_rest) for m, rate in zip(mu, linear, strict=True)])
     velocity = dict(zip(u, inverse * rest, strict=True))
     products = [rest[i] * rest[j] * inverse[i, j] / 2 for i in range(len(u)) for j in range(len(u))]
     energy = Add(*products) - reduced.lagrangian.xreplace(at_rest)
@@ -53,18 +53,11 @@ def hamiltonian_of_rotations(system: LagrangianSystem) -> HamiltonianSystem | No
 
     applied = tuple((name, tuple(map(in_phase_space, each))) for name, each in reduced.forces)
     return HamiltonianSystem(
-        name=system.name,
-        coordinates=system.coordinates,
+        **system._common_fields,
         momenta=tuple(momenta.values()),
-        time=system.time,
-        parameters=system.parameters,
-        defaults=system.defaults,
         hamiltonian=in_phase_space(energy),
         gauge=names.gauge(lambda each: names.inertia(each, reduced.lagrangian, system.parameters)),
         forces=names.forces(applied, [q.name for q in system.coordinates]),
-        damping=system.damping,
-        inputs=system.inputs,
-        rotations=system.rotations,
     )
 
 

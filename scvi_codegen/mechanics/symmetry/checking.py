@@ -15,7 +15,7 @@ from sympy import Expr, Symbol
 from sympy.integrals.manualintegrate import manualintegrate
 
 from scvi_codegen.errors import SystemDefinitionError, closest
-from scvi_codegen.formulas.expressions import evaluated, gradient, unsupported_part
+from scvi_codegen.formulas.expressions import evaluated, gradient, gradient_tuple, unsupported_part
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.forces import with_constraint_forces
@@ -41,15 +41,10 @@ def integrated(system: MechanicalSystem, change: Expr) -> Expr | None:
     )
     origin = change.xreplace(rest | dict.fromkeys(system.coordinates, sympy.S.Zero))
     signed = {x: sympy.Dummy(positive=True) for x in (*system.coordinates, *system.parameters)}
-    parts = (_definite(work.xreplace(signed), s), manualintegrate(sympy.expand(origin), system.time))
+    primitive = manualintegrate(sympy.expand(work.xreplace(signed)), s)
+    parts = ((primitive.subs(s, 1) - primitive.subs(s, 0)), manualintegrate(sympy.expand(origin), system.time))
     total = sympy.expand(sympy.Add(*parts)).xreplace({dummy: x for x, dummy in signed.items()})
     return None if unsupported_part(total) else total
-
-
-def _definite(expression: Expr, s: Symbol) -> Expr:
-    """Return the integral over s from 0 to 1."""
-    primitive = manualintegrate(sympy.expand(expression), s)
-    return primitive.subs(s, 1) - primitive.subs(s, 0)
 
 
 def is_total_derivative(system: MechanicalSystem, change: Expr, points: Iterable[Sample]) -> bool | None:
@@ -153,8 +148,7 @@ def _generated(system: MechanicalSystem, G: Expr, name: str) -> Symmetry:
             f"{G} does not generate a symmetry of '{system.name}': its rate of change, {{G, H}} + "
             f"G_t, is {_cut(rate)}, not 0"
         )
-    derivatives = gradient(G, p)
-    direction = tuple(derivatives.get(i, sympy.S.Zero) for i in range(len(q)))
+    direction = gradient_tuple(G, p)
     gauge = sympy.Add(*(a * b for a, b in zip(p, direction, strict=True)), -G)
     return Symmetry(name=name, coordinates=q, momenta=p, time=t, direction=direction, gauge=gauge, momentum_map=G)
 

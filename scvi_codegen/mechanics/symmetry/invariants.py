@@ -177,11 +177,7 @@ class _Search:
 
 
 def _null_space(matrix: Array, sizes: Array) -> Array:
-    """Return the null space in reduced row echelon form, of shape (d, columns).
-
-    Rows and columns are scaled by ``sizes`` of the terms that entries are sums of, so entries are judged relative to
-    these.
-    """
+    """Return the null space in reduced row echelon form; rows and columns are scaled by ``sizes`` of terms."""
     heights = sizes.max(axis=1, keepdims=True)
     heights = np.where(heights > 0.0, heights, 1.0)
     widths = np.sqrt(((sizes / heights) ** 2).mean(axis=0))
@@ -196,10 +192,7 @@ def _null_space(matrix: Array, sizes: Array) -> Array:
 
 
 def _all_larger(matrix: Array, small: float) -> bool:
-    """Return whether all singular values exceed ``small``, by the bound 1 / |R^-1| (Frobenius norm) with M = Q R.
-
-    It costs a twentieth of a singular value decomposition.
-    """
+    """Return whether singular values exceed ``small``, by 1 / |R^-1|_F with M = Q R, a twentieth of the cost of SVD."""
     try:
         return bool(np.linalg.norm(np.linalg.inv(np.linalg.qr(matrix, mode="r"))) < 1.0 / small)
     except np.linalg.LinAlgError:

@@ -44,7 +44,7 @@ from sympy import Expr, Symbol
 from scvi_codegen.display.cards import Html, card
 from scvi_codegen.display.mathml import mathml
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.expressions import gradient
+from scvi_codegen.formulas.expressions import gradient_tuple
 from scvi_codegen.indices import ArrayMap
 from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
 from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
@@ -119,8 +119,8 @@ class Symmetry:
             .union(self.gauge.free_symbols, *(xi.free_symbols for xi in self.direction))
             .isdisjoint(self.momenta)
         ):
-            derivatives = gradient(self.momentum_map, self.coordinates)
-            moved += [(p, -derivatives.get(i, sympy.S.Zero)) for i, p in enumerate(self.momenta)]
+            derivatives = gradient_tuple(self.momentum_map, self.coordinates)
+            moved += [(p, -rate) for p, rate in zip(self.momenta, derivatives, strict=True)]
         changes = [f"{mathml(Symbol('delta'))}{mathml(x)} = {mathml(xi)}" for x, xi in moved if xi != 0]
         facts = [("conserves", Html(mathml(self.momentum_map))), ("direction", Html("; ".join(changes[:MOST_SHOWN])))]
         facts += [("gauge", Html(mathml(self.gauge)))] if self.gauge != 0 else []
@@ -172,7 +172,18 @@ def symmetries(system: MechanicalSystem | ArraySystem) -> tuple[Symmetry, ...] |
     if isinstance(system, ArraySystem):
         return momentum_maps(system)
     if isinstance(system, FirstOrderSystem) and not system.is_canonical:
-        return _of_first_order(system)
+        return tuple(
+            Symmetry(
+                name=f"momentum of {', '.join(system.coordinates[i].name for i in moved)}",
+                coordinates=system.coordinates,
+                momenta=system.momenta,
+                time=system.time,
+                direction=tuple(sympy.Integer(i in moved) for i in range(system.dimension)),
+                gauge=sympy.S.Zero,
+                momentum_map=sympy.Add(*(system.one_form[i] for i in moved)),
+            )
+            for moved in translations(system)
+        )
     return _distinct([_symmetry(system, terms) for terms in _found(system)])
 
 
@@ -194,22 +205,6 @@ def all_symmetries(system: MechanicalSystem, additional: Sequence[Symmetry]) -> 
         if names.count(name) > 1:
             raise SystemDefinitionError(f"two symmetries are called '{name}': choose another name for yours")
     return result
-
-
-def _of_first_order(system: FirstOrderSystem) -> tuple[Symmetry, ...]:
-    """Return the translations of coordinates that leave L unchanged; they conserve sums of theta(q, y)."""
-    return tuple(
-        Symmetry(
-            name=f"momentum of {', '.join(system.coordinates[i].name for i in moved)}",
-            coordinates=system.coordinates,
-            momenta=system.momenta,
-            time=system.time,
-            direction=tuple(sympy.Integer(i in moved) for i in range(system.dimension)),
-            gauge=sympy.S.Zero,
-            momentum_map=sympy.Add(*(system.one_form[i] for i in moved)),
-        )
-        for moved in translations(system)
-    )
 
 
 def _found(system: MechanicalSystem) -> list[Terms]:
@@ -278,8 +273,7 @@ def _combined(rows: Sequence[Mapping[int, Expr]], columns: Sequence[Polynomial])
 def _spanned(system: MechanicalSystem, motion: Rates, *, curved: bool) -> list[Terms]:
     """Return a basis of the conserved polynomials, including those of degree 2 in p if ``curved``."""
     columns = list(monomial_columns(system.dimension, curved=curved))
-    combinations = (combined(row, columns) for row in conserved(system, motion, columns, fractions=curved))
-    return [terms for terms in combinations if terms]
+    return _combined(conserved(system, motion, columns, fractions=curved), columns)
 
 
 def _energy(system: MechanicalSystem) -> list[Terms]:
@@ -337,13 +331,12 @@ def _symmetry(system: MechanicalSystem, terms: Terms) -> Symmetry:
         factor = scale  # angular momenta of quaternions have the coefficients 1/2
     signed = {monomial: factor * coefficient for monomial, coefficient in terms.items()}
     J, p = polynomial_in(system, signed), system.momentum_symbols
-    derivatives = gradient(J, p)
     return Symmetry(
         name=name,
         coordinates=system.coordinates,
         momenta=p,
         time=system.time,
-        direction=tuple(derivatives.get(i, sympy.S.Zero) for i in range(m)),
+        direction=gradient_tuple(J, p),
         gauge=polynomial_in(system, {a: (degrees[a] - 1) * x for a, x in signed.items()}),
         momentum_map=J,
     )

@@ -13,8 +13,7 @@ from scvi_codegen.indices import Array
 from scvi_codegen.mechanics.first_order import FirstOrderSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_files.sections import EVENT_KEYS
-from scvi_codegen.runtime.events.event import Event
+from scvi_codegen.models.model_files.values import STATE
 
 if TYPE_CHECKING:
     from scvi_codegen.models.model_files.input_tables import InputTable
@@ -23,8 +22,6 @@ SHORT_VECTOR = 4
 TEXT_WIDTH = 100
 LONG_ARRAY = 1000
 """Largest number of entries of an array that is written into a model file with tables."""
-STATE = {"q": "q", "p": "p", "q_dot": "velocity"}
-"""Field of a model by key of ``[initial]``."""
 
 
 def document_of(model: Model, *, as_arrays: bool = True) -> dict[str, Any]:
@@ -35,9 +32,9 @@ def document_of(model: Model, *, as_arrays: bool = True) -> dict[str, Any]:
     if g := clock.time_transformation if clock else model.time_transformation:
         document["system"]["time_transformation"] = g
     if model.inputs:
-        document["inputs"] = {name: _as_lists(table) for name, table in model.inputs.items()}
+        document["inputs"] = {name: _as_lists(value) for name, value in model.inputs.items()}
     if model.events:
-        document["events"] = [_event_entry(event) for event in model.events]
+        document["events"] = [event.table for event in model.events]
     if (sizes := {name: size for name, size in model.sizes.items() if size}) and "field" not in document:
         document["sizes"] = sizes
     if parameters:
@@ -70,21 +67,6 @@ def _system_and_state(
             return {"field": field_section(mesh)}, numbers, motion | {"initial": state}
         return _definition(system), _declared_parameters(model), motion | {"initial": state}
     return _formulas(system, names), model.parameters, motion
-
-
-def _event_entry(event: Event) -> dict[str, Any]:
-    """Return the table of an event."""
-    entry = {name: getattr(event, name) for name in EVENT_KEYS if getattr(event, name) not in (None, 0, False)}
-    if event.restitution is not None:
-        entry |= {"restitution": event.restitution}
-    texts: dict[str, Any] = {
-        key: value if isinstance(value, int | float | str) else str(value) for key, value in entry.items()
-    }
-    if event.then is not None:
-        texts["then"] = {name: value if isinstance(value, int | float) else str(value) for name, value in event.changes}
-    if isinstance(event.where, tuple):
-        texts["where"] = list(map(str, event.where))
-    return texts
 
 
 def _definition(system: MechanicalSystem) -> dict[str, Any]:
@@ -166,7 +148,9 @@ def _without(values: Mapping[str, Any], names: Any) -> dict[str, Any]:
     return {name: value for name, value in values.items() if name not in names}
 
 
-def _as_lists(table: InputTable) -> dict[str, Any]:
+def _as_lists(table: InputTable | float) -> Any:
+    if isinstance(table, float):
+        return table
     return {key: list(value) if isinstance(value, tuple) else value for key, value in table._asdict().items()}
 
 

@@ -28,19 +28,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.errors import ModelFileError, closest
 from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.input_tables import parse_table
 from scvi_codegen.models.time_span import real
+from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.validation import checked_count
 
 if TYPE_CHECKING:
     from scvi_codegen.runtime.core.stepper import Stepper
 
-Array = NDArray[np.float64]
 Check = Callable[[Sequence[str]], None]
 
 MOST = 10**8
@@ -71,7 +70,7 @@ class EnsembleStates:
     @property
     def q(self) -> Array:
         """Coordinates of shape (k, m)."""
-        return self._table(self._coordinates, self.model.q)
+        return self._table(_names_of(self.model)[0], self.model.q)
 
     def momenta(self, stepper: Stepper) -> Array:
         """Return (k, m) momenta: those of the file, or Legendre transforms of its velocities; others from the model.
@@ -80,36 +79,19 @@ class EnsembleStates:
             StateError: if a velocity has no momentum.
         """
         model = self.model
-        if self._names(self._momenta) or (model.velocity is None and not self._names(self._velocities)):
-            return self._table(self._momenta, model.momenta(stepper))
+        _, velocities, momenta = _names_of(model)
+        moving = not self.columns.keys().isdisjoint(velocities)
+        if not self.columns.keys().isdisjoint(momenta) or (model.velocity is None and not moving):
+            return self._table(momenta, model.momenta(stepper))
         default = model.velocity
         if default is None:
             start = model.parameters_at_start(stepper)
             default = tuple(stepper.velocity(model.q, model.momenta(stepper), model.t, start))
-        states = zip(self.q, self._table(self._velocities, default), self._at_start(stepper), strict=True)
+        parameters = self.parameters
+        if model.inputs:  # with their initial coefficients
+            parameters = self._table(list(stepper.parameters), model.parameters_at_start(stepper))
+        states = zip(self.q, self._table(velocities, default), parameters, strict=True)
         return np.array([stepper.momentum(q, v, model.t, values) for q, v, values in states])
-
-    def _at_start(self, stepper: Stepper) -> Array:
-        """Return (k, number of parameters), including the initial coefficients of the model's inputs."""
-        if not self.model.inputs:
-            return self.parameters
-        return self._table(list(stepper.parameters), self.model.parameters_at_start(stepper))
-
-    @property
-    def _coordinates(self) -> list[str]:
-        return [coordinate.name for coordinate in self.model.system.coordinates]
-
-    @property
-    def _velocities(self) -> list[str]:
-        return [f"{name}_dot" for name in self._coordinates]
-
-    @property
-    def _momenta(self) -> list[str]:
-        return [f"p_{name}" for name in self._coordinates]
-
-    def _names(self, names: list[str]) -> bool:
-        """Return whether the file contains one of the names."""
-        return not set(names).isdisjoint(self.columns)
 
     def _table(self, names: list[str], defaults: Any) -> Array:
         table = np.tile(np.asarray(defaults, dtype=float), (len(self), 1))
@@ -119,13 +101,20 @@ class EnsembleStates:
         return table
 
 
+def _names_of(model: Model) -> tuple[list[str], list[str], list[str]]:
+    """Return the names of coordinates, velocities and momenta."""
+    names = [coordinate.name for coordinate in model.system.coordinates]
+    return names, [f"{name}_dot" for name in names], [f"p_{name}" for name in names]
+
+
 def load_ensemble(path: str | os.PathLike[str], model: Model) -> EnsembleStates:
     """Read a grid (``.toml``) or a table (``.csv``).
 
     Raises:
         ModelFileError: beginning with the path and naming the name or line at fault.
     """
-    readers = {".toml": _read_grid, ".csv": _read_table}
+    readers: dict[str, Callable[[str, Check], dict[str, Array]]]
+    readers = {".toml": _read_grid, ".csv": lambda text, check: parse_table(text, check).columns}
     suffix = Path(path).suffix.lower()
     try:
         if suffix not in readers:
@@ -167,15 +156,9 @@ def _axis(value: Any, where: str) -> Array:
     return np.array([real(item, where) for item in values])
 
 
-def _read_table(text: str, check: Check) -> dict[str, Array]:
-    return parse_table(text, check).columns
-
-
 def _check_names(model: Model, names: Sequence[str]) -> None:
-    coordinates = [coordinate.name for coordinate in model.system.coordinates]
-    parameters = list(model.parameters)
-    velocities, momenta = [f"{name}_dot" for name in coordinates], [f"p_{name}" for name in coordinates]
-    known = [*coordinates, *velocities, *momenta, *parameters]
+    coordinates, velocities, momenta = _names_of(model)
+    known = [*coordinates, *velocities, *momenta, *model.parameters]
     for name in names:
         if name not in known:
             hint = f"{closest(name, known)} Known: {', '.join(known[:12])}"

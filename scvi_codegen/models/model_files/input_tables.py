@@ -3,6 +3,7 @@
     [inputs]
     u = { file = "u.csv", kind = "cubic" }              # .csv or .npz, relative to the model file; columns t and u
     w = { t = [0.0, 1.0, 2.0], values = [0.0, 0.5, 0.0] }
+    c = 0.1                                             # a constant
 
 Values are interpolated as ``constant`` (zero-order hold), ``linear`` (default) or ``cubic``. The column of an input has
 its name, or is called ``value``, or is the only one other than ``t``: one file may contain several inputs.
@@ -98,34 +99,41 @@ class InputTable(NamedTuple):
     kind: str = "linear"
 
 
-def checked_tables(system: MechanicalSystem, tables: Mapping[str, Any]) -> dict[str, InputTable]:
-    """Return validated tables by name, as plain numbers; some may be missing.
+def checked_tables(system: MechanicalSystem, tables: Mapping[str, Any]) -> dict[str, InputTable | float]:
+    """Return validated tables and constants by name, as plain numbers; some may be missing.
 
     Raises:
-        ModelFileError: for a name that is not an input of the system, and a value that is not a table.
+        ModelFileError: for a name that is not an input of the system, and a value that is neither table nor number.
     """
-    checked = {}
+    checked = dict[str, InputTable | float]()
     for name, table in tables.items():
         if name not in system.inputs:
             raise ModelFileError(
                 f"'{name}' is not an input of '{system.name}', whose inputs are {', '.join(system.inputs) or 'none'}"
             )
-        if not isinstance(table, tuple):
-            raise ModelFileError(f"the input {name} of a model must be a table, (t, values) or (t, values, kind)")
+        if hasattr(table, "c"):
+            raise ModelFileError(f"the input {name} of a model must be a number, (t, values) or (t, values, kind)")
         try:
-            input_of(name, tuple(table))
+            input_of(name, table)
         except StateError as error:
             raise ModelFileError(str(error)) from error
+        if not isinstance(table, tuple):
+            checked[name] = float(table)
+            continue
         t, values = (tuple(np.asarray(part, dtype=float).tolist()) for part in table[:2])
         checked[name] = InputTable(t, values, *table[2:])
     return checked
 
 
 def tables_of_example(
-    system: MechanicalSystem, inputs: Mapping[str, InputTable], span: tuple[float, float]
+    system: MechanicalSystem, inputs: Mapping[str, InputTable | float], span: tuple[float, float]
 ) -> tuple[tuple[ExampleInput, ...], tuple[float, ...]]:
     """Return the tables of all inputs (or none) for C, and all parameters at the start of a run over that time span."""
-    data = {name: input_of(name, tuple(inputs[name])) for name in system.inputs if inputs}
+    whole = min(span), max(span) + 1.0  # of the only piece of a constant
+    given = {name: inputs[name] for name in system.inputs if inputs}
+    data = {
+        name: input_of(name, each if isinstance(each, tuple) else (whole, (each, each))) for name, each in given.items()
+    }
     tables = tuple(
         ExampleInput(name, tuple(each.breakpoints.tolist()), tuple(map(tuple, each.pieces[:, :POWERS].tolist())))
         for name, each in data.items()
@@ -138,20 +146,23 @@ TIME, VALUE = "t", "value"
 KEYS = ("file", "t", "values", "kind")
 
 
-def read_input(name: str, entry: Any, folder: str | os.PathLike[str]) -> InputTable:
+def read_input(name: str, entry: Any, folder: str | os.PathLike[str]) -> InputTable | float:
     """Read the entry of an input in a model file.
 
     Args:
         name: of the input.
-        entry: ``{file, kind}`` or ``{t, values, kind}``.
+        entry: a number, ``{file, kind}`` or ``{t, values, kind}``.
         folder: base of relative paths.
 
     Raises:
         ModelFileError: naming the input, the file and the line or row at fault.
     """
     where = f"[inputs] {name}"
+    if isinstance(entry, int | float):
+        return real(entry, where)
     if not isinstance(entry, dict):
-        raise ModelFileError(f'{where} must be a table, {{ file = "{name}.csv" }} or {{ t = [..], values = [..] }}')
+        tables = f'{{ file = "{name}.csv" }} or {{ t = [..], values = [..] }}'
+        raise ModelFileError(f"{where} must be a number or a table, {tables}")
     for key in entry:
         if key not in KEYS:
             raise ModelFileError(f"unknown key '{key}' in {where}. Known: {', '.join(KEYS)}")

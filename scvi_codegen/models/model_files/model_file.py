@@ -80,7 +80,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from scvi_codegen.errors import ModelFileError, SystemDefinitionWarning
 from scvi_codegen.files.atomic import write_text
@@ -92,6 +92,7 @@ from scvi_codegen.mechanics.time_transformation import time_rescaling_function, 
 from scvi_codegen.methods import fitted
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.document import document_of, motion_of, with_files
+from scvi_codegen.models.model_files.input_tables import InputTable
 from scvi_codegen.models.model_files.sections import (
     FORMULAS,
     TORQUES,
@@ -114,9 +115,6 @@ from scvi_codegen.models.model_files.sections import (
 from scvi_codegen.models.model_files.values import read_values
 from scvi_codegen.models.problems import Problem
 from scvi_codegen.validation import checks_arguments, of
-
-if TYPE_CHECKING:
-    from scvi_codegen.models.model_files.input_tables import InputTable
 
 SYSTEM_KEYS = (
     *(
@@ -301,10 +299,10 @@ def _with_time_transformation(model: Model, document: Document, specification: S
         system, g = in_section(where, lambda: with_time_transformation(model.system, g, controller))
         method = read_method(fitted(specification, system))
         model = replace(model, system=system, method=method, time_transformation=g)
-    if model.array_system is not None:
-        model.array_system.warn_of_mistakes()
-        return model
     others = [symbol(word) for word in re.findall(r"[A-Za-z_]\w*", str(document.get("events", "")))]
+    if model.array_system is not None:
+        model.array_system.warn_of_mistakes(others)
+        return model
     rescaling = [] if g is None else [time_rescaling_function(model.system, g, in_time=True)]
     warn_of_mistakes(model.system, (*others, *rescaling))
     return model
@@ -327,7 +325,7 @@ def _check_error_bound(error: Any, run: Section) -> None:
         )
 
 
-def _read_inputs(section: Section, folder: str | os.PathLike[str]) -> Mapping[str, InputTable]:
+def _read_inputs(section: Section, folder: str | os.PathLike[str]) -> Mapping[str, InputTable | float]:
     if not section:
         return {}
     from scvi_codegen.models.model_files.input_tables import read_input  # imported here: it imports the runtime

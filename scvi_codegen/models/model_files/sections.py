@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterable, Mapping
+from itertools import chain
 from typing import Any, Final, TypeVar
 
 from scvi_codegen.errors import ModelFileError, ScviCodegenError, closest
@@ -25,9 +26,10 @@ KEYS: Final = {
     "field": "density space boundary discretisation",
 }
 EVENT_KEYS: Final = ("function", "direction", "terminal", "then", "where", "restitution")
+NAMED_SECTIONS: Final = ("parameters", "forces", "torques", "torques_space", "initial", "run")
 LOCATIONS: Final = {
     **{key: f"'{key}' belongs in [{section}]" for section, keys in KEYS.items() for key in keys.split()},
-    **{section: f"there is a section [{section}]" for section in ("parameters", "forces", "initial", "run")},
+    **{key: f"there is a section [{key}]" for key in NAMED_SECTIONS},
 }
 """Location of each key in a model file."""
 
@@ -210,11 +212,10 @@ REQUIRED = {
 
 
 def has_arrays(document: Document, sizes: str = r"\w") -> bool:
-    """Return whether coordinates are arrays, with sizes that contain a pattern."""
-    coordinates = document.get("system", {}).get("coordinates", ())
-    return isinstance(coordinates, list) and any(
-        isinstance(name, str) and re.search(rf"\[.*{sizes}", name) for name in coordinates
-    )
+    """Return whether coordinates, rotations, directions or spins are arrays, with sizes that contain a pattern."""
+    groups = [document.get("system", {}).get(key) for key in ("coordinates", *TURNING)]
+    names = chain(*(each for each in groups if isinstance(each, list | dict)))
+    return any(isinstance(name, str) and re.search(rf"\[.*{sizes}", name) for name in names)
 
 
 def is_number(value: Any) -> bool:
@@ -321,7 +322,16 @@ def read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
     }
     constraints = names_of(section, "constraints") if "constraints" in section else ()
     if "hamiltonian" in section:
-        return _read_hamiltonian(section, arguments, constraints)
+        if "dissipation" in section:
+            raise ModelFileError(
+                "[system] has a dissipation, in velocities, and a hamiltonian: write the forces in [forces] instead"
+            )
+        arguments["hamiltonian"] = text_of(section, "hamiltonian", "[system]")
+        arguments["momenta"] = names_of(section, "momenta") if "momenta" in section else None
+        hamiltonian = in_section("[system]", lambda: HamiltonianSystem.from_text(**arguments))
+        if not constraints:
+            return hamiltonian
+        return in_section("[system]", lambda: lagrangian_of(hamiltonian, constraints=constraints))
     if "momenta" in section:
         raise ModelFileError(
             "[system] has momenta and a lagrangian: momenta are names for a hamiltonian; leave them out"
@@ -348,17 +358,3 @@ def _scalars(document: Document) -> dict[str, float]:
         key: real(value, f"[parameters] {key}") if "[" not in key or is_number(value) else 1.0
         for key, value in parameters.items()
     }
-
-
-def _read_hamiltonian(section: Section, arguments: dict[str, Any], constraints: Any) -> MechanicalSystem:
-    """Return the system of a Hamiltonian; with constraints that of its Lagrangian."""
-    if "dissipation" in section:
-        raise ModelFileError(
-            "[system] has a dissipation, in velocities, and a hamiltonian: write the forces in [forces] instead"
-        )
-    arguments["hamiltonian"] = text_of(section, "hamiltonian", "[system]")
-    arguments["momenta"] = names_of(section, "momenta") if "momenta" in section else None
-    hamiltonian = in_section("[system]", lambda: HamiltonianSystem.from_text(**arguments))
-    if not constraints:
-        return hamiltonian
-    return in_section("[system]", lambda: lagrangian_of(hamiltonian, constraints=constraints))

@@ -44,7 +44,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sympy import Expr
 
-from scvi_codegen.errors import ExpressionError, ModelFileError, closest
+from scvi_codegen.errors import ExpressionError, ModelFileError
 from scvi_codegen.files.export import loaded
 from scvi_codegen.formulas.arrays import parse_array
 from scvi_codegen.formulas.grammar import parse_expression
@@ -99,6 +99,9 @@ def read_values(
     time = {"t": real(section.get("t", 0.0), "[initial] t")}
     entries = _parameter_entries(document.get("parameters", {}), system)
     if isinstance(any_system, ArraySystem):
+        if any_system.rotations:
+            name = any_system.rotations[0].member.name
+            raise ModelFileError(f"sizes of arrays of rotations, directions and spins must be numbers, as '{name}[3]'")
         if any_system.mesh is not None:
             from scvi_codegen.models.model_files.field_section import fields_at_points  # not needed for other systems
 
@@ -128,10 +131,7 @@ def read_values(
 
 
 def _by_coordinate(section: Section, system: MechanicalSystem) -> Section:
-    """Return the initial state with rotations, directions and spins as homogeneous coordinates.
-
-    That of a first-order system is divided into coordinates and the variables in the place of momenta.
-    """
+    """Return the initial state in homogeneous coordinates; that of a first-order system as coordinates and momenta."""
     from scvi_codegen.runtime.rotations.states import state_by_name  # not needed for other systems
 
     q = section.get("q")
@@ -207,10 +207,7 @@ def _read_sizes(section: Section, system: ArraySystem) -> dict[str, int]:
 
 
 def _read_arrays(
-    entries: Mapping[Key, Entry],
-    sizes: Mapping[str, int],
-    folder: str | os.PathLike[str],
-    numbers: Mapping[str, float],
+    entries: Mapping[Key, Entry], sizes: Mapping[str, int], folder: str | os.PathLike[str], numbers: Mapping[str, float]
 ) -> dict[Key, Numbers]:
     """Read all arrays: lists and files first, since they determine sizes, then numbers and formulas."""
     sizes, arrays = dict(sizes), {}
@@ -329,15 +326,11 @@ def _from_list(value: list[Any], where: str) -> Numbers:
 
 
 def _from_file(array: Array, value: Mapping[str, Any], where: str, folder: Path) -> Numbers:
-    for key in value:
-        if key not in FILE_KEYS:
-            raise ModelFileError(
-                f"unknown key '{key}' in {where}{closest(key, FILE_KEYS)} Known: {', '.join(FILE_KEYS)}"
-            )
+    check_keys(value, FILE_KEYS, "key", where)
     name, wanted = value.get("file"), value.get("array", array.name)
     if not isinstance(name, str) or not isinstance(wanted, str):
         raise ModelFileError(f'{where} must be a file, {{ file = "{array.name}.npy" }}, with text between quotes')
-    readers = {".npy": _read_npy, ".npz": _read_npz, ".csv": _read_csv}
+    readers = {".npy": _read_numpy, ".npz": _read_numpy, ".csv": _read_csv}
     reader = readers.get(Path(name).suffix.lower())
     if reader is None:
         raise ModelFileError(f"{where}: {name}: arrays must be in {', '.join(readers)} files")
@@ -349,13 +342,11 @@ def _from_file(array: Array, value: Mapping[str, Any], where: str, folder: Path)
         raise ModelFileError(f"{where}: {name}: {error}") from error
 
 
-def _read_npy(path: Path, name: str, array: Array) -> Numbers:
-    with loaded(path) as array_in_file:
-        return real_array(array_in_file, name)
-
-
-def _read_npz(path: Path, name: str, array: Array) -> Numbers:
+def _read_numpy(path: Path, name: str, array: Array) -> Numbers:
+    """Read the array of a .npy file, or that of the name, or the only one, of a .npz file."""
     with loaded(path) as arrays:
+        if path.suffix.lower() == ".npy":
+            return real_array(arrays, name)
         chosen = name if name in arrays or len(arrays) != 1 else arrays.files[0]
         if chosen not in arrays:
             raise ModelFileError(f"there is no array {name} among {', '.join(arrays)}")

@@ -17,14 +17,18 @@ from scvi_codegen.rendering.environment import template_environment
 from scvi_codegen.rendering.program_source import Embedded, ExampleArrays, ExampleRun
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.interface import read_arrays, read_state, table_limits
+from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.tables.precision import mp
 
 
-def readme_text(interface: Interface, *, with_model: bool, embedded: Embedded | None, controlled: bool) -> str:
+def readme_text(
+    interface: Interface, events: tuple[Event, ...], *, with_model: bool, embedded: Embedded | None, controlled: bool
+) -> str:
     """Return the text of ``README.md``."""
     template = template_environment().get_template(f"package/README{'_embedded' if embedded else ''}.md.jinja")
     text = template.render(
         interface=interface,
+        events=events,
         g=interface.time_transformation,
         real="float" if embedded == "single" else "double",
         with_model=with_model,
@@ -80,6 +84,7 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
         to_end=bool(clock) and model.ends_at_time,
         inputs=inputs,
         end=model.end if inputs else 0.0,
+        events=model.events,
     )
 
 

@@ -60,7 +60,9 @@ class Variable(NamedTuple):
     start: float | None = None
 
 
-def model_description(interface: Interface, start: ExampleRun, *, by_velocity: bool, token: str) -> str:
+def model_description(
+    interface: Interface, start: ExampleRun, *, by_velocity: bool, token: str, has_events: bool = False
+) -> str:
     """Return the text of ``modelDescription.xml``.
 
     Args:
@@ -68,6 +70,7 @@ def model_description(interface: Interface, start: ExampleRun, *, by_velocity: b
         start: initial state, with velocities in place of p if ``by_velocity``; parameters, time, span and step.
         by_velocity: whether initial velocities are variables with start values, instead of momenta.
         token: instantiation token.
+        has_events: whether the FMU has an event mode.
     """
     root = Element(
         "fmiModelDescription",
@@ -78,7 +81,8 @@ def model_description(interface: Interface, start: ExampleRun, *, by_velocity: b
         generationTool=f"scvi-codegen {__version__}",
         variableNamingConvention="flat",
     )
-    SubElement(root, "CoSimulation", ABLE, modelIdentifier=interface.prefix, fixedInternalStepSize=repr(start.h))
+    able = ABLE | {"hasEventMode": "true"} if has_events else ABLE
+    SubElement(root, "CoSimulation", able, modelIdentifier=interface.prefix, fixedInternalStepSize=repr(start.h))
     categories = SubElement(root, "LogCategories")
     for name, what in LOGGED.items():
         SubElement(categories, "Category", name=name, description=what)
@@ -130,9 +134,7 @@ def _parameters(interface: Interface, values: Sequence[float]) -> Iterator[Varia
     hidden = {f"{name}_{part}" for name in interface.inputs for part in "123t"}
     for name, value in zip(interface.parameters, values, strict=True):
         if name in inputs:
-            yield Variable(
-                inputs[name], "input", "continuous", "input, held from one communication point to the next", value
-            )
+            yield Variable(inputs[name], "input", "continuous", HELD, value)
         else:
             yield Variable(name, "parameter", "tunable", "" if name in hidden else f"parameter {name}", value)
 
@@ -237,12 +239,13 @@ def _texts(model: Model, prefix: str) -> tuple[Source, dict[str, bytes]]:
     by_velocity = model.velocity is not None
     start = _start(model)
     indices = tuple(interface.parameters.index(f"{name}_{PARTS[0]}") for name in interface.inputs)
-    token = _token(source.to_json(), interface, start)
+    made_from = "\0".join([__version__, source.to_json(), repr(interface.to_record()), repr(start)])
+    token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, made_from)}}}"
     source = with_fmu(
         source, interface, start, by_velocity=by_velocity, input_indices=indices, token=token, events=settings
     )
     texts = {
-        DESCRIPTION: model_description(interface, start, by_velocity=by_velocity, token=token),
+        DESCRIPTION: model_description(interface, start, by_velocity=by_velocity, token=token, has_events=bool(events)),
         **{f"sources/{name}": text for name, text in source.files.items()},
         "sources/buildDescription.xml": build_description(prefix, [f"{each.prefix}.c" for each in source.sources]),
         **{f"resources/{name}": text for name, text in model_texts(model).items()},
@@ -263,12 +266,6 @@ def _start(model: Model) -> ExampleRun:
         raise ModelFileError(f"the step size of an FMU must be positive, not {model.h:g}")
     start = example_of(replace(model, inputs={}), controlled=False)
     return start if model.velocity is None else replace(start, p=model.velocity)
-
-
-def _token(text: str, interface: Interface, start: ExampleRun) -> str:
-    """Return the instantiation token, a hash of everything that determines library and description."""
-    made_from = "\0".join([__version__, text, repr(interface.to_record()), repr(start)])
-    return f"{{{uuid.uuid5(uuid.NAMESPACE_URL, made_from)}}}"
 
 
 def _this_platform() -> str:

@@ -7,6 +7,7 @@ import os
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -114,16 +115,21 @@ def source_in(folder: Path, prefix: str) -> Source:
     if not PREFIX.fullmatch(prefix):
         raise damaged(folder, ValueError(f"{prefix!r} is not a prefix of C names"))
     try:
-        header, code = (_read(folder / f"{prefix}.{kind}") for kind in "hc")
-        declarations = "\n".join(read_record(folder)["declarations"])
-        support = included(code, lambda name: _read(folder / name))
+        record = read_record(folder)
+        beside = _source(folder, f"{prefix}_events", record["event_declarations"]) if "events" in record else None
+        return replace(_source(folder, prefix, record["declarations"]), beside=beside)
     except OSError as error:
         raise PackageError(f"{folder} is not a generated package: {error.filename}: {error.strerror}") from error
+    except PackageError:
+        raise
     except (ValueError, KeyError, TypeError) as error:
-        if isinstance(error, PackageError):
-            raise
         raise damaged(folder, error) from error
-    return Source(prefix=prefix, header=header, code=code, declarations=declarations, support=support)
+
+
+def _source(folder: Path, prefix: str, declarations: Sequence[str]) -> Source:
+    header, code = ((folder / f"{prefix}.{kind}").read_text(encoding="utf-8") for kind in "hc")
+    support = included(code, lambda name: (folder / name).read_text(encoding="utf-8"))
+    return Source(prefix=prefix, header=header, code=code, declarations="\n".join(declarations), support=support)
 
 
 def damaged(folder: Path, error: Exception) -> PackageError:
@@ -131,16 +137,9 @@ def damaged(folder: Path, error: Exception) -> PackageError:
     return PackageError(f"{folder / INTERFACE_FILE} is damaged ({error!r}): generate the folder again")
 
 
-def _read(file: Path) -> str:
-    return file.read_text(encoding="utf-8")
-
-
 def prefix_of(folder: Path) -> str:
     """Return the name of the folder, validated as a prefix of C names and as a Python module."""
-    from scvi_codegen.pipeline import (
-        LONGEST_PREFIX,
-        c_identifier,  # imported here: it imports SymPy
-    )
+    from scvi_codegen.pipeline import LONGEST_PREFIX, c_identifier  # imported here: it imports SymPy
 
     try:
         name = folder.resolve().name

@@ -16,10 +16,9 @@ The name of the folder is the prefix of all C names. Importing it compiles the C
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.errors import PackageError
 from scvi_codegen.models.packages.folders import (
@@ -32,8 +31,10 @@ from scvi_codegen.models.packages.folders import (
     source_in,
     write_folder,
 )
-from scvi_codegen.rendering.source import Interface, Source, check_interface
+from scvi_codegen.rendering.source import Interface, check_interface
+from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.validation import ArgumentType, checks_arguments
 
 if TYPE_CHECKING:
@@ -80,12 +81,12 @@ def generate_package(
         MethodError: for a solver that does not support the method, and for a number beyond single precision.
         StateError: if the initial velocities have no momenta.
     """
-    if model.events:
-        raise PackageError("a generated package has no events: omit them, or use generate_source(.., events=..)")
+    if model.events and model.inputs:
+        raise PackageError("a generated package with events has no inputs: omit [inputs], or the events")
     target = Path(folder)
     prefix = prefix_of(target)
     model = model if solver == "auto" else replace(model, solver=solver)
-    of_any_sizes = model.array_system is not None and model.h is not None and not embedded
+    of_any_sizes = model.array_system is not None and model.h is not None and not embedded and not model.events
     write = _texts_of_arrays if of_any_sizes else _texts
     write_folder(target, write(model, prefix, embedded, single_file=single_file), force=force)
     return target
@@ -108,16 +109,15 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
         if "interface" not in record:
             return _stepper_of_arrays(target)
         interface = Interface.from_record(record["interface"])
-    except (ValueError, KeyError, TypeError) as error:
-        if isinstance(error, PackageError):
-            raise
-        raise damaged(target, error) from error
-    source = source_in(target, interface.prefix)
-    try:
+        events = tuple(Event(**table) for table in record.get("events", ()))
+        source = source_in(target, interface.prefix)
         check_interface(source, interface)
-    except ValueError as error:
+    except PackageError:
+        raise
+    except (ValueError, KeyError, TypeError) as error:
         raise damaged(target, error) from error
-    return Stepper(source, interface)
+    variants = Variants({events: source}) if events else None
+    return Stepper(replace(source, beside=None), interface, events=events, variants=variants)
 
 
 def _stepper_of_arrays(folder: Path) -> Stepper:
@@ -145,6 +145,7 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
         model.method,
         solver=model.solver,
         prefix=prefix,
+        events=model.events,
         embedded=embedded,
         controlled=not embedded or model.h is None,
         time_transformation=model.time_transformation,
@@ -152,14 +153,18 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
     source = source.single_file() if single_file else source.specialised()
     texts = source.files
     texts |= render_example(interface, example_of(model, controlled=ADVANCE_TO in source.header), embedded or "double")
-    described = model_texts(model)
-    texts |= described
+    written = model_texts(model)
+    texts |= written
     texts["README.md"] = readme_text(
-        interface, with_model=bool(described), embedded=embedded, controlled=ADVANCE_TO in source.header
+        interface, model.events, with_model=bool(written), embedded=embedded, controlled=ADVANCE_TO in source.header
     )
     if not embedded:
         texts["__init__.py"] = package_template("__init__.py")
-    return {**texts, INTERFACE_FILE: _interface_text(source, interface, texts)}
+    described: dict[str, Any] = {"interface": interface.to_record(), "declarations": source.declarations.split("\n")}
+    if source.beside is not None:
+        described["event_declarations"] = source.beside.declarations.split("\n")
+        described["events"] = [event.table for event in model.events]
+    return {**texts, INTERFACE_FILE: record_text(texts, **described)}
 
 
 def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
@@ -179,8 +184,3 @@ def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, si
         texts |= {**described, "__init__.py": package_template("__init__.py")}
     about = {"title": interface.title, "sizes": model.sizes, "declarations": source.declarations.split("\n")}
     return {**texts, INTERFACE_FILE: record_text(texts, **about)}
-
-
-def _interface_text(source: Source, interface: Interface, texts: Mapping[str, str]) -> str:
-    described = {"interface": interface.to_record(), "declarations": source.declarations.split("\n")}
-    return record_text(texts, **described)

@@ -88,17 +88,15 @@ class _Statements:
         """Return all statements, with the given entries of the Jacobian."""
         program, blocks = self.program, self.program.equations.blocks
         sites = range(program.equations.sites)
+
+        def residual(s: int, r: int) -> str:
+            return _statement(f"rows[{s * (blocks + 1) + r}] = {self._sum(self._row(s, r))};")
+
         return UnrolledEquations(
             stage_groups=tuple(self._family(k, group) for k, group in enumerate(program.equations.stage_groups)),
             sizes=(self.u[-1], self.value[-1], self.derivative[-1]),
-            residuals=tuple(
-                _statement(f"rows[{s * (blocks + 1) + r}] = {self._sum(self._row(s, r))};")
-                for s in sites
-                for r in range(blocks)
-            ),
-            increments=tuple(
-                _statement(f"rows[{s * (blocks + 1) + blocks}] = {self._sum(self._row(s, blocks))};") for s in sites
-            ),
+            residuals=tuple(residual(s, r) for s in sites for r in range(blocks)),
+            increments=tuple(residual(s, blocks) for s in sites),
             magnitudes=tuple(map(_statement, self._magnitudes())),
             jacobian=tuple(
                 _statement(f"*entry(jacobian, shape, {i}, {r}, {j}, {b}) = {self._sum_of_sums(groups)};")
@@ -193,7 +191,7 @@ class _Statements:
 
     def _product(self, weight: Number, power: int, factor: str, *, first: bool = False) -> str:
         """Return the product of weight, h^power and factor from the left; h before the weight if it is ``first``."""
-        scale = [] if power == 0 else ["h" if power == 1 else f"({_power(power)})"]
+        scale = [] if power == 0 else ["h" if power == 1 else f"({power_of_h(power)})"]
         numbers = [] if weight == 1 else [self._signed(weight)]
         return " * ".join([*scale, *numbers, factor] if first else [*numbers, *scale, factor])
 
@@ -226,15 +224,16 @@ def _statement(text: str) -> str:
     return wrapped(text.replace(" * ", "\0*\0"))
 
 
-def _power(power: int) -> str:
-    product = " * ".join(["h"] * abs(power))
-    return product if power > 0 else f"1 / ({product})"
+def power_of_h(k: int) -> str:
+    """Return C source of h^k as a factor."""
+    product = " * ".join(["h"] * abs(k)) or "1"
+    return product if k >= 0 else f"1 / ({product})"
 
 
 def _scaled(power: int, text: str) -> str:
     if power == 0:
         return text
-    scale = "h" if power == 1 else f"({_power(power)})"
+    scale = "h" if power == 1 else f"({power_of_h(power)})"
     return f"{scale} * ({text})" if " " in text or text.startswith("-") else f"{scale} * {text}"
 
 
@@ -269,7 +268,10 @@ def _text(kernel: Kernel, target: Target, lanes: Lanes | None, printed: Printed,
     time, parameter = (lanes.type_of(name) if lanes else real for name in ("t", "parameters"))
     declared = {name: f"{real} *{name}" for name in ARRAYS} | {"u": f"const {real} *u", "t": f"{time} t"}
     declared |= {"parameters": f"const {parameter} *parameters", "kept": f"{real} *restrict kept"}
-    texts = [_function(PART, part, _used(part, declared), printed(part)) for part in _parts(kernel)]
+    texts = [
+        _function(PART, part, [declared[name] for name in ARRAYS if part.uses(name)], printed(part))
+        for part in _parts(kernel)
+    ]
     texts += [
         text for each in kernel.sums for text in (_text(each.kernel, target, lanes, printed), *_tables(each, target))
     ]
@@ -339,10 +341,6 @@ def _parts(kernel: Kernel) -> tuple[Part, ...]:
     """Return the functions that a kernel calls if it is divided into several."""
     cut = parts(kernel)
     return cut if len(cut) > 1 else ()
-
-
-def _used(part: Part, declared: Mapping[str, str]) -> list[str]:
-    return [declared[name] for name in ARRAYS if part.uses(name)]
 
 
 def _arguments(kernel: Kernel, declared: Mapping[str, str], *, partials: bool = False) -> list[str]:

@@ -30,13 +30,10 @@ def product_text(array: Array) -> str:
 
 def count_text(loops: Sequence[Loop]) -> str:
     """Return the number of elements of loops, in C."""
-    behind = {loop.behind: loop for loop in loops if loop.behind}
-    return " * ".join(_span_text(loop, loop.index in behind) for loop in loops if not loop.behind) or "1"
-
-
-def _span_text(loop: Loop, paired: bool) -> str:
-    size = f"({size_text(loop.end)} - {size_text(loop.first)})"
-    return f"(({size_text(loop.end)}) * ({size_text(loop.end)} - 1) / 2)" if paired else size
+    outer = {loop.behind for loop in loops}
+    spans = [(loop, size_text(loop.end), size_text(loop.first)) for loop in loops if not loop.behind]
+    counts = (f"(({n}) * ({n} - 1) / 2)" if loop.index in outer else f"({n} - {first})" for loop, n, first in spans)
+    return " * ".join(counts) or "1"
 
 
 def size_text(size: Size) -> str:
@@ -111,11 +108,15 @@ Lines: TypeAlias = Callable[[int], list[str]]
 """Function that returns the lines of a slot, by its number."""
 
 
-def _starts(layout: Layout) -> Iterator[tuple[str, str]]:
-    """Yield the offset of each array in the state: coordinates, then momenta of a Hamiltonian, or velocities."""
+def starts_text(layout: Layout, text: str) -> Iterator[str]:
+    """Yield declarations of the offsets in the state of the arrays that occur in a source.
+
+    The state consists of coordinates, then momenta of a Hamiltonian, or velocities.
+    """
     sizes: list[str] = []
     for array in (*layout.coordinates, *layout.momenta, *layout.velocities):
-        yield array.name, " + ".join(sizes) or "0"
+        if re.search(rf"\bstart_{array.name}\b", text):
+            yield f"const long long start_{array.name} = {' + '.join(sizes) or '0'};"
         sizes.append(product_text(array))
 
 
@@ -153,8 +154,9 @@ class Nest:
 
     def read(self, k: int, slot: Access) -> str:
         """Return the assignment of an argument: an entry of the state, or of a direction."""
-        source = self.source if k < len(self.looped.reads) - self.looped.along else DIRECTION
-        return f"u[{k}] = {source}[{self.place_of(slot)}];"
+        along = k >= len(self.looped.reads) - self.looped.along
+        source = ("image_along" if along else "image") if slot.sums else DIRECTION if along else self.source
+        return f"u[{k}] = {source}[{self.place_in(slot, self.place_of(slot))}];"
 
     def constant(self, k: int, access: Access) -> str:
         """Return the assignment of a parameter: an entry of a field."""
@@ -180,6 +182,7 @@ class Nest:
         innermost: Sequence[str],
         finish: Lines = lambda k: [],
         behind: Sequence[Sequence[str]] = (),
+        depth: int = 0,
     ) -> list[str]:
         """Return the lines of the nested loops.
 
@@ -187,28 +190,29 @@ class Nest:
             prepare, finish: lines of targets before and after the loops that do not change them.
             innermost: lines in the innermost loop.
             behind: lines, those of each target in a separate loop over the same part.
+            depth: number of loops around these lines.
         """
-        return self._inside(0, prepare, innermost, finish, behind)
-
-    def _inside(
-        self, depth_of: int, prepare: Lines, innermost: Sequence[str], finish: Lines, behind: Sequence[Sequence[str]]
-    ) -> list[str]:
-        lines = list(self.known(depth_of))
-        outer = [k for k, target in enumerate(self.looped.writes) if self.depth_of(target) == depth_of]
-        if depth_of == len(self.looped.loops):
+        lines = list(self.known(depth))
+        if depth == len(self.looped.loops):
             return [*lines, *innermost]
+        outer = [k for k, target in enumerate(self.looped.writes) if self.depth_of(target) == depth]
         lines += [line for k in outer for line in prepare(k)]
-        loop, inner = self.looped.loops[depth_of], self._inside(depth_of + 1, prepare, innermost, finish, behind)
+        inner = self.text(prepare=prepare, innermost=innermost, finish=finish, behind=behind, depth=depth + 1)
+        loop = self.looped.loops[depth]
         if loop.near:
             lines.append(f"const section row = row_of(near_{loop.near}, index_{loop.behind}, {self._window()});")
-        last = depth_of + 1 == len(self.looped.loops)
-        lines += self._parts(loop, inner, behind) if last else _loop(loop, *self._span(loop), inner)
+        lines += (
+            self._parts(loop, inner, behind) if loop is self.looped.loops[-1] else _loop(loop, *self._span(loop), inner)
+        )
         return lines + [line for k in outer for line in finish(k)]
 
     def _parts(self, loop: Loop, inner: Sequence[str], behind: Sequence[Sequence[str]]) -> list[str]:
         """Return the innermost loop, divided into parts if necessary."""
         first, end = self._span(loop)
-        offsets = self._offsets(loop)
+        accesses = (*self.looped.reads, *self.looped.writes, *self.looped.given)
+        places = [place for access in accesses for place in access.places]
+        moved = {place.base.number for place in places if place.index == loop.index and not place.table}
+        offsets = sorted(moved - {0}) if loop.periodic else []
         if not offsets and not self.chunked:
             return _loop(loop, first, end, inner)
         lines = [f"end = {end} - begin > CHUNK ? begin + CHUNK : {end};" if self.chunked else f"end = {end};"]
@@ -247,10 +251,13 @@ class Nest:
 
     def adding(self, k: int, value: str) -> list[str]:
         """Return the lines that add to the element of a target, if the task adds to it."""
+        target = self.looped.writes[k]
+        into = "transposed" if target.sums else "F"
         if self.sharing is not Sharing.BY_PLACES:
-            return [f"F[{self.place_of(self.looped.writes[k])}] += {value};"]
+            return [f"{into}[{self.place_in(target, self.place_of(target))}] += {value};"]
         named = [self._named(k)] if self._in_a_part(k) else []
-        return [*named, f"if (whole || within(here, place_{k}))", f"  F[place_{k}] += {value};"]
+        place = self.place_in(target, f"place_{k}")
+        return [*named, f"if (whole || within(here, place_{k}))", f"  {into}[{place}] += {value};"]
 
     def _named(self, k: int) -> str:
         return f"const long long place_{k} = {self.place_of(self.looped.writes[k])};"
@@ -275,13 +282,6 @@ class Nest:
         look = _loop(loop, "begin", "end && !wanted", [*named, *tests])
         return ["int wanted = whole;", *look, "if (!wanted)", "  continue;"]
 
-    def _offsets(self, loop: Loop) -> list[int]:
-        """Return the distances of neighbours across a periodic boundary."""
-        accesses = (*self.looped.reads, *self.looped.writes, *self.looped.given)
-        places = [place for access in accesses for place in access.places]
-        moved = {place.base.number for place in places if place.index == loop.index and not place.table}
-        return sorted(moved - {0}) if loop.periodic else []
-
     def known(self, depth_of: int) -> Iterator[str]:
         """Yield the lines known at a level: arguments, parameters, elements that not every task adds to."""
         for k, target in enumerate(self.looped.writes if self.sharing is Sharing.BY_PLACES else ()):
@@ -295,6 +295,10 @@ class Nest:
         for k, access in enumerate(self.looped.given):
             if self.depth_of(access) == depth_of:
                 yield self.constant(k, access)
+
+    def place_in(self, access: Access, place: str) -> str:
+        """Return the index in the values of all convolutions if an entry is one of a convolution, else in the state."""
+        return f"{self.layout.sums.index(access.sums)} * length + {place}" if access.sums else place
 
     def place_of(self, access: Access) -> str:
         """Return the index of an entry in the state."""
@@ -315,6 +319,8 @@ class Nest:
             return self.table_entry(place)
         if not place.index:
             return size_text(place.base)
+        if place.minus:
+            return f"index_{place.index} - index_{place.minus}"
         name, offset = f"index_{place.index}", place.base.number
         loop = self.loops[place.index]
         if not offset or not loop.periodic:
@@ -348,17 +354,19 @@ class Nest:
             yield from (f"parameters[{k}] = given->parameters[{k}];" for k in range(self.scalars))
 
     def _arrays(self, text: str) -> Iterator[str]:
-        """Yield the offsets of the arrays that occur."""
-        for name, start in _starts(self.layout):
-            if re.search(rf"\bstart_{name}\b", text):
-                yield f"const long long start_{name} = {start};"
-        for kind, arrays, number in (
-            ("field", self.layout.fields, "double"),
-            ("table", self.layout.tables, "int"),
-        ):
+        """Yield the arrays that occur."""
+        yield from starts_text(self.layout, text)
+        for kind, arrays, number in (("field", self.layout.fields, "double"), ("table", self.layout.tables, "int")):
             for k, array in enumerate(arrays):
                 if f"{kind}_{array.name}[" in text:
                     yield f"const {number} *{kind}_{array.name} = given->{kind}[{k}];"
+        if "image[" in text and self.scalar == "lanes":
+            yield "const lanes *image = sums->values;"
+            yield "const long long length = sums->length;"
+        if "image_along[" in text:
+            yield "const lanes *image_along = sums->along;"
+        if "transposed[" in text:
+            yield "lanes *transposed = sums->transposed;"
         for loop in self.looped.loops:
             if loop.near:
                 yield f"const neighbours *near_{loop.near} = given->near_{loop.near};"

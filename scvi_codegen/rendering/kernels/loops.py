@@ -2,11 +2,11 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import accumulate
+from itertools import accumulate, groupby
 from math import prod
 from typing import Any
 
-from scvi_codegen.indices import MOST_THREADS, Array
+from scvi_codegen.indices import MOST_THREADS, Array, Convolution
 from scvi_codegen.ir.equations import ConstrainedSteps
 from scvi_codegen.ir.kernel import Kernel, LoopedKernel, is_divided
 from scvi_codegen.ir.program import Program
@@ -22,9 +22,10 @@ from scvi_codegen.rendering.kernels.loop_nests import (
     sharing_text,
     size_text,
     sizes_text,
+    starts_text,
 )
 from scvi_codegen.rendering.kernels.printer import DOUBLE, inverse_roots, scalar_functions
-from scvi_codegen.rendering.kernels.simd import LIBRARY, POINTS, IterationSource, iteration_source
+from scvi_codegen.rendering.kernels.simd import LIBRARY, POINTS, iteration_source
 
 EXPLICIT_VECTORS, CONSTRAINED_VECTORS, ITERATION_VECTORS = 4, 7, 4
 """Number of vectors in ``work``.
@@ -36,17 +37,21 @@ NEWTON_VECTORS = 4 + 17
 """Further vectors: residual, correction, products, and the basis of GMRES (templates/support/arrays/newton_gmres.h)."""
 FOURIER_VECTORS = 2
 """Further vectors: Fourier transforms (templates/support/arrays/preconditioner.h)."""
+PLAN_VECTORS, TRANSFORM_VECTORS, TRANSFORM_ALIGNMENT = 7, 4, 8
+"""Further vectors: plan of each circulant matrix, transforms and their alignment (support/arrays/circulant.h)."""
 STEP_VECTORS = 14
 """Further vectors: inverse sizes, half steps, increments of a step (templates/support/arrays/work_arrays.h)."""
 
 
 def loop_context(program: Program) -> dict[str, Any]:
     """Return the template's context for the program of a system of arrays."""
-    loops, constrained = program.loops, program.loops.constrained
+    loops, constrained, pairs = program.loops, program.loops.constrained, _circulants(program)
+    sums, fixed_point = _convolutions(program), program.fixed_point
+    starts = [*starts_text(program.layout, " ".join(sums))]
     terms = [(each, each.scalar) for each in loops.forces if each.scalar]
     terms += [(each, each.kernel) for each in loops.constants]
     scalars = [each.kernel for each in loops.masses] + [scalar for _, scalar in terms]
-    if program.fixed_point is None:
+    if fixed_point is None:
         scalars += [each.kernel for each in loops.forces]
     if constrained:
         scalars += [each.kernel for each in (*constrained.conditions, *constrained.curvatures)]
@@ -55,37 +60,87 @@ def loop_context(program: Program) -> dict[str, Any]:
         "most_threads": 1 if constrained else MOST_THREADS,
         "cut": is_divided((*scalars, *(each.kernel for each in loops.applied))),
         "forces": [_force_text(program, each) for each in loops.applied],
-        "energies": [_energy_text(program, each, scalar) for each, scalar in terms],
+        "energies": [_energy_text(program, each, scalar, declared=each in pairs) for each, scalar in terms],
         "masses": [_mass_text(program, each) for each in loops.masses],
         "lists": [(name, _list_text(program, count, lengths)) for name, count, lengths in loops.neighbours],
+        "circulants": {each.kernel.name: _circulant_text(program, each) for each in pairs},
+        "sums": sums,
+        "names_of_sums": [*sizes_text(program.layout, " ".join([*sums, *starts])), *starts],
+        "summed": [each.kernel.name for each in loops.applied if _has_sums(each)],
+        "plans": len(_plans(program)),
+        "most_stages": max((len(_stages(each)) for each in program.layout.sums), default=0),
         "force_names": [each.kernel.name for each in loops.forces],
-        "energy_names": [scalar.name for _, scalar in terms],
+        "energy_names": [(scalar.name, _has_sums(each)) for each, scalar in terms],
         "mass_names": [each.kernel.name for each in loops.masses],
         "scalar_kernels": [kernel_text(kernel, DOUBLE) for kernel in scalars],
         "inverse_roots": inverse_roots(scalars),
         "vector_functions": _vector_functions(program),
         "coordinates": " + ".join(map(product_text, program.layout.coordinates)),
-        "fixed_point": _iteration_text(program),
-        "work": _work(program),
+        "fixed_point": fixed_point
+        and iteration_source(fixed_point, POINTS, kernels=[each.kernel for each in loops.applied]),
+        "work": _step_work(program) + _transform_work(program),
         "hot": "static",
         "waves": _lattice_context(program) if loops.reach else None,
         **_constraint_context(program, constrained),
     }
 
 
-def _work(program: Program) -> int:
-    """Return the number of doubles of ``work`` per coordinate."""
+def _circulants(program: Program) -> list[LoopedKernel]:
+    """Return the terms whose forces, or products with a direction, are products with circulant matrices."""
+    return [each for each in program.loops.applied if each.circulant is not None]
+
+
+def _has_sums(looped: LoopedKernel) -> bool:
+    return any(each.sums for each in looped.reads)
+
+
+def _stages(sums: Sequence[Convolution]) -> list[tuple[int, str, int]]:
+    """Return the axis, the array of coefficients and the power of each circulant matrix of convolutions in turn."""
+    alike = groupby(sums, key=lambda each: (each.axis, each.coefficients.name))
+    return [(*of, len([*group])) for of, group in alike]
+
+
+def _plans(program: Program) -> list[tuple[str, int]]:
+    """Return the arrays of coefficients and powers of all circulant matrices; of sums over pairs the power is 0."""
+    pairs = [(each.given[0].array.name, 0) for each in _circulants(program)]
+    return [*dict.fromkeys([*pairs, *(stage[1:] for sums in program.layout.sums for stage in _stages(sums))])]
+
+
+def _convolutions(program: Program) -> list[str]:
+    """Return the convolutions of each array in C: their number, whether forces are derivatives by them, stages."""
+    kernels = program.loops.applied
+    reads, writes = (
+        dict.fromkeys((each.sums, each.array) for one in kernels for each in getattr(one, kind) if each.sums)
+        for kind in ("reads", "writes")
+    )
+    found = []
+    for sums, array in reads:
+        stages = [_circulant_matrix(program, array, *stage) for stage in _stages(sums)]
+        number, target = program.layout.sums.index(sums), int((sums, array) in writes)
+        found.append(f"{{{number}, {target}, {len(stages)}, {{{', '.join(stages)}}}}}")
+    return found
+
+
+def _transform_work(program: Program) -> int:
+    """Return the number of doubles per coordinate of Fourier transforms."""
+    lanes, plans = program.fixed_point.lanes if program.fixed_point else 1, len(_plans(program))
+    states = 2 if program.layout.momenta or program.layout.velocities else 1
+    each = 3 if program.loops.products else 2  # values, derivatives by them, and values along a direction
+    vectors = TRANSFORM_VECTORS + states * each * len(program.layout.sums)
+    return vectors * lanes + TRANSFORM_ALIGNMENT + PLAN_VECTORS * plans if plans else 0
+
+
+def _step_work(program: Program) -> int:
+    """Return the number of doubles per coordinate that the method uses."""
     if program.fixed_point is None:
         return CONSTRAINED_VECTORS + bool(program.layout.velocities) if program.loops.constrained else EXPLICIT_VECTORS
-    own = 2 * ITERATION_VECTORS if program.layout.momenta else ITERATION_VECTORS + bool(program.layout.velocities)
-    linear = NEWTON_VECTORS + program.fixed_point.lanes if program.loops.products else 0
-    waves = FOURIER_VECTORS * program.fixed_point.lanes + _roots_per_coordinate(program) if program.loops.reach else 0
+    momenta, velocities = bool(program.layout.momenta), bool(program.layout.velocities)
+    own = (1 + momenta) * ITERATION_VECTORS + velocities
+    newton = (1 + momenta + velocities) * NEWTON_VECTORS + program.fixed_point.lanes
+    linear = newton if program.loops.products else 0
+    roots = 2 * max(map(_axes, program.layout.coordinates))  # of unity, of every axis
+    waves = FOURIER_VECTORS * program.fixed_point.lanes + roots if program.loops.reach else 0
     return (own + linear) * program.fixed_point.lanes + waves + STEP_VECTORS
-
-
-def _iteration_text(program: Program) -> IterationSource | None:
-    fixed_point, kernels = program.fixed_point, [each.kernel for each in program.loops.applied]
-    return iteration_source(fixed_point, POINTS, kernels=kernels) if fixed_point else None
 
 
 def _vector_functions(program: Program) -> list[str]:
@@ -123,7 +178,7 @@ def _force_text(program: Program, looped: LoopedKernel) -> str:
     factor = ["double by"] if explicit else []
     direction = [f"const lanes *{DIRECTION}"] if looped.along else []
     arguments = ["const problem *given", "const lanes *restrict X", "times t", *direction, *factor, "lanes *restrict F"]
-    arguments += ["const window *here"]
+    arguments += ["const window *here", *(["const images *sums"] if _has_sums(looped) else [])]
     if sharing is Sharing.BY_PLACES:
         zero.append("const int whole = here->whole;")
     unused = ["(void)here;"] if sharing is Sharing.ALONE else []
@@ -132,6 +187,37 @@ def _force_text(program: Program, looped: LoopedKernel) -> str:
     if text.count("given") == 1:  # among the arguments
         text = nest.function(name, arguments, ["(void)given;", *unused, *zero, *lines], values=values)
     return f"{text}\n\n{_sharing_text(program, looped)}"
+
+
+def _circulant_text(program: Program, looped: LoopedKernel) -> str:
+    """Return functions that describe the circulant matrix of a term and return its factor, and that add its energy."""
+    nest, name, scalar = Nest(program.layout, looped, "lanes", "X"), looped.kernel.name, looped.scalar
+    matrix = _matrix_of_pairs(program, looped)
+    unit = f"parameters[{len(program.layout.parameters)}] = 1.0;"
+    lines = [
+        f"*matrix = {matrix};",
+        *(f"u[{k}] = lanes_of({1 - k % 2}.0);" for k in range(len(looped.reads))),
+        unit,
+        f"{name}(u, t, parameters, value);",
+        "return value[0];",
+    ]
+    arguments = ["const problem *given", "times t", "circulant *matrix"]
+    force = nest.function(f"static lanes describe_{name}", arguments, lines, values="lanes value[2]")
+    return f"{force}\n\n{_energy_text(program, looped, scalar, before=[unit])}" if scalar else force
+
+
+def _matrix_of_pairs(program: Program, looped: LoopedKernel) -> str:
+    """Return the description of the circulant matrix of a sum over pairs in C."""
+    array, name = looped.reads[0].array, looped.given[0].array.name
+    return f"(circulant){_circulant_matrix(program, array, looped.circulant or 0, name, 0)}"
+
+
+def _circulant_matrix(program: Program, array: Array, axis: int, coefficients: str, power: int) -> str:
+    """Return the initialiser of the description of a circulant matrix in C."""
+    outer, inner = (product_text(replace(array, axes=axes)) for axes in (array.axes[:axis], array.axes[axis + 1 :]))
+    plan, size = _plans(program).index((coefficients, power)), size_text(array.axes[axis])
+    field = [each.name for each in program.layout.fields].index(coefficients)
+    return f"{{start_{array.name}, {outer}, {size}, {inner}, given->field[{field}], {power}, {plan}}}"
 
 
 def _list_text(program: Program, components: int, lengths: LoopedKernel) -> str:
@@ -166,19 +252,30 @@ def _function(
     *,
     values: int = 1,
     source: str = "X",
+    before: Sequence[str] = (),
 ) -> str:
-    """Return a function of numbers with the same statements for every element."""
+    """Return a function of numbers with the same statements for every element, and others before."""
     nest = Nest(program.layout, looped, "double", source)
-    text = ["(void)given;", *nest.text(innermost=lines)]
+    text = ["(void)given;", *before, *nest.text(innermost=lines)]
     declared = f"double value[{values}]" if values else ""
     return nest.function(f"static void {name}", ["const problem *given", *arguments], text, values=declared)
 
 
-def _energy_text(program: Program, looped: LoopedKernel, kernel: Kernel) -> str:
-    """Return a function that computes the sum of the terms."""
+def _energy_text(
+    program: Program, looped: LoopedKernel, kernel: Kernel, *, declared: bool = False, before: Sequence[str] = ()
+) -> str:
+    """Return a function that sums the terms; ``before``: for the factor of a circulant matrix, at u = (1, 0)."""
     arguments = ["const double *q", "double t", "compensated *total"]
-    lines = [f"{kernel.name}(u, t, parameters, value);", "add_to_sum(total, value[0]);"]
-    return _function(program, looped, f"sum_{kernel.name}", arguments, lines, source="q")
+    arguments += ["const double *image", "long long length"] if _has_sums(looped) else []
+    call = f"{kernel.name}(u, t, parameters, value);"
+    if declared:
+        return f"static void sum_{kernel.name}(const problem *given, {', '.join(arguments)});"
+    if before:
+        matrix = _matrix_of_pairs(program, looped)
+        added = "if (add_energy(&matrix, q, value[0], total))"
+        before = [f"const circulant matrix = {matrix};", "u[0] = 1.0, u[1] = 0.0;", *before, call, added, "  return;"]
+    lines = [call, "add_to_sum(total, value[0]);"]
+    return _function(program, looped, f"sum_{kernel.name}", arguments, lines, source="q", before=before)
 
 
 def _mass_text(program: Program, looped: LoopedKernel) -> str:
@@ -247,11 +344,6 @@ def _lattice_context(program: Program) -> dict[str, Any]:
         "components": sum(map(_components, program.layout.coordinates)),
         "sizes": list(sizes_text(program.layout, " ".join(lines))),
     }
-
-
-def _roots_per_coordinate(program: Program) -> int:
-    """Return the doubles per coordinate that suffice for the roots of unity of every axis."""
-    return 2 * max(map(_axes, program.layout.coordinates))
 
 
 def _axes(array: Array) -> int:

@@ -10,7 +10,18 @@ from typing import TypeAlias
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.equations import FixedPointIteration
-from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Number, Operation, Part, kept_length, parts
+from scvi_codegen.ir.kernel import (
+    Constant,
+    Expression,
+    Kernel,
+    Load,
+    Number,
+    Operation,
+    Part,
+    kept_length,
+    parts,
+    subexpressions,
+)
 from scvi_codegen.rendering.text import TOLERANCE
 from scvi_codegen.tables.precision import mp, nearest_float, settled
 
@@ -54,10 +65,6 @@ class Target:
             return repr(nearest)
         text = f"{nearest:.{self.digits}g}"
         return f"{text}{self.suffix}" if "." in text or "e" in text else f"{text}.0{self.suffix}"
-
-    def function(self, name: str) -> str:
-        """Return the name of a function of libm."""
-        return f"{name}{self.suffix}"
 
     def check(self, values: Iterable[Number]) -> None:
         """Raise :class:`MethodError` for numbers of a model outside the range of the target."""
@@ -109,12 +116,11 @@ def print_number(value: Number, target: Target = DOUBLE) -> str:
     return target.number(value)
 
 
-def print_expression(expression: Expression, target: Target = DOUBLE) -> str:
-    """Return the C source of an expression over ``u``, ``t``, ``parameters`` and temporaries ``w<k>``."""
-    return _print(expression, 0, target)
+def print_expression(expression: Expression, target: Target = DOUBLE, context: int = 0) -> str:
+    """Return the C source of an expression over ``u``, ``t``, ``parameters`` and temporaries ``w<k>``.
 
-
-def _print(expression: Expression, context: int, target: Target) -> str:
+    It has parentheses if its precedence is below ``context``.
+    """
     if isinstance(expression, Constant):
         text = print_number(expression.value, target)
         return f"({text})" if text.startswith("-") and context else text
@@ -122,19 +128,15 @@ def _print(expression: Expression, context: int, target: Target) -> str:
         return _load(expression)
     operator, operands = expression.operator, expression.operands
     if operator not in PRECEDENCE:
-        return f"{_function(operator, target)}({', '.join(_print(operand, 0, target) for operand in operands)})"
+        name = operator if operator.startswith(OWN_FUNCTIONS) else f"{operator}{target.suffix}"
+        return f"{name}({', '.join(print_expression(operand, target) for operand in operands)})"
     level = PRECEDENCE[operator]
     if operator == "neg":
-        text = f"-{_print(operands[0], level + 1, target)}"
+        text = f"-{print_expression(operands[0], target, level + 1)}"
     else:
-        left, right = operands
-        text = f"{_print(left, level, target)} {operator} {_print(right, level + 1, target)}"
+        left, right = (print_expression(each, target, level + k) for k, each in enumerate(operands))
+        text = f"{left} {operator} {right}"
     return f"({text})" if level < context else text
-
-
-def _function(operator: str, target: Target) -> str:
-    """Return the name of a function: those of libm have one for each type."""
-    return operator if operator.startswith(OWN_FUNCTIONS) else target.function(operator)
 
 
 def _load(load: Load) -> str:
@@ -176,13 +178,7 @@ def _functions(part: Part, wanted: Callable[[Expression], bool]) -> set[str]:
 
 
 def _expressions(part: Part) -> Iterator[Expression]:
-    """Yield every expression of a part, with its subexpressions."""
-    pending: list[Expression] = [expression for _, _, expression in part.statements]
-    while pending:
-        expression = pending.pop()
-        yield expression
-        if isinstance(expression, Operation):
-            pending.extend(expression.operands)
+    return subexpressions(*(expression for _, _, expression in part.statements))
 
 
 def print_statements(code: Kernel | Part, target: Target = DOUBLE) -> list[str]:
@@ -209,7 +205,7 @@ def print_lane_statements(code: Kernel | Part, fixed_point: FixedPointIteration,
     vectors = _Vectors(cut[0], sources)
     statements = []
     for kind, k, expression in cut[0].statements:
-        text, vector = _print_lanes(expression, vectors), vectors.has(expression)
+        text, vector = print_expression(_with_lane_calls(expression, vectors)), vectors.has(expression)
         if kind == "w":
             statements.append(f"const {'lanes' if vector else 'double'} w{k} = {text};")
         else:
@@ -244,10 +240,6 @@ class _Vectors:
                 expression.source == "w" and expression.index in self.temporaries
             )
         return isinstance(expression, Operation) and any(self.has(operand) for operand in expression.operands)
-
-
-def _print_lanes(expression: Expression, vectors: _Vectors) -> str:
-    return print_expression(_with_lane_calls(expression, vectors))
 
 
 def _with_lane_calls(expression: Expression, vectors: _Vectors) -> Expression:

@@ -101,11 +101,7 @@ class IterationSource:
 
 
 def iteration_source(
-    fixed_point: FixedPointIteration,
-    meaning: Lanes,
-    *,
-    kernels: Sequence[Kernel] | None = None,
-    changes: bool = False,
+    fixed_point: FixedPointIteration, meaning: Lanes, *, kernels: Sequence[Kernel] | None = None, changes: bool = False
 ) -> IterationSource:
     """Return the template data of a fixed-point iteration.
 
@@ -143,10 +139,8 @@ def iteration_source(
 
 
 def _kept(fixed_point: FixedPointIteration) -> dict[str, str]:
-    """Return the macros of the error estimate.
-
-    Coefficient k of velocities is h / (4k - 2) times coefficient k - 1 of accelerations.
-    """
+    """Return the macros of the error estimate."""
+    # coefficient k of velocities is h / (4k - 2) times coefficient k - 1 of accelerations
     velocities, degree = fixed_point.kept is StoredValues.VELOCITIES, fixed_point.guess.degree
     forces = fixed_point.kept is StoredValues.FORCES
     return {
@@ -171,8 +165,7 @@ def _tables(fixed_point: FixedPointIteration, meaning: Lanes, *, changes: bool) 
     one_each = fixed_point.in_groups and not meaning.are_points
     points = len(fixed_point.guess.abscissae) if one_each else 0
     for each in (*fixed_point.tables, *(fixed_point.derivatives_tables if changes else ())):
-        numbers = _in_order(each.numbers, exchanges=fixed_point.exchanges) if each.is_matrix else each.numbers
-        yield _table(each.name, numbers, points, groups=fixed_point.in_groups)
+        yield _table(each.name, each.numbers, points, groups=fixed_point.in_groups)
         if each.in_two_parts:
             low = tuple(tuple(map(DOUBLE.rest, x)) if each.is_matrix else DOUBLE.rest(x) for x in each.numbers)
             yield _table(f"{each.name}_LOW", low, points, groups=fixed_point.in_groups)
@@ -193,33 +186,17 @@ def _table(name: str, numbers: tuple[Number, ...] | NumberTable, points: int = 0
 HEAD = "/* Predictor tables from former steps to the next, by changes of the step-size level. Requires: points.h. */\n"
 
 
-def _in_order(rows: NumberTable, *, exchanges: bool) -> NumberTable:
-    """Return a table for sums over points, whose column c + m has in row k the entry (k ^ c, k ^ m) if lanes exchange.
-
-    c are the multiples of 4, m the numbers below it.
-    """
-    if not exchanges:
-        return rows
-    size = len(rows)
-    inner = min(size, 4)
-    return tuple(tuple(rows[k ^ j ^ j % inner][k ^ j % inner] for j in range(size)) for k in range(size))
+def predictor_text(predictor: AdaptivePredictor) -> str:
+    """Return the header."""
+    return HEAD + "".join(f"{table}\n" for table in _predictor_tables(predictor))
 
 
-def predictor_text(predictor: AdaptivePredictor, *, exchanges: bool) -> str:
-    """Return the header; ``exchanges``: of an iteration whose sums over points exchange lanes."""
-    return HEAD + "".join(f"{table}\n" for table in _predictor_tables(predictor, exchanges=exchanges))
-
-
-def _predictor_tables(predictor: AdaptivePredictor, *, exchanges: bool) -> Iterator[str]:
+def _predictor_tables(predictor: AdaptivePredictor) -> Iterator[str]:
     """Yield the tables from stored values to predicted ones: of the last step, and of each of the last two."""
-
-    def columns(rows: NumberTable) -> list[str]:
-        return _columns(_in_order(rows, exchanges=exchanges))
-
     changes, size = len(predictor.alone), "[POINTS * GROUPS]"
-    yield table(f"static const lanes PREDICTOR_ALONE[{changes}]{size}", [columns(each) for each in predictor.alone])
+    yield table(f"static const lanes PREDICTOR_ALONE[{changes}]{size}", list(map(_columns, predictor.alone)))
     for name, lines in (("LAST", predictor.last), ("BEFORE", predictor.before)):
-        rows = [[f"{{{', '.join(columns(each))}}}" for each in line] for line in lines]
+        rows = [[f"{{{', '.join(_columns(each))}}}" for each in line] for line in lines]
         yield table(f"static const lanes PREDICTOR_{name}[{changes}][{changes}]{size}", rows)
 
 

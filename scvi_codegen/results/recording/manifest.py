@@ -22,6 +22,7 @@ from scvi_codegen.rendering.source import Interface, Source, check_interface
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.validation import checked_count
@@ -40,11 +41,13 @@ class Chunk:
         piece: the states.
         step: number of steps at the checkpoint.
         memory: memory of the run, as returned by :meth:`Run.checkpoint`.
+        crossings: (k, 2 + 2m) crossings of events in these steps: number of the event, t, q, p.
     """
 
     piece: Piece
     step: int
     memory: bytes
+    crossings: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.piece[0])
@@ -84,7 +87,8 @@ def write_chunk(folder: Path, number: int, chunk: Chunk) -> None:
     buffer = io.BytesIO()  # a full disk then fails in one plain write
     t, q, p, iterations = chunk.piece
     memory = np.frombuffer(chunk.memory, dtype=np.uint8)
-    np.savez(buffer, t=t, q=q, p=p, iterations=iterations, step=np.int64(chunk.step), memory=memory)
+    further: dict[str, Any] = {"step": np.int64(chunk.step), "memory": memory, "crossings": chunk.crossings}
+    np.savez(buffer, t=t, q=q, p=p, iterations=iterations, **further)
     write_atomically(chunk_path(folder, number), lambda file: file.write(buffer.getbuffer()))
     sync_folder(folder)
 
@@ -98,7 +102,8 @@ def read_chunk(path: Path, dimension: int | None = None, rows: int | None = None
     try:
         with path.open("rb") as file, loaded(file) as arrays:
             t, q, p, iterations = (arrays[name] for name in COLUMNS)
-            chunk = Chunk((t, q, p, iterations), int(arrays["step"]), arrays["memory"].tobytes())
+            crossings = arrays["crossings"] if "crossings" in arrays else np.empty((0, 2 + 2 * q.shape[-1]))
+            chunk = Chunk((t, q, p, iterations), int(arrays["step"]), arrays["memory"].tobytes(), crossings)
             _check_shapes(chunk, q.shape[-1] if dimension is None else dimension, rows)
             return chunk
     except (OSError, ValueError) as error:
@@ -112,6 +117,9 @@ def _check_shapes(chunk: Chunk, dimension: int, rows: int | None) -> None:
     for name, column, like in zip(COLUMNS, columns, likes, strict=True):
         if column.shape != (len(chunk), *like.shape[1:]) or column.dtype != like.dtype:
             raise ValueError(f"{name} has the shape {column.shape} and the type {column.dtype}")
+    crossings = chunk.crossings
+    if crossings.ndim != 2 or crossings.shape[1] != 2 + 2 * dimension or crossings.dtype != np.float64:
+        raise ValueError(f"crossings has the shape {crossings.shape} and the type {crossings.dtype}")
     if chunk.step < 0 or (rows is not None and len(chunk) > rows):
         raise ValueError(f"it has {len(chunk)} states up to step {chunk.step}")
 
@@ -166,6 +174,7 @@ class Manifest:
         model: text of the model file, if there is one.
         certificate: verification report as JSON, if there is one.
         builds: the build at the start, then each that continued the run.
+        events: events of the run, which the source does not contain.
     """
 
     source: Source
@@ -183,14 +192,17 @@ class Manifest:
     certificate: Any
     builds: tuple[Build, ...]
     fallback: Source | None = None
+    events: tuple[Event, ...] = ()
 
-    def stepper(self) -> Stepper:
-        """Return the integrator, compiled or loaded from the cache."""
-        return Stepper(self.source, self.interface, variants=Variants({"fallback": self.fallback}), flags=self.flags)
+    def stepper(self, mesh: Any = None) -> Stepper:
+        """Return the integrator, compiled or loaded from the cache; ``mesh``: of the fields of a density."""
+        variants = Variants({"fallback": self.fallback})
+        interface = replace(self.interface, layout=replace(self.interface.layout, mesh=mesh))
+        return Stepper(self.source, interface, variants=variants, flags=self.flags, events=self.events)
 
     def reached(self, run: Run) -> bool:
         """Return whether a run has reached its end."""
-        return run.arrived if self.steps is None else run.steps >= self.steps
+        return run.ended or (run.arrived if self.steps is None else run.steps >= self.steps)
 
     def continued_by(self, build: Build) -> Manifest:
         """Return the manifest with ``build`` continuing the run."""
@@ -244,6 +256,7 @@ class Manifest:
             "interface": self.interface.to_record(),
             "source": self.source.to_record(),
             **({"fallback": self.fallback.to_record()} if self.fallback else {}),
+            **({"events": [event.table for event in self.events]} if self.events else {}),
         }
         return json.dumps(document, indent=1) + "\n"
 
@@ -266,6 +279,7 @@ class Manifest:
             interface=Interface.from_record(document["interface"]),
             source=Source.from_record(document["source"]),
             fallback=Source.from_record(document["fallback"]) if "fallback" in document else None,
+            events=tuple(Event(**table) for table in document.get("events", ())),
         )
         manifest.check()
         return manifest

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -17,7 +17,11 @@ from scvi_codegen.files.export import COLUMNS, Piece, States, write_states
 from scvi_codegen.files.labelled_arrays import checked_units
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.results.recording.manifest import Chunk, chunk_paths, no_states, read_chunk, read_manifest
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.events.event import Crossings
+from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.rotations.quantities import named_quantities
+from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.run_loop import first_step_size, trajectory_of
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.quantities import quantities
@@ -25,25 +29,25 @@ from scvi_codegen.runtime.trajectory.saved_states import checked_row
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import checks_arguments
 
-if TYPE_CHECKING:
-    from scvi_codegen.runtime.core.stepper import Stepper
-    from scvi_codegen.runtime.run.run import Run
-
 Array = NDArray[np.float64]
 PIECES_IN_MEMORY = 2
 
 
 @checks_arguments()
-def load_run(folder: str | os.PathLike[str]) -> RecordedRun:
+def load_run(folder: str | os.PathLike[str], *, mesh: Any = None) -> RecordedRun:
     """Return the run recorded in a folder, as far as it goes; another process may still be recording it.
+
+    Args:
+        folder: the folder.
+        mesh: of the fields of a density, which the folder does not contain: for :meth:`RecordedRun.unresolved`.
 
     Raises:
         RecordingError: if there is none, or a file of it is missing or damaged.
     """
-    return RecordedRun(Path(folder))
+    return RecordedRun(Path(folder), mesh)
 
 
-class RecordedRun:
+class RecordedRun(AttitudeHistory):
     """Run recorded in a folder; states are read on access.
 
     Indexing returns a :class:`Trajectory`: ``run[-1000:]``, ``run[::100]``; ``run.pieces()`` iterates over parts that
@@ -52,11 +56,12 @@ class RecordedRun:
     Attributes:
         folder: the folder.
         manifest: description of the run.
+        mesh: of the fields of a density, or ``None``.
         t, q, p, iterations: lazy arrays of shapes (n,), (n, m), (n, m), (n,); ``numpy.asarray`` reads them in full.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.manifest = folder, read_manifest(folder)
+    def __init__(self, folder: Path, mesh: Any = None) -> None:
+        self.folder, self.manifest, self.mesh = folder, read_manifest(folder), mesh
         try:
             self._paths = chunk_paths(folder)
         except OSError as error:
@@ -94,7 +99,7 @@ class RecordedRun:
     @cached_property
     def stepper(self) -> Stepper:
         """The integrator, compiled from the source in the manifest."""
-        return self.manifest.stepper()
+        return self.manifest.stepper(self.mesh)
 
     @property
     def steps(self) -> int:
@@ -105,7 +110,20 @@ class RecordedRun:
     def finished(self) -> bool:
         """Return whether the run has reached its end."""
         plan, steps = self.manifest.plan, self.manifest.steps
-        return bool(plan and self.t[-1] == plan.t_end) if steps is None else self.steps >= steps
+        arrived = bool(plan and self.t[-1] == plan.t_end) if steps is None else self.steps >= steps
+        return arrived or (bool(self.manifest.events) and self._checkpointed_run.ended)
+
+    @cached_property
+    def events(self) -> tuple[Crossings, ...]:
+        """Crossings of the events of the run."""
+        paths, events = self._paths[:-1], self.manifest.events
+        rows = [*(self._read(path).crossings for path in paths if events), self._last.crossings]
+        e, t, *states = np.concatenate(rows).T
+        q, p = np.split(np.transpose(states), 2, axis=1)
+        every, none = enumerate(events), np.zeros(len(t), np.int64)
+        return tuple(
+            Crossings(event=event, t=t[e == k], q=q[e == k], p=p[e == k], element=none[e == k]) for k, event in every
+        )
 
     @cached_property
     def h(self) -> float:
@@ -194,9 +212,22 @@ class RecordedRun:
                 result[some] = self.piece(number)[column][offsets]
         return results
 
+    @property
+    def velocity(self) -> Array:
+        """(n, m) velocities."""
+        return np.concatenate([piece.velocity for piece in self.pieces()])
+
     def energy(self) -> Array:
         """Return (n,) energies p.v - L."""
         return np.concatenate([piece.energy() for piece in self.pieces()])
+
+    def unresolved(self) -> Array:
+        """Return (n,) parts of the squared amplitude of fields in the highest modes, as :meth:`Trajectory.unresolved`.
+
+        Raises:
+            MethodError: if there is no mesh: pass ``load_run(folder, mesh=mesh)``.
+        """
+        return np.concatenate([piece.unresolved() for piece in self.pieces()])
 
     def states(self, units: Mapping[str, str] | None = None) -> States:
         """Return the states for :mod:`scvi_codegen.files.export`, read file by file."""
@@ -231,14 +262,17 @@ class RecordedRun:
         taken = manifest.save_every * rows
         transformed = bool(manifest.interface.energy_parameter)
         tau = times_after(0.0, manifest.h, taken)[0] if transformed else None
-        trajectory = trajectory_of(run, (t, q, p, iterations), self._lengths(t, rows), tau=tau)
+        lengths, low, high = self._lengths(t, rows), t.min(initial=np.inf), t.max(initial=-np.inf)
+        events = tuple(each.chosen((each.t >= low) & (each.t <= high)) for each in self.events)
+        trajectory = trajectory_of(run, (t, q, p, iterations), lengths, tau=tau, events=events)
         trajectory.h = self.h
         return trajectory
 
     def _lengths(self, t: Array, rows: NDArray[np.int64]) -> Array:
-        """Return (n,) sizes of the steps after the states; NaN for an adaptive step whose end is not saved."""
+        """Return (n,) sizes of the steps after the states; NaN for steps with states that are not saved."""
         if self.manifest.plan is None:
-            return np.broadcast_to(self.manifest.h, t.shape)
+            changes = any(event.changes_state for event in self.manifest.events)
+            return np.broadcast_to(np.nan if changes else self.manifest.h, t.shape)
         sizes = np.where((np.diff(rows) == 1) & (self.manifest.save_every == 1), np.diff(t), np.nan)
         return np.append(sizes, np.nan)[: len(t)]
 

@@ -11,11 +11,12 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
-from scvi_codegen.errors import RecordingError, RecordingWarning, StateError, StepFailedError, warn
+from scvi_codegen.errors import EventError, RecordingError, RecordingWarning, StateError, StepFailedError, warn
 from scvi_codegen.files.atomic import sync_folder
 from scvi_codegen.files.export import Piece, chunk_rows
 from scvi_codegen.native.arguments import checked_number
@@ -34,7 +35,9 @@ from scvi_codegen.results.recording.manifest import (
     write_manifest,
 )
 from scvi_codegen.results.recording.reading import RecordedRun, load_run
+from scvi_codegen.runtime.run.accuracy import warn_of_energy_error, warn_of_large_steps, warn_of_unresolved_fields
 from scvi_codegen.runtime.run.chunks import drive
+from scvi_codegen.runtime.run.observation import Observation
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.run_loop import record
 from scvi_codegen.runtime.run.step_plan import StepPlan
@@ -92,11 +95,11 @@ def record_run(
     if run.steps:
         raise StateError(f"record_run requires a run at its start, but this run has {run.steps} steps: start a new one")
     _check_inputs(run)
-    run.stepper._check_no_changes("record_run")
     run = _of_known_sizes(run)
     check_flags(run.stepper.flags, StateError)
     manifest = Manifest(
-        source=run.stepper.source,
+        source=run.stepper._plain,
+        events=run.stepper.events,
         fallback=run.stepper.fallback,
         interface=run.stepper.interface,
         flags=run.stepper.flags,
@@ -118,12 +121,12 @@ def record_run(
     with _locked(target), run.alone():
         with recorder.reporting_recovery():
             _clear(target)
-            recorder.keep(_piece(record(run, 0), 0))
+            recorder.keep(record(run, 0), 0)
             recorder.write()
             write_manifest(target, manifest)
             sync_folder(target)
         recorder.advance(progress, stop)
-    return load_run(target)
+    return _checked(target, run)
 
 
 @checks_arguments(checkpoint_seconds=REAL)
@@ -136,6 +139,7 @@ def resume_run(
     checkpoint_steps: int | None = None,
     progress: Callable[[int], None] | None = None,
     stop: Callable[[], bool] | None = None,
+    mesh: Any = None,
 ) -> RecordedRun:
     """Restart a recorded run from its last checkpoint, bitwise equal to an uninterrupted run.
 
@@ -145,6 +149,7 @@ def resume_run(
         t_end: new target time of an adaptive run, not before its current time. A run that had arrived continues from
             there; its shortened last step remains.
         checkpoint_seconds, checkpoint_steps, progress, stop: as of :func:`record_run`.
+        mesh: as of :func:`load_run`.
 
     Returns:
         The recorded run.
@@ -161,11 +166,17 @@ def resume_run(
     target = Path(folder)
     read_manifest(target)  # a folder without one is not locked
     with _locked(target):
-        recorded = load_run(target)
+        recorded = load_run(target, mesh=mesh)
         run, manifest = recorded.resumed(), recorded.manifest
         continued = manifest.continued_by(Build.of(run.stepper, run.steps))
         if len(continued.builds) > len(manifest.builds):
-            _warn_of_another_build(manifest.builds[-1], continued.builds[-1])
+            before, now = manifest.builds[-1], continued.builds[-1]
+            warn(
+                f"from step {now.step} on another build is used ({now.compiler}; before: {before.compiler}): another "
+                "compiler, processor or Python. States may differ in the last bits from those of an uninterrupted run; "
+                "the manifest records this",
+                RecordingWarning,
+            )
         continued, run.plan = _extended(continued, run, steps, t_end)
         recorder = _Recorder(target, continued, run, *_checked_checkpoints(checkpoint_seconds, checkpoint_steps))
         recorder.load_last_file(target)
@@ -173,7 +184,17 @@ def resume_run(
             _remove(unfinished(target))
             write_manifest(target, continued)  # fails early if the folder cannot be written
         recorder.advance(progress, stop)
-    return load_run(target)
+    return _checked(target, run)
+
+
+def _checked(folder: Path, run: Run) -> RecordedRun:
+    """Return the run in a folder, with the accuracy warnings of a run in memory."""
+    recorded = load_run(folder, mesh=run.stepper.interface.layout.mesh)
+    if not run._leaving:
+        warn_of_large_steps(cast(Any, run))
+    warn_of_energy_error(recorded[:: max(1, len(recorded) - 1)], run)
+    warn_of_unresolved_fields(cast(Any, recorded))
+    return recorded
 
 
 class _Recorder:
@@ -183,7 +204,9 @@ class _Recorder:
         self.folder, self.manifest, self.run = folder, manifest, run
         self.seconds, self.steps = seconds, steps
         self.number, self.written, self.written_t = 0, -1, run.t
-        self.pending: tuple[list[Piece], int, float, bytes] = ([], run.steps, run.t, run.checkpoint())
+        self.crossings = np.empty((0, 2 + 2 * run.stepper.dimension))
+        self.pending: tuple[list[Piece], NDArray[np.float64], int, float, bytes]
+        self.pending = [], self.crossings, run.steps, run.t, run.checkpoint()
 
     def load_last_file(self, folder: Path) -> None:
         """Load the last file in order to complete it."""
@@ -191,7 +214,8 @@ class _Recorder:
         chunk = read_chunk(paths[-1])
         full = len(chunk) == self.manifest.rows
         self.number = len(paths) - 1 + full
-        self.pending = ([] if full else [chunk.piece], chunk.step, self.run.t, chunk.memory)
+        pieces, crossings = ([], self.crossings) if full else ([chunk.piece], chunk.crossings)
+        self.pending = (pieces, crossings, chunk.step, self.run.t, chunk.memory)
         self.written = chunk.step
 
     def advance(self, progress: Callable[[int], None] | None, stop: Callable[[], bool] | None) -> None:
@@ -202,7 +226,8 @@ class _Recorder:
             nonlocal checked
             before = run.steps
             self._advance(min(size, self._most_steps()))
-            if self._rows() == manifest.rows or time.monotonic() - checked >= self.seconds or self._at_checkpoint():
+            due = self.steps is not None and run.steps % self.steps == 0
+            if due or self._rows() == manifest.rows or time.monotonic() - checked >= self.seconds:
                 self.checkpoint()
                 checked = time.monotonic()
             return run.steps - before
@@ -229,12 +254,17 @@ class _Recorder:
         self.checkpoint()
 
     def _advance(self, steps: int) -> None:
+        run, save_every = self.run, self.manifest.save_every
         try:
-            self.keep(_piece(record(self.run, steps, save_every=self.manifest.save_every), 1))
-        except StepFailedError as error:
+            if run.stepper.events:
+                trajectory = Observation(run, save_every=save_every, within_steps=False).advance(steps)
+            else:
+                trajectory = record(run, steps, save_every=save_every)
+        except (StepFailedError, EventError) as error:
             if isinstance(error.trajectory, Trajectory):
-                self.keep(_piece(error.trajectory, 1))
+                self.keep(error.trajectory, 1)
             raise
+        self.keep(trajectory, 1)
 
     def _most_steps(self) -> int:
         """Return the number of steps to the end, the end of the current file, or the next checkpoint."""
@@ -245,15 +275,16 @@ class _Recorder:
             ends.append((done // self.steps + 1) * self.steps)
         return min(ends) - done
 
-    def _at_checkpoint(self) -> bool:
-        return self.steps is not None and self.run.steps % self.steps == 0
-
     def _rows(self) -> int:
         return sum(len(piece[0]) for piece in self.pending[0])
 
-    def keep(self, piece: Piece) -> None:
-        """Store states and memory in one assignment, so that they stay consistent after an interruption."""
-        self.pending = ([*self.pending[0], piece], self.run.steps, self.run.t, self.run.checkpoint())
+    def keep(self, trajectory: Trajectory, first: int) -> None:
+        """Store states from row ``first`` on and memory in one assignment, consistent after an interruption."""
+        run, (pieces, crossings, *_) = self.run, self.pending
+        piece = trajectory.t[first:], trajectory.q[first:], trajectory.p[first:], trajectory.iterations[first:]
+        columns = [(np.full(len(each), k), each.t, each.q, each.p) for k, each in enumerate(trajectory.events)]
+        crossings = np.concatenate([crossings, *map(np.column_stack, columns)])
+        self.pending = ([*pieces, piece], crossings, run.steps, run.t, run.checkpoint())
 
     def checkpoint(self) -> None:
         """Write the states computed since the last checkpoint.
@@ -266,15 +297,16 @@ class _Recorder:
 
     def write(self) -> None:
         """Replace the current file, and begin the next one if it is full."""
-        pieces, step, reached, memory = self.pending
-        if step == self.written:
+        pieces, crossings, step, reached, memory = self.pending
+        if (step, reached) == (self.written, self.written_t):
             return
         t, q, p, iterations = map(np.concatenate, zip(no_states(self.run.stepper.dimension), *pieces, strict=True))
         piece = (t, q, p, iterations)
-        write_chunk(self.folder, self.number, Chunk(piece, step, memory))
+        write_chunk(self.folder, self.number, Chunk(piece, step, memory, crossings))
         self.written, self.written_t = step, reached
         full = len(t) == self.manifest.rows
-        self.number, self.pending = self.number + full, ([] if full else [piece], step, reached, memory)
+        pieces, crossings = ([], self.crossings) if full else ([piece], crossings)
+        self.number, self.pending = self.number + full, (pieces, crossings, step, reached, memory)
 
     @contextmanager
     def reporting_recovery(self) -> Iterator[None]:
@@ -284,17 +316,14 @@ class _Recorder:
         except RecordingError:
             raise
         except OSError as error:
-            raise RecordingError(self._recovery_message(error)) from error
-
-    def _recovery_message(self, error: OSError) -> str:
-        problem = f"'{self.folder}' cannot be written: {error.strerror or error}"
-        if self.written < 0:
-            return f"{problem}. Nothing was recorded"
-        return (
-            f"{problem}. It contains the run up to step {self.written} (t = {self.written_t:g}); "
-            f"{self.run.steps - self.written} later steps are not saved. When it can be written, continue with "
-            f"'scvi-codegen run --resume {shlex.quote(str(self.folder))}' or resume_run"
-        )
+            problem = f"'{self.folder}' cannot be written: {error.strerror or error}"
+            if self.written < 0:
+                raise RecordingError(f"{problem}. Nothing was recorded") from error
+            raise RecordingError(
+                f"{problem}. It contains the run up to step {self.written} (t = {self.written_t:g}); "
+                f"{self.run.steps - self.written} later steps are not saved. When it can be written, continue with "
+                f"'scvi-codegen run --resume {shlex.quote(str(self.folder))}' or resume_run"
+            ) from error
 
 
 def _check_inputs(run: Run) -> None:
@@ -331,25 +360,12 @@ def _extended(manifest: Manifest, run: Run, steps: int | None, t_end: float | No
     return replace(manifest, plan=plan), plan
 
 
-def _piece(trajectory: Trajectory, first: int) -> Piece:
-    """Return the states of a trajectory from row ``first`` on."""
-    return trajectory.t[first:], trajectory.q[first:], trajectory.p[first:], trajectory.iterations[first:]
-
-
 def _of_known_sizes(run: Run) -> Run:
     """Return the run of the stepper with known sizes from the same state."""
-    stepper, plan = run.stepper, run.plan
-    if stepper.known is stepper:
+    if run.stepper.known is run.stepper:
         return run
-    return Run.started(
-        stepper.known,
-        run.q,
-        run.p,
-        plan=plan,
-        t=run.t,
-        parameters=run.parameters,
-        options=run.options,
-    )
+    known = run.stepper._known_with_events
+    return Run.started(known, run.q, run.p, plan=run.plan, t=run.t, parameters=run.parameters, options=run.options)
 
 
 def _checked_checkpoints(seconds: float, steps: int | None) -> tuple[float, int | None]:
@@ -416,12 +432,3 @@ def _locked(folder: Path) -> Iterator[None]:
         with suppress(OSError):  # Windows removes it on release
             (folder / LOCK).unlink()
         lock.release()
-
-
-def _warn_of_another_build(before: Build, now: Build) -> None:
-    warn(
-        f"from step {now.step} on another build is used ({now.compiler}; before: {before.compiler}): another compiler, "
-        "processor or Python. States may differ in the last bits from those of an uninterrupted run; the manifest "
-        "records this",
-        RecordingWarning,
-    )

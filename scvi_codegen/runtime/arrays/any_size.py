@@ -16,11 +16,13 @@ from scvi_codegen.rendering.source import ArrayLayout, Interface
 from scvi_codegen.runtime.arrays.interface import RunSizes, first_state, read_arrays
 from scvi_codegen.runtime.core.validation import EntryNames
 from scvi_codegen.runtime.rotations.attitudes import quaternions
+from scvi_codegen.runtime.rotations.states import homogeneous_state
 from scvi_codegen.validation import MAPPING, check_kind, checked_count
 
-MOST_COORDINATES = 2000
-"""Largest number of coordinates that are compiled with known sizes for what requires it."""
-AT_REST = ("start", "integrate", "project")
+MOST_COORDINATES, MOST_OF_MESH = 2000, 64
+"""Largest numbers of coordinates that are compiled with known sizes for what requires it: in general, and for Newton's
+method on a mesh."""
+AT_REST = ("start", "integrate", "project", "integrate_ensemble", "chaos_indicators_ensemble")
 """Methods whose initial velocity is 0 if neither p nor velocity is passed."""
 
 
@@ -65,7 +67,7 @@ def _call(
     **others: Any,
 ) -> Any:
     """Call a method of the stepper that is bound to the arrays of the call."""
-    threads = others.pop("threads", None) if name in AT_REST else None
+    threads = others.pop("threads", None) if name in ("start", "integrate") else None
     if others.get("events") is not None:
         stepper = stepper.with_events(others.pop("events"))
     bound, state = stepper.bind(q, parameters, tables, threads)
@@ -76,7 +78,8 @@ def _call(
         general = layout.momentum_formulas or (stepper._reason and not layout.momenta)
         spins = any(each.startswith("spin") for each in bound.interface.rotations)
         if not (spins or bound.interface.variables):  # their state has momenta of its own
-            others["velocity" if general else "p"] = np.zeros(bound.dimension)
+            positions, *_ = homogeneous_state(bound.interface, state, None, None)
+            others["velocity" if general else "p"] = np.zeros(np.shape(positions))
     return getattr(bound, name)(state, *arguments, parameters=parameters, **others)
 
 
@@ -121,10 +124,13 @@ def check_few_coordinates(interface: Interface, sizes: Mapping[str, int], reason
     if missing := [name for name in interface.layout.sizes if name not in sizes]:
         raise MethodError(f"the size {missing[0]} is missing: give with_sizes({missing[0]}=...)")
     count = sum(int(np.prod(array.shape(sizes))) for array in interface.layout.coordinates)
-    if count > MOST_COORDINATES:
+    of_mesh = reason and interface.layout.mesh and interface.solver == "newton"
+    most = MOST_OF_MESH if of_mesh else MOST_COORDINATES
+    if count > most:
         raise MethodError(
             f"{count} coordinates are too many to compile with known sizes, which this requires: at most "
-            f"{MOST_COORDINATES}{'. ' * bool(reason)}{reason}"
+            f"{most}. Reduce the sizes; derivatives of larger systems are differences of runs"
+            f"{'. ' * bool(reason)}{reason}"
         )
 
 

@@ -113,10 +113,12 @@ class ArrayBinding(Binding):
         return {word: (what, remedy + hint) for word, (what, remedy) in failures.items()}
 
     def new(self, what: str) -> Any:
-        """Return a run with its arrays, or the report of a call, as :meth:`Binding.new` does."""
+        """Return a run with its arrays, the report of a call, or what :meth:`Binding.new` returns."""
         if what == "run *":
             return self._new_run()
-        return SimpleNamespace(failures=self.failures, steps=0, stored=0, iterations=0, change=0.0, t=0.0)
+        if what == "report *":
+            return SimpleNamespace(failures=self.failures, steps=0, stored=0, iterations=0, change=0.0, t=0.0)
+        return super().new(what)
 
     def _new_problem(self) -> Any:
         """Return the C struct of the problem, with its sizes, tables and lists of neighbours."""
@@ -142,7 +144,7 @@ class ArrayBinding(Binding):
             computed |= self._constraint_indices(first, problem)
             lengths["held"] = 11 * first.constraints + 2 * (first.entries + first.pairs)
         if self.envelope is not None:
-            factors = ALIGNMENT + (n + self.envelope.entries) * 2 * self.constant("SHIFTS")
+            factors = ALIGNMENT + self.envelope.numbers * 2 * self.constant("SHIFTS")
             computed |= {"pattern": self.envelope.pattern, "compared_factors": aligned(factors)}
             lengths["factors"] = factors
         size, places = len(bytes(self._ffi.buffer(first))), dict[str, int]()
@@ -186,8 +188,8 @@ class ArrayBinding(Binding):
         return np.frombuffer(self._ffi.buffer(part, 8 * size)) if size else np.empty(0)
 
     def buffer(self, struct: Any) -> Any:
-        """Return the bytes of the state of a run, writable."""
-        return self._arrays[struct].stored
+        """Return the bytes of the state of a run, or of another struct, writable."""
+        return self._arrays[struct].stored if struct in self._arrays else super().buffer(struct)
 
     def has(self, name: str) -> bool:
         """Return whether there is such a function."""

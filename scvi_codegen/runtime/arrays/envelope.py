@@ -1,8 +1,8 @@
 """Order of coupled coordinates in which the factors of the linear part of a step have few entries.
 
-The rows of the factors L D L^T of a matrix have entries from the first column in which the matrix has one (envelope:
-A. Jennings, Comput. J. 9 (1966), 281). Coordinates of parallel arrays are interleaved; those that are coupled across a
-periodic boundary are last.
+The rows of L and the columns of U in the factors L D U of a matrix have entries from the first column in which the
+matrix has one (envelope: A. Jennings, Comput. J. 9 (1966), 281). Coordinates of parallel arrays, and those of a
+Hamiltonian with their momenta, are interleaved; those that are coupled across a periodic boundary are last.
 """
 
 from typing import Any, NamedTuple
@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.errors import StateError
 from scvi_codegen.rendering.source import ArrayLayout
 from scvi_codegen.runtime.arrays.interface import RunSizes
 
@@ -22,20 +23,40 @@ FAR = 0.5
 
 
 class Envelope(NamedTuple):
-    """Pattern for templates/support/arrays/envelope.h, and the number of entries of the factors."""
+    """Pattern for templates/support/arrays/envelope.h, and the number of complex vectors of the factors."""
 
     pattern: NDArray[np.int32]
-    entries: int
+    numbers: int
 
 
 def envelope_of(layout: ArrayLayout, arrays: RunSizes) -> Envelope | None:
-    """Return the envelope of the coordinates of a run; ``None`` without couplings or with too many."""
+    """Return the envelope of the unknowns of a run: coordinates, and the momenta of a Hamiltonian.
+
+    Returns:
+        ``None`` without couplings.
+
+    Raises:
+        StateError: if a linear part that is not symmetric has more couplings than factors can have, since there is no
+            other preconditioner.
+    """
     if not layout.couplings:
         return None
+    found = _envelope(layout, arrays)
+    if found is None and not layout.symmetric:
+        raise StateError(
+            "solver='newton' factorises the linear part of a Hamiltonian or with forces of velocities, with at most "
+            f"{MOST_PER_ROW} entries per row and {MOST_ENTRIES} in all, which this system exceeds: use "
+            "solver='fixed-point', finite differences or spectral elements, or fewer points across"
+        )
+    return found
+
+
+def _envelope(layout: ArrayLayout, arrays: RunSizes) -> Envelope | None:
+    """Return the envelope; ``None`` with too many couplings."""
     pairs = _coupled_pairs(layout, arrays)
     if pairs is None:
         return None
-    shapes = [array.shape(arrays.sizes) for array in layout.coordinates]
+    shapes = [array.shape(arrays.sizes) for array in (*layout.coordinates, *layout.momenta)]
     order, apart = _order(shapes, pairs)
     n, position = len(order), np.empty(len(order), np.int64)
     position[order] = np.arange(n)
@@ -46,30 +67,49 @@ def envelope_of(layout: ArrayLayout, arrays: RunSizes) -> Envelope | None:
     np.minimum.at(first, row, column)
     lengths = np.arange(n) - first + 1
     entries = int(lengths.sum())
-    if entries > min(MOST_ENTRIES, (MOST_PER_ROW if layout.tables else MOST_WITHOUT_TABLES) * n):
+    alone = layout.tables or not layout.symmetric
+    if entries > min(MOST_ENTRIES, (MOST_PER_ROW if alone else MOST_WITHOUT_TABLES) * n):
         return None
     near = row < n - apart
     width = 2 * int((row - column)[near].max(initial=0)) + 1
     across = ~near & (column < n - apart)
     while len(np.unique(row[across] * n + column[across] % width)) < across.sum():
         width += 1  # columns of one colour have no row in common, not one of the last either
+    if not layout.symmetric:
+        both = np.unique(np.concatenate([codes, row * n + column]))
+        column, row = both // n, both % n
     parts = (
         *([min(width, max(1, n - apart)), apart], order, first, np.cumsum(lengths) - lengths),
         *(np.searchsorted(column, np.arange(n + 1)), row),
     )
-    return Envelope(np.concatenate(parts).astype(np.int32), entries)
+    return Envelope(np.concatenate(parts).astype(np.int32), n + (1 if layout.symmetric else 2) * entries)
 
 
 def _coupled_pairs(layout: ArrayLayout, arrays: RunSizes) -> NDArray[np.int64] | None:
     """Return the indices of pairs of coordinates that occur in the same element of a term, (2, n)."""
-    from scvi_codegen.formulas.numpy_values import Elements  # here, because it imports SymPy
+    from scvi_codegen.formulas.arrays import ArrayTerm  # here, because it imports SymPy
+    from scvi_codegen.formulas.numpy_values import Elements
+    from scvi_codegen.formulas.symbols import DOT
 
-    shapes = {array.name: array.shape(arrays.sizes) for array in layout.coordinates}
-    firsts = dict(zip(shapes, np.cumsum([0, *(int(np.prod(shape)) for shape in shapes.values())]), strict=False))
+    shapes = {array.name: array.shape(arrays.sizes) for array in (*layout.coordinates, *layout.momenta)}
+    starts = np.cumsum([0, *(int(np.prod(shape)) for shape in shapes.values())])
+    firsts = dict(zip(shapes, starts, strict=False))
+    firsts |= {name + DOT: first for name, first in firsts.items()}
+    shapes |= {name + DOT: shape for name, shape in shapes.items()}
     found: list[NDArray[np.int64]] = []
     count = 0
     for term in layout.couplings:
-        accesses = [access for _, access in term.slots if access.array.name in shapes]
+        targets = () if isinstance(term, ArrayTerm) else term.targets
+        slots = [*(access for _, access in term.slots), *(access for access, _ in targets)]
+        accesses = [access for access in slots if access.array.name in firsts]
+        if any(access.sums for access in accesses):  # all entries of these arrays are taken as coupled
+            names = {access.array.name for access in accesses}
+            entries = np.concatenate([firsts[name] + np.arange(int(np.prod(shapes[name]))) for name in sorted(names)])
+            count += len(entries) ** 2
+            if count > MOST_COUPLINGS:
+                return None
+            found.append(entries[np.stack(np.triu_indices(len(entries), 1))])
+            continue
         size = np.prod([float(loop.end.at(arrays.sizes) - loop.first.at(arrays.sizes)) for loop in term.loops])
         count += int(size) * len(accesses) ** 2
         if count > MOST_COUPLINGS:
@@ -79,7 +119,12 @@ def _coupled_pairs(layout: ArrayLayout, arrays: RunSizes) -> NDArray[np.int64] |
         places = [_flat(elements.of(access), shapes[access.array.name], rows) for access in accesses]
         indices = [place + firsts[access.array.name] for place, access in zip(places, accesses, strict=True)]
         found += [np.stack([a, b]) for k, a in enumerate(indices) for b in indices[k + 1 :]]
-    return np.concatenate([np.zeros((2, 0), np.int64), *found], axis=1)
+    pairs = np.concatenate([np.zeros((2, 0), np.int64), *found], axis=1)
+    if layout.momenta:  # the rate of an unknown is a derivative with respect to its conjugate
+        n = int(starts[-1]) // 2
+        pairs = np.concatenate([pairs, [range(n), range(n, 2 * n)]], axis=1) % n
+        pairs = np.concatenate([pairs + np.array([[a], [b]]) for a in (0, n) for b in (0, n)], axis=1)
+    return pairs
 
 
 def _flat(index: tuple[Any, ...], shape: tuple[int, ...], count: int) -> NDArray[np.int64]:

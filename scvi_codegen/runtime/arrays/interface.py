@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.errors import StateError, closest
+from scvi_codegen.errors import StateError
 from scvi_codegen.indices import Array, Loop, Place
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.rendering.source import ArrayLayout, Interface
-from scvi_codegen.runtime.core.validation import NamedState
+from scvi_codegen.runtime.core.validation import NamedState, check_named
 
 Numbers = NDArray[np.float64]
 IndexTable = NDArray[np.int32]
@@ -94,22 +94,17 @@ def read_state(interface: Interface, argument: ArrayLike | Mapping[str, ArrayLik
         if len(names) > 1:
             raise StateError(f"{what} must be given by name, as {{'{names[0]}': .., '{names[1]}': ..}}")
         argument = {names[0]: argument}
-    _check_named(argument, names, what, whole=True)
+    check_named(argument, names, what, whole=True)
     return {
         array.name: _of_axes(array, real_array(argument[array.name], what), what)
         for array in interface.layout.coordinates
     }
 
 
-def flat(state: Mapping[str, Numbers]) -> Numbers:
-    """Return arrays as one vector."""
-    return np.concatenate([array.reshape(-1) for array in state.values()])
-
-
 def number_values(interface: Interface, argument: Mapping[str, ArrayLike]) -> list[float]:
     """Return the scalar parameters in order."""
     known = dict(zip(interface.parameters, interface.defaults, strict=True))
-    _check_named(argument, [*known, *(field.name for field in interface.layout.fields)], "parameters", whole=False)
+    check_named(argument, [*known, *(field.name for field in interface.layout.fields)], "parameters", whole=False)
     return [checked_number(argument.get(name, value), name) for name, value in known.items()]
 
 
@@ -132,7 +127,7 @@ def read_tables(interface: Interface, argument: Mapping[str, ArrayLike] | None) 
     """Return read-only copies of the tables by name, so that indices cannot change after validation."""
     names = [table.name for table in interface.layout.tables]
     given = {name: value for name, value in interface.layout.data.items() if name in names} | dict(argument or {})
-    _check_named(given, names, "tables", whole=True)
+    check_named(given, names, "tables", whole=True)
     result = {}
     for table in interface.layout.tables:
         try:
@@ -220,7 +215,7 @@ def _index_range(
     loop, offset = spans[subscript.index], subscript.base.number
     if loop.periodic and abs(offset) <= length:
         return 0, loop.end.at(sizes) - 1
-    first, last = _span(loop, sizes)
+    first, last = (1, loop.end.at(sizes) - 1) if subscript.minus else _span(loop, sizes)
     return first + offset, last + offset
 
 
@@ -249,17 +244,6 @@ def _check_finite(values: Numbers, what: str) -> None:
     if not np.all(np.isfinite(values)):
         index = np.argwhere(~np.isfinite(np.atleast_1d(values)))[0]
         raise StateError(f"{what} must be finite, but is not at the index {[int(k) for k in index]}")
-
-
-def _check_named(argument: Mapping[str, object], names: Sequence[str], what: str, *, whole: bool) -> None:
-    for name in argument:
-        if name not in names:
-            raise StateError(
-                f"there is no '{name}' in {what}{closest(str(name), names)} Known: {', '.join(names) or 'none'}"
-            )
-    for name in names:
-        if whole and name not in argument:
-            raise StateError(f"'{name}' is missing in {what}")
 
 
 def _text(shape: Sequence[int]) -> str:

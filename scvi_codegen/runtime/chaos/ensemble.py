@@ -3,9 +3,15 @@
 If the ensemble source supports variational equations they run in SIMD lanes. Otherwise, and where a SIMD step fails,
 states and derivatives are computed trajectory by trajectory in C, chunk by chunk. Only the indicator series are stored,
 so memory does not limit the number of initial states.
+
+Tangent vectors of many trajectories in SIMD lanes: each lane integrates a trajectory and its variational equations.
+
+The variations are additional coordinates (:mod:`scvi_codegen.mechanics.derived_systems`) of an ensemble. After each
+block of steps the tangent frame of every lane is replaced by Q of its QR factorisation. A block is repeated with half
+as many steps if its R shows that the tangent vectors became nearly parallel.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Any, Final
 
@@ -17,10 +23,10 @@ from scvi_codegen.native import building
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, checked_options
-from scvi_codegen.runtime.chaos.growth import SERIES
+from scvi_codegen.runtime.chaos.growth import SERIES, Growth, ill_conditioned, r_factors
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
-from scvi_codegen.runtime.chaos.tangent_lanes import TRAJECTORIES_TOGETHER, propagate_in_lanes
-from scvi_codegen.runtime.chaos.tangent_propagation import InitialTangents, ahead
+from scvi_codegen.runtime.chaos.tangent_propagation import MOST as LARGEST_CHUNK
+from scvi_codegen.runtime.chaos.tangent_propagation import InitialTangents, StepSegment, TangentPropagation
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, States
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, start_of_ensemble
@@ -31,8 +37,13 @@ from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.run_loop import record
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.run.times import times_after
+from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
 from scvi_codegen.validation import checked_count
 
+TRAJECTORIES_TOGETHER = 256
+"""Number of trajectories integrated together, so that the output of a block of steps fits into the cache."""
+FIRST, MOST = 8, 32
+"""Number of steps of the first and of the largest block."""
 CHECKED_STRIDE: Final = 64
 """Stride of the trajectories whose step error is estimated."""
 
@@ -56,6 +67,7 @@ class ChaosIndicatorsEnsemble:
         options: SolverOptions | None,
     ) -> None:
         stepper._check_fixed_steps("chaos_indicators_ensemble")
+        stepper._check_no_changes("chaos_indicators_ensemble")
         self.stepper, self.options = stepper, checked_options(options)
         self.h, steps = checked_step(h), checked_count(steps, "steps", least=1)
         self.save_every = steps if save_every is None else checked_count(save_every, "save_every", least=1)
@@ -75,7 +87,7 @@ class ChaosIndicatorsEnsemble:
 
         Trajectories without SIMD support, or whose SIMD steps failed, use the derivatives of single steps.
         """
-        report, left = progress or _silence, np.arange(len(self.q))
+        report, left = progress or (lambda _: None), np.arange(len(self.q))
         if (binding := self._lanes()) is not None:
             left = self._all_in_lanes(binding, report, threads)
         if len(left):
@@ -96,7 +108,7 @@ class ChaosIndicatorsEnsemble:
         for j in range(0, len(self.q), CHECKED_STRIDE):
             start = self.q[j], self.p[j]
             given: dict[str, Any] = {"t": self.t[0], "parameters": self.parameters[j], "options": self.options}
-            memory = Memory.started(self.stepper, *start, plan=StepPlan.with_step(self.h), **given)
+            memory = Memory.started(self.stepper, *start, plan=StepPlan(h=self.h), **given)
             with suppress(StepFailedError):
                 runs[j] = record(memory, steps, save_every=steps)
         worst = max(runs, key=lambda j: np.nan_to_num(runs[j].step_error), default=None)
@@ -107,7 +119,7 @@ class ChaosIndicatorsEnsemble:
         """Return the compiled ensemble library with tangent vectors, or ``None``."""
         if self.stepper.interface.constraints or self.stepper.interface.rotations:
             return None
-        source = self.stepper._variational_source(self.values.shape[-1])
+        source = self.stepper._variants[f"changes {self.values.shape[-1]}"]
         return None if source is None else Binding(building.load(source, flags=self.stepper.flags), source.prefix)
 
     def _all_in_lanes(self, binding: Binding, report: Callable[[int], None], threads: int | None) -> NDArray[np.intp]:
@@ -117,18 +129,7 @@ class ChaosIndicatorsEnsemble:
 
         def follow(k: int, check_stop: StopCheck) -> None:
             part = slice(k * TRAJECTORIES_TOGETHER, min((k + 1) * TRAJECTORIES_TOGETHER, count))
-            self.values[:, :, part], done[part] = propagate_in_lanes(
-                binding,
-                changes,
-                self.q[part],
-                self.p[part],
-                self.parameters[part],
-                t=self.t,
-                h=self.h,
-                save_every=self.save_every,
-                options=self.options,
-                check_stop=check_stop,
-            )
+            self.values[:, :, part], done[part] = self._in_lanes(binding, changes, part, check_stop)
 
         run_jobs(
             -(-count // TRAJECTORIES_TOGETHER), follow, progress=lambda _: report(int(done.sum())), threads=threads
@@ -147,22 +148,127 @@ class ChaosIndicatorsEnsemble:
         start = self.q[j], self.p[j], self.h, float(self.t[0])
         return self.changes.at(*start, self.parameters[j], self.options)
 
+    def _in_lanes(
+        self, binding: Binding, tangents: Array, part: slice, check_stop: StopCheck
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Return the (5, n, K, k) series of K trajectories from (2m, k) tangents, and (K,) flags of complete ones."""
+        t, lanes = self.t, _TangentLanes(self, binding, part, tangents.shape[1])
+        frame, triangle = (np.broadcast_to(factor, (lanes.size, *factor.shape)) for factor in np.linalg.qr(tangents))
+        with np.errstate(divide="ignore"):  # linearly dependent directions span zero volume: log 0 = -inf
+            growth = Growth(t[:: self.save_every], np.log(np.abs(np.diagonal(triangle, axis1=1, axis2=2))))
+        done, steps, size, most = 0, len(t) - 1, FIRST, MOST
+        lanes.take(frame)
+        memory = binding.buffer(lanes.memory)
+        while done < steps:
+            check_stop(done)
+            size = min(size, most, self.save_every - done % self.save_every, steps - done)
+            before = bytes(memory)
+            images = lanes.advance(size)
+            running = lanes.running
+            frame, last = _factors(np.where(running[:, np.newaxis, np.newaxis], images[-1], frame))
+            if size > 1 and ill_conditioned(last).any():
+                memory[:] = before
+                most = size // 2
+                continue
+            done += size
+            sizes = _lengths(images, triangle)
+            numbers = np.full(size, -1)
+            numbers[-1] = done // self.save_every if done % self.save_every == 0 else -1
+            with np.errstate(divide="ignore"):
+                diagonals = np.log(np.abs(np.diagonal(last, axis1=1, axis2=2)))
+                stretched = np.broadcast_to(diagonals, (size, *diagonals.shape))
+                growth.add(t[done - size : done + 1], numbers, np.log(sizes), stretched)
+            triangle = last @ triangle / sizes[-1][:, np.newaxis]
+            lanes.take(frame)
+            size *= 2
+        return growth.values, lanes.running
+
     def _follow(self, j: int, check_stop: StopCheck) -> None:
-        values, failure = ahead(
-            self.changes,
-            self.q[j],
-            self.p[j],
-            self.parameters[j],
-            t=self.t,
-            h=self.h,
-            save_every=self.save_every,
-            options=self.options,
-            check_stop=check_stop,
-        )
-        self.values[:, :, j] = np.nan if values is None else values
-        if failure:
+        """Integrate trajectory j with tangent vectors, by derivatives of single steps; NaN after a failed step."""
+        stepper, steps = self.stepper, len(self.t) - 1
+
+        def propagate_chunk(part: Starts, numbers: NDArray[np.intp], vectors: Array) -> None:
+            check_stop(int(numbers[-1]))
+            stepper._propagate(part, vectors, self.parameters[j], self.options)
+
+        def step_segments() -> Iterator[StepSegment]:
+            now = self.q[j], self.p[j]
+            for first in range(0, steps, LARGEST_CHUNK):
+                last = min(first + LARGEST_CHUNK, steps)
+                starts = Starts.chain(*now, self.t[first:last], np.full(last - first, self.h))
+                at = np.arange(first, last + 1)
+                yield starts, np.where(at % self.save_every, -1, at // self.save_every)
+                now = starts.q[-1], starts.p[-1]
+
+        propagation = None
+        try:
+            propagation = TangentPropagation(self.changes, self._first(j), self.t[:: self.save_every])
+            propagation.follow(step_segments(), propagate_chunk)
+        except StepFailedError as failure:
             self.status[j] = failure.status
+        self.values[:, :, j] = np.nan if propagation is None else propagation.growth.values
 
 
-def _silence(_: int) -> None:
-    pass
+def _lengths(images: Array, triangle: Array) -> Array:
+    """Return (steps, K, k) norms of the tangent vectors, whose images in the frame are (steps, K, 2m, k)."""
+    whole = images if images.shape[-1] == 1 else images @ triangle
+    return np.asarray(np.sqrt(np.einsum("skij,skij->skj", whole, whole)))
+
+
+def _factors(images: Array) -> tuple[Array, Array]:
+    """Return the QR factors, (K, 2m, k) and (K, k, k)."""
+    if images.shape[-1] > 1:
+        orthonormal, upper = np.linalg.qr(images)
+        return np.asarray(orthonormal), np.asarray(upper)
+    lengths = r_factors(images)
+    return images / lengths, lengths
+
+
+class _TangentLanes:
+    """SIMD blocks of K trajectories with k tangent vectors each; surplus lanes hold inactive copies of the last one."""
+
+    def __init__(self, work: ChaosIndicatorsEnsemble, binding: Binding, part: slice, count: int) -> None:
+        q, p, parameters = work.q[part], work.p[part], work.parameters[part]
+        (self.size, self.dimension), self.count = q.shape, count
+        self.width = len(binding.new("block *").active)
+        blocks = -(-self.size // self.width)
+        self.binding, self.options = binding, binding.options(work.options)
+        self.memory = binding.new(f"block[{blocks}]")
+        for k in range(blocks):
+            binding.function("start")(self.memory + k, float(work.t[0]), work.h)
+        self.lanes = binding.records(self.memory)
+        save_every = np.arange(blocks * self.width)
+        self.lane_indices = np.minimum(save_every, self.size - 1)
+        self.lanes["q"][:, : self.dimension], self.lanes["p"][:, : self.dimension] = map(self._across, (q, p))
+        self.lanes["parameters"][:, : parameters.shape[1]] = self._across(parameters)
+        self.lanes["active"] = (save_every < self.size).reshape(blocks, self.width)
+
+    def _across(self, rows: Array) -> Array:
+        """Transpose (K, n) rows to (blocks, n, lanes)."""
+        lanes = rows[self.lane_indices].reshape(len(self.lanes), self.width, rows.shape[1])
+        return np.asarray(lanes.transpose(0, 2, 1))
+
+    @property
+    def running(self) -> NDArray[np.bool_]:
+        """(K,) flags of the trajectories without a failed step."""
+        return np.asarray(self.lanes["active"].ravel()[: self.size] > 0.0)
+
+    def take(self, frame: Array) -> None:
+        """Set (K, 2m, k) tangent vectors, clear their compensation terms and discard the predictor."""
+        m = self.dimension
+        for name, part in (("q", frame[:, :m]), ("p", frame[:, m:])):
+            self.lanes[name][:, m:] = self._across(part.transpose(0, 2, 1).reshape(self.size, -1))
+            self.lanes[f"carry_{name}"][:, m:] = 0.0
+        self.lanes["guess"] = 0
+
+    def advance(self, steps: int) -> Array:
+        """Advance all trajectories and return the (steps, K, 2m, k) tangent vectors after each step."""
+        advance, size = self.binding.function("advance"), self.dimension * (self.count + 1)
+        q, p = np.empty((2, steps, len(self.lane_indices), size))
+        row, (at_q, at_p) = len(self.lane_indices) * size, map(self.binding.pointer, (q, p))
+        for k in range(len(self.lanes)):
+            offset = k * self.width * size
+            advance(self.memory + k, self.width, steps, 1, self.options, at_q + offset, at_p + offset, row)
+        shape = steps, self.size, self.count, self.dimension
+        parts = [x[:, : self.size, self.dimension :].reshape(shape).transpose(0, 1, 3, 2) for x in (q, p)]
+        return np.concatenate(parts, axis=2)

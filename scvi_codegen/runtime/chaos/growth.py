@@ -60,26 +60,21 @@ class Growth:
             rates[saved],
             areas[saved] / times[saved + 1],
         ]
-        self.log_norms, self.max_log_norms, self.log_r_diagonal = (
-            log_norms[-1],
-            max_log_norms[-1],
-            self.log_r_diagonal + log_diagonals[-1],
-        )
+        self.log_norms = log_norms[-1]
+        self.max_log_norms = max_log_norms[-1]
+        self.log_r_diagonal = self.log_r_diagonal + log_diagonals[-1]
         self.moments, self.rates, self.areas = moments[-1], rates[-1], areas[-1]
 
 
 def r_factors(images: Array) -> Array:
     """Return the (.., k, k) factors R of (.., 2m, k) matrices."""
     if images.shape[-1] == 1:
-        factors: Array = np.linalg.norm(images, axis=-2)[..., np.newaxis]
-    else:
-        factors = np.asarray(np.linalg.qr(images, mode="r"))
-    return factors
+        return np.asarray(np.linalg.norm(images, axis=-2)[..., np.newaxis])
+    return np.asarray(np.linalg.qr(images, mode="r"))
 
 
 def ill_conditioned(images: Array) -> NDArray[np.bool_]:
     """Return (..) flags of the factors R (.., k, k) whose tangent vectors lost too many significant digits."""
     largest = np.abs(images).max(axis=(-2, -1))
     least = np.abs(np.diagonal(images, axis1=-2, axis2=-1)).min(axis=-1)
-    parted: NDArray[np.bool_] = ~(np.maximum(largest, 1.0) <= MOST_GROWTH_RATIO * np.minimum(least, 1.0))
-    return parted
+    return np.asarray(~(np.maximum(largest, 1.0) <= MOST_GROWTH_RATIO * np.minimum(least, 1.0)))

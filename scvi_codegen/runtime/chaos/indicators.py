@@ -56,8 +56,7 @@ class ChaosIndicators:
         QR method of Benettin et al., Meccanica 15 (1980) 9.
         """
         time = np.abs(self.t - self.t[0]).reshape(-1, *[1] * (self.log_r_diagonal.ndim - 1))
-        exponents: Array = -np.sort(-self.log_r_diagonal / np.where(time > 0.0, time, np.nan), axis=-1)
-        return exponents
+        return np.asarray(-np.sort(-self.log_r_diagonal / np.where(time > 0.0, time, np.nan), axis=-1))
 
     def megno(self) -> Array:
         """Return (n,) MEGNO, the time-averaged mean exponential growth of nearby orbits, of the first tangent vector.
@@ -65,8 +64,7 @@ class ChaosIndicators:
         It tends to 2 for regular motion (to less near stable periodic orbits) and to lambda t / 2 for chaotic motion:
         Cincotta & Simo, Astron. Astrophys. Suppl. 147 (2000) 205.
         """
-        mean: Array = self.mean_rates[..., 0]
-        return mean
+        return np.asarray(self.mean_rates[..., 0])
 
     def fli(self) -> Array:
         """Return (n,) the fast Lyapunov indicator: the logarithm of the largest norm of any tangent vector so far.
@@ -74,8 +72,7 @@ class ChaosIndicators:
         It grows as log t for regular motion and as lambda t for chaotic motion: Froeschle, Lega & Gonczi, Celest. Mech.
         Dyn. Astron. 67 (1997) 41; Froeschle & Lega, ibid. 78 (2000) 167.
         """
-        largest: Array = self.max_log_norms.max(axis=-1)
-        return largest
+        return np.asarray(self.max_log_norms.max(axis=-1))
 
     def log_gali(self, k: int = 2) -> Array:
         """Return (n,) natural logarithms of :meth:`gali`, also where GALI underflows."""
@@ -84,8 +81,7 @@ class ChaosIndicators:
             raise StateError(
                 f"k = {k} exceeds the number of tangent vectors, {most}: compute deviations with count={k}"
             )
-        volume: Array = (self.log_r_diagonal - self.log_norms)[..., :k].sum(axis=-1)
-        return volume
+        return np.asarray((self.log_r_diagonal - self.log_norms)[..., :k].sum(axis=-1))
 
     def gali(self, k: int = 2) -> Array:
         """Return (n,) the generalised alignment index: the volume spanned by the first k tangent vectors, normalised.
@@ -94,8 +90,7 @@ class ChaosIndicators:
         m it is about constant for k <= m and decays as t^(-2(k - m)) for k > m: Skokos, Bountis & Antonopoulos, Physica
         D 231 (2007) 30.
         """
-        volume: Array = np.exp(self.log_gali(k))
-        return volume
+        return np.asarray(np.exp(self.log_gali(k)))
 
     def sali(self) -> Array:
         """Return (n,) the alignment index ``min(|u + v|, |u - v|)`` of the first two normalised tangent vectors.
@@ -103,5 +98,4 @@ class ChaosIndicators:
         Skokos, J. Phys. A 34 (2001) 10029.
         """
         sine = np.minimum(self.gali(2), 1.0)
-        smaller: Array = sine * np.sqrt(2.0 / (1.0 + np.sqrt(1.0 - sine**2)))
-        return smaller
+        return np.asarray(sine * np.sqrt(2.0 / (1.0 + np.sqrt(1.0 - sine**2))))

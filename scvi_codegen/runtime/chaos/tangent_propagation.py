@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.errors import MethodError, StateError, StepFailedError
+from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.chaos.growth import Growth, ill_conditioned, r_factors
@@ -118,8 +119,7 @@ class InitialTangents:
         if self.count is not None and self.count > frame.shape[1]:
             raise StateError(f"count={self.count} exceeds the {frame.shape[1]} directions that the constraints allow")
         mixed, _ = np.linalg.qr(np.random.default_rng(SEED).normal(size=2 * frame.shape[1:]))
-        tangents: Array = (frame @ mixed)[:, : self.count]
-        return tangents
+        return np.asarray((frame @ mixed)[:, : self.count])
 
 
 def _frame(dimension: int) -> Array:
@@ -133,64 +133,15 @@ def _frame(dimension: int) -> Array:
 
 def along(states: SavedStates, tangents: InitialTangents) -> ChaosIndicators:
     """Return the deviations of a run at its saved states; steps between these are recomputed."""
-
-    def propagate_chunk(steps: Starts, numbers: NDArray[np.intp], vectors: Array) -> None:
-        propagate(states, steps, numbers, vectors, back=False)
-
     states.stepper._check_physical_time("the growth of tangent vectors")
     first = states.q[0], states.p[0], float(states.step_sizes[0]), float(states.t[0])
-    propagation = _TangentPropagation(tangents, tangents.at(*first, states.parameters, states.options), states.t)
-    propagation.follow((starts_of(states, first, last) for first, last in pieces(states)), propagate_chunk)
+    propagation = TangentPropagation(tangents, tangents.at(*first, states.parameters, states.options), states.t)
+    segments = (starts_of(states, first, last) for first, last in pieces(states))
+    propagation.follow(segments, partial(propagate, states, back=False))
     return ChaosIndicators.of(states.t, propagation.growth.values)
 
 
-def ahead(
-    tangents: InitialTangents,
-    q: Array,
-    p: Array,
-    parameters: Array,
-    *,
-    t: Array,
-    h: float,
-    save_every: int,
-    options: SolverOptions | None,
-    check_stop: Callable[[int], None],
-) -> tuple[Array | None, StepFailedError | None]:
-    """Integrate from (q, p) with tangent vectors over (steps + 1,) times t, saving every ``save_every``-th value.
-
-    Args:
-        check_stop: called before each chunk; may raise to stop.
-
-    Returns:
-        The series of :class:`Growth`, NaN after a failed step, ``None`` if the first step fails; and the failure.
-    """
-    stepper, steps = tangents.stepper, len(t) - 1
-
-    def propagate_chunk(part: Starts, numbers: NDArray[np.intp], vectors: Array) -> None:
-        check_stop(int(numbers[-1]))
-        stepper._propagate(part, vectors, parameters, options)
-
-    def step_segments() -> Iterator[StepSegment]:
-        now = q, p
-        for first in range(0, steps, MOST):
-            last = min(first + MOST, steps)
-            starts = Starts.chain(*now, t[first:last], np.full(last - first, h))
-            at = np.arange(first, last + 1)
-            yield starts, np.where(at % save_every, -1, at // save_every)
-            now = starts.q[-1], starts.p[-1]
-
-    propagation = None
-    try:
-        propagation = _TangentPropagation(
-            tangents, tangents.at(q, p, h, float(t[0]), parameters, options), t[::save_every]
-        )
-        propagation.follow(step_segments(), propagate_chunk)
-    except StepFailedError as failure:
-        return propagation.growth.values if propagation else None, failure
-    return propagation.growth.values, None
-
-
-class _TangentPropagation:
+class TangentPropagation:
     """Propagation of tangent vectors.
 
     Args:

@@ -1,25 +1,25 @@
-"""States on the constraints g(q, t) = 0 of a system: residuals, projection, multipliers, initial consistency."""
+"""States on the constraints g(q, t) = 0 of a system: residuals, projection, multipliers, initial consistency.
+
+Linearly dependent and contradictory constraints are found from the rank of the constraint Jacobian G at a state. G is
+computed from the rates G v + g_t, which are linear in v, at unit velocities. A constraint implied by others only on the
+constraint manifold (``(u - 1)**2 + y**2 = 1`` by ``x**2 + y**2 = 1`` and ``u = x + 1``) reduces the rank there but not
+at generic points.
+"""
 
 import re
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, warn
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import REASONS, STATUS
 from scvi_codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
-from scvi_codegen.runtime.constraints.rank import Jacobian, nearly_dependent, rank_deficiency
 from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.core.validation import (
-    Array,
-    Parameters,
-    States,
-    checked_states,
-    checked_vector,
-    inputs_not_given,
-    missing_input,
-)
+from scvi_codegen.runtime.core.validation import Array, Parameters, States, inputs_not_given, missing_input
+from scvi_codegen.runtime.rotations.states import checked_pair, checked_states
 
 MOST_SHOWN, MOST_DENSE = 4, 64
 """Largest numbers of positions and constraints in a message, and of those whose rank is checked at run-time sizes."""
@@ -53,7 +53,7 @@ def projected(
     Raises:
         StateError: if the iteration fails, or if the constraints are linearly dependent there.
     """
-    q0, p0 = checked_vector(stepper.interface, q, "q"), checked_vector(stepper.interface, p, "p")
+    q0, p0 = checked_pair(stepper.interface, q, p)
     _of_constrained(stepper, q0, p0, t)
     binding, q1, p1 = stepper.binding, np.empty_like(q0), np.empty_like(p0)
     values = stepper._parameters(parameters)
@@ -83,7 +83,7 @@ def consistent(
     for name in inputs_not_given(stepper.interface, parameters):
         if any(re.search(rf"\b{name}\b", formula) for formula in stepper.constraints):
             raise missing_input(name)
-    q0, p0 = checked_vector(stepper.interface, q, "q"), checked_vector(stepper.interface, p, "p")
+    q0, p0 = checked_pair(stepper.interface, q, p)
     q1, p1, apart = projected(stepper, q0, p0, t, parameters)
     if check_rank and (wrong := _dependent(stepper, q1, t, parameters)):
         raise StateError(f"{wrong} (q = {_shown(q1)})")
@@ -163,7 +163,7 @@ def singular_position(stepper: Integrator, q: Array, t: float, parameters: Array
     return nearly_dependent(_linearised(stepper, t, parameters)(q)[1])
 
 
-def _linearised(stepper: Integrator, t: float, parameters: Parameters) -> Jacobian:
+def _linearised(stepper: Integrator, t: float, parameters: Parameters) -> Callable[[Array], tuple[Array, Array]]:
     """Return a function that evaluates g and G by unit velocities; NaN where velocities have no momenta."""
     unit = np.concatenate([np.zeros((1, stepper.dimension)), np.eye(stepper.dimension)])
 
@@ -187,3 +187,76 @@ def _refuse(stepper: Integrator, status: int, q: Array) -> None:
     hint = "; check for redundant or contradictory constraints" if "singular" in STATUS[status] else ""
     shown = ", ".join(stepper.constraints[:MOST_SHOWN]) + ", .." * (len(stepper.constraints) > MOST_SHOWN)
     raise StateError(f"the constraints {shown} cannot be satisfied near q = {_shown(q)}: {REASONS[status]}{hint}")
+
+
+DEPENDENT = 1e-9
+"""Smallest singular value of G, with rows of length 1, below which rows count as linearly dependent."""
+NEARLY_DEPENDENT = 0.15
+"""The same for constraints at a state from which a step fails."""
+NAMED_SHARE = 1e-6
+"""Entries of a null vector above this fraction of 1 mark the constraints that are dependent."""
+CONTRADICTED = 1e-7
+"""Residual at the nearest state, relative to the size of q, above which constraints count as contradictory."""
+ITERATIONS = 30
+
+Jacobian: TypeAlias = Callable[[Array], tuple[Array, Array]]
+"""Values g and Jacobian G of the constraints at positions."""
+
+
+def _unit_rows(jacobian: Array) -> Array:
+    with np.errstate(over="ignore"):
+        sizes = np.linalg.norm(jacobian, axis=1, keepdims=True)
+    return jacobian / np.where(sizes > 0.0, sizes, 1.0)
+
+
+def dependence(jacobian: Array) -> tuple[int, NDArray[np.intp]]:
+    """Return the rank of (c, m) rows, and the (k,) indices of those that depend on each other."""
+    left, values, _ = np.linalg.svd(_unit_rows(jacobian))
+    null = left[:, np.append(values, np.zeros(len(left) - len(values))) <= DEPENDENT]
+    shares = np.abs(null).max(axis=1, initial=0.0)
+    return len(left) - null.shape[1], np.flatnonzero(shares > NAMED_SHARE)
+
+
+def nearly_dependent(jacobian: Array) -> str:
+    """Return a remark with the rank that a nearly singular Jacobian loses, or ""."""
+    values = np.linalg.svd(_unit_rows(jacobian), compute_uv=False) if np.isfinite(jacobian).all() else np.ones(1)
+    if values[-1] > NEARLY_DEPENDENT:
+        return ""
+    return (
+        f". The Jacobian of the constraints is nearly singular there (smallest singular value {values[-1]:.2g} with "
+        f"rows of length 1; rank {np.count_nonzero(values > NEARLY_DEPENDENT)} of {len(values)} where it is 0), as at "
+        "a dead point of a mechanism: end the run before it, or prescribe the motion of another coordinate"
+    )
+
+
+def rank_deficiency(names: Sequence[str], q: Array, at: Jacobian, *, nearest: bool = False) -> str:
+    """Return what is wrong with constraints of deficient rank, and what to do; "" if they are independent.
+
+    Args:
+        names: formulas of the constraints.
+        q: (m,) positions.
+        at: function that returns g and G at positions.
+        nearest: first minimise the constraint residual by Gauss-Newton iteration.
+    """
+    for _ in range(ITERATIONS if nearest else 0):
+        g, jacobian = at(q)
+        if not (np.isfinite(g).all() and np.isfinite(jacobian).all()):
+            return ""
+        q = q - np.linalg.lstsq(jacobian, g, rcond=DEPENDENT)[0]
+    g, jacobian = at(q)
+    if not (np.isfinite(g).all() and np.isfinite(jacobian).all()):
+        return ""
+    rank, rows = dependence(jacobian)
+    if not len(rows):
+        return ""
+    listed = " and ".join(f"'{names[k]}'" for k in rows) if len(rows) < 5 else f"{len(rows)} of them"
+    rests = ", ".join(f"{g[k]:.3g}" for k in rows[:4])
+    if nearest and np.abs(g).max() > CONTRADICTED * max(float(np.abs(q).max()), 1e-300):
+        return (
+            f"the constraints {listed} contradict each other or cannot be reached: at the nearest positions their "
+            f"values are {rests}, not 0. Change or remove one of them"
+        )
+    return (
+        f"the constraints {listed} are linearly dependent there (rank {rank} of {len(g)}), so their multipliers are "
+        "undetermined. Remove one that follows from the others, or start from a state where they are independent"
+    )

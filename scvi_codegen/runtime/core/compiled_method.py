@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from functools import cached_property
 from typing import Any, Self, cast
 
 import numpy as np
@@ -43,14 +44,15 @@ class Variants:
     steps, and ``"changes K"`` (ensembles with K tangent vectors).
 
     Args:
-        made: sources by name; ``None`` for a variant that the method lacks.
+        made: sources by name; ``None`` for a variant that the method lacks. Those with events by the tuple of these.
         make: derives a source that is not among them.
     """
 
     def __init__(
-        self, made: Mapping[str, Source | None] | None = None, make: Callable[[str], Source | None] = lambda _: None
+        self, made: Mapping[Any, Source | None] | None = None, make: Callable[[str], Source | None] = lambda _: None
     ) -> None:
-        self._made, self._make = dict(made or {}), make
+        self._made: dict[Any, Source | None] = dict(made or {})
+        self._make = make
 
     def __getitem__(self, name: str) -> Source | None:
         if name not in self._made:
@@ -100,11 +102,10 @@ class CompiledMethod:
         self.origin, self.problem, self._of_sizes, self._reason = origin, problem, of_sizes, reason
         self.any_size = problem is None and bool(interface.layout.coordinates)
         self._variants = Variants() if variants is None else variants
-        self._with_tangent: Binding | None = None
-        self._with_curvature: Binding | None = None
         self._event_variants: dict[tuple[Event, ...], Self] = {}
         self._released_runs: list[Any] = []
         self._known: dict[Hashable, Self] = {}
+        self._entries: dict[Event, tuple[Event, ...]] = {}
         self._bound: tuple[Hashable, Self] | None = None
         self._plain = cast(Source, source)
         self.shapes = shapes_of(interface)
@@ -114,22 +115,22 @@ class CompiledMethod:
 
     def _load(self) -> None:
         """Load the library with the events; of arrays of run-time sizes once these are known."""
-        interface, events = self.interface, self.events
+        interface, events = self.interface if self.origin is None else self.origin.interface, self.events
         self.source = self._plain
         if self.any_size:
             return
-        if self.problem is not None and self.origin is not None:
-            interface = self.origin.interface
-            if events:
-                self.source = _event_variant(self._plain, interface, events)
-            library = building.load(self.source, flags=self.flags)
+        if events and (known := self._variants._made.get(events)) is not None:
+            self.source = known
+        elif events:
+            from scvi_codegen.rendering.events import with_events  # here, because it imports SymPy
+
+            self.source = with_events(self._plain, interface, events)
+        library = building.load(self.source, flags=self.flags)
+        if self.problem is not None:
             arrays = library, interface, self.problem
             self.binding: Binding = EventBinding(*arrays, events) if events else ArrayBinding(*arrays)
-            return
-        if events:
-            self.source = _event_variant(self._plain, interface, events)
-        library = building.load(self.source, flags=self.flags)
-        self.binding = Binding(library, interface.prefix, interface.workspace, fallback=self._load_fallback)
+        else:
+            self.binding = Binding(library, interface.prefix, interface.workspace, fallback=self._load_fallback)
 
     def _copy(self, events: tuple[Event, ...]) -> Self:
         """Return the integrator with other events."""
@@ -151,11 +152,7 @@ class CompiledMethod:
         raise AttributeError(f"'{type(self).__name__}' has no attribute '{name}'")
 
     def bind(
-        self,
-        q: Any,
-        parameters: Any = None,
-        tables: Mapping[str, ArrayLike] | None = None,
-        threads: int | None = None,
+        self, q: Any, parameters: Any = None, tables: Mapping[str, ArrayLike] | None = None, threads: int | None = None
     ) -> tuple[Self, Any]:
         """Return the stepper bound to the sizes and tables of these arrays, and their states as vectors.
 
@@ -172,8 +169,9 @@ class CompiledMethod:
             raise MethodError(f"omit threads: this system is compiled with the sizes of each call. {self._reason}")
         bound = self.with_sizes(problem.sizes, tables=problem.places) if self._reason else self._bound_to(problem)
         if self.events:
-            of_entries = events_of_entries(self.interface, problem, self.events) if self._reason else self.events
-            bound = bound.with_events(of_entries)
+            rotations = bound.interface.rotations
+            each = events_of_entries(self.interface, problem, self.events, rotations) if self._reason else self.events
+            bound = bound.with_events(each)
         return bound, q if bound.interface.rotations or bound.interface.variables else flat_state(
             bound.interface, q, "q"
         )
@@ -216,13 +214,22 @@ class CompiledMethod:
             return self
         return self.origin.with_sizes(self.problem.sizes, tables=self.problem.places)
 
+    @property
+    def _known_with_events(self) -> Self:
+        """:attr:`known` with the events, in the names of its coordinates."""
+        return self.known.with_events([each for event in self.events for each in self._events_of_entries(event)])
+
+    def _events_of_entries(self, event: Event) -> tuple[Event, ...]:
+        """Return the events of :attr:`known` that an event in index notation defines, one for each element."""
+        if self.problem is None or self.origin is None:
+            return (event,)
+        if event not in self._entries:
+            of = self.origin.interface, self.problem, (event,)
+            self._entries[event] = events_of_entries(*of, self.interface.rotations)
+        return self._entries[event]
+
     def with_sizes(
-        self,
-        sizes: Mapping[str, int] | None = None,
-        /,
-        *,
-        tables: Mapping[str, ArrayLike] | None = None,
-        **named: int,
+        self, sizes: Mapping[str, int] | None = None, /, *, tables: Mapping[str, ArrayLike] | None = None, **named: int
     ) -> Self:
         """Return the stepper of arrays of run-time sizes compiled with these sizes, ``with_sizes(N=9)``, once.
 
@@ -283,13 +290,6 @@ class CompiledMethod:
         """C source with second derivatives of steps, derived on first use; ``None`` if unavailable."""
         return self._variants["second_derivatives"]
 
-    def _variational_source(self, count: int) -> Source | None:
-        """Return the C source of ensembles with ``count`` tangent vectors per trajectory, derived on first use.
-
-        ``None`` if tangent vectors can only be propagated by the derivatives of steps.
-        """
-        return self._variants[f"changes {count}"]
-
     def prepare(
         self,
         *,
@@ -322,19 +322,15 @@ class CompiledMethod:
         elif not self._reason:
             building.load(self.source, flags=self.flags)
 
-    @property
+    @cached_property
     def tangent(self) -> Binding:
         """Library with derivatives of steps, compiled on first use."""
-        if self._with_tangent is None:
-            self._with_tangent = self._linearised(self.derivatives, "derivatives")
-        return self._with_tangent
+        return self._linearised(self.derivatives, "derivatives")
 
-    @property
+    @cached_property
     def _second_derivatives(self) -> Binding:
         """Library with second derivatives of steps, compiled on first use; raises ``MethodError`` if unavailable."""
-        if self._with_curvature is None:
-            self._with_curvature = self._linearised(self.second_derivatives, "second derivatives")
-        return self._with_curvature
+        return self._linearised(self.second_derivatives, "second derivatives")
 
     def _linearised(self, source: Source | None, what: str) -> Binding:
         if source is None:
@@ -406,7 +402,7 @@ class CompiledMethod:
     def _check_no_changes(self, what: str, *, wanted: bool = True) -> None:
         """Raise :class:`MethodError` if something is wanted that events that change the states of runs exclude."""
         if wanted and self.changes_states:
-            raise MethodError(f"{what} does not support events that change the state: use stepper.with_events(())")
+            raise MethodError(f"{what} does not support events that change the state: make them terminal and restart")
 
     def with_events(self, events: EventLike | Sequence[EventLike]) -> Self:
         """Return the integrator with these events in place of its own."""
@@ -427,9 +423,3 @@ class CompiledMethod:
                 "requires forces at two or more stages, or velocities that vary along a step; give h and steps (fixed "
                 "step size)"
             )
-
-
-def _event_variant(source: Source, interface: Interface, events: tuple[Event, ...]) -> Source:
-    from scvi_codegen.rendering.events import with_events  # here, because it imports SymPy
-
-    return with_events(source, interface, events)

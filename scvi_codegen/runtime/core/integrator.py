@@ -10,6 +10,7 @@ from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, step_failure
 from scvi_codegen.runtime.core.validation import Array, Parameters, States, check_inputs_given
+from scvi_codegen.runtime.rotations.states import checked_pair
 from scvi_codegen.runtime.sensitivity.step_derivatives import LinearisedMethod
 
 
@@ -43,7 +44,7 @@ class Integrator(LinearisedMethod):
             StateError: if a shape or name is invalid, or a number is not finite.
             StepFailedError: if the stage equations cannot be solved.
         """
-        q0, p0 = self._vector(q, "q"), self._vector(p, "p")
+        q0, p0 = checked_pair(self.interface, q, p)
         check_inputs_given(self.interface, parameters)
         q1, p1 = np.empty_like(q0), np.empty_like(p0)
         arrays = (q0, p0, self._parameters_at(q0, p0, parameters))
@@ -146,7 +147,7 @@ class Integrator(LinearisedMethod):
                 "require forces, and SVI, SCVI, a Gauss method, or StoermerVerlet with solver='newton'"
             )
         check_inputs_given(self.interface, parameters)
-        state = self._vector(q, "q"), self._vector(p, "p"), self._parameters(parameters)
+        state = *checked_pair(self.interface, q, p), self._parameters(parameters)
         q1, p1, values = *np.empty((2, self.dimension)), np.empty(len(self.interface.exchange_names))
         name = "work_and_impulses"
         self._solve(self.binding.with_function(name), name, t, h, state, options, (q1, p1, values))
@@ -170,13 +171,7 @@ class Integrator(LinearisedMethod):
         return self.step(q, p, h, t + h, parameters, options=options)[0]
 
     def _discrete_legendre(
-        self,
-        q0: ArrayLike,
-        q1: ArrayLike,
-        h: float,
-        t: float,
-        parameters: Parameters,
-        options: SolverOptions | None,
+        self, q0: ArrayLike, q1: ArrayLike, h: float, t: float, parameters: Parameters, options: SolverOptions | None
     ) -> tuple[Array, Array, float]:
         if self.known is not self:
             return self.known._discrete_legendre(q0, q1, h, t, self._parameters(parameters), options)

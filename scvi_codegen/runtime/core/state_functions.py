@@ -20,13 +20,11 @@ from scvi_codegen.runtime.core.validation import (
     States,
     by_name,
     checked_parameters,
-    checked_states,
     checked_vector,
     coordinate_shapes,
-    flat_state,
-    is_one_state,
     parameter_index,
 )
+from scvi_codegen.runtime.rotations.states import checked_pair, checked_states, is_one_state
 
 REPORTED = 1e-3
 """Largest relative difference between a velocity and the velocity recomputed from its momentum."""
@@ -88,10 +86,8 @@ class StateFunctions(CompiledMethod):
         Raises:
             StateError: if the mass matrix is singular along the velocity, so the momentum does not determine it.
         """
-        p, v = (
-            self._transform("momentum", q, velocity, t, parameters, "velocity"),
-            np.asarray(flat_state(self.interface, velocity, "velocity"), dtype=float),
-        )
+        q, v = checked_pair(self.interface, q, velocity, "velocity")
+        p = self._transform("momentum", q, v, t, parameters, "velocity")
         dropped = (p == 0.0) & (v != 0.0)
         if dropped.any():
             try:
@@ -185,7 +181,7 @@ class StateFunctions(CompiledMethod):
     ) -> Array:
         if is_one_state(self.interface, q):
             at, values = checked_number(t, "the time t"), self._parameters(parameters)
-            return self._transformed(name, at, self._vector(q, "q"), self._vector(other, label), values)
+            return self._transformed(name, at, *checked_pair(self.interface, q, other, label), values)
         times, positions, others = checked_states(self.interface, q, other, t, second=label)
         values, result = self._parameters(parameters), np.empty_like(others)
         for k, (at, position, row) in enumerate(zip(times.tolist(), positions, others, strict=True)):

@@ -23,20 +23,20 @@ from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
 from scvi_codegen.runtime.constraints.projection import consistent, constraint_values, multipliers, projected
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.core.validation import Array, Parameters, States, is_one_state
+from scvi_codegen.runtime.core.validation import Array, Parameters, States
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, momenta_of_each
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 from scvi_codegen.runtime.events.event import Event, EventLike
 from scvi_codegen.runtime.inputs.segments import (
     advance_to,
-    checked_inputs,
+    checked_data,
     final_time,
     first_inner_time,
     parameters_of,
     record_pieces,
 )
-from scvi_codegen.runtime.rotations.states import homogeneous_state
+from scvi_codegen.runtime.rotations.states import homogeneous_state, is_one_state
 from scvi_codegen.runtime.run.accuracy import (
     check_growth_requested,
     warn_of_energy_error,
@@ -44,6 +44,7 @@ from scvi_codegen.runtime.run.accuracy import (
     warn_of_error_growth,
     warn_of_large_steps,
     warn_of_unresolved_fields,
+    warn_of_unresolved_members,
 )
 from scvi_codegen.runtime.run.global_error import checked_error, confirmed_run, warn_of_unconfirmed
 from scvi_codegen.runtime.run.run import Run
@@ -95,9 +96,9 @@ class Stepper(Integrator):
         Args:
             q, p: (m,) initial positions and momenta.
             inputs: of a system with inputs, by name: ``(t, values)``, interpolated linearly; ``(t, values, kind)`` with
-                ``"constant"`` (zero-order hold), ``"linear"`` or ``"cubic"`` (SciPy's spline); or a ``CubicSpline`` or
-                ``PPoly`` of degree 3 at most. Steps end at the breakpoints, which preserves the order; states there are
-                saved. Without them inputs need values among the parameters.
+                ``"constant"`` (zero-order hold), ``"linear"`` or ``"cubic"`` (SciPy's spline); a ``CubicSpline`` or
+                ``PPoly`` of degree 3 at most; or a number. Steps end at the breakpoints, which preserves the order;
+                states there are saved. Without them inputs need values among the parameters.
             velocity: (m,) initial velocities, instead of p.
             h: fixed step size, negative to integrate backward; step of tau in transformed time
                 (:func:`~scvi_codegen.reparametrise`).
@@ -144,13 +145,9 @@ class Stepper(Integrator):
         if tables is not None or threads is not None:
             self._check_not_of_run(tables, threads)
         stepper, interface = self if events is None else self.with_events(events), self.interface
-        if t_eval is not None and save_every != 1:
-            raise StateError(f"give either t_eval or save_every={save_every}, not both")
-        data = None if inputs is None else checked_inputs(interface, inputs)
-        if data is not None and t_eval is not None:
-            raise StateError("t_eval is not supported with inputs: omit t_eval")
-        if observe is not None and (data is not None or t_eval is not None):
-            raise StateError("observe is not supported with inputs or t_eval: omit observe")
+        data = None
+        if inputs is not None or t_eval is not None or observe is not None:
+            data = checked_data(interface, inputs, t_eval, save_every, observed=observe is not None)
         if interface.rotations or interface.variables:
             q, p, velocity = homogeneous_state(interface, q, p, velocity)
         if error is not None:
@@ -168,28 +165,25 @@ class Stepper(Integrator):
             begin = 0.0 if h is None or t_end is None else t
             transformed = interface.time_transformation, bool(interface.energy_parameter)
             plan, count = planned_steps(h, steps, t_end, tolerance, save_every, begin, *transformed)
-            run = stepper._started(q, p, velocity, plan, t, parameters, options, reuse=True)
-            if check_growth:
-                check_growth_requested(plan, stepper)
+            run, repeat = stepper._started(q, p, velocity, plan, t, parameters, options, reuse=True), None
+        else:
+            fixed = h is not None and not interface.time_transformation
+            end, values = final_time(t, h if fixed else None, steps, t_end), parameters_of(self, parameters, data)
+            plan, first = self._plan(h, None if fixed else end, tolerance), values(first_inner_time(t, end))
+            run = stepper._started(q, p, velocity, plan, t, first, options, reuse=True)
+            repeat = partial(advance_to, run, data, values=values)
+        if check_growth:
+            check_growth_requested(plan, stepper)
+        if data is None:
             times = None if t_eval is None else stepper._output_times(t_eval, run, count)
             trajectory = run._recorded(count, save_every=save_every, times=times, progress=progress, observe=observe)
             warn_of_large_steps(trajectory)
             warn_of_energy_error(trajectory, run)
-            warn_of_unresolved_fields(trajectory)
-            warn_of_error_growth(run, trajectory, check_growth)
-            run._release()
-            return trajectory
-        to_end = h is None or bool(interface.time_transformation)
-        end = final_time(t, None if interface.time_transformation else h, steps, t_end)
-        values = parameters_of(self, parameters, data)
-        plan = self._plan(h, end if to_end else None, tolerance)
-        run = stepper._started(q, p, velocity, plan, t, values(first_inner_time(t, end)), options, reuse=True)
-        if check_growth:
-            check_growth_requested(plan, stepper)
-        save_every = checked_count(save_every, "save_every", least=1)
-        trajectory = record_pieces(run, data, end, save_every=save_every, values=values, progress=progress)
+        else:
+            save_every = checked_count(save_every, "save_every", least=1)
+            trajectory = record_pieces(run, data, end, save_every=save_every, values=values, progress=progress)
         warn_of_unresolved_fields(trajectory)
-        warn_of_error_growth(run, trajectory, check_growth, lambda time: advance_to(run, data, time, values))
+        warn_of_error_growth(run, trajectory, check_growth, repeat)
         run._release()
         return trajectory
 
@@ -219,8 +213,7 @@ class Stepper(Integrator):
         Tables and threads are those of :meth:`integrate`.
         """
         self._check_not_of_run(tables, threads)
-        if self.interface.rotations or self.interface.variables:
-            q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
+        q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
         return self._started(q, p, velocity, self._plan(h, t_end, tolerance), t, parameters, options)
 
     def _started(
@@ -243,6 +236,10 @@ class Stepper(Integrator):
         run = Run._reused(self) if reuse else Run(self)
         run._start(q, p, plan=plan, t=t, parameters=parameters, options=options)
         return run
+
+    def _run(self, q: Array, p: Array, **arguments: Any) -> Run:
+        """Return a run from a state that satisfies the constraints."""
+        return Run.started(self, q, p, **arguments)
 
     def _plan(self, h: float | None, t_end: float | None, tolerance: float | None) -> StepPlan:
         """Return the step plan of these arguments of :meth:`start`."""
@@ -319,8 +316,9 @@ class Stepper(Integrator):
         Args:
             q, p: (k, m) initial positions and momenta.
             inputs: of a system with inputs, as of :meth:`integrate`, common to all trajectories, or values of shape
-                (k, n), one row per trajectory. Fixed steps are common, end at all breakpoints and lead to one t_end.
-            velocity: (k, m) initial velocities, instead of p.
+                (k, n), one row per trajectory; k constants. Fixed steps are common, end at all breakpoints and lead to
+                one t_end.
+            velocity: (k, m) initial velocities, instead of p; of arrays of run-time sizes by default 0.
             h, steps, save_every, t, options, progress: as in :meth:`integrate`.
             t_end: final time; with h the last step is shorter unless h divides the time. Without h and steps: final
                 time, or (k,) final times, of adaptive steps; every ``save_every``-th state and the last state of each
@@ -340,8 +338,7 @@ class Stepper(Integrator):
         Raises:
             StateError: if a shape, name or number is invalid.
         """
-        if self.interface.rotations or self.interface.variables:
-            q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
+        q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
         self._check_no_changes("error=", wanted=error is not None)
         if error is not None:
             others = {"h": h, "steps": steps, "tolerance": tolerance}
@@ -367,6 +364,7 @@ class Stepper(Integrator):
         trajectories = work.result()
         warn_of_unconfirmed(trajectories.confirmations)
         warn_of_energy_errors(trajectories)
+        warn_of_unresolved_members(trajectories)
         return trajectories
 
     @checks_arguments(StateError)
@@ -409,8 +407,7 @@ class Stepper(Integrator):
             MethodError: if time is transformed.
             StateError: if a shape, name or number is invalid.
         """
-        if self.interface.rotations or self.interface.variables:
-            q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
+        q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
         p = momenta_of_each(self, q, p, velocity, t, parameters)
         work = ChaosIndicatorsEnsemble(
             self,

@@ -104,13 +104,16 @@ class EntryNames(Sequence[str]):
 def flat_state(interface: Interface, value: Any, name: str) -> Any:
     """Return a state given by the names of its arrays as (.., m) numbers in order, and other values as they are.
 
-    The only array of a system need not be named: numbers of its shape suffice.
+    Momenta of a Hamiltonian have the names of their arrays or of those of the coordinates. The only array of a system
+    need not be named: numbers of its shape suffice.
     """
     if not interface.arrays and not isinstance(value, Mapping):
         return value
     arrays = coordinate_shapes(interface)
     if isinstance(value, Mapping):
-        return _joined(arrays, value, name)
+        coordinates = dict(zip((each.name for each in interface.layout.momenta), arrays, strict=False))
+        named = {coordinates[key][0] if name == "p" and key in coordinates else key: value[key] for key in value}
+        return _joined(arrays, named, name)
     (_, shape), *others = arrays
     if others or len(shape) < 2:
         return value
@@ -134,14 +137,9 @@ def shapes_of(interface: Interface) -> Shapes | None:
 
 
 def _joined(arrays: Sequence[tuple[str, tuple[int, ...]]], by_name: Mapping[str, Any], what: str) -> Array:
-    names = [name for name, _ in arrays]
-    for name in by_name:
-        if name not in names:
-            raise StateError(f"there is no '{name}' in {what}{closest(str(name), names)} Known: {', '.join(names)}")
+    check_named(by_name, [name for name, _ in arrays], what)
     parts = []
     for name, shape in arrays:
-        if name not in by_name:
-            raise StateError(f"'{name}' is missing in {what}")
         part = real_array(by_name[name], f"{what}: '{name}'")
         if part.shape[max(0, part.ndim - len(shape)) :] != shape:
             raise StateError(f"{what}: '{name}' must have the shape {shape}, not {part.shape}")
@@ -149,6 +147,18 @@ def _joined(arrays: Sequence[tuple[str, tuple[int, ...]]], by_name: Mapping[str,
     if len({part.shape[:-1] for part in parts}) > 1:
         raise StateError(f"{what}: the arrays have different numbers of states")
     return np.concatenate(parts, axis=-1)
+
+
+def check_named(values: Mapping[str, object], names: Sequence[str], what: str, *, whole: bool = True) -> None:
+    """Raise :class:`StateError` for a name that is unknown, or with ``whole`` missing."""
+    for name in values:
+        if name not in names:
+            raise StateError(
+                f"there is no '{name}' in {what}{closest(str(name), names)} Known: {', '.join(names) or 'none'}"
+            )
+    for name in names:
+        if whole and name not in values:
+            raise StateError(f"'{name}' is missing in {what}")
 
 
 def coordinate_shapes(interface: Interface) -> list[tuple[str, tuple[int, ...]]]:
@@ -194,34 +204,6 @@ def checked_vector(interface: Interface, value: States, name: str) -> Array:
         worst = int(np.flatnonzero(~np.isfinite(array))[0])
         raise StateError(f"{name}[{worst}] ({coordinates[worst]}) is {array[worst]}: it must be finite")
     return array
-
-
-def checked_states(
-    interface: Interface, q: States, p: States, t: ArrayLike, *, second: str = "p"
-) -> tuple[Array, Array, Array]:
-    """Return (n,) times and contiguous (n, m) positions and momenta (or what ``second`` names) of one or n states."""
-    positions = real_array(flat_state(interface, q, "q"), "q")
-    momenta = real_array(flat_state(interface, p, second), second)
-    if positions.ndim <= 1:
-        positions, momenta = checked_vector(interface, q, "q"), checked_vector(interface, p, second)
-    elif positions.ndim != 2 or positions.shape != momenta.shape or positions.shape[1] != interface.dimension:
-        raise StateError(
-            f"states must have shape (n, {interface.dimension}), not q {positions.shape} and {second} {momenta.shape}"
-        )
-    count = positions.size // interface.dimension
-    times = real_array(t, "the time t")
-    if not np.isfinite(times).all():
-        raise StateError("the time t must be finite")
-    if times.shape not in ((), (count,)):
-        raise StateError(f"the time t must be one number or {count}, one for each state, not of shape {times.shape}")
-    times = np.ascontiguousarray(np.broadcast_to(times, (count,)))
-    return times, np.ascontiguousarray(positions), np.ascontiguousarray(momenta)
-
-
-def is_one_state(interface: Interface, q: States) -> bool:
-    """Return whether these are the positions of one state, not of several."""
-    plain = not isinstance(q, Mapping) and real_array(q, "q").ndim == 1
-    return plain or real_array(flat_state(interface, q, "q"), "q").ndim == 1
 
 
 def checked_parameters(interface: Interface, parameters: Parameters, base: Array | None = None) -> Array:
@@ -289,8 +271,8 @@ def check_left_to_inputs(interface: Interface, parameters: Any) -> None:
 def missing_input(name: str) -> StateError:
     """Return the error for an input that is not set."""
     return StateError(
-        f"the input '{name}' is not set: pass inputs={{'{name}': (t, values)}} to stepper.integrate, call "
-        f"run.set_inputs({name}=...), or give parameters={{'{name}_0': ...}} for a constant"
+        f"the input '{name}' is not set: pass inputs={{'{name}': (t, values)}}, or a number for a constant, to "
+        f"stepper.integrate, call run.set_inputs({name}=...), or give parameters={{'{name}_0': ...}}"
     )
 
 

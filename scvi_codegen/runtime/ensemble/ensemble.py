@@ -7,7 +7,6 @@ C runs without the GIL, so threads share the work; results are bitwise equal for
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple, cast
@@ -18,13 +17,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import EventError, StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import SolverOptions, checked_options
-from scvi_codegen.runtime.core.validation import (
-    Array,
-    States,
-    check_left_to_inputs,
-    columns_of_inputs,
-    parameter_index,
-)
+from scvi_codegen.runtime.core.validation import Array, States, check_left_to_inputs, columns_of_inputs, parameter_index
 from scvi_codegen.runtime.ensemble.initial_states import (
     EnsembleParameters,
     checked_ensemble,
@@ -210,19 +203,6 @@ class Ensemble:
         if found.times is not None:
             found.times[:, part] = trajectories.times
 
-    def _parameters_and_inputs(self, j: int) -> dict[str, Any]:
-        """Return the arguments ``parameters`` and ``inputs`` of a single run of trajectory j."""
-        of_inputs = columns_of_inputs(self.stepper.interface) if self.inputs else ()
-        values = zip(self.stepper.parameters, self.parameters[j].tolist(), strict=True)
-        inputs = {
-            name: replace(each, pieces=each.pieces[:, j]) if each.pieces.ndim == 3 else each
-            for name, each in self.inputs.items()
-        }
-        return {
-            "parameters": {name: x for k, (name, x) in enumerate(values) if k not in of_inputs},
-            "inputs": inputs or None,
-        }
-
     def run(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> None:
         """Integrate all trajectories with ``threads`` threads; an exception raised by ``progress`` stops them promptly.
 
@@ -273,7 +253,12 @@ class Ensemble:
         One whose confirming runs fail has errors at round-off level.
         """
         plan, (q, p), status = self.plans[j], (each[j] for each in self.start), OK
-        arguments: dict[str, Any] = self._parameters_and_inputs(j) | {
+        of_inputs = columns_of_inputs(self.stepper.interface) if self.inputs else ()
+        values = zip(self.stepper.parameters, self.parameters[j].tolist(), strict=True)
+        arguments: dict[str, Any] = {
+            "parameters": {name: x for k, (name, x) in enumerate(values) if k not in of_inputs},
+            "inputs": inputs_of_slice(self.inputs, j) or None,
+        } | {
             "t": self.t0,
             "t_end": plan.t_end,
             "save_every": self.save_every if self.t_eval is None else 1,
@@ -370,12 +355,7 @@ class Ensemble:
 
 
 def _steps_or_end(
-    t: float,
-    h: float | None,
-    steps: int | None,
-    t_end: ArrayLike | None,
-    inputs: object,
-    **adaptive: object,
+    t: float, h: float | None, steps: int | None, t_end: ArrayLike | None, inputs: object, **adaptive: object
 ) -> tuple[int | None, ArrayLike | None]:
     """Return the number of common steps or the final time; with adaptive steps the final time or times.
 

@@ -24,22 +24,15 @@ def checked_ensemble(stepper: Integrator, q: States, p: States) -> tuple[Array, 
 
 
 def momenta_of_each(
-    stepper: Integrator,
-    q: States,
-    p: States | None,
-    velocity: States | None,
-    t: float,
-    parameters: EnsembleParameters,
+    stepper: Integrator, q: States, p: States | None, velocity: States | None, t: float, parameters: EnsembleParameters
 ) -> States:
     """Return the momenta of states specified by p or by velocity, each with its own parameters."""
     name, argument = stepper.momentum_or_velocity(p, velocity)
     if name == "p":
         return argument
-    at, positions, velocities = (
-        checked_number(t, "the time t"),
-        _states(stepper, q, "q"),
-        _states(stepper, argument, name),
-    )
+    at = checked_number(t, "the time t")
+    positions = _states(stepper, q, "q")
+    velocities = _states(stepper, argument, name)
     if positions.shape != velocities.shape:
         raise StateError(f"q and velocity must have equal shapes, not {positions.shape} and {velocities.shape}")
     values = parameters_of_each(stepper, parameters, len(positions))

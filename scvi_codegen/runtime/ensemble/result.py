@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TypeAlias
@@ -79,8 +80,7 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
     @property
     def ok(self) -> NDArray[np.bool_]:
         """(k,) flags of the trajectories that reached the end."""
-        reached: NDArray[np.bool_] = self.status == OK
-        return reached
+        return np.asarray(self.status == OK)
 
     @property
     def ends(self) -> tuple[Array, Array, Array]:
@@ -104,12 +104,10 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
         """Return (n, k) energies p.v - L; NaN after a failure, and for trajectories that leave the domain of L."""
         energies = np.full(self.q.shape[:2], np.nan)
         for j, good, parameters in self._with_parameters():
-            try:
+            with suppress(StateError):
                 energies[good, j] = self.stepper.energy(
                     self.q[good, j], self.p[good, j], self._times()[good, j], parameters
                 )
-            except StateError:
-                continue
         return energies
 
     def momentum_maps(self) -> Array:
@@ -123,12 +121,10 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
     def _momentum_maps(self) -> tuple[Array, Array]:
         values, sizes = np.full((2, *self.q.shape[:2], len(self.stepper.momentum_map_names)), np.nan)
         for j, good, parameters in self._with_parameters():
-            try:
+            with suppress(StateError):
                 values[good, j], sizes[good, j] = self.stepper._momentum_maps_and_sizes(
                     self.q[good, j], self.p[good, j], self._times()[good, j], parameters
                 )
-            except StateError:
-                continue
         return values, sizes
 
     def _with_parameters(self) -> Iterator[tuple[int, NDArray[np.intp], Array]]:

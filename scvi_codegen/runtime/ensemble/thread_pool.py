@@ -19,18 +19,8 @@ class _Stopped(Exception):  # noqa: N818  (a signal, not an error)
     """Signal that stops a job after another one failed or was interrupted."""
 
 
-def workers_of(threads: int | None) -> int:
-    """Return the number of threads, by default one per core."""
-    argument = 0 if threads is None else checked_count(threads, "threads", least=1)
-    return argument or os.cpu_count() or 1
-
-
 def run_jobs(
-    count: int,
-    work: Callable[[int, StopCheck], None],
-    *,
-    progress: Callable[[int], None] | None,
-    threads: int | None,
+    count: int, work: Callable[[int, StopCheck], None], *, progress: Callable[[int], None] | None, threads: int | None
 ) -> None:
     """Call ``work(j, check_stop)`` for j < count; an exception of ``progress`` or ``work`` stops all jobs promptly.
 
@@ -38,7 +28,8 @@ def run_jobs(
         progress: called with the number of completed jobs.
         threads: number of threads, by default one per core.
     """
-    workers, stop = workers_of(threads), threading.Event()
+    argument = 0 if threads is None else checked_count(threads, "threads", least=1)
+    workers, stop = (argument or os.cpu_count() or 1), threading.Event()
     pieces, done = min(count, MOST_JOBS), 0
 
     def check_stop(_: int) -> None:

@@ -19,11 +19,11 @@ from scvi_codegen.native.arguments import real_array
 from scvi_codegen.pictures.conserved import ResidualPlot
 from scvi_codegen.representation import summary
 from scvi_codegen.runtime.core.stepper import STEPPER, Stepper
-from scvi_codegen.runtime.core.validation import Array, checked_vector
+from scvi_codegen.runtime.core.validation import Array, columns_of_inputs
 from scvi_codegen.runtime.estimation.measurements import Measurements, distinct, state_names
 from scvi_codegen.runtime.estimation.multiple_shooting import LOOSE, TIGHT, Chain, Limits, chained, joined
 from scvi_codegen.runtime.inputs.segments import checked_inputs
-from scvi_codegen.runtime.rotations.states import homogeneous_state
+from scvi_codegen.runtime.rotations.states import checked_pair, homogeneous_state
 from scvi_codegen.validation import checked_count, checks_arguments
 
 SAME = 1e-10
@@ -148,7 +148,7 @@ def fit(
         StateError: if a shape, name or number is invalid.
         StepFailedError: if a step of the initial guess fails.
     """
-    stepper = stepper.bind(q, parameters)[0].known
+    stepper = stepper.bind(q, parameters)[0]._known_with_events
     q, p, velocity = homogeneous_state(stepper.interface, q, p, velocity)
     measurements = Measurements.checked(
         stepper, t, measured, observed, deviations, start, h, checked_inputs(stepper.interface, inputs)
@@ -215,7 +215,8 @@ class _Model:
     ) -> _Model:
         """Construct from validated arguments of :func:`fit`."""
         stepper, m = measurements.stepper, measurements.stepper.dimension
-        estimable = [name for name in stepper.parameters if name not in _of_inputs(stepper)]
+        inputs = columns_of_inputs(stepper.interface)
+        estimable = [name for k, name in enumerate(stepper.parameters) if k not in inputs]
         wanted = tuple(estimable) if unknown is None else distinct(unknown, "unknown")
         for name in wanted:
             if name not in estimable:
@@ -239,8 +240,7 @@ class _Model:
         unknown_indices = [2 * m + stepper.parameters.index(name) for name in wanted]
         names = (*wanted, *state_names(stepper)) if fit_initial_state else tuple(wanted)
         unknown_indices += range(2 * m) if fit_initial_state else ()
-        first = (checked_vector(stepper.interface, argument, name) for argument, name in ((q, "q"), (momenta, "p")))
-        known = np.concatenate([*first, values])
+        known = np.concatenate([*checked_pair(stepper.interface, q, momenta), values])
         return cls(measurements, names, np.array(unknown_indices, dtype=np.intp), known)
 
     @property
@@ -316,10 +316,6 @@ def _step_size_warning(chain: Chain, fitted: Fit, x: Array, free: NDArray[np.boo
     return ""
 
 
-def _of_inputs(stepper: Stepper) -> set[str]:
-    return {f"{name}_{part}" for name in stepper.interface.inputs for part in "0123t"}
-
-
 def _check_determined(names: Sequence[str], jacobian: Array, sizes: Array, at_bound: NDArray[np.bool_]) -> None:
     """Raise :class:`FitError` for unknowns that can change without changing the computed measurements.
 
@@ -334,11 +330,9 @@ def _check_determined(names: Sequence[str], jacobian: Array, sizes: Array, at_bo
     if at_bound.all():
         return
     labels = [*names, *[""] * (len(at_bound) - len(names))]
-    free, jacobian, sizes = (
-        [name for name, at in zip(labels, at_bound, strict=True) if not at],
-        jacobian[:, ~at_bound],
-        sizes[~at_bound],
-    )
+    free = [name for name, at in zip(labels, at_bound, strict=True) if not at]
+    jacobian = jacobian[:, ~at_bound]
+    sizes = sizes[~at_bound]
     lengths = np.linalg.norm(jacobian, axis=0)
     changes = lengths * sizes
     if nothing := np.flatnonzero((lengths == 0.0) | ((sizes > 0.0) & (changes <= SAME * changes.max()))).tolist():

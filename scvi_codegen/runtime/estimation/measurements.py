@@ -20,7 +20,7 @@ from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.inputs.segments import Input, parameters_of
 from scvi_codegen.runtime.rotations.quantities import observable_derivatives, observable_names, observables
 from scvi_codegen.runtime.run.times import steps_within
-from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
+from scvi_codegen.runtime.sensitivity.fixed_steps import tangents_along
 from scvi_codegen.runtime.trajectory.dense_output import checked_times
 
 
@@ -119,20 +119,16 @@ class Measurements:
             (n, c) computed values, (n, c, k) their derivatives along the (k, variables) initial variations, (2m,) final
             state, (k, variables) final variations.
         """
-        m, done = self.stepper.dimension, 0
+        done = 0
         values, derivatives = self._observed(state[np.newaxis], tangents[np.newaxis])  # where no step follows
         values, derivatives = np.tile(values, (len(self.t), 1)), np.tile(derivatives, (len(self.t), 1, 1))
         for t, h in self.pieces:
             at = parameters_of(self.stepper, parameters, self.inputs)(float(t[0]) + 0.5 * float(h[0]))
-            starts = Starts.chain(state[:m], state[m:], t, h)
-            vectors = np.zeros((len(h) + 1, *tangents.shape))
-            vectors[0] = tangents
-            self.stepper._propagate(starts, vectors, at, None)
-            states = np.concatenate([starts.q, starts.p], axis=1)
+            states, vectors, tangents = tangents_along(self.stepper, state, t, h, tangents, at)
             here = np.flatnonzero((self.step_numbers >= done) & (self.step_numbers <= done + len(h)))
             rows = self.step_numbers[here] - done
             values[here], derivatives[here] = self._observed(states[rows], vectors[rows])
-            state, tangents, done = states[-1], vectors[-1], done + len(h)
+            state, done = states[-1], done + len(h)
         return values, derivatives, state, tangents
 
     def _observed(self, states: Array, vectors: Array) -> tuple[Array, Array]:
@@ -181,7 +177,5 @@ def distinct(names: Sequence[str], what: str) -> tuple[str, ...]:
 def _column(stepper: Stepper, name: str) -> int:
     names = (*state_names(stepper), *observable_names(stepper.interface))
     if name not in names:
-        known = "coordinates, momenta, R_11, p_R_1, n_1 and the like" if stepper.interface.rotations else ""
-        known = known or "coordinates and momenta"
-        raise StateError(f"'{name}' cannot be observed, only {known}{closest(name, names)}")
+        raise StateError(f"'{name}' cannot be observed{closest(name, names)} Possible: {', '.join(names[:99])}")
     return names.index(name)

@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import FitError, StepFailedError
+from scvi_codegen.errors import EventError, FitError, StepFailedError
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.estimation.measurements import Measurements
 from scvi_codegen.runtime.inputs.segments import parameters_at
@@ -80,7 +80,7 @@ class Chain:
         """Return residuals in standard deviations, then jumps; infinite if a step fails, which shortens the update."""
         try:
             return self.evaluated(x)[0]
-        except StepFailedError:
+        except (EventError, StepFailedError):
             if self.at is None:
                 raise
             return np.full(len(self.evaluation[0]), np.inf)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -11,9 +10,9 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import EventError, EventWarning, StateError, warn
 from scvi_codegen.native.options import step_failure
+from scvi_codegen.runtime.arrays.any_size import MOST_COORDINATES
 from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.events.event import ACCUMULATED, JAMMED, THROUGH, Crossings
-from scvi_codegen.runtime.trajectory.dense_output import grid_tolerance
+from scvi_codegen.runtime.events.event import ACCUMULATED, BEHIND, JAMMED, THROUGH, UNDEFINED, Crossings
 from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ class CrossingSearch:
 
     Args:
         stepper: the stepper, with its events.
-        crossed: numbers of earlier crossings of each event; none by default.
+        watch: state of the search in an earlier part of the run, which has not ended; ``None`` starts anew.
         terminal: whether terminal events end the search.
 
     Attributes:
@@ -37,16 +36,16 @@ class CrossingSearch:
         changes: whether crossings change the state, so that the run must be advanced by :meth:`advance`.
     """
 
-    def __init__(self, stepper: Integrator, crossed: Sequence[int] = (), *, terminal: bool = True) -> None:
+    def __init__(self, stepper: Integrator, watch: Any = None, *, terminal: bool = True) -> None:
         self.stepper, self.binding = stepper, stepper.binding
         self.recorded: list[NDArray[Any]] = []
-        self.watch = self.binding.new("watch *")
+        self.watch = self.binding.new("watch *") if watch is None else watch
         self.changes = terminal and stepper.changes_states
-        for number, event in enumerate(stepper.events):
+        for number, event in enumerate(stepper.events if watch is None else ()):
             self.watch.direction[number] = event.direction
             self.watch.acts[number] = terminal and event.changes_state
-            if terminal and event.terminal:
-                self.watch.remaining[number] = int(event.terminal) - (crossed[number] if crossed else 0)
+            self.watch.remaining[number] = terminal and int(event.terminal)
+        self._discards_states = stepper.dimension > MOST_COORDINATES and any(event.loops for event in stepper.events)
         self._capacity = min(INITIAL_CAPACITY, max(LEAST_CAPACITY, CROSSING_NUMBERS // stepper.dimension))
 
     @property
@@ -71,23 +70,10 @@ class CrossingSearch:
         done = 0
         while True:
             crossings, filled = self.binding.new(f"crossing[{self._capacity}]"), self.binding.numbers("long long *")
-            status = self.binding.function("crossings")(
-                self.watch,
-                len(t) - done,
-                self.binding.pointer(h[done:]),
-                self.binding.pointer(t[done:]),
-                self.binding.pointer(q[done:]),
-                self.binding.pointer(p[done:]),
-                parameters,
-                options,
-                self._capacity,
-                crossings,
-                filled,
-                report,
-                workspace,
-            )
-            count = int(filled[0])
-            self.recorded.append(self.binding.records(crossings)[:count].copy())
+            rows = [self.binding.pointer(each[done:]) for each in (h, t, q, p)]
+            to = self._capacity, crossings, filled, report, workspace
+            status = self.binding.function("crossings")(self.watch, len(t) - done, *rows, parameters, options, *to)
+            self._record(crossings, int(filled[0]))
             done += int(report.steps)
             if status:
                 raise self._failure(status, report, first + done, float(h[done]))
@@ -113,23 +99,12 @@ class CrossingSearch:
         rows[0][0], rows[1][0], rows[2][0] = run.t, run._q, run._p
         iterations, numbers = np.zeros(most + 1, np.int32), np.full(most + 1, number, np.int64)
         crossings, filled = binding.new(f"crossing[{self._capacity}]"), binding.numbers("long long *")
-        status = binding.function("advance_with_changes", run._memory)(
-            self.watch,
-            plan.t_end,
-            plan.tau or plan.tolerance,
-            size,
-            *run._arguments,
-            most,
-            *(binding.pointer(each[1:]) for each in rows),
-            binding.integers(iterations[1:]),
-            binding.whole_numbers(numbers[1:]),
-            self._capacity,
-            crossings,
-            filled,
-            run._report,
-            run._workspace,
-        )
-        self.recorded.append(binding.records(crossings)[: int(filled[0])].copy())
+        arguments = self.watch, plan.t_end, plan.tau or plan.tolerance, size, *run._arguments, most
+        states = *(binding.pointer(each[1:]) for each in rows), binding.integers(iterations[1:])
+        to = self._capacity, crossings, filled, run._report, run._workspace
+        advance = binding.function("advance_with_changes", run._memory)
+        status = advance(*arguments, *states, binding.whole_numbers(numbers[1:]), *to)
+        self._record(crossings, int(filled[0]))
         report, count = run._report, int(run._report.stored) + 1
         failure = self._failure(status, report, number + int(report.steps), run.h) if status else None
         if not (failure or self.ended or report.steps == size or run.arrived):
@@ -138,21 +113,23 @@ class CrossingSearch:
         sizes = np.append(lengths[1:], run.h or np.nan)
         return (t, q, p, iterations[:count]), sizes, numbers[:count], failure
 
-    def _failure(self, status: int, report: Any, step: int, h: float) -> Exception:
-        if self.watch.undefined:
-            function = self.stepper.events[self.watch.undefined - 1].function
-            return EventError(f"the event function '{function}' is not finite in the step from t = {report.t:.17g}")
-        if self.watch.accumulated and not self.watch.ended:
-            function = self.stepper.events[self.watch.accumulated - 1].function
-            return EventError(ACCUMULATED.format(function=function, t=report.t))
-        for number, message in ((self.watch_value("through"), THROUGH), (self.watch_value("jammed"), JAMMED)):
-            if number:
-                return EventError(message.format(function=self.stepper.events[number - 1].function, t=report.t))
-        return step_failure(status, report, step=step, h=h)
+    def _record(self, crossings: Any, count: int) -> None:
+        """Record the first crossings of an array, without states if these would be too many."""
+        records = self.binding.records(crossings)[:count].copy()
+        if count:
+            self.last = float(records["t"][-1]), records["q"][-1], records["p"][-1]
+        self.recorded.append(records[["t", "function", "element"]].copy() if self._discards_states else records)
 
-    def watch_value(self, name: str) -> int:
-        """Return a number of the watch, 0 without changes of the state."""
-        return int(getattr(self.watch, name)) if self.changes else 0
+    def _failure(self, status: int, report: Any, step: int, h: float) -> Exception:
+        behind = getattr(self.watch, "behind", 0.0)
+        through = BEHIND if behind < 0.0 else THROUGH
+        messages = {"undefined": UNDEFINED, "accumulated": ACCUMULATED, "through": through, "jammed": JAMMED}
+        for name, message in messages.items():
+            number = getattr(self.watch, name, 0)
+            if number and not (name == "accumulated" and self.ended):
+                function = self.stepper.events[number - 1].function
+                return EventError(message.format(function=function, t=report.t, g=behind))
+        return step_failure(status, report, step=step, h=h)
 
     def warn_of_accumulation(self) -> None:
         """Issue a :class:`EventWarning` if the run ended where crossings accumulate."""
@@ -164,21 +141,19 @@ class CrossingSearch:
                 EventWarning,
             )
 
-    @property
-    def last(self) -> tuple[float, Array, Array]:
-        """Time, positions and momenta of the last crossing."""
-        crossing = self.recorded[-1][-1]
-        return float(crossing["t"]), crossing["q"], crossing["p"]
-
     def crossings(self) -> tuple[Crossings, ...]:
         """Return the crossings by event."""
-        none = self.binding.records(self.binding.new("crossing[1]"))[:0]
-        records, named = np.concatenate([none, *self.recorded]), self.stepper.named
-        return tuple(
-            Crossings(event=event, t=mine["t"].copy(), q=named(mine["q"].copy()), p=named(mine["p"].copy()))
-            for number, event in enumerate(self.stepper.events)
-            for mine in [records[records["function"] == number]]
-        )
+        none, named = self.binding.records(self.binding.new("crossing[1]"))[:0], self.stepper.named
+        records: Any = np.concatenate(self.recorded or [none])
+        crossings = []
+        for number, event in enumerate(self.stepper.events):
+            mine = records[records["function"] == number]
+            values = {name: mine[name].copy() for name in ("t", "q", "p", "element") if name in mine.dtype.names}
+            unknown = np.broadcast_to(np.nan, (len(mine), self.stepper.dimension))
+            values |= {name: named(values.get(name, unknown)) for name in "qp"}
+            values.setdefault("element", np.zeros(len(mine), np.int64))
+            crossings.append(Crossings(event=event, **values))
+        return tuple(crossings)
 
 
 def crossings_of(stepper: Integrator, states: SavedStates) -> tuple[Crossings, ...]:
@@ -188,7 +163,7 @@ def crossings_of(stepper: Integrator, states: SavedStates) -> tuple[Crossings, .
         StateError: if intermediate states were not saved.
         EventError, StepFailedError: as :meth:`CrossingSearch.search`.
     """
-    lengths, spans, tolerance = states.step_sizes.copy(), np.diff(states.stepped), grid_tolerance(states)[:-1]
+    lengths, spans, tolerance = states.step_sizes.copy(), np.diff(states.stepped), states.grid_tolerance[:-1]
     short = np.abs(spans) < np.abs(lengths[:-1]) - tolerance
     if short[:-1].any() or not (np.abs(spans) <= np.abs(lengths[:-1]) + tolerance).all():
         raise StateError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 DIRECTIONS = (-1, 0, 1)
 COMPARISON = re.compile(r"(>=|<=|>|<)")
+LOOPS = re.compile(r"\s+for\b.*", re.DOTALL)
+UNDEFINED = "the event function '{function}' is not finite in the step from t = {t:.17g}"
 ACCUMULATED = (
     "the crossings of the terminal event '{function}' accumulate at t = {t:.17g}: the run starts at its zero and "
     "returns within a rounding error (Zeno behaviour, as of infinitely many bounces). End the run here, or continue "
@@ -27,12 +30,18 @@ ACCUMULATED = (
 )
 
 THROUGH = (
-    "the state passes the wall '{function}' in the step from t = {t:.17g} without an impact: it was at rest on the "
-    "wall, or two impacts are closer than rounding. End the run before that time, or continue with a constraint"
+    "the state passes the wall '{function}' in the step from t = {t:.17g} without an impact: it started on the "
+    "wall or was at rest there, or two impacts are closer than rounding. Start before the wall, end the run before "
+    "that time, or continue with a constraint"
 )
+BEHIND = (
+    "the run starts behind the wall '{function}', which is {g:.6g} at t = {t:.17g} and must not be negative. Start in "
+    "its region, change its sign if the region is the other one, or limit the wall by where="
+)
+
 JAMMED = (
     "the changes of the state by '{function}' do not end in the step from t = {t:.17g}: a point is jammed in a corner "
-    "that closes, or the new state crosses zero again at once. Check then= and where=, or use a smaller restitution"
+    "that closes, constraints leave no motion away from it, or the new state crosses zero again. Check then= and where="
 )
 
 
@@ -46,7 +55,8 @@ class Event:
 
     Attributes:
         function: g, as a formula or a SymPy expression in the coordinates, their velocities (``q_dot``), their momenta
-            (``p_q``, or the names of the Hamiltonian), time ``t``, inputs and parameters.
+            (``p_q``, or the names of the Hamiltonian), time ``t``, inputs and parameters. For arrays of run-time sizes
+            ``"r[i, 0] for i in N"`` is a function for each element; its index may occur in all formulas of the event.
         direction: 1 for crossings from negative to positive in the direction of the run, -1 for the opposite, 0 both.
         terminal: ``True`` if the first crossing ends the run, or the number of the crossing that ends it. Simultaneous
             crossings of other events (two walls in a corner) are recorded as well.
@@ -78,7 +88,10 @@ class Event:
                 f"the wall '{self.function}' must have direction=-1 and no then=: use impact('{self.function}', "
                 f"restitution={self.restitution!r})"
             )
-        if isinstance(self.restitution, int | float) and not 0.0 <= self.restitution <= 1.0:
+        number = 0.0
+        with suppress(TypeError, ValueError):  # of formulas with names
+            number = float(cast(float, self.restitution))
+        if not 0.0 <= number <= 1.0:
             raise EventError(f"the restitution of the wall '{self.function}' is {self.restitution}: give 0 to 1")
         if isinstance(self.then, Mapping):
             object.__setattr__(self, "then", tuple((_name(key), value) for key, value in self.then.items()))
@@ -89,6 +102,25 @@ class Event:
         if isinstance(self.where, list):
             object.__setattr__(self, "where", tuple(self.where))
         _ = self.conditions
+
+    def check_function(self, moving: Sequence[str], *, constant: bool) -> None:
+        """Raise :class:`EventError` for a constant function, and a wall that contains ``moving``, momenta or rates."""
+        if constant:
+            raise EventError(
+                f"the event function '{self.function}' is constant and never crosses zero: use a function of the "
+                "state or of time"
+            )
+        if self.restitution is not None and moving:
+            raise EventError(
+                f"the wall '{self.function}' of an impact contains '{moving[0]}': a wall is a function of "
+                "positions, time and parameters; write the change of the state with then="
+            )
+
+    @property
+    def loops(self) -> str:
+        """Loops of an event with a function for each of their elements, ``" for i in N"``; else empty."""
+        found = LOOPS.search(self.function) if isinstance(self.function, str) else None
+        return found[0] if found else ""
 
     @property
     def changes_state(self) -> bool:
@@ -106,6 +138,19 @@ class Event:
         if self.where is None:
             return ()
         return tuple(map(_condition, self.where if isinstance(self.where, tuple) else (self.where,)))
+
+    @property
+    def table(self) -> dict[str, Any]:
+        """Table ``[[events]]`` of a model file; ``Event(**table)`` is this event, with formulas as text."""
+
+        def plain(value: Any) -> Any:
+            return [*map(str, value)] if isinstance(value, tuple) else value if isinstance(value, kinds) else str(value)
+
+        kinds = str, int, float
+        named = {name: getattr(self, name) for name in ("function", "where", "restitution", "direction", "terminal")}
+        unset = {"direction": 0, "terminal": 0}
+        table = {name: plain(value) for name, value in named.items() if value != unset.get(name)}
+        return table | ({"then": {name: plain(value) for name, value in self.changes}} if self.then else {})
 
 
 def _name(variable: Any) -> str:
@@ -164,13 +209,15 @@ class Crossings:
     Attributes:
         event: the event.
         t: (k,) times.
-        q, p: (k, m) states.
+        q, p: (k, m) states; NaN for an event with ``for`` of more than 2000 coordinates.
+        element: (k,) numbers of the elements of its loops, 0 without loops; i for ``"q[i] for i in N"``.
     """
 
     event: Event
     t: Array
     q: Array
     p: Array
+    element: NDArray[np.int64]
 
     __repr__ = summary("event", "t")
 
@@ -179,7 +226,7 @@ class Crossings:
 
     def chosen(self, which: NDArray[np.bool_]) -> Crossings:
         """Return the crossings selected by a (k,) boolean mask."""
-        return replace(self, t=self.t[which], q=self.q[which], p=self.p[which])
+        return replace(self, **{name: getattr(self, name)[which] for name in ("t", "q", "p", "element")})
 
 
 def as_events(events: EventLike | Sequence[EventLike] | None) -> tuple[Event, ...]:

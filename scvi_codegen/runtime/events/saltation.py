@@ -7,7 +7,8 @@ initial data, rate = g_z X- + g_t. At a fixed time after it
 
 where X- and X+ are the rates of the computed flow: the derivatives of the steps before and after the crossing with
 respect to their sizes, so that the result is the derivative of the computed run (Aizerman & Gantmacher, Q. J. Mech.
-Appl. Math. 11 (1958) 243). The impulse lambda_1 of an impact is differentiated through its energy equation.
+Appl. Math. 11 (1958) 243). The impulse lambda_1 of an impact is differentiated through its energy equation. Constraints
+add the derivative of the projection P of the new state, p+ = P(q, p + lambda g_q).
 """
 
 from __future__ import annotations
@@ -21,9 +22,11 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.constraints.projection import projected
 from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.runtime.events.array_events import events_of_entries
 from scvi_codegen.runtime.events.event import Event
+from scvi_codegen.runtime.run.times import WHOLE
+from scvi_codegen.runtime.trajectory.recomputation import changes_by_events
 
 if TYPE_CHECKING:
     from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
@@ -31,11 +34,13 @@ if TYPE_CHECKING:
 
 GRAZING = 2.0**-20
 """Smallest rate of an event function relative to its gradient and the flow; below it rounding dominates 1/rate."""
-SMALL_STEP = 2.0**-30
+SMALL_STEP = 2.0**-15
 """Fraction of a step from which the rate of the flow at a last state is computed."""
-DIFFERENCE = 2.0**-7
-"""Relative increment of differences of sixth order of the energy."""
-WEIGHTS = np.array([-1.0, 9.0, -45.0, 45.0, -9.0, 1.0]) / 60.0
+DIFFERENCE = 2.0**-10
+"""Relative increment of differences of sixth order."""
+ADMISSIBLE = 0.5
+"""Singular values of the derivative of a projection are at least 1, or 0 for inadmissible directions."""
+WEIGHTS = np.array([1.0, -9.0, 45.0]) / 60.0
 PLACES = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
 
 
@@ -67,33 +72,21 @@ def jumps_within(
 
 
 def _changes(states: SavedStates, numbers: NDArray[np.intp]) -> dict[int, tuple[Event, Array]]:
-    """Return the event and the state before it for each of the saved states ``numbers`` at which an event acted."""
+    """Return the event, of entries, and the state before it for each of ``numbers`` at which an event acted."""
     result: dict[int, tuple[Event, Array]] = {}
-    span = states.t[[numbers[0], numbers[-1]]]
-    for crossings in getattr(states, "events", ()):
-        if not crossings.event.changes_state:
-            continue
+    for crossings, rows in changes_by_events(states):
         if states.forward < 0.0:
             raise StateError("derivatives through events that change the state require a run forward in time")
-        if states.stepper.constraints or states.stepper.interface.time_transformation:
-            raise StateError(
-                "derivatives through events that change the state are not available with constraints, onto which the "
-                "new state is projected, and with a time transformation: use free coordinates and other steps"
-            )
-        here = slice(*np.searchsorted(crossings.t, span, side="right").tolist())
-        rows = np.searchsorted(states.t, crossings.t[here])
-        if not np.array_equal(states.t[rows], crossings.t[here]):
-            raise StateError(
-                "derivatives through events that change the state require all states: integrate with save_every=1 and "
-                "without t_eval"
-            )
-        for row, q, p in zip(rows.tolist(), np.asarray(crossings.q)[here], np.asarray(crossings.p)[here], strict=True):
+        here = (numbers[0] < rows) & (rows <= numbers[-1])
+        each = states.stepper._events_of_entries(crossings.event) if here.any() else ()
+        found = (crossings.element[here], crossings.q[here], crossings.p[here])
+        for row, element, q, p in zip(rows[here].tolist(), *found, strict=True):
             if row in result:
                 raise StateError(
                     f"the run meets the events '{result[row][0].function}' and '{crossings.event.function}' at once at "
                     f"t = {states.t[row]:.17g}: derivatives do not exist in a corner"
                 )
-            result[row] = crossings.event, np.concatenate([q, p])
+            result[row] = each[element], np.concatenate([q, p])
     return result
 
 
@@ -108,20 +101,21 @@ def _jump(
     def products(state: Array, h: float, time: float, seeds: Array) -> Array:
         return stepper._products(state[:m], state[m:], h, time, parameters, options, seeds)[:, : 2 * m].T
 
-    size_seed = np.eye(size)[-1:]
     start = np.concatenate([starts.q[k - 1], starts.p[k - 1]])
-    arrival = products(start, float(starts.h[k - 1]), float(starts.t[k - 1]), size_seed)[:, 0]
-    if row + 1 < len(states):
-        h = float(states.t[row + 1] - t)
-        step = products(after, h, t, np.eye(size))
-        departure = np.linalg.solve(step[:, : 2 * m], step[:, -1] - step[:, -2])
-    else:
-        h = SMALL_STEP * float(starts.h[k - 1])
-        departure = 0.5 * (products(after, h, t, size_seed) + products(after, -h, t, size_seed))[:, 0]
-    formulas = event  # in the names of the coordinates of known sizes
-    if stepper.origin is not None and stepper.problem is not None:
-        (formulas,) = events_of_entries(stepper.origin.interface, stepper.problem, (event,))
-    values = _derivatives(stepper.known.interface, formulas)(before, t, parameters)
+    arrival = products(start, float(starts.h[k - 1]), float(starts.t[k - 1]), np.eye(size)[-1:])[:, 0]
+    at_end = row + 1 == len(states)
+    h = SMALL_STEP * abs(states.h) if at_end else float(states.t[row + 1] - t)
+    # 1 if the next step is the rest of a step of size h, whose variation belongs to the first part
+    rest = float(not at_end and states.plan.fixed and abs(h) < (1.0 - WHOLE) * abs(states.h))
+    step = products(after, h, t, np.eye(size))
+    departure, basis = np.zeros(2 * m), np.eye(2 * m)
+    if stepper.constraints:  # tangent vectors are admissible: departure + the range of the derivative of the projection
+        onto = _projection(states, after, t, all_inputs=False)[1]
+        directions, sizes, _ = np.linalg.svd(onto[:, : 2 * m])
+        departure, basis = onto[:, -1], directions[:, sizes > ADMISSIBLE]
+    moved = step[:, -1] - step[:, -2] - step[:, : 2 * m] @ departure
+    departure = departure + basis @ np.linalg.lstsq(step[:, : 2 * m] @ basis, moved)[0]
+    values = _derivatives(stepper.known.interface, event)(before, t, parameters)
     gradient = np.concatenate([values.gradient, np.zeros(1)])
     rate = values.gradient[: 2 * m] @ arrival + values.gradient[-1]
     steepest = np.linalg.norm(values.gradient[: 2 * m]) * np.linalg.norm(arrival) + abs(values.gradient[-1])
@@ -130,11 +124,18 @@ def _jump(
             f"the event '{event.function}' is tangent to the run at t = {t:.17g}: derivatives do not exist at a "
             "grazing crossing"
         )
-    change = values.map if event.restitution is None else _impact(states, event, values, before, after, t, all_inputs)
+    if event.restitution is not None:
+        change = _impact(states, values, before, after, t, all_inputs)
+    else:
+        by = _projection(states, values.value, t, all_inputs=all_inputs)[1]
+        change = by[:, : 2 * m] @ values.map
+        change[:, 2 * m :] += by[:, 2 * m :]
     shift = -gradient / rate
     matrix = np.eye(size)
     matrix[: 2 * m] = np.concatenate([change, np.zeros((2 * m, 1))], axis=1)
     matrix[: 2 * m] += np.outer(change[:, : 2 * m] @ arrival + change[:, -1] - departure, shift)
+    matrix[: 2 * m, -1] -= rest * departure
+    matrix[-2, -1] -= rest
     return Jump(matrix, before)
 
 
@@ -144,12 +145,12 @@ class Values(NamedTuple):
     Attributes:
         gradient: (x,) of g.
         map: (2m, x) of the new state; of an impact those of g_q, g_t and e, (m + 2, x).
-        normal: (m + 2,) g_q, g_t and e of an impact.
+        value: (2m,) new state; of an impact (m + 2,) g_q, g_t and e.
     """
 
     gradient: Array
     map: Array
-    normal: Array
+    value: Array
 
 
 @lru_cache(maxsize=64)
@@ -171,11 +172,10 @@ def _derivatives(interface: Interface, event: Event) -> Callable[[Array, float, 
         raise StateError(
             f"derivatives through the event '{event.function}' require momenta instead of velocities in its formulas"
         )
-    normal = list(values) if event.restitution is not None else []
-    mapped = normal or [new.get(k, each) for k, each in enumerate(z)]
+    mapped = [new.get(k, each) for k, each in enumerate(z)] if event.restitution is None else list(values)
     entries = [formulas.functions[0].diff(x) for x in variables]
     entries += [value.diff(x) for value in mapped for x in variables]
-    function = sympy.lambdify((variables,), [*entries, *normal], cse=True)
+    function = sympy.lambdify((variables,), [*entries, *mapped], cse=True)
     count = len(variables)
 
     def evaluate(state: Array, t: float, parameters: Array) -> Values:
@@ -186,30 +186,74 @@ def _derivatives(interface: Interface, event: Event) -> Callable[[Array, float, 
     return evaluate
 
 
-def _impact(
-    states: SavedStates, event: Event, values: Values, before: Array, after: Array, t: float, all_inputs: bool
-) -> Array:
+def _impact(states: SavedStates, values: Values, before: Array, after: Array, t: float, all_inputs: bool) -> Array:
     """Return the (2m, x) derivative of the state after an impact by x = (q, p, parameters, t).
 
-    F = H(q, p + lambda n) - H(q, p) + lambda g_t = 0 gives lambda_x = -F_x / F_lambda.
+    With n = g_q, u = p + lambda n and p1 = P(q, u), F = H(q, p1) - H(q, p) + lambda g_t - (p1 - u).v1 = 0 gives
+    lambda_x = -F_x / F_lambda; the last term is the work of moving constraints.
     """
     stepper, parameters = states.stepper, states.parameters
     m, count = stepper.dimension, values.gradient.size
-    n, e = values.normal[:m], values.normal[m + 1]
-    impulse = (after - before)[m:] @ n / (n @ n)
+    n, e, (q, p) = values.value[:m], values.value[m + 1], np.split(before, 2)
+    # P_u maps G^T mu to 0, and the change of p, lambda n + G^T mu, to lambda P_u n
+    onto = _projection(states, after, t, all_inputs=False)[1][m:, m : 2 * m]
+    impulse = float((onto @ (after - before)[m:]) @ (onto @ n) / ((onto @ n) @ (onto @ n)))
     full = 2.0 * impulse / (1.0 + e)
-    q, p = before[:m], before[m:]
-    ends = p, p + full * n
-    v0, v1 = (np.asarray(stepper.velocity(q, each, t, parameters)) for each in ends)
+
+    def changed(impulse: float) -> tuple[Array, Array, Array]:
+        """Return P(q, p + lambda n), its derivative by x at constant lambda, and by lambda."""
+        state, by = _projection(states, np.concatenate([q, p + impulse * n]), t, all_inputs=all_inputs)
+        onto = by[m:, m : 2 * m]
+        return state[m:], by[m:] + impulse * onto @ values.map[:m], onto @ n
+
+    p1, p1_by, p1_by_impulse = changed(full)
+    v0, v1 = (np.asarray(stepper.velocity(q, each, t, parameters)) for each in (p, p1))
     residual = full * (v1 @ values.map[:m] + values.map[m])
     residual[m : 2 * m] += v1 - v0
-    residual += _energy_differences(states, q, ends, t, all_inputs)
-    by = -residual / (n @ v1 + values.normal[m])
-    total = 0.5 * ((1.0 + e) * by + full * values.map[m + 1])
-    change = np.zeros((2 * m, count))
-    change[:, : 2 * m] = np.eye(2 * m)
-    change[m:] += np.outer(n, total) + impulse * values.map[:m]
-    return change
+    residual += _energy_differences(states, q, (p, p1), t, all_inputs)
+    residual_by_impulse = n @ v1 + values.value[m]
+    if stepper.constraints:
+        work = (p1 - p - full * n) @ _differences(stepper.velocity, q, p1, parameters, t, all_inputs=all_inputs)
+        by_momentum = work[m : 2 * m].copy()
+        work[m : 2 * m] = 0.0
+        residual -= work + by_momentum @ p1_by
+        residual_by_impulse -= by_momentum @ p1_by_impulse
+    total = 0.5 * (full * values.map[m + 1] - (1.0 + e) * residual / residual_by_impulse)
+    _, by, by_impulse = changed(impulse)
+    return np.vstack([np.eye(m, count), by + np.outer(by_impulse, total)])
+
+
+def _projection(states: SavedStates, state: Array, t: float, *, all_inputs: bool) -> tuple[Array, Array]:
+    """Return the projection of a state onto the constraints, and its (2m, x) derivative; without constraints 1."""
+    stepper, parameters = states.stepper, states.parameters
+    if not stepper.constraints:
+        return state, np.eye(len(state), len(state) + len(parameters) + 1)
+
+    def onto(q: Array, p: Array, t: float, values: Array) -> Array:
+        return np.concatenate(projected(stepper, q, p, t, values)[:2])
+
+    q, p = np.split(state, 2)
+    return onto(q, p, t, parameters), _differences(onto, q, p, parameters, t, all_inputs=all_inputs)
+
+
+def _differences(
+    function: Callable[[Array, Array, float, Array], Array],
+    q: Array,
+    p: Array,
+    parameters: Array,
+    t: float,
+    *,
+    all_inputs: bool,
+) -> Array:
+    """Return the (.., x) derivative of a function of q, p, t and parameters by differences of sixth order."""
+    m, x = len(q), np.concatenate([q, p, parameters, [t]])
+    columns = np.zeros((len(x), len(function(q, p, t, parameters))))
+    for k in (*range(2 * m), *(range(2 * m, len(x) - 1) if all_inputs else ()), -1):
+        step, values = DIFFERENCE * max(1.0, abs(x[k])), np.tile(x, (len(PLACES), 1))
+        values[:, k] += step * PLACES
+        at = [np.asarray(function(y[:m], y[m : 2 * m], float(y[-1]), y[2 * m : -1])) for y in values]
+        columns[k] = _central_differences(np.stack(at, axis=-1)) / step
+    return columns.T
 
 
 def _energy_differences(states: SavedStates, q: Array, ends: tuple[Array, Array], t: float, all_inputs: bool) -> Array:
@@ -226,11 +270,16 @@ def _energy_differences(states: SavedStates, q: Array, ends: tuple[Array, Array]
         )
         return np.asarray(last - first)
 
-    partials = difference(parameters).reshape(m + 1, -1) @ WEIGHTS / steps
+    partials = _central_differences(difference(parameters).reshape(m + 1, -1)) / steps
     result[:m], result[-1] = partials[:m], partials[m]
     shifted = x[np.newaxis]
     for k in range(len(parameters) if all_inputs else 0):
         step = DIFFERENCE * max(1.0, abs(parameters[k]))
         sides = [parameters + place * step * (np.arange(len(parameters)) == k) for place in PLACES]
-        result[2 * m + k] = np.concatenate([difference(each) for each in sides]) @ WEIGHTS / step
+        result[2 * m + k] = _central_differences(np.concatenate([difference(each) for each in sides])) / step
     return result
+
+
+def _central_differences(values: Array) -> Array:
+    """Return the sixth-order differences of values at ``PLACES``, exactly 0 if these are equal."""
+    return np.asarray((values[..., :2:-1] - values[..., :3]) @ WEIGHTS)

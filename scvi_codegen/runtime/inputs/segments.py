@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.native.arguments import checked_number, checked_step, real_array
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.core.validation import Array, check_left_to_inputs, no_input
 from scvi_codegen.runtime.run.accuracy import warn_of_large_steps
@@ -41,7 +41,7 @@ class Input:
     Attributes:
         breakpoints: (n + 1,) ascending times.
         pieces: (n, 5) C parameters of each piece: ascending coefficients in powers of the time since its breakpoint,
-            and that breakpoint; (n, k, 5) for k trajectories.
+            and that breakpoint; (n, k, 5) for k trajectories. A constant has one piece without ends, from time 0.
     """
 
     breakpoints: Array
@@ -57,22 +57,37 @@ class Input:
 def checked_inputs(
     interface: Interface, argument: Mapping[str, Any] | None, trajectories: int | None = None
 ) -> dict[str, Input]:
-    """Return validated inputs: (t, values), (t, values, kind) or a piecewise polynomial of SciPy for each name.
+    """Return validated inputs: (t, values), (t, values, kind), a number or a piecewise polynomial of SciPy by name.
 
-    With a number of trajectories, values may have one row for each trajectory.
+    With a number of trajectories, values may have one row for each trajectory, and constants one number.
 
     Raises:
         StateError: if a name is no input, an input is missing, or data define no function of time.
     """
-    names, argument = interface.inputs, dict(argument or {})
-    if interface.energy_parameter:
+    if interface.energy_parameter and argument is not None:
         raise StateError("inputs are not supported in transformed time: compile the original system")
+    names, argument = interface.inputs, dict(argument or {})
     for name in argument:
         if name not in names:
             raise no_input(name, names)
     if missing := [name for name in names if name not in argument]:
-        raise StateError(f"the input '{missing[0]}' is not set: pass inputs={{'{missing[0]}': (t, values)}}")
+        raise StateError(
+            f"the input '{missing[0]}' is not set: pass inputs={{'{missing[0]}': (t, values)}}, or a number"
+        )
     return {name: input_of(name, value, trajectories) for name, value in argument.items()}
+
+
+def checked_data(
+    interface: Interface, inputs: Mapping[str, Any] | None, t_eval: Any, save_every: int, *, observed: bool
+) -> dict[str, Input] | None:
+    """Return validated inputs; raise :class:`StateError` for output arguments that exclude each other or inputs."""
+    if t_eval is not None and save_every != 1:
+        raise StateError(f"give either t_eval or save_every={save_every}, not both")
+    if inputs is not None and t_eval is not None:
+        raise StateError("t_eval is not supported with inputs: omit t_eval")
+    if observed and (inputs is not None or t_eval is not None):
+        raise StateError("observe is not supported with inputs or t_eval: omit observe")
+    return None if inputs is None else checked_inputs(interface, inputs)
 
 
 def input_of(name: str, argument: Any, trajectories: int | None = None) -> Input:
@@ -86,8 +101,13 @@ def input_of(name: str, argument: Any, trajectories: int | None = None) -> Input
         )
     if hasattr(argument, "c") and hasattr(argument, "x"):
         return _from_pieces(name, *_powers(name, argument), trajectories)
+    if not isinstance(argument, tuple):
+        constant = real_array(argument, f"the input '{name}'")
+        if constant.shape in ((), (trajectories,)):
+            return _from_pieces(name, np.array([-np.inf, np.inf]), constant[np.newaxis, ..., np.newaxis], trajectories)
     if not isinstance(argument, tuple) or len(argument) not in (2, 3):
-        raise StateError(f"the input '{name}' must be (t, values) or (t, values, 'cubic'), not {argument!r:.60}")
+        kinds = "a number, (t, values) or (t, values, 'cubic')"
+        raise StateError(f"the input '{name}' must be {kinds}, not {argument!r:.60}")
     t, values = (
         checked_times(part, f"{what} of the input {name}")
         for part, what in zip(argument, ("t", "values"), strict=False)
@@ -151,12 +171,12 @@ def _from_pieces(name: str, breakpoints: Array, ascending: Array, trajectories: 
         )
     pieces = np.zeros((ascending.shape[-1], *ascending.shape[1:-1], POWERS + 1))
     pieces[..., : len(ascending)] = ascending.T
-    pieces.T[POWERS] = breakpoints[:-1]
+    pieces.T[POWERS] = np.where(np.isfinite(breakpoints[:-1]), breakpoints[:-1], 0.0)
     return Input(breakpoints, pieces)
 
 
-def inputs_of_slice(inputs: Mapping[str, Input], part: slice) -> dict[str, Input]:
-    """Return the inputs of a slice of the trajectories of an ensemble."""
+def inputs_of_slice(inputs: Mapping[str, Input], part: slice | int) -> dict[str, Input]:
+    """Return the inputs of a slice of the trajectories of an ensemble, or of one of them."""
     return {
         name: replace(data, pieces=data.pieces[:, part]) if data.pieces.ndim == 3 else data
         for name, data in inputs.items()
@@ -183,7 +203,7 @@ def record_pieces(
         progress: called with the number of completed steps.
     """
     pieces: list[Trajectory] = []
-    first, run._crossed = run.steps, (0,) * len(run.stepper.events)
+    first, run._watch = run.steps, None
     report = None if progress is None else lambda _: progress(run.steps - first)
     for steps in prepared_segments(run, inputs, t_end, values):
         try:
@@ -191,11 +211,8 @@ def record_pieces(
         except StepFailedError as failure:
             failure.trajectory = joined([*pieces, Trajectory.before(failure)])
             raise
-        run._crossed = tuple(n + len(crossings) for n, crossings in zip(run._crossed, piece.events, strict=True))
-        terminal = [int(crossings.event.terminal) for crossings in piece.events]
-        ended = any(0 < last <= count for last, count in zip(terminal, run._crossed, strict=True))
-        pieces.append(piece if ended else with_final_state(piece, run))
-        if ended:
+        pieces.append(piece if run.ended else with_final_state(piece, run))
+        if run.ended:
             break
     if run._leaving and pieces:
         warn_of_large_steps(pieces[-1])

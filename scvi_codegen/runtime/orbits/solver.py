@@ -17,22 +17,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.errors import MethodError, OrbitError, StateError, StepFailedError, closest
+from scvi_codegen.errors import EventError, MethodError, OrbitError, StateError, StepFailedError, closest
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.stepper import STEPPER, Stepper
-from scvi_codegen.runtime.core.validation import (
-    Array,
-    Parameters,
-    check_inputs_given,
-    checked_vector,
-)
+from scvi_codegen.runtime.core.validation import Array, Parameters, check_inputs_given, checked_vector
 from scvi_codegen.runtime.estimation.measurements import state_names
 from scvi_codegen.runtime.orbits.periodic_orbit import PeriodicOrbit
 from scvi_codegen.runtime.rotations.reduction import Reduction
-from scvi_codegen.runtime.rotations.states import homogeneous_state
+from scvi_codegen.runtime.rotations.states import checked_pair, homogeneous_state
 from scvi_codegen.runtime.run.times import steps_within, times_after
-from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
+from scvi_codegen.runtime.sensitivity.fixed_steps import tangents_along
 from scvi_codegen.validation import checked_count, checks_arguments
 
 MOST_ITERATIONS, MOST_HALVINGS = 50, 12
@@ -101,7 +96,7 @@ def periodic_orbit(
         StateError: if a shape, name or number is invalid, or an input is not set.
         StepFailedError: if a step from the initial guess fails.
     """
-    stepper = stepper.bind(q, parameters)[0].known
+    stepper = stepper.bind(q, parameters)[0]._known_with_events
     q, p, velocity = homogeneous_state(stepper.interface, q, p, velocity)
     interface, names = stepper.interface, state_names(stepper)
     stepper._check_fixed_steps("periodic_orbit")
@@ -130,7 +125,7 @@ def periodic_orbit(
         options=options,
     )
     momenta = stepper._initial_momenta(q, p, velocity, search.t, search.parameters)
-    start = np.concatenate([checked_vector(stepper.interface, each, name) for each, name in ((q, "q"), (momenta, "p"))])
+    start = np.concatenate(checked_pair(stepper.interface, q, momenta))
     return search.orbit(np.append(start, search.period))
 
 
@@ -169,7 +164,19 @@ class _OrbitSearch:
         if np.linalg.norm(self._leaving(motion) @ motion.by_period) * z[-1] <= EQUILIBRIUM_MOTION * size:
             raise OrbitError("the iteration converged to an equilibrium: give a better initial guess")
         if motion.by_time.any():
-            self._check_repeats(z, equations, allowed * size)
+            period = float(z[-1])
+            if -1 not in self.fixed_indices:
+                raise MethodError(
+                    f"'{self.stepper.interface.system}' depends on time: give the period of this dependence as period, "
+                    "with fixed_period=True"
+                )
+            later = replace(self, t=self.t + period)._closing(z)
+            away = max(float(np.abs(later.motion.states[-1] - equations.motion.states[-1]).max()), later.error)
+            if not away <= (allowed * size):
+                raise OrbitError(
+                    f"the orbit from t = {self.t:g} does not close in the next period (error {away:.1e}): "
+                    f"'{self.stepper.interface.system}' is not periodic in time with the period {period:.10g}"
+                )
         return PeriodicOrbit(
             q=z[:m],
             p=z[m:-1],
@@ -191,6 +198,8 @@ class _OrbitSearch:
         *Introduction to Numerical Analysis*, 7.3.5). The first nodes are those of half a period forward and half a
         period backward from the guess: an error of the guess grows by the square root of the growth in a period.
         """
+        if self.stepper.changes_states:  # derivatives through events require runs forward in time
+            return guess, self._closing(guess), 0
         half, start = self.steps // 2, guess[:-1]
         forward = self._segment(start, 0, half, guess[-1])
         backward = self._segment(start, 0, self.steps - half, -guess[-1])
@@ -229,22 +238,6 @@ class _OrbitSearch:
                 "fix fewer entries of the state, or give a better initial guess"
             )
 
-    def _check_repeats(self, z: Array, equations: _ClosingEquations, allowed: float) -> None:
-        """Raise an error unless the system is periodic in time: the orbit must also close in the next period."""
-        period = float(z[-1])
-        if -1 not in self.fixed_indices:
-            raise MethodError(
-                f"'{self.stepper.interface.system}' depends on time: give the period of this dependence as period, "
-                "with fixed_period=True"
-            )
-        later = replace(self, t=self.t + period)._closing(z)
-        away = max(float(np.abs(later.motion.states[-1] - equations.motion.states[-1]).max()), later.error)
-        if not away <= allowed:
-            raise OrbitError(
-                f"the orbit from t = {self.t:g} does not close in the next period (error {away:.1e}): "
-                f"'{self.stepper.interface.system}' is not periodic in time with the period {period:.10g}"
-            )
-
     def _newton_iterate(self, z: Array, equations: _ClosingEquations) -> tuple[Array, _ClosingEquations] | None:
         """Return the damped Newton iterate, or ``None`` if no step length succeeds or the step is negligible.
 
@@ -258,10 +251,12 @@ class _OrbitSearch:
         if np.linalg.norm(change) <= SETTLED * np.linalg.norm(z):
             return None
         for shortened in 0.5 ** np.arange(MOST_HALVINGS):
-            trial = self._normalised(z - shortened * change)
+            trial = z - shortened * change
             if trial[-1] <= 0.0:
                 continue
-            with suppress(StepFailedError):
+            states = trial[:-1].reshape(-1, 2, self.stepper.dimension)
+            trial[:-1] = np.ravel([self.reduction.normalised(*state) for state in states])
+            with suppress(EventError, StepFailedError):
                 at = self._closing(trial)
                 less = np.linalg.norm(inverse @ at.defects) < (1.0 - shortened / 4.0) * np.linalg.norm(change)
                 if less and np.linalg.norm(at.defects) < MOST_INCREASE * np.linalg.norm(equations.defects):
@@ -304,25 +299,19 @@ class _OrbitSearch:
         """Return the matrix from changes of (q, p) at the end of a segment to the reduced tangent space."""
         return self.reduction.outward(*np.split(segment.states[-1], 2))
 
-    def _normalised(self, z: Array) -> Array:
-        """Return the unknowns with the gauge normalised in each state."""
-        states = z[:-1].reshape(-1, 2, self.stepper.dimension)
-        return np.append([self.reduction.normalised(*state) for state in states], z[-1])
-
     def _segment(self, start: Array, first: int, last: int, period: float) -> _Segment:
         """Integrate from the start of step ``first`` to the start of step ``last``."""
-        stepper, size, steps = self.stepper, len(start), last - first
-        h = period / self.steps
+        size, h = len(start), period / self.steps
         times = times_after(self.t, h, np.arange(first, last))[0]
-        starts = Starts.chain(start[: size // 2], start[size // 2 :], times, np.full(steps, h))
-        vectors = np.zeros((steps + 1, size + 2, stepper._input_size))
-        vectors[0, :size, :size] = np.eye(size)
-        vectors[0, size, -2:] = first / self.steps, 1.0 / self.steps
-        vectors[0, size + 1, -2] = 1.0
-        q, p = stepper._propagate(starts, vectors, self.parameters, self.options)
-        partials = vectors[-1, :, :size].T.copy()
+        tangents = np.zeros((size + 2, self.stepper._input_size))
+        tangents[:size, :size] = np.eye(size)
+        tangents[size, -2:] = first / self.steps, 1.0 / self.steps
+        tangents[size + 1, -2] = 1.0
+        steps = times, np.full(last - first, h)
+        states, vectors, _ = tangents_along(self.stepper, start, *steps, tangents, self.parameters, self.options)
+        partials = vectors[-1].T.copy()
         return _Segment(
-            states=np.column_stack([q, p]),
+            states=states[1:],
             start_time=self.t + period * (first / self.steps),
             end_time=self.t + period * (last / self.steps),
             monodromy=partials[:, :size],
@@ -333,7 +322,8 @@ class _OrbitSearch:
     def _independent_equations(self, starts: Array, segments: Sequence[_Segment]) -> Array:
         """Return the (size, size) projection onto the equations of return not implied by conserved quantities.
 
-        Energy and momentum maps count as conserved if the Jacobian of every segment maps their gradients accordingly.
+        Energy and momentum maps count as conserved if the Jacobian of every segment maps their gradients accordingly,
+        and if events that change the state leave their values at the ends of steps unchanged.
         """
         conserved_masks = []
         for start, segment in zip(starts, segments, strict=True):
@@ -342,11 +332,15 @@ class _OrbitSearch:
             monodromy = self._leaving(segment) @ segment.monodromy @ self.reduction.inward(*np.split(start, 2))
             sizes = np.linalg.norm(end, axis=1) * np.linalg.norm(monodromy, 2)
             conserved_masks.append(np.linalg.norm(end @ monodromy - begin, axis=1) <= CONSERVED * sizes)
+            if self.stepper.changes_states:
+                states = np.vstack([start, segment.states])
+                values = self._integrals(states, np.linspace(segment.start_time, segment.end_time, len(states)))
+                largest = np.linalg.norm(begin, axis=1) * np.linalg.norm(states, axis=1).max()
+                conserved_masks.append(np.ptp(values, axis=0) <= CONSERVED * largest)
         conserved = self._reduced_gradients(starts[0], self.t)[np.all(conserved_masks, axis=0)]
         directions, strengths, _ = np.linalg.svd(conserved.T, full_matrices=False)
         directions = directions[:, strengths > CONSERVED * strengths.max(initial=0.0)]
-        projection: Array = np.eye(self.reduction.size) - directions @ directions.T
-        return projection
+        return np.asarray(np.eye(self.reduction.size) - directions @ directions.T)
 
     def _reduced_gradients(self, state: Array, t: float) -> Array:
         """Return (r, size) gradients in the reduced tangent space."""
@@ -356,16 +350,14 @@ class _OrbitSearch:
         """Return (r, 2m) gradients of the energy and the momentum maps by finite differences, for directions only."""
         size, width = len(state), DIFFERENCE_INCREMENT * max(1.0, float(np.abs(state).max()))
         states = np.vstack([state + width * np.eye(size), state - width * np.eye(size)])
-        q, p = np.ascontiguousarray(states[:, : size // 2]), np.ascontiguousarray(states[:, size // 2 :])
-        times = np.full(2 * size, t)
-        values = np.column_stack(
-            [
-                self.stepper.energy(q, p, times, self.parameters),
-                self.stepper.momentum_maps(q, p, times, self.parameters).reshape(2 * size, -1),
-            ]
-        )
-        partials: Array = (values[:size] - values[size:]).T / (2.0 * width)
-        return partials
+        values = self._integrals(states, np.full(2 * size, t))
+        return np.asarray((values[:size] - values[size:]).T / (2.0 * width))
+
+    def _integrals(self, states: Array, t: Array) -> Array:
+        """Return (n, r) values of the energy and the momentum maps of states."""
+        q, p = map(np.ascontiguousarray, np.split(states, 2, axis=1))
+        maps = self.stepper.momentum_maps(q, p, t, self.parameters).reshape(len(t), -1)
+        return np.column_stack([self.stepper.energy(q, p, t, self.parameters), maps])
 
 
 @dataclass(frozen=True, eq=False)

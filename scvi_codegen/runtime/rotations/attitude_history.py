@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.rendering.source import Interface
-from scvi_codegen.runtime.core.validation import shapes_of
+from scvi_codegen.runtime.core.validation import Array, shapes_of
 from scvi_codegen.runtime.rotations.attitudes import (
     angular_velocity,
     body_momentum,
@@ -20,8 +20,6 @@ from scvi_codegen.runtime.rotations.attitudes import (
 )
 from scvi_codegen.runtime.rotations.quantities import spins
 from scvi_codegen.runtime.rotations.states import Member, members_of
-
-Array = NDArray[np.float64]
 
 
 class AttitudeHistory:
@@ -61,6 +59,12 @@ class AttitudeHistory:
         """Return (n, 3, 3) rotation matrices, from components in the body frame to components in space."""
         return matrices(self._states(t)[0][..., self._member("rotation", name).columns])
 
+    def scipy_rotation(self, name: str | None = None, *, t: ArrayLike | None = None) -> Any:
+        """Return n rotations as a ``scipy.spatial.transform.Rotation``, from the body frame to space."""
+        from scipy.spatial.transform import Rotation  # imported on use: the core does without SciPy
+
+        return Rotation.from_quat(np.roll(self.quaternion(name, t=t), -1, axis=-1))
+
     def quaternion(self, name: str | None = None, *, t: ArrayLike | None = None) -> Array:
         """Return (n, 4) unit quaternions (w, x, y, z), continuous in time: q and -q are the same rotation."""
         return unit_vectors(self._states(t)[0][..., self._member("rotation", name).columns])
@@ -97,9 +101,9 @@ class AttitudeHistory:
     def _states(self, t: ArrayLike | None) -> tuple[Array, Array]:
         """Return the saved states, or those at times t."""
         if t is None:
-            return self.q, self.p
+            return np.asarray(self.q), np.asarray(self.p)  # of recordings, which are read on access
         if not hasattr(self, "at"):
-            raise StateError("ensembles and runs in progress have no dense output: omit t")
+            raise StateError("recordings, ensembles and runs in progress have no dense output: omit t")
         q, p = self.at(t)
         return q, p
 
@@ -129,7 +133,8 @@ class AttitudeHistory:
         if name is None and len(members) == 1:
             return members[0]
         if name not in names:
-            reason = f"there are {len(names)} of them: name one" if name is None else f"there is no {kind} '{name}'"
+            reason = f"there is no {kind}" + f" '{name}'" * (name is not None)
+            reason = f"there are {len(names)} of them: name one" if names and name is None else reason
             hint = closest(str(name), names) if name is not None else "."
             raise StateError(f"{reason}{hint} The system has: {', '.join(names) or f'no {kind}'}")
         return members[names.index(name)]

@@ -9,12 +9,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import real_array
-
-Array = NDArray[np.float64]
+from scvi_codegen.runtime.core.validation import Array
 
 ACCEPTED = (
     "a quaternion (w, x, y, z), a rotation matrix (3, 3), {'euler': 'zxz', 'angles': [..]}, {'axis': [..], 'angle': "
@@ -39,29 +37,33 @@ def quaternions(value: Any, name: str) -> Array:
     Raises:
         StateError: if the value is none of these, a quaternion is zero, or a matrix is not a rotation.
     """
+    array = _components(value, name)
+    if not array.ndim or array.shape[-1] != 4:
+        raise StateError(f"the rotation '{name}' must be {ACCEPTED}, not an array of the shape {array.shape}")
+    largest = np.abs(array).max(axis=-1, keepdims=True)
+    if not (np.isfinite(largest) & (largest > 0)).all():
+        raise StateError(f"the quaternion of '{name}' must be finite and not zero, not {array.tolist()}")
+    array = np.ldexp(array, -np.frexp(largest)[1])  # so that squares neither overflow nor underflow
+    return np.asarray(array / np.linalg.norm(array, axis=-1, keepdims=True))
+
+
+def _components(value: Any, name: str) -> Array:
+    """Return (.., 4) quaternions of any length, or an array of another shape as it is."""
     if hasattr(value, "as_quat"):
         return np.roll(np.asarray(value.as_quat(), dtype=float), 1, axis=-1)
     if isinstance(value, Mapping):
         return _of_angles(value, name)
     array = real_array(value, name)
-    if array.ndim >= 2 and array.shape[-2:] == (3, 3):
-        return _of_matrices(array, name)
-    if not array.ndim or array.shape[-1] != 4:
-        raise StateError(f"the rotation '{name}' must be {ACCEPTED}, not an array of the shape {array.shape}")
-    lengths = np.linalg.norm(array, axis=-1, keepdims=True)
-    if not (np.isfinite(lengths) & (lengths > 0)).all():
-        raise StateError(f"the quaternion of '{name}' must be finite and not zero, not {array.tolist()}")
-    return np.asarray(array / lengths)
+    return _of_matrices(array, name) if array.ndim >= 2 and array.shape[-2:] == (3, 3) else array
 
 
 def _of_angles(value: Mapping[str, Any], name: str) -> Array:
     if set(value) == {"quaternion", "order"}:
-        if value["order"] not in ORDERS:
+        if value["order"] not in (*ORDERS,):
             raise StateError(
                 f"the order of the quaternion of '{name}' must be 'wxyz' or 'xyzw', not {value['order']!r}"
             )
-        components = real_array(value["quaternion"], name)
-        return quaternions(np.roll(components, ORDERS[value["order"]], axis=-1), name)
+        return np.roll(real_array(value["quaternion"], name), ORDERS[value["order"]], axis=-1)
     from scipy.spatial.transform import Rotation  # imported on use: the core does without SciPy
 
     if set(value) == {"euler", "angles"}:
@@ -72,8 +74,8 @@ def _of_angles(value: Mapping[str, Any], name: str) -> Array:
     elif set(value) == {"axis", "angle"}:
         axis, angle = real_array(value["axis"], name), real_array(value["angle"], name)
         length = np.linalg.norm(axis)
-        if axis.shape != (3,) or angle.ndim or not length > 0:
-            raise StateError(f"the axis of '{name}' must be three numbers, not all zero, and the angle one number")
+        if axis.shape != (3,) or angle.ndim or not 0 < length < np.inf or not np.isfinite(angle):
+            raise StateError(f"the axis of '{name}' must be three numbers, not all zero, and the angle a finite number")
         rotation = Rotation.from_rotvec(axis / length * angle)
     elif set(value) == {"rotation_vector"}:
         vector = real_array(value["rotation_vector"], name)
@@ -94,9 +96,9 @@ def _of_matrices(matrix: Array, name: str) -> Array:
     """
     defect = np.abs(np.swapaxes(matrix, -1, -2) @ matrix - np.eye(3)).max()
     if not defect <= ORTHOGONAL or not (np.linalg.det(matrix) > 0).all():
+        wrong = "its determinant is -1" if defect <= ORTHOGONAL else f"R^T R differs from the identity by {defect:.1e}"
         raise StateError(
-            f"the matrix of '{name}' is not a rotation: R^T R differs from the identity by {defect:.1e}, or det R is "
-            "negative. Give an orthogonal matrix with determinant 1"
+            f"the matrix of '{name}' is not a rotation: {wrong}. Give an orthogonal matrix with determinant 1"
         )
     unit = np.eye(4)
     pairs = unit[:, np.newaxis] + unit

@@ -3,14 +3,12 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.files.labelled_arrays import LONG_NAMES, NamedQuantity
 from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.rotations.attitudes import angular_velocity, body_momentum, matrices, unit_vectors
 from scvi_codegen.runtime.rotations.states import Member, members_of
-
-Array = NDArray[np.float64]
 
 COMPLEX_STEP = 1e-30
 SPACE, BODY = (("space_axis",), ("body_axis",))

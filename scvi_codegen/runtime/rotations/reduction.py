@@ -18,10 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.rotations.attitudes import rates_matrices
 from scvi_codegen.runtime.rotations.states import Member, members_of
-
-Array = NDArray[np.float64]
 
 FREEDOM = {"rotation": 3, "direction": 2, "spin": 1}
 """Degrees of freedom without gauge."""

@@ -9,23 +9,16 @@ from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.rendering.source import COMPONENTS, Interface
-from scvi_codegen.runtime.core.validation import Shapes, shapes_of
-from scvi_codegen.runtime.rotations.attitudes import (
-    matrices,
-    momenta_of_body,
-    quaternions,
-    velocities_of_body,
-)
+from scvi_codegen.runtime.core.validation import Array, Shapes, States, checked_vector, flat_state, shapes_of
+from scvi_codegen.runtime.rotations.attitudes import matrices, momenta_of_body, quaternions, velocities_of_body
 
 if TYPE_CHECKING:
     from scvi_codegen.mechanics.system import MechanicalSystem
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +37,6 @@ class Member:
     rate: str
     columns: Any
     momentum: bool = False
-
-    def moving_name(self, what: str) -> str:
-        """Return the name of its velocity (``what`` is ``"velocity"``) or momentum in states by name."""
-        return self.rate if self.kind == "rotation" and (self.momentum or what == "velocity") else self.name
 
 
 def members_of(dimension: int, declarations: Sequence[str]) -> tuple[Member, ...]:
@@ -71,10 +60,57 @@ def homogeneous_state(interface: Interface, q: Any, p: Any, velocity: Any) -> tu
     """Return (q, p, velocity) with states by name as (.., m) numbers, and numbers as they are; see :func:`state_of`."""
     if interface.variables:
         return _first_order_state(interface, q, p, velocity)
-    if not isinstance(q, Mapping) or not interface.rotations:
+    by_name = [each for each in (q, p, velocity) if isinstance(each, Mapping)]
+    if not by_name or not interface.rotations:
         return q, p, velocity
     members = members_of(interface.dimension, interface.rotations)
+    homogeneous = interface.coordinates[members[0].columns.start :]
+    if not any(each.keys().isdisjoint(homogeneous) for each in by_name):
+        return q, p, velocity
     return state_of(interface.coordinates, members, q, p, velocity, shapes_of(interface) or ())
+
+
+def flat_states(interface: Interface, q: States, other: States | None, name: str) -> tuple[Any, Any]:
+    """Return positions, and the momenta (``name`` is ``"p"``) or velocities, by name as (.., m) numbers in order."""
+    if interface.rotations and (isinstance(q, Mapping) or isinstance(other, Mapping)):
+        q, *moving = homogeneous_state(interface, q, *((other, None) if name == "p" else (None, other)))
+        other = moving[name != "p"]
+    return flat_state(interface, q, "q"), None if other is None else flat_state(interface, other, name)
+
+
+def checked_pair(interface: Interface, q: States, other: States, name: str = "p") -> tuple[Array, Array]:
+    """Return finite, contiguous (m,) copies of positions and momenta (or what ``name`` names), also by name."""
+    if isinstance(q, Mapping) or isinstance(other, Mapping):
+        q, other = flat_states(interface, q, other, name)
+    return checked_vector(interface, q, "q"), checked_vector(interface, other, name)
+
+
+def checked_states(
+    interface: Interface, q: States, p: States, t: ArrayLike, *, second: str = "p"
+) -> tuple[Array, Array, Array]:
+    """Return (n,) times and contiguous (n, m) positions and momenta (or what ``second`` names) of one or n states."""
+    q, p = flat = flat_states(interface, q, p, second)
+    positions, momenta = (real_array(each, name) for each, name in zip(flat, ("q", second), strict=True))
+    if positions.ndim <= 1:
+        positions, momenta = checked_pair(interface, q, p, second)
+    elif positions.ndim != 2 or positions.shape != momenta.shape or positions.shape[1] != interface.dimension:
+        raise StateError(
+            f"states must have shape (n, {interface.dimension}), not q {positions.shape} and {second} {momenta.shape}"
+        )
+    count = positions.size // interface.dimension
+    times = real_array(t, "the time t")
+    if not np.isfinite(times).all():
+        raise StateError("the time t must be finite")
+    if times.shape not in ((), (count,)):
+        raise StateError(f"the time t must be one number or {count}, one for each state, not of shape {times.shape}")
+    times = np.ascontiguousarray(np.broadcast_to(times, (count,)))
+    return times, np.ascontiguousarray(positions), np.ascontiguousarray(momenta)
+
+
+def is_one_state(interface: Interface, q: States) -> bool:
+    """Return whether these are the positions of one state, not of several."""
+    plain = not isinstance(q, Mapping) and real_array(q, "q").ndim == 1
+    return plain or real_array(flat_states(interface, q, None, "p")[0], "q").ndim == 1
 
 
 def _first_order_state(interface: Interface, z: Any, p: Any, velocity: Any) -> tuple[Any, Any, None]:
@@ -132,12 +168,8 @@ def _by_entry(shapes: Shapes, members: Sequence[Member], values: Any) -> Any:
         if not axes.get(base):
             entries[name] = value
             continue
-        array = (
-            quaternions(value, name)
-            if kinds.get(base) == "rotation" and np.ndim(value) > len(axes[base]) + 1
-            else value
-        )
-        array, last = real_array(array, name), int(base in kinds)
+        array = quaternions(value, name) if kinds.get(base) == "rotation" else real_array(value, name)
+        last = int(base in kinds)
         outer = array.ndim - last - len(axes[base])
         if outer < 0 or array.shape[outer : array.ndim - last] != axes[base]:
             raise StateError(f"'{name}' must have the shape {axes[base]}{' of vectors' * last}, not {array.shape}")
@@ -148,19 +180,15 @@ def _by_entry(shapes: Shapes, members: Sequence[Member], values: Any) -> Any:
 
 
 def state_of(
-    coordinates: Sequence[str],
-    members: Sequence[Member],
-    q: Mapping[str, Any],
-    p: Any,
-    velocity: Any,
-    shapes: Shapes = (),
+    coordinates: Sequence[str], members: Sequence[Member], q: Any, p: Any, velocity: Any, shapes: Shapes = ()
 ) -> tuple[Any, Any, Any]:
     """Return (q, p, velocity) with states by name as (.., m) numbers, and momenta and velocities as they are.
 
     Args:
         coordinates: names of all coordinates.
         members: rotations, directions and spins.
-        q: by name: ordinary coordinates, rotations as of :func:`quaternions`, unit vectors (.., 3), spins (.., 3).
+        q: by name: ordinary coordinates, rotations as of :func:`quaternions`, unit vectors (.., 3), spins (.., 3);
+            without spins also numbers (.., m).
         p: by name: momenta of ordinary coordinates, angular momentum of a rotation in the body frame under its name
             (that of its momentum in a Hamiltonian), or in the space frame under this name with ``_space``.
         velocity: by name: of ordinary coordinates and directions, and the angular velocity under its own name (body
@@ -172,10 +200,21 @@ def state_of(
     """
     q, p, velocity = (_by_entry(shapes, members, each) for each in (q, p, velocity))
     ordinary = coordinates[: members[0].columns.start]
-    _check(q, [*ordinary, *(member.name for member in members)], "q")
-    parts = [_column(q, name, "q") for name in ordinary]
-    own = {member.name: _coordinates(member, q) for member in members}
-    state = _joined([*parts, *(own[member.name][0] for member in members)])
+    if isinstance(q, Mapping):
+        _check(q, [*ordinary, *(member.name for member in members)], "q")
+        parts = [_column(q, name, "q") for name in ordinary]
+        own = {member.name: _coordinates(member, q) for member in members}
+        state = _joined([*parts, *(own[member.name][0] for member in members)])
+    else:
+        state = real_array(q, "q")
+        if not state.ndim or state.shape[-1] != len(coordinates) or any(member.kind == "spin" for member in members):
+            raise StateError(
+                f"momenta and velocities by name require q by name, or numbers of the shape (.., {len(coordinates)}) "
+                "and no spins"
+            )
+        own = {member.name: (state[..., member.columns], np.zeros(0)) for member in members}
+    if velocity is not None and any(member.kind == "spin" for member in members):
+        raise StateError("spins have no velocities: give p, the momenta of coordinates and rotations by name")
     if p is None and velocity is None and not ordinary and all(member.kind == "spin" for member in members):
         p = {}
     if isinstance(velocity, Mapping):
@@ -231,7 +270,8 @@ def _moving(
     what: str,
 ) -> list[Array]:
     """Return the parts of momenta or velocities."""
-    names = {member.name: member.moving_name(what) for member in members}
+    named = {m.name for m in members if m.kind == "rotation" and (m.momentum or what == "velocity")}
+    names = {m.name: m.rate if m.name in named else m.name for m in members}
     known = [*ordinary, *(names[m.name] for m in members if m.kind != "spin")]
     _check(values, known, what, also=[f"{names[m.name]}_space" for m in members if m.kind == "rotation"])
     parts = [_column(values, name, what) for name in ordinary]
@@ -243,8 +283,8 @@ def _moving(
             continue
         in_space = member.kind == "rotation" and f"{name}_space" in values
         vector = real_array(values[f"{name}_space" if in_space else name], f"{what}: '{name}'")
-        if not vector.ndim or vector.shape[-1] != 3:
-            raise StateError(f"{what}: '{name}' must have three components, not the shape {vector.shape}")
+        if not vector.ndim or vector.shape[-1] != 3 or not np.isfinite(vector).all():
+            raise StateError(f"{what}: '{name}' must have three finite components, not {vector.tolist()}")
         if member.kind == "direction":
             parts.append(np.asarray(vector - q * (q * vector).sum(axis=-1, keepdims=True)))
             continue
@@ -261,8 +301,10 @@ def _check(values: Mapping[str, Any], known: Sequence[str], what: str, also: Seq
                 f"there is no '{name}' in {what}{closest(str(name), [*known, *also])} Known: {', '.join(known)}"
             )
     for name in known:
-        if name not in values and f"{name}_space" not in set(also) & set(values):
-            raise StateError(f"'{name}' is missing in {what}")
+        count = (name in values) + (f"{name}_space" in set(also) & set(values))
+        if count != 1:
+            both = f"both '{name}' and '{name}_space' are in {what}: give one of them"
+            raise StateError(both if count else f"'{name}' is missing in {what}")
 
 
 def _column(values: Mapping[str, Any], name: str, what: str) -> Array:

@@ -6,8 +6,6 @@ the steps whether errors grow exponentially; only then is the run repeated from 
 repeated run stores no states and has a bounded number of steps.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Callable, Iterator
@@ -15,19 +13,17 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import lru_cache
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
 from scvi_codegen.runtime.constraints.projection import projected
+from scvi_codegen.runtime.core.integrator import Integrator
+from scvi_codegen.runtime.core.validation import Array, by_name, coordinate_shapes
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
-
-if TYPE_CHECKING:
-    from scvi_codegen.runtime.core.integrator import Integrator
 
 TOLERABLE_ERROR: Final = 1e-3
 """Largest relative error of a step, and largest relative change of the energy of a run, without a warning."""
@@ -55,21 +51,8 @@ FIXED_STEP_REMEDY: Final = (
     "adaptive steps (t_end=)"
 )
 
-Array = NDArray[np.float64]
 
 _warnings_enabled: ContextVar[bool] = ContextVar("accuracy warnings are wanted", default=True)
-
-
-class EnsembleEnergyData(Protocol):
-    """States of an ensemble; ``each`` yields times, positions, momenta, status and step count of each trajectory."""
-
-    @property
-    def plans(self) -> tuple[StepPlan, ...]: ...
-    @property
-    def stepper(self) -> Integrator: ...
-    @property
-    def parameters(self) -> Array: ...
-    def each(self) -> Iterator[tuple[Array, Array, Array, str, int]]: ...
 
 
 @contextmanager
@@ -124,7 +107,7 @@ def warn_of_energy_error(trajectory: SavedStates, run: Memory) -> None:
         warn_of_energies(*energies, **limits)
 
 
-def warn_of_energy_errors(ensemble: EnsembleEnergyData) -> None:
+def warn_of_energy_errors(ensemble: Any) -> None:
     """Issue the warning of :func:`warn_of_energy_error` for the worst of ``MOST_CHECKED`` trajectories."""
     plans, stepper = ensemble.plans, ensemble.stepper
     if stepper.changes_states or not (plans and stepper.interface.conserves_energy and _warnings_enabled.get()):
@@ -138,33 +121,47 @@ def warn_of_energy_errors(ensemble: EnsembleEnergyData) -> None:
         warn_of_energies(*by_trajectory[worst], where=f" of trajectory {worst}")
 
 
-def unresolved_parts(states: SavedStates, rows: slice = slice(None)) -> Array | None:
+def unresolved_parts(stepper: Integrator, q: Array) -> Array | None:
     """Return (n,) parts of the squared amplitude of fields in the highest modes of their mesh; ``None`` without one."""
-    mesh = states.stepper.interface.layout.mesh
+    mesh = stepper.interface.layout.mesh
     if mesh is None:
         return None
-    q: Any = states.q[rows]
-    return np.asarray(np.max([mesh.unresolved(q[name]) for name in mesh.field_system.fields], axis=0))
+    fields = by_name(np.asarray(q), coordinate_shapes(stepper.interface))
+    return np.asarray(np.max([mesh.unresolved(fields[name]) for name in mesh.field_system.fields], axis=0))
+
+
+def warn_of_unresolved_members(ensemble: Any) -> None:
+    """Issue the warning of :func:`warn_of_unresolved_fields` for the first of some trajectories that need it."""
+    for j, (t, q, *_) in islice(enumerate(ensemble.each()), 0, None, -(-len(ensemble.parameters) // MOST_SPECTRA)):
+        h = ensemble.plans[j].h if ensemble.plans else 0.0
+        if len(t) and _unresolved(ensemble.stepper, t, q, h or math.nan, f"trajectory {j}, "):
+            return
 
 
 def warn_of_unresolved_fields(trajectory: SavedStates) -> None:
     """Issue an :class:`AccuracyWarning` if the highest modes of a mesh contain too much in one of some saved states."""
-    if trajectory.stepper.interface.layout.mesh is None:
-        return
-    count = max(4, min(MOST_SPECTRA, MOST_VALUES // max(1, trajectory.q.shape[-1])))
-    stride = -(-max(len(trajectory.t) - 1, 1) // count)
-    rows = slice((len(trajectory.t) - 1) % stride, None, stride)
-    parts = unresolved_parts(trajectory, rows) if warnings_wanted() else None
+    _unresolved(trajectory.stepper, trajectory.t, trajectory.q, trajectory.h)
+
+
+def _unresolved(stepper: Integrator, t: Array, q: Array, h: float, where: str = "") -> bool:
+    """Issue the warning of :func:`warn_of_unresolved_fields` for saved states; true if it is necessary."""
+    if stepper.interface.layout.mesh is None:
+        return False
+    count = max(4, min(MOST_SPECTRA, MOST_VALUES // max(1, q.shape[-1])))
+    stride = -(-max(len(t) - 1, 1) // count)
+    rows = slice((len(t) - 1) % stride, None, stride)
+    parts = unresolved_parts(stepper, q[rows]) if warnings_wanted() else None
     if parts is None or parts.max() <= UNRESOLVED:
-        return
+        return False
     first = int(np.argmax(~(parts <= UNRESOLVED)))
-    phase = abs(trajectory.h) * trajectory.stepper.interface.layout.mesh.highest_frequency()
+    phase = abs(h) * stepper.interface.layout.mesh.highest_frequency()
     warn(
-        f"the mesh does not resolve the fields: at t = {trajectory.t[rows][first]:g} the highest modes have "
+        f"the mesh does not resolve the fields: {where}at t = {t[rows][first]:g} the highest modes have "
         f"{parts[first]:.1e} of the squared amplitude ({UNRESOLVED:g} is tolerable). Use more elements or points, or a "
         f"smaller h if the run is unstable (h times the highest frequency is {phase:.2g}); shocks are not supported",
         AccuracyWarning,
     )
+    return True
 
 
 def warn_of_energies(
@@ -248,10 +245,7 @@ def check_growth_requested(plan: StepPlan, stepper: Integrator) -> None:
 
 
 def warn_of_error_growth(
-    run: Memory,
-    states: SavedStates,
-    requested: bool | None,
-    advance_until: Callable[[float], None] | None = None,
+    run: Memory, states: SavedStates, requested: bool | None, advance_until: Callable[[float], None] | None = None
 ) -> None:
     """Repeat an adaptive run and warn if its states differ by more than is tolerable; the run is left where that ends.
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 CALL_SECONDS = 0.1
 """Target duration of a C call in seconds; bounds the delay of Ctrl-C and of ``progress``."""
+LONGEST_CHUNK = 2.0**62
 
 
 def drive(
@@ -13,7 +14,7 @@ def drive(
     steps: float,
     *,
     first: int = 1,
-    most: float = math.inf,
+    most: float = LONGEST_CHUNK,
     growth: float = 2.0,
     seconds: float | None = None,
     ended: Callable[[], bool],

@@ -7,21 +7,14 @@ from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 
 
-def describe_run(title: str, solver: str, run: Memory, *, tau: bool = False, unset_inputs: tuple[str, ...] = ()) -> str:
-    """Return ``<Run of TITLE; t = 3 after 30 steps of 0.1, solver fixed-point>``.
-
-    Args:
-        title: system and method.
-        solver: solver of the stage equations, "" if unknown.
-        run: the run.
-        tau: whether steps are of transformed time.
-        unset_inputs: inputs that are not set.
-    """
+def describe_run(run: Memory) -> str:
+    """Return ``<Run of TITLE; t = 3 after 30 steps of 0.1, solver fixed-point>``."""
+    interface, unset = run.stepper.interface, ", ".join(run._unset_inputs)
     plan = "" if run.plan.fixed else f", t_end = {run.plan.t_end:g}"
-    solved = f", solver {solver}" if solver else ""
-    waits = f", inputs not set: {', '.join(unset_inputs)}" if unset_inputs else ""
-    steps = f"{run.steps} steps{describe_step_size(run.h, run.plan, tau=tau)}"
-    return one_line(run, title, f"t = {run.t:g} after {steps}{plan}{solved}{waits}")
+    solved = f", solver {interface.solver}" if interface.solver else ""
+    steps = f"{run.steps} steps{describe_step_size(run.h, run.plan, tau=bool(interface.energy_parameter))}"
+    waits = f", inputs not set: {unset}" if unset else ""
+    return one_line(run, short_title(interface), f"t = {run.t:g} after {steps}{plan}{solved}{waits}")
 
 
 def describe_states(result: SavedStates, lengths: str) -> str:

@@ -7,7 +7,6 @@ violations appear in ``step_error`` of the run, the largest error of all its ste
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
 
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number
@@ -63,55 +62,44 @@ def largest_step(
     first = abs(length) if reversible else length
     known = start(h=first, parameters=parameters).parameters
     rate = float(stepper.rates(q, p, known)[0])
-
-    def pilot(h: float) -> _Pilot:
-        return _pilot(start(h=h, parameters=known), end)
-
-    return _longest(pilot, first / rate, wanted or ROUND_OFF)
+    return _longest(lambda h: _pilot(start(h=h, parameters=known), end), first / rate, wanted or ROUND_OFF)
 
 
-class _Pilot(NamedTuple):
-    """Largest error of a pilot run, and its number of steps."""
-
-    error: float
-    steps: int
-
-
-def _longest(pilot: Callable[[float], _Pilot], h: float, allowed: float) -> float:
+def _longest(pilot: Callable[[float], tuple[float, int]], h: float, allowed: float) -> float:
     """Bracket the step by doubling or halving, then refine it geometrically."""
-    trial = pilot(h)
+    error, steps = pilot(h)
     for _ in range(MOST_HALVINGS):
-        if trial.error <= allowed and trial.steps <= 1:
+        if error <= allowed and steps <= 1:
             return h
-        if trial.error <= allowed:
+        if error <= allowed:
             longer = pilot(2.0 * h)
-            if longer.error > allowed:
+            if longer[0] > allowed:
                 break
-            h, trial = 2.0 * h, longer
+            h, (error, steps) = 2.0 * h, longer
         else:
-            h, trial = h / 2.0, pilot(h / 2.0)
+            h, (error, steps) = h / 2.0, pilot(h / 2.0)
     else:
         raise StateError(
             f"no step of tau has an error below {allowed:.1e}: use another time transformation or a larger tolerance"
         )
     between = (h * 2.0 ** (k / REFINEMENTS) for k in range(REFINEMENTS - 1, 0, -1))
-    return next((longest for longest in between if pilot(longest).error <= allowed), h)
+    return next((longest for longest in between if pilot(longest)[0] <= allowed), h)
 
 
 @without_accuracy_warnings()
-def _pilot(run: Run, end: float) -> _Pilot:
-    """Take the first steps of a run; the error is infinite if a step fails."""
+def _pilot(run: Run, end: float) -> tuple[float, int]:
+    """Return the largest error of the first steps of a run, infinite if one fails, and their number."""
     error, done = 0.0, 0
     while done < PILOT_STEPS and not run.arrived and (not run.plan.fixed or (end - run.t) * run.h > 0.0):
         size = max(1, done)
         try:
             error = run.record(size, save_every=size).step_error
         except StepFailedError:
-            return _Pilot(math.inf, done + 1)
+            return math.inf, done + 1
         if math.isnan(error):
             raise MethodError(f"{run.stepper.interface.title} has no error estimate: give h")
         done = run.steps
-    return _Pilot(error, done)
+    return error, done
 
 
 def accuracy_message(step_error: float, t: float, tolerance: float) -> str | None:

@@ -8,7 +8,6 @@ import numpy as np
 
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, checked_step
-from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, checked_options, step_failure
 from scvi_codegen.runtime.constraints.projection import check_reachable, singular_position
 from scvi_codegen.runtime.core.integrator import Integrator
@@ -16,12 +15,12 @@ from scvi_codegen.runtime.core.validation import (
     Array,
     Parameters,
     States,
-    checked_vector,
     inputs_not_given,
     missing_input,
     no_input,
     parameter_index,
 )
+from scvi_codegen.runtime.rotations.states import checked_pair
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.one_thread import OneThread, alone, in_use
 from scvi_codegen.runtime.run.saving import checkpoint
@@ -41,6 +40,8 @@ RANGES = {
     "avoiding": (-MOST_GRID_LEVEL, LARGEST_STEP),
 }
 """Smallest and largest values of whole numbers in the memory of a run, which C uses as counts and indices."""
+EVENT_NUMBERS = ("undefined", "accumulated", "through", "jammed")
+"""Numbers of events, from 1 on, in the state of the search for events; 0 for none."""
 FUNCTIONS = ("start", "set_parameters", "advance", "advance_to", "step_error")
 """Functions of C that take a run; sources of version 0.1 have no error estimate."""
 NO_OUTPUT, NO_PLAN = LARGEST_COUNT, StepPlan()
@@ -67,7 +68,7 @@ class Memory(OneThread):
         self._arguments = binding.pointer(self._parameters), binding.null
         self._options: SolverOptions | None = None
         self._has_defaults = False  # whether no parameter differs from its default, also in C
-        self._crossed: tuple[int, ...] = ()  # crossings of each event in earlier pieces, counted for terminal events
+        self._watch: Any = None  # state of the search for events in C
         self._energies: Any = None  # function of C, and memory for its results
         self._rows: Any = None  # memory for states that every recording uses
         self._discarded = *(binding.numbers(f"double[{stepper.dimension}]"),) * 3, binding.numbers("int *")
@@ -100,7 +101,7 @@ class Memory(OneThread):
         t, rows = checked_number(t, "the time t"), self._rows
         pointers: Iterable[Any] | None = None if rows is None else rows.begin(t, q, p)
         if pointers is None:
-            q0, p0 = checked_vector(interface, q, "q"), checked_vector(interface, p, "p")
+            q0, p0 = checked_pair(interface, q, p)
             pointers = stepper.binding.pointers(q0, p0) if rows is None else rows.begin_checked(t, q0, p0)
         self._functions["start"](t, plan.h, *pointers)
         if parameters is not None or not self._has_defaults:
@@ -112,7 +113,7 @@ class Memory(OneThread):
             self.plan = plan
         if options is not self._options:
             self._set_options(options)
-        self.longest, self._crossed = 0.0, ()
+        self.longest, self._watch = 0.0, None
 
     def _set_options(self, options: SolverOptions | None) -> None:
         self._arguments = self._arguments[0], self.stepper.binding.options(checked_options(options))
@@ -130,13 +131,21 @@ class Memory(OneThread):
     ) -> Self:
         """Construct from the bytes of :meth:`save`; raise ``StateError`` for invalid bytes or another kind of steps."""
         run = cls(stepper)
-        memory, buffer = run._memory, stepper.binding.buffer(run._memory)
+        memory, size = run._memory, len(stepper.binding.buffer(run._memory))
         if not isinstance(saved, bytes):
             raise StateError(f"a saved run must be bytes, not {type(saved).__name__}")
-        if len(saved) != len(buffer):
-            raise StateError(f"invalid saved run: it has {len(saved)} bytes, those of this stepper have {len(buffer)}")
-        buffer[:] = saved
-        _check_memory(memory, stepper.binding)
+        watched = len(stepper.binding.buffer(stepper.binding.new("watch *"))) if stepper.events else 0
+        if len(saved) not in (size, size + watched):
+            raise StateError(f"invalid saved run: it has {len(saved)} bytes, those of this stepper have {size}")
+        run.rollback(saved)
+        vectors = map(stepper.binding.vector, (memory.q, memory.p, memory.carry_q, memory.carry_p))
+        if not np.isfinite(np.concatenate([[_time(memory), memory.h], *vectors])).all():
+            raise StateError(f"invalid saved run: its state is not finite, h = {memory.h:g}")
+        searched = dict.fromkeys(EVENT_NUMBERS, (0, len(stepper.events)))
+        numbers = [*((memory, *each) for each in RANGES.items()), *((run._watch, *each) for each in searched.items())]
+        for owner, name, (least, most) in numbers:
+            if not least <= (value := getattr(owner, name, least)) <= most:
+                raise StateError(f"invalid saved run: {name} is {value}, not a whole number from {least} to {most}")
         if plan is None and memory.h == 0.0:
             raise StateError("the saved run has adaptive steps: give t_end")
         plan = StepPlan(h=memory.h) if plan is None else plan
@@ -203,7 +212,7 @@ class Memory(OneThread):
             self._set_parameters(self.stepper._parameters(parameters, self._parameters))
             self._unset_inputs = tuple(name for name in self._unset_inputs if name in missing)
         if h is not None and checked_step(h) != self._memory.h:
-            self.plan = StepPlan.with_step(h)
+            self.plan = StepPlan(h=checked_step(h))
             self._memory.h, self._memory.guess = self.plan.h, 0
         if plan is not None:
             self.plan = plan
@@ -268,7 +277,8 @@ class Memory(OneThread):
     @property
     def snapshot(self) -> bytes:
         """Bitwise copy of the present state for :meth:`rollback`."""
-        return bytes(self.stepper.binding.buffer(self._memory))
+        buffer = self.stepper.binding.buffer
+        return bytes(buffer(self._memory)) + (b"" if self._watch is None else bytes(buffer(self._watch)))
 
     @alone
     def checkpoint(self) -> bytes:
@@ -283,14 +293,14 @@ class Memory(OneThread):
     @alone
     def rollback(self, saved: bytes) -> None:
         """Restore the state saved by :meth:`save`."""
-        self.stepper.binding.buffer(self._memory)[:] = saved
+        buffer = self.stepper.binding.buffer(self._memory)
+        buffer[:], watch = saved[: len(buffer)], saved[len(buffer) :]
+        self._watch = self.stepper.binding.new("watch *") if watch else None
+        if watch:
+            self.stepper.binding.buffer(self._watch)[:] = watch
 
     def advance(
-        self,
-        steps: int,
-        *,
-        progress: Callable[[int], None] | None = None,
-        stop: Callable[[], bool] | None = None,
+        self, steps: int, *, progress: Callable[[int], None] | None = None, stop: Callable[[], bool] | None = None
     ) -> None:
         """Take ``steps`` steps; adaptive steps end at the target time.
 
@@ -367,6 +377,11 @@ class Memory(OneThread):
         return not self._plan.h and self.left_to(self._plan.t_end) == 0.0
 
     @property
+    def ended(self) -> bool:
+        """Return whether a terminal event ended the run."""
+        return self._watch is not None and bool(self._watch.ended)
+
+    @property
     def rejected_steps(self) -> int:
         """Number of rejected steps."""
         return int(self._memory.rejected) if self._plan.adaptive else 0
@@ -405,13 +420,3 @@ class Memory(OneThread):
 def _time(memory: Any) -> float:
     """Return the time of a run; structs of version 0.1 store the start and the number of steps instead."""
     return float(memory.t if hasattr(memory, "t") else memory.t0 + memory.step * memory.h)
-
-
-def _check_memory(memory: Any, binding: Binding) -> None:
-    """Raise :class:`StateError` if the bytes cannot belong to a run."""
-    vectors = map(binding.vector, (memory.q, memory.p, memory.carry_q, memory.carry_p))
-    if not np.isfinite(np.concatenate([[_time(memory), memory.h], *vectors])).all():
-        raise StateError(f"invalid saved run: its state is not finite, h = {memory.h:g}")
-    for name, (least, most) in RANGES.items():
-        if not least <= (value := getattr(memory, name, least)) <= most:
-            raise StateError(f"invalid saved run: {name} is {value}, not a whole number from {least} to {most}")

@@ -39,6 +39,7 @@ class Observation:
         save_every: without ``times``, save the present state and those whose step number is a multiple of this.
         times: (n,) output times, sorted in the direction of the run.
         observe: function of the run that returns the data to save instead of the states between first and last.
+        within_steps: with ``save_every=1``, save also states after changes by events within steps.
     """
 
     def __init__(
@@ -48,9 +49,12 @@ class Observation:
         save_every: int = 1,
         times: Array | None = None,
         observe: Callable[[Any], ArrayLike] | None = None,
+        within_steps: bool = True,
     ) -> None:
         self.run, self.save_every, self.times = run, checked_count(save_every, "save_every", least=1), times
-        self.search = CrossingSearch(run.stepper, run._crossed) if run.stepper.events else None
+        self.within_steps = within_steps
+        self.search = CrossingSearch(run.stepper, None if run.ended else run._watch) if run.stepper.events else None
+        run._watch = self.search and self.search.watch
         plan = run.plan
         self.end = plan.t_end if plan.fixed and math.isfinite(plan.t_end) else None
         self.arrived, self.partial_steps = False, 0
@@ -66,10 +70,7 @@ class Observation:
         return self.arrived or (self.search is not None and self.search.ended)
 
     def advance(
-        self,
-        steps: int | None,
-        progress: Callable[[int], None] | None = None,
-        stop: Callable[[], bool] = lambda: False,
+        self, steps: int | None, progress: Callable[[int], None] | None = None, stop: Callable[[], bool] = lambda: False
     ) -> Trajectory:
         """Advance by ``steps`` (``None``: to the end) or to a terminal event; return the saved states.
 
@@ -129,7 +130,10 @@ class Observation:
             reached = self.search.search(part, first=self.run.steps - len(part) + 1 + self.arrived)
             if self.search.ended:
                 self.run.rollback(before)
-                part, failure, self.arrived = self._ended(record(self.run, reached)), None, False
+                part, failure, self.arrived = record(self.run, reached), None, False
+                t, q, p = self.search.last
+                part = self._with_state(part, part.step_sizes, t, q, p, self._state_within_step(part, t)[2])
+                self.run._watch = self.search.watch
         self._keep(part)
         if failure is not None:
             raise failure
@@ -147,13 +151,6 @@ class Observation:
             failure.trajectory = self.trajectory()
         if failure is not None:
             raise failure
-
-    def _ended(self, part: Trajectory) -> Trajectory:
-        """Return the chunk with the state of the terminal event appended."""
-        assert self.search is not None
-        t, q, p = self.search.last
-        _, _, tau = self._state_within_step(part, t)
-        return self._with_state(part, part.step_sizes, t, q, p, tau)
 
     def _arrived(self, part: Trajectory, before: bytes) -> Trajectory:
         """Return the chunk up to the final time, with a shorter last step; the run is left before that step."""
@@ -210,31 +207,29 @@ class Observation:
             return
         number = self.run.steps - (len(part) - 1 - self.ended) + np.arange(len(part)) if numbers is None else numbers
         wanted = number % self.save_every == 0  # states within a step only if all are saved
+        wanted &= self.within_steps | (number >= 0)
         wanted[0] = first
         wanted[-1] |= self.ended or self.run.arrived
         q, p = part.q[wanted], part.p[wanted]
         if self.observe is not None and len(q):
-            self.observed.append(self._observation(part))
+            run = self.run
+            if self.ended:
+                here = {"t": part.t[-1], "parameters": run.parameters, "options": run.options}
+                run = type(run).started(run.stepper, part.q[-1], part.p[-1], plan=run.plan, **here)
+            assert self.observe is not None  # by the caller
+            array, when = real_array(self.observe(run), "the result of observe"), f"at t = {run.t:g}"
+            if self.observed and array.shape != self.observed[0].shape:
+                raise StateError(
+                    f"the result of observe must keep its shape: {array.shape} {when}, {self.observed[0].shape} before"
+                )
+            self.observed.append(array)
             end, stepper = part[-1:], self.run.stepper
             maps = end.momentum_maps() if stepper.momentum_map_names else np.empty((1, 0))
             self.conserved.append(np.concatenate([end.energies, maps], axis=1)[0])
             self.ends = [*self.ends[:1], (q[-1], p[-1])]
             q, p = q[:0], p[:0]
-        self.states.append((part.t[wanted], q, p, part.step_sizes[wanted], part.stepped[wanted], total[wanted]))
-
-    def _observation(self, part: Trajectory) -> Array:
-        """Return the data to save of the last state of a chunk; a state within a step is that of a run from there."""
-        run = self.run
-        if self.ended:
-            here = {"t": part.t[-1], "parameters": run.parameters, "options": run.options}
-            run = type(run).started(run.stepper, part.q[-1], part.p[-1], plan=run.plan, **here)
-        assert self.observe is not None  # by the caller
-        array, when = real_array(self.observe(run), "the result of observe"), f"at t = {run.t:g}"
-        if self.observed and array.shape != self.observed[0].shape:
-            raise StateError(
-                f"the result of observe must keep its shape: {array.shape} {when}, {self.observed[0].shape} before"
-            )
-        return array
+        if wanted.any():
+            self.states.append((part.t[wanted], q, p, part.step_sizes[wanted], part.stepped[wanted], total[wanted]))
 
     def _keep_times(self, part: Trajectory, total: NDArray[np.int64], *, first: bool) -> None:
         assert self.times is not None

@@ -9,14 +9,13 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.errors import StateError
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.constraints.projection import constraint_values, multipliers
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, Parameters
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
-from scvi_codegen.runtime.run.accuracy import warn_of_energy_error, warn_of_large_steps
-from scvi_codegen.runtime.run.descriptions import describe_run, short_title
+from scvi_codegen.runtime.run.accuracy import warn_of_energy_error, warn_of_large_steps, warn_of_unresolved_fields
+from scvi_codegen.runtime.run.descriptions import describe_run
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.observation import Observation
 from scvi_codegen.runtime.run.one_thread import alone
@@ -33,9 +32,7 @@ class Run(Memory, AttitudeHistory):
     """Run in progress: :class:`Memory` with recording of states."""
 
     def __repr__(self) -> str:
-        interface = self.stepper.interface
-        tau = bool(interface.energy_parameter)
-        return describe_run(short_title(interface), interface.solver, self, tau=tau, unset_inputs=self._unset_inputs)
+        return describe_run(self)
 
     @classmethod
     def _reused(cls, stepper: Integrator) -> Self:
@@ -81,22 +78,19 @@ class Run(Memory, AttitudeHistory):
         if not self._leaving:
             warn_of_large_steps(trajectory, before=before)
         warn_of_energy_error(trajectory, self)
+        warn_of_unresolved_fields(trajectory)
         return trajectory
 
     def advance(
-        self,
-        steps: int,
-        *,
-        progress: Callable[[int], None] | None = None,
-        stop: Callable[[], bool] | None = None,
+        self, steps: int, *, progress: Callable[[int], None] | None = None, stop: Callable[[], bool] | None = None
     ) -> None:
         """Take steps as :meth:`Memory.advance`, with the changes of the state by events."""
         if not self.stepper.changes_states:
             super().advance(steps, progress=progress, stop=stop)
-        elif stop is not None:
-            raise StateError("stop is not supported with events that change the state: omit stop")
         else:
-            self.record(steps, save_every=LARGEST_COUNT, progress=progress)
+            with self.alone():
+                report = progress and (lambda _: progress(self.steps))
+                Observation(self, save_every=LARGEST_COUNT).advance(steps, report, stop or (lambda: False))
 
     def _recorded(
         self,

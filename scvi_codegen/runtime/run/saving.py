@@ -3,8 +3,6 @@
 import hashlib
 import json
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -51,8 +49,12 @@ def read_checkpoint(
     body = saved[len(MAGIC) + DIGEST :]
     if not saved.startswith(MAGIC) or hashlib.sha256(body).digest() != saved[len(MAGIC) : -len(body)]:
         raise StateError("invalid saved run: the checksum differs. Save the run again")
-    with damage_as_state_error():
+    try:
         return _read(body, origin, threads, adaptive=adaptive)
+    except StateError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, MemoryError, ScviCodegenError) as error:
+        raise StateError(f"invalid saved run: {error!r}") from error
 
 
 def _read(
@@ -76,23 +78,12 @@ def _read(
     places = read_tables(origin.interface, tables)
     check_accesses(layout, sizes, places)
     count = checked_count(1 if threads is None else threads, "threads", least=1, most=MOST_THREADS)
-    bound = origin._bound_to(RunSizes(sizes=sizes, places=places, threads=count))
+    bound = origin._bound_to(RunSizes(sizes=sizes, places=places, threads=count)).with_events(origin.events)
     values = np.frombuffer(rest, count=len(bound.defaults), offset=first)
     known = bound.parameters_by_name(values)
     for name in header["unset inputs"]:
         del known[f"{name}_0"]
     return bound, rest[first + values.nbytes :], known
-
-
-@contextmanager
-def damage_as_state_error() -> Iterator[None]:
-    """Convert exceptions caused by damaged bytes to :class:`StateError`."""
-    try:
-        yield
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, MemoryError, ScviCodegenError) as error:
-        if isinstance(error, StateError):
-            raise
-        raise StateError(f"invalid saved run: {error!r}") from error
 
 
 def _integrator(interface: Interface) -> str:

@@ -42,11 +42,6 @@ class StepPlan:
         """Return whether step sizes follow from the tolerance."""
         return not (self.h or self.tau)
 
-    @classmethod
-    def with_step(cls, h: float) -> StepPlan:
-        """Construct with a fixed step size; raise ``StateError`` unless it is finite and not 0."""
-        return cls(h=checked_step(h))
-
 
 def evaluated_once(function: Evaluated) -> Evaluated:
     """Decorate a function of numbers: equal arguments of equal types are evaluated once."""
@@ -95,7 +90,7 @@ def checked_plan(
     if h is not None:
         if tolerance is not None:
             raise StateError("tolerance requires adaptive steps: give t_end without h and steps")
-        return StepPlan.with_step(h)
+        return StepPlan(h=checked_step(h))
     allowed = 0.0
     if tolerance is not None:
         check_tolerance(allowed := checked_number(tolerance, "the tolerance"))

@@ -17,8 +17,6 @@ from scvi_codegen.native.arguments import real_array
 from scvi_codegen.representation import summary
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.events.saltation import Jump, jumps_within
-from scvi_codegen.runtime.run.memory import Memory
-from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.sensitivity.step_derivatives import LinearisedMethod, Sensitivity, Starts
 from scvi_codegen.runtime.sensitivity.transformed_derivatives import time_of
 from scvi_codegen.runtime.trajectory.recomputation import check_recomputed, steps_between
@@ -202,16 +200,7 @@ def starts_of(states: SavedStates, first: int, last: int) -> tuple[Starts, NDArr
         return starts, np.arange(first, last + 1)
     t, h = states.t[first] + length * np.arange(count), np.full(count, length)
     starts = Starts.chain(states.q[first], states.p[first], t, h)
-    run = Memory.started(
-        states.stepper,
-        states.q[first],
-        states.p[first],
-        plan=StepPlan.with_step(length),
-        t=float(t[0]),
-        parameters=states.parameters,
-        options=states.options,
-    )
-    times = run._fill(count, starts.q[1:], starts.p[1:])
+    times = states._restarted(first, length)._fill(count, starts.q[1:], starts.p[1:])
     if states.tau is not None:
         starts.t[1:] = times[:-1]
     numbers = np.full(count + 1, -1)

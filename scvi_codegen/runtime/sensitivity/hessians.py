@@ -54,8 +54,7 @@ def second_order_adjoints(
         vectors[-1] += now
         states.stepper._second_order_adjoint(starts, moved, vectors, states.parameters, states.options)
         now = vectors[0]
-    first_partials: Array = now + _seeds(derivatives[:1], hessian_blocks[:1], tangents[np.newaxis])[0]
-    return first_partials
+    return np.asarray(now + _seeds(derivatives[:1], hessian_blocks[:1], tangents[np.newaxis])[0])
 
 
 def _tangents_at_starts(states: SavedStates, between: list[tuple[int, int]], tangents: Array) -> list[Array]:

@@ -119,6 +119,7 @@ class TrajectoryDerivatives(SavedStates):
             MethodError: if time is transformed, or the system is damped.
             StateError: if a shape is another, or the states are not at whole steps.
         """
+        self.stepper._check_no_changes("hessian_product")
         derivatives, hessian_blocks = checked_function(self.stepper, len(self), cotangents, curvatures)
         columns = finite(directions, "directions")
         self.stepper._second_derivatives  # noqa: B018  (raises MethodError if unavailable)

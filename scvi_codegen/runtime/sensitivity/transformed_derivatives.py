@@ -85,8 +85,7 @@ class TransformedTime(PhysicalTime):
         vectors[0, 0, -1] = 1.0
         starts = Starts(states.t[-2:-1].copy(), span, states.q[-2:].copy(), states.p[-2:].copy())
         states.stepper._propagate(starts, vectors, states.parameters, states.options)
-        derivatives: Array = vectors[1, 0] / vectors[1, 0, T]
-        return derivatives
+        return np.asarray(vectors[1, 0] / vectors[1, 0, T])
 
     def initial_tangents(self, tangents: Array) -> Array:
         """Add the variation of the energy; see :meth:`PhysicalTime.initial_tangents`."""

@@ -13,6 +13,7 @@ One state takes 0.65 microseconds there, four times as long as a step of the run
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,14 +21,11 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import step_failure
-from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.step_plan import StepPlan
-from scvi_codegen.runtime.trajectory.saved_states import SavedStates
+from scvi_codegen.runtime.trajectory.saved_states import ROUNDINGS, SavedStates
 from scvi_codegen.runtime.trajectory.time_transformation import states_in_transformed_time
 
 Array = NDArray[np.float64]
-ROUNDINGS = 4.0
-STEP_END_TOLERANCE = 1e-6
 
 
 def states_at(states: SavedStates, times: Array) -> tuple[Array, Array]:
@@ -48,13 +46,21 @@ def states_and_steps_at(states: SavedStates, times: Array) -> tuple[Array, Array
         _check_on_grid(states)
         return states_in_transformed_time(states, times)
     left = np.searchsorted(states.forward * states.t, states.forward * times, side="right") - 1
-    if not states.plan.fixed and np.isnan(states.step_sizes[:-1]).any():
+    spans, lengths = np.diff(states.t), states.step_sizes[:-1]
+    several = not (np.abs(spans) < 1.5 * np.abs(lengths)).all()
+    if (several and states.stepper.changes_states) or (not states.plan.fixed and np.isnan(lengths).any()):
         return *_integrate_to_each(states, left, times, states.plan), times
     _check_on_grid(states)
     t, q, p = states.t[left], states.q[left], states.p[left]
     whole = whole_steps(times - t, np.nan_to_num(states.step_sizes[left], nan=np.inf))
     between = np.flatnonzero(whole)
-    _take_whole_steps(states, left, whole, between[np.lexsort((whole[between], left[between]))], t, q, p)
+    saved, run = -1, None
+    for k in between[np.lexsort((whole[between], left[between]))]:
+        if run is None or left[k] != saved:
+            saved = int(left[k])
+            run = states._restarted(saved, float(states.step_sizes[saved]))
+        run.advance(int(whole[k]) - run.steps)
+        t[k], q[k], p[k] = run.t, run.q, run.p
     _take_partial_steps(states, t, times - t, q, p)
     return q, p, times
 
@@ -62,20 +68,15 @@ def states_and_steps_at(states: SavedStates, times: Array) -> tuple[Array, Array
 def _integrate_to_each(
     states: SavedStates, left: NDArray[np.intp], times: Array, plan: StepPlan
 ) -> tuple[Array, Array]:
-    """Integrate with adaptive steps from the saved state before each time to that time."""
+    """Integrate from the saved state before each time to that time, with adaptive steps or events."""
     q, p = states.q[left], states.p[left]
+    stepper: Any = states.stepper
     for k in np.flatnonzero(times != states.t[left]):
-        memory = Memory.started(
-            states.stepper,
-            q[k],
-            p[k],
-            plan=replace(plan, t_end=float(times[k])),
-            t=states.t[left[k]],
-            parameters=states.parameters,
-            options=states.options,
-        )
-        memory._run_to_target()
-        q[k], p[k] = memory.q, memory.p
+        to_here = replace(plan, t_end=float(times[k]))
+        settings = {"t": states.t[left[k]], "parameters": states.parameters, "options": states.options}
+        run = stepper._run(q[k], p[k], plan=to_here, **settings)
+        reached = run._recorded(None, times=times[k : k + 1])
+        q[k], p[k] = reached.q[0], reached.p[0]
     return q, p
 
 
@@ -85,33 +86,6 @@ def whole_steps(spans: Array, h: Array, slack: float = 0.0) -> NDArray[np.int64]
     nearest = np.rint(ratio)
     fits = np.abs(ratio - nearest) <= slack + ROUNDINGS * np.finfo(float).eps * np.maximum(1.0, nearest)
     return np.where(fits, nearest, np.floor(ratio)).astype(np.int64)
-
-
-def _take_whole_steps(
-    states: SavedStates,
-    left: NDArray[np.intp],
-    whole: NDArray[np.int64],
-    order: NDArray[np.intp],
-    t: Array,
-    q: Array,
-    p: Array,
-) -> None:
-    """Advance in place by whole steps: one run from each saved state, stopped at every requested step number."""
-    saved, run = -1, None
-    for k in order:
-        if run is None or left[k] != saved:
-            saved = left[k]
-            run = Memory.started(
-                states.stepper,
-                q[k],
-                p[k],
-                plan=StepPlan.with_step(float(states.step_sizes[saved])),
-                t=t[k],
-                parameters=states.parameters,
-                options=states.options,
-            )
-        run.advance(int(whole[k]) - run.steps)
-        t[k], q[k], p[k] = run.t, run.q, run.p
 
 
 def _take_partial_steps(states: SavedStates, t: Array, h: Array, q: Array, p: Array) -> None:
@@ -160,19 +134,12 @@ def within(times: Array, first: float, last: float) -> Array:
     return np.clip(times, low, high)
 
 
-def grid_tolerance(states: SavedStates) -> Array:
-    """Return (n,) distances within which a time counts as the end of a step: times are rounded."""
-    rounding = ROUNDINGS * np.finfo(float).eps * np.abs(states.stepped).max()
-    tolerance: Array = np.fmax(STEP_END_TOLERANCE * np.abs(states.step_sizes), rounding)
-    return tolerance
-
-
 def step_sizes_at(states: SavedStates, times: Array) -> Array:
     """Return (n,) sizes of the steps that begin at the given times; NaN at times between two steps."""
     before = np.searchsorted(states.forward * states.t, states.forward * times, side="right") - 1
     after = np.minimum(before + 1, len(states) - 1)
     nearest = np.where(np.abs(states.t[after] - times) < np.abs(times - states.t[before]), after, before)
-    off = np.abs(times - states.t[nearest]) > grid_tolerance(states)[nearest]
+    off = np.abs(times - states.t[nearest]) > states.grid_tolerance[nearest]
     return np.where(off, np.nan, states.step_sizes[nearest])
 
 

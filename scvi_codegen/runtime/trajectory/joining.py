@@ -42,8 +42,9 @@ def concatenated(parts: Sequence[NDArray[Number]]) -> NDArray[Number]:
 
 def joined_crossings(crossings: Sequence[Crossings]) -> Crossings:
     """Concatenate the crossings of one event over all pieces."""
-    t, q, p = (np.concatenate([getattr(each, name) for each in crossings]) for name in ("t", "q", "p"))
-    return Crossings(event=crossings[0].event, t=t, q=q, p=p)
+    names = "t", "q", "p", "element"
+    joined = {name: np.concatenate([getattr(each, name) for each in crossings]) for name in names}
+    return Crossings(event=crossings[0].event, **joined)
 
 
 def relative_changes(values: Array, sizes: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,27 +16,17 @@ from scvi_codegen.runtime.rotations.quantities import values_by_name
 def quantities(stepper: Integrator, parameters: Array, t: Array, q: Array, p: Array) -> dict[str, Array]:
     """Return velocity (n, m), energy (n,), momentum_map (n, c) and attitudes (if there are any) of n states."""
     rows_of_states = np.flatnonzero(np.isfinite(q).all(axis=1) & np.isfinite(p).all(axis=1))
-
-    def energies(rows: NDArray[np.intp]) -> Array:
-        result: Array = stepper.energy(q[rows], p[rows], t[rows], parameters)
-        return result
-
-    def maps(rows: NDArray[np.intp]) -> Array:
-        return stepper.momentum_maps(q[rows], p[rows], t[rows], parameters)
-
-    def rates(rows: NDArray[np.intp]) -> Array:
-        return stepper.rates(q[rows], p[rows], parameters)
-
     per_time = np.full(len(t), np.nan)
-    _fill(per_time, rows_of_states, rates)
+    _fill(per_time, rows_of_states, lambda rows: stepper.rates(q[rows], p[rows], parameters))
     result = {
         "velocity": _velocities(stepper, parameters, t, q, p) / per_time[:, np.newaxis],
         "energy": np.full(len(t), np.nan),
     }
-    _fill(result["energy"], rows_of_states, energies)
+    _fill(result["energy"], rows_of_states, lambda rows: stepper.energy(q[rows], p[rows], t[rows], parameters))
     if names := stepper.momentum_map_names:
         result["momentum_map"] = np.full((len(t), len(names)), np.nan)
-        _fill(result["momentum_map"], rows_of_states, maps)
+        maps = partial(stepper.momentum_maps, parameters=parameters)
+        _fill(result["momentum_map"], rows_of_states, lambda rows: maps(q[rows], p[rows], t[rows]))
     return result | values_by_name(stepper.interface, q, p, result["velocity"])
 
 

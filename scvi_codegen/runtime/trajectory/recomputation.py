@@ -4,45 +4,59 @@ Newton's iteration solves the steps again, from a linear initial guess. It may c
 equations; recomputed steps that do not end in the next saved state raise an error.
 """
 
-from collections.abc import Callable, Iterator
-from typing import TypeVar
+from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.runtime.trajectory.dense_output import STEP_END_TOLERANCE, whole_steps
-from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
-
-Found = TypeVar("Found")
+from scvi_codegen.runtime.events.event import Crossings
+from scvi_codegen.runtime.trajectory.dense_output import whole_steps
+from scvi_codegen.runtime.trajectory.saved_states import STEP_END_TOLERANCE, Array, SavedStates
 
 SAME_STATE = 1e-6
 """Largest deviation of a recomputed state, relative to its largest entry; other roots are further away."""
 
 
-def recomputed_steps(
-    states: SavedStates, step: Callable[[Array, Array, float, float], tuple[Array, Array, Found]]
-) -> Iterator[list[Found]]:
-    """Yield the results of all steps between each pair of consecutive saved states.
-
-    Args:
-        states: states at whole steps.
-        step: function of (q, p, h, t) that returns (q1, p1, result).
+def work_and_impulses_until(states: SavedStates) -> Array:
+    """Return (n, 1 + k) work of the forces from the first state to each, and their impulses on the momentum maps.
 
     Raises:
-        StateError: if the states are not at whole steps, or recomputed steps deviate.
+        MethodError: if no forces act, or the method has no curve of positions.
+        StateError: if the states are not at whole steps, or recomputed steps differ.
         StepFailedError: if Newton's iteration does not converge.
     """
+    stepper = states.stepper
+    total = np.zeros((len(states), max(1, len(stepper.interface.exchange_names))))
+    step = partial(stepper.work_and_impulses, parameters=states.parameters, options=states.options)
+    ends = np.concatenate([states.q, states.p], axis=1)
+    for crossings, rows in changes_by_events(states):
+        ends[rows] = np.concatenate([crossings.q, crossings.p], axis=1)
     for k, (start, length, end) in enumerate(
         zip(states.t[:-1].tolist(), states.step_sizes[:-1].tolist(), states.t[1:].tolist(), strict=True)
     ):
-        count, outputs = steps_between(length, end - start), []
-        q, p = states.q[k], states.p[k]
+        count, q, p = steps_between(length, end - start), states.q[k], states.p[k]
+        total[k + 1] = total[k]
         for j in range(count):
             q, p, output = step(q, p, length if count > 1 else end - start, start + j * length)
-            outputs.append(output)
-        known = np.concatenate([states.q[k : k + 2], states.p[k : k + 2]], axis=1)
-        check_recomputed(states.t[k : k + 1], np.concatenate([q, p])[np.newaxis], known[1:], known[:1])
-        yield outputs
+            total[k + 1] += output
+        recomputed = np.concatenate([q, p])[np.newaxis]
+        check_recomputed(states.t[k : k + 1], recomputed, ends[k + 1 : k + 2], ends[k : k + 1])
+    return total
+
+
+def changes_by_events(states: SavedStates) -> Iterator[tuple[Crossings, NDArray[np.intp]]]:
+    """Yield the crossings of each event that changes the state, and the rows of the states after them."""
+    t = states.forward * states.t
+    for crossings in getattr(states, "events", ()):
+        times = states.forward * crossings.t
+        here = (t[0] <= times) & (times <= t[-1])
+        rows = np.searchsorted(t, times[here])
+        if crossings.event.changes_state:
+            if not np.array_equal(t[rows], times[here]):
+                raise StateError("this requires the states after changes by events: save all states (save_every=1)")
+            yield crossings.chosen(here), rows
 
 
 def steps_between(length: float, span: float) -> int:

@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.integrator import Integrator
+from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.step_plan import StepPlan
 
 Array = NDArray[np.float64]
+ROUNDINGS, STEP_END_TOLERANCE = 4.0, 1e-6
 
 
 def checked_row(row: Any, count: int) -> int:
@@ -28,14 +30,6 @@ def checked_row(row: Any, count: int) -> int:
     if not -count <= number < count:
         raise IndexError(f"the index {number} is out of range: the trajectory has {count} states")
     return number % count
-
-
-def checked_rows(rows: slice, count: int) -> tuple[int, int, int]:
-    """Return first, end and stride of a slice of ``count`` states; raise IndexError if it is empty or descending."""
-    first, last, stride = rows.indices(count)
-    if stride < 0 or first >= last:
-        raise IndexError(f"a slice of a trajectory must be ascending and not empty, unlike {rows} of {count} states")
-    return first, last, stride
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -71,5 +65,16 @@ class SavedStates:
         """1, or -1 for a run backward in time."""
         return math.copysign(1.0, self.t[-1] - self.t[0])
 
+    @property
+    def grid_tolerance(self) -> Array:
+        """(n,) distances within which a time counts as the end of a step: times are rounded."""
+        rounding = ROUNDINGS * np.finfo(float).eps * np.abs(self.stepped).max()
+        return np.asarray(np.fmax(STEP_END_TOLERANCE * np.abs(self.step_sizes), rounding))
+
     def __len__(self) -> int:
         return len(self.t)
+
+    def _restarted(self, k: int, h: float) -> Memory:
+        """Return a run from saved state k with fixed steps h."""
+        given: dict[str, Any] = {"parameters": self.parameters, "options": self.options}
+        return Memory.started(self.stepper, self.q[k], self.p[k], plan=StepPlan(h=h), t=float(self.t[k]), **given)

@@ -4,14 +4,11 @@ A run in transformed time takes steps of tau and integrates t with the method's 
 refer to t: velocities are dq/dt and energies are those of the original system.
 """
 
-from typing import Any
-
 import numpy as np
 
 from scvi_codegen.native.options import SolverOptions, step_failure
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 
 
@@ -78,10 +75,6 @@ def _steps_from(states: SavedStates, saved: int) -> tuple[Array, Array, Array, f
     count = round((states.tau[saved + 1] - states.tau[saved]) / h) if saved + 1 < len(states) else 1
     if count <= 1:
         return t, q, p, h
-    from scvi_codegen.runtime.run.memory import Memory
-
-    given: dict[str, Any] = {"parameters": states.parameters, "options": states.options}
-    run = Memory.started(states.stepper, q[0], p[0], plan=StepPlan.with_step(h), t=float(t[0]), **given)
     positions, momenta = np.empty((2, count - 1, q.shape[1]))
-    times = run._fill(count - 1, positions, momenta)
+    times = states._restarted(saved, h)._fill(count - 1, positions, momenta)
     return np.append(t, times), np.concatenate([q, positions]), np.concatenate([p, momenta]), h

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
@@ -30,8 +31,8 @@ from scvi_codegen.runtime.sensitivity.trajectory_derivatives import TrajectoryDe
 from scvi_codegen.runtime.trajectory.dense_output import checked_times, states_at, within
 from scvi_codegen.runtime.trajectory.joining import Number, concatenated, joined, joined_crossings, relative_changes
 from scvi_codegen.runtime.trajectory.quantities import quantities
-from scvi_codegen.runtime.trajectory.saved_states import Array, checked_row, checked_rows
-from scvi_codegen.runtime.trajectory.work_and_impulses import work_and_impulses_until
+from scvi_codegen.runtime.trajectory.recomputation import work_and_impulses_until
+from scvi_codegen.runtime.trajectory.saved_states import Array, checked_row
 from scvi_codegen.validation import checks_arguments
 
 if TYPE_CHECKING:
@@ -107,7 +108,9 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
         if not isinstance(rows, slice):
             k = checked_row(rows, len(self))
             return float(self.t[k]), self.q[k].copy(), self.p[k].copy()
-        first, last, stride = checked_rows(rows, len(self))
+        first, last, stride = rows.indices(len(self))
+        if stride < 0 or first >= last:
+            raise IndexError(f"a slice of {len(self)} states must be ascending and not empty, unlike {rows}")
         if self.pieces:
             return self._slice_of_pieces(first, last, stride, rows)
         lengths = self.step_sizes[rows]
@@ -263,8 +266,11 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
         Raises:
             MethodError: if the system is not that of a mesh.
         """
-        if (parts := unresolved_parts(self)) is None:
-            raise MethodError("the system is not discretised from a density: unresolved() requires a mesh")
+        if (parts := unresolved_parts(self.stepper, self.q)) is None:
+            raise MethodError(
+                "the system is not discretised from a density: unresolved() requires a mesh (of a recorded run, pass "
+                "load_run(folder, mesh=mesh))"
+            )
         return parts
 
     @property
@@ -328,9 +334,9 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
     def _repr_html_(self) -> str:
         save_every = max(1, -(-len(self) // MOST_DRAWN))
         series = list(zip(self.stepper.coordinates, self.q[::save_every].T, strict=True))[:MOST_CURVES]
-        energies = self._energies(save_every)
         rows = [(plain(name), sparkline(values.tolist(), name), _range(values)) for name, values in series]
-        if energies is not None:
+        with suppress(StateError):  # outside the domain of L
+            energies = self.energy()[::save_every]
             rows.append((plain("energy"), sparkline(energies.tolist(), "energy"), _range(energies)))
         names = zip(self.stepper.parameters, self.parameters, strict=True)
         facts = (
@@ -353,14 +359,6 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
             return "unknown: the method has no error estimate here"
         message = f"about {self.step_error:.1e} relative in the step from t = {self.worst_step_time:g}, the worst"
         return f"{message}; h is too large" if self.step_error > TOLERABLE_ERROR else message
-
-    def _energies(self, save_every: int) -> Array | None:
-        """Return the energies of every ``save_every``-th state, ``None`` outside the domain of L."""
-        try:
-            energies: Array = self.energy()[::save_every]
-        except StateError:
-            return None
-        return energies
 
     @property
     def plot(self) -> Plots:

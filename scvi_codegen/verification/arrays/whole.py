@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sympy import Expr
 
 from scvi_codegen.errors import StepFailedError
-from scvi_codegen.formulas.numpy_values import Elements
+from scvi_codegen.formulas.numpy_values import Elements, convolved
 from scvi_codegen.formulas.symbols import DOT
 from scvi_codegen.indices import Access, Loop
 from scvi_codegen.mechanics.arrays.system import ArraySystem
@@ -66,11 +66,13 @@ class WholeStart:
 
     def begin(self, q: Mapping[str, Numbers], p: Mapping[str, Numbers], h: float, t: float) -> Run:
         """Start a run at a state."""
+        return self.stepper.start(q, p, h=h, t=t, parameters=self.parameters, tables=self.arrays.places)
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Numbers and fields by name."""
         names = [parameter.name for parameter in self.system.parameters]
-        numbers = dict(zip(names, self.arrays.numbers, strict=True))
-        return self.stepper.start(
-            q, p, h=h, t=t, parameters={**numbers, **self.arrays.fields}, tables=self.arrays.places
-        )
+        return {**dict(zip(names, self.arrays.numbers, strict=True)), **self.arrays.fields}
 
 
 def whole_checks(start: WholeStart) -> Iterator[Check]:
@@ -122,7 +124,9 @@ def _numpy_rates(start: WholeStart) -> tuple[dict[str, Numbers], dict[str, Numbe
     for force in system.all_forces:
         at = start.elements(force.loops)
         for access, formula in force.targets:
-            _add(result[access.array.name], at.of(access), _values(start, at, formula, force.slots))
+            added = np.zeros_like(result[access.array.name])
+            _add(added, at.of(access), _values(start, at, formula, force.slots))
+            result[access.array.name] += convolved(added, access, start.arrays.fields, -1)
     if system.momenta:
         pairs = list(zip(system.coordinates, system.momenta, strict=True))
         return {q.name: -result[p.name] for q, p in pairs}, {q.name: result[q.name] for q, _ in pairs}
@@ -162,7 +166,7 @@ def _energies(start: WholeStart) -> Finding:
 
 def _values(start: WholeStart, at: Elements, formula: Expr, slots: Sequence[tuple[Any, Access]]) -> Any:
     """Return the values of a formula at every element."""
-    arrays = {access.array.name: start.array(access.array.name) for _, access in slots}
+    arrays = {access.array.name: start.array(access.array.name) for _, access in slots} | {**start.arrays.fields}
     numbers: dict[Expr, float] = dict(zip(start.system.parameters, start.arrays.numbers, strict=True))
     return at.values(formula, slots, arrays, {**numbers, start.system.time: start.t})
 

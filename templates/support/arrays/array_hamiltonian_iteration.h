@@ -6,9 +6,9 @@
 #include "../iteration/point_weights.h"
 #include "arrays.h"
 
-/* Fixed-point iteration of a step of an array Hamiltonian system, with the equations of hamiltonian_iteration.h.
- * Since one function computes all rates from terms that contain positions and momenta, both are updated together
- * (Jacobi), not in turn. Requires: one_trajectory.h, point_weights.h, the tables, forces_at, which
+/* Points of a step of an array Hamiltonian system, with the equations of hamiltonian_iteration.h, and their fixed-point
+ * iteration. Since one function computes all rates from terms that contain positions and momenta, both are updated
+ * together (Jacobi), not in turn. Requires: one_trajectory.h, point_weights.h, the tables, forces_at, which
  * computes the rates at the points: -H_q of the momenta, then H_p of the positions. Momenta follow positions in
  * memory. */
 
@@ -30,6 +30,43 @@ static inline void weighted_rates(const half_state *of, long long apart, long lo
     scaled[g] = of->weights[g] * of->rates[g * apart + i];
 }
 
+/* Arguments and arrays of a step: the points X, their rates F, and both halves of the state. */
+typedef struct {
+  const step_data *step;
+  const iteration_data *data;
+  lanes *X, *F;
+  long long n;
+  half_state half[2];
+} step_points;
+
+static step_points points_in(const step_data *step, const iteration_data *data, history past)
+{
+  const long long n = step->n;
+  lanes *X = step->work->X;
+  const half_state q = {step->q0, step->carry_q, X, past.now + n, POSITION, POINT_END_POSITION,
+      data->position_weight, 0.0};
+  const half_state p = {step->p0, step->carry_p, X + n, past.now, MOMENTUM, POINT_END_MOMENTUM,
+      data->momentum_weight, 0.0};
+  const step_points points = {step, data, X, past.now, n, {q, p}};
+  return points;
+}
+
+static void forces(const step_points *w)
+{
+  forces_at(w->step, w->X, 2 * w->n, w->F);
+}
+
+/* Extrapolates the rates from former steps, if any. */
+static void first_rates(const step_points *w, history past, long long steps)
+{
+  const section own = own_part(w->step);
+  for (int g = 0; g < GROUPS; g++)
+    for (long long half = 0; half < 2 * w->n; half += w->n)
+      for (long long i = half + own.first; i < half + own.end; i++)
+        w->F[g * 2 * w->n + i] = extrapolated(w->step, past, steps, g, i);
+}
+
+#ifndef NEWTON_KRYLOV
 /* Updates y from its rates; returns the mean of the squared changes relative to the size of each coordinate. */
 static double improve(const step_data *step, half_state *of, const solver_options *options)
 {
@@ -63,16 +100,95 @@ static double improve(const step_data *step, half_state *of, const solver_option
   return of->largest > SUDDEN_GROWTH * before ? 1.0 : change;
 }
 
-/* Computes increments of positions or momenta at the end of the step. */
-static void find_increments(const step_data *step, const half_state *of, double *increment)
+#endif
+
+/* Computes the increments of positions, whose low words are 0, and of momenta at the end of the step. */
+static void find_increments(const step_points *w, section own, double *dq, double *dp)
 {
-  const section own = own_part(step);
   for (long long i = own.first; i < own.end; i++) {
     lanes scaled[GROUPS];
-    weighted_rates(of, 2 * step->n, i, scaled);
-    increment[i] = weigh_apart(of->end, scaled, 1);
+    weighted_rates(&w->half[0], 2 * w->n, i, scaled);
+    dq[i] = weigh_apart(w->half[0].end, scaled, 1), dq[w->n + i] = 0.0;
+    weighted_rates(&w->half[1], 2 * w->n, i, scaled);
+    dp[i] = weigh_apart(w->half[1].end, scaled, 1);
   }
 }
+
+#ifdef NEWTON_KRYLOV
+/* For Newton's method: the state consists of positions, then momenta, whose increments by the rates are h A F. */
+
+/* Index of the rate of an unknown in F. */
+static inline long long index_of_rate(long long n, long long i)
+{
+  return i < n ? i + n : i - n;
+}
+
+static inline double mass_of(const step_points *w, long long i)
+{
+  (void)w, (void)i;
+  return 1.0;
+}
+
+static inline double unit_of(const step_points *w, long long i)
+{
+  (void)i;
+  return w->step->h;
+}
+
+/* Increment of a value of the state at the points of a group by the rates F. */
+static inline lanes increment_at(const step_points *w, int part, int g, long long i, const lanes *F)
+{
+  half_state of = w->half[part];
+  lanes scaled[GROUPS];
+  of.rates = F + index_of_rate(w->n, part * w->n);
+  weighted_rates(&of, 2 * w->n, i, scaled);
+  return contribution_of_points(of.table, g, scaled, 1);
+}
+
+static inline double start_at(const step_points *w, int part, long long i)
+{
+  return w->half[part].start[i];
+}
+
+/* Change of a value by one fixed-point iteration. */
+static inline lanes residual_at(const step_points *w, int part, int g, long long i)
+{
+  const lanes increment = w->half[part].carry[i] + increment_at(w, part, g, i, w->F);
+  return (start_at(w, part, i) - w->X[(2 * g + part) * w->n + i]) + increment;
+}
+
+/* Value without rates. */
+static inline lanes unforced_at(const step_points *w, int part, int g, long long i)
+{
+  (void)g;
+  return lanes_of(start_at(w, part, i));
+}
+
+/* Size of a value at the start of the step, and with its first increment. */
+static inline double drifted_size(const step_points *w, int part, long long i)
+{
+  return fabs(start_at(w, part, i));
+}
+
+static inline double first_size(const step_points *w, int part, long long i)
+{
+  lanes increment = increment_at(w, part, GROUPS - 1, i, w->F);
+  return drifted_size(w, part, i) + fabs(at_point(&increment, 1, LANES - 1));
+}
+
+/* Points with the extrapolated rates, or at rest. */
+static void first_points(const step_points *w, history past, long long steps)
+{
+  const section own = own_part(w->step);
+  first_rates(w, past, steps);
+  for (int part = 0; part < 2; part++)
+    for (int g = 0; g < GROUPS; g++)
+      for (long long i = own.first; i < own.end; i++)
+        w->X[(2 * g + part) * w->n + i] =
+            start_at(w, part, i) + (w->half[part].carry[i] + increment_at(w, part, g, i, w->F));
+  meet(w->step); /* before the rates are overwritten */
+}
+#else
 
 /* Computes the increments of one step: iterates until the points converge. Errors of positions become errors of momenta
  * in one iteration and back in the next, so that changes are judged in pairs. Starts from the rates of *steps former
@@ -80,21 +196,14 @@ static void find_increments(const step_data *step, const half_state *of, double 
 static int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, double *dq,
     double *dp, const solver_options *options, solver_report *report)
 {
-  const long long n = step->n;
-  const section own = own_part(step);
-  lanes *X = step->work->X;
-  half_state q = {step->q0, step->carry_q, X, past.now + n, POSITION, POINT_END_POSITION, data->position_weight, 0.0};
-  half_state p = {step->p0, step->carry_p, X + n, past.now, MOMENTUM, POINT_END_MOMENTUM, data->momentum_weight, 0.0};
+  step_points w = points_in(step, data, past);
   progress now = before_iterations();
   double last = 0.0;
   int status;
-  for (int g = 0; g < GROUPS; g++)
-    for (long long half = 0; half < 2 * n; half += n)
-      for (long long i = half + own.first; i < half + own.end; i++)
-        past.now[g * 2 * n + i] = extrapolated(step, past, *steps, g, i);
+  first_rates(&w, past, *steps);
   for (int k = 0; needs_iteration(&now); k++) {
-    const double of_q = improve(step, &q, options), both = of_q + improve(step, &p, options);
-    forces_at(step, X, 2 * n, past.now);
+    const double of_q = improve(step, &w.half[0], options), both = of_q + improve(step, &w.half[1], options);
+    forces(&w);
     if (k > 0 && k % 2 == 0)
       take_change(&now, last + both, options, k / 2 - 1, report);
     last = both;
@@ -102,13 +211,12 @@ static int fixed_point(const step_data *step, const iteration_data *data, histor
   status = outcome(&now, report);
   if (status != OK)
     return status;
-  find_increments(step, &q, dq);
-  find_increments(step, &p, dp);
-  memset(dq + n + own.first, 0, sizeof(double) * (size_t)(own.end - own.first));
+  find_increments(&w, own_part(step), dq, dp);
   if (!accept(step, dq, dp, report))
     return NOT_FINITE;
   *steps = next_guess(*steps, &now, report);
   return OK;
 }
+#endif
 
 #endif

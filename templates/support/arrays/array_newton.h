@@ -4,13 +4,15 @@
 #include "../core/points.h"
 #include "../core/step.h"
 #include "../iteration/convergence.h"
-#include "../iteration/separable_iteration.h"
 #include "arrays.h"
 
-/* Linear systems of Newton's method for the points of a step of an array system: (1 - h^2 A F' / m) dX = the change
- * by one fixed-point iteration, where A is PRODUCT and F' the Jacobian of the forces at the points, which is only
- * multiplied by vectors, term group by term group. Requires: separable_iteration.h, jacobian_times,
- * jacobian_diagonal. */
+/* Linear systems of Newton's method for the points of a step of an array system: (1 - A F') dX = the change by one
+ * fixed-point iteration, where A gives the increments of the state by the forces (or rates of a Hamiltonian), of which
+ * F' is the Jacobian at the points. F' is only multiplied by vectors, term group by term group. Positions, and momenta
+ * if X_VECTORS is 2, are the parts of a vector: ROWS rows of n lanes. Requires: jacobian_times; jacobian_diagonal
+ * unless FACTORS_ALONE; second_order_points.h or array_hamiltonian_iteration.h. */
+
+enum { ROWS = GROUPS * X_VECTORS };
 
 typedef struct {
   const step_data *step;
@@ -19,25 +21,37 @@ typedef struct {
   const work_arrays *work;
   long long n, count; /* coordinates, and lanes of a vector over all points */
   section own; /* coordinates of this thread */
-  double scale, state; /* of coordinates before they are squared, and their scaled size */
+  double scale[X_VECTORS], state; /* of the parts before they are squared, and the scaled size of the state */
   int by_factors; /* 1 if the preconditioner is that of envelope.h */
   int by_fourier, tried; /* 1 if the inverses are those of the Fourier modes; number of preconditioners for which one
                         * cycle was not enough */
   double left; /* reduction of the residual by the first of them */
 } linear_system;
 
-/* y = x - h^2 A F' x / m. */
+/* y = x - A F' x. */
 static void multiply(const linear_system *of, const lanes *x, lanes *y)
 {
   const long long n = of->n;
   jacobian_times(of->step, of->points->X, x, of->work->forces);
-  for (long long i = of->own.first; i < of->own.end; i++) {
-    const double unit = unit_of(of->points, i);
-    for (int g = 0; g < GROUPS; g++)
-      y[g * n + i] = x[g * n + i] - unit * contribution_of_points(PRODUCT, g, &of->work->forces[i], n);
-  }
+  for (int part = 0; part < X_VECTORS; part++)
+    for (long long i = of->own.first; i < of->own.end; i++)
+      for (int g = 0; g < GROUPS; g++) {
+        const long long at = (g * X_VECTORS + part) * n + i;
+        y[at] = x[at] - increment_at(of->points, part, g, i, of->work->forces);
+      }
 }
 
+/* Derivative of an unknown by forces x averaged over the points: h^2 x / m, or h times a rate. */
+static double mean_derivative(const linear_system *of, const lanes *x, long long i)
+{
+  const lanes *own = x + index_of_rate(of->n, i);
+  double mean = 0.0;
+  for (int j = 0; j < KEPT; j++)
+    mean += at_point(own, F_VECTORS * of->n, j) / KEPT;
+  return unit_of(of->points, i) * mean;
+}
+
+#ifndef FACTORS_ALONE
 /* y = the inverses times x, per coordinate; x may be y. */
 static void apply_inverses(const linear_system *of, const lanes *x, lanes *y, section here)
 {
@@ -92,15 +106,6 @@ static void keep_inverse(linear_system *of, long long i, double derivative, doub
   memcpy(of->work->inverse + i * POINTS * GROUPS, inverse, sizeof inverse);
 }
 
-/* h^2 x / m of a coordinate, x averaged over the points. */
-static double mean_derivative(const linear_system *of, const lanes *x, long long i)
-{
-  double mean = 0.0;
-  for (int j = 0; j < KEPT; j++)
-    mean += at_point(&x[i], of->n, j) / KEPT;
-  return unit_of(of->points, i) * mean;
-}
-
 /* Inverts 1 - h^2 A F'_ii / m of every coordinate. */
 static void find_own_inverses(linear_system *of)
 {
@@ -109,17 +114,19 @@ static void find_own_inverses(linear_system *of)
     keep_inverse(of, i, mean_derivative(of, of->work->forces, i), 1.0);
 }
 
+#endif
+
 /* Vectors over all points of all coordinates; every thread computes its own part. */
 
 /* Inner product of scaled vectors. */
 static double inner_product(const linear_system *of, const lanes *x, const lanes *y)
 {
-  const double scale = of->scale;
   sums all;
   begin_sums(&all, of->run, of->n);
   while (next_block(&all)) {
     lanes a = lanes_of(0.0), b = lanes_of(0.0);
-    for (int g = 0; g < GROUPS; g++) {
+    for (int g = 0; g < ROWS; g++) {
+      const double scale = of->scale[g % X_VECTORS];
       long long i = g * of->n + all.here.first;
       const long long end = g * of->n + all.here.end;
       for (; i + 1 < end; i += 2) {
@@ -138,22 +145,22 @@ static double inner_product(const linear_system *of, const lanes *x, const lanes
 /* y += by x, for the coordinates of this thread. */
 static void add_multiple(const linear_system *of, lanes *restrict y, double by, const lanes *restrict x)
 {
-  for (int g = 0; g < GROUPS; g++)
+  for (int g = 0; g < ROWS; g++)
     for (long long i = g * of->n + of->own.first; i < g * of->n + of->own.end; i++)
       y[i] += by * x[i];
 }
 
 /* x = by y, for the coordinates of this thread. */
-static void scale(const linear_system *of, lanes *x, double by, const lanes *y)
+static void set_multiple(const linear_system *of, lanes *x, double by, const lanes *y)
 {
-  for (int g = 0; g < GROUPS; g++)
+  for (int g = 0; g < ROWS; g++)
     for (long long i = g * of->n + of->own.first; i < g * of->n + of->own.end; i++)
       x[i] = by * y[i];
 }
 
 static void make_zero(const linear_system *of, lanes *x)
 {
-  for (int g = 0; g < GROUPS; g++)
+  for (int g = 0; g < ROWS; g++)
     memset(x + g * of->n + of->own.first, 0, sizeof(lanes) * (size_t)(of->own.end - of->own.first));
 }
 

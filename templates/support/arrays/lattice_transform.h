@@ -1,15 +1,14 @@
 #ifndef SUPPORT_LATTICE_TRANSFORM_H
 #define SUPPORT_LATTICE_TRANSFORM_H
 
-#include "../core/points.h"
-#include "../core/step.h"
 #include "arrays.h"
 
 /* Fast Fourier transforms along the axes of lattices, at all points of a step, with one pass per factor of the size,
  * each from one array into another (Stockham autosort; C. Van Loan, Computational Frameworks for the Fast Fourier
- * Transform, 1992, section 1.7). Requires: array_newton.h. */
+ * Transform, 1992, section 1.7). Requires: arrays.h, lanes, lanes_of,
+ * GROUPS. */
 
-enum { LARGEST_FACTOR = 499 }; /* of a size that is transformed: a pass costs as many products per element */
+enum { LARGEST_FACTOR = 499 }; /* of a size with an alternative: a pass costs as many products per element */
 
 /* Real and imaginary parts of all coordinates. */
 typedef struct {
@@ -27,6 +26,16 @@ typedef struct {
   roots of_one;
 } axis;
 
+/* Sets entries `first` to `end` of the roots. */
+static void fill_roots(roots of_one, long long size, long long first, long long end)
+{
+  for (long long k = first; k < end; k++) {
+    const double angle = 6.283185307179586 * (double)k / (double)size;
+    of_one.cosine[k] = cos(angle);
+    of_one.sine[k] = -sin(angle);
+  }
+}
+
 /* A pass: `left` places of a line are not yet transformed, each of `done` numbers; `factor` of them are combined. */
 typedef struct {
   const axis *along;
@@ -37,7 +46,7 @@ typedef struct {
 static int factor_of(long long size)
 {
   int factor = size % 4 == 0 ? 4 : 2;
-  while (factor <= LARGEST_FACTOR && size % factor)
+  while (size % factor)
     factor++;
   return factor;
 }
@@ -141,6 +150,7 @@ static void transform(const run_memory *run, const axis *along, complex_lanes *x
   }
 }
 
+#ifdef ON_LATTICES
 /* An array whose first axes are those of a lattice, with `components` numbers per place. */
 typedef struct {
   long long first, components, size[AXES];
@@ -155,5 +165,6 @@ static long long positions_of(const lattice *one)
     places *= one->size[a];
   return places;
 }
+#endif
 
 #endif

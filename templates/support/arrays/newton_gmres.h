@@ -55,7 +55,7 @@ static int build_basis(linear_system *of, triangle *all, double enough, solver_r
     }
     all->column[k][k + 1] = sqrt(inner_product(of, next, next));
     if (all->column[k][k + 1] > 0.0)
-      scale(of, next, 1.0 / all->column[k][k + 1], next);
+      set_multiple(of, next, 1.0 / all->column[k][k + 1], next);
     left = rotate(all, k);
     if (!(left > enough))
       return k + 1;
@@ -91,7 +91,7 @@ static double find_correction(linear_system *of, solver_report *report)
   for (int cycle = 0; cycle < MOST_CYCLES; cycle++) {
     triangle all = {.rest = {0.0}};
     lanes *left = of->work->basis;
-    scale(of, left, 1.0, of->work->residual);
+    set_multiple(of, left, 1.0, of->work->residual);
     if (cycle > 0) {
       multiply(of, of->work->correction, of->work->product);
       add_multiple(of, left, -1.0, of->work->product);
@@ -99,7 +99,7 @@ static double find_correction(linear_system *of, solver_report *report)
     all.rest[0] = sqrt(inner_product(of, left, left));
     if (!(all.rest[0] > enough && all.rest[0] < INFINITY)) {
       if (enough > LINEAR_TOLERANCE * size && !of->by_fourier && !of->by_factors) {
-        apply_inverses(of, left, of->work->product, of->own);
+        precondition(of, left, of->work->product);
         add_multiple(of, of->work->correction, 1.0, of->work->product);
       }
       return all.rest[0];
@@ -107,7 +107,7 @@ static double find_correction(linear_system *of, solver_report *report)
     if (cycle > 0)
       choose_preconditioner(of, all.rest[0] / last);
     last = all.rest[0];
-    scale(of, left, 1.0 / all.rest[0], left);
+    set_multiple(of, left, 1.0 / all.rest[0], left);
     add_combination(of, &all, build_basis(of, &all, enough, report));
   }
   return last;
@@ -125,18 +125,13 @@ static double find_correction(linear_system *of, solver_report *report)
  * thread. */
 static void find_residual(linear_system *of, const step_points *w)
 {
-  for (long long i = of->own.first; i < of->own.end; i++) {
-    const drift_words along = find_drift(w, i);
-    const double q = w->step->q0[i];
-    for (int g = 0; g < GROUPS; g++) {
-      const lanes sum = SUM_OF_FORCES(PRODUCT, w, g, i) + SUM_OF_FORCES(PRODUCT_LOW, w, g, i);
-      of->work->residual[g * w->n + i] = (q - w->X[g * w->n + i]) + DRIFT[g] * along.high +
-          (unit_of(w, i) * sum + low_words(w, g, along, i));
-    }
-  }
+  for (int part = 0; part < X_VECTORS; part++)
+    for (long long i = of->own.first; i < of->own.end; i++)
+      for (int g = 0; g < GROUPS; g++)
+        of->work->residual[(g * X_VECTORS + part) * w->n + i] = residual_at(w, part, g, i);
 }
 
-/* Squared scaled size of the coordinates in the step. */
+/* Squared scaled size of the state in the step. */
 static double size_of_state(const linear_system *of)
 {
   const step_points *w = of->points;
@@ -144,19 +139,20 @@ static double size_of_state(const linear_system *of)
   begin_blocks(&all, w->step);
   EACH_BLOCK (all) {
     double size = 0.0;
-    for (long long i = all.here.first; i < all.here.end; i++) {
-      const double q = w->step->q0[i], part = fabs(q) + fabs(find_drift(w, i).high);
-      const double of_one = of->scale * (part + fabs(at_point(&w->X[i], w->n, KEPT - 1) - q));
-      size += of_one * of_one;
-    }
+    for (int part = 0; part < X_VECTORS; part++)
+      for (long long i = all.here.first; i < all.here.end; i++) {
+        const double end = at_point(&w->X[part * w->n + i], X_VECTORS * w->n, KEPT - 1);
+        const double of_one = of->scale[part] * (drifted_size(w, part, i) + fabs(end - start_at(w, part, i)));
+        size += of_one * of_one;
+      }
     add_block(&all, size, 0.0);
   }
   meet(w->step);
   return sum_of(&all, 0);
 }
 
-/* Starts from the extrapolated points or from points at rest, whichever has the smaller residual: the forces of a stiff
- * system have no curve that could be extrapolated. */
+/* Starts from the extrapolated points or from points without forces, whichever has the smaller residual: the forces of
+ * a stiff system have no curve that could be extrapolated. */
 static void start_nearer(linear_system *of)
 {
   const step_points *w = of->points;
@@ -165,32 +161,43 @@ static void start_nearer(linear_system *of)
   rest.X = of->work->correction, rest.F = of->work->forces;
   find_residual(of, w);
   continued = inner_product(of, of->work->residual, of->work->residual);
-  for (int g = 0; g < GROUPS; g++)
+  for (int g = 0; g < ROWS; g++)
     for (long long i = of->own.first; i < of->own.end; i++)
-      rest.X[g * of->n + i] = lanes_of(w->step->q0[i]);
+      rest.X[g * of->n + i] = unforced_at(w, g % X_VECTORS, g / X_VECTORS, i);
   forces(&rest);
   find_residual(of, &rest);
   at_rest = inner_product(of, of->work->residual, of->work->residual);
   if (continued <= at_rest)
     return;
-  scale(of, w->X, 1.0, rest.X);
-  scale(of, w->F, 1.0, rest.F);
+  set_multiple(of, w->X, 1.0, rest.X);
+  for (int g = 0; g < GROUPS * F_VECTORS; g++)
+    for (long long i = g * of->n + of->own.first; i < g * of->n + of->own.end; i++)
+      w->F[i] = rest.F[i];
 }
 
-/* Largest coordinate at the start of the step, or displacement by the drift or by the first force: for a step from rest
- * at 0 the only size. */
-static double largest_size(const step_points *w)
+/* Scales the parts of the state by the largest value at the start of the step, or displacement by the drift or by the
+ * first force: for a step from rest at 0 the only size. */
+static void find_scales(linear_system *of, const solver_options *options)
 {
+  const step_points *w = of->points;
+  double size[SUMS];
   sums all;
   begin_blocks(&all, w->step);
   EACH_BLOCK (all) {
-    double of_block = DBL_MIN;
-    for (long long i = all.here.first; i < all.here.end; i++)
-      of_block = larger(of_block, size_of(w, find_drift(w, i), i));
-    add_block(&all, of_block, 0.0);
+    for (int part = 0; part < X_VECTORS; part++) {
+      size[part] = DBL_MIN;
+      for (long long i = all.here.first; i < all.here.end; i++)
+        size[part] = larger(size[part], first_size(w, part, i));
+    }
+    add_values(&all, size, X_VECTORS);
   }
   meet(w->step);
-  return largest_over(&all, 0);
+  for (int part = 0; part < X_VECTORS; part++)
+    size[part] = largest_over(&all, part);
+  for (int part = 0; part < X_VECTORS; part++) {
+    const double own = size[part] > DBL_MIN ? size[part] : size[X_VECTORS - 1 - part];
+    of->scale[part] = X_VECTORS == 1 || options->absolute ? scale_of(own) : 1.0 / own;
+  }
 }
 
 /* Returns 1 if further corrections of the same rate would exceed the tolerance: linear convergence without a final
@@ -219,7 +226,7 @@ static int solve(const step_data *step, const solver_data *data, history past, l
       .points = &w,
       .work = step->work,
       .n = step->n,
-      .count = GROUPS * step->n,
+      .count = ROWS * step->n,
       .own = own_part(step),
       .by_factors = step->run->pattern != NULL};
   progress now = before_iterations();
@@ -227,7 +234,7 @@ static int solve(const step_data *step, const solver_data *data, history past, l
   (void)workspace;
   first_points(&w, past, *guess);
   forces(&w);
-  of.scale = scale_of(largest_size(&w));
+  find_scales(&of, options);
   start_nearer(&of);
   of.state = sqrt(size_of_state(&of));
   for (int k = 0; needs_iteration(&now); k++) {
@@ -242,10 +249,13 @@ static int solve(const step_data *step, const solver_data *data, history past, l
     else
       left = find_correction(&of, report);
     add_multiple(&of, w.X, 1.0, of.work->correction);
+#ifdef FORCES_OF_VELOCITIES
+    find_positions(&w);
+#endif
     forces(&w);
     change = inner_product(&of, of.work->correction, of.work->correction);
     of.state = sqrt(size_of_state(&of));
-    size = options->absolute ? of.scale * of.scale : of.state * of.state;
+    size = options->absolute ? of.scale[0] * of.scale[0] : of.state * of.state;
     slow += k > 0 && relative_change(change, size) > larger(SLOW * now.last, PROGRESS_LEVEL);
     take_change(&now, relative_change(change, size), options, k, report);
     if (now.status > 0 && of.by_factors && leaves_more(&now, options))

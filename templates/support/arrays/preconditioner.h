@@ -4,7 +4,8 @@
 #include "array_newton.h"
 #include "envelope.h"
 
-/* Preconditioner for Newton-GMRES: factors of F' (envelope.h), Fourier modes (ON_LATTICES) or the diagonal of F'. */
+/* Preconditioner for Newton-GMRES: factors of F' (envelope.h), and unless FACTORS_ALONE Fourier modes (ON_LATTICES) or
+ * the diagonal of F'. */
 #ifdef ON_LATTICES
 /* Mean stencil of h^2 F' / m on a lattice by stencil probing: probes are placed so far apart that their responses do
  * not overlap or reach a boundary, and F' is multiplied by all of them at once. Requires: lattice_transform.h,
@@ -158,11 +159,7 @@ static void find_roots(const linear_system *of, const lattice *all)
     for (int a = 0; a < one->axes; a++) {
       const long long size = one->size[a];
       const section own = share_of(of->run, size);
-      for (long long k = own.first; k < own.end; k++) {
-        const double angle = 6.283185307179586 * (double)k / (double)size;
-        one->of_one[a].cosine[k] = cos(angle);
-        one->of_one[a].sine[k] = -sin(angle);
-      }
+      fill_roots(one->of_one[a], size, own.first, own.end);
     }
 }
 
@@ -215,7 +212,7 @@ static void apply_modes(const linear_system *of, const lanes *x, lanes *y)
 {
   lattice all[LATTICES];
   find_lattices(of, all);
-  scale(of, y, 1.0, x);
+  set_multiple(of, y, 1.0, x);
   make_zero(of, of->work->forces);
   wait_at_barrier(of->run);
   for (const lattice *one = all; one < all + LATTICES; one++) {
@@ -237,24 +234,31 @@ static void apply_modes(const linear_system *of, const lanes *x, lanes *y)
 
 static void precondition(const linear_system *of, const lanes *x, lanes *y)
 {
-  if (of->by_factors)
-    apply_factors(of, x, y);
-  else if (of->by_fourier)
+#ifndef FACTORS_ALONE
+  if (of->by_fourier) {
     apply_modes(of, x, y);
-  else
+    return;
+  }
+  if (!of->by_factors) {
     apply_inverses(of, x, y, of->own);
+    return;
+  }
+#endif
+  apply_factors(of, x, y);
 }
 
 /* Computes the preconditioner, at the first points of a step the Fourier one if coordinates are coupled. */
 static void find_inverses(linear_system *of)
 {
-  if (of->by_factors) {
-    find_factors(of);
+#ifndef FACTORS_ALONE
+  if (!of->by_factors) {
+    of->by_fourier = (of->tried == 0 || of->by_fourier) && invert_modes(of);
+    if (!of->by_fourier)
+      find_own_inverses(of);
     return;
   }
-  of->by_fourier = (of->tried == 0 || of->by_fourier) && invert_modes(of);
-  if (!of->by_fourier)
-    find_own_inverses(of);
+#endif
+  find_factors(of);
 }
 
 /* Called with the reduction of the residual by a cycle: if the Fourier preconditioner did not suffice, tries the

@@ -42,9 +42,9 @@ static work_arrays bind_work_arrays(const run_memory *run, long long n)
 #ifdef NEWTON_KRYLOV
   lanes **const products[] = {&of.residual, &of.correction, &of.product, &of.forces};
   for (int k = 0; k < 4; k++)
-    *products[k] = next_array(&rest, POINTS * n);
+    *products[k] = next_array(&rest, X_VECTORS * POINTS * n);
   of.inverse = next_array(&rest, POINTS * POINTS * n);
-  of.basis = next_array(&rest, (BASIS + 1) * POINTS * n);
+  of.basis = next_array(&rest, X_VECTORS * (BASIS + 1) * POINTS * n);
 #endif
 #ifdef ON_LATTICES
   of.spare = next_array(&rest, 2 * POINTS * n);

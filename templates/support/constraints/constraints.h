@@ -12,7 +12,9 @@
  * constraints and constrained_motion, and CONSTRAINT_ENTRY, the indices of the entries of G = g_q or A. */
 
 #define MAX_PROJECTIONS 100 /* Gauss-Newton iterations; more indicate that no state is near */
-#define MOMENTUM_PROJECTIONS 3 /* one suffices except for rounding and non-quadratic kinetic energies */
+#define MOMENTUM_PROJECTIONS 3 /* one suffices except for rounding and non-quadratic kinetic energies, for which the
+                                * iteration continues until an update of the velocity, relative to it, is settled */
+#define SETTLED_UPDATE REAL(1e-9)
 /* relative to the state: accepted size of the last update where rounding prevents a smaller residual */
 #define ACCEPTED_UPDATE REAL(1e-6)
 
@@ -148,7 +150,7 @@ static int project_position(real t, real *u, const real *parameters, saddle *at)
 static int project_momentum(real t, const real *q, real *p, const real *parameters, saddle *at, real *workspace)
 {
   real u[2 * M], g[CONSTRAINTS], rate[CONSTRAINTS], y[CONSTRAINTS], update[M], derivative[CONSTRAINT_ENTRIES];
-  for (int k = 0; k < MOMENTUM_PROJECTIONS; k++) {
+  for (int k = 0; k < MAX_PROJECTIONS; k++) {
     int status = constrained(t, q, p, parameters, u, g, rate, workspace);
     if (status == OK)
       status = factorise_saddle(t, u, parameters, at, g);
@@ -160,6 +162,8 @@ static int project_momentum(real t, const real *q, real *p, const real *paramete
     constraints(u, t, parameters, g, derivative);
     for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
       p[CONSTRAINT_ENTRY[e][1]] -= derivative[e] * y[CONSTRAINT_ENTRY[e][0]];
+    if (k + 1 >= MOMENTUM_PROJECTIONS && !(largest_of(update) > SETTLED_UPDATE * largest_of(u + M)))
+      break;
   }
   return all_finite(p, M) ? OK : NOT_FINITE;
 }

@@ -25,6 +25,7 @@ typedef enum {
   INSTANTIATED,
   INITIALIZATION_MODE,
   STEP_MODE,
+  EVENT_MODE,
   TERMINATED
 } fmu_mode;
 
@@ -37,6 +38,8 @@ typedef struct {
 #ifdef EVENT_SETTINGS
   NAME(watch)
   watch;
+  bool pending; /* 1 if the values are those before a change of the run's state */
+  double whole; /* end of the step that the last event cut */
 #endif
   NAME(run)
   run;
@@ -50,18 +53,17 @@ typedef struct {
   double t[MOST_CHANGES], q[MOST_CHANGES * M], p[MOST_CHANGES * M], length[MOST_CHANGES];
   int iterations[MOST_CHANGES];
   long long number[MOST_CHANGES];
+  long long filled;
   NAME(crossing)
   found[MOST_CHANGES];
 } event_memory;
 #endif
 
 typedef struct {
-  fmu_state now;
-  NAME(run)
-  before; /* before the last step, to restore after a failure */
+  fmu_state now, before; /* before: at the last communication point, to restore after a failure */
   fmi3InstanceEnvironment environment;
   fmi3LogMessageCallback log;
-  bool logs_discards;
+  bool logs_discards, has_event_mode, returns_early;
 #ifdef EVENT_SETTINGS
   event_memory memory;
 #endif
@@ -148,17 +150,25 @@ FMI_EXPORT fmi3Instance FMI(InstantiateCoSimulation)(fmi3String name, fmi3String
 {
   fmu *one = calloc(1, sizeof *one);
   const char *wrong = NULL;
-  (void)name, (void)resources, (void)visible, (void)early, (void)required, (void)update;
+  bool without_events = true;
+  (void)name, (void)resources, (void)visible, (void)required, (void)update;
+#ifdef EVENT_SETTINGS
+  without_events = false;
+#endif
   if (!one)
     return NULL;
   one->environment = environment;
   one->log = log;
   one->logs_discards = logging;
+  one->has_event_mode = events;
+  one->returns_early = events && early;
   set_start(&one->now);
   if (!token || strcmp(token, TOKEN) != 0)
     wrong = "the instantiation token belongs to another FMU: use the token of this modelDescription.xml";
-  else if (events || count > 0)
-    wrong = "this FMU has no event mode and no intermediate variables";
+  else if (events && without_events)
+    wrong = "this FMU has no events, hence no event mode";
+  else if (count > 0)
+    wrong = "this FMU has no intermediate variables";
   if (!wrong)
     return one;
   failed(one, fmi3Error, "%s", wrong);
@@ -204,7 +214,7 @@ FMI_EXPORT fmi3Status FMI(EnterInitializationMode)(fmi3Instance instance, fmi3Bo
 FMI_EXPORT fmi3Status FMI(Terminate)(fmi3Instance instance)
 {
   fmu *one = instance;
-  if (one->now.mode != STEP_MODE)
+  if (one->now.mode != STEP_MODE && one->now.mode != EVENT_MODE)
     return not_now(one, "fmi3Terminate");
   one->now.mode = TERMINATED;
   return fmi3OK;
@@ -332,8 +342,18 @@ FMI_EXPORT fmi3Status FMI(ExitInitializationMode)(fmi3Instance instance)
     return status;
   NAME(start)(&one->now.run, x[TIME], STEP, x + POSITIONS, x + MOMENTA);
   one->now.behind = CONSTRAINTS > 0;
-  one->now.mode = STEP_MODE;
+  one->now.mode = one->has_event_mode ? EVENT_MODE : STEP_MODE;
   return fmi3OK;
+}
+
+/* Sets the values to a state at the time of the run. */
+static void show_state(fmu *one, const double *q, const double *p)
+{
+  double *x = one->now.values;
+  x[TIME] = one->now.run.t;
+  memcpy(x + POSITIONS, q, sizeof(double) * M);
+  memcpy(x + MOMENTA, p, sizeof(double) * M);
+  one->now.behind = true;
 }
 
 /* Admissible error of a communication point. */
@@ -357,30 +377,70 @@ static long long plan(NAME(run) * run, double end)
   return (long long)count;
 }
 
-/* Advances to the next communication point, or to the event that ends the simulation. */
+#ifdef EVENT_SETTINGS
+/* Counts the crossings of a call in `remaining`. If one of them changes the state or ends the simulation, the values
+ * become those before the change, which the run contains already. */
+static void stop_at_event(fmu *one, int *remaining, double end, const run_report *report)
+{
+  NAME(watch) *const watch = &one->now.watch;
+  const event_memory *to = &one->memory;
+  const NAME(crossing) *const last = to->found + to->filled - 1;
+  bool finished = watch->accumulated > 0;
+  for (long long i = 0; i < to->filled; i++) {
+    int *const left = remaining + to->found[i].function;
+    finished |= *left > 0 && --*left == 0;
+  }
+  one->now.pending = watch->ended && to->filled > 0 && fabs(last->t - one->now.run.t) <= slack_at(last->t);
+  one->now.whole = fmin(report->t + one->now.run.h, end);
+  if (one->now.pending)
+    show_state(one, last->q, last->p);
+  watch->ended &= finished;
+}
+
+/* Advances to the next communication point, to the event that ends the simulation, or if the importer has an event mode
+ * to the next one that changes the state. The step that an event cut is completed first. */
 static int advance(fmu *one, double end, run_report *report)
 {
   NAME(run) *const run = &one->now.run;
-  const double *parameters = one->now.values + FIRST_PARAMETER;
-  long long left = plan(run, end);
-#ifdef EVENT_SETTINGS
+  NAME(watch) *const watch = &one->now.watch;
   event_memory *const to = &one->memory;
-  while (left > 0 && !one->now.watch.ended && fabs(end - run->t) > slack_at(end)) {
-    long long filled;
-    const int status = NAME(advance_with_changes)(run, &one->now.watch, end, 0.0, left, parameters, NULL, MOST_CHANGES,
-        to->t, to->q, to->p, to->length, to->iterations, to->number, MOST_CHANGES, to->found, &filled, report,
-        one->workspace);
+  const double whole = one->now.whole;
+  const bool cut = whole - run->t > slack_at(whole) && end - whole > slack_at(end);
+  const double target = cut ? whole : end;
+  int remaining[EVENTS], status = STATUS(OK);
+  long long left = plan(run, target);
+  memcpy(remaining, watch->remaining, sizeof remaining);
+  for (int e = 0; one->returns_early && e < EVENTS; e++)
+    watch->remaining[e] = watch->acts[e] ? 1 : remaining[e];
+  one->now.pending = false;
+  while (left > 0 && !watch->ended && !one->now.pending && fabs(target - run->t) > slack_at(target)) {
+    status = NAME(advance_with_changes)(run, watch, target, 0.0, left, one->now.values + FIRST_PARAMETER, NULL,
+        MOST_CHANGES, to->t, to->q, to->p, to->length, to->iterations, to->number, MOST_CHANGES, to->found, &to->filled,
+        report, one->workspace);
     if (status != STATUS(OK) || report->steps == 0)
       return status != STATUS(OK) ? status : STATUS(NOT_CONVERGED);
     left -= report->steps;
+    show_state(one, run->q, run->p);
+    if (one->returns_early)
+      stop_at_event(one, remaining, end, report);
   }
-  return STATUS(OK);
+  if (one->returns_early)
+    memcpy(watch->remaining, remaining, sizeof remaining);
+  return cut && !watch->ended && !one->now.pending ? advance(one, end, report) : STATUS(OK);
+}
 #else
+/* Advances to the next communication point. */
+static int advance(fmu *one, double end, run_report *report)
+{
+  NAME(run) *const run = &one->now.run;
   double t, q[M], p[M];
   int iterations;
-  return NAME(advance)(run, left, LLONG_MAX, parameters, NULL, &t, q, p, &iterations, report, one->workspace);
-#endif
+  const int status = NAME(advance)(run, plan(run, end), LLONG_MAX, one->now.values + FIRST_PARAMETER, NULL, &t, q, p,
+      &iterations, report, one->workspace);
+  show_state(one, run->q, run->p);
+  return status;
 }
+#endif
 
 FMI_EXPORT fmi3Status FMI(DoStep)(fmi3Instance instance, fmi3Float64 point, fmi3Float64 size, fmi3Boolean no_return,
     fmi3Boolean *event, fmi3Boolean *terminate, fmi3Boolean *early, fmi3Float64 *last)
@@ -389,11 +449,7 @@ FMI_EXPORT fmi3Status FMI(DoStep)(fmi3Instance instance, fmi3Float64 point, fmi3
   run_memory *run = &one->now.run;
   NAME(report)
   report;
-  double *x = one->now.values;
   int status;
-#ifdef EVENT_SETTINGS
-  const NAME(watch) watched = one->now.watch;
-#endif
   (void)no_return;
   if (one->now.mode != STEP_MODE)
     return not_now(one, "fmi3DoStep");
@@ -401,24 +457,57 @@ FMI_EXPORT fmi3Status FMI(DoStep)(fmi3Instance instance, fmi3Float64 point, fmi3
     return failed(one, fmi3Error, "the communication point is t = %.17g, but the FMU is at t = %.17g", point, run->t);
   if (!(size > 0 && size / STEP < 1 / DBL_EPSILON))
     return failed(one, fmi3Error, "the communication step size %g must be positive, and less than 2^52 steps", size);
-  one->before = *run;
+  one->before = one->now;
   status = advance(one, point + size, &report);
-  if (status != STATUS(OK)) {
-    *run = one->before;
-#ifdef EVENT_SETTINGS
-    one->now.watch = watched;
-#endif
-    *last = run->t;
+  if (status != STATUS(OK))
+    one->now = one->before;
+  *last = run->t;
+  if (status != STATUS(OK))
     return failed(one, fmi3Discard, "the step at t = %g: %s", report.t, reason(status));
-  }
-  x[TIME] = *last = run->t;
-  memcpy(x + POSITIONS, run->q, sizeof run->q);
-  memcpy(x + MOMENTA, run->p, sizeof run->p);
-  one->now.behind = true;
   *event = *terminate = *early = false;
 #ifdef EVENT_SETTINGS
-  *terminate = one->now.watch.ended;
+  *event = one->now.pending;
+  *terminate = one->now.watch.ended && !one->now.pending;
+  *early = one->now.pending && fabs(point + size - run->t) > slack_at(point + size);
 #endif
+  return fmi3OK;
+}
+
+/* Event mode: the values are those before the change of the state until the discrete states are updated. */
+
+FMI_EXPORT fmi3Status FMI(EnterEventMode)(fmi3Instance instance)
+{
+  fmu *one = instance;
+  if (!one->has_event_mode || one->now.mode != STEP_MODE)
+    return not_now(one, "fmi3EnterEventMode");
+  one->now.mode = EVENT_MODE;
+  return fmi3OK;
+}
+
+FMI_EXPORT fmi3Status FMI(UpdateDiscreteStates)(fmi3Instance instance, fmi3Boolean *again, fmi3Boolean *terminate,
+    fmi3Boolean *nominals, fmi3Boolean *states, fmi3Boolean *defined, fmi3Float64 *time)
+{
+  fmu *one = instance;
+  (void)time;
+  if (one->now.mode != EVENT_MODE)
+    return not_now(one, "fmi3UpdateDiscreteStates");
+  *again = *terminate = *nominals = *states = *defined = false;
+#ifdef EVENT_SETTINGS
+  *states = one->now.pending;
+  *terminate = one->now.watch.ended;
+  one->now.pending = false;
+  if (*states)
+    show_state(one, one->now.run.q, one->now.run.p);
+#endif
+  return fmi3OK;
+}
+
+FMI_EXPORT fmi3Status FMI(EnterStepMode)(fmi3Instance instance)
+{
+  fmu *one = instance;
+  if (one->now.mode != EVENT_MODE)
+    return not_now(one, "fmi3EnterStepMode");
+  one->now.mode = STEP_MODE;
   return fmi3OK;
 }
 
@@ -550,8 +639,6 @@ ABSENT(SetIntervalFraction, const fmi3ValueReference *references, size_t count, 
 ABSENT(SetShiftDecimal, const fmi3ValueReference *references, size_t count, const fmi3Float64 *shifts)
 ABSENT(SetShiftFraction, const fmi3ValueReference *references, size_t count, const fmi3UInt64 *counters, const
     fmi3UInt64 *resolutions)
-ABSENT(UpdateDiscreteStates, fmi3Boolean *again, fmi3Boolean *terminate, fmi3Boolean *nominals, fmi3Boolean *states,
-    fmi3Boolean *defined, fmi3Float64 *time)
 ABSENT(CompletedIntegratorStep, fmi3Boolean no_return, fmi3Boolean *event, fmi3Boolean *terminate)
 ABSENT(SetTime, fmi3Float64 time)
 ABSENT(SetContinuousStates, const fmi3Float64 *states, size_t count)
@@ -562,12 +649,10 @@ ABSENT(GetNominalsOfContinuousStates, fmi3Float64 *nominals, size_t count)
 ABSENT(GetNumberOfEventIndicators, size_t *count)
 ABSENT(GetNumberOfContinuousStates, size_t *count)
 ABSENT(ActivateModelPartition, fmi3ValueReference clock, fmi3Float64 time)
-NO_MODE(EnterEventMode)
 NO_MODE(EnterConfigurationMode)
 NO_MODE(ExitConfigurationMode)
 NO_MODE(EvaluateDiscreteStates)
 NO_MODE(EnterContinuousTimeMode)
-NO_MODE(EnterStepMode)
 /* clang-format on */
 
 FMI_EXPORT fmi3Instance FMI(InstantiateModelExchange)(fmi3String name, fmi3String token, fmi3String resources,

@@ -72,7 +72,11 @@ static inline long long steps_to_continue(long long steps, double first_change)
 }
 
 #ifdef ARRAYS
+#ifdef PLANS
+#define LEAST_SIZE 1.0 /* rounding errors of Fourier transforms are relative to the largest coordinate */
+#else
 #define LEAST_SIZE 1e-6 /* relative to the largest coordinate: added to the size of each */
+#endif
 
 /* Replaces sizes by inverse sizes whose squared changes add up to the mean over n coordinates, so that the sum of the
  * rounding errors of many is not above the tolerance; with absolute = 1, to the 2-norm. NaN if a size is not finite. */

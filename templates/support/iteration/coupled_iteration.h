@@ -14,9 +14,7 @@
 /* The mass matrices are those of the first of MASS_AGE iterations, which is at extrapolated points: their errors are
  * small and affect only the convergence rate. Requires: the kernel value_lanes. */
 enum { MASS_AGE = 16 };
-#ifdef POINTS
 #include "secants.h"
-#endif
 #endif
 
 /* Computes the increments of one step: the velocities z at the points are corrected by mass^-1 (P - L_v) until they
@@ -124,8 +122,8 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
       }
     take_change(&now, total_change(change), options, k, report);
 #ifdef SUPPORT_SECANTS_H
-    if (k >= FIRST_ITERATIONS && (before.known || now.last > ACCELERATED_LEVEL))
-      accelerate(&before, k % MASS_AGE == 0, inverse_size, r, z);
+    if (k >= FIRST_ITERATIONS && (before.known || any_positive(undecided(&now, ACCELERATED_LEVEL))))
+      accelerate(&before, k % MASS_AGE == 0, inverse_size, undecided(&now, 0.0), r, z);
 #endif
     if (must_amplify(&now, options, k))
       for (int n = 0; n < GROUPS; n++)

@@ -14,24 +14,32 @@
  * evaluated in turn. Requires: one_trajectory.h, point_weights.h, the tables, the kernels velocity_lanes and
  * force_lanes, and with JOINT_RATES rate_lanes. */
 
+/* Values u at the points, from those at the start and their rates: start + (carry + sum_j TABLE_nj weight_j rate_j). */
+static inline void integrate(const lanes *table, const weight *weights, lanes (*rate)[M], const double *start,
+    const double *carry, lanes (*u)[2 * M], int first)
+{
+  double scaled[M][POINTS] __attribute__((aligned(sizeof(lanes))));
+  for (int i = 0; i < M; i++)
+    for (int n = 0; n < GROUPS; n++) {
+      const lanes value = weights[n] * rate[n][i];
+      memcpy(scaled[i] + n * LANES, &value, sizeof value);
+    }
+  IN_MEMORY(scaled);
+  for (int n = 0; n < GROUPS; n++)
+    for (int i = 0; i < M; i++)
+      u[n][first + i] = start[i] + (carry[i] + sum_over_points(table, n, scaled[i]));
+}
+
 /* Positions at the points of the curve with velocities z. */
 static inline void place(const step_data *step, const iteration_data *data, lanes (*z)[M], lanes (*u)[2 * M])
 {
-  lanes scaled[GROUPS][M];
-  scale(data->position_weight, z, scaled);
-  for (int n = 0; n < GROUPS; n++)
-    for (int i = 0; i < M; i++)
-      u[n][i] = step->q0[i] + (step->carry_q[i] + apply(POSITION, n, scaled, i));
+  integrate(POSITION, data->position_weight, z, step->q0, step->carry_q, u, 0);
 }
 
 /* Momenta at the points from the forces. */
 static inline void push(const step_data *step, const iteration_data *data, lanes (*force)[M], lanes (*u)[2 * M])
 {
-  lanes scaled[GROUPS][M];
-  scale(data->momentum_weight, force, scaled);
-  for (int n = 0; n < GROUPS; n++)
-    for (int i = 0; i < M; i++)
-      u[n][M + i] = step->p0[i] + (step->carry_p[i] + apply(MOMENTUM, n, scaled, i));
+  integrate(MOMENTUM, data->momentum_weight, force, step->p0, step->carry_p, u, M);
 }
 
 /* 1 / the size of x at both ends of the step, which makes its changes relative, or `absolute`. */
@@ -48,6 +56,56 @@ static inline void forces(const step_data *step, lanes (*u)[2 * M], lanes (*forc
   for (int n = 0; n < GROUPS; n++)
     force_lanes(u[n], step->t + step->h * ABSCISSA[n], step->parameters, force[n]);
 }
+
+#ifdef TURNS
+/* Turns of bodies about axes of symmetry, q <- q exp(a e_k), p <- p exp(a e_k), a = kappa h Pi_k/2, after a step of the
+ * other terms of H, with which they commute. Requires: TURNS, the kernels angles and turn_lanes. */
+
+/* Turns vectors x and y at the points. */
+static inline void turn_vectors(const step_data *step, const double *angle, lanes (*x)[M], lanes (*y)[M])
+{
+  for (int n = 0; n < GROUPS; n++) {
+    lanes u[2 * M + 2 * TURNS], change[2 * M];
+    for (int k = 0; k < 2 * TURNS; k++)
+      u[2 * M + k] = lanes_of(angle[k]);
+    memcpy(u, x[n], sizeof x[n]);
+    memcpy(u + M, y[n], sizeof y[n]);
+    turn_lanes(u, lanes_of(step->t), step->parameters, change);
+    for (int i = 0; i < M; i++) {
+      x[n][i] += change[i];
+      y[n][i] += change[M + i];
+    }
+  }
+}
+
+/* Adds the turns to the increments, and turns the values of this step and of the last one for the predictor. */
+static inline void turn_step(const step_data *step, history past, lanes (*z)[M], lanes (*force)[M], double *dq,
+    double *dp)
+{
+  lanes last[GROUPS][M], last_force[GROUPS][M], change[2 * M], end[2 * M + 2 * TURNS];
+  double u[2 * M], angle[2 * TURNS];
+  for (int i = 0; i < M; i++) {
+    const double q = step->q0[i] + (step->carry_q[i] + dq[i]), p = step->p0[i] + (step->carry_p[i] + dp[i]);
+    end[i] = lanes_of(u[i] = q);
+    end[M + i] = lanes_of(p);
+    u[M + i] = step->h * p;
+  }
+  angles(u, step->t, step->parameters, angle);
+  for (int k = 0; k < 2 * TURNS; k++)
+    end[2 * M + k] = lanes_of(angle[k]);
+  turn_lanes(end, lanes_of(step->t), step->parameters, change);
+  for (int i = 0; i < M; i++) {
+    dq[i] += at_first(&change[i]);
+    dp[i] += at_first(&change[M + i]);
+  }
+  turn_vectors(step, angle, z, force);
+  lanes_load(past, last);
+  lanes_load(past + 2 * M * POINTS, last_force);
+  turn_vectors(step, angle, last, last_force);
+  lanes_store(last, past);
+  lanes_store(last_force, past + 2 * M * POINTS);
+}
+#endif
 
 /* Computes the increments of one step: forces, momenta and velocities are updated in turn until momenta and velocities
  * converge; the increments follow from the forces there. Velocities and forces are stored for the predictor. On failure
@@ -72,7 +130,8 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
   for (int k = 0; needs_iteration(&now); k++) {
     lanes change = lanes_of(0.0), before[GROUPS][M];
     for (int n = 0; n < GROUPS; n++)
-      memcpy(before[n], u[n] + M, sizeof before[n]);
+      for (int i = 0; i < M; i++)
+        before[n][i] = u[n][M + i];
     place(step, data, z, u);
 #ifdef JOINT_RATES
     if (joint) {
@@ -80,8 +139,10 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
       for (int n = 0; n < GROUPS; n++) {
         lanes rates[2 * M];
         rate_lanes(u[n], step->t + step->h * ABSCISSA[n], step->parameters, rates);
-        memcpy(value[n], rates, sizeof value[n]);
-        memcpy(force[n], rates + M, sizeof force[n]);
+        for (int i = 0; i < M; i++) {
+          value[n][i] = rates[i];
+          force[n][i] = rates[M + i];
+        }
       }
     } else
 #endif
@@ -91,16 +152,17 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
       for (int n = 0; n < GROUPS; n++)
         velocity_lanes(u[n], step->t + step->h * ABSCISSA[n], step->parameters, value[n]);
     }
-    for (int n = 0; n < GROUPS; n++)
-      memcpy(momentum[n], u[n] + M, sizeof momentum[n]);
     if (k == 0) {
+      for (int n = 0; n < GROUPS; n++)
+        for (int i = 0; i < M; i++)
+          momentum[n][i] = u[n][M + i];
       measure_ends(value, options, fabs(step->h), velocity_size);
       measure_ends(momentum, options, 1.0, momentum_size);
     }
     for (int n = 0; n < GROUPS; n++)
       for (int i = 0; i < M; i++) {
         const lanes correction = value[n][i] - z[n][i], moved = correction * velocity_size[i];
-        const lanes pushed = (momentum[n][i] - before[n][i]) * momentum_size[i];
+        const lanes pushed = (u[n][M + i] - before[n][i]) * momentum_size[i];
         change += moved * moved + pushed * pushed;
         z[n][i] = value[n][i];
         value[n][i] = correction;
@@ -124,6 +186,9 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
     dq[i] = weigh(POINT_END_POSITION, value, i);
     dp[i] = weigh(POINT_END_MOMENTUM, momentum, i);
   }
+#ifdef TURNS
+  turn_step(step, past, z, force, dq, dp);
+#endif
   if (!accept(step, dq, dp, report))
     return NOT_FINITE;
   remember_curve(z, past);

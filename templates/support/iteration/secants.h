@@ -6,10 +6,60 @@
 /* Anderson acceleration of a fixed-point iteration g(z) = z + r(z) (D. G. Anderson, J. ACM 12 (1965), 547-560): with
  * the changes dr, dg of r and g over the last iterations, the part of r in the span of the dr is removed,
  *   z = g - sum_j <dr_j, r> dg_j,
- * where the pairs are combined such that the dr_j are orthonormal. Requires: points.h. */
-enum { SECANTS = 8 };
+ * where the pairs are combined such that the dr_j are orthonormal. Requires: points.h, or trajectories.h, where every
+ * trajectory has its own factors. */
 #define DEPENDENT 1e-8 /* relative to its square: a change that the earlier ones span is not stored */
 #define ACCELERATED_LEVEL 1e-18 /* changes below 1e-9 of the state after the first iterations need no acceleration */
+
+/* undecided: 1, or 0 if the iteration has converged or its last change is below a level; normalisation: 1 / sqrt(rest),
+ * or 0 if rest is small. */
+#ifdef POINTS
+enum { SECANTS = 8 };
+
+static inline number undecided(const progress *now, double level)
+{
+  return now->last > level;
+}
+
+static inline number normalisation(number size, number rest)
+{
+  return rest > DEPENDENT * size ? 1.0 / sqrt(rest) : 0.0;
+}
+
+static inline int any_positive(number x)
+{
+  return x > 0.0;
+}
+#else
+enum { SECANTS = 4 }; /* of each trajectory: less memory */
+
+static inline number undecided(const progress *now, double level)
+{
+  const lane_view last = {now->last};
+  lane_view status = {now->status};
+  for (int j = 0; j < LANES; j++)
+    status.lane[j] = status.lane[j] == 0.0 && last.lane[j] > level ? 1.0 : 0.0;
+  return status.all;
+}
+
+static inline number normalisation(number size, number rest)
+{
+  const lane_view whole = {size};
+  lane_view part = {rest};
+  for (int j = 0; j < LANES; j++)
+    part.lane[j] = part.lane[j] > DEPENDENT * whole.lane[j] ? 1.0 / sqrt(part.lane[j]) : 0.0;
+  return part.all;
+}
+
+static inline int any_positive(number x)
+{
+  const lane_view view = {x};
+  int any = 0;
+  for (int j = 0; j < LANES; j++)
+    any |= view.lane[j] > 0.0;
+  return any;
+}
+#endif
 
 /* known: whether r and g are those of the iteration before; count: of pairs since the last start. */
 typedef struct {
@@ -18,25 +68,27 @@ typedef struct {
 } secants;
 
 /* Inner product of values at the points, with weights of the coordinates. */
-static inline double inner_product(lanes (*x)[M], lanes (*y)[M], const double *unit)
+static inline number inner_product(lanes (*x)[M], lanes (*y)[M], const number *unit)
 {
   lanes sum = lanes_of(0.0);
   for (int n = 0; n < GROUPS; n++)
     for (int i = 0; i < M; i++)
       sum += x[n][i] * y[n][i] * (unit[i] * unit[i]);
-  return lanes_total(sum);
+  return total_change(sum);
 }
 
 /* x += factor y. */
-static inline void add_multiple(double factor, lanes (*y)[M], lanes (*x)[M])
+static inline void add_multiple(number factor, lanes (*y)[M], lanes (*x)[M])
 {
   for (int n = 0; n < GROUPS; n++)
     for (int i = 0; i < M; i++)
       x[n][i] += factor * y[n][i];
 }
 
-/* Replaces z = g by the accelerated iterate, and stores r and g; restart: whether earlier ones are forgotten. */
-static inline void accelerate(secants *past, int restart, const double *unit, lanes (*r)[M], lanes (*z)[M])
+/* Replaces z = g by the accelerated iterate, and stores r and g; restart: whether earlier ones are forgotten; share: 1,
+ * or 0 for trajectories that have converged, which the iterations of others do not move. */
+static inline void accelerate(secants *past, int restart, const number *unit, number share, lanes (*r)[M],
+    lanes (*z)[M])
 {
   lanes g[GROUPS][M];
   memcpy(g, z, sizeof g);
@@ -45,24 +97,24 @@ static inline void accelerate(secants *past, int restart, const double *unit, la
   if (past->known) {
     const int last = past->count % SECANTS, known = past->count < SECANTS ? past->count : SECANTS;
     lanes dr[GROUPS][M], dg[GROUPS][M];
-    double size, rest;
+    number size, factor;
     memcpy(dr, r, sizeof dr);
     memcpy(dg, g, sizeof dg);
-    add_multiple(-1.0, past->r, dr);
-    add_multiple(-1.0, past->g, dg);
+    add_multiple(number_of(-1.0), past->r, dr);
+    add_multiple(number_of(-1.0), past->g, dg);
     size = inner_product(dr, dr, unit);
     for (int j = 0; j < known; j++)
       if (j != last) {
-        const double along = inner_product(past->dr[j], dr, unit);
+        const number along = inner_product(past->dr[j], dr, unit);
         add_multiple(-along, past->dr[j], dr);
         add_multiple(-along, past->dg[j], dg);
       }
-    rest = inner_product(dr, dr, unit);
-    if (rest > DEPENDENT * size) {
+    factor = normalisation(size, inner_product(dr, dr, unit));
+    if (any_positive(factor)) {
       memset(past->dr[last], 0, sizeof dr);
       memset(past->dg[last], 0, sizeof dg);
-      add_multiple(1.0 / sqrt(rest), dr, past->dr[last]);
-      add_multiple(1.0 / sqrt(rest), dg, past->dg[last]);
+      add_multiple(factor, dr, past->dr[last]);
+      add_multiple(factor, dg, past->dg[last]);
       past->count++;
     }
   }
@@ -70,7 +122,7 @@ static inline void accelerate(secants *past, int restart, const double *unit, la
   memcpy(past->r, r, sizeof past->r);
   memcpy(past->g, g, sizeof past->g);
   for (int j = 0; j < past->count && j < SECANTS; j++)
-    add_multiple(-inner_product(past->dr[j], r, unit), past->dg[j], z);
+    add_multiple(-share * inner_product(past->dr[j], r, unit), past->dg[j], z);
 }
 
 #endif

@@ -6,7 +6,8 @@
 
 /* Explicit splitting method (Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. II.5): for every n
  *   p += h KICK[n] F(q, t + h KICK_ABSCISSA[n]),      q += h DRIFT[n] v,
- * with v = M^-1 p for constant masses (CONSTANT_MASSES), else v(p, t). */
+ * with v = M^-1 p for constant masses (CONSTANT_MASSES), else v(p, t), for rigid bodies (ROTATING_BODIES) with the flow
+ * of their kinetic energy in the time h DRIFT[n]. */
 #ifdef CONSTANT_MASSES
 /* Drift with constant masses. Requires: the kernel mass. */
 typedef struct {
@@ -21,33 +22,52 @@ static void prepare(const step_data *step, solver_data *data)
 }
 
 /* Advances the positions by a part of the step with the momenta p0 + dp. */
-static inline void drift(const step_data *step, const solver_data *data, real part, const real *dp, real *dq)
+static inline void drift(const step_data *step, const solver_data *data, real part, real *dp, real *dq)
 {
   for (int i = 0; i < M; i++)
     dq[i] += step->h * part * data->inverse_mass[i] * (step->p0[i] + (step->carry_p[i] + dp[i]));
 }
 #else
-/* Drift with velocities v(p, t). Requires: the kernel drift_velocity. */
+/* Drift with velocities v(p, t). Requires: the kernel drift_velocity; of bodies free_rotation.h. */
 typedef struct {
+#ifdef ROTATING_BODIES
+  free_body bodies[BODIES];
+#else
   int unused;
+#endif
 } solver_data;
 
 static void prepare(const step_data *step, solver_data *data)
 {
+#ifdef ROTATING_BODIES
+  real rates[3 * BODIES];
+  turning(NULL, step->t, step->parameters, rates);
+  for (int k = 0; k < BODIES; k++)
+    data->bodies[k] = sorted_axes(BODY[k] + 1, rates + 3 * k);
+#else
   (void)step;
   data->unused = 0;
+#endif
 }
 
 /* Advances the positions by a part of the step with the momenta p0 + dp. */
-static inline void drift(const step_data *step, const solver_data *data, real part, const real *dp, real *dq)
+static inline void drift(const step_data *step, const solver_data *data, real part, real *dp, real *dq)
 {
   real p[M], v[M];
-  (void)data;
   for (int i = 0; i < M; i++)
     p[i] = step->p0[i] + (step->carry_p[i] + dp[i]);
   drift_velocity(p, step->t, step->parameters, v);
   for (int i = 0; i < M; i++)
     dq[i] += step->h * part * v[i];
+#ifdef ROTATING_BODIES
+  for (int k = 0; k < BODIES; k++) {
+    const int first = BODY[k][0];
+    turn_body(
+        step, first, BODY[k][2], data->bodies + k, step->h * part, p + first, dq + first, dp + first);
+  }
+#else
+  (void)data;
+#endif
 }
 #endif
 

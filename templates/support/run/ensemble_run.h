@@ -87,6 +87,49 @@ static void store_states(const state *now, int count, double *q, double *p)
   }
 }
 
+/* Results of a step of which some trajectories are repeated. */
+typedef struct {
+  lanes curve[S][M], position[2 * M], momentum[2 * M];
+  double active[LANES]; /* before the step, or before its repetition */
+  int repeated;
+} first_results;
+
+/* Returns 1 if a step has to be repeated for the trajectories that failed in it, from the value at the beginning of the
+ * extrapolated curve, as single runs do from the straight line; after that, restores the results of the others. */
+static SELDOM int repeats_failed(first_results *stored, history past, long long *guess, lanes *dq, lanes *dp,
+    double *active)
+{
+  lanes *before = &past.before[0][0], *curve = &stored->curve[0][0];
+  if (stored->repeated) {
+    for (int j = 0; j < LANES; j++) {
+      if (stored->active[j] > 0.0) {
+        for (int i = 0; i < S * M; i++)
+          before[i][j] = curve[i][j];
+        for (int i = 0; i < 2 * M; i++) {
+          dq[i][j] = stored->position[i][j];
+          dp[i][j] = stored->momentum[i][j];
+        }
+        active[j] = stored->active[j];
+      }
+    }
+    return 0;
+  }
+  memcpy(stored->curve, past.before, sizeof stored->curve);
+  memcpy(stored->position, dq, sizeof stored->position);
+  memcpy(stored->momentum, dp, sizeof stored->momentum);
+  for (int n = 0; n < S; n++)
+    for (int i = 0; i < M; i++)
+      past.before[n][i] = apply(LAST_ALONE, 0, past.last, i);
+  for (int j = 0; j < LANES; j++) {
+    const double succeeded = active[j];
+    active[j] = stored->active[j] > 0.0 && !(succeeded > 0.0) ? 1.0 : 0.0;
+    stored->active[j] = succeeded;
+  }
+  stored->repeated = 1;
+  *guess = 0;
+  return 1;
+}
+
 void NAME(advance)(block_memory *block, int count, long long steps, long long every, const solver_options *options,
     double *q, double *p, long long row_length)
 {
@@ -95,6 +138,7 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
   iteration_data data;
   solver_report report = {.active = block->active};
   lanes parameters[P + 1], memory[2][S][M];
+  first_results stored_results;
   lanes dq[2 * M] = {{0.0}}, dp[2 * M] = {{0.0}}; /* increments, then their low words */
   step_data step = {.t = block->t,
       .h = block->h,
@@ -111,7 +155,12 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
     const long long parity = block->step % 2;
     const history past = {memory[1 - parity], memory[parity]};
     step.t = block->t;
-    fixed_point(&step, &data, past, &block->guess, dq, dp, options ? options : &standard, &report);
+    memcpy(stored_results.active, block->active, sizeof stored_results.active);
+    stored_results.repeated = 0;
+    do
+      fixed_point(&step, &data, past, &block->guess, dq, dp, options ? options : &standard, &report);
+    while (memcmp(stored_results.active, block->active, sizeof stored_results.active) != 0 && block->step > 0 &&
+        repeats_failed(&stored_results, past, &block->guess, dq, dp, block->active));
     drop_infinite(&now, dq, dp, block->active);
     add_increments(now.q, now.carry_q, dq, block->active);
     add_increments(now.p, now.carry_p, dp, block->active);

@@ -10,7 +10,7 @@
  * by lambda n, n = g_q; lambda = (1 + e)/2 lambda_1, where lambda_1 conserves energy:
  * H(p + lambda_1 n) - H(p) = -lambda_1 g_t. With constraints (EVENT_CONSTRAINTS), of Jacobian G, n is g_q - G^T kappa,
  * G H_pp n = 0: momenta are projected. Requires: events.h, the kernel event_changes, CHANGE_VALUES, FIRST_VALUE,
- * IS_IMPACT, CHANGED, EVENTS_CONTROLLED. */
+ * CHANGED, IS_IMPACT, EVENTS_CONTROLLED; in index notation gradients and maps, their entries alone. */
 enum {
   CHANGE_ROUNDS = 20, /* largest number of passes over the walls of a corner */
   CHANGES_IN_STEP = 100000, /* largest number of changes of the state in a step */
@@ -26,12 +26,55 @@ enum {
 typedef NAME(run) event_run;
 typedef NAME(report) array_report;
 
-/* Wall of an impact at a state: n = (g_q, g_t, e); the rate of g in the direction of the run, a bound of its terms, and
- * how far rounding may move the state behind the wall. Of a map n are its values. */
+/* Wall of an impact at a state: nonzero entries n of g_q, g_t, e; the rate of g in the direction of the run, a bound of
+ * its terms, and how far rounding may move the state behind the wall. Of a map the variables (q, p, v) that it changes
+ * and their values n. */
 typedef struct {
-  real rate, size, slack;
+  int count;
+  const int *place;
   const real *n;
+  real by_time, restitution, rate, size, slack;
 } event_wall;
+
+#ifndef EVENTS_OF_ANY_SIZE
+/* Changes by function e at a state. */
+static int changes_by(const event_step *step, int e, const event_sample *at, event_wall *wall)
+{
+  real u[3 * M], *const value = step->values + EVENT_VALUES * EVENTS;
+  const int status = event_arguments(at->t, at->q, at->p, step->parameters, u, step->workspace);
+  if (status != OK)
+    return status;
+  event_changes(u, at->t, step->parameters, value);
+  wall->n = value + FIRST_VALUE[e];
+  wall->place = CHANGED + FIRST_VALUE[e];
+  wall->count = FIRST_VALUE[e + 1] - FIRST_VALUE[e] - 2 * IS_IMPACT[e];
+  wall->by_time = wall->restitution = 0.0;
+  if (IS_IMPACT[e]) {
+    wall->by_time = wall->n[wall->count];
+    wall->restitution = wall->n[wall->count + 1];
+  }
+  return status;
+}
+#else
+/* Changes by function e at a state. */
+static int changes_by(const event_step *step, int e, const event_sample *at, event_wall *wall)
+{
+  const int event = event_of(e);
+  section in[EVENT_LOOPS];
+  event_point here;
+  event_entries to = {.place = event_host->places, .value = event_host->values};
+  const int status = point_at(at->t, at->q, at->p, step->parameters, &here, step->workspace);
+  find_element(event, e - event_host->first[event], in);
+  if (status == OK)
+    add_changes(event, event_host->problem, &here, in, &to);
+  wall->count = to.count;
+  wall->place = to.place;
+  wall->n = to.value;
+  wall->by_time = to.by_time;
+  wall->restitution = to.restitution;
+  return status;
+}
+#endif
 
 /* Copies a run; in index notation also its arrays, into those of `to`. */
 static void copy_run(event_run *to, const event_run *from)
@@ -58,53 +101,72 @@ static int satisfy_constraints(const event_step *step, real t, real *q, real *p,
 #ifdef EVENT_CONSTRAINTS
   real *const q1 = step->memory, *const p1 = q1 + M;
 #ifdef EVENTS_OF_ANY_SIZE
-  status = event_host->project(t, q, p, step->parameters, q1, p1, step->workspace);
+  (void)step;
+  status = project_state(t, q, p, q1, p1);
 #else
   status = NAME(project)(t, q, p, step->parameters, q1, p1, step->workspace);
 #endif
-  memcpy(p, p1, sizeof(real) * M);
+  memcpy(p, p1, BYTES(M));
   if (moves)
-    memcpy(q, q1, sizeof(real) * M);
+    memcpy(q, q1, BYTES(M));
 #else
   (void)step, (void)t, (void)q, (void)p, (void)moves;
 #endif
   return status;
 }
 
-/* Velocities at p + lambda n, and n.v + g_t. */
-static int approach(const event_step *step, const event_sample *at, const real *n, real lambda, real *v, real *rate)
+/* Momenta p + lambda n. */
+static void add_impulse(const event_wall *wall, real lambda, const real *p, real *moved)
 {
+  memcpy(moved, p, BYTES(M));
+  for (int i = 0; i < wall->count; i++)
+    moved[wall->place[i]] += lambda * wall->n[i];
+}
+
+/* Velocities at p + lambda n, and n.v + g_t; wall NULL: at p. */
+static int approach(const event_step *step, const event_sample *at, const event_wall *wall, real lambda, real *v,
+    real *rate)
+{
+  const event_wall none = {.count = 0};
   real *const p = step->memory + 2 * M;
   int status;
-  for (int i = 0; i < M; i++)
-    p[i] = at->p[i] + lambda * n[i];
+  wall = wall ? wall : &none;
+  add_impulse(wall, lambda, at->p, p);
   status = satisfy_constraints(step, at->t, at->q, p, 0);
   if (status == OK)
     status = NAME(velocity)(at->t, at->q, p, step->parameters, v, step->workspace);
-  *rate = n[M];
-  for (int i = 0; i < M; i++)
-    *rate += n[i] * v[i];
+  *rate = wall->by_time;
+  for (int i = 0; i < wall->count; i++)
+    *rate += wall->n[i] * v[wall->place[i]];
   return status;
 }
 
-/* Values of the kernel event_changes; the wall of function e if it is one. */
-static int evaluate_changes(const event_step *step, int e, const event_sample *at, event_wall *wall)
+/* Changes by function e; if it is a wall, with its rate at velocities v. */
+static int evaluate_changes(const event_step *step, int e, const event_sample *at, const real *v, event_wall *wall)
 {
-  real *const v = step->memory + 3 * M, *const value = step->memory + 13 * M;
-  int status = event_kernel(EVENT_MAPS + e, at->t, at->q, at->p, step->parameters, value, step->workspace);
-  wall->n = value + FIRST_VALUE[e];
-  if (status != OK || !IS_IMPACT[e])
+  const int status = changes_by(step, e, at, wall);
+  if (status != OK || !IS_IMPACT[EVENT_OF(e)])
     return status;
-  status = approach(step, at, wall->n, 0.0, v, &wall->rate);
-  wall->size = fabs(wall->n[M]);
-  wall->slack = fabs(wall->n[M] * at->t);
-  for (int i = 0; status == OK && i < M; i++) {
-    wall->size += fabs(wall->n[i] * v[i]);
-    wall->slack += fabs(wall->n[i]) * (fabs(at->q[i]) + fabs(v[i] * step->h));
+  wall->rate = wall->by_time;
+  wall->size = fabs(wall->by_time);
+  wall->slack = fabs(wall->by_time * at->t);
+  for (int i = 0; i < wall->count; i++) {
+    const int k = wall->place[i];
+    wall->rate += wall->n[i] * v[k];
+    wall->size += fabs(wall->n[i] * v[k]);
+    wall->slack += fabs(wall->n[i]) * (fabs(at->q[k]) + fabs(v[k] * step->h));
   }
   wall->slack *= CHANGE_SAFETY * DBL_EPSILON;
   wall->rate *= step->h < 0.0 ? -1.0 : 1.0;
   return status;
+}
+
+/* Changes by function e at the velocities of a state. */
+static int changes_at(const event_step *step, int e, const event_sample *at, event_wall *wall)
+{
+  real rate, *const v = step->memory + 3 * M;
+  const int status = IS_IMPACT[EVENT_OF(e)] ? approach(step, at, NULL, 0.0, v, &rate) : OK;
+  return status == OK ? evaluate_changes(step, e, at, v, wall) : status;
 }
 
 /* sum + low += a b with the rounding errors of product and sum (Dekker; Ogita, Rump & Oishi, SIAM J. Sci. Comput. 26
@@ -119,117 +181,143 @@ static void add_product(real a, real b, real *sum, real *low)
 /* Correction of lambda by Newton's method for the energy equation of a quadratic kinetic energy divided by lambda,
  * n.v + g_t + (lambda / 2) n.(W n) = 0, evaluated in twice the precision: the rounding error of lambda has a mean
  * that is not zero, from which energy would drift over many impacts. v, change: velocities before the impact, W n. */
-static real correct_impulse(const real *n, const real *v, const real *change, real lambda, real rate)
+static real correct_impulse(const event_wall *wall, const real *v, const real *change, real lambda, real rate)
 {
-  real sum = n[M], low = 0.0, bend = 0.0, bend_low = 0.0;
-  for (int i = 0; i < M; i++) {
-    add_product(n[i], v[i], &sum, &low);
-    add_product(n[i], change[i], &bend, &bend_low);
+  real sum = wall->by_time, low = 0.0, bend = 0.0, bend_low = 0.0;
+  for (int i = 0; i < wall->count; i++) {
+    add_product(wall->n[i], v[wall->place[i]], &sum, &low);
+    add_product(wall->n[i], change[wall->place[i]], &bend, &bend_low);
   }
   add_product(0.5 * lambda, bend, &sum, &low);
   return lambda * (sum + (low + 0.5 * lambda * bend_low)) / rate;
 }
 
-/* Impulse of an impact: p += (1 + e)/2 lambda_1 n. Where the kinetic energy is quadratic, lambda_1 = -2 rate / (n.W n),
- * W = H_pp, reverses the rate; else Newton's method solves the energy equation, whose derivative by lambda is the rate.
- * A run backward in time undoes the impact. */
+/* Mean of n.v + g_t on the way from p to p + lambda n by Gauss quadrature with three nodes: the energy equation divided
+ * by lambda, without the cancellation of H(p + lambda n) - H(p) of small impulses. */
+static int mean_rate(const event_step *step, const event_sample *at, const event_wall *wall, real lambda, real *v,
+    real *mean)
+{
+  static const real NODE[3] = {0.11270166537925831, 0.5, 0.88729833462074169};
+  static const real WEIGHT[3] = {5.0 / 18, 4.0 / 9, 5.0 / 18};
+  int status = OK;
+  *mean = 0.0;
+  for (int k = 0; status == OK && k < 3; k++) {
+    real rate = 0.0;
+    status = approach(step, at, wall, NODE[k] * lambda, v, &rate);
+    *mean += WEIGHT[k] * rate;
+  }
+  return status;
+}
+
+/* Impulse of an impact: p += (1 + e)/2 lambda_1 n. Where the kinetic energy is quadratic, i.e. W n, W = H_pp, is the
+ * same at p and at 0, lambda_1 = -2 rate / (n.W n) reverses the rate; else Newton's method solves the energy equation,
+ * whose derivative by lambda is the rate. A run backward in time undoes the impact. */
 static int impact(const event_step *step, event_sample *at, const event_wall *wall)
 {
-  const real *n = wall->n, restitution = step->h < 0.0 ? 1.0 / n[M + 1] : n[M + 1];
+  const real restitution = step->h < 0.0 ? 1.0 / wall->restitution : wall->restitution;
   const real rate = step->h < 0.0 ? -wall->rate : wall->rate;
   event_sample moved = *at;
   real *const v = step->memory + 3 * M, *const rest = v + 2 * M, *const change = rest + M;
-  real lambda, low = 0.0, at_rest = 0.0, after = 0.0, energy = 0.0, now = 0.0, correction, before = INFINITY;
+  real lambda, low = 0.0, at_rest = 0.0, after = 0.0, energy = 0.0, now = 0.0, mean = 0.0;
+  real correction, before = INFINITY;
+  real inverse_mass, there = 0.0, size = wall->size;
   int status;
   moved.p = step->memory + 4 * M;
-  memset(moved.p, 0, sizeof(real) * M);
-  status = approach(step, &moved, n, 0.0, rest, &at_rest);
+  memset(moved.p, 0, BYTES(M));
+  status = approach(step, &moved, wall, 0.0, rest, &at_rest);
   if (status == OK)
-    status = approach(step, &moved, n, 1.0, change, &after);
-  lambda = -2.0 * rate / (after - at_rest);
+    status = approach(step, &moved, wall, 1.0, change, &after);
+  inverse_mass = after - at_rest;
   if (status == OK)
-    status = approach(step, at, n, lambda, v, &after);
-  if (status == OK && !(fabs(after + rate) <= CHANGE_SAFETY * DBL_EPSILON * wall->size))
+    status = approach(step, at, wall, 1.0, v, &there);
+  for (int i = 0; i < wall->count; i++)
+    size += fabs(wall->n[i] * v[wall->place[i]]) + fabs(wall->n[i] * change[wall->place[i]]);
+  lambda = -2.0 * rate / inverse_mass;
+  if (status == OK && !(fabs(there - rate - inverse_mass) <= CHANGE_SAFETY * DBL_EPSILON * size)) {
     status = NAME(energy)(at->t, at->q, at->p, step->parameters, &energy, step->workspace);
-  else {
+    if (status == OK)
+      status = approach(step, at, wall, lambda, v, &after);
+  } else {
     before = 0.0; /* the kinetic energy is quadratic */
     if (status == OK)
-      status = approach(step, at, n, 0.0, v, &after);
+      status = approach(step, at, wall, 0.0, v, &after);
     for (int i = 0; i < M; i++)
       change[i] -= rest[i];
-    low = correct_impulse(n, v, change, lambda, rate);
+    low = correct_impulse(wall, v, change, lambda, rate);
   }
   for (int k = 0; before > 0.0 && status == OK && k < CHANGE_ITERATIONS && !(after * rate < 0.0); k++) {
     lambda *= 2.0; /* beyond the minimum of the convex energy: Newton's method does not return to lambda = 0 */
-    status = approach(step, at, n, lambda, v, &after);
+    status = approach(step, at, wall, lambda, v, &after);
   }
-  for (int k = 0; status == OK && k < CHANGE_ITERATIONS; k++) {
-    for (int i = 0; i < M; i++)
-      moved.p[i] = at->p[i] + lambda * n[i];
+  for (int k = 0; status == OK && before > 0.0 && k < CHANGE_ITERATIONS; k++) {
+    add_impulse(wall, lambda, at->p, rest);
+    memcpy(moved.p, rest, BYTES(M));
     status = satisfy_constraints(step, at->t, at->q, moved.p, 0);
-    if (before > 0.0 && status == OK)
+    if (status == OK)
       status = NAME(energy)(at->t, at->q, moved.p, step->parameters, &now, step->workspace);
-    correction = (now - energy + lambda * n[M]) / after;
+    correction = now - energy + lambda * wall->by_time;
+    for (int i = 0; i < M; i++)
+      correction -= (moved.p[i] - rest[i]) * v[i]; /* work of the constraints, mu.c_t = -mu.(G v) */
+    if (status == OK)
+      status = mean_rate(step, at, wall, lambda, v, &mean);
+    if (fabs(correction - lambda * mean) <= 4.0 * DBL_EPSILON * (fabs(energy) + fabs(now) + fabs(lambda) * wall->size))
+      correction = lambda * mean; /* the difference is rounding of the energy */
+    correction /= after;
     if (status != OK || !(fabs(correction) < before))
-      break; /* the correction is rounding of the energy */
+      break; /* the correction is rounding */
     before = fabs(correction);
     lambda -= correction;
-    status = approach(step, at, n, lambda, v, &after);
+    status = approach(step, at, wall, lambda, v, &after);
   }
   lambda *= 0.5 * (1.0 + restitution);
   low *= 0.5 * (1.0 + restitution);
-  for (int i = 0; i < M; i++) {
-    real remainder = low * n[i];
-    add_product(lambda, n[i], at->p + i, &remainder);
-    at->p[i] += remainder;
+  for (int i = 0; i < wall->count; i++) {
+    real *const p = at->p + wall->place[i], remainder = low * wall->n[i];
+    add_product(lambda, wall->n[i], p, &remainder);
+    *p += remainder;
   }
   return status == OK ? satisfy_constraints(step, at->t, at->q, at->p, 0) : status;
 }
 
-/* Sets the variables of a map to its values; velocities are set last, by their momenta. In index notation the values
- * are those of q and p. */
-static int apply_map(const event_step *step, int e, event_sample *at, const real *value)
+/* Sets the variables of a map to its values; velocities are set last, by their momenta. */
+static int apply_map(const event_step *step, event_sample *at, const event_wall *map)
 {
-#ifdef EVENTS_OF_ANY_SIZE
-  (void)step, (void)e;
-  copy_state(at->q, at->p, value, value + M);
-  return OK;
-#else
-  const int *const changed = CHANGED + FIRST_VALUE[e], count = FIRST_VALUE[e + 1] - FIRST_VALUE[e];
   real *const v = step->memory + 3 * M;
   int by_velocity = 0, status = OK;
-  for (int i = 0; i < count; i++)
-    by_velocity |= changed[i] >= 2 * M;
+  for (int i = 0; i < map->count; i++)
+    by_velocity |= map->place[i] >= 2 * M;
   if (by_velocity)
     status = NAME(velocity)(at->t, at->q, at->p, step->parameters, v, step->workspace);
-  for (int i = 0; i < count; i++)
-    if (changed[i] < M)
-      at->q[changed[i]] = value[i];
-    else if (changed[i] < 2 * M)
-      at->p[changed[i] - M] = value[i];
+  for (int i = 0; i < map->count; i++)
+    if (map->place[i] < M)
+      at->q[map->place[i]] = map->n[i];
+    else if (map->place[i] < 2 * M)
+      at->p[map->place[i] - M] = map->n[i];
     else
-      v[changed[i] - 2 * M] = value[i];
+      v[map->place[i] - 2 * M] = map->n[i];
   return by_velocity && status == OK
       ? NAME(momentum)(at->t, at->q, v, step->parameters, at->p, step->workspace)
       : status;
-#endif
 }
 
 /* Changes the state by function e: by its map, or by an impact if the wall is approached. */
 static int change_state(const event_step *step, int e, event_sample *at)
 {
   event_wall wall;
-  int status = evaluate_changes(step, e, at, &wall);
-  if (status == OK && IS_IMPACT[e] && wall.rate < 0.0) {
-    step->watch->rounding[e] = wall.slack / -wall.rate;
+  const int is_impact = IS_IMPACT[EVENT_OF(e)];
+  int status = changes_at(step, e, at, &wall);
+  if (status == OK && is_impact && wall.rate < 0.0) {
+    step->watch->history[e].rounding = wall.slack / -wall.rate;
     status = impact(step, at, &wall);
-  } else if (status == OK && !IS_IMPACT[e]) {
-    status = apply_map(step, e, at, wall.n);
+    if (status == NOT_CONVERGED)
+      step->watch->jammed = EVENT_OF(e) + 1; /* such as of prescribed motion, whose momenta no impulse changes */
+  } else if (status == OK && !is_impact) {
+    status = apply_map(step, at, &wall);
     if (status == OK)
       status = satisfy_constraints(step, at->t, at->q, at->p, 1);
   }
   if (status == OK && !(all_finite(at->q, M) && all_finite(at->p, M))) {
-    step->watch->undefined = e + 1;
+    step->watch->undefined = EVENT_OF(e) + 1;
     status = NOT_FINITE;
   }
   return status;
@@ -237,24 +325,29 @@ static int change_state(const event_step *step, int e, event_sample *at)
 
 /* Records the interval since the last hit. If the last intervals decrease geometrically and the remaining ones are
  * negligible, crossings accumulate: the search ends and watch->end is the sum of the series. */
-static void note_hit(const event_step *step, int e, real t)
+static void note_hit(const event_step *step, event_crossing *crossing, real t)
 {
   event_watch *watch = step->watch;
-  real *gaps = watch->gaps[e], low = INFINITY, high = 0.0, ratio = 0.0, last;
+  NAME(event_history) *const history = watch->history + FUNCTION_OF(crossing);
+  real *gaps = history->gaps, low = INFINITY, high = 0.0, ratio = 0.0, last;
+#ifdef EVENTS_OF_ANY_SIZE
+  crossing->before = *history;
+  crossing->acted = 1;
+#endif
   memmove(gaps, gaps + 1, sizeof(real) * (CHANGE_GAPS - 1));
-  last = gaps[CHANGE_GAPS - 1] = fabs(watch->since[e]);
-  watch->since[e] = 0.0;
-  watch->hits[e] += watch->hits[e] <= CHANGE_GAPS;
+  last = gaps[CHANGE_GAPS - 1] = fabs(watch->time - history->last);
+  history->last = watch->time;
+  history->hits += history->hits <= CHANGE_GAPS;
   for (int k = 1; k < CHANGE_GAPS; k++) {
     ratio = gaps[k] / gaps[k - 1];
     low = fmin(low, ratio);
     high = fmax(high, ratio);
   }
   watch->end = t + (step->h < 0.0 ? -1.0 : 1.0) * (ratio < 1.0 ? last * ratio / (1.0 - ratio) : 0.0);
-  if (watch->hits[e] > CHANGE_GAPS && high < 1.0 &&
-      high - low <= CHANGE_RATIO * ratio + 50.0 * DBL_EPSILON * fabs(t) / last + watch->rounding[e] / last &&
+  if (history->hits > CHANGE_GAPS && high < 1.0 &&
+      high - low <= CHANGE_RATIO * ratio + 50.0 * DBL_EPSILON * fabs(t) / last + history->rounding / last &&
       last * ratio / (1.0 - ratio) < CHANGE_END * fabs(step->whole)) {
-    watch->accumulated = e + 1;
+    watch->accumulated = crossing->function + 1;
     watch->ended = 1;
   }
 }
@@ -270,11 +363,14 @@ static int refine_crossing(const event_step *step, long long first, event_sample
   int status;
   at->t = crossing->t;
   copy_state(at->q, at->p, crossing->q, crossing->p);
-  status = evaluate_functions(step, at);
+  status = evaluate_function(step, FUNCTION_OF(crossing), at);
   if (status != OK || !IS_IMPACT[crossing->function])
     return status;
-  status = evaluate_changes(step, crossing->function, at, &wall);
-  back = at->g[crossing->function] / wall.rate; /* in the direction of the run */
+  status = changes_at(step, FUNCTION_OF(crossing), at, &wall);
+  back = at->g / wall.rate; /* in the direction of the run */
+#ifdef EVENT_CONSTRAINTS
+  back = 0.0; /* a constrained step of the size of rounding is ill-conditioned */
+#endif
   if (status != OK || !(back > 0.0 && back <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->h)))
     return status;
   back = step->h < 0.0 ? -back : back;
@@ -295,39 +391,50 @@ static int change_at_crossings(const event_step *step, long long first, event_sa
 {
   int met = 1, status = OK;
   const long long last = *step->filled;
+  const real *const value = values_at(step, EVENT_DEGREE + 1);
+  real rate, *const v = step->memory + 3 * M;
   for (long long i = first; status == OK && i < last; i++)
     if (step->watch->acts[step->found[i].function]) {
-      status = change_state(step, step->found[i].function, at);
-      note_hit(step, step->found[i].function, at->t);
+      status = change_state(step, FUNCTION_OF(step->found + i), at);
+      note_hit(step, step->found + i, at->t);
     }
   for (int round = 0; status == OK && met; round++) {
     met = 0;
-    status = evaluate_functions(step, at);
+    status = evaluate_functions(step, at, values_at(step, EVENT_DEGREE + 1));
+    if (status == OK && ANY_IMPACTS)
+      status = approach(step, at, NULL, 0.0, v, &rate);
     for (int e = 0; status == OK && e < EVENTS; e++) {
+      const int event = EVENT_OF(e);
       event_wall wall;
       int open = 0, known = 0;
-      if (!IS_IMPACT[e] || !step->watch->acts[e])
+      if (!IS_IMPACT[event] || !step->watch->acts[event])
         continue;
-      status = evaluate_changes(step, e, at, &wall);
-      if (status == OK && fabs(at->g[e]) <= wall.slack && wall.rate < -CHANGE_SAFETY * DBL_EPSILON * wall.size)
-        status = check_guards(step, e, at->t, at->q, at->p, &open);
+      status = evaluate_changes(step, e, at, v, &wall);
+      if (status == OK && fabs(value[e]) <= wall.slack && wall.rate < -CHANGE_SAFETY * DBL_EPSILON * wall.size)
+        status = conditions(e, at->t, at->q, at->p, step->parameters, &open, step->workspace);
       if (status != OK || !open)
         continue;
       met = 1;
       if (round == CHANGE_ROUNDS) {
-        step->watch->jammed = e + 1;
+        step->watch->jammed = event + 1;
         return NOT_CONVERGED;
       }
       status = change_state(step, e, at);
+      if (status == OK)
+        status = approach(step, at, NULL, 0.0, v, &rate);
       for (long long i = first; i < *step->filled; i++)
-        known |= step->found[i].function == e;
+        known |= FUNCTION_OF(step->found + i) == e;
       if (known)
         continue;
       if (*step->filled == step->room)
         return EVENT_NO_ROOM;
       step->found[*step->filled] = step->found[first];
-      step->found[*step->filled].function = e;
+      step->found[*step->filled].function = event;
       step->found[*step->filled].direction = -1;
+#ifdef EVENTS_OF_ANY_SIZE
+      step->found[*step->filled].element = e - event_host->first[event];
+      step->found[*step->filled].acted = 0;
+#endif
       ends_search(step->watch, step->found + *step->filled);
       ++*step->filled;
     }
@@ -335,20 +442,33 @@ static int change_at_crossings(const event_step *step, long long first, event_sa
   return status;
 }
 
-/* Fails if a step that began before a wall ends behind it without a crossing: contact that persists. */
+/* Fails if a step that began before a wall ends behind it without a crossing: contact that persists. Without `left`,
+ * fails if the start `right` of a run is behind a wall that has no conditions: a wall of finite size may be passed. */
 static int check_walls(const event_step *step, const event_sample *left, const event_sample *right)
 {
-  int status = OK;
+  const real *const before = values_at(step, 0), *const after = values_at(step, left ? EVENT_DEGREE : 0);
+  real rate, *const v = step->memory + 3 * M;
+  int known = 0, status = OK;
   for (int e = 0; status == OK && e < EVENTS; e++) {
+    const int event = EVENT_OF(e);
     event_wall wall;
-    int open;
-    if (!IS_IMPACT[e] || !step->watch->acts[e] || right->g[e] >= 0.0)
+    int open = 1;
+    if (after[e] >= 0.0 || !IS_IMPACT[event] || !step->watch->acts[event])
       continue;
-    status = evaluate_changes(step, e, left, &wall);
+    if (!known)
+      status = approach(step, left ? left : right, NULL, 0.0, v, &rate);
+    known = 1;
     if (status == OK)
-      status = check_guards(step, e, right->t, right->q, right->p, &open);
-    if (status == OK && open && left->g[e] >= -wall.slack && right->g[e] < -wall.slack) {
-      step->watch->through = e + 1;
+      status = evaluate_changes(step, e, left ? left : right, v, &wall);
+    if (status == OK && left)
+      status = conditions(e, right->t, right->q, right->p, step->parameters, &open, step->workspace);
+#if EVENT_GUARDS > 0
+    for (int i = 0; !left && i < EVENT_GUARDS; i++)
+      open &= GUARDED[i] != event;
+#endif
+    if (status == OK && open && (!left || before[e] >= -wall.slack) && after[e] < -wall.slack) {
+      step->watch->through = event + 1;
+      step->watch->behind = left ? 0.0 : after[e];
       status = NOT_CONVERGED;
     }
   }
@@ -382,8 +502,8 @@ static void set_run(event_run *run, real t, const event_sample *at)
 {
   run->t = t;
   copy_state(run->q, run->p, at->q, at->p);
-  memset(run->carry_q, 0, sizeof(real) * M);
-  memset(run->carry_p, 0, sizeof(real) * M);
+  memset(run->carry_q, 0, BYTES(M));
+  memset(run->carry_p, 0, BYTES(M));
   run->guess = 0;
 }
 
@@ -391,14 +511,18 @@ static void set_run(event_run *run, real t, const event_sample *at)
 static int change_in_step(const event_run *before, event_run *run, event_step *step, real length, int iterations,
     const stored_states *to)
 {
-  real *const states = step->memory + 7 * M;
+  const int adaptive = before->h == 0.0;
+  const long long within = adaptive ? before->step + 1 : -1;
+  real *const states = step->memory + 9 * M;
   event_sample left = {.t = before->t, .q = states, .p = states + M};
   event_sample right = {.fraction = 1.0, .t = run->t, .q = states + 2 * M, .p = states + 3 * M};
   int status;
-  step->whole = length;
+  step->whole = step->h = length;
   copy_state(left.q, left.p, before->q, before->p);
   copy_state(right.q, right.p, run->q, run->p);
-  status = evaluate_functions(step, &left);
+  status = evaluate_functions(step, &left, values_at(step, 0));
+  if (status == OK && before->step == 0)
+    status = check_walls(step, NULL, &left);
   for (int changes = 0; status == OK; changes++) {
     const long long first = *step->filled;
     long long group = first;
@@ -410,7 +534,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     step->h = length;
     step->q = left.q;
     step->p = left.p;
-    status = evaluate_functions(step, &right);
+    status = evaluate_functions(step, &right, values_at(step, EVENT_DEGREE));
     if (status == OK)
       status = search_step(step, &left, &right);
     if (status == OK)
@@ -432,8 +556,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       part *= step->found[group].fraction;
       status = refine_crossing(step, group, &at, &part);
     }
-    for (int e = 0; e < EVENTS; e++)
-      step->watch->since[e] += part;
+    step->watch->time += part;
     if (!acts && !step->watch->ended) {
       step->watch->started = 1;
       if (changes > 0)
@@ -446,16 +569,16 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     length -= part;
     ends = fabs(length) <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->whole);
     if (status == OK)
-      status = store_state(to, &at, part, ends ? iterations : 0, ends ? run->step : -1, step->report);
+      status = store_state(to, &at, part, ends ? iterations : 0, ends ? run->step : within, step->report);
     if (status == OK && !ends && changes == CHANGES_IN_STEP) {
       step->watch->jammed = step->found[group].function + 1;
       status = NOT_CONVERGED;
     }
     step->watch->started = 0;
-    if (status == OK && (ends || before->h == 0.0 || step->watch->ended)) {
+    if (status == OK && (ends || adaptive || step->watch->ended)) {
       if (!ends) {
         copy_run(run, before);
-        run->step += before->h == 0.0; /* adaptive */
+        run->step += adaptive;
         run->t_low = 0.0;
       }
       set_run(run, ends ? run->t : at.t, &at);
@@ -464,7 +587,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     left.t = at.t;
     copy_state(left.q, left.p, at.q, at.p);
     if (status == OK)
-      status = evaluate_functions(step, &left);
+      status = evaluate_functions(step, &left, values_at(step, 0));
     if (status == OK)
       status = NAME(step)(left.t, length, left.q, left.p, step->parameters, step->options, right.q, right.p, &own,
           step->workspace);
@@ -480,10 +603,10 @@ static int advance_run(event_run *run, real t_end, real tolerance, const event_s
 #ifdef EVENTS_OF_ANY_SIZE
   array_report made;
   if (run->h != 0.0)
-    status = NAME(advance)(run, 1, 0, event_host->problem, step->options, NULL, NULL, NULL, NULL, &made);
+    status = NAME(advance)(run, 1, 0, event_host->own, step->options, NULL, NULL, NULL, NULL, &made);
 #if EVENTS_CONTROLLED
   else {
-    status = NAME(advance_to)(run, t_end, tolerance, 1, 0, event_host->problem, step->options, NULL, NULL, NULL, NULL,
+    status = NAME(advance_to)(run, t_end, tolerance, 1, 0, event_host->own, step->options, NULL, NULL, NULL, NULL,
         &made);
     run->h = 0.0;
   }
@@ -537,7 +660,8 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, r
     int *iterations, long long *number, long long room, event_crossing *found, long long *filled, solver_report *report,
     real *workspace)
 {
-  EVENT_MEMORY(watch, memory, 13 * M + CHANGE_VALUES)
+  EVENT_MEMORY(watch, memory, 15 * M + CHANGE_VALUES)
+  event_sample horizon = {.q = memory + 7 * M, .p = memory + 8 * M};
   const event_watch initial = *watch;
   const stored_states to = {states, number, t, q, p, length, iterations};
   int status = OK;
@@ -548,11 +672,11 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, r
     const event_watch watched = *watch;
     const long long kept = report->stored, crossed = *filled;
     event_step step = {0.0, 0.0, 0.0, NULL, NULL, parameters, options, watch, found, room, filled, report, workspace,
-        memory};
+        memory, memory + 15 * M, &horizon};
     real size;
     int count = 0;
 #ifdef EVENTS_OF_ANY_SIZE
-    before.q = memory + 15 * M + 2;
+    before.q = step.values + (long long)EVENT_VALUES * EVENTS;
     before.p = before.q + M;
     before.carry_q = before.p + M;
     before.carry_p = before.carry_q + M;
@@ -564,11 +688,17 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, r
     if (status != OK) {
       copy_run(run, &before);
       report->stored = kept;
-      *filled = crossed;
       if (status == EVENT_NO_ROOM) {
+#ifdef EVENTS_OF_ANY_SIZE
+        for (long long i = *filled - 1; i >= crossed; i--)
+          if (found[i].acted)
+            watch->history[FUNCTION_OF(found + i)] = found[i].before;
+#endif
         *watch = watched;
+        *filled = crossed;
         return OK;
       }
+      *filled = crossed;
       if (status > STATUS(SPURIOUS_SOLUTION))
         *watch = initial; /* the call is repeated */
       return status;

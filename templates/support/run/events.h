@@ -41,10 +41,10 @@ static inline real duration_of_part(real h, const solver_report *part)
 /* Location of zero crossings of event functions, by the public functions of the integrator alone.
  *
  * A step is sampled at Chebyshev nodes; the interpolating polynomial separates the crossings, which are then enclosed
- * by a secant iteration on partial steps. Requires: numbers.h, event_velocity, the kernel event_functions, EVENTS,
- * EVENT_DEGREE, EVENTS_USE_VELOCITIES; EVENT_NODES, the nodes as fractions of a part of a step; EVENT_COEFFICIENTS,
- * from values there to coefficients of x^k, -1 <= x <= 1; EVENT_DOUBTS, the factors of the last two coefficients in the
- * error estimate. */
+ * by a secant iteration on partial steps. Requires: numbers.h, event_velocity, BYTES, the kernel event_functions or, in
+ * index notation, all_values, one_value and conditions; EVENTS, EVENT_DEGREE, EVENTS_USE_VELOCITIES; EVENT_NODES, the
+ * nodes as fractions of a part of a step; EVENT_COEFFICIENTS, from values there to coefficients of x^k, -1 <= x <= 1;
+ * EVENT_DOUBTS, the factors of the last two coefficients in the error estimate. */
 enum {
   EVENT_SPLITS = 6, /* greatest depth of subdivision of a step */
   EVENT_TRIALS = 200, /* largest number of states evaluated for one crossing; bisection takes 52 */
@@ -60,72 +60,97 @@ enum {
 #define EVENT_UNCHANGED (4.0 * DBL_EPSILON) /* relative to the range of a function on a step: a change that may be
                                            * rounding */
 #define EVENT_SMALL_PART 0.03 /* a polynomial whose error estimate is less than this part of its range is accepted */
+#define EVENT_FAR 32.0 /* a function is far from zero beyond so many times its range at the nodes: polynomials and their
+                        * error estimates deviate by at most 22 of them */
 #define EVENT_STEEPNESS 8.0 /* a zero is simple if the derivative exceeds so many error estimates */
 
 typedef NAME(watch) event_watch;
 typedef NAME(crossing) event_crossing;
 
-#ifndef EVENT_GUARDS
-#define EVENT_GUARDS 0 /* values of the kernel event_guards: conditions of crossings, each of the function GUARDED */
+/* Whether the state where a search starts is that of the last change by function e, within rounding of its zero. */
+#ifdef EVENT_CHANGES
+#define JUST_CHANGED(watch, e) ((watch)->history[e].hits > 0 && (watch)->history[e].last == (watch)->time)
+#else
+#define JUST_CHANGED(watch, e) 0
 #endif
 
-/* Kernels of events; EVENT_MAPS + e: changes by function e. */
-enum {
-  EVENT_FUNCTIONS,
-  EVENT_CONDITIONS,
-  EVENT_MAPS
-};
-
-/* Values of a kernel of events at a state; in index notation they are computed by the caller. */
-static int event_kernel(int kernel, real t, const real *q, const real *p, const real *parameters, real *value,
-    real *workspace)
-{
+#ifndef EVENT_GUARDS
+#define EVENT_GUARDS 0 /* conditions of crossings, each of the event GUARDED: values of the kernel event_guards */
+#endif
 #ifdef EVENTS_OF_ANY_SIZE
-  (void)workspace;
-  return event_host->evaluate(kernel, t, q, p, parameters, value);
+#define FUNCTION_OF(crossing) ((int)(event_host->first[(crossing)->function] + (crossing)->element))
 #else
+#define EVENT_OF(e) (e) /* event of a function; in index notation an event has one for each element of its loops */
+#define FUNCTION_OF(crossing) ((crossing)->function)
+
+/* Arguments (q, p, v) of the kernels of events at a state. */
+static int event_arguments(real t, const real *q, const real *p, const real *parameters, real *u, real *workspace)
+{
+  memcpy(u, q, BYTES(M));
+  memcpy(u + M, p, BYTES(M));
+  memset(u + 2 * M, 0, BYTES(M));
+  return EVENTS_USE_VELOCITIES ? event_velocity(t, q, p, parameters, u + 2 * M, workspace) : OK;
+}
+
+/* Values of all functions, and of function e, at a state. */
+static int all_values(real t, const real *q, const real *p, const real *parameters, real *value, real *workspace)
+{
   real u[3 * M];
+  const int status = event_arguments(t, q, p, parameters, u, workspace);
+  if (status == OK)
+    event_functions(u, t, parameters, value);
+  return status;
+}
+
+static int one_value(int e, real t, const real *q, const real *p, const real *parameters, real *value, real *workspace)
+{
+  real all[EVENTS];
+  const int status = all_values(t, q, p, parameters, all, workspace);
+  *value = all[e];
+  return status;
+}
+
+/* Sets *open to 1 if the conditions of function e are satisfied at a state, all >= 0, else to 0. */
+static int conditions(int e, real t, const real *q, const real *p, const real *parameters, int *open, real *workspace)
+{
   int status = OK;
-  memcpy(u, q, sizeof(real) * M);
-  memcpy(u + M, p, sizeof(real) * M);
-  memset(u + 2 * M, 0, sizeof(real) * M);
-  if (EVENTS_USE_VELOCITIES)
-    status = event_velocity(t, q, p, parameters, u + 2 * M, workspace);
+  *open = 1;
+#if EVENT_GUARDS > 0
+  real u[3 * M], value[EVENT_GUARDS];
+  status = event_arguments(t, q, p, parameters, u, workspace);
   if (status != OK)
     return status;
-  if (kernel == EVENT_FUNCTIONS)
-    event_functions(u, t, parameters, value);
-#if EVENT_GUARDS > 0
-  else if (kernel == EVENT_CONDITIONS)
-    event_guards(u, t, parameters, value);
+  event_guards(u, t, parameters, value);
+  for (int i = 0; i < EVENT_GUARDS; i++)
+    *open &= GUARDED[i] != e || value[i] >= 0.0;
+#else
+  (void)e, (void)t, (void)q, (void)p, (void)parameters, (void)workspace;
 #endif
-#ifdef EVENT_CHANGES
-  else
-    event_changes(u, t, parameters, value);
-#endif
-  return OK;
-#endif
+  return status;
 }
 
 int NAME(event_values)(real t, const real *q, const real *p, const real *parameters, real *value, real *workspace)
 {
-  const int status = event_kernel(EVENT_FUNCTIONS, t, q, p, parameters, value, workspace);
+  const int status = all_values(t, q, p, parameters, value, workspace);
   if (status != OK)
     return status;
   return all_finite(value, EVENTS) ? OK : NOT_FINITE;
 }
+#endif
 
-/* Event functions at a fraction of a step, and the state there, in memory that later samples may use as well. */
+/* A function at a fraction of a step, and the state there, in memory that later samples may use as well. */
 typedef struct {
-  real fraction, t, g[EVENTS], *q, *p;
+  real fraction, t, g, *q, *p;
 } event_sample;
+
+enum { EVENT_VALUES = EVENT_DEGREE + 3 }; /* values of each function: at the nodes, at a state, and their rounding */
 
 #ifdef EVENTS_OF_ANY_SIZE
 #define EVENT_MEMORY(watch, name, size)                    \
   real *const name = (event_host = (watch)->host)->memory; \
   (watch)->used = 0;
 #else
-#define EVENT_MEMORY(watch, name, size) real name[size];
+#define EVENT_MEMORY(watch, name, size) real name[(size) + EVENT_VALUES * EVENTS];
 #endif
 
 /* A step that is searched, and the array for its crossings. */
@@ -138,29 +163,49 @@ typedef struct {
   long long room, *filled;
   solver_report *report;
   real *workspace;
-  real *memory; /* state of the last sample (2 M), work (5 M); states, values and work of changes */
+  real *memory; /* state of the last sample (2 M), work (5 M), state of the horizon (2 M); those of changes */
+  real *values; /* of the functions (EVENT_VALUES EVENTS) */
+  event_sample *horizon; /* first known crossing that changes the state; later ones are not located */
 } event_step;
+
+/* Values of all functions at a node, at a state (EVENT_DEGREE + 1), and the effect of rounding (EVENT_DEGREE + 2). */
+static real *values_at(const event_step *step, int row)
+{
+  return step->values + (long long)row * EVENTS;
+}
 
 static void copy_state(real *q, real *p, const real *q0, const real *p0)
 {
-  memcpy(q, q0, sizeof(real) * M);
-  memcpy(p, p0, sizeof(real) * M);
+  memcpy(q, q0, BYTES(M));
+  memcpy(p, p0, BYTES(M));
 }
 
-/* Evaluates the functions at the state of a sample; watch->undefined is 1 + the index of the first that is not
+/* Evaluates all functions at the state of a sample; watch->undefined is 1 + the event of the first that is not
  * finite. */
-static int evaluate_functions(const event_step *step, event_sample *sample)
+static int evaluate_functions(const event_step *step, const event_sample *at, real *value)
 {
-  const int status = NAME(event_values)(sample->t, sample->q, sample->p, step->parameters, sample->g, step->workspace);
-  if (status == NOT_FINITE)
-    for (int e = EVENTS - 1; e >= 0; e--)
-      if (!all_finite(sample->g + e, 1))
-        step->watch->undefined = e + 1;
+  const int status = all_values(at->t, at->q, at->p, step->parameters, value, step->workspace);
+  for (int e = 0; status == OK && e < EVENTS; e++)
+    if (!is_finite(value[e])) {
+      step->watch->undefined = EVENT_OF(e) + 1;
+      return NOT_FINITE;
+    }
   return status;
 }
 
-/* Computes the sample at a fraction of the step by one step of that size. */
-static int take_sample(const event_step *step, real fraction, event_sample *sample)
+/* Evaluates function e at the state of a sample. */
+static int evaluate_function(const event_step *step, int e, event_sample *at)
+{
+  int status = one_value(e, at->t, at->q, at->p, step->parameters, &at->g, step->workspace);
+  if (status == OK && !is_finite(at->g)) {
+    step->watch->undefined = EVENT_OF(e) + 1;
+    status = NOT_FINITE;
+  }
+  return status;
+}
+
+/* Computes the state at a fraction of the step by one step of that size. */
+static int state_at(const event_step *step, real fraction, event_sample *sample)
 {
   solver_report own;
   int status;
@@ -172,7 +217,14 @@ static int take_sample(const event_step *step, real fraction, event_sample *samp
   sample->t = step->t + duration_of_part(fraction * step->h, &own);
   step->report->iterations += own.iterations;
   step->report->change = own.change;
-  return status == OK ? evaluate_functions(step, sample) : status;
+  return status;
+}
+
+/* Computes the sample of function e at a fraction of the step. */
+static int take_sample(const event_step *step, int e, real fraction, event_sample *sample)
+{
+  const int status = state_at(step, fraction, sample);
+  return status == OK ? evaluate_function(step, e, sample) : status;
 }
 
 static int changes_sign(real from, real to)
@@ -262,18 +314,18 @@ static int enclose_crossing(const event_step *step, int e, event_sample low, eve
   const real least = 2.0 * DBL_EPSILON;
   real moved = 0.0;
   int beyond = 0; /* 1: low is advanced, -1: high is */
-  for (int k = 0; k < EVENT_TRIALS && high->g[e] != 0.0 && high->fraction - low.fraction > 2.0 * least; k++) {
+  for (int k = 0; k < EVENT_TRIALS && high->g != 0.0 && high->fraction - low.fraction > 2.0 * least; k++) {
     const real width = high->fraction - low.fraction, leap = fmin(2.0 * moved, 0.5 * width);
-    real fraction = low.fraction + low.g[e] / (low.g[e] - high->g[e]) * width;
+    real fraction = low.fraction + low.g / (low.g - high->g) * width;
     event_sample now;
     int status;
     if (beyond)
       fraction = beyond > 0 ? low.fraction + leap : high->fraction - leap;
     fraction = fmin(fmax(fraction, low.fraction + least), high->fraction - least);
-    status = take_sample(step, fraction, &now);
+    status = take_sample(step, e, fraction, &now);
     if (status != OK)
       return status;
-    if (changes_sign(low.g[e], now.g[e])) {
+    if (changes_sign(low.g, now.g)) {
       moved = high->fraction - fraction;
       beyond = beyond > 0 ? 0 : -1;
       *high = now;
@@ -286,34 +338,50 @@ static int enclose_crossing(const event_step *step, int e, event_sample low, eve
   return OK;
 }
 
-/* Adds the crossing between two samples if its direction is requested. */
+/* Adds the crossing between two samples if its direction is requested and it is not behind the horizon, which is then
+ * the crossing if it changes the state. */
 static int add_crossing(const event_step *step, int e, const event_sample *from, const event_sample *to)
 {
-  const int direction = from->g[e] < 0.0 ? 1 : -1;
-  event_sample at = *to;
+  const int direction = from->g < 0.0 ? 1 : -1, event = EVENT_OF(e);
+  event_sample at = *to, *const horizon = step->horizon;
   event_crossing *crossing = step->found + *step->filled;
-  int status;
-  if (step->watch->direction[e] == -direction)
+  int open, status = OK;
+  if (step->watch->direction[event] == -direction || from->fraction >= horizon->fraction)
     return OK;
+  if (to->fraction > horizon->fraction) {
+    at = *horizon;
+    status = evaluate_function(step, e, &at);
+    if (status != OK || !changes_sign(from->g, at.g))
+      return status;
+  }
   if (*step->filled == step->room)
     return EVENT_NO_ROOM;
   status = enclose_crossing(step, e, *from, &at);
   if (status == OK && at.q == step->memory)
-    status = take_sample(step, at.fraction, &at);
-  if (status != OK)
+    status = take_sample(step, e, at.fraction, &at);
+  if (status == OK)
+    status = conditions(e, at.t, at.q, at.p, step->parameters, &open, step->workspace);
+  if (status != OK || !open)
     return status;
 #ifdef EVENTS_OF_ANY_SIZE
   if (step->watch->used == step->room)
     return EVENT_NO_ROOM;
   crossing->q = event_host->states + 2 * M * step->watch->used++;
   crossing->p = crossing->q + M;
+  crossing->element = e - event_host->first[event];
+  crossing->acted = 0;
 #endif
   crossing->t = at.t;
   crossing->fraction = at.fraction;
-  crossing->function = e;
+  crossing->function = event;
   crossing->direction = direction;
   copy_state(crossing->q, crossing->p, at.q, at.p);
   ++*step->filled;
+  if (step->watch->acts[event]) {
+    horizon->fraction = at.fraction;
+    horizon->t = at.t;
+    copy_state(horizon->q, horizon->p, crossing->q, crossing->p);
+  }
   return OK;
 }
 
@@ -325,10 +393,10 @@ static int add_crossings(const event_step *step, int e, const event_sample *left
   for (int i = 0; i <= count; i++) {
     int status = OK;
     if (i < count)
-      status = take_sample(step, extrema[i], &to);
+      status = take_sample(step, e, extrema[i], &to);
     else
       to = *right;
-    if (status == OK && changes_sign(from.g[e], to.g[e]))
+    if (status == OK && changes_sign(from.g, to.g))
       status = add_crossing(step, e, &from, &to);
     if (status != OK)
       return status;
@@ -344,18 +412,20 @@ static int search_part(const event_step *step, int e, const event_sample *left, 
     const real *known, int splits)
 {
   const real half = 0.5 * (right->fraction - left->fraction), middle = left->fraction + half;
-  real g[EVENT_DEGREE + 1], c[EVENT_DEGREE + 1], extrema[EVENT_DEGREE], doubt, range, split, before = left->g[e];
+  real g[EVENT_DEGREE + 1], c[EVENT_DEGREE + 1], extrema[EVENT_DEGREE], doubt, range, split, before = left->g;
   int count, follows, crossed = 0, status = OK;
   event_sample sample;
-  g[0] = left->g[e];
-  g[EVENT_DEGREE] = right->g[e];
+  if (left->fraction >= step->horizon->fraction)
+    return OK;
+  g[0] = left->g;
+  g[EVENT_DEGREE] = right->g;
   for (int j = 1; j < EVENT_DEGREE; j++) {
     if (!known) {
-      status = take_sample(step, left->fraction + EVENT_NODES[j] * 2.0 * half, &sample);
+      status = take_sample(step, e, left->fraction + EVENT_NODES[j] * 2.0 * half, &sample);
       if (status != OK)
         return status;
     }
-    g[j] = known ? known[j - 1] : sample.g[e];
+    g[j] = known ? known[j - 1] : sample.g;
   }
   interpolate(g, c, &doubt, &range);
   follows = doubt <= EVENT_SMALL_PART * range;
@@ -373,42 +443,41 @@ static int search_part(const event_step *step, int e, const event_sample *left, 
   }
   if (split > 1.0 || splits == 0)
     return crossed || split < 1.0 ? add_crossings(step, e, left, right, extrema, count) : status;
-  status = take_sample(step, middle + half * split, &sample);
+  status = take_sample(step, e, middle + half * split, &sample);
   if (status == OK)
     status = search_part(step, e, left, &sample, NULL, splits - 1);
   return status == OK ? search_part(step, e, &sample, right, NULL, splits - 1) : status;
 }
 
-/* Change of a function if each coordinate changes by one ulp: the effect of rounding of the state. In index notation
- * the largest change if all coordinates change at once, with alternating signs of three patterns. */
-static int rounding_of(const event_step *step, int e, const event_sample *at, real *noise)
+/* Changes of the functions if each coordinate changes by one ulp: the effect of rounding of the state. In index
+ * notation the largest change if all coordinates change at once, with alternating signs of three patterns. */
+static int rounding_of(const event_step *step, const event_sample *at)
 {
+  real *const noise = values_at(step, EVENT_DEGREE + 2), *const now = values_at(step, EVENT_DEGREE + 1);
+  const real *const before = values_at(step, 0);
   event_sample next = *at;
+  int status = OK;
   next.q = step->memory + 2 * M;
-  *noise = 0.0;
+  memset(noise, 0, BYTES(EVENTS));
 #ifdef EVENTS_OF_ANY_SIZE
-  for (int pattern = 0; pattern < 3; pattern++) {
-    int status;
+  for (int pattern = 0; status == OK && pattern < 3; pattern++) {
     for (int i = 0; i < M; i++)
       next.q[i] = at->q[i] * (1.0 + ((i * pattern / 2) % 2 ? -DBL_EPSILON : DBL_EPSILON));
-    status = evaluate_functions(step, &next);
-    if (status != OK)
-      return status;
-    *noise = fmax(*noise, fabs(next.g[e] - at->g[e]));
+    status = evaluate_functions(step, &next, now);
+    for (int e = 0; status == OK && e < EVENTS; e++)
+      noise[e] = fmax(noise[e], fabs(now[e] - before[e]));
   }
 #else
-  memcpy(next.q, at->q, sizeof(real) * M);
-  for (int i = 0; i < M; i++) {
-    int status;
+  memcpy(next.q, at->q, BYTES(M));
+  for (int i = 0; status == OK && i < M; i++) {
     next.q[i] *= 1.0 + DBL_EPSILON;
-    status = evaluate_functions(step, &next);
-    if (status != OK)
-      return status;
-    *noise += fabs(next.g[e] - at->g[e]);
+    status = evaluate_functions(step, &next, now);
+    for (int e = 0; e < EVENTS; e++)
+      noise[e] += fabs(now[e] - before[e]);
     next.q[i] = at->q[i];
   }
 #endif
-  return OK;
+  return status;
 }
 
 /* Central difference of a function along (q, p, t), divided by the size of the change; dq or dp NULL: zeros. */
@@ -426,11 +495,11 @@ static int difference(const event_step *step, int e, const event_sample *at, con
       ends[side].p[i] = at->p[i] + (dp ? part * dp[i] : 0.0);
     }
     ends[side].t += part * dt;
-    status = evaluate_functions(step, ends + side);
+    status = evaluate_function(step, e, ends + side);
     if (status != OK)
       return status;
   }
-  *found = (ends[1].g[e] - ends[0].g[e]) / (2.0 * size);
+  *found = (ends[1].g - ends[0].g) / (2.0 * size);
   return OK;
 }
 
@@ -444,7 +513,7 @@ static int first_change(const event_step *step, int e, const event_sample *at, r
   event_sample next;
   int status = event_velocity(at->t, at->q, at->p, step->parameters, v, step->workspace);
   if (status == OK)
-    status = take_sample(step, little, &next);
+    status = state_at(step, little, &next);
   if (status != OK)
     return status;
   for (int i = 0; i < M; i++) {
@@ -470,32 +539,39 @@ static int first_change(const event_step *step, int e, const event_sample *at, r
 static int leave_zero(const event_step *step, int e, const event_sample *left, real range, event_sample *from)
 {
   event_sample next;
-  real noise, change, doubt;
-  int sign, place = EVENT_FIRST_PROBE, away = 0, status = rounding_of(step, e, left, &noise);
-  if (status == OK && fabs(left->g[e]) > EVENT_AT_ZERO * range + 8.0 * noise)
+  real noise = values_at(step, EVENT_DEGREE + 2)[e], change, doubt;
+  int sign, place = EVENT_FIRST_PROBE, away = 0, event = EVENT_OF(e), status;
+  if (fabs(left->g) > EVENT_AT_ZERO * range + 8.0 * noise)
     return OK;
-  if (status == OK)
-    status = first_change(step, e, left, noise, &change, &doubt);
+  status = first_change(step, e, left, noise, &change, &doubt);
   if (status != OK) {
     step->watch->undefined = 0; /* the rate is not defined at this state */
     return OK;
   }
   sign = change > 0.0 ? 1 : -1;
-  if (fabs(change) <= EVENT_UNCHANGED * range + 4.0 * doubt || sign * left->g[e] > 0.0)
+  if (fabs(change) <= EVENT_UNCHANGED * range + 4.0 * doubt || sign * left->g > 0.0)
     return OK;
-  for (; place >= EVENT_LAST_PROBE; place -= 2) {
-    status = take_sample(step, ldexp(1.0, -place), &next);
+  /* g = x dg + x^2 c with g >= x dg / 2 at the last of these states does not return before 2 x */
+  status = take_sample(step, e, ldexp(1.0, -EVENT_LAST_PROBE), &next);
+  if (status == OK && sign * next.g >= ldexp(0.5 * fabs(change), -EVENT_LAST_PROBE) && sign * next.g > 8.0 * noise) {
+    if (changes_sign(from->g, next.g) && !JUST_CHANGED(step->watch, e))
+      status = add_crossing(step, e, from, &next);
+    from->g = sign * fabs(from->g);
+    return status;
+  }
+  for (; status == OK && place >= EVENT_LAST_PROBE; place -= 2) {
+    status = take_sample(step, e, ldexp(1.0, -place), &next);
     if (status != OK)
       return status;
-    if (!away && fabs(next.g[e]) <= 8.0 * noise + 4.0 * fabs(left->g[e]))
+    if (!away && fabs(next.g) <= 8.0 * noise + 4.0 * fabs(left->g))
       continue;
-    if (!away && sign * next.g[e] < 0.0 && (step->watch->remaining[e] > 0 || step->watch->acts[e]) &&
-        step->watch->direction[e] != sign) {
-      step->watch->accumulated = e + 1;
+    if (!away && sign * next.g < 0.0 && (step->watch->remaining[event] > 0 || step->watch->acts[event]) &&
+        step->watch->direction[event] != sign) {
+      step->watch->accumulated = event + 1;
       return NOT_CONVERGED;
     }
     away = 1;
-    if (changes_sign(from->g[e], next.g[e]))
+    if (changes_sign(from->g, next.g) && !(from->fraction == 0.0 && JUST_CHANGED(step->watch, e)))
       status = add_crossing(step, e, from, &next);
     if (status != OK)
       return status;
@@ -504,33 +580,70 @@ static int leave_zero(const event_step *step, int e, const event_sample *left, r
   return OK;
 }
 
-/* Finds the crossings of all functions on a step, in no particular order. */
+/* Function that changes the state and first changes its sign, by the values at the nodes; -1: none. */
+static int first_to_change(const event_step *step)
+{
+  int first = -1;
+  real least = INFINITY;
+  for (int e = 0; e < EVENTS; e++)
+    for (int j = step->watch->acts[EVENT_OF(e)] ? 1 : EVENT_DEGREE + 1; j <= EVENT_DEGREE; j++) {
+      const real from = values_at(step, j - 1)[e], to = values_at(step, j)[e];
+      const real fraction = EVENT_NODES[j - 1] + from / (from - to) * (EVENT_NODES[j] - EVENT_NODES[j - 1]);
+      if (changes_sign(from, to) && fraction < least) {
+        least = fraction;
+        first = e;
+      }
+    }
+  return first;
+}
+
+/* Finds the crossings of one function on a step. */
+static int search_function(const event_step *step, int e, const event_sample *left, const event_sample *right)
+{
+  event_sample start = *left, from, to = *right;
+  real inner[EVENT_DEGREE - 1], middle = values_at(step, EVENT_DEGREE / 2)[e], range = 0.0;
+  int status = OK;
+  start.g = values_at(step, 0)[e];
+  to.g = values_at(step, EVENT_DEGREE)[e];
+  for (int j = 1; j < EVENT_DEGREE; j++)
+    inner[j - 1] = values_at(step, j)[e];
+  for (int j = 0; j <= EVENT_DEGREE; j++)
+    range = fmax(range, fabs(values_at(step, j)[e] - middle));
+  if (fabs(middle) > EVENT_FAR * range)
+    return OK;
+  from = start;
+  if (!step->watch->started) {
+    range = fabs(to.g - from.g);
+    for (int j = 1; j < EVENT_DEGREE; j++)
+      range = fmax(range, fabs(inner[j - 1] - from.g));
+    status = leave_zero(step, e, &start, range, &from);
+  }
+  return status == OK ? search_part(step, e, &from, &to, from.fraction > 0.0 ? NULL : inner, EVENT_SPLITS) : status;
+}
+
+/* Finds the crossings of all functions on a step, in no particular order; the values at its ends are known. The first
+ * one that changes the state is located first, as no later one is needed. */
 static int search_step(const event_step *step, const event_sample *left, const event_sample *right)
 {
-  real inner[EVENTS][EVENT_DEGREE - 1];
-  for (int j = 1; j < EVENT_DEGREE; j++) {
-    event_sample sample;
-    const int status = take_sample(step, EVENT_NODES[j], &sample);
-    if (status != OK)
-      return status;
-    for (int e = 0; e < EVENTS; e++)
-      inner[e][j - 1] = sample.g[e];
-  }
-  for (int e = 0; e < EVENTS; e++) {
-    event_sample from = *left;
-    int status = OK;
-    if (!step->watch->started) {
-      real range = fabs(right->g[e] - left->g[e]);
-      for (int j = 1; j < EVENT_DEGREE; j++)
-        range = fmax(range, fabs(inner[e][j - 1] - left->g[e]));
-      status = leave_zero(step, e, left, range, &from);
-    }
+  int status = OK, first;
+  event_sample sample;
+  step->horizon->fraction = INFINITY;
+  for (int j = 1; j < EVENT_DEGREE && status == OK; j++) {
+    status = state_at(step, EVENT_NODES[j], &sample);
     if (status == OK)
-      status = search_part(step, e, &from, right, from.fraction > 0.0 ? NULL : inner[e], EVENT_SPLITS);
-    if (status != OK)
-      return status;
+      status = evaluate_functions(step, &sample, values_at(step, j));
   }
-  return OK;
+  if (status == OK && !step->watch->started)
+    status = rounding_of(step, left);
+  if (status != OK)
+    return status;
+  first = first_to_change(step);
+  if (first >= 0)
+    status = search_function(step, first, left, right);
+  for (int e = 0; e < EVENTS && status == OK; e++)
+    if (e != first)
+      status = search_function(step, e, left, right);
+  return status;
 }
 
 /* Counts a crossing; returns 1 if it ends the search, or changes the state. */
@@ -541,68 +654,40 @@ static int ends_search(event_watch *watch, const event_crossing *crossing)
   return watch->ended || watch->acts[crossing->function];
 }
 
-/* Sets *open to 1 if the conditions of a function are satisfied at a state, all g >= 0, else to 0. */
-static int check_guards(const event_step *step, int e, real t, const real *q, const real *p, int *open)
-{
-  int status = OK;
-  *open = 1;
-#if EVENT_GUARDS > 0
-  real value[EVENT_GUARDS];
-  status = event_kernel(EVENT_CONDITIONS, t, q, p, step->parameters, value, step->workspace);
-  if (status != OK)
-    return status;
-  for (int i = 0; i < EVENT_GUARDS; i++)
-    *open &= GUARDED[i] != e || value[i] >= 0.0;
-#else
-  (void)step, (void)e, (void)t, (void)q, (void)p;
-#endif
-  return status;
-}
-
 /* After the crossing that ends the search, keeps those of other functions that have already changed sign at its state:
  * a search from there would not find them. */
 static int keep_coincident(const event_step *step, long long last)
 {
   const long long filled = *step->filled;
-  const event_crossing end = step->found[last];
-  event_sample at = {.t = end.t, .q = step->memory, .p = step->memory + M};
-  int status;
-  copy_state(at.q, at.p, end.q, end.p);
-  status = evaluate_functions(step, &at);
+  event_crossing end = step->found[last];
+  event_sample at = {.t = end.t, .q = end.q, .p = end.p};
+  int status = OK;
   *step->filled = last + 1;
   for (long long i = last + 1; status == OK && i < filled; i++) {
-    const event_crossing other = step->found[i];
-    if (other.fraction - end.fraction > EVENT_TIE || (real)other.direction * at.g[other.function] < 0.0)
+    event_crossing other = step->found[i];
+    if (other.fraction - end.fraction <= EVENT_TIE)
+      status = evaluate_function(step, FUNCTION_OF(&other), &at);
+    if (status != OK || other.fraction - end.fraction > EVENT_TIE || (real)other.direction * at.g < 0.0)
       continue;
     ends_search(step->watch, &other);
-    step->found[*step->filled] = end;
-    step->found[*step->filled].function = other.function;
-    step->found[*step->filled].direction = other.direction;
-    ++*step->filled;
+    other.t = end.t;
+    other.fraction = end.fraction;
+    copy_state(other.q, other.p, end.q, end.p);
+    step->found[(*step->filled)++] = other;
   }
   return status;
 }
 
-/* Sorts the crossings of one step by their fractions, as times may coincide, and drops those whose conditions are not
- * satisfied and those after the one that ends the search or changes the state. */
+/* Sorts the crossings of one step by their fractions, as times may coincide, and drops those after the one that ends
+ * the search or changes the state. */
 static int settle_crossings(const event_step *step, long long first)
 {
-  long long kept = first;
   for (long long i = first + 1; i < *step->filled; i++)
     for (long long k = i; k > first && step->found[k].fraction < step->found[k - 1].fraction; k--) {
       const event_crossing later = step->found[k - 1];
       step->found[k - 1] = step->found[k];
       step->found[k] = later;
     }
-  for (long long i = first; i < *step->filled; i++) {
-    const event_crossing *now = step->found + i;
-    int open, status = check_guards(step, now->function, now->t, now->q, now->p, &open);
-    if (status != OK)
-      return status;
-    if (open)
-      step->found[kept++] = *now;
-  }
-  *step->filled = kept;
   for (long long i = first; i < *step->filled; i++)
     if (ends_search(step->watch, step->found + i))
       return keep_coincident(step, i);
@@ -613,21 +698,23 @@ int NAME(crossings)(event_watch *watch, long long count, const real *h, const re
     const real *p, const real *parameters, const solver_options *options, long long room,
     event_crossing *found, long long *filled, solver_report *report, real *workspace)
 {
-  EVENT_MEMORY(watch, memory, 7 * M)
-  event_sample left, right;
+  EVENT_MEMORY(watch, memory, 9 * M)
+  event_sample left, right, horizon = {.q = memory + 7 * M, .p = memory + 8 * M};
   memset(report, 0, sizeof *report);
   *filled = 0;
   for (long long k = 0; k < count && !watch->ended; k++) {
     const long long start = k > 0 ? k - 1 : 0, first = *filled;
     const event_step step = {t[start], h[start], h[start], q + start * M, p + start * M, parameters, options, watch,
-        found, room, filled, report, workspace, memory};
+        found, room, filled, report, workspace, memory, memory + 9 * M, &horizon};
     int status;
     report->t = t[start];
     right.fraction = k > 0 ? 1.0 : 0.0;
     right.t = t[k];
     right.q = (real *)(q + k * M); /* not changed */
     right.p = (real *)(p + k * M);
-    status = evaluate_functions(&step, &right);
+    if (k > 0)
+      memcpy(values_at(&step, 0), values_at(&step, EVENT_DEGREE), BYTES(EVENTS));
+    status = evaluate_functions(&step, &right, values_at(&step, EVENT_DEGREE));
     if (status == OK && k > 0) {
       left.fraction = 0.0;
       status = search_step(&step, &left, &right);

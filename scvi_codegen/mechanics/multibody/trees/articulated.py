@@ -82,7 +82,7 @@ def dual_energy(tree: Tree) -> Expr:
     """
     inertias, biases = [], [zeros(6, 1) for _ in tree.links]
     for link in tree.links:
-        m, c = exact_number(link.inertia.mass), _cross_matrix(exact_vector(link.inertia.center))
+        m, c = exact_number(link.inertia.mass), exact_vector(link.inertia.center).hat()
         matrix = exact_matrix(link.inertia.matrix)
         inertias.append(Matrix([[matrix - m * c * c, m * c], [-m * c, m * eye(3)]]))
     terms: list[Expr] = []
@@ -120,7 +120,7 @@ def _degrees_of_freedom(tree: Tree, joint: Joint) -> Iterator[tuple[int, Expr]]:
 
 def _in_parent(tree: Tree, joint: Joint, inertia: Matrix, bias: Matrix) -> tuple[Matrix, Matrix]:
     """Return an inertia and a bias in the frame of the parent."""
-    arm = _cross_matrix(tree.origin(joint))
+    arm = tree.origin(joint).hat()
     angular, mixed, linear = (
         _turned_twice(tree, joint, block) for block in (inertia[:3, :3], inertia[:3, 3:], inertia[3:, 3:])
     )
@@ -140,7 +140,3 @@ def _turned_twice(tree: Tree, joint: Joint, block: Matrix) -> Matrix:
 def _symmetric(matrix: Matrix) -> Matrix:
     """Return a symmetric matrix with the entries of its lower half in both."""
     return Matrix(*matrix.shape, lambda i, j: matrix[max(i, j), min(i, j)])
-
-
-def _cross_matrix(v: Matrix) -> Matrix:
-    return Matrix([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])

@@ -56,7 +56,9 @@ class Tree:
         links = self.links = aligned(named(without_fixed(links)))
         self.gravity = exact_vector(gravity)
         self.joints = {link.joint.name: link.joint for link in links}
-        self.moments, self.masses = self.first_moments()
+        self.masses = self.of_subtrees([exact_number(each.inertia.mass) for each in links])
+        self.weights = self.of_subtrees([exact_number(each.inertia.mass - each.inertia.lift[0]) for each in links])
+        self.moments = self.first_moments()
 
     def coordinate(self, joint: Joint) -> tuple[Expr, Expr]:
         """Return q and q_dot of a hinge or slide."""
@@ -90,17 +92,25 @@ class Tree:
         at = exact_vector(joint.pose.position)
         return at + exact_matrix(joint.pose.rotation)[:, 2] * self.displacement(joint) if joint.kind == "slide" else at
 
-    def first_moments(self) -> tuple[list[Matrix], list[Expr]]:
-        """Return the first moment and the mass of each subtree, in the frame of its root."""
-        moments = [exact_number(each.inertia.mass) * exact_vector(each.inertia.center) for each in self.links]
-        masses = [exact_number(each.inertia.mass) for each in self.links]
+    def of_subtrees(self, masses: list[Expr]) -> list[Expr]:
+        """Return the mass of each subtree from those of the links."""
+        for i in reversed(range(len(masses))):
+            if self.links[i].parent >= 0:
+                masses[self.links[i].parent] += masses[i]
+        return masses
+
+    def first_moments(self) -> list[Matrix]:
+        """Return the first moment of the weight of each subtree, in the frame of its root."""
+        moments = [
+            exact_number(each.mass) * exact_vector(each.center) - exact_vector(each.lift[1])
+            for each in (link.inertia for link in self.links)
+        ]
         for i in reversed(range(len(self.links))):
             parent, joint = self.links[i].parent, self.links[i].joint
             if parent >= 0:
-                moments[parent] += masses[i] * self.origin(joint) + self.turned(joint, moments[i])
+                moments[parent] += self.weights[i] * self.origin(joint) + self.turned(joint, moments[i])
                 moments[parent] = as_quantities(moments[parent])
-                masses[parent] += masses[i]
-        return moments, masses
+        return moments
 
     def kinetic_energy(self) -> Expr:
         """Return T; bases that are free contribute as in the docstring of the module."""
@@ -164,7 +174,7 @@ class Tree:
                 position = self.origin(joint)
                 if joint.kind == "free":
                     position = Matrix([symbol(name) for name in position_of(joint)])
-                place = self.masses[i] * position + self.turned(joint, self.moments[i])
+                place = self.weights[i] * position + self.turned(joint, self.moments[i])
                 terms.append(-self.gravity.dot(place))
             if joint.stiffness:
                 terms.append(
@@ -176,10 +186,6 @@ class Tree:
         """Return Rayleigh's function of the damping of joints."""
         return Add(*(self.quadratic(joint, joint.damping) for joint in self.joints.values()))
 
-    def single_coordinates(self) -> list[str]:
-        """Return the names of the coordinates of hinges and slides."""
-        return [each.name for each in self.joints.values() if each.kind in SINGLE and not each.follows]
-
     def arguments(self, actuated: Collection[str] | bool) -> dict[str, Any]:
         """Return arguments of :meth:`LagrangianSystem.from_sympy`: coordinates, rotations, lagrangian, forces.
 
@@ -189,7 +195,7 @@ class Tree:
         Raises:
             SystemDefinitionError: if a joint does not exist.
         """
-        singles = self.single_coordinates()
+        singles = [each.name for each in self.joints.values() if each.kind in SINGLE and not each.follows]
         driven = (singles if actuated else []) if isinstance(actuated, bool) else [*map(identifier, actuated)]
         for name in driven:
             if name not in singles:

@@ -104,8 +104,6 @@ class _MujocoModel:
         for frame in body.children("frame"):
             self.read(frame, link, at @ self.pose(frame), inherited)
         for inner in body.children("body"):
-            if inner.number("gravcomp", 0) != 0:
-                inner.refuse("has a gravity compensation, which is not read: remove gravcomp")
             pose = at @ self.pose(inner)
             self.places["body", inner.name] = (
                 self.add(inner, link, pose, inner.node.get("childclass", inherited)),
@@ -125,7 +123,8 @@ class _MujocoModel:
             self.links.append(Link(label, parent, self.joint(joint, label, place, frame, parent), Inertia()))
             parent, pose, anchor = len(self.links) - 1, Pose(), at
         carried = Joint(name=name, kind="fixed", pose=pose @ Pose(-anchor))
-        self.links.append(Link(name, parent, carried, self.inertia(body, inherited)))
+        inertia = self.inertia(body, inherited).compensated(body.number("gravcomp", 0))
+        self.links.append(Link(name, parent, carried, inertia))
         return len(self.links) - 1
 
     def contents(self, body: Element, *tags: str) -> Iterator[tuple[Element, Pose]]:

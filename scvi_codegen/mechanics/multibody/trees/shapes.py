@@ -14,10 +14,6 @@ def _ellipsoid(size: Sizes) -> tuple[float, Vector]:
     return 4 / 3 * np.pi * float(np.prod(size)), (squares.sum() - squares) / 5
 
 
-def _sphere(size: Sizes) -> tuple[float, Vector]:
-    return _ellipsoid(np.repeat(size[0], 3))
-
-
 def _box(size: Sizes) -> tuple[float, Vector]:
     squares = size**2
     return 8 * float(np.prod(size)), (squares.sum() - squares) / 3
@@ -40,7 +36,7 @@ def _capsule(size: Sizes) -> tuple[float, Vector]:
 
 
 SHAPES: dict[str, tuple[int, Callable[[Sizes], tuple[float, Vector]]]] = {
-    "sphere": (1, _sphere),
+    "sphere": (1, lambda size: _ellipsoid(np.repeat(size[0], 3))),
     "ellipsoid": (3, _ellipsoid),
     "box": (3, _box),
     "cylinder": (2, _cylinder),

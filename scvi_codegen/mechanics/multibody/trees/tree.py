@@ -40,25 +40,38 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class Inertia:
-    """Mass, center of mass and inertia matrix about the center of mass, in the axes of the link."""
+    """Mass, center of mass and inertia matrix about the center of mass, in the axes of the link.
+
+    Attributes:
+        lift: mass whose weight is compensated, and its first moment.
+    """
 
     mass: float = 0.0
     center: Vector = field(default_factory=lambda: np.zeros(3))
     matrix: Vector = field(default_factory=lambda: np.zeros((3, 3)))
+    lift: tuple[float, Vector] = field(default_factory=lambda: (0.0, np.zeros(3)))
 
     def seen_from(self, pose: Pose) -> Inertia:
         """Return the inertia in the frame in which its own frame has the given pose."""
         turned = pose.rotation @ self.matrix @ pose.rotation.T
-        return Inertia(self.mass, pose.position + pose.rotation @ self.center, turned)
+        lift = self.lift[0], self.lift[0] * pose.position + pose.rotation @ self.lift[1]
+        return Inertia(self.mass, pose.position + pose.rotation @ self.center, turned, lift)
 
     def scaled(self, factor: float) -> Inertia:
         """Return the inertia of a body of another density."""
-        return Inertia(self.mass * factor, self.center, self.matrix * factor)
+        return Inertia(
+            self.mass * factor, self.center, self.matrix * factor, (self.lift[0] * factor, self.lift[1] * factor)
+        )
+
+    def compensated(self, share: float) -> Inertia:
+        """Return the inertia of a body that gravity does not act on with a share of its mass."""
+        return replace(self, lift=(share * self.mass, share * self.mass * self.center))
 
     def __add__(self, other: Inertia) -> Inertia:
         mass = self.mass + other.mass
         center = (self.mass * self.center + other.mass * other.center) / mass if mass else self.center
-        return Inertia(mass, center, sum((each.about(center) for each in (self, other)), np.zeros((3, 3))))
+        lift = self.lift[0] + other.lift[0], self.lift[1] + other.lift[1]
+        return Inertia(mass, center, sum((each.about(center) for each in (self, other)), np.zeros((3, 3))), lift)
 
     def about(self, point: Vector) -> Vector:
         """Return the inertia matrix about a point (parallel axis theorem)."""

@@ -1,0 +1,66 @@
+"""Tangent vectors along consecutive steps of prescribed sizes, through events that change the state."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from scvi_codegen.errors import EventError
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.times import times_after
+from scvi_codegen.runtime.sensitivity.gradients import SAME_STEP_SIZE, forward
+from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
+
+
+def tangents_along(
+    stepper: Stepper,
+    state: Array,
+    t: Array,
+    h: Array,
+    tangents: Array,
+    parameters: Array,
+    options: SolverOptions | None = None,
+) -> tuple[Array, Array, Array]:
+    """Return the states at the ends of steps, and tangent vectors there.
+
+    Args:
+        stepper: the compiled stepper, with its events.
+        state: (2m,) initial state.
+        t, h: (n,) times and sizes of consecutive steps.
+        tangents: (count, variables) initial variations of (q, p, parameters, t, h).
+        parameters: values in order.
+        options: solver options.
+
+    Returns:
+        (n + 1, 2m) states, (n + 1, count, 2m) variations and (count, variables) final variations.
+
+    Raises:
+        EventError: if events end the run before the last step.
+        StateError: if derivatives through an event do not exist.
+        StepFailedError: if a step fails.
+    """
+    m, size, count = stepper.dimension, len(state), len(h)
+    if not stepper.changes_states:
+        starts, vectors = Starts.chain(state[:m], state[m:], t, h), np.zeros((count + 1, *tangents.shape))
+        vectors[0] = tangents
+        stepper._propagate(starts, vectors, parameters, options)
+        return np.concatenate([starts.q, starts.p], axis=1), vectors[..., :size], vectors[-1]
+    states, vectors = np.empty((count + 1, size)), np.empty((count + 1, len(tangents), size))
+    states[0], vectors[0] = state, tangents[:, :size]
+    others = np.flatnonzero(np.abs(np.diff(h)) > SAME_STEP_SIZE * np.abs(h[1:])) + 1
+    for first, last in pairwise([0, *others.tolist(), count]):
+        length, start = float(h[first]), states[first]
+        run = stepper._started(start[:m], start[m:], None, StepPlan(h=length), float(t[first]), parameters, options)
+        trajectory = run._recorded(last - first)
+        ends = times_after(float(t[first]), length, np.arange(1, last - first + 1))[0]
+        if trajectory.t[-1] < ends[-1] - 0.5 * length:
+            raise EventError(f"events end the run at t = {trajectory.t[-1]:g}, before its last time {ends[-1]:g}")
+        rows = np.searchsorted(trajectory.t, ends + SAME_STEP_SIZE * length, side="right") - 1
+        found, tangents = forward(trajectory, tangents)
+        states[first + 1 : last + 1] = np.concatenate([trajectory.q, trajectory.p], axis=1)[rows]
+        vectors[first + 1 : last + 1] = found[rows].transpose(0, 2, 1)
+    return states, vectors, tangents

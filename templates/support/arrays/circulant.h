@@ -1,0 +1,497 @@
+#ifndef SUPPORT_CIRCULANT_H
+#define SUPPORT_CIRCULANT_H
+
+#include <stdint.h>
+#include <stdlib.h>
+
+#include "arrays.h"
+#include "lattice_transform.h"
+
+/* Products with circulant matrices along an axis by fast Fourier transforms: convolutions
+ *
+ *   (C x)_i = sum_j c[j - i] x_j,  with the eigenvalues  L_k = sum_d c[d] exp(2 pi i k d / size),
+ *
+ * their powers and transposes, and forces of sums over pairs with c[d] = c[size - d],
+ *
+ *   f sum_(i<j) c[j - i] (x_i - x_j)^2 / 2:  f C x,  (C x)_i = sum_j c[j - i] (x_i - x_j),
+ *   L_k = sum_d c[d] (1 - cos(2 pi k d / size)) = 2 sum_d c[d] sin^2(pi k d / size).
+ *
+ * Of an axis of even size, the places 2 j and 2 j + 1 of a line are real and imaginary part of a line of half the size.
+ * From the transforms E, O of even and odd places follow the modes k and k + size/2, E + w O and E - w O with
+ * w = exp(-2 pi i k / size); the eigenvalue of the latter is the conjugate of L_(size/2 - k). Requires:
+ * lattice_transform.h, NAME(coordinates); PLANS, KINDS, SUM_VECTORS and STATES, the numbers of circulant matrices, of
+ * convolutions, of vectors of their values, and of vectors of a state. */
+
+enum {
+  PLAN = 7, /* numbers per place of an axis */
+  ALIGNMENT = 8,
+  WIDTH = (int)(sizeof(lanes) / sizeof(double)),
+  TRANSFORMED = 4 * GROUPS * WIDTH, /* numbers per coordinate: two complex arrays */
+  TRANSFORM_WORK = PLAN * PLANS + ALIGNMENT + TRANSFORMED + SUM_VECTORS * KINDS * STATES * GROUPS * WIDTH
+};
+
+/* Places of x: `outer` lines of `size` places with `inner` numbers each, from `start`. A power of a convolution, 0 for
+ * sums over pairs. */
+typedef struct {
+  long long start, outer, size, inner;
+  const double *coefficients;
+  int power, plan;
+} circulant;
+
+/* Coefficients that a plan was made for; roots of unity for both sizes; eigenvalues 0 to size/2, divided by the size,
+ * of even sizes by twice the size. */
+typedef struct {
+  double *usable, *coefficients, *re, *im;
+  roots of_half, of_size;
+} plan;
+
+/* Workspace: plans, aligned arrays, values of convolutions for `count` coordinates. */
+typedef struct {
+  const run_memory *run;
+  long long count;
+  double *plans;
+  lanes *spare, *sums;
+} transforms;
+
+static transforms transforms_in(const run_memory *run, double *memory, long long count)
+{
+  lanes *spare = (lanes *)(((uintptr_t)(memory + PLAN * PLANS * count) + 63) / 64 * 64);
+  const transforms of = {run, count, memory, spare, spare + 4 * GROUPS * count};
+  return of;
+}
+
+static transforms transforms_of(const run_memory *run, const problem *given)
+{
+  const long long count = NAME(coordinates)(given);
+  return transforms_in(run, run->work + (STATUS(WORK) - TRANSFORM_WORK) * count, count);
+}
+
+/* The plan of a circulant matrix. */
+static plan plan_at(double *memory, long long size)
+{
+  const long long half = size / 2;
+  double *re = memory + 1 + size, *im = re + half + 1, *next = im + half + 1;
+  const plan of = {memory, memory + 1, re, im, {next, next + half}, {next + 2 * half, next + 2 * half + size}};
+  return of;
+}
+
+/* Returns eigenvalue k of sums over pairs from the squares sin^2(pi j / size), which are those of j modulo size. */
+static double eigenvalue(const double *coefficients, const double *squares, long long k, long long size)
+{
+  double sum = 0.0;
+  for (long long d = 1, place = k; 2 * d <= size; d++) {
+    sum += (2 * d < size ? 4.0 : 2.0) * coefficients[d] * squares[place]; /* c[d] = c[size - d] */
+    place += k - (place + k < size ? 0 : size);
+  }
+  return sum;
+}
+
+/* Computes the eigenvalues of sums over pairs; returns 0 if C is not circulant or has a large prime factor. */
+static int find_eigenvalues_of_pairs(const plan *of, long long size)
+{
+  double *squares = of->of_size.sine;
+  int usable = can_be_transformed(size % 2 ? size : size / 2);
+  for (long long d = 1; 2 * d < size; d++)
+    usable &= of->coefficients[d] == of->coefficients[size - d];
+  for (long long j = 0; j < size && usable; j++)
+    squares[j] = sin(3.141592653589793 * (double)j / (double)size) * sin(3.141592653589793 * (double)j / (double)size);
+  for (long long k = 0; 2 * k <= size && usable; k++) {
+    of->re[k] = eigenvalue(of->coefficients, squares, k, size);
+    of->im[k] = 0.0;
+  }
+  return usable;
+}
+
+/* Computes the eigenvalues of a power of a convolution by a transform; those of symmetric coefficients are real, those
+ * of antisymmetric ones imaginary. */
+static void find_eigenvalues(const plan *of, const circulant *by, lanes *spare)
+{
+  const run_memory alone = {0};
+  const long long size = by->size;
+  const axis along = {0, 1, size, 1, of->of_size};
+  complex_lanes x = {spare, spare + GROUPS * size}, y = {spare + 2 * GROUPS * size, spare + 3 * GROUPS * size};
+  int even = 1, odd = of->coefficients[0] == 0.0;
+  for (long long d = 1; d < size; d++) {
+    even &= of->coefficients[d] == of->coefficients[size - d];
+    odd &= of->coefficients[d] == -of->coefficients[size - d];
+  }
+  for (long long j = 0; j < GROUPS * size; j++)
+    x.re[j] = lanes_of(of->coefficients[j % size]), x.im[j] = lanes_of(0.0);
+  transform(&alone, &along, &x, &y, size);
+  for (long long k = 0; 2 * k <= size; k++) {
+    const double re = odd ? 0.0 : *(const double *)&x.re[k];
+    const double im = even || k == 0 || 2 * k == size ? 0.0 : -*(const double *)&x.im[k];
+    of->re[k] = 1.0, of->im[k] = 0.0;
+    for (int power = 0; power < by->power; power++) {
+      const double last = of->re[k];
+      of->re[k] = last * re - of->im[k] * im;
+      of->im[k] = last * im + of->im[k] * re;
+    }
+  }
+}
+
+/* Makes the plan of a matrix unless it has these coefficients; not usable if pairs have to be summed. */
+static void make_plan(const plan *of, const circulant *by, lanes *spare)
+{
+  const long long size = by->size, half = size / 2;
+  const double unit = 1.0 / (double)(size % 2 ? size : 2 * size);
+  if (memcmp(of->coefficients, by->coefficients, sizeof(double) * (size_t)size) == 0)
+    return;
+  memcpy(of->coefficients, by->coefficients, sizeof(double) * (size_t)size);
+  *of->usable = by->power > 0 || find_eigenvalues_of_pairs(of, size);
+  if (*of->usable == 0.0)
+    return;
+  fill_roots(of->of_size, size, 0, size);
+  fill_roots(of->of_half, half, 0, half);
+  if (by->power > 0)
+    find_eigenvalues(of, by, spare);
+  for (long long k = 0; k <= half; k++)
+    of->re[k] *= unit, of->im[k] *= unit;
+}
+
+/* Multiplies the modes k and k + size/2 by their eigenvalues, from z_k and z_(half - k) of half the size. The imaginary
+ * parts of the eigenvalues are multiplied by `turn`: -1 for the transpose, 0 if they are 0. */
+static inline void multiply_modes(const plan *of, long long half, long long k, double turn, lanes *re, lanes *im,
+    lanes *other_re, lanes *other_im)
+{
+  const double c = of->of_size.cosine[k], s = of->of_size.sine[k], one = of->re[k], other = of->re[half - k];
+  const lanes even = *re + *other_re, even_i = *im - *other_im, odd = *im + *other_im, odd_i = *other_re - *re;
+  const lanes turned = c * odd - s * odd_i, turned_i = c * odd_i + s * odd;
+  const lanes sum = even + turned, sum_i = even_i + turned_i, rest = even - turned, rest_i = even_i - turned_i;
+  lanes low = one * sum, low_i = one * sum_i, high = other * rest, high_i = other * rest_i;
+  if (turn != 0.0) {
+    const double one_i = turn * of->im[k], other_i = -turn * of->im[half - k];
+    low -= one_i * sum_i, low_i += one_i * sum;
+    high -= other_i * rest_i, high_i += other_i * rest;
+  }
+  {
+    const lanes x = low + high, x_i = low_i + high_i, gap = low - high, gap_i = low_i - high_i;
+    const lanes y = c * gap + s * gap_i, y_i = c * gap_i - s * gap;
+    *re = x - y_i, *im = x_i + y;
+    *other_re = x + y_i, *other_im = y - x_i;
+  }
+}
+
+/* Multiplies the modes of this thread, of lines of half the size. */
+static inline void multiply_half_lines(const run_memory *run, const axis *along, const plan *of, double turn,
+    complex_lanes z, long long n)
+{
+  const long long half = along->size, modes = half / 2 + 1;
+  const section own = share_of(run, along->outer * modes);
+  for (int group = 0; group < GROUPS; group++)
+    for (long long at = own.first; at < own.end; at++) {
+      const long long k = at % modes, line = group * n + at / modes * half * along->inner;
+      const long long one = line + k * along->inner, other = line + (half - k) % half * along->inner;
+      for (long long b = 0; b < along->inner; b++)
+        multiply_modes(of, half, k, turn, z.re + one + b, z.im + one + b, z.re + other + b, z.im + other + b);
+    }
+}
+
+/* Multiplies the modes of this thread, of whole lines. */
+static void multiply_whole_lines(const run_memory *run, const axis *along, const plan *of, double turn, complex_lanes z,
+    long long n)
+{
+  const long long size = along->size;
+  const section own = share_of(run, along->outer * size);
+  for (int group = 0; group < GROUPS; group++)
+    for (long long at = own.first; at < own.end; at++) {
+      const long long k = at % size, mode = 2 * k <= size ? k : size - k, first = group * n + at * along->inner;
+      const double re = of->re[mode], im = turn * (mode == k ? of->im[mode] : -of->im[mode]);
+      for (long long i = first; i < first + along->inner; i++) {
+        const lanes x = z.re[i];
+        z.re[i] = re * x - im * z.im[i];
+        z.im[i] = re * z.im[i] + im * x;
+      }
+    }
+}
+
+/* Copies places of x to z, of axes of even size even and odd ones as real and imaginary parts. */
+static void take_lines(const run_memory *run, const axis *along, int halves, complex_lanes z, long long n,
+    const lanes *x, long long apart)
+{
+  const long long inner = along->inner;
+  const section own = share_of(run, along->outer * along->size);
+  for (int group = 0; group < GROUPS; group++)
+    for (long long place = own.first; place < own.end; place++) {
+      const long long at = group * n + place * inner, from = group * apart + (1 + halves) * place * inner;
+      for (long long b = 0; b < inner; b++)
+        z.re[at + b] = x[from + b], z.im[at + b] = halves ? x[from + inner + b] : lanes_of(0.0);
+    }
+  wait_at_barrier(run);
+}
+
+/* Copies z to places of y, or with factors f adds f z to them. */
+static void give_lines(const run_memory *run, const axis *along, int halves, complex_lanes z, long long n,
+    const lanes *factor, lanes *y, long long apart)
+{
+  const long long inner = along->inner;
+  const section own = share_of(run, along->outer * along->size);
+  for (int group = 0; group < GROUPS; group++)
+    for (long long place = own.first; place < own.end; place++) {
+      const long long at = group * n + place * inner, to = group * apart + (1 + halves) * place * inner;
+      for (long long b = 0; b < inner; b++) {
+        y[to + b] = factor ? y[to + b] + factor[group] * z.re[at + b] : z.re[at + b];
+        if (halves)
+          y[to + inner + b] = factor ? y[to + inner + b] + factor[group] * z.im[at + b] : z.im[at + b];
+      }
+    }
+  wait_at_barrier(run);
+}
+
+/* The plan of a matrix, made by one thread while the others wait. */
+static plan shared_plan(const transforms *in, const circulant *by)
+{
+  const plan of = plan_at(in->plans + by->plan * PLAN * in->count, by->size);
+  if (!in->run->thread_barrier || in->run->part == 0)
+    make_plan(&of, by, in->spare);
+  wait_at_barrier(in->run);
+  return of;
+}
+
+/* y = C x, for `turn` -1 the transpose, or with factors f adds f C x; groups of x and y are `apart` and `behind`
+ * numbers apart. */
+static void multiply_by_plan(const transforms *in, const circulant *by, const plan *of, double turn, const lanes *X,
+    long long apart, const lanes *factor, lanes *Y, long long behind)
+{
+  const run_memory *run = in->run;
+  const int halves = by->size % 2 == 0;
+  const long long size = halves ? by->size / 2 : by->size, n = by->outer * size * by->inner;
+  const axis along = {0, by->outer, size, by->inner, halves ? of->of_half : of->of_size};
+  complex_lanes x = {in->spare, in->spare + GROUPS * n}, z;
+  complex_lanes y = {in->spare + 2 * GROUPS * n, in->spare + 3 * GROUPS * n};
+  take_lines(run, &along, halves, x, n, X + by->start, apart);
+  transform(run, &along, &x, &y, n);
+  if (!halves)
+    multiply_whole_lines(run, &along, of, turn, x, n);
+  else if (by->power == 0)
+    multiply_half_lines(run, &along, of, 0.0, x, n);
+  else
+    multiply_half_lines(run, &along, of, turn, x, n);
+  wait_at_barrier(run);
+  z.re = x.im, z.im = x.re; /* the inverse transform exchanges the parts */
+  x = y, y.re = x.im, y.im = x.re;
+  transform(run, &along, &z, &y, n);
+  x.re = z.im, x.im = z.re;
+  give_lines(run, &along, halves, x, n, factor, Y + by->start, behind);
+}
+
+#ifdef PAIRS
+/* Adds the forces f C x of a sum over pairs, or its diagonal, if X is NULL, to F, whose groups are n numbers apart; x:
+ * groups `apart`. Returns 0 if the pairs have to be summed. */
+static int add_pairs(const transforms *in, const circulant *by, const lanes *X, long long apart, const lanes *factor,
+    lanes *F, long long n)
+{
+  const plan of = shared_plan(in, by);
+  const section own = share_of(in->run, by->outer * by->size * by->inner);
+  double sum = 0.0;
+  if (*of.usable == 0.0)
+    return 0;
+  if (X) {
+    multiply_by_plan(in, by, &of, 0.0, X, apart, factor, F, n);
+    return 1;
+  }
+  for (long long d = 1; d < by->size; d++)
+    sum += by->coefficients[d];
+  for (int group = 0; group < GROUPS; group++)
+    for (long long i = own.first; i < own.end; i++)
+      F[group * n + by->start + i] += sum * factor[group];
+  wait_at_barrier(in->run);
+  return 1;
+}
+
+/* Adds f x C x of a line, whose transform is in every width-th number of re and im, from the squares of its modes. */
+static void add_squares(const plan *of, long long size, long long width, const double *re, const double *im,
+    double factor, compensated *total)
+{
+  const long long half = size / 2;
+  for (long long k = 0; size % 2 && k <= half; k++) {
+    const double square = re[k * width] * re[k * width] + im[k * width] * im[k * width];
+    add_to_sum(total, (k == 0 ? factor : 2.0 * factor) * of->re[k] * square);
+  }
+  for (long long k = 0; size % 2 == 0 && 2 * k <= half; k++) {
+    const long long one = k * width, other = (half - k) % half * width;
+    const double c = of->of_size.cosine[k], s = of->of_size.sine[k];
+    const double even = re[one] + re[other], even_i = im[one] - im[other];
+    const double odd = im[one] + im[other], odd_i = re[other] - re[one];
+    const double turned = c * odd - s * odd_i, turned_i = c * odd_i + s * odd;
+    const double low = (even + turned) * (even + turned) + (even_i + turned_i) * (even_i + turned_i);
+    const double high = (even - turned) * (even - turned) + (even_i - turned_i) * (even_i - turned_i);
+    const double twice = k == 0 || 2 * k == half ? 0.5 * factor : factor; /* the modes k and size - k */
+    add_to_sum(total, twice * of->re[k] * low);
+    add_to_sum(total, twice * of->re[half - k] * high);
+  }
+}
+
+/* Adds f x C x to a sum, by transforms of several lines at a time; returns 0 if the pairs have to be summed. */
+static int add_energy(const circulant *by, const double *x, double factor, compensated *total)
+{
+  const int halves = by->size % 2 == 0;
+  const long long size = by->size, places = halves ? size / 2 : size;
+  double *memory = calloc((size_t)((PLAN * PLANS + TRANSFORMED) * size + ALIGNMENT), sizeof(double));
+  const run_memory alone = {0};
+  const transforms in = transforms_in(&alone, memory, size);
+  complex_lanes z = {in.spare, in.spare + GROUPS * places};
+  complex_lanes y = {z.re + 2 * GROUPS * places, z.im + 2 * GROUPS * places};
+  const plan of = plan_at(memory, size);
+  const axis along = {0, 1, places, 1, halves ? of.of_half : of.of_size};
+  if (memory)
+    make_plan(&of, by, in.spare);
+  if (!memory || *of.usable == 0.0) {
+    free(memory);
+    return 0;
+  }
+  for (long long first = 0; first < by->outer * by->inner; first += GROUPS * WIDTH) {
+    const long long count = between(0, by->outer * by->inner - first, GROUPS * WIDTH);
+    for (long long k = 0; k < count; k++) {
+      const long long row = (first + k) / by->inner * size, column = by->start + (first + k) % by->inner;
+      const long long at = k / WIDTH * places * WIDTH + k % WIDTH;
+      for (long long j = 0; j < places; j++) {
+        const long long here = (row + (1 + halves) * j) * by->inner + column;
+        ((double *)z.re)[at + j * WIDTH] = x[here];
+        ((double *)z.im)[at + j * WIDTH] = halves ? x[here + by->inner] : 0.0;
+      }
+    }
+    transform(&alone, &along, &z, &y, places);
+    for (long long k = 0; k < count; k++) {
+      const long long at = k / WIDTH * places * WIDTH + k % WIDTH;
+      add_squares(&of, size, WIDTH, (const double *)z.re + at, (const double *)z.im + at, factor, total);
+    }
+  }
+  free(memory);
+  return 1;
+}
+
+#endif
+
+#ifdef MOST_STAGES
+/* Values of all convolutions of a state and of a direction, and derivatives with respect to them, at a group of points;
+ * `length` numbers each. */
+typedef struct {
+  const lanes *values, *along;
+  lanes *transposed;
+  long long length;
+} images;
+
+/* Convolution number `number`: products with circulant matrices, one after the other. Derivatives with respect to those
+ * with target = 1 are added to the forces. */
+typedef struct {
+  int number, target, count;
+  circulant stages[MOST_STAGES];
+} convolution;
+
+static void describe_convolutions(const problem *given, convolution *all);
+
+/* The values of a state are vector 0, derivatives vector 1, values of a direction vector 2. */
+static lanes *sums_at(const transforms *in, int vector, int group)
+{
+  return in->sums + (vector * GROUPS + group) * KINDS * STATES * in->count;
+}
+
+static images images_at(const transforms *in, int group)
+{
+  const images of = {sums_at(in, 0, group), sums_at(in, 2, group), sums_at(in, 1, group), STATES * in->count};
+  return of;
+}
+
+static void multiply_by_circulant(const transforms *in, const circulant *by, double turn, const lanes *X,
+    long long apart, const lanes *factor, lanes *Y, long long behind)
+{
+  const plan of = shared_plan(in, by);
+  multiply_by_plan(in, by, &of, turn, X, apart, factor, Y, behind);
+}
+
+/* Computes all convolutions of x, whose groups are `apart` numbers apart, for a vector. */
+static void find_sums(const transforms *in, const problem *given, int vector, const lanes *x, long long apart)
+{
+  const long long length = STATES * in->count;
+  convolution all[CONVOLUTIONS];
+  describe_convolutions(given, all);
+  for (const convolution *one = all; one < all + CONVOLUTIONS; one++) {
+    lanes *into = sums_at(in, vector, 0) + one->number * length;
+    for (int k = 0; k < one->count; k++)
+      multiply_by_circulant(in, &one->stages[k], 1.0, k ? into : x, k ? KINDS * length : apart, NULL, into,
+          KINDS * length);
+  }
+}
+
+/* Sets the derivatives to 0, each thread its own part. */
+static void clear_transposed(const transforms *in)
+{
+  const section own = share_of(in->run, KINDS * STATES * in->count);
+  for (int group = 0; group < GROUPS; group++)
+    memset(sums_at(in, 1, group) + own.first, 0, sizeof(lanes) * (size_t)(own.end - own.first));
+  wait_at_barrier(in->run);
+}
+
+/* Adds the transposed convolutions of the derivatives to F, whose groups are n numbers apart. */
+static void add_transposed(const transforms *in, const problem *given, lanes *F, long long n)
+{
+  const long long length = STATES * in->count;
+  lanes factor[GROUPS];
+  convolution all[CONVOLUTIONS];
+  describe_convolutions(given, all);
+  for (int group = 0; group < GROUPS; group++)
+    factor[group] = lanes_of(1.0);
+  for (const convolution *one = all; one < all + CONVOLUTIONS; one++) {
+    lanes *from = sums_at(in, 1, 0) + one->number * length;
+    for (int k = one->count - 1; k >= 0 && one->target; k--)
+      multiply_by_circulant(in, &one->stages[k], -1.0, from, KINDS * length, k ? NULL : factor, k ? from : F,
+          k ? KINDS * length : n);
+  }
+}
+
+#ifdef DIAGONALS
+/* Adds the diagonal of C^T D C to F, for each C of mean squares of its entries times the derivatives D. */
+static void add_diagonals(const transforms *in, const problem *given, lanes *F, long long n)
+{
+  const long long length = STATES * in->count;
+  convolution all[CONVOLUTIONS];
+  describe_convolutions(given, all);
+  for (const convolution *one = all; one < all + CONVOLUTIONS; one++) {
+    const circulant *by = one->stages;
+    const section own = share_of(in->run, by->outer * by->size * by->inner);
+    double square = 1.0;
+    for (int k = 0; k < one->count; k++) {
+      const plan of = shared_plan(in, by + k);
+      const long long size = by[k].size;
+      double sum = 0.0; /* of |L_j|^2 / size^2, of even sizes divided by 4 */
+      for (long long j = 0; 2 * j <= size; j++)
+        sum += (j == 0 || 2 * j == size ? 1.0 : 2.0) * (of.re[j] * of.re[j] + of.im[j] * of.im[j]);
+      square *= (double)size * (size % 2 ? sum : 4.0 * sum);
+    }
+    for (int group = 0; group < GROUPS && one->target; group++)
+      for (long long i = by->start + own.first; i < by->start + own.end; i++)
+        F[group * n + i] += square * sums_at(in, 1, group)[one->number * length + i];
+  }
+  wait_at_barrier(in->run);
+}
+
+#endif
+
+/* Returns all convolutions of a single state in new memory, NULL without memory. */
+static double *sums_of_state(const problem *given, const double *q)
+{
+  const long long count = NAME(coordinates)(given), length = STATES * count;
+  const run_memory alone = {0};
+  double *memory = calloc((size_t)(TRANSFORM_WORK * count + ALIGNMENT), sizeof(double));
+  double *state = malloc(sizeof(double) * (size_t)(length * (GROUPS * WIDTH + KINDS) + ALIGNMENT));
+  const transforms in = transforms_in(&alone, memory, count);
+  lanes *x = (lanes *)(((uintptr_t)state + 63) / 64 * 64);
+  double *values = state;
+  if (memory && state) {
+    for (int group = 0; group < GROUPS; group++)
+      for (long long i = 0; i < length; i++)
+        x[group * length + i] = lanes_of(q[i]);
+    find_sums(&in, given, 0, x, length);
+    for (long long i = 0; i < KINDS * length; i++)
+      values[i] = *(const double *)&sums_at(&in, 0, 0)[i];
+  } else {
+    free(state);
+    values = NULL;
+  }
+  free(memory);
+  return values;
+}
+#endif
+
+#endif

@@ -1,0 +1,91 @@
+"""Spin of axially symmetric bodies by an exact turn, compared with the same bodies with three symbols for moments."""
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.mechanics.rotations.axial import axial_turns
+from scvi_codegen.mechanics.rotations.hamiltonian import hamiltonian_of_rotations
+
+KINETIC = "(A*(omega_1**2 + omega_2**2) + C*omega_3**2)/2"
+THREE = "(A*omega_1**2 + B*omega_2**2 + C*omega_3**2)/2"
+START = {"R": [0.9, 0.3, -0.2, 0.1]}
+OMEGA = {"omega": [0.4, -0.7, 6.0]}
+
+
+def body(lagrangian, **arguments):
+    given = {"parameters": {"A": 1.0, "C": 0.5, "w": 1.0}, "rotations": {"R": "omega"}} | arguments
+    return sc.LagrangianSystem.from_text("top", lagrangian=lagrangian, **given)
+
+
+def three(potential="w*R_33"):
+    return body(f"{THREE} - {potential}", parameters={"A": 1.0, "B": 1.0, "C": 0.5, "w": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("lagrangian", "arguments", "axes"),
+    [
+        (f"{KINETIC} - w*R_33", {}, [2]),
+        (f"{KINETIC} - w*(R_13**2 + R_33)*sin(R_23)", {}, [2]),
+        (f"{KINETIC} - w*R_31", {}, []),
+        (f"{KINETIC} - w*(R_31**2 + R_32**2 + R_33)", {}, [2]),  # R_31^2 + R_32^2 = 1 - R_33^2
+        ("(A*omega_1**2 + C*(omega_2**2 + omega_3**2))/2 - w*R_21", {}, [0]),
+        ("(omega_1**2 + omega_2**2/4 + omega_3**2)/2 - w*R_32", {"parameters": {"w": 1.0}}, [1]),
+        ("A*(omega_1**2 + omega_2**2 + omega_3**2)/2 - w*R_33", {"parameters": {"A": 1.0, "w": 1.0}}, []),
+        (f"{KINETIC} - w*R_33", {"torques": {"R": ["-A*omega_1", "0", "0"]}}, []),
+        (f"{KINETIC} - w*R_33", {"damping": 0.1}, []),
+    ],
+)
+def test_axes_of_symmetry(lagrangian, arguments, axes):
+    system = hamiltonian_of_rotations(body(lagrangian, **arguments))
+    core, turns = axial_turns(system)
+    assert [turn.axis for turn in turns] == axes
+    assert (core is system) == (not axes)
+
+
+@pytest.mark.parametrize("solver", ["auto", pytest.param("newton", marks=pytest.mark.full)])
+def test_a_symmetric_top_moves_as_one_with_three_moments(solver):
+    ours, other = (sc.compile_stepper(each, "svi:6", solver=solver) for each in (body(f"{KINETIC} - w*R_33"), three()))
+    run, expected = (each.integrate(START, velocity=OMEGA, h=0.1, steps=40) for each in (ours, other))
+    np.testing.assert_allclose(run.q, expected.q, rtol=0, atol=3e-10)
+    np.testing.assert_allclose(run.p, expected.p, rtol=0, atol=3e-9)
+    if solver == "auto":
+        assert run.iterations.sum() < 0.8 * expected.iterations.sum()  # the predictor turns with the body
+    q, p = run.q[-1], run.p[-1]
+    np.testing.assert_allclose(ours.jacobian(q, p, 0.05), other.jacobian(q, p, 0.05), rtol=0, atol=1e-10)
+    momentum = run.angular_momentum()[:, 2]
+    assert abs(momentum - momentum[0]).max() < 1e-13 * abs(momentum[0])
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_order_of_steps_with_turns(degree):
+    stepper, exact = (
+        sc.compile_stepper(body(f"{KINETIC} - w*R_33"), sc.SVI(degree)),
+        sc.compile_stepper(three(), "svi:8"),
+    )
+    end = exact.integrate(START, velocity=OMEGA, h=0.02, steps=50).rotation()[-1]
+    errors = [
+        abs(stepper.integrate(START, velocity=OMEGA, h=1 / n, steps=n).rotation()[-1] - end).max() for n in (20, 40)
+    ]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2 * degree, abs=0.15)
+
+
+@pytest.mark.full
+def test_steps_with_turns_backward_at_other_times_and_with_adaptive_steps():
+    ours, other = (sc.compile_stepper(each, "svi:8") for each in (body(f"{KINETIC} - w*R_33"), three()))
+    run, expected = (each.integrate(START, velocity=OMEGA, t_end=5.0, tolerance=1e-12) for each in (ours, other))
+    assert len(run.t) < 0.8 * len(expected.t)
+    np.testing.assert_allclose(run.at(3.3)[0], expected.at(3.3)[0], rtol=0, atol=1e-11)
+    there = ours.integrate(START, velocity=OMEGA, h=0.2, steps=20)
+    back = ours.integrate(there.q[-1], there.p[-1], h=-0.2, steps=20)
+    np.testing.assert_allclose(back.q[-1], there.q[0], rtol=0, atol=1e-13)
+
+
+@pytest.mark.full
+def test_energy_of_a_symmetric_top_over_many_steps():
+    stepper = sc.compile_stepper(body(f"{KINETIC} - w*R_33"), "svi:4")
+    run = stepper.integrate(START, velocity=OMEGA, h=0.1, steps=10**6, save_every=1000)
+    energies = np.array([stepper.energy(q, p) for q, p in zip(run.q, run.p, strict=True)])
+    error = abs(energies / energies[0] - 1)
+    assert error[-100:].max() < 2 * error[:100].max() + 1e-13

@@ -1,0 +1,160 @@
+"""Explicit splitting of rigid bodies: free rotation in closed form between kicks by potentials and torques."""
+
+import numpy as np
+import pytest
+from samples import QUICK_FLAGS
+from scipy.spatial.transform import Rotation
+from tops import lagrange_top
+
+import scvi_codegen as sc
+from scvi_codegen.errors import MethodError
+from scvi_codegen.runtime.rotations.reduction import Reduction
+
+ATTITUDE = Rotation.from_euler("ZXZ", [0.3, 0.8, -0.4])
+OMEGA = np.array([0.7, -0.4, 4.5])
+TOP = sc.LagrangianSystem.from_text(
+    "top", rotations={"R": "omega"}, lagrangian="omega_1**2 + omega_2**2 + omega_3**2/2 - 3*R_33/2"
+)
+FREE = "a*omega_1**2/2 + omega_2**2 + omega_3**2/2 + x_dot**2/2"
+PARAMETERS = {"a": 3.0}
+COUPLED = sc.LagrangianSystem.from_text(
+    "body and mass",
+    ["x"],
+    FREE + " - x**2/2 - x*R_33 - cos(t)*R_12*R_31",
+    rotations={"R": "omega"},
+    parameters=PARAMETERS,
+    torques={"R": ["x", "R_13", "sin(t)/3"]},
+)
+CANONICAL = sc.HamiltonianSystem.from_text(
+    "body and mass, canonical",
+    ["x"],
+    "Pi_1**2/(2*a) + Pi_2**2/4 + Pi_3**2/2 + p_x**2/2 + x**2/2 + x*R_33 + R_12*R_31",
+    rotations={"R": "Pi"},
+    parameters=PARAMETERS,
+)
+AUTONOMOUS = sc.LagrangianSystem.from_text(
+    "body and mass, autonomous",
+    ["x"],
+    FREE + " - x**2/2 - x*R_33 - R_12*R_31",
+    rotations={"R": "omega"},
+    parameters=PARAMETERS,
+)
+
+
+def compiled(system, method, **how):
+    return sc.compile_stepper(system, method, flags=QUICK_FLAGS, **how)
+
+
+def test_orders_against_elliptic_functions():
+    matrix, _ = lagrange_top((2, 1), 1.5, (0.3, 0.8, -0.4), OMEGA, 1.0)
+    for method, order, counts in (("stoermer-verlet", 2, (30, 60)), ("composition:8", 8, (4, 6))):
+        stepper = compiled(TOP, method)
+        assert stepper.interface.solver == "explicit"
+        runs = [
+            stepper.integrate({"R": ATTITUDE}, velocity={"omega": OMEGA}, h=1 / n, steps=n, save_every=n)
+            for n in counts
+        ]
+        first, second = (np.abs(run.rotation()[-1] - matrix).max() for run in runs)
+        assert second < 1e-4
+        assert np.log(first / second) / np.log(counts[1] / counts[0]) == pytest.approx(order, abs=0.5)
+
+
+def test_a_symmetric_body_rotates_exactly_in_a_step_of_any_size():
+    system = sc.LagrangianSystem.from_text(
+        "free", rotations={"R": "omega"}, lagrangian="(omega_1**2 + 2*omega_2**2 + 2*omega_3**2)/2"
+    )
+    stepper, momentum = compiled(system, "stoermer-verlet"), OMEGA * (1, 2, 2)
+    for h in (0.05, 0.2, 7.0):
+        run = stepper.integrate({"R": ATTITUDE}, velocity={"omega": OMEGA}, h=h, steps=1)
+        common, own = Rotation.from_rotvec(momentum * h / 2), Rotation.from_rotvec([momentum[0] * h / 2, 0, 0])
+        np.testing.assert_allclose(run.rotation()[-1], (ATTITUDE * common * own).as_matrix(), rtol=0, atol=3e-14)
+        np.testing.assert_allclose(run.angular_velocity()[-1], own.inv().apply(OMEGA), rtol=0, atol=3e-14)
+
+
+@pytest.fixture(scope="module")
+def moving():
+    """Return the stepper of the autonomous system by leapfrog, and a run of 20,000 steps."""
+    stepper = compiled(AUTONOMOUS, "stoermer-verlet")
+    start = {"x": 0.5, "R": ATTITUDE}
+    return stepper, stepper.integrate(start, velocity={"x": 0.2, "omega": [0.7, -0.4, 1.5]}, h=0.05, steps=20_000)
+
+
+def test_steps_are_symplectic_reversible_and_keep_the_gauge(moving):
+    stepper, run = moving
+    reduction = Reduction(stepper.interface)
+    inward, outward = reduction.inward(run.q, run.p), reduction.outward(run.q, run.p)
+    step = outward[8] @ stepper.jacobian(run.q[7], run.p[7], 0.05) @ inward[7]
+    n = reduction.size // 2
+    form = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
+    np.testing.assert_allclose(step.T @ form @ step, form, rtol=0, atol=3e-14)
+    back = stepper.step(*stepper.step(run.q[7], run.p[7], 0.05), -0.05)
+    np.testing.assert_allclose(np.ravel(back), np.ravel([run.q[7], run.p[7]]), rtol=0, atol=1e-14)
+    assert np.abs(np.sum(run.q[:, 1:] ** 2, axis=1) - 1).max() < 1e-12
+    assert np.abs(np.sum(run.q[:, 1:] * run.p[:, 1:], axis=1)).max() < 1e-12
+
+
+def test_energy_does_not_drift(moving):
+    error = np.abs(moving[1].energy() - moving[1].energy()[0])
+    assert error[-2000:].max() < 1.3 * error[:2000].max() < 0.01
+
+
+@pytest.mark.full
+def test_energy_does_not_drift_over_a_million_steps():
+    run = compiled(TOP, "composition:8").integrate(
+        {"R": ATTITUDE}, velocity={"omega": OMEGA}, h=0.1, steps=1_000_000, save_every=10
+    )
+    error = np.abs(run.energy() / run.energy()[0] - 1)
+    assert error[-10_000:].max() < 1.5 * error[:10_000].max() + 1e-13
+    vertical = run.angular_momentum()[:, 2]
+    assert np.abs(vertical / vertical[0] - 1).max() < 1e-12
+
+
+def test_explicit_steps_with_time_dependent_torques_solve_the_stage_equations():
+    state = {"x": 0.5, "R": ATTITUDE}, {"x": 0.2, "omega": [0.7, -0.4, 1.5]}
+    ends = []
+    for solver in ("explicit", "newton"):
+        run = compiled(COUPLED, "composition:2", solver=solver).integrate(
+            state[0], velocity=state[1], h=0.1, steps=3, parameters={"a": 2.5}
+        )
+        ends.append(np.ravel([run.q[-1], run.p[-1]]))
+    np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-14)
+
+
+def test_hamiltonians_with_rotations_have_the_same_steps(moving):
+    _, run = moving
+    q, p = compiled(CANONICAL, "stoermer-verlet").step(run.q[0], run.p[0], 0.05)
+    np.testing.assert_allclose(np.ravel([q, p]), np.ravel([run.q[1], run.p[1]]), rtol=0, atol=1e-15)
+
+
+def test_arrays_of_bodies_move_as_by_an_implicit_method():
+    body = "2*omega_1[i]**2 + J[i]*omega_2[i]**2 + 2*omega_3[i]**2 + x_dot[i]**2/2 - x[i]*R_33[i]"
+    system = sc.LagrangianSystem.from_text(
+        name="bodies",
+        coordinates=["x[N]"],
+        lagrangian=f"sum(i in N, {body}) - sum(i < j in N, R_13[i]*R_13[j] + x[i]*x[j]/2)",
+        parameters={"J[N]": 1},
+        rotations={"R[N]": "omega"},
+    )
+    start = {"x": [0.3, -0.2], "R": [[1, 0.2, 0, 0.3], [0.5, 0.5, -0.1, 0]]}
+    moving = {"x": [0, 0.1], "omega": [[0.7, -0.4, 1.5], [0.2, 1.0, -0.3]]}
+    ends = []
+    for method, steps in (("composition:8", 10), ("svi:6", 4)):
+        stepper = compiled(system, method)
+        run = stepper.integrate(start, velocity=moving, parameters={"J": [1, 3]}, h=0.4 / steps, steps=steps)
+        ends.append(run.rotation()[-1])
+    np.testing.assert_allclose(*ends, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("lagrangian", "reason"),
+    [
+        ("(omega_1**2 + omega_2**2 + omega_3**2)/2 + omega_1*omega_2/4", "couples angular velocities"),
+        ("(omega_1**2 + omega_2**2 + omega_3**2 + x_dot**2)/2 + x_dot*omega_1/4", "couples angular velocities"),
+        ("(omega_1**2 + omega_2**2 + omega_3**2)/2 + R_13*omega_1", "not a quadratic form"),
+        ("(omega_1**2 + omega_2**2 + (2 + x**2)*omega_3**2)/2", "masses that vary"),
+    ],
+)
+def test_other_kinetic_energies_are_refused_with_the_reason(lagrangian, reason):
+    system = sc.LagrangianSystem.from_text("other", ["x"], lagrangian + " + x_dot**2/2", rotations={"R": "omega"})
+    with pytest.raises(MethodError, match=reason):
+        compiled(system, "composition:8")

@@ -1,0 +1,169 @@
+"""Events of arrays of run-time sizes: a function for each element of loops, without a limit of size."""
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import EventError
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.runtime.events import detection
+from scvi_codegen.runtime.events.event import Event, impact
+from scvi_codegen.verification.certificate import Outcome
+
+FLAGS = ("-O1",)
+GAS = LagrangianSystem.from_text(
+    name="gas",
+    coordinates=["r[N, 2]"],
+    lagrangian="sum(i in N, (r_dot[i, 0]**2 + r_dot[i, 1]**2)/2 + 0*d)",
+    parameters={"d": 0.25},
+)
+CHAIN = LagrangianSystem.from_text(
+    name="chain",
+    coordinates=["q[N]"],
+    parameters={"m": 1.5, "e": 0.9, "b": 0.1},
+    lagrangian="sum(i in N, m*q_dot[i]**2/2 + 0*(e+b)) - sum(i in N-1, (q[i+1] - q[i])**2/2 + (q[i+1] - q[i])**4/20)",
+)
+BOX = [impact("r[i, k] for i in N, k in 2"), impact("1 - r[i, k] for i in N, k in 2")]
+
+
+@pytest.fixture(scope="module")
+def gas():
+    return compile_stepper(GAS, "svi:1", flags=FLAGS)
+
+
+def folded(r, v, t):
+    """Position between walls at 0 and 1 of a point that is reflected."""
+    return np.abs((r + v * t + 1.0) % 2.0 - 1.0)
+
+
+def test_a_box_of_particles(gas):
+    """Each particle is reflected by itself; elements are numbered along the loops."""
+    random = np.random.default_rng(2)
+    r, v = random.random((40, 2)), random.normal(size=(40, 2))
+    run = gas.integrate({"r": r}, velocity={"r": v}, h=0.05, steps=20, events=BOX)
+    assert np.abs(run.q["r"][-1] - folded(r, v, 1.0)).max() < 1e-14
+    low, high = np.floor(r + v).reshape(-1) < 0, np.floor(r + v).reshape(-1) > 0
+    assert set(np.flatnonzero(low)) <= set(run.events[0].element)
+    assert set(np.flatnonzero(high)) <= set(run.events[1].element)
+    for each, wall in zip(run.events, (0.0, 1.0), strict=True):
+        places = np.asarray(each.q)[np.arange(len(each)), each.element]
+        assert np.abs(places - wall).max() < 1e-14
+    assert abs(np.sum(run.p["r"][-1] ** 2) / np.sum(v**2) - 1.0) < 1e-14
+
+
+def test_a_restored_run_continues_with_its_events(gas):
+    run = gas.with_events(BOX).start({"r": [[0.3, 0.6], [0.8, 0.2]]}, velocity={"r": [[0.5, -0.3], [1.0, 0.7]]}, h=0.1)
+    run.advance(20)
+    restored = gas.with_events(BOX).from_checkpoint(run.checkpoint())
+    one, two = run.record(20), restored.record(20)
+    assert np.array_equal(one.q["r"], two.q["r"])
+    assert sum(len(each) for each in two.events) == sum(len(each) for each in one.events) > 0
+
+
+def test_discs_exchange_momentum_in_pairs(gas):
+    """Hard discs: energy and momentum are those of the start, and every crossing is that of the pair it names."""
+    random = np.random.default_rng(4)
+    r, v = np.stack(np.meshgrid(*[np.arange(3.0) / 2] * 2), -1).reshape(-1, 2), random.normal(size=(9, 2))
+    discs = impact("(r[i, 0] - r[j, 0])**2 + (r[i, 1] - r[j, 1])**2 - d**2 for i < j in N")
+    run = gas.integrate({"r": r}, velocity={"r": v}, h=0.03, steps=150, events=discs)
+    (each,), pairs = run.events, np.transpose(np.triu_indices(9, 1))
+    assert len(each) > 2
+    q = np.asarray(each.q).reshape(-1, 9, 2)
+    i, j = pairs[each.element].T
+    gaps = q[np.arange(len(q)), i] - q[np.arange(len(q)), j]
+    assert np.abs(np.hypot(*gaps.T) - 0.25).max() < 1e-13
+    p = run.p["r"][-1]
+    assert np.abs(p.sum(axis=0) - v.sum(axis=0)).max() < 1e-14
+    assert abs(np.sum(p**2) / np.sum(v**2) - 1.0) < 1e-14
+
+
+def test_more_impacts_in_a_step_than_memory_for_them(gas, monkeypatch):
+    """A step whose crossings do not fit is repeated: 20 impacts at different times in one step, and memory for 8."""
+    monkeypatch.setattr(detection, "INITIAL_CAPACITY", 8)
+    r = np.column_stack([np.linspace(0.01, 0.4, 20), np.full(20, 0.5)])
+    v = np.tile([-1.0, 0.0], (20, 1))
+    run = gas.integrate({"r": r}, velocity={"r": v}, h=0.5, steps=2, save_every=2, events=BOX)
+    assert len(run.events[0]) == 20
+    assert np.abs(run.q["r"][-1] - folded(r, v, 1.0)).max() < 1e-14
+
+
+def test_an_event_of_every_element_equals_events_of_entries():
+    """Conditions, maps of velocities and restitution in loops, their derivatives, and adaptive steps."""
+    stepper, n = compile_stepper(CHAIN, "svi:4", flags=FLAGS), 4
+    known = stepper.with_sizes(N=n)
+    q, v = np.linspace(0.2, 1.0, n), np.cos(3.0 * np.arange(n))
+    loops = [
+        impact("13/10 + b - q[i] for i in N", "e", where="q_dot[i] > q[0]/9"),
+        Event("q[i] + 1/2 for i in 1..N-1", -1, then={"q_dot[i]": "-e*q_dot[i] + q[i-1]/99"}, where="q[i] < 3"),
+    ]
+    single = [impact(f"13/10 + b - q_{i}", "e", where=f"q_{i}_dot > q_0/9") for i in range(n)]
+    single += [
+        Event(f"q_{i} + 1/2", -1, then={f"q_{i}_dot": f"-e*q_{i}_dot + q_{i - 1}/99"}, where=f"q_{i} < 3")
+        for i in range(1, n)
+    ]
+    for plan in ({"h": 0.1, "steps": 60}, {"t_end": 6.0, "tolerance": 1e-11}):
+        one = stepper.integrate(q, velocity=v, events=loops, **plan)
+        two = known.integrate(q, velocity=v, events=single, **plan)
+        assert [len(each) for each in one.events] == [sum(map(len, two.events[:n])), sum(map(len, two.events[n:]))]
+        assert min(map(len, one.events)) > 0
+        assert np.abs(one.q["q"][-1] - np.asarray(two.q)[-1]).max() < (1e-13 if "h" in plan else 1e-8)
+    runs = [
+        stepper.integrate(q, velocity=v, h=0.1, steps=30, events=impact("13/10 + b - q[i] for i in N", "e")),
+        known.integrate(q, velocity=v, h=0.1, steps=30, events=[impact(f"13/10 + b - q_{i}", "e") for i in range(n)]),
+    ]
+    tangents = [np.asarray(run.tangent()[-1]) for run in runs]
+    assert np.abs(tangents[0] - tangents[1]).max() < 1e-11 * np.abs(tangents[1]).max()
+
+
+def test_memory_of_a_wall_has_all_its_entries(gas):
+    """A wall that contains all coordinates, of more than 2000: a sphere around particles in 3000 dimensions."""
+    r = np.full((1500, 2), 0.01)
+    run = gas.integrate(
+        {"r": r}, velocity={"r": r}, h=0.7, steps=3, events=impact("1 - sum(i in N, r[i, 0]**2 + r[i, 1]**2)")
+    )
+    radius = np.linalg.norm(run.q["r"].reshape(len(run.t), -1), axis=1)
+    assert len(run.events[0]) == 1
+    assert abs(radius[-1] - (2.0 - np.linalg.norm(r) * (1.0 + 3 * 0.7))) < 1e-13
+
+
+@pytest.mark.full
+def test_states_of_crossings_of_many_coordinates_are_not_saved(gas):
+    random = np.random.default_rng(5)
+    r, v = random.random((3000, 2)), 0.1 * random.normal(size=(3000, 2))
+    run = gas.integrate({"r": r}, velocity={"r": v}, h=1e-2, steps=5, save_every=5, events=BOX)
+    assert np.abs(run.q["r"][-1] - folded(r, v, 0.05)).max() < 1e-14
+    assert len(run.events[0]) > 2
+    assert np.isnan(run.events[0].q["r"]).all()
+
+
+@pytest.mark.full
+def test_certificate_of_a_chain_between_walls():
+    walls = [impact("q[i] + 1 for i in N"), impact("3/2 - q[i] for i in N")]
+    stepper = compile_stepper(CHAIN, "svi:2", flags=FLAGS, events=walls)
+    certificate = sc.verify(CHAIN, "svi:2", [0.1, 0.5], [1.0, 0.2], h=0.1, stepper=stepper)
+    names = {"event surfaces", "saltation", "impacts", "symplecticity, impacts", "reversal, impacts"}
+    assert names <= {each.name for each in certificate.checks}
+    assert all(each.outcome is not Outcome.VIOLATED for each in certificate.checks)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: impact("q[i+1] for i in N"), "q\\[i\\+1\\]"),
+        (lambda: impact("sum(k in N, q[k]) - q[i] for i in N"), "a sum within a sum must have whole numbers"),
+        (lambda: Event("q[i] for i in N", then={"q[i] + 1": "0"}), "is not an entry of a coordinate"),
+        (lambda: impact("q[0]", where="q[i] > 0"), "'i' is not an index"),
+    ],
+)
+def test_errors_name_the_formula(make, words):
+    with pytest.raises(EventError, match=words):
+        compile_stepper(CHAIN, "svi:4", flags=FLAGS).integrate(np.ones(3), h=0.1, steps=1, events=make())
+
+
+def test_a_recorded_run_has_its_events(gas, tmp_path):
+    r, v = np.array([[0.3, 0.6]]), np.array([[0.5, -0.3]])
+    run = gas.with_events(BOX).start({"r": r}, velocity={"r": v}, h=0.1)
+    recorded = sc.record_run(run, tmp_path / "run", steps=25)
+    assert np.abs(recorded.q[-1] - folded(r, v, 2.5)).max() < 1e-14
+    assert [len(each) for each in recorded.events] == [0, 1, 1, 0]

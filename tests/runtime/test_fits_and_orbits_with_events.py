@@ -1,0 +1,122 @@
+"""Fits and periodic orbits of systems whose events change the state, of coordinates and of arrays."""
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import EventError
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.events.event import impact
+
+FLAGS = ("-O1",)
+E = 0.8
+"""Restitution of the table."""
+
+
+@pytest.fixture(scope="module")
+def table() -> Stepper:
+    """Ball on the table A sin t: y is the distance from it."""
+    system = LagrangianSystem.from_text(
+        name="table", coordinates=["y"], lagrangian="y_dot**2/2 - (1 - A*sin(t))*y", parameters={"A": 0.8}
+    )
+    return compile_stepper(system, "svi:6", flags=FLAGS, events=impact("y", E))
+
+
+def start_of_period_one(amplitude: float) -> tuple[float, float]:
+    """Phase of the impacts and velocity after them."""
+    return np.arccos(np.pi * (1 - E) / (1 + E) / amplitude), 2 * np.pi * E / (1 + E)
+
+
+def multipliers_of_flights(orbit, amplitude):
+    """Multipliers from the exact map (time, velocity) of one impact to the next."""
+    (hits,), matrix = orbit.run().events, np.eye(2)
+    times, speeds = np.append(hits.t, hits.t[0] + orbit.period), -E * hits.p[:, 0]
+    for (t0, t1), u in zip(np.stack([times[:-1], times[1:]], axis=1), speeds, strict=True):
+        (g0, g1), s = 1 - amplitude * np.sin([t0, t1]), t1 - t0
+        arrival = u - s + amplitude * (np.cos(t0) - np.cos(t1))
+        later = -np.array([g0 * s - u, s]) / arrival
+        matrix = np.array([later, -E * (np.array([g0, 1.0]) - g1 * later)]) @ matrix
+    return len(speeds), matrix
+
+
+def test_ball_on_a_vibrating_table_has_orbits_of_period_one_and_two(table):
+    """Period one against its closed formula, tr M = (1 + e)^2 (1 - A sin phase) - 2 e; period two by its flights."""
+    phase, speed = start_of_period_one(0.8)
+    orbit = sc.periodic_orbit(table, [3.5], [-2.7], period=2 * np.pi, fixed_period=True, h=0.1)
+    flight = table.integrate([0.0], [np.pi * (1 + (E - 1) / (1 + E))], t=phase, h=0.1, t_end=2 * np.pi)
+    assert abs(orbit.q - flight.q[-1]).max() < 1e-13
+    assert abs(orbit.multipliers.sum() - ((1 + E) ** 2 * (1 - 0.8 * np.sin(phase)) - 2 * E)) < 1e-12
+    assert abs(orbit.multipliers.prod() - E**2) < 1e-13
+    assert orbit.stable
+    known = {"A": 1.15}
+    phase, speed = start_of_period_one(1.15)
+    late = table.integrate([0.1], [speed], t=phase, h=0.1, t_end=60 * np.pi, parameters=known)
+    at = {"fixed_period": True, "h": 0.1, "parameters": known}
+    one = sc.periodic_orbit(table, late.q[-1], late.p[-1], period=2 * np.pi, **at)
+    two = sc.periodic_orbit(table, late.q[-1], late.p[-1], period=4 * np.pi, **at)
+    assert (one.stable, two.stable) == (False, True)
+    assert abs(one.multipliers.sum() - ((1 + E) ** 2 * (1 - 1.15 * np.sin(phase)) - 2 * E)) < 1e-12
+    count, matrix = multipliers_of_flights(two, 1.15)
+    assert count == 2
+    assert abs(two.multipliers.sum() - np.trace(matrix)) < 1e-12
+
+
+def test_orbits_of_billiards_have_the_multipliers_of_mirrors():
+    """Two mirrors of radius R at distance L: half the trace of the round trip is 2 g^2 - 1, g = 1 - L/R."""
+    point = compile_stepper(
+        LagrangianSystem.from_text(name="point", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2"),
+        "svi:1",
+        flags=FLAGS,
+    )
+    ellipse = point.with_events(impact("1 - (x/1.5)**2 - y**2"))
+    discs = point.with_events([impact("(x - 3/2)**2 + y**2 - 1"), impact("(x + 3/2)**2 + y**2 - 1")])
+    for stepper, velocity, ratio, period in ((ellipse, [0.01, 1.0], 2 / 2.25, 4.0), (discs, [1.0, 0.01], -1.0, 2.0)):
+        orbit = sc.periodic_orbit(stepper, [0.02, 0.03], velocity=velocity, period=period + 0.05, steps=9, energy=0.5)
+        half = 2 * (1 - ratio) ** 2 - 1
+        assert abs(orbit.period - period) < 1e-12
+        assert min(abs(orbit.stability_indices - half)) < 1e-12
+        assert min(abs(orbit.stability_indices - 1)) < 1e-12
+        run = orbit.run()
+        by_h = run.tangent(np.eye(6)[:, 5])[-1]  # with respect to the size of 9 steps
+        assert abs(by_h - [*(9 * run.p[-1]), 0.0, 0.0]).max() < 1e-12
+
+
+def test_fit_of_restitution_and_wall_from_bounces():
+    """Exact parameters from exact heights, and parameters within their errors from noisy ones."""
+    with pytest.warns(sc.SystemDefinitionWarning, match="'e' is not used"):
+        ball = LagrangianSystem.from_text(
+            name="ball", coordinates=["y"], lagrangian="y_dot**2/2 - g*y", parameters={"g": 1.0, "e": 0.8, "w": 0.1}
+        )
+    stepper = compile_stepper(ball, "svi:2", flags=FLAGS, events=impact("y - w", "e"))
+    exact, t = {"g": 1.05, "e": 0.77, "w": 0.12}, np.linspace(0.05, 6.3, 40)
+    heights = stepper.integrate([1.0], [0.0], h=0.1, t_end=6.4, parameters=exact, t_eval=t).q[:, 0]
+    given = {"q": [1.0], "p": [0.0], "h": 0.2, "start": 0.0, "fit_initial_state": False}
+    assert abs(sc.fit(stepper, t, heights, **given).values - list(exact.values())).max() < 1e-12
+    noisy = sc.fit(stepper, t, heights + 0.01 * np.random.default_rng(3).normal(size=40), **given)
+    errors = np.array(list(noisy.standard_errors.values()))
+    assert (abs(noisy.values - list(exact.values())) < 4 * errors).all()
+    assert (errors < 0.02).all()
+    ended = stepper.with_events(impact("y - w", "e", terminal=2))
+    with pytest.raises(EventError, match="end the run at t = 3"):
+        sc.fit(ended, t, heights, **given)
+
+
+def test_fits_and_orbits_of_arrays():
+    """A chain that bounces on its end: a fit of array coordinates, and the orbit of one ball by its distance."""
+    chain = LagrangianSystem.from_text(
+        name="chain",
+        coordinates=["y[N]"],
+        lagrangian="sum(i in N, y_dot[i]**2/2 - y[i] + 0*e*w) - k*sum(i in N-1, (y[i+1] - y[i])**2/2)",
+        parameters={"k": 6.0, "e": 0.7, "w": 0.12},
+    )
+    stepper = compile_stepper(chain, "svi:4", flags=FLAGS, events=impact("y[0] - w", "e"))
+    q, t = np.array([1.0, 1.6]), np.linspace(0.1, 4.0, 40)
+    run = stepper.integrate(q, velocity=0 * q, h=0.1, steps=40, t_eval=t)
+    assert len(run.events[0]) == 2
+    given = {"p": 0 * q, "h": 0.1, "start": 0.0, "fit_initial_state": False}
+    fit = sc.fit(stepper, t, np.asarray(run.q), q=q, parameters={"k": 5.8, "e": 0.75, "w": 0.1}, **given)
+    assert abs(fit.values - [6.0, 0.7, 0.12]).max() < 1e-8
+    elastic = sc.periodic_orbit(stepper, [0.3], [0.1], period=1.3, steps=20, parameters={"e": 1.0})
+    assert abs(elastic.period**2 - 8 * (elastic.energy - 0.12)) < 1e-12
