@@ -264,6 +264,22 @@ def test_initial_states_are_projected_or_rejected():
     assert np.abs(stepper.constraint_values(*moved.start)).max() < 1e-15
 
 
+def test_angles_at_zero_satisfy_constraints_up_to_rounding():
+    """The second constraint of this linkage is 0.2 + 0.4 - 0.6 = 1.1e-16 at 0, where angles have no relative size."""
+    linkage = LagrangianSystem.from_text(
+        name="linkage",
+        coordinates=["a", "b", "c"],
+        lagrangian="(a_dot**2 + b_dot**2 + c_dot**2)/2",
+        constraints=[
+            "(sin(b)/5 + cos(b))*cos(a) + (2/5 - sin(b) + cos(b)/5)*sin(a) - 3*sin(c)/5 - 1",
+            "-(sin(b)/5 + cos(b))*sin(a) + (2/5 - sin(b) + cos(b)/5)*cos(a) - 3*cos(c)/5",
+        ],
+    )
+    stepper = compile_stepper(linkage, lobatto(2))
+    run = stepper.integrate([0.0, 0.0, 0.0], velocity=[2.0, -2.0, 4 / 3], h=0.01, steps=100)
+    assert np.abs(run.constraint_values()[0]).max() < 1e-15
+
+
 @pytest.mark.parametrize("unit", [1e3, 1e-3])
 def test_constraint_violation_is_independent_of_units(unit):
     """For a slide in metres and an angle in radians, reports and rejections do not depend on the unit of length."""

@@ -17,6 +17,8 @@
 #define SETTLED_UPDATE REAL(1e-9)
 /* relative to the state: accepted size of the last update where rounding prevents a smaller residual */
 #define ACCEPTED_UPDATE REAL(1e-6)
+#define BEYOND REAL(1e6) /* times an update: where g is still linear, rounding limits |g| */
+#define SLOW REAL(0.01) /* reduction of |g|^2 by an update that indicates rounding */
 
 /* Factors of the saddle-point matrix [L_vv, G^T; G, 0] of a state, and a right-hand side. */
 typedef struct {
@@ -110,11 +112,27 @@ static real misfit(real t, const real *q, const real *parameters, real *g)
   return all_finite(g, CONSTRAINTS) ? sum : (real)INFINITY;
 }
 
+/* Whether rounding alone prevents that `update`, which solves G update = right, reduces |g|: g changes linearly far
+ * beyond it. A state at 0, as of angles, has no size with which the update could be compared. */
+static int is_rounding(real t, const real *u, const real *right, const real *update, const real *parameters)
+{
+  real x[M], beyond[CONSTRAINTS], wrong = 0, size = 0;
+  for (int i = 0; i < M; i++)
+    x[i] = u[i] + BEYOND * update[i];
+  misfit(t, x, parameters, beyond);
+  for (int k = 0; k < CONSTRAINTS; k++) {
+    const real from_linear = beyond[k] - (BEYOND - 1) * right[k];
+    wrong += from_linear * from_linear;
+    size += right[k] * right[k];
+  }
+  return wrong < BEYOND * BEYOND * size / 4;
+}
+
 /* Projects q onto g = 0 by Gauss-Newton steps in the metric of the mass matrix at u = (q, v). An update is halved while
  * it does not reduce |g|; the iteration ends when rounding prevents a reduction. */
 static int project_position(real t, real *u, const real *parameters, saddle *at)
 {
-  real g[CONSTRAINTS], y[CONSTRAINTS], update[M], nearest[M];
+  real g[CONSTRAINTS], right[CONSTRAINTS], y[CONSTRAINTS], update[M], nearest[M];
   real left = misfit(t, u, parameters, g);
   memcpy(nearest, u, sizeof nearest);
   for (int k = 0; k < MAX_PROJECTIONS; k++) {
@@ -123,8 +141,8 @@ static int project_position(real t, real *u, const real *parameters, saddle *at)
     if (status != OK)
       return status;
     for (int j = 0; j < CONSTRAINTS; j++)
-      g[j] = -g[j];
-    solve_saddle(at, NULL, g, update, y);
+      right[j] = -g[j];
+    solve_saddle(at, NULL, right, update, y);
     size = largest_of(update);
     if (!is_finite(size))
       return SINGULAR;
@@ -134,12 +152,15 @@ static int project_position(real t, real *u, const real *parameters, saddle *at)
       now = misfit(t, u, parameters, g);
       scale /= 2;
     } while (!(now < left) && scale * size > REAL_EPSILON * largest_of(nearest));
-    if (!(now < left)) {
-      memcpy(u, nearest, sizeof nearest);
-      return size <= ACCEPTED_UPDATE * largest_of(nearest) ? OK : NOT_CONVERGED;
-    }
-    if (size <= REAL_EPSILON * largest_of(nearest))
+    if (size <= REAL_EPSILON * largest_of(nearest) && now < left)
       return OK;
+    if (!(now < SLOW * left)) {
+      const int rounding = is_rounding(t, nearest, right, update, parameters);
+      if ((k == 0 && rounding) || !(now < left))
+        memcpy(u, nearest, sizeof nearest);
+      if (rounding || !(now < left))
+        return rounding || size <= ACCEPTED_UPDATE * largest_of(nearest) ? OK : NOT_CONVERGED;
+    }
     left = now;
     memcpy(nearest, u, sizeof nearest);
   }
