@@ -24,8 +24,8 @@ from scvi_codegen.reproduce.experiment import Experiment, Result
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 
 CATALOGUE = "scvi_codegen.reproduce.catalogue"
-PATIENCE = 2.0
-"""Seconds to wait for a process to end."""
+PATIENCE = 10.0
+"""Seconds to wait for a process to end by itself."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -183,10 +183,9 @@ def _in_processes(
                 yield _received(ended, *running.pop(ended))
         watch([])
     finally:
-        for _, process in running.values():
-            process.terminate()
         for connection, (_, process) in running.items():
-            process.join(PATIENCE)
+            process.kill()
+            process.join()
             connection.close()
 
 
