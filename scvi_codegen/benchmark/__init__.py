@@ -21,7 +21,6 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from scvi_codegen.benchmark.cases.unforced import CASES
@@ -89,7 +88,6 @@ def benchmark(
     *,
     json_path: str | None = None,
     plot_path: str | None = None,
-    resume: bool = False,
     report_activity: ReportActivity = lambda text: None,
     show: ReportActivity = lambda text: None,
 ) -> Report:
@@ -100,21 +98,18 @@ def benchmark(
         plan: settings of the measurement.
         json_path: file to write, after each section.
         plot_path: file of the plot.
-        resume: keep the sections of ``json_path`` that did not fail, and add others to them.
         report_activity: called with a description of each activity.
         show: called with the text of the report, section by section.
 
     Raises:
-        StateError: for an unknown section; if ``json_path`` is not a report of this version.
+        StateError: for an unknown section.
     """
     sections = tuple(section for name in names for section in _sections(name))
     if plot_path is not None:
         from scvi_codegen.pictures.canvas import check_plot_path
 
         check_plot_path(plot_path)
-    known = _known(json_path) if resume and json_path is not None else {}
-    wanted = dict.fromkeys((*known, *(sections or SECTIONS)))
-    for report in _reports(tuple(wanted), known, plan or Plan(), report_activity, show):
+    for report in _reports(tuple(dict.fromkeys(sections or SECTIONS)), plan or Plan(), report_activity, show):
         if json_path is not None:
             write_text(json_path, json.dumps(report.data(), indent=1, allow_nan=False) + "\n")
     if plot_path is not None and report.cases:
@@ -132,40 +127,20 @@ def _sections(name: str) -> tuple[str, ...]:
     return names
 
 
-Result = CaseResult | ResultTable
-FAILED = "failed: "
-
-
-def _known(json_path: str) -> dict[str, Result]:
-    """Return the sections of a report on disk by name; none if there is no such file."""
-    path = Path(json_path)
-    if not path.exists():
-        return {}
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        results: list[Result] = [
-            *map(CaseResult.from_data, data["cases"]),
-            *(ResultTable.from_data(each) for each in data["tables"] if not each["title"].startswith(FAILED)),
-        ]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise StateError(f"{json_path} is not a report that can be resumed: {type(error).__name__}: {error}") from None
-    return {each.name: each for each in results}
-
-
 def _reports(
-    names: Sequence[str], known: Mapping[str, Result], plan: Plan, report_activity: ReportActivity, show: ReportActivity
+    names: Sequence[str], plan: Plan, report_activity: ReportActivity, show: ReportActivity
 ) -> Iterator[Report]:
     """Yield the report after each section; its text is shown as it grows."""
     report = Report(machine=machine(), results=())
     show(header_lines(report.machine))
     for name in names:
         try:
-            result = known[name] if name in known else SECTIONS[name](plan, report_activity)
+            result = SECTIONS[name](plan, report_activity)
         except KeyboardInterrupt:
             yield replace(report, interrupted=name)
             break
         except ScviCodegenError as error:
-            result = ResultTable(name=name, title=f"{FAILED}{error}", columns={}, rows=())
+            result = ResultTable(name=name, title=f"failed: {error}", columns={}, rows=())
         report = replace(report, results=(*report.results, result))
         show(f"\n{result.text()}")
         yield report

@@ -43,11 +43,6 @@ class ResultTable:
         aligned = ("  ".join(map(str.ljust, row, widths)).rstrip() for row in (header, *cells))
         return "\n  ".join([f"{self.name}: {self.title}", *aligned, *self.remarks])
 
-    @classmethod
-    def from_data(cls, data: Mapping[str, Any]) -> ResultTable:
-        """Return the table that :meth:`data` describes."""
-        return cls(**{**data, "rows": tuple(data["rows"]), "remarks": tuple(data["remarks"])})
-
     def data(self) -> dict[str, Any]:
         """Return the table as data for JSON."""
         return asdict(self) | {"rows": [finite(dict(row)) for row in self.rows], "remarks": [*self.remarks]}
@@ -213,15 +208,6 @@ class CaseResult:
                 *(f"skipped {name}: {why}" for name, why in self.skipped.items()),
             ),
         ).text()
-
-    @classmethod
-    def from_data(cls, data: Mapping[str, Any]) -> CaseResult:
-        """Return the result that :meth:`data` describes; null becomes NaN."""
-        measurements: list[dict[str, Any]] = [
-            {key: math.nan if value is None else value for key, value in each.items()} for each in data["measurements"]
-        ]
-        named = {name: data[name] for name in ("name", "span", "dimension", "skipped", "reference_accuracy")}
-        return cls(**named, measurements=tuple(Measurement(**entries) for entries in measurements))
 
     def data(self) -> dict[str, Any]:
         """Return all measurements as data for ``json.dump``; numbers that are not finite are null."""

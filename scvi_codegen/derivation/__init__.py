@@ -11,6 +11,5 @@ readable.
 """
 
 from scvi_codegen.derivation.page.document import derivation_html
-from scvi_codegen.derivation.page.jacobian import Start
 
-__all__ = ["Start", "derivation_html"]
+__all__ = ["derivation_html"]

@@ -23,10 +23,8 @@ from typing import TYPE_CHECKING, overload
 
 import sympy
 
-from scvi_codegen.derivation.matrix_form import MatrixForm, matrix_form
 from scvi_codegen.derivation.notation import LARGEST_SHOWN, Equation, TableEntry, entries, html, latex, text_lines
 from scvi_codegen.display.cards import card, listed, plain
-from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.expressions import jacobian
 from scvi_codegen.formulas.intermediates import inner_of, written_out
 from scvi_codegen.formulas.translation import format_expression
@@ -36,7 +34,6 @@ from scvi_codegen.mechanics.rotations.axial import axial_turns
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, symmetries
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import as_method
-from scvi_codegen.methods.collocation import SpectralCollocation
 from scvi_codegen.methods.discretise import discretised_form, paper_equations
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import Block, Row, StageGroup, StageSystem, Table
@@ -105,18 +102,6 @@ class StepEquations:
     def numeric(self, expression: sympy.Expr) -> sympy.Expr:
         """Return ``expression`` with the values of table entries, to 50 digits."""
         return expression.xreplace({entry.symbol: sympy.Float(str(entry.value), 50) for entry in self.entries})
-
-    def matrix_form(self) -> MatrixForm:
-        """Return the Kronecker form (18) or (21); spectral collocation only.
-
-        Raises:
-            MethodError: for other methods.
-        """
-        if not isinstance(self.method, SpectralCollocation):
-            raise MethodError(
-                f"{self.method.name} has no matrix form (18), (21): it is available for spectral collocation"
-            )
-        return matrix_form(self.system, self.method, self.unknowns, self.state, self.time, self.step)
 
     def to_text(self) -> str:
         """Return plain text: unknowns, equations, end state, guess, tables."""

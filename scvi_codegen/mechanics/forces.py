@@ -1,40 +1,18 @@
-"""Forces, damping and constraints of a system.
+"""Forces, damping and constraints of a system; the derivations are in docs/theory/forces.md.
 
-**Forces** are given by coordinate or by Rayleigh's function. The equations of motion with generalised forces f follow
-from the principle of Lagrange and d'Alembert,
+**Forces** f, by coordinate or by Rayleigh's function, follow the principle of Lagrange and d'Alembert: d/dt L_v = L_q +
+f. For a Hamiltonian they are forces on momenta, p' = -H_q + f(q, p, t).
 
-    delta int L dt + int f . delta q dt = 0,      that is      d/dt L_v = L_q + f.
+**Uniform damping** at the rate gamma makes the action of e^(gamma t) L stationary: d/dt L_v = L_q - gamma L_v. The map
+of a step contracts areas and momentum maps of L by e^(-gamma h), both to round-off, for any step size.
 
-Every method discretises the second integral like the first, by the same quadrature along the same curve: at each
-point L_q becomes L_q + f. The order is unchanged, and momentum maps along whose directions the forces do no work are
-conserved as before. For a Hamiltonian they are forces on momenta, p' = -H_q + f(q, p, t).
+**Constraints** are holonomic, g(q, t) = 0 with G = g_q, or nonholonomic, A(q, t) v + b(q, t) = 0 with G = A:
+d/dt L_v = L_q + f + G^T lambda. The index is not reduced (:mod:`scvi_codegen.methods.constraints`).
 
 Sources: C. Kane, J. E. Marsden, M. Ortiz, M. West, Int. J. Numer. Meth. Eng. 49 (2000); J. E. Marsden, M. West, Acta
-Numerica 10 (2001), part 3; C. M. Campos, S. Ober-Bloebaum, Math. Model. Numer. Anal. 49 (2015).
-
-Uniform damping: one rate gamma for all momenta; each step contracts phase-space area by exactly exp(-gamma h).
-
-The damped equations follow from the action of Caldirola and Kanai,
-
-    delta int e^(gamma t) L dt = 0,      that is      d/dt L_v = L_q - gamma L_v,
-
-whose flow is conformally symplectic: it multiplies dq ^ dp by e^(-gamma t). A step discretises this action like any
-other, with time measured from the start of the step, and divides the final momentum by e^(gamma h): the quadrature
-weights w_n become w_n e^(gamma c_n h). Nothing grows from step to step, the order is that of the method, masses are
-unchanged, and the map contracts areas and momentum maps of L by e^(-gamma h), both to round-off, for any step size.
-(A splitting, half of the damping before and half after each step, does so too, at order 2.)
-
-Sources: P. Caldirola, Nuovo Cimento 18 (1941); E. Kanai, Prog. Theor. Phys. 3 (1948); R. McLachlan, M. Perlmutter,
-Conformal Hamiltonian systems, J. Geom. Phys. 39 (2001); J. E. Marsden, M. West, Acta Numerica 10 (2001), section 1.3.
-
-**Constraints** are holonomic, g(q, t) = 0 (rods, joints, loops), or nonholonomic, A v + b = 0 (rolling, skates).
-They enter the equations of motion with Lagrange multipliers lambda; constraint forces do no virtual work,
-
-    d/dt L_v = L_q + f + G^T lambda,        g = 0 with G = g_q,        or A(q, t) v + b(q, t) = 0 with G = A
-
-(holonomic; nonholonomic by the principle of Lagrange and d'Alembert). Both imply a velocity constraint G v = ..; for
-holonomic constraints it is the hidden constraint g_q v + g_t = 0. The index is not reduced: methods impose g itself at
-the points of a step (:mod:`scvi_codegen.methods.constraints`).
+Numerica 10 (2001), sections 1.3 and 3; C. M. Campos, S. Ober-Bloebaum, Math. Model. Numer. Anal. 49 (2015);
+P. Caldirola, Nuovo Cimento 18 (1941); E. Kanai, Prog. Theor. Phys. 3 (1948); R. McLachlan, M. Perlmutter, J. Geom.
+Phys. 39 (2001).
 """
 
 from __future__ import annotations

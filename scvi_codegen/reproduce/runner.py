@@ -16,15 +16,16 @@ from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
-from typing import TypeAlias
+from multiprocessing.context import SpawnProcess
+from typing import Any, TypeAlias
 
 from scvi_codegen.errors import MethodWarning, StateError, closest
 from scvi_codegen.reproduce.experiment import Experiment, Result
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 
 CATALOGUE = "scvi_codegen.reproduce.catalogue"
-PATIENCE = 2.0
-"""Seconds to wait for a process to end."""
+PATIENCE = 10.0
+"""Seconds to wait for a process to end by itself."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,33 +136,6 @@ def _in_this_process(
     watch([])
 
 
-class _Worker:
-    """Process that runs experiments by name, and the name of the one that it runs."""
-
-    def __init__(self, module: str) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.connection, there = context.Pipe()
-        self.process, self.running = context.Process(target=_work, args=(there, module), daemon=True), ""
-        with _sigint_blocked():
-            self.process.start()
-        there.close()
-
-    def give(self, name: str) -> None:
-        self.running = name
-        with suppress(OSError):  # the process died; take reports it
-            self.connection.send(name)
-
-    def take(self) -> Outcome:
-        """Return the outcome that the process sent, or the failure that it died."""
-        name, self.running = self.running, ""
-        try:
-            outcome: Outcome = self.connection.recv()
-        except (EOFError, OSError):
-            self.process.join(PATIENCE)
-            return Failure(name=name, message=f"its process ended with exit status {self.process.exitcode}")
-        return outcome
-
-
 @contextmanager
 def _sigint_blocked() -> Iterator[None]:
     """Block SIGINT, also for processes started meanwhile, which inherit the mask: Ctrl-C does not end their imports."""
@@ -176,51 +150,49 @@ def _sigint_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _work(connection: Connection, module: str) -> None:
-    """Serve a process: receive names, send outcomes. Ctrl-C is handled by the parent."""
+def _work(connection: Connection, module: str, name: str) -> None:
+    """Run an experiment in a process of its own and send the outcome; the parent handles Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    experiments = catalogue(module)
-    with suppress(EOFError, OSError):  # the parent is gone
-        while True:
-            name = connection.recv()
-            outcome = _outcome(experiments[name], {})
-            try:
-                connection.send(outcome)
-            except OSError:
-                raise
-            except Exception as error:  # noqa: BLE001  (results that cannot be pickled)
-                connection.send(_failure(name, error))
+    outcome = _outcome(catalogue(module)[name], {})
+    with suppress(OSError):  # the parent is gone
+        try:
+            connection.send(outcome)
+        except OSError:
+            raise
+        except Exception as error:  # noqa: BLE001  (results that cannot be pickled)
+            connection.send(_failure(name, error))
 
 
 def _in_processes(
     experiments: Sequence[Experiment], count: int, module: str, watch: Watch
 ) -> Generator[Outcome, None, None]:
-    pending = deque(each.name for each in experiments)
-    with _crew(count, module) as crew:
-        while True:
-            for worker in crew:
-                if pending and not worker.running:
-                    worker.give(pending.popleft())
-            busy = {worker.connection: worker for worker in crew if worker.running}
-            watch([worker.running for worker in busy.values()])
-            if not busy:
-                return
-            for connection in wait(list(busy)):
-                worker = busy[connection]  # type: ignore[index]  # these are the connections waited for
-                outcome = worker.take()
-                if not worker.process.is_alive():
-                    crew[crew.index(worker)] = _Worker(module)
-                yield outcome
-
-
-@contextmanager
-def _crew(count: int, module: str) -> Iterator[list[_Worker]]:
-    crew = [_Worker(module) for _ in range(count)]
+    """Run each experiment in a process of its own, at most ``count`` at a time."""
+    context, pending = multiprocessing.get_context("spawn"), deque(each.name for each in experiments)
+    running = dict[Any, tuple[str, SpawnProcess]]()
     try:
-        yield crew
+        while pending or running:
+            while pending and len(running) < count:
+                connection, there = context.Pipe(duplex=False)
+                process = context.Process(target=_work, args=(there, module, name := pending.popleft()), daemon=True)
+                with _sigint_blocked():
+                    process.start()
+                there.close()
+                running[connection] = name, process
+            watch([name for name, _ in running.values()])
+            for ended in wait(list(running)):
+                yield _received(ended, *running.pop(ended))
+        watch([])
     finally:
-        for worker in crew:
-            worker.process.terminate()
-        for worker in crew:
-            worker.process.join(PATIENCE)
-            worker.connection.close()
+        for connection, (_, process) in running.items():
+            process.kill()
+            process.join()
+            connection.close()
+
+
+def _received(connection: Any, name: str, process: SpawnProcess) -> Outcome:
+    """Return the outcome that a process sent, or the failure that it died."""
+    outcome: Outcome | None = None
+    with connection, suppress(EOFError, OSError):
+        outcome = connection.recv()
+    process.join(PATIENCE)
+    return outcome or Failure(name=name, message=f"its process ended with exit status {process.exitcode}")

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from scvi_codegen import SVI, LagrangianSystem, compile_stepper, load_model
+from scvi_codegen import SVI, LagrangianSystem, StateError, compile_stepper, load_model, verification
 from scvi_codegen.cli import main
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.method import Method
 from scvi_codegen.models.packages.package import load_package
 from scvi_codegen.native.compilers import find_compiler
 
@@ -54,7 +56,7 @@ def invoke(*words: str) -> Result:
     return CliRunner().invoke(main, list(words), prog_name="scvi-codegen")
 
 
-def test_adaptive_run_of_an_array_system(ring: str) -> None:
+def test_adaptive_run_of_an_array_system(ring: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The tolerance replaces the step of the file; verify and generate compile the sizes."""
     result = invoke("run", ring, "--tolerance", "1e-9", "--span", "7", "--json")
     assert result.exit_code == 0, result.output
@@ -64,13 +66,27 @@ def test_adaptive_run_of_an_array_system(ring: str) -> None:
     assert found["energy_change"] < 1e-7
     assert "rejected) from t = 0 to t = 2;" in invoke("run", ring, "--tolerance", "1e-9").stdout
     Path("own.toml").write_text(RING.replace("step = 0.1\nsteps = 20", "tolerance = 1e-9\nspan = 2.0"))
-    assert invoke("verify", "own.toml", "--size", "N=3").exit_code == 0
+    verified = list[tuple[int, float]]()
+
+    def verify(system: MechanicalSystem, method: Method, *, tolerance: float, **others: object) -> None:
+        verified.append((system.dimension, tolerance))
+        raise StateError("not measured here")
+
+    monkeypatch.setattr(verification, "verify", verify)
+    assert "not measured here" in invoke("verify", "own.toml", "--size", "N=3").output
+    assert verified == [(3, 1e-9)]
     assert invoke("generate", "own.toml", "-o", "own_svi").exit_code == 0
     printed = subprocess.run(["make", "-s", "run"], cwd="own_svi", check=True, capture_output=True, text=True).stdout
     last = [float(word) for word in printed.splitlines()[-2].split()]
     assert last[0] == 2.0
     expected = json.loads(invoke("run", ring, "--json").stdout)["final"]["q"]["q"]
     assert last[1:9] == pytest.approx(expected, abs=1e-7)
+
+
+@pytest.mark.full
+def test_adaptive_steps_of_an_array_system_are_verified(ring: str) -> None:
+    Path("own.toml").write_text(RING.replace("step = 0.1\nsteps = 20", "tolerance = 1e-9\nspan = 2.0"))
+    assert invoke("verify", "own.toml", "--size", "N=3").exit_code == 0
 
 
 def test_run_of_an_array_system(ring: str) -> None:

@@ -6,6 +6,7 @@ import mpmath
 import numpy as np
 import pytest
 import sympy
+from matrix_form import matrix_form
 from sympy import cos, sin, sqrt
 
 from scvi_codegen.compiler import compile_stepper
@@ -177,22 +178,16 @@ def test_matrix_form_is_zero_where_the_scalar_form_is(system, form, degree):
     }
     values |= {derived.time: sympy.Float("0.3", 40), derived.step: sympy.Float("0.2", 40)}
     scalar = [derived.numeric(e.residual).subs(values) for e in derived.equations]
-    matrix = [e.subs(values) for e in derived.matrix_form().residual]
+    A, matrix = (part.subs(values) for part in matrix_form(derived))
     m = system.dimension
     if form == "position":
         assert len(matrix) == degree * m
         assert max(abs(a - b) for a, b in zip(scalar, matrix, strict=False)) < 1e-30
         return
     # (21) is A times the Runge-Kutta rows: the first half (15) holds by construction, the second is -A (scalar rows)
-    A = sympy.Matrix(derived.matrix_form().A).subs(values)
     rows = sympy.Matrix(degree, m, scalar)
     expected = [*[0] * (degree * m), *(-A * rows)]
     assert max(abs(a - b) for a, b in zip(expected, matrix, strict=True)) < 1e-30
-
-
-def test_matrix_form_is_one_of_spectral_collocation():
-    with pytest.raises(MethodError, match="spectral collocation"):
-        derive(PENDULUM, SVI(2)).matrix_form()
 
 
 @pytest.mark.parametrize("method", [SVI(3, "gauss-legendre:3"), SCVI(2), SpectralCollocation(4), Gauss(3)])

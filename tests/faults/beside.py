@@ -240,9 +240,9 @@ C_TEXT = (
     (
         "adjoint by iteration with masses of the other sign",
         "double/svi",
-        "add_input_gradient",
-        r"part : -part",
-        "part : part",
+        "linearise_points",
+        r": -at->given",
+        ": at->given",
     ),
     (
         "sweeps of changes that end early",

@@ -121,6 +121,8 @@ def test_convolutions_of_any_size_and_coefficients(method, solver):
         assert run.energy()[0] == pytest.approx(potential(q), rel=1e-13)
         np.testing.assert_allclose(run.q["q"][-1], leapfrog(force, q, 1e-4, 30), rtol=0, atol=1e-7)
         assert np.ptp(run.energy()) < (1e-5 if solver is None and "svi" not in method else 1e-12) * potential(q)
+        if solver == "newton":  # a wrong product of the matrix takes 4 to 8 iterations
+            assert stepper.integrate({"q": q}, parameters={"c": c, "d": d}, h=0.1, steps=1).iterations[1] <= 3
 
 
 def test_convolutions_are_unrolled_and_verified():

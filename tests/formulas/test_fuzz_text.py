@@ -76,7 +76,7 @@ def try_formula(number: int) -> bool:
 
 
 def test_formulas_are_read_or_rejected():
-    assert sum(map(try_formula, range(2000))) > 200
+    assert sum(map(try_formula, range(1000))) > 100
 
 
 @pytest.mark.full
@@ -87,7 +87,7 @@ def test_seven_hundred_thousand_random_formulas():
 @given(
     st.one_of(st.text(max_size=200), st.lists(st.sampled_from([*NAMES, *FUNCTIONS, *NUMBERS, *POISON])).map("".join))
 )
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 def test_any_text_is_a_formula_or_an_error(text):
     with guarded(), suppress(ExpressionError):
         parse_expression(text, SYMBOLS)
@@ -166,7 +166,7 @@ def try_model(number: int) -> bool:
 
 
 def test_model_files_are_read_or_rejected():
-    assert sum(map(try_model, range(2000))) > 50
+    assert sum(map(try_model, range(1000))) > 20
 
 
 @pytest.mark.full

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pages import BLOCK, ROOT
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import ExpressionError, MethodWarning, ModelFileError, SystemDefinitionError
@@ -61,12 +62,11 @@ def test_model_file_is_read():
     assert (model.h, model.span, model.steps, model.save_every, model.step_count) == (0.25, 10.0, None, 4, 40)
 
 
-def test_the_layout_described_in_the_module_is_read():
-    from scvi_codegen.models.model_files import model_file
-
-    lines = (model_file.__doc__ or "").splitlines()
-    text = "\n".join(line for line in lines if line.startswith("    ") or not line)
-    assert parse_model(text).method == SVI(8)
+def test_the_layouts_of_the_page_are_read():
+    page = (ROOT / "docs/model_files.md").read_text(encoding="utf-8")
+    models = [parse_model(text) for _, language, text in BLOCK.findall(page) if language == "toml"]
+    assert [model.method for model in models] == [SVI(8)] * 3
+    assert [model.array_system is None for model in models] == [True, False, False]
 
 
 def test_vectors_may_be_tables_by_coordinate():

@@ -200,7 +200,7 @@ def test_code_allocates_nothing_writes_nothing_and_has_no_static_state(method):
 
 
 def test_headers_compile_as_c_plus_plus(tmp_path):
-    pairs = [generated(method)["kepler"] for method in METHODS]
+    pairs = [generate_source(systems()["kepler"], method) for method in METHODS.values()]
     files = write([source for source, _ in pairs], tmp_path)
     uses = "".join(
         f"  total += {s.prefix}_default_options().tolerance + {s.prefix.upper()}_WORKSPACE;\n" for s, _ in pairs

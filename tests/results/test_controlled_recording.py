@@ -1,6 +1,5 @@
 """Recorded runs with adaptive steps: continued bit for bit, extended, read, and on the command line."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -28,17 +27,6 @@ degree = 4
 tolerance = {TOLERANCE}
 span = {END}
 """
-
-
-@pytest.fixture(scope="session")
-def kepler(compiled) -> Stepper:
-    return compiled("kepler", SVI(4))
-
-
-@pytest.fixture(autouse=True)
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.chdir(tmp_path)
-    return
 
 
 def controlled(stepper: Stepper, folder: str, t_end: float = END, **settings: object):

@@ -22,18 +22,6 @@ from scvi_codegen.methods import SVI
 from scvi_codegen.results.recording import load_run, record_run, resume_run
 from scvi_codegen.runtime.core.stepper import Stepper
 
-
-@pytest.fixture(scope="session")
-def kepler(compiled) -> Stepper:
-    return compiled("kepler", SVI(4))
-
-
-@pytest.fixture(autouse=True)
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.chdir(tmp_path)
-    return
-
-
 CHILD = """
 import os, pickle, resource, sys
 from pathlib import Path

@@ -5,7 +5,6 @@ import os
 import sys
 import tracemalloc
 import warnings
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,21 +23,9 @@ from scvi_codegen.models.model_files.model_file import dump_model
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.results.recording import RecordedRun, load_run, manifest, record_run, resume_run, writing
-from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.run_loop import record
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-
-
-@pytest.fixture(scope="session")
-def kepler(compiled) -> Stepper:
-    return compiled("kepler", SVI(4))
-
-
-@pytest.fixture(autouse=True)
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.chdir(tmp_path)
-    return
 
 
 class TestRecording:

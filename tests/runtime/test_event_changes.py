@@ -301,6 +301,9 @@ def test_maps_in_both_directions_act_once_at_each_crossing(ball):
     """Rounding leaves the new state on either side of the zero that it departs from."""
     one = ball.integrate([1.0], [0.0], h=0.1, t_end=60.0, events=Event("y", then={"y_dot": "-y_dot"}))
     assert np.abs(one.events[0].t - math.sqrt(2.0) * (1 + 2 * np.arange(21))).max() < 1e-12
+    event = Event("y", then={"y_dot": "-0.01*y_dot"}, terminal=3)
+    slow = ball.integrate([0.7], [0.0], h=1.0, steps=2, events=event)
+    assert np.abs(slow.events[0].t - math.sqrt(1.4) * np.array([1.0, 1.02, 1.0202])).max() < 1e-12
 
 
 DROP = LagrangianSystem.from_text(

@@ -115,8 +115,9 @@ def test_several_quantities_with_gaps_and_individual_noise():
     assert bounded.values[2] == pytest.approx(0.25, abs=1e-6)
 
 
-def test_fit_with_known_start_and_tabulated_inputs():
-    """The cart is pushed as measured; what is known is not found."""
+@pytest.fixture(scope="module")
+def pushed():
+    """Return the stepper of a pushed oscillator, its input, a run, and times of measurements."""
     system = LagrangianSystem.from_text(
         name="pushed",
         coordinates=["x"],
@@ -129,6 +130,12 @@ def test_fit_with_known_start_and_tabulated_inputs():
     push = {"u": (np.linspace(0.0, 8.0, 9), np.random.default_rng(4).normal(size=9))}
     run = stepper.integrate([0.5], [0.0], inputs=push, h=0.05, t_end=8.0)
     times = np.linspace(0.13, 7.9, 60)
+    return stepper, push, run, times
+
+
+def test_fit_with_known_start_and_tabulated_inputs(pushed):
+    """The cart is pushed as measured; what is known is not found."""
+    stepper, push, run, times = pushed
     found = fit(
         stepper,
         times,
@@ -321,19 +328,8 @@ def test_segments_and_single_shooting_agree():
     assert_allclose(momenta.values[:3], [TRUE[name] for name in SOME], rtol=0, atol=0.05)
 
 
-def test_segments_with_known_start_and_inputs():
-    system = LagrangianSystem.from_text(
-        name="pushed",
-        coordinates=["x"],
-        lagrangian="m*x_dot**2/2 - k*x**2/2",
-        parameters={"m": 1.5, "k": 2.0},
-        forces={"x": "u"},
-        inputs=["u"],
-    )
-    stepper = compile_stepper(system, SVI(4), flags=QUICK_FLAGS)
-    push = {"u": (np.linspace(0.0, 8.0, 9), np.random.default_rng(4).normal(size=9))}
-    run = stepper.integrate([0.5], [0.0], inputs=push, h=0.05, t_end=8.0)
-    times = np.linspace(0.13, 7.9, 60)
+def test_segments_with_known_start_and_inputs(pushed):
+    stepper, push, run, times = pushed
     known = {"q": [0.5], "p": [0.0], "start": 0.0, "h": 0.05, "inputs": push, "fit_initial_state": False}
     found = fit(stepper, times, run.at(times)[0], parameters={"m": 1.0, "k": 1.0}, segments=4, **known)
     assert found.names == ("m", "k")

@@ -14,17 +14,10 @@ from scvi_codegen.cli.command_group import INTERRUPTED, CommandFailure, check_wr
 @click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Write all measurements as JSON.")
 @click.option("--plot", type=click.Path(), metavar="FILE", help="Work-precision plot, .png or .svg.")
 @click.option("--repeats", type=int, default=5, show_default=True, help="Timed rounds.")
-@click.option("--resume", is_flag=True, help="Keep the sections of FILE (-o), add others.")
 @click.option("--quick", is_flag=True, help="Smoke test: short spans and few settings.")
 @reporting
 def bench(
-    sections: tuple[str, ...],
-    peers: str | None,
-    output: str | None,
-    plot: str | None,
-    repeats: int,
-    resume: bool,
-    quick: bool,
+    sections: tuple[str, ...], peers: str | None, output: str | None, plot: str | None, repeats: int, quick: bool
 ) -> None:
     """Compare this package with other installed integrators at equal error.
 
@@ -45,21 +38,19 @@ def bench(
       first-step                time from text to the first step
 
     Install the peers with 'scvi-codegen[bench]'. Each section is printed, and written to the JSON file, when it is
-    complete; after Ctrl-C, --resume continues.
+    complete.
 
     \b
     Examples:
       scvi-codegen bench kepler:0.5 --peers heyoka --plot kepler.svg
       scvi-codegen bench drift robots -o measured.json
     """
-    if resume and output is None:
-        raise click.UsageError("--resume requires -o FILE, the report to continue")
     for path, hint in ((output, "'-o'"), (plot, "'--plot'")):
         if path is not None:
             check_writable(Path(path), hint)
     names = tuple(PEERS) if peers is None else tuple(filter(None, peers.split(",")))
     plan = Plan(peers=names, repeats=repeats, quick=quick)
-    report = benchmark(sections, plan, json_path=output, plot_path=plot, resume=resume, report_activity=note, show=tell)
+    report = benchmark(sections, plan, json_path=output, plot_path=plot, report_activity=note, show=tell)
     tell(**report.data())
     if report.interrupted:
         raise CommandFailure(

@@ -7,7 +7,7 @@ import click
 
 from scvi_codegen.cli.command_group import check_writable, emit, reporting
 from scvi_codegen.cli.model_options import model_arguments, read_model, with_known_sizes
-from scvi_codegen.derivation import Start, derivation_html
+from scvi_codegen.derivation import derivation_html
 from scvi_codegen.derivation.equations import StepEquations
 from scvi_codegen.derivation.equations import derive as derive_equations
 from scvi_codegen.derivation.events import events_text
@@ -48,9 +48,7 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
     if html is not None or radicals:
         model = with_known_sizes(model, "--html" if html is not None else "--radicals")
     if html is not None:
-        h = model.first_step(model.stepper()) if model.h is None else model.step
-        start = Start(q=model.q, velocity=model.velocity, p=model.p, h=h, t=model.t)
-        emit(derivation_html(model.system, model.method, start=start, events=model.events), html, **about)
+        emit(derivation_html(model.system, model.method, events=model.events), html, **about)
         return
     equations = derive_equations(model.system, model.method, radicals=radicals)
     text = equations.to_latex() if latex else equations.to_text()

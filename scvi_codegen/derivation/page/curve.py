@@ -219,7 +219,7 @@ def _nodal(degree: int) -> Iterator[Content]:
 
 
 def kronecker_form(method: SpectralCollocation) -> Iterator[Paragraph | Formula]:
-    """Yield (18), (21) with letters for matrices; ``StepEquations.matrix_form`` has all entries."""
+    """Yield (18), (21) with letters for matrices."""
     s, m = method.degree, Symbol("m", integer=True, positive=True)
     A, a0 = MatrixSymbol("A", s, s), MatrixSymbol("a_0", s, 1)
     q0, p0, v0 = (MatrixSymbol(name, m, 1) for name in ("q_k", "p_k", "v_k"))

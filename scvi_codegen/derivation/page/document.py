@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from scvi_codegen.derivation.events import events_text
 from scvi_codegen.derivation.notation import table_entries
 from scvi_codegen.derivation.page.curve import curve_section, tables_section
-from scvi_codegen.derivation.page.jacobian import Start, jacobian_section
+from scvi_codegen.derivation.page.jacobian import jacobian_section
 from scvi_codegen.derivation.page.kernels import functions_section, kernels_section, operations_section
 from scvi_codegen.derivation.page.stage_equations import (
     component_equations,
@@ -27,15 +27,12 @@ from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.version import __version__
 
 
-def derivation_html(
-    system: MechanicalSystem, method: Method, *, start: Start | None = None, events: Sequence[Event] = ()
-) -> str:
+def derivation_html(system: MechanicalSystem, method: Method, *, events: Sequence[Event] = ()) -> str:
     """Return the derivation of ``method`` for ``system`` as a self-contained page of HTML.
 
     Args:
         system: the mechanical system.
         method: its discretisation.
-        start: of a step, at whose initial guess the entries of the Jacobian are evaluated.
         events: of runs, which may change the state.
 
     Raises:
@@ -48,13 +45,13 @@ def derivation_html(
         body_class="derivation",
         system=system,
         method=method,
-        sections=[*_sections(system, method, start), *more],
+        sections=[*_sections(system, method), *more],
         css=style_sheet("page.css", "derivation.css"),
         version=__version__,
     )
 
 
-def _sections(system: MechanicalSystem, method: Method, start: Start | None) -> Iterator[Section]:
+def _sections(system: MechanicalSystem, method: Method) -> Iterator[Section]:
     program = program_of(system, method, prefix=c_identifier(system.name))
     functions = functions_of(render(program).amalgamated().code)
     stages = paper_equations(system, method)
@@ -66,7 +63,7 @@ def _sections(system: MechanicalSystem, method: Method, start: Start | None) -> 
     yield stage_section(system, stages)
     yield idel_section(system, stages)
     yield component_equations_section(derived)
-    yield jacobian_section(system, stages, derived, program, start)
+    yield jacobian_section(system, stages, derived, program)
     yield operations_section(program)
     yield kernels_section(system, program, functions)
     yield functions_section(system, method, program, functions)

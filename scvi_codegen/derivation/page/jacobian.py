@@ -1,14 +1,10 @@
-"""Sparsity pattern of the Jacobian, from the tables and the derivatives of kernels.
+"""Sparsity pattern of the Jacobian of the stage equations, from the tables and the derivatives of kernels."""
 
-Jacobian of the stage equations: sparsity pattern, and values at the initial guess of a step.
-"""
-
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from itertools import accumulate
 
-import sympy
 from sympy import Symbol
 
 from scvi_codegen.derivation.equations import StepEquations
@@ -66,8 +62,8 @@ def _coupled_pairs(
     }
 
 
-def pattern_drawing(pattern: Pattern, titles: Mapping[tuple[int, int], str] | None = None) -> Drawing | None:
-    """Return a picture of the matrix, ``None`` if it is too large; ``titles`` are tooltips."""
+def pattern_drawing(pattern: Pattern, unknowns: Sequence[str] = ()) -> Drawing | None:
+    """Return a picture of the matrix, ``None`` if it is too large; with names of unknowns its entries have tooltips."""
     if pattern.size > LARGEST_DRAWN:
         return None
     cell = SIDE / pattern.size
@@ -84,17 +80,18 @@ def pattern_drawing(pattern: Pattern, titles: Mapping[tuple[int, int], str] | No
     svg = (
         f'<svg viewBox="-1 -1 {SIDE + 2} {SIDE + 2}" role="img" aria-label="{caption}" '
         f'style="--width: {SIDE}px; min-width: 0">'
-        f'<path d="{"".join(runs)}" fill="var(--link)"/>{"".join(_tooltips(titles or {}, cell))}'
+        f'<path d="{"".join(runs)}" fill="var(--link)"/>{"".join(_tooltips(pattern, unknowns, cell))}'
         f'<path d="M0 0H{SIDE}V{SIDE}H0z" fill="none" stroke="currentColor" opacity="0.5"/></svg>'
     )
     return Drawing(svg, caption)
 
 
-def _tooltips(titles: Mapping[tuple[int, int], str], cell: float) -> Iterator[str]:
-    """Yield the tooltips of entries."""
-    for (i, j), title in titles.items():
-        geometry = f'x="{j * cell:.2f}" y="{i * cell:.2f}" width="{cell:.2f}" height="{cell:.2f}"'
-        yield f'<rect class="entry" {geometry}><title>{escape(title)}</title></rect>'
+def _tooltips(pattern: Pattern, unknowns: Sequence[str], cell: float) -> Iterator[str]:
+    """Yield the tooltips of entries: the equation and the unknown."""
+    for i, row in enumerate(pattern.rows if unknowns else ()):
+        for j in row:
+            geometry = f'x="{j * cell:.2f}" y="{i * cell:.2f}" width="{cell:.2f}" height="{cell:.2f}"'
+            yield f'<rect class="entry" {geometry}><title>equation {i + 1} by {escape(unknowns[j])}</title></rect>'
 
 
 def _runs(columns: tuple[int, ...]) -> list[tuple[int, int]]:
@@ -110,39 +107,17 @@ def _runs(columns: tuple[int, ...]) -> list[tuple[int, int]]:
 
 LARGEST_SHOWN = 3
 """Largest number of rows of a Jacobian whose entries are typeset."""
-MOST_NUMBERS = 1000
-"""Largest number of entries of a Jacobian that are evaluated."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Start:
-    """Start of a step, at whose initial guess the Jacobian is evaluated.
-
-    Attributes:
-        q: (m,) positions.
-        velocity, p: (m,) each, ``None`` if unknown; entries that depend on them are then not evaluated.
-        h, t: step size and time.
-    """
-
-    q: Sequence[float]
-    velocity: Sequence[float] | None
-    p: Sequence[float] | None
-    h: float
-    t: float = 0.0
+MOST_TITLED = 1000
+"""Largest number of entries of a Jacobian with tooltips."""
 
 
 def jacobian_section(
-    system: MechanicalSystem,
-    stages: StageSystem,
-    derived: StepEquations | None,
-    program: Program,
-    start: Start | None = None,
+    system: MechanicalSystem, stages: StageSystem, derived: StepEquations | None, program: Program
 ) -> Section:
-    """Return the section on the sparsity pattern of the Jacobian, and its values at a start."""
+    """Return the section on the sparsity pattern of the Jacobian."""
     pattern = jacobian_pattern(stages, system.dimension)
-    small = derived is not None and pattern.entries <= MOST_NUMBERS
-    numbers = entry_numbers(derived, start) if derived is not None and start is not None and small else {}
-    drawing = pattern_drawing(pattern, _titles(derived, pattern, numbers) if derived is not None and small else {})
+    titled = derived is not None and pattern.entries <= MOST_TITLED
+    drawing = pattern_drawing(pattern, [str(z) for z in derived.unknowns] if derived is not None and titled else ())
     text = (
         f"Derivatives of the {pattern.size} equations with respect to the {pattern.size} unknowns: {pattern.entries} "
         f"of {pattern.size**2} entries are structurally nonzero. It is assembled by sums over the points "
@@ -150,10 +125,6 @@ def jacobian_section(
     )
     contents: list[Content] = [Paragraph(text)]
     contents += [] if drawing is None else [drawing]
-    if numbers and start is not None:
-        contents.append(
-            Paragraph(f"The tooltip of an entry shows its value at the initial guess of a step h = {start.h:g}.")
-        )
     if derived is not None and pattern.size <= LARGEST_SHOWN:
         entries = derived.jacobian.todok().items()
         contents += formulas([Formula(value, Symbol(f"J_{i + 1}_{j + 1}")) for (i, j), value in entries], "entry")
@@ -171,30 +142,3 @@ def jacobian_section(
             Paragraph("The step is explicit, or solved by fixed-point iteration alone: the C has no Jacobian.")
         )
     return Section(name="jacobian", title="Jacobian", contents=tuple(contents))
-
-
-def entry_numbers(derived: StepEquations, start: Start) -> dict[tuple[int, int], float]:
-    """Return entries by row and column at the initial guess, without those that depend on unknown values."""
-    values: dict[Symbol, sympy.Expr] = {entry.symbol: sympy.Float(str(entry.value)) for entry in derived.entries}
-    values |= {parameter: sympy.Float(value) for parameter, value in derived.system.constants.items()}
-    values |= {derived.step: sympy.Float(start.h), derived.time: sympy.Float(start.t)}
-    q, p = derived.state
-    rates = [Symbol(f"{symbol.name.removesuffix('_k')}_dot_k") for symbol in q]
-    for symbols, numbers in ((q, start.q), (p, start.p), (rates, start.velocity)):
-        values |= dict(zip(symbols, map(sympy.Float, numbers), strict=True)) if numbers is not None else {}
-    named = {symbol.name: value for symbol, value in values.items()}
-    for unknown, guess in derived.initial_guess.items():
-        values[unknown] = guess.xreplace({s: named[s.name] for s in guess.free_symbols if s.name in named})
-    evaluated = {index: entry.xreplace(values).evalf() for index, entry in derived.jacobian.todok().items()}
-    return {index: float(value) for index, value in evaluated.items() if value.is_Float}
-
-
-def _titles(
-    derived: StepEquations, pattern: Pattern, numbers: Mapping[tuple[int, int], float]
-) -> dict[tuple[int, int], str]:
-    """Return the titles of entries: the equation, the unknown, and the value if it is known."""
-    return {
-        (i, j): f"equation {i + 1} by {derived.unknowns[j]}" + (f": {numbers[i, j]:.6g}" if (i, j) in numbers else "")
-        for i, row in enumerate(pattern.rows)
-        for j in row
-    }

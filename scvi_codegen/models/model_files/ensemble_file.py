@@ -1,20 +1,8 @@
 """Initial states of an ensemble, from a grid in TOML or a table in CSV; other values are those of the model.
 
-A grid lists values of some quantities; every combination is a trajectory, the last name varying fastest:
-
-    [grid]
-    q1 = { from = 0.5, to = 1.5, count = 11 }           # equally spaced, both ends included
-    p_q2 = [0.9, 1.0, 1.1]                              # a list
-    mu = 2.0                                            # or one number
-
-A table has a header of names and one line per trajectory:
-
-    q1,q1_dot,mu
-    0.5,0.0,1.0
-    0.6,0.1,1.2
-
-Names are those of coordinates, of velocities (``q1_dot``) or momenta (``p_q1``), not both in one file, and of
-parameters.
+A grid lists values of some quantities; every combination is a trajectory, the last name varying fastest. A table has a
+header of names and one line per trajectory. Names are those of coordinates, of velocities (``q1_dot``) or momenta
+(``p_q1``), not both in one file, and of parameters; see ``scvi-codegen run --help`` for examples.
 """
 
 from __future__ import annotations

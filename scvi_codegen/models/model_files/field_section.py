@@ -1,20 +1,5 @@
 """Section ``[field]`` of model files: a density with its discretisation in space, in the place of ``[system]``.
 
-    [field]
-    name = "sine-Gordon"
-    fields = ["u"]                                      # and momenta = ["p"] with hamiltonian = ".."
-    space = { x = [-20.0, 20.0] }                       # bounds are numbers or formulas of numbers
-    boundary = { x = "periodic" }                       # or two ends, ["natural", "sin(t)"]; default: natural ends
-    density = "u_t**2/2 - u_x**2/2 - c*(1 - cos(u))"
-    discretisation = { method = "spectral-elements", degree = 8, elements = 40 }
-    # dissipation = "0.1*u_t**2/2"
-    # scalars = ["X"]                                   # coordinates beside the fields, for point Lagrangians:
-    # point_lagrangians = [{ x = 0.0, lagrangian = "m*X_t**2/2 - k*(u - X)**2/2" }]
-
-    [initial]
-    q = { u = "4*atan(exp(x))" }                        # a formula in the axes, t and parameters, or an array
-    q_dot = { u = "0" }                                 # or p; q = { a = "..", b = ".." } sets momenta b, too
-
 Keys are the arguments of :meth:`~scvi_codegen.FieldSystem.from_text` and
 :meth:`~scvi_codegen.FieldSystem.discretise`.
 """

@@ -1,9 +1,4 @@
-"""Inputs in model files: tables in the model file or in separate files.
-
-    [inputs]
-    u = { file = "u.csv", kind = "cubic" }              # .csv or .npz, relative to the model file; columns t and u
-    w = { t = [0.0, 1.0, 2.0], values = [0.0, 0.5, 0.0] }
-    c = 0.1                                             # a constant
+"""Inputs in model files: tables in the model file or in separate files, or constants.
 
 Values are interpolated as ``constant`` (zero-order hold), ``linear`` (default) or ``cubic``. The column of an input has
 its name, or is called ``value``, or is the only one other than ``t``: one file may contain several inputs.

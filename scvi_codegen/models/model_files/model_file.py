@@ -1,75 +1,7 @@
-'''Model files: a TOML file with a system, a method, an initial state and a time span.
-
-    [system]
-    name = "planar pendulum"
-    coordinates = ["q"]
-    lagrangian = "m*l**2*q_dot**2/2 + m*g*l*cos(q)"     # several lines between """ and """
-    # time_transformation = "1/(1 + sin(q)**2)"         # dt/dtau, or a name of one: the step size is then in tau,
-                                                        # the span in time; default: adaptive steps
-
-    dissipation = "c*q_dot**2/2"                        # Rayleigh's function: forces -dD/dq_dot; default: 0
-    # damping = "gamma"                                 # damping rate of all momenta, or a number; default: 0
-    # constraints = ["x**2 + y**2 = l**2"]              # g(q, t) = 0, or equations
-    # inputs = ["u"]                                    # functions of time given as data
-    # rotations = { R = "omega" }                       # rigid bodies: R_11, .., omega_1, ..; directions, spins: names
-    # neighbours.near = { of = "r", cutoff = "c", box = "L" }   # lists for sums over i < j in near
-    # point_forces = [{ body = "R", point = ["0", "0", "l"], force = ["F", "0", "0"] }]
-
-    [forces]                                            # on coordinates; default: 0
-    q = "F*cos(w*t)"
-
-    # [torques]                                         # on rotations, in the body frame; [torques_space] in space
-    # R = ["0", "0", "-c*omega_3"]
-
-    [inputs]                                            # of the inputs named above; see input_tables.py
-    # u = { file = "u.csv", kind = "cubic" }            # relative to this file; or constant, linear (default)
-    # w = { t = [0.0, 1.0, 2.0], values = [0.0, 0.5, 0.0] }
-
-    [parameters]                                        # default values; the section is optional
-    m = 1.0
-    l = 1.0
-    g = 9.81
-    c = 0.1
-    F = 0.5
-    w = 2.0
-
-    [initial]
-    q = [2.0]                                           # or by name: a table [initial.q] with a line theta = 2.0
-    q_dot = [0.0]                                       # velocities, or p = [...] for momenta, not both
-    t = 0.0                                             # default: 0
-
-    # [[events]]                                        # zero crossings, which may change the state; any number
-    # function = "q - 1"
-    # direction = 1                                     # from negative to positive; default: both; terminal = 3
-    # then = { p_q = "-0.8*p_q" }                       # or restitution = 0.8, of the wall of an impact
-    # where = "q_dot > 0"                               # condition
-
-    [method]                                            # default: SVI(8); with constraints SVI(6)
-    method = "svi"                                      # then its arguments: degree, quadrature, nodes, ...
-    degree = 8
-    # solver = "newton"                                 # for stiff systems; default: "auto"
-
-    [run]
-    step = 0.5                                          # negative: backward in time
-    span = 100.0                                        # time span, or steps = 200
-                                                        # or tolerance = 1e-9 for adaptive steps (without both:
-                                                        # errors at round-off level); then negative spans go backward
-    # controller = "reversible"                         # g controls steps in physical time, by the step density
-    save_every = 1                                      # stride of saved states; default: 1
-
-A Hamiltonian is given in ``[system]`` as ``hamiltonian = "p**2/2 - cos(q)"``, with ``momenta = ["p"]`` or
-the names ``p_q``; with constraints the model is that of its Lagrangian.
-
-A density of fields is given in ``[field]``, in the place of ``[system]``: see
-:mod:`scvi_codegen.models.model_files.field_section`.
-
-``[system]`` may also be ``catalogue = "kepler"`` alone; then ``[parameters]`` changes default values, and missing
-entries of ``[initial]`` and ``[run]`` are the catalogue's. Written files are complete.
-
-Coordinates and parameters may be arrays, ``["x", "q[N]"]``: see :mod:`scvi_codegen.models.model_files.values`.
+"""Model files: a TOML file with a system, a method, an initial state and a time span (docs/model_files.md).
 
 Further sections, such as command-line options, can be merged over those of a file: they add and replace entries.
-'''
+"""
 
 from __future__ import annotations
 

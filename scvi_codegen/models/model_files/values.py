@@ -1,35 +1,5 @@
 """Values in model files: parameters, index tables and the initial state, as numbers, lists, files and formulas.
 
-Coordinates and parameters may be arrays, whose sizes are numbers or names:
-
-    [system]
-    coordinates = ["x", "q[N]"]                         # "r[N, 3]", "u[NX, NY]", "q[8]"
-    lagrangian = "M*x_dot**2/2 + sum(i in N, m[i]*q_dot[i]**2/2) - k*sum(i in N periodic, (q[i+1] - q[i] - x)**2/2)"
-    # constraints = ["(q[i+1] - q[i])**2 = 1 for i in 0..N-2"]
-
-    [forces]                                            # on coordinates, for all indices or for one; default: 0
-    # "q[i]" = "-c*q_dot[i]"
-
-    [sizes]                                             # unless determined by a list or file of numbers
-    N = 1000
-
-    [parameters]
-    "m[N]" = 1.0                                        # an array
-
-    [tables]                                            # whole numbers; or { file = "bonds.csv" }
-    # "bonds[B, 2]" = [[0, 1], [1, 2]]
-
-    [initial]                                           # of one array: q = "sin(2*pi*i/N)"
-    q = { x = 0.0, q = "sin(2*pi*i/N)" }                # q_dot or p; with sizes that are names default: 0
-
-Values of arrays are numbers, lists, files or formulas:
-
-    q = 0.5                                             # all entries
-    q = [0.1, 0.2, 0.3]                                 # its length is the size
-    q = { file = "q.npy" }                              # .npy, .npz, .csv; of several arrays in a file: array = "name"
-    q = "sin(2*pi*i/N)"                                 # in the indices i, j, k of its axes, sizes and parameters
-    r = ["cos(2*pi*i/N)", "sin(2*pi*i/N)", 0.0]         # each component of r[N, 3]
-
 Formulas are those of :mod:`scvi_codegen.formulas.grammar`: parsed by it and evaluated node by node, never executed as
 code.
 """

@@ -17,14 +17,11 @@
  * vector_convergence.h; CHANGE_POSITION (A), CHANGE_MOMENTUM (W) and their transposes with _BACK; the kernels
  * point_derivatives, derivative_product, TRANSPOSED_PRODUCT; POINT_INPUTS and input_derivatives. */
 
-enum {
-  STORED_OF_STEP = M * (POINTS + 2), /* numbers: velocities, then the increments of q and p */
-  INPUT_T = STEP_INPUTS - 2
-};
+enum { STORED_OF_STEP = M * (POINTS + 2) }; /* numbers: velocities, then the increments of q and p */
 
 /* Linearisation of a solved step: its increments, displacements D, E of the points from (q0, p0), x and v followed by
- * the derivatives of forces and momenta with respect to them, derivatives with respect to parameters and time, and
- * factors of the mass matrices. */
+ * the derivatives of forces and momenta with respect to them, derivatives with respect to parameters and time, of
+ * momenta times -1, and factors of the mass matrices. */
 typedef struct {
   const step_data *step;
   const double *dq, *dp;
@@ -68,6 +65,8 @@ static __attribute__((noinline)) void linearise_points(const step_data *step, co
       at->E[n][i] = value[i] - step->p0[i];
     memcpy(at->u[n] + 2 * M, value + M, sizeof(lanes) * POINT_DERIVATIVES);
     input_derivatives(u, t, step->parameters, at->given[n]);
+    for (int e = 0; e < INPUT_DERIVATIVES; e++)
+      at->given[n][e] = POINT_INPUTS[e][0] < M ? at->given[n][e] : -at->given[n][e];
   }
 }
 
@@ -121,30 +120,18 @@ static inline int solve_vectors(iterated_step *at, int back, lanes (*x0)[M], lan
   return status == 1 ? OK : NOT_CONVERGED;
 }
 
-/* Variations of forces and momenta at fixed points, by those of parameters and time. */
-static inline void vary_inputs(const iterated_step *at, const double *v, lanes (*F)[2 * M])
-{
-  memset(F, 0, sizeof(lanes) * GROUPS * 2 * M);
-  for (int n = 0; n < GROUPS; n++)
-    for (int e = 0; e < INPUT_DERIVATIVES; e++) {
-      const int from = 2 * M + POINT_INPUTS[e][1];
-      const lanes by = from == INPUT_T ? v[INPUT_T] + v[INPUT_T + 1] * ABSCISSA[n] : lanes_of(v[from]);
-      F[n][POINT_INPUTS[e][0]] += at->given[n][e] * by;
-    }
-}
-
 /* Replaces v, variations of (q0, p0, parameters, t, h), by those of (q1, p1, parameters, t + h, h) (JVP). */
 static __attribute__((noinline)) int jvp_by_iteration(iterated_step *at, double *v, int *look)
 {
   const double h = at->step->h, dh = v[INPUT_T + 1] / h;
   lanes given[GROUPS][2 * M], x0[GROUPS][M], p0[GROUPS][M], f[GROUPS][2 * M], F[GROUPS][M];
-  vary_inputs(at, v, given);
+  vary_by_inputs(at->given, v, given[0], 2 * M);
   for (int n = 0; n < GROUPS; n++)
     memcpy(F[n], given[n], sizeof F[n]);
   for (int n = 0; n < GROUPS; n++)
     for (int i = 0; i < M; i++) {
       x0[n][i] = v[i] + dh * at->D[n][i];
-      p0[n][i] = v[M + i] + dh * at->E[n][i] + h * apply(CHANGE_MOMENTUM, n, F, i) - given[n][M + i];
+      p0[n][i] = v[M + i] + dh * at->E[n][i] + h * apply(CHANGE_MOMENTUM, n, F, i) + given[n][M + i];
     }
   if (solve_vectors(at, 0, x0, p0, f, look) != OK)
     return NOT_CONVERGED;
@@ -161,23 +148,6 @@ static __attribute__((noinline)) int jvp_by_iteration(iterated_step *at, double 
   return OK;
 }
 
-/* Adds to v the gradient with respect to parameters and time from the adjoint variables of forces and momenta in u. */
-static inline void add_input_gradient(const iterated_step *at, double *v)
-{
-  lanes by[STEP_INPUTS - 2 * M][GROUPS];
-  memset(by, 0, sizeof by);
-  for (int n = 0; n < GROUPS; n++)
-    for (int e = 0; e < INPUT_DERIVATIVES; e++) {
-      const int from = POINT_INPUTS[e][0], to = POINT_INPUTS[e][1];
-      const lanes part = at->given[n][e] * at->u[n][from];
-      by[to][n] += from < M ? part : -part;
-      if (to == INPUT_T - 2 * M)
-        by[to + 1][n] += ABSCISSA[n] * (from < M ? part : -part);
-    }
-  for (int j = 0; j < STEP_INPUTS - 2 * M; j++)
-    v[2 * M + j] += points_total(by[j]);
-}
-
 /* Replaces v, adjoint variables of (q1, p1, parameters, t + h, h), by those of (q0, p0, parameters, t, h) (VJP). */
 static __attribute__((noinline)) int vjp_by_iteration(iterated_step *at, double *v, int *look)
 {
@@ -191,7 +161,7 @@ static __attribute__((noinline)) int vjp_by_iteration(iterated_step *at, double 
   if (solve_vectors(at, 1, y0, v0, z, look) != OK)
     return NOT_CONVERGED;
   v[INPUT_T + 1] += v[INPUT_T];
-  add_input_gradient(at, v);
+  add_input_gradient(at->given, at->u[0], 2 * M + POINT_DERIVATIVES, v);
   for (int i = 0; i < M; i++) {
     lanes placed[GROUPS], pushed[GROUPS], grown[GROUPS];
     for (int n = 0; n < GROUPS; n++) {

@@ -15,10 +15,7 @@
  * point_derivatives and derivative_product, TRANSPOSED_PRODUCT, POINT_INPUTS and input_derivatives, MASS_INPUTS and
  * mass_by_inputs. */
 
-enum {
-  STORED_OF_STEP = M * (POINTS + 2), /* numbers: D, then the increments of q and p */
-  INPUT_T = STEP_INPUTS - 2
-};
+enum { STORED_OF_STEP = M * (POINTS + 2) }; /* numbers: D, then the increments of q and p */
 
 /* Linearisation of a solved step: displacements D of its points from q0, the increments, and the derivatives of its
  * forces behind memory for M variations. */
@@ -132,18 +129,6 @@ static inline void vary_masses(iterated_step *at, const double *v, double *dm)
 #endif
 }
 
-/* Variations of the forces at fixed points. */
-static inline void vary_forces(iterated_step *at, const double *v, lanes (*F)[M])
-{
-  memset(F, 0, sizeof(lanes) * GROUPS * M);
-  for (int n = 0; n < GROUPS; n++)
-    for (int e = 0; e < INPUT_DERIVATIVES; e++) {
-      const int from = 2 * M + POINT_INPUTS[e][1];
-      const lanes by = from == INPUT_T ? v[INPUT_T] + v[INPUT_T + 1] * ABSCISSA[n] : lanes_of(v[from]);
-      F[n][POINT_INPUTS[e][0]] += at->given[n][e] * by;
-    }
-}
-
 /* Returns 1 if only q0 and p0 vary. */
 static inline int is_of_state(const double *v)
 {
@@ -162,7 +147,7 @@ static __attribute__((noinline)) int jvp_by_iteration(iterated_step *at, double 
   double dm[M];
   lanes f[GROUPS][M], F[GROUPS][M];
   vary_masses(at, v, dm);
-  vary_forces(at, v, F);
+  vary_by_inputs(at->given, v, F[0], M);
   for (int i = 0; i < M; i++) {
     const double by_length = 2.0 * dh - data->inverse_mass[i] * dm[i];
     const double drift = h * data->inverse_mass[i] * (v[M + i] - dh * at->step->p0[i]);
@@ -185,23 +170,6 @@ static __attribute__((noinline)) int jvp_by_iteration(iterated_step *at, double 
   return OK;
 }
 
-/* Adds to v the gradient with respect to parameters and time from the adjoint variables of the forces in u. */
-static inline void add_input_gradient(iterated_step *at, double *v)
-{
-  lanes by[STEP_INPUTS - 2 * M][GROUPS];
-  memset(by, 0, sizeof by);
-  for (int n = 0; n < GROUPS; n++)
-    for (int e = 0; e < INPUT_DERIVATIVES; e++) {
-      const int to = POINT_INPUTS[e][1];
-      const lanes part = at->given[n][e] * at->u[n][POINT_INPUTS[e][0]];
-      by[to][n] += part;
-      if (to == INPUT_T - 2 * M)
-        by[to + 1][n] += ABSCISSA[n] * part;
-    }
-  for (int j = 0; j < STEP_INPUTS - 2 * M; j++)
-    v[2 * M + j] += points_total(by[j]);
-}
-
 /* Replaces v, adjoint variables of (q1, p1, parameters, t + h, h), by those of (q0, p0, parameters, t, h) (VJP). */
 static __attribute__((noinline)) int vjp_by_iteration(iterated_step *at, double *v, int *look)
 {
@@ -215,7 +183,7 @@ static __attribute__((noinline)) int vjp_by_iteration(iterated_step *at, double 
   if (solve_vectors(at, 1, f, look) != OK)
     return NOT_CONVERGED;
   v[INPUT_T + 1] += v[INPUT_T];
-  add_input_gradient(at, v);
+  add_input_gradient(at->given, at->u[0], M + POINT_DERIVATIVES, v);
   for (int i = 0; i < M; i++) {
     lanes part[GROUPS], turned[GROUPS], drifted[GROUPS];
     for (int n = 0; n < GROUPS; n++) {

@@ -3,7 +3,10 @@
 
 #include "../iteration/convergence.h"
 
-/* Convergence criterion for the fixed-point iterations of tangent and adjoint vectors. Requires: convergence.h. */
+/* Convergence criterion for the fixed-point iterations of tangent and adjoint vectors, and their dependence on
+ * parameters and time. Requires: convergence.h, POINT_INPUTS. */
+
+enum { INPUT_T = STEP_INPUTS - 2 };
 
 #define MOVED_BY_ROUNDING (4.0 * DBL_EPSILON * DBL_EPSILON) /* squared: relative change that rounding alone may cause */
 #define LEFT_TO_COME (DBL_EPSILON * DBL_EPSILON / 16.0) /* squared: relative change still to come that is accepted */
@@ -35,6 +38,36 @@ static inline int vectors_status(double moved, double size, vector_changes *past
     return 1;
   }
   return finite && relative < INFINITY && k < MAX_ITERATIONS && shrinks ? 0 : -1;
+}
+
+/* Variations of the results of kernels at fixed points, `results` at each, by those of parameters and time. */
+static inline void vary_by_inputs(lanes (*given)[INPUT_DERIVATIVES], const double *v, lanes *F, int results)
+{
+  memset(F, 0, sizeof(lanes) * (size_t)(GROUPS * results));
+  for (int n = 0; n < GROUPS; n++)
+    for (int e = 0; e < INPUT_DERIVATIVES; e++) {
+      const int from = 2 * M + POINT_INPUTS[e][1];
+      const lanes by = from == INPUT_T ? v[INPUT_T] + v[INPUT_T + 1] * ABSCISSA[n] : lanes_of(v[from]);
+      F[n * results + POINT_INPUTS[e][0]] += given[n][e] * by;
+    }
+}
+
+/* Adds to v the gradient with respect to parameters and time from the adjoint variables of the results in u, with
+ * `stride` numbers per group. */
+static inline void add_input_gradient(lanes (*given)[INPUT_DERIVATIVES], const lanes *u, int stride, double *v)
+{
+  lanes by[STEP_INPUTS - 2 * M][GROUPS];
+  memset(by, 0, sizeof by);
+  for (int n = 0; n < GROUPS; n++)
+    for (int e = 0; e < INPUT_DERIVATIVES; e++) {
+      const int to = POINT_INPUTS[e][1];
+      const lanes part = given[n][e] * u[n * stride + POINT_INPUTS[e][0]];
+      by[to][n] += part;
+      if (to == INPUT_T - 2 * M)
+        by[to + 1][n] += ABSCISSA[n] * part;
+    }
+  for (int j = 0; j < STEP_INPUTS - 2 * M; j++)
+    v[2 * M + j] += points_total(by[j]);
 }
 
 #endif

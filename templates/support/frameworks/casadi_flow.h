@@ -18,6 +18,33 @@ static const casadi_int STATES_SHAPE[] = {FLOW_STATE, FLOW_COLUMNS, 1};
 static const casadi_int JACOBIAN_SHAPE[] = {FLOW_STATE * FLOW_COLUMNS, STEP_INPUTS, 1};
 static const casadi_int NO_STATES_SHAPE[2 + FLOW_COLUMNS + 1] = {FLOW_STATE, FLOW_COLUMNS};
 
+/* Defines the numbers and sparsity patterns of the arguments and results of a function. */
+#define DESCRIBE(function, ARGUMENTS, RESULTS)                      \
+  casadi_int EXTERNAL(function, _n_in)(void)                        \
+  {                                                                 \
+    return sizeof ARGUMENTS / sizeof *ARGUMENTS;                    \
+  }                                                                 \
+  casadi_int EXTERNAL(function, _n_out)(void)                       \
+  {                                                                 \
+    return sizeof RESULTS / sizeof *RESULTS;                        \
+  }                                                                 \
+  const casadi_int *EXTERNAL(function, _sparsity_in)(casadi_int i)  \
+  {                                                                 \
+    return i < EXTERNAL(function, _n_in)() ? ARGUMENTS[i] : NULL;   \
+  }                                                                 \
+  const casadi_int *EXTERNAL(function, _sparsity_out)(casadi_int i) \
+  {                                                                 \
+    return i < EXTERNAL(function, _n_out)() ? RESULTS[i] : NULL;    \
+  }
+
+static const casadi_int *const FLOW_ARGUMENTS[] = {INPUT_SHAPE}, *const FLOW_RESULTS[] = {STATES_SHAPE};
+DESCRIBE(, FLOW_ARGUMENTS, FLOW_RESULTS)
+static const casadi_int *const JACOBIAN_ARGUMENTS[] = {INPUT_SHAPE, NO_STATES_SHAPE};
+static const casadi_int *const JACOBIAN_RESULTS[] = {JACOBIAN_SHAPE};
+DESCRIBE(jac_, JACOBIAN_ARGUMENTS, JACOBIAN_RESULTS)
+static const casadi_int *const ADJOINT_ARGUMENTS[] = {INPUT_SHAPE, NO_STATES_SHAPE, STATES_SHAPE};
+DESCRIBE(adj1_, ADJOINT_ARGUMENTS, FLOW_ARGUMENTS)
+
 /* Calls the flow. A NULL result is not computed; a NULL argument counts as 0. */
 static int external_flow(flow_part part, int count, const double *x, const double *given, double *found)
 {
@@ -32,26 +59,6 @@ int EXTERNAL(, )(const double **arg, double **res, casadi_int *iw, double *w, in
   return external_flow(FLOW_STATES, 0, arg[0], NULL, res[0]);
 }
 
-casadi_int EXTERNAL(, _n_in)(void)
-{
-  return 1;
-}
-
-casadi_int EXTERNAL(, _n_out)(void)
-{
-  return 1;
-}
-
-const casadi_int *EXTERNAL(, _sparsity_in)(casadi_int i)
-{
-  return i == 0 ? INPUT_SHAPE : NULL;
-}
-
-const casadi_int *EXTERNAL(, _sparsity_out)(casadi_int i)
-{
-  return i == 0 ? STATES_SHAPE : NULL;
-}
-
 /* Jacobian, by columns: the JVPs of the unit vectors. */
 int EXTERNAL(jac_, )(const double **arg, double **res, casadi_int *iw, double *w, int mem)
 {
@@ -60,27 +67,6 @@ int EXTERNAL(jac_, )(const double **arg, double **res, casadi_int *iw, double *w
   for (int i = 0; i < STEP_INPUTS; i++)
     each[i * STEP_INPUTS + i] = 1;
   return external_flow(FLOW_JVP, STEP_INPUTS, arg[0], each, res[0]);
-}
-
-casadi_int EXTERNAL(jac_, _n_in)(void)
-{
-  return 2;
-}
-
-casadi_int EXTERNAL(jac_, _n_out)(void)
-{
-  return 1;
-}
-
-const casadi_int *EXTERNAL(jac_, _sparsity_in)(casadi_int i)
-{
-  return i == 0 ? INPUT_SHAPE : i == 1 ? NO_STATES_SHAPE
-                                       : NULL;
-}
-
-const casadi_int *EXTERNAL(jac_, _sparsity_out)(casadi_int i)
-{
-  return i == 0 ? JACOBIAN_SHAPE : NULL;
 }
 
 /* Gradient with respect to the inputs from the adjoint variables of the states (VJP). */
@@ -92,28 +78,6 @@ int EXTERNAL(adj1_, )(const double **arg, double **res, casadi_int *iw, double *
   return arg[2] && external_flow(FLOW_VJP, 1, arg[0], arg[2], res[0]);
 }
 
-casadi_int EXTERNAL(adj1_, _n_in)(void)
-{
-  return 3;
-}
-
-casadi_int EXTERNAL(adj1_, _n_out)(void)
-{
-  return 1;
-}
-
-const casadi_int *EXTERNAL(adj1_, _sparsity_in)(casadi_int i)
-{
-  return i == 0 ? INPUT_SHAPE : i == 1 ? NO_STATES_SHAPE
-      : i == 2                         ? STATES_SHAPE
-                                       : NULL;
-}
-
-const casadi_int *EXTERNAL(adj1_, _sparsity_out)(casadi_int i)
-{
-  return i == 0 ? INPUT_SHAPE : NULL;
-}
-
 #ifdef SECOND_DERIVATIVES
 /* Jacobian of the adjoint of a flow for CasADi: exact second derivatives. Requires: flow.h. */
 
@@ -121,6 +85,9 @@ static const casadi_int NO_INPUT_SHAPE[2 + 1 + 1] = {STEP_INPUTS, 1};
 static const casadi_int HESSIAN_SHAPE[] = {STEP_INPUTS, STEP_INPUTS, 1};
 static const casadi_int NO_JACOBIAN_SHAPE[2 + FLOW_STATE * FLOW_COLUMNS + 1] = {STEP_INPUTS, FLOW_STATE * FLOW_COLUMNS};
 static const casadi_int TRANSPOSED_SHAPE[] = {STEP_INPUTS, FLOW_STATE * FLOW_COLUMNS, 1};
+static const casadi_int *const SECOND_ARGUMENTS[] = {INPUT_SHAPE, NO_STATES_SHAPE, STATES_SHAPE, NO_INPUT_SHAPE};
+static const casadi_int *const SECOND_RESULTS[] = {HESSIAN_SHAPE, NO_JACOBIAN_SHAPE, TRANSPOSED_SHAPE};
+DESCRIBE(jac_adj1_, SECOND_ARGUMENTS, SECOND_RESULTS)
 
 /* Derivatives of the adjoint with respect to the inputs (Hessian-vector products of the unit vectors), by columns. */
 static int external_hessian(const double *x, const double *partials, double *found)
@@ -167,30 +134,6 @@ int EXTERNAL(jac_adj1_, )(const double **arg, double **res, casadi_int *iw, doub
   return status != OK;
 }
 
-casadi_int EXTERNAL(jac_adj1_, _n_in)(void)
-{
-  return 4;
-}
-
-casadi_int EXTERNAL(jac_adj1_, _n_out)(void)
-{
-  return 3;
-}
-
-const casadi_int *EXTERNAL(jac_adj1_, _sparsity_in)(casadi_int i)
-{
-  return i == 0 ? INPUT_SHAPE : i == 1 ? NO_STATES_SHAPE
-      : i == 2                         ? STATES_SHAPE
-      : i == 3                         ? NO_INPUT_SHAPE
-                                       : NULL;
-}
-
-const casadi_int *EXTERNAL(jac_adj1_, _sparsity_out)(casadi_int i)
-{
-  return i == 0 ? HESSIAN_SHAPE : i == 1 ? NO_JACOBIAN_SHAPE
-      : i == 2                           ? TRANSPOSED_SHAPE
-                                         : NULL;
-}
 #endif
 
 #endif
