@@ -47,9 +47,9 @@ static int changes_by(const event_step *step, int e, const event_sample *at, eve
   event_changes(u, at->t, step->parameters, value);
   wall->n = value + FIRST_VALUE[e];
   wall->place = CHANGED + FIRST_VALUE[e];
-  wall->count = FIRST_VALUE[e + 1] - FIRST_VALUE[e] - 2 * IS_IMPACT[e];
+  wall->count = FIRST_VALUE[e + 1] - FIRST_VALUE[e] - 2 * IS_IMPACT[EVENT_OF(e)];
   wall->by_time = wall->restitution = 0.0;
-  if (IS_IMPACT[e]) {
+  if (IS_IMPACT[EVENT_OF(e)]) {
     wall->by_time = wall->n[wall->count];
     wall->restitution = wall->n[wall->count + 1];
   }
@@ -431,8 +431,8 @@ static int change_at_crossings(const event_step *step, long long first, event_sa
       step->found[*step->filled] = step->found[first];
       step->found[*step->filled].function = event;
       step->found[*step->filled].direction = -1;
+      SET_ELEMENT(step->found + *step->filled, e);
 #ifdef EVENTS_OF_ANY_SIZE
-      step->found[*step->filled].element = e - event_host->first[event];
       step->found[*step->filled].acted = 0;
 #endif
       ends_search(step->watch, step->found + *step->filled);
@@ -464,7 +464,7 @@ static int check_walls(const event_step *step, const event_sample *left, const e
       status = conditions(e, right->t, right->q, right->p, step->parameters, &open, step->workspace);
 #if EVENT_GUARDS > 0
     for (int i = 0; !left && i < EVENT_GUARDS; i++)
-      open &= GUARDED[i] != event;
+      open &= GUARDED[i] != GUARD_OF(e);
 #endif
     if (status == OK && open && (!left || before[e] >= -wall.slack) && after[e] < -wall.slack) {
       step->watch->through = event + 1;

@@ -75,14 +75,20 @@ typedef NAME(crossing) event_crossing;
 #endif
 
 #ifndef EVENT_GUARDS
-#define EVENT_GUARDS 0 /* conditions of crossings, each of the event GUARDED: values of the kernel event_guards */
+#define EVENT_GUARDS 0 /* conditions of crossings, each of the event or function GUARDED: values of the kernel event_guards */
+#endif
+#ifdef EVENT_FIRST /* index notation: an event has a function for each element of its loops */
+#define FUNCTION_OF(crossing) ((int)(EVENT_FIRST[(crossing)->function] + (crossing)->element))
+#define SET_ELEMENT(crossing, e) ((crossing)->element = (e) - EVENT_FIRST[(crossing)->function])
+#else
+#define EVENT_OF(e) (e) /* event of a function */
+#define FUNCTION_OF(crossing) ((crossing)->function)
+#define SET_ELEMENT(crossing, e) ((void)(e))
 #endif
 #ifdef EVENTS_OF_ANY_SIZE
-#define FUNCTION_OF(crossing) ((int)(event_host->first[(crossing)->function] + (crossing)->element))
+#define GUARD_OF(e) EVENT_OF(e) /* conditions are those of an event */
 #else
-#define EVENT_OF(e) (e) /* event of a function; in index notation an event has one for each element of its loops */
-#define FUNCTION_OF(crossing) ((crossing)->function)
-
+#define GUARD_OF(e) (e) /* those of a function */
 /* Arguments (q, p, v) of the kernels of events at a state. */
 static int event_arguments(real t, const real *q, const real *p, const real *parameters, real *u, real *workspace)
 {
@@ -122,7 +128,7 @@ static int conditions(int e, real t, const real *q, const real *p, const real *p
     return status;
   event_guards(u, t, parameters, value);
   for (int i = 0; i < EVENT_GUARDS; i++)
-    *open &= GUARDED[i] != e || value[i] >= 0.0;
+    *open &= GUARDED[i] != GUARD_OF(e) || value[i] >= 0.0;
 #else
   (void)e, (void)t, (void)q, (void)p, (void)parameters, (void)workspace;
 #endif
@@ -368,12 +374,12 @@ static int add_crossing(const event_step *step, int e, const event_sample *from,
     return EVENT_NO_ROOM;
   crossing->q = event_host->states + 2 * M * step->watch->used++;
   crossing->p = crossing->q + M;
-  crossing->element = e - event_host->first[event];
   crossing->acted = 0;
 #endif
   crossing->t = at.t;
   crossing->fraction = at.fraction;
   crossing->function = event;
+  SET_ELEMENT(crossing, e);
   crossing->direction = direction;
   copy_state(crossing->q, crossing->p, at.q, at.p);
   ++*step->filled;
