@@ -130,13 +130,21 @@ def test_memory_of_a_wall_has_all_its_entries(gas):
     assert abs(radius[-1] - (2.0 - np.linalg.norm(r) * (1.0 + 3 * 0.7))) < 1e-13
 
 
-@pytest.mark.full
-def test_states_of_crossings_of_many_coordinates_are_not_saved(gas):
+def test_states_of_crossings_have_a_limit_of_memory(gas, monkeypatch):
+    """At most ``MOST_BYTES`` of states are kept; times and elements always are."""
     random = np.random.default_rng(5)
-    r, v = random.random((3000, 2)), 0.1 * random.normal(size=(3000, 2))
-    run = gas.integrate({"r": r}, velocity={"r": v}, h=1e-2, steps=5, save_every=5, events=BOX)
-    assert np.abs(run.q["r"][-1] - folded(r, v, 0.05)).max() < 1e-14
-    assert len(run.events[0]) > 2
+    r, v = random.random((1100, 2)), 0.02 * random.normal(size=(1100, 2))
+    start, plan = ({"r": r}, {"velocity": {"r": v}}), {"h": 1e-2, "steps": 4, "save_every": 4, "events": BOX}
+    kept = gas.integrate(*start[:1], **start[1], **plan)
+    for each, wall in zip(kept.events, (0.0, 1.0), strict=True):
+        places = each.q["r"].reshape(len(each), -1)[np.arange(len(each)), each.element]
+        assert len(each) > 0
+        assert np.abs(places - wall).max() < 1e-14
+    monkeypatch.setattr(detection, "MOST_BYTES", 10_000)
+    with pytest.warns(sc.errors.EventWarning, match="are not kept: run.events has times and elements"):
+        run = gas.integrate(*start[:1], **start[1], **plan)
+    assert np.abs(run.q["r"][-1] - folded(r, v, 0.04)).max() < 1e-14
+    assert [each.element.tolist() for each in run.events] == [each.element.tolist() for each in kept.events]
     assert np.isnan(run.events[0].q["r"]).all()
 
 

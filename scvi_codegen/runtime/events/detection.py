@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import EventError, EventWarning, StateError, warn
 from scvi_codegen.native.options import step_failure
-from scvi_codegen.runtime.arrays.any_size import MOST_COORDINATES
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.events.event import ACCUMULATED, BEHIND, JAMMED, THROUGH, UNDEFINED, Crossings
 from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
@@ -20,6 +19,8 @@ if TYPE_CHECKING:
 
 INITIAL_CAPACITY, LEAST_CAPACITY, CROSSING_NUMBERS = 256, 16, 2**21
 """Initial number of crossings that one call can return, doubled when exceeded; fewer of more than 8192 coordinates."""
+MOST_BYTES = 2**31
+"""Largest memory for the states of crossings of a run; if they exceed it, none is kept."""
 
 
 class CrossingSearch:
@@ -45,7 +46,7 @@ class CrossingSearch:
             self.watch.direction[number] = event.direction
             self.watch.acts[number] = terminal and event.changes_state
             self.watch.remaining[number] = terminal and int(event.terminal)
-        self._discards_states = stepper.dimension > MOST_COORDINATES and any(event.loops for event in stepper.events)
+        self._bytes = 0
         self._capacity = min(INITIAL_CAPACITY, max(LEAST_CAPACITY, CROSSING_NUMBERS // stepper.dimension))
 
     @property
@@ -114,11 +115,21 @@ class CrossingSearch:
         return (t, q, p, iterations[:count]), sizes, numbers[:count], failure
 
     def _record(self, crossings: Any, count: int) -> None:
-        """Record the first crossings of an array, without states if these would be too many."""
+        """Record the first crossings of an array; discard all states if these would exceed ``MOST_BYTES``."""
         records = self.binding.records(crossings)[:count].copy()
         if count:
             self.last = float(records["t"][-1]), records["q"][-1], records["p"][-1]
-        self.recorded.append(records[["t", "function", "element"]].copy() if self._discards_states else records)
+        before, self._bytes = self._bytes, self._bytes + records.nbytes
+        self.recorded.append(records)
+        if self._bytes > MOST_BYTES:
+            names = [name for name in ("t", "function", "element") if name in records.dtype.names]
+            self.recorded = [each[names].copy() for each in self.recorded]
+        if before <= MOST_BYTES < self._bytes:
+            warn(
+                f"the states of crossings until t = {self.last[0]:.6g} exceed {MOST_BYTES / 2**30:g} GiB and are not "
+                "kept: run.events has times and elements. Integrate in parts, or compute states with run.at(t)",
+                EventWarning,
+            )
 
     def _failure(self, status: int, report: Any, step: int, h: float) -> Exception:
         behind = getattr(self.watch, "behind", 0.0)

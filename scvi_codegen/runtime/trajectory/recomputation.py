@@ -56,7 +56,10 @@ def changes_by_events(states: SavedStates) -> Iterator[tuple[Crossings, NDArray[
         if crossings.event.changes_state:
             if not np.array_equal(t[rows], times[here]):
                 raise StateError("this requires the states after changes by events: save all states (save_every=1)")
-            yield crossings.chosen(here), rows
+            chosen = crossings.chosen(here)
+            if np.isnan(np.asarray(chosen.q)).any():
+                raise StateError("this requires the states of crossings, which exceed 2 GiB: integrate in parts")
+            yield chosen, rows
 
 
 def steps_between(length: float, span: float) -> int:
