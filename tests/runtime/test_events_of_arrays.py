@@ -119,6 +119,41 @@ def test_an_event_of_every_element_equals_events_of_entries():
     assert np.abs(tangents[0] - tangents[1]).max() < 1e-11 * np.abs(tangents[1]).max()
 
 
+@pytest.mark.parametrize("of_known_sizes", [False, pytest.param(True, marks=pytest.mark.full)])
+def test_gradients_through_events_of_elements(of_known_sizes):
+    """The adjoint equals the tangents to round-off, and extrapolated differences of the run."""
+    stepper, n = compile_stepper(CHAIN, "svi:4", flags=FLAGS), 4
+    stepper = stepper.with_sizes(N=n) if of_known_sizes else stepper
+    loops = [
+        impact("13/10 + b - q[i] for i in N", "e"),
+        Event("q[i] + 1/2 for i in 1..N-1", -1, then={"p_q[i]": "-e*p_q[i] + q[i-1]/99"}),
+    ]
+    q, w = np.linspace(0.2, 1.0, n), np.cos(np.arange(2 * n) + 1.0)
+    x = np.concatenate([q, 1.5 * np.cos(3.0 * np.arange(n)), [1.5, 0.9, 0.1]])
+
+    def run_from(x):
+        known = dict(zip(("m", "e", "b"), x[2 * n :], strict=True))
+        return stepper.integrate(x[:n], p=x[n : 2 * n], parameters=known, events=loops, h=0.1, steps=50)
+
+    def differences(d):
+        ends = [
+            np.hstack([each.q[-1], each.p[-1]]) for each in map(run_from, x + d * np.vstack([np.eye(11), -np.eye(11)]))
+        ]
+        return (np.array(ends[:11]) - ends[11:]) @ w / (2 * d)
+
+    run = run_from(x)
+    assert min(map(len, run.events)) > 0
+    cotangents = np.zeros((len(run.t), 2 * n))
+    cotangents[-1] = w
+    gradient, sensitivity = run.pullback(cotangents), run.sensitivity()
+    adjoint = np.concatenate([np.ravel(each) for each in (gradient.q, gradient.p, gradient.parameters)])
+    tangent = w @ np.hstack([sensitivity.state[-1], sensitivity.parameters[-1]])
+    assert np.abs(adjoint - tangent).max() < 1e-13 * np.abs(tangent).max()
+    one, two, three = (differences(d) for d in (2e-4, 1e-4, 5e-5))
+    extrapolated = (64 * three - 20 * two + one) / 45
+    assert np.abs(adjoint - extrapolated).max() < 1e-8 * np.abs(tangent).max()
+
+
 def test_memory_of_a_wall_has_all_its_entries(gas):
     """A wall that contains all coordinates, of more than 2000: a sphere around particles in 3000 dimensions."""
     r = np.full((1500, 2), 0.01)
