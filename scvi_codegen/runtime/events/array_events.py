@@ -56,13 +56,12 @@ class EventBinding(ArrayBinding):
             return self._ffi.new(f"{self._prefix}_watch *", {"history": int(self._first[-1])})
         return super().new(what)
 
-    def records(self, structs: Any) -> NDArray[np.void]:
-        """Return a copy of crossings, by the names of their fields."""
+    def records(self, structs: Any, count: int) -> NDArray[np.void]:
+        """Return a copy of the first of several crossings, by the names of their fields."""
         fields = {"t": float, "fraction": float, "function": np.int32, "direction": np.int32, "element": np.int64}
-        records = np.zeros(len(structs), [*fields.items(), *((name, float, (self.count,)) for name in "qp")])
-        for record, crossing in zip(records, structs, strict=True):
-            if crossing.q == self.null:
-                break
+        records = np.empty(count, [*fields.items(), *((name, float, (self.count,)) for name in "qp")])
+        for k in range(count):
+            record, crossing = records[k], structs[k]
             record["q"], record["p"] = self.vector(crossing.q), self.vector(crossing.p)
             for name in fields:
                 record[name] = getattr(crossing, name)
@@ -75,7 +74,8 @@ class EventBinding(ArrayBinding):
         host, made = self.new("event_host *"), super(ArrayBinding, self).new("report *")
         size = self.constant("EVENT_STATES") * n + self.constant("EVENT_VALUES") * functions
         work, values, places = np.empty(size), np.empty(self._changes + n), np.zeros(self._changes, np.int32)
-        self._rows[found] = np.empty((room, 2 * n))
+        if found not in self._rows:
+            self._rows[found] = np.empty((room, 2 * n))
         host.count, host.functions, host.changes, host.first = n, functions, self._changes, self._first.tolist()
         host.memory, host.states = self.pointer(work), self.pointer(self._rows[found])
         host.values, host.places = self.pointer(values), self.pointer(places)

@@ -17,9 +17,9 @@ from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
 if TYPE_CHECKING:
     from scvi_codegen.runtime.run.memory import Memory
 
-INITIAL_CAPACITY, LEAST_CAPACITY, CROSSING_NUMBERS = 256, 16, 2**21
-"""Initial number of crossings that one call can return, doubled when exceeded; fewer of more than 8192 coordinates."""
-MOST_BYTES = 2**31
+INITIAL_CAPACITY, LEAST_CAPACITY, CROSSING_NUMBERS = 256, 16, 2**24
+"""Initial number of crossings that one call can return, doubled when exceeded; fewer of more than 65,536 coordinates."""
+MOST_BYTES = 2**30
 """Largest memory for the states of crossings of a run; if they exceed it, none is kept."""
 
 
@@ -46,7 +46,7 @@ class CrossingSearch:
             self.watch.direction[number] = event.direction
             self.watch.acts[number] = terminal and event.changes_state
             self.watch.remaining[number] = terminal and int(event.terminal)
-        self._bytes = 0
+        self._bytes, self._buffers = 0, (None, [np.empty(0)])
         self._capacity = min(INITIAL_CAPACITY, max(LEAST_CAPACITY, CROSSING_NUMBERS // stepper.dimension))
 
     @property
@@ -96,10 +96,15 @@ class CrossingSearch:
         """
         plan, binding, number = run._plan, self.binding, run.steps
         most = 2 * size + self._capacity
-        rows = [np.empty((most + 1, *shape)) for shape in ((), run._q.shape, run._p.shape, ())]
+        crossings, rows = self._buffers  # kept for later calls, as new memory of large states is slow
+        if crossings is None or len(crossings) != self._capacity:
+            crossings = binding.new(f"crossing[{self._capacity}]")
+        if len(rows[0]) != most + 1:
+            rows = [np.empty((most + 1, *shape)) for shape in ((), run._q.shape, run._p.shape, ())]
+        self._buffers = crossings, rows
         rows[0][0], rows[1][0], rows[2][0] = run.t, run._q, run._p
         iterations, numbers = np.zeros(most + 1, np.int32), np.full(most + 1, number, np.int64)
-        crossings, filled = binding.new(f"crossing[{self._capacity}]"), binding.numbers("long long *")
+        filled = binding.numbers("long long *")
         arguments = self.watch, plan.t_end, plan.tau or plan.tolerance, size, *run._arguments, most
         states = *(binding.pointer(each[1:]) for each in rows), binding.integers(iterations[1:])
         to = self._capacity, crossings, filled, run._report, run._workspace
@@ -116,7 +121,7 @@ class CrossingSearch:
 
     def _record(self, crossings: Any, count: int) -> None:
         """Record the first crossings of an array; discard all states if these would exceed ``MOST_BYTES``."""
-        records = self.binding.records(crossings)[:count].copy()
+        records = self.binding.records(crossings, count)
         if count:
             self.last = float(records["t"][-1]), records["q"][-1], records["p"][-1]
         before, self._bytes = self._bytes, self._bytes + records.nbytes
@@ -154,15 +159,15 @@ class CrossingSearch:
 
     def crossings(self) -> tuple[Crossings, ...]:
         """Return the crossings by event."""
-        none, named = self.binding.records(self.binding.new("crossing[1]"))[:0], self.stepper.named
-        records: Any = np.concatenate(self.recorded or [none])
+        none, named = self.binding.records(self.binding.new("crossing[1]"), 0), self.stepper.named
+        records: Any = np.concatenate(self.recorded) if len(self.recorded) > 1 else [*self.recorded, none][0]
         crossings = []
         for number, event in enumerate(self.stepper.events):
-            mine = records[records["function"] == number]
-            values = {name: mine[name].copy() for name in ("t", "q", "p", "element") if name in mine.dtype.names}
-            unknown = np.broadcast_to(np.nan, (len(mine), self.stepper.dimension))
+            mine, names = records["function"] == number, records.dtype.names
+            values = {name: records[name][mine] for name in ("t", "q", "p", "element") if name in names}
+            unknown = np.broadcast_to(np.nan, (np.count_nonzero(mine), self.stepper.dimension))
             values |= {name: named(values.get(name, unknown)) for name in "qp"}
-            values.setdefault("element", np.zeros(len(mine), np.int64))
+            values.setdefault("element", np.zeros(len(unknown), np.int64))
             crossings.append(Crossings(event=event, **values))
         return tuple(crossings)
 

@@ -65,7 +65,7 @@ def changes_by_events(states: SavedStates) -> Iterator[tuple[Crossings, NDArray[
             if not np.array_equal(t[rows], times[here]):
                 raise StateError("this requires the states after changes by events: save all states (save_every=1)")
             if np.isnan(np.asarray(chosen.q)).any():
-                raise StateError("this requires the states of crossings, which exceed 2 GiB: integrate in parts")
+                raise StateError("this requires the states of crossings, which exceed 1 GiB: integrate in parts")
             yield chosen, rows
 
 

@@ -385,6 +385,19 @@ static int refine_crossing(const event_step *step, long long first, event_sample
   return status;
 }
 
+/* Whether function e may be within rounding of zero at the state of a change, by bounds 2^20 times as large: of the
+ * effect of rounding, and of its change along the step. Saves the gradients of most of many functions. */
+static int may_be_touched(const event_step *step, int e)
+{
+  const real value = values_at(step, EVENT_DEGREE + 1)[e];
+  real range = 0.0;
+  if (EVENTS <= EVENT_FEW)
+    return 1;
+  for (int j = 0; j <= EVENT_DEGREE; j++)
+    range = fmax(range, fabs(values_at(step, j)[e] - value));
+  return fabs(value) <= 0x1p-20 * range + 0x1p26 * values_at(step, EVENT_DEGREE + 2)[e];
+}
+
 /* Changes the state at the crossings from `first` on, which have one state, then at all walls that it touches within
  * rounding and approaches, in their order, until there is none; walls that are met there are crossings, too. */
 static int change_at_crossings(const event_step *step, long long first, event_sample *at)
@@ -407,7 +420,7 @@ static int change_at_crossings(const event_step *step, long long first, event_sa
       const int event = EVENT_OF(e);
       event_wall wall;
       int open = 0, known = 0;
-      if (!IS_IMPACT[event] || !step->watch->acts[event])
+      if (!IS_IMPACT[event] || !step->watch->acts[event] || !may_be_touched(step, e))
         continue;
       status = evaluate_changes(step, e, at, v, &wall);
       if (status == OK && fabs(value[e]) <= wall.slack && wall.rate < -CHANGE_SAFETY * DBL_EPSILON * wall.size)
@@ -537,6 +550,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     status = evaluate_functions(step, &right, values_at(step, EVENT_DEGREE));
     if (status == OK)
       status = search_step(step, &left, &right);
+    step->rounding_known |= !step->watch->started;
     if (status == OK)
       status = settle_crossings(step, first);
     if (status == NOT_CONVERGED && step->watch->accumulated) {
@@ -563,6 +577,10 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
         set_run(run, run->t, &right);
       status = check_walls(step, &left, &right);
       return status == OK ? store_state(to, &right, length, iterations, run->step, step->report) : status;
+    }
+    if (status == OK && EVENTS > EVENT_FEW && !step->rounding_known) {
+      status = rounding_of(step, &left);
+      step->rounding_known = 1;
     }
     if (status == OK)
       status = change_at_crossings(step, group, &at);
@@ -672,7 +690,7 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, r
     const event_watch watched = *watch;
     const long long kept = report->stored, crossed = *filled;
     event_step step = {0.0, 0.0, 0.0, NULL, NULL, parameters, options, watch, found, room, filled, report, workspace,
-        memory, memory + 15 * M, &horizon};
+        memory, memory + 15 * M, 0, &horizon};
     real size;
     int count = 0;
 #ifdef EVENTS_OF_ANY_SIZE
