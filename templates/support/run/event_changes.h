@@ -154,7 +154,7 @@ static int evaluate_changes(const event_step *step, int e, const event_sample *a
     const int k = wall->place[i];
     wall->rate += wall->n[i] * v[k];
     wall->size += fabs(wall->n[i] * v[k]);
-    wall->slack += fabs(wall->n[i]) * (fabs(at->q[k]) + fabs(v[k] * step->h));
+    wall->slack += fabs(wall->n[i]) * (fabs(at->q[k]) + fabs(v[k] * step->whole));
   }
   wall->slack *= CHANGE_SAFETY * DBL_EPSILON;
   wall->rate *= step->h < 0.0 ? -1.0 : 1.0;
@@ -307,6 +307,7 @@ static int change_state(const event_step *step, int e, event_sample *at)
   const int is_impact = IS_IMPACT[EVENT_OF(e)];
   int status = changes_at(step, e, at, &wall);
   if (status == OK && is_impact && wall.rate < 0.0) {
+    step->watch->history[e].slack = wall.slack;
     step->watch->history[e].rounding = wall.slack / -wall.rate;
     status = impact(step, at, &wall);
     if (status == NOT_CONVERGED)
@@ -475,6 +476,7 @@ static int check_walls(const event_step *step, const event_sample *left, const e
       status = evaluate_changes(step, e, left ? left : right, v, &wall);
     if (status == OK && left)
       status = conditions(e, right->t, right->q, right->p, step->parameters, &open, step->workspace);
+    wall.slack = fmax(wall.slack, step->watch->history[e].slack); /* the velocity after an impact may be 0 */
 #if EVENT_GUARDS > 0
     for (int i = 0; !left && i < EVENT_GUARDS; i++)
       open &= GUARDED[i] != GUARD_OF(e);

@@ -49,20 +49,20 @@ enum {
   EVENT_SPLITS = 6, /* greatest depth of subdivision of a step */
   EVENT_TRIALS = 200, /* largest number of states evaluated for one crossing; bisection takes 52 */
   EVENT_BISECTIONS = 30, /* for the abscissa of an extremum: an error of 2^-30 changes the extremum by 2^-60 */
-  EVENT_FEW = 16, /* functions that are all examined after a change */
   EVENT_FIRST_PROBE = 40, /* after a start at a zero, the first state tested is 2^-40 of a step later */
   EVENT_LAST_PROBE = 4,
   EVENT_NO_ROOM = -1
 };
 
 #define EVENT_TIE 0x1p-30 /* relative to the step: closer crossings may coincide */
-#define EVENT_AT_ZERO (16.0 * DBL_EPSILON) /* relative to the range of a function on a step: residual of a located
-                                            * zero */
+#define EVENT_AT_ZERO (16.0 * DBL_EPSILON) /* relative to the range of a function on a whole step: residual of a
+                                            * located zero */
 #define EVENT_UNCHANGED (4.0 * DBL_EPSILON) /* relative to the range of a function on a step: a change that may be
                                            * rounding */
 #define EVENT_SMALL_PART 0.03 /* a polynomial whose error estimate is less than this part of its range is accepted */
 #define EVENT_FAR 32.0 /* a function is far from zero beyond so many times its range at the nodes: polynomials and their
                         * error estimates deviate by at most 22 of them */
+#define EVENT_FEW 16 /* functions that are all examined after a change */
 #define EVENT_OVERSHOOT 0x1p-10 /* part of a secant step by which it is longer, so that the sign changes */
 #define EVENT_STEEPNESS 8.0 /* a zero is simple if the derivative exceeds so many error estimates */
 
@@ -573,7 +573,7 @@ static int leave_zero(const event_step *step, int e, const event_sample *left, r
   event_sample next;
   real noise = values_at(step, EVENT_DEGREE + 2)[e], change, doubt;
   int sign, place = EVENT_FIRST_PROBE, away = 0, event = EVENT_OF(e), status;
-  if (fabs(left->g) > EVENT_AT_ZERO * range + 8.0 * noise)
+  if (fabs(left->g) > EVENT_AT_ZERO * range * fabs(step->whole / step->h) + 8.0 * noise)
     return OK;
   status = first_change(step, e, left, noise, &change, &doubt);
   if (status != OK) {
@@ -616,6 +616,7 @@ static int leave_zero(const event_step *step, int e, const event_sample *left, r
 static void mark_far(const event_step *step, real *far)
 {
   const long long count = EVENTS;
+  const real at_zero = EVENT_AT_ZERO * fabs(step->whole / step->h);
   const real *const value = values_at(step, 0), *const noise = values_at(step, EVENT_DEGREE + 2);
   for (long long e = 0; e < count; e++) {
     real c[EVENT_DEGREE + 1], range = 0.0, doubt;
@@ -626,10 +627,10 @@ static void mark_far(const event_step *step, real *far)
       range += k > 0 ? fabs(c[k]) : 0.0;
     }
     doubt = EVENT_DOUBTS[0] * fabs(c[EVENT_DEGREE - 1]) + EVENT_DOUBTS[1] * fabs(c[EVENT_DEGREE]);
-    far[e] = fabs(c[0]) > range + (doubt <= EVENT_SMALL_PART * range ? doubt : range) ? 1.0 : 0.0;
+    far[e] = fabs(c[0]) > (1.0 + EVENT_TIE) * range + (doubt <= EVENT_SMALL_PART * range ? doubt : range) ? 1.0 : 0.0;
   }
   for (long long e = 0; e < count && !step->watch->started; e++)
-    if (fabs(value[e]) <= EVENT_UNCHANGED * fabs(value[EVENT_DEGREE / 2 * count + e]) + 8.0 * noise[e])
+    if (fabs(value[e]) <= at_zero * fabs(value[EVENT_DEGREE / 2 * count + e]) + 8.0 * noise[e])
       far[e] = 0.0;
 }
 
