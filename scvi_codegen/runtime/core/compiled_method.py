@@ -222,7 +222,7 @@ class CompiledMethod:
         if event not in self._entries:
             from scvi_codegen.rendering.events import EventFormulas  # here, because it imports SymPy
 
-            self._entries[event] = tuple(EventFormulas(self.known.interface, (event,)).events)
+            self._entries[event] = cast("tuple[Event, ...]", tuple(EventFormulas(self.known.interface, [event]).events))
         return self._entries[event]
 
     def with_sizes(

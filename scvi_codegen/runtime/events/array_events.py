@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import EventError
+from scvi_codegen.errors import EventError, ScviCodegenError
 from scvi_codegen.native.building import Library
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.binding import REPORTED, ArrayBinding
@@ -56,9 +56,10 @@ class EventBinding(ArrayBinding):
             return self._ffi.new(f"{self._prefix}_watch *", {"history": int(self._first[-1])})
         return super().new(what)
 
-    def records(self, structs: Any, count: int) -> NDArray[np.void]:
+    def records(self, structs: Any, count: int | None = None) -> NDArray[np.void]:
         """Return a copy of the first of several crossings, by the names of their fields."""
         fields = {"t": float, "fraction": float, "function": np.int32, "direction": np.int32, "element": np.int64}
+        count = len(structs) if count is None else count
         records = np.empty(count, [*fields.items(), *((name, float, (self.count,)) for name in "qp")])
         for k in range(count):
             record, crossing = records[k], structs[k]

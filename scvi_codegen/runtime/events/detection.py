@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from scvi_codegen.runtime.run.memory import Memory
 
 INITIAL_CAPACITY, LEAST_CAPACITY, CROSSING_NUMBERS = 256, 16, 2**24
-"""Initial number of crossings that one call can return, doubled when exceeded; fewer of more than 65,536 coordinates."""
+"""Initial number of crossings that one call can return, doubled when exceeded; fewer of over 65,536 coordinates."""
 MOST_BYTES = 2**30
 """Largest memory for the states of crossings of a run; if they exceed it, none is kept."""
 
@@ -127,8 +127,8 @@ class CrossingSearch:
         before, self._bytes = self._bytes, self._bytes + records.nbytes
         self.recorded.append(records)
         if self._bytes > MOST_BYTES:
-            names = [name for name in ("t", "function", "element") if name in records.dtype.names]
-            self.recorded = [each[names].copy() for each in self.recorded]
+            names: Any = [name for name in ("t", "function", "element") if name in (records.dtype.names or ())]
+            self.recorded = [each[names].copy() if "q" in each.dtype.fields else each for each in self.recorded]
         if before <= MOST_BYTES < self._bytes:
             warn(
                 f"the states of crossings until t = {self.last[0]:.6g} exceed {MOST_BYTES / 2**30:g} GiB and are not "
@@ -165,7 +165,7 @@ class CrossingSearch:
         for number, event in enumerate(self.stepper.events):
             mine, names = records["function"] == number, records.dtype.names
             values = {name: records[name][mine] for name in ("t", "q", "p", "element") if name in names}
-            unknown = np.broadcast_to(np.nan, (np.count_nonzero(mine), self.stepper.dimension))
+            unknown = np.broadcast_to(np.nan, (len(values["t"]), self.stepper.dimension))
             values |= {name: named(values.get(name, unknown)) for name in "qp"}
             values.setdefault("element", np.zeros(len(unknown), np.int64))
             crossings.append(Crossings(event=event, **values))

@@ -26,7 +26,7 @@ from scvi_codegen.runtime.constraints.projection import projected
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.runtime.run.times import WHOLE
-from scvi_codegen.runtime.trajectory.recomputation import changes_by_events, step_sizes_after
+from scvi_codegen.runtime.trajectory.recomputation import changes_by_events, steps_after
 
 if TYPE_CHECKING:
     from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
@@ -104,7 +104,7 @@ def _jump(
     start = np.concatenate([starts.q[k - 1], starts.p[k - 1]])
     arrival = products(start, float(starts.h[k - 1]), float(starts.t[k - 1]), np.eye(size)[-1:])[:, 0]
     at_end = row + 1 == len(states)
-    h = SMALL_STEP * abs(states.h) if at_end else float(step_sizes_after(states, row, row + 1)[0])
+    h = SMALL_STEP * abs(states.h) if at_end else float(steps_after(states, row, row + 1)[0])
     # 1 if the next step is the rest of a step of size h, whose variation belongs to the first part
     partial = abs(h) < (1.0 - WHOLE) * abs(states.h) or abs(starts.h[k - 1]) < WHOLE * abs(states.h)
     rest = float(not at_end and states.plan.fixed and partial)

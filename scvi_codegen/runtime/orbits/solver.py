@@ -203,12 +203,13 @@ class _OrbitSearch:
         inward = self.reduction.inward(*np.split(start, 2))
         if self.stepper.changes_states:  # derivatives through events require runs forward in time
             forward = self._segment(start, 0, self.steps, guess[-1])
-            later, monodromy = self._states_before(start, guess[-1]), self._leaving(forward) @ forward.monodromy @ inward
+            monodromy = self._leaving(forward) @ forward.monodromy @ inward
+            later = self._states_before(start, guess[-1])
         else:
             forward = self._segment(start, 0, half, guess[-1])
             backward = self._segment(start, 0, self.steps - half, -guess[-1])
             forth, back = (self._leaving(each) @ each.monodromy @ inward for each in (forward, backward))
-            later, monodromy = backward.states, np.linalg.solve(back.T, forth.T).T
+            later, monodromy = backward.states, np.asarray(np.linalg.solve(back.T, forth.T).T)
         growth = float(np.abs(np.linalg.eigvals(monodromy)).max())
         if growth <= EASY:
             return guess, self._closing(guess), 0
@@ -222,13 +223,11 @@ class _OrbitSearch:
 
     def _states_before(self, start: Array, period: float) -> Array:
         """Return the states before a state, in steps backward over half a period, of impacts that can be undone."""
-        events, steps, m = self.stepper.events, self.steps - self.steps // 2, self.stepper.dimension
-        if all(event.restitution is not None or not event.changes_state for event in events):
-            plan, t = StepPlan(h=-period / self.steps), self.t
-            run = self.stepper._started(start[:m], start[m:], None, plan, t, self.parameters, self.options)
+        plan, steps, (q, p) = StepPlan(h=-period / self.steps), self.steps - self.steps // 2, np.split(start, 2)
+        if not any(event.changes for event in self.stepper.events):
+            run = self.stepper._started(q, p, None, plan, self.t, self.parameters, self.options)
             with suppress(EventError, StepFailedError):
-                motion = run._recorded(steps)
-                ends = self.t + plan.h * np.arange(1, steps + 1)
+                motion, ends = run._recorded(steps), self.t + plan.h * np.arange(1, steps + 1)
                 rows = np.searchsorted(-motion.t, -ends + 0.5**30 * period, side="right") - 1
                 return np.concatenate([motion.q, motion.p], axis=1)[rows]
         return start[np.newaxis]

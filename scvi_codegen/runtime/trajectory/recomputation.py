@@ -35,7 +35,7 @@ def work_and_impulses_until(states: SavedStates) -> Array:
     ends = np.concatenate([states.q, states.p], axis=1)
     for crossings, rows in changes_by_events(states):
         ends[rows] = np.concatenate([crossings.q, crossings.p], axis=1)
-    spans = step_sizes_after(states, 0, len(states) - 1).tolist()
+    spans = steps_after(states, 0, len(states) - 1).tolist()
     for k, (start, length, span) in enumerate(
         zip(states.t[:-1].tolist(), states.step_sizes[:-1].tolist(), spans, strict=True)
     ):
@@ -69,7 +69,7 @@ def changes_by_events(states: SavedStates) -> Iterator[tuple[Crossings, NDArray[
             yield chosen, rows
 
 
-def step_sizes_after(states: SavedStates, first: int, last: int) -> Array:
+def steps_after(states: SavedStates, first: int, last: int) -> Array:
     """Return the sizes of the steps from saved states to the next ones: as taken, or the differences of times.
 
     Times are rounded; a crossing can be closer than that to the end of a step.
