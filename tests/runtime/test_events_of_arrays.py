@@ -170,8 +170,8 @@ def test_states_of_crossings_have_a_limit_of_memory(gas, monkeypatch):
     random = np.random.default_rng(5)
     r, v = random.random((1100, 2)), 0.02 * random.normal(size=(1100, 2))
     start, plan = ({"r": r}, {"velocity": {"r": v}}), {"h": 1e-2, "steps": 4, "save_every": 4, "events": BOX}
-    kept = gas.integrate(*start[:1], **start[1], **plan)
-    for each, wall in zip(kept.events, (0.0, 1.0), strict=True):
+    saved = gas.integrate(*start[:1], **start[1], **plan)
+    for each, wall in zip(saved.events, (0.0, 1.0), strict=True):
         places = each.q["r"].reshape(len(each), -1)[np.arange(len(each)), each.element]
         assert len(each) > 0
         assert np.abs(places - wall).max() < 1e-14
@@ -179,7 +179,7 @@ def test_states_of_crossings_have_a_limit_of_memory(gas, monkeypatch):
     with pytest.warns(sc.errors.EventWarning, match="are not kept: run.events has times and elements"):
         run = gas.integrate(*start[:1], **start[1], **plan)
     assert np.abs(run.q["r"][-1] - folded(r, v, 0.04)).max() < 1e-14
-    assert [each.element.tolist() for each in run.events] == [each.element.tolist() for each in kept.events]
+    assert [each.element.tolist() for each in run.events] == [each.element.tolist() for each in saved.events]
     assert np.isnan(run.events[0].q["r"]).all()
 
 
