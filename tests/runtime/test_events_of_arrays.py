@@ -78,6 +78,16 @@ def test_discs_exchange_momentum_in_pairs(gas):
     assert abs(np.sum(p**2) / np.sum(v**2) - 1.0) < 1e-14
 
 
+def test_impacts_pass_through_discs_that_touch(gas):
+    """Newton's cradle: the first disc stops, the last one leaves with its velocity, in one step and at once."""
+    r, v = np.array([[0.0, 0.5], [0.5, 0.5], [0.75, 0.5], [1.0, 0.5]]), np.array([[1.0, 0.0], *[[0.0, 0.0]] * 3])
+    row = impact("r[i+1, 0] - r[i, 0] - d for i in N-1")
+    run = gas.integrate({"r": r}, velocity={"r": v}, h=0.3, steps=2, events=row)
+    assert np.abs(run.p["r"][-1] - v[::-1]).max() < 1e-15
+    assert sorted(run.events[0].element) == [0, 1, 2]
+    assert np.ptp(run.events[0].t) == 0.0
+
+
 def test_more_impacts_in_a_step_than_memory_for_them(gas, monkeypatch):
     """A step whose crossings do not fit is repeated: 20 impacts at different times in one step, and memory for 8."""
     monkeypatch.setattr(detection, "INITIAL_CAPACITY", 8)
