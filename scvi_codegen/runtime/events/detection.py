@@ -128,7 +128,7 @@ class CrossingSearch:
         self.recorded.append(records)
         if self._bytes > MOST_BYTES:
             names: Any = [name for name in ("t", "function", "element") if name in (records.dtype.names or ())]
-            self.recorded = [each[names].copy() if "q" in each.dtype.fields else each for each in self.recorded]
+            self.recorded = [each[names].copy() if each.dtype.names != (*names,) else each for each in self.recorded]
         if before <= MOST_BYTES < self._bytes:
             warn(
                 f"the states of crossings until t = {self.last[0]:.6g} exceed {MOST_BYTES / 2**30:g} GiB and are not "

@@ -77,7 +77,7 @@ typedef NAME(crossing) event_crossing;
 #endif
 
 #ifndef EVENT_GUARDS
-#define EVENT_GUARDS 0 /* conditions of crossings, each of the event or function GUARDED: values of the kernel event_guards */
+#define EVENT_GUARDS 0 /* conditions of crossings, of the function GUARDED: values of the kernel event_guards */
 #endif
 #ifdef EVENT_FIRST /* index notation: an event has a function for each element of its loops */
 #define FUNCTION_OF(crossing) ((int)(EVENT_FIRST[(crossing)->function] + (crossing)->element))
@@ -320,9 +320,9 @@ static real uncertain_abscissa(const real *c, real doubt, real *extrema, int *co
   return place;
 }
 
-/* Narrows a sign change to neighbouring fractions; high is the later end, `guess` its approximation or NAN. Secant steps
- * from the end nearer to zero pass the crossing by a small part, so that both ends approach it; an interval that is not
- * halved by two of them is bisected. *sampled is the fraction of the last sample. */
+/* Narrows a sign change to neighbouring fractions; high is the later end, `guess` its approximation or NAN. Secant
+ * steps from the end nearer to zero pass the crossing by a small part, so that both ends approach it; an interval that
+ * is not halved by two of them is bisected. *sampled is the fraction of the last sample. */
 static int enclose_crossing(const event_step *step, int e, event_sample low, event_sample *high, real guess,
     real *sampled)
 {
