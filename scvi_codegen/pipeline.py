@@ -137,6 +137,7 @@ def describe(
         inputs=system.inputs,
         conserves_energy=not system.changes_energy and not system.inputs,
         arrays=_arrays_of(system),
+        indices=tuple(f"{name} = {value}" for name, value in system.indices.items()),
         rotations=tuple(each.declaration for each in system.rotations),
         energy_parameter=system.clock.energy.name if system.clock else "",
         solver=_solver_of(program),

@@ -163,6 +163,7 @@ class MechanicalSystem(Deferred, ABC):
         constraints: expressions in (q, t), or linear in v, that are 0 along trajectories of a Lagrangian
             (:mod:`scvi_codegen.mechanics.forces`).
         arrays: declarations of the arrays of known sizes whose entries are coordinates and parameters.
+        indices: sizes and index tables of these arrays by name, for events in index notation.
         definition: the text with arrays or rotations that the system was read from, for model files; else empty.
         rotations: rotations, directions and spins, whose coordinates follow the ordinary ones
             (:mod:`scvi_codegen.formulas.rotations.members`).
@@ -179,6 +180,7 @@ class MechanicalSystem(Deferred, ABC):
     inputs: tuple[str, ...] = ()
     damping: Expr = field(default_factory=zero)
     arrays: tuple[Array, ...] = field(default=(), compare=False)
+    indices: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
     definition: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
     rotations: tuple[Homogeneous, ...] = ()
 

@@ -135,8 +135,8 @@ class Binding:
         """Return the bytes of a struct, writable."""
         return self._ffi.buffer(struct)
 
-    def records(self, structs: Any) -> NDArray[np.void]:
-        """Return an array of structs, by the names of their fields, in the same memory."""
+    def records(self, structs: Any, count: int | None = None) -> NDArray[np.void]:
+        """Return an array of structs, by the names of their fields, in the same memory; a copy of the first few."""
         item = self._ffi.typeof(structs).item
         layout: Any = {
             "names": [name for name, _ in item.fields],
@@ -145,7 +145,7 @@ class Binding:
             "itemsize": self._ffi.sizeof(item),
         }
         records: NDArray[np.void] = np.frombuffer(self._ffi.buffer(structs), dtype=layout)
-        return records
+        return records if count is None else records[:count].copy()
 
     def pointer(self, array: NDArray[Any]) -> Any:
         """Return a pointer to the first element of a contiguous float64 or int32 array; NULL for an empty one."""

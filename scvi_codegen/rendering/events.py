@@ -21,18 +21,20 @@ from functools import lru_cache
 from itertools import accumulate
 from typing import Any, Protocol, TypeAlias, cast
 
+import numpy as np
 import sympy
 from sympy import Expr, Symbol
 from sympy.core.function import AppliedUndef
 
-from scvi_codegen.errors import EventError, SystemDefinitionError, closest
+from scvi_codegen.errors import EventError, ScviCodegenError, SystemDefinitionError, closest
 from scvi_codegen.formulas.array_entries import EntryRules, entry_names, formula_of_entries, is_indexed, momentum_arrays
+from scvi_codegen.formulas.array_statements import parse_constraint
 from scvi_codegen.formulas.arrays import parse_coordinate
 from scvi_codegen.formulas.expressions import evaluated, unsupported_part
 from scvi_codegen.formulas.rotations.arrays import entries_in_formulas
 from scvi_codegen.formulas.rotations.names import RotationNames
 from scvi_codegen.formulas.symbols import DOT, TIME, identifier, input_formulas, symbol
-from scvi_codegen.indices import Array
+from scvi_codegen.indices import Array, Size
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Kernel, lower_matrix, lower_vector
 from scvi_codegen.rendering.array_events import array_events
@@ -56,6 +58,8 @@ class SearchedEvent(Protocol):
     def changes(self) -> tuple[tuple[str, Formula], ...]: ...
     @property
     def conditions(self) -> tuple[Formula, ...]: ...
+    @property
+    def loops(self) -> str: ...
     @property
     def changes_state(self) -> bool: ...
     def check_function(self, moving: Sequence[str], *, constant: bool) -> None: ...
@@ -88,26 +92,28 @@ class EventFormulas:
     """
 
     def __init__(self, interface: Interface, events: Sequence[SearchedEvent]) -> None:
-        self.interface, self.events = interface, events
+        self.interface = interface
         self._turning = RotationNames.of_states(interface.rotations, _names(interface))
-        self._known, self._arrays = self._turning.symbols | _names(interface), _arrays(interface)
+        self._known, self._grammar = self._turning.symbols | _names(interface), _Grammar(interface, self._turning)
+        elements = [self._elements(event) for event in events]
+        self.elements, self.events = [*map(len, elements)], [each for element in elements for each in element]
         self.q = [symbol(name) for name in interface.coordinates]
         self.v = [symbol(name + DOT) for name in interface.coordinates]
         self.parameters = tuple(symbol(name) for name in interface.parameters)
         taken = {*self.q, *self.v, symbol(TIME), *self.parameters}
         self.p = [sympy.Dummy() if symbol(name) in taken else symbol(name) for name in interface.momenta]
-        self.functions = [self._read(event.function, f"event function '{event.function}'") for event in events]
-        for event, function in zip(events, self.functions, strict=True):
+        self.functions = [self._read(event.function, f"event function '{event.function}'") for event in self.events]
+        for event, function in zip(self.events, self.functions, strict=True):
             if interface.variables and event.restitution is not None:
                 raise EventError(f"'{interface.system}' is a first-order system without impacts: write them in then=")
             moving = sorted(free.name for free in function.free_symbols & {*self.p, *self.v})
             event.check_function(moving, constant=not function.free_symbols)
         self.guards = [
             (number, self._read(condition, f"condition where='{condition}'"))
-            for number, event in enumerate(events)
+            for number, event in enumerate(self.events)
             for condition in event.conditions
         ]
-        self.changes = [self._changes(*each) for each in zip(events, self.functions, strict=True)]
+        self.changes = [self._changes(*each) for each in zip(self.events, self.functions, strict=True)]
         if interface.energy_parameter and any(event.changes_state for event in events):
             raise EventError(
                 "events that change the state are impossible in transformed time, where the energy is the constant "
@@ -126,13 +132,39 @@ class EventFormulas:
         return lower_kernel(name, arguments=self.arguments, time=time, parameters=parameters, values=values)
 
     def _read(self, formula: Formula, what: str) -> Expr:
-        if isinstance(formula, str) and self._arrays and is_indexed(formula):
-            turning = entries_in_formulas(self._arrays, self._turning.members, {})
-            names = {array: entry_names(array, {}) for array in self._arrays if not array.name.endswith(DOT)} | turning
-            rules = EntryRules({}, {}, {array.name: each for array, each in names.items()})
-            formula = formula_of_entries(formula, (*self._arrays, *turning), self._known, rules=rules)
+        grammar = self._grammar
+        if isinstance(formula, str) and grammar.arrays and is_indexed(formula):
+            formula = formula_of_entries(formula, grammar.arrays, self._known, grammar.tables, grammar.rules)
         expression = self._turning.in_coordinates(_expression(formula, self._known, what, self._turning.read))
         return cast(Expr, expression.xreplace(input_formulas(self.interface.inputs, symbol(TIME))))
+
+    def _elements(self, event: SearchedEvent) -> list[SearchedEvent]:
+        """Return the events of the elements of the loops of an event, with formulas of the entries of arrays."""
+        if not event.loops:
+            return [event]
+
+        def formulas(text: Any) -> list[Expr]:
+            whole, grammar = str(text) if text is event.function else f"{text}{event.loops}", self._grammar
+            try:
+                term = parse_constraint(whole, grammar.arrays, self._known, grammar.tables)
+                return [cast("Expr", term.formula.xreplace(rule)) for _, rule in grammar.rules.rules(term)]
+            except ScviCodegenError as error:
+                raise EventError(f"the formula '{text}' of the event '{event.function}': {error}") from error
+
+        functions = formulas(event.function)
+        changes = [(formulas(name), formulas(value)) for name, value in event.changes]
+        conditions = [formulas(each) for each in event.conditions]
+        restitutions = None if event.restitution is None else formulas(event.restitution)
+        return [
+            replace(
+                cast(Any, event),
+                function=function,
+                then={str(names[k]): values[k] for names, values in changes} or None,
+                where=tuple(cast(Any, each[k]) >= 0 for each in conditions) or None,
+                restitution=restitutions and restitutions[k],
+            )
+            for k, function in enumerate(functions)
+        ]
 
     def _changes(self, event: SearchedEvent, g: Expr) -> tuple[list[int], list[Expr]]:
         if event.restitution is not None:
@@ -170,6 +202,21 @@ class EventFormulas:
                 for name, value in zip(member.coordinates, p, strict=True):
                     of_momentum = symbols == member.momenta
                     new[f"p_{name}" if of_momentum else name + DOT] = value if of_momentum else value * size / 4
+
+
+class _Grammar:
+    """Index notation at known sizes: arrays, index tables, and the names of entries."""
+
+    def __init__(self, interface: Interface, turning: RotationNames) -> None:
+        indices = interface.index_values
+        sizes = {name: value for name, value in indices.items() if isinstance(value, int)}
+        tables = {name: np.array(value) for name, value in indices.items() if name not in sizes}
+        arrays = _arrays(interface)
+        of_rotations = entries_in_formulas(arrays, turning.members, {})
+        names = {array: entry_names(array, {}) for array in arrays if not array.name.endswith(DOT)} | of_rotations
+        self.rules = EntryRules(sizes, tables, {array.name: each for array, each in names.items()})
+        self.arrays = [*arrays, *of_rotations, *([Array("", tuple(map(Size, sizes)))] if sizes else ())]
+        self.tables = [Array(name, tuple(Size("", n) for n in table.shape)) for name, table in tables.items()]
 
 
 def _arrays(interface: Interface) -> list[Array]:
@@ -253,6 +300,8 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], header: str
     every = {"event_functions": formulas.functions, "event_guards": guards, "event_changes": values}
     return replace(
         search,
+        elements=tuple(formulas.elements) if any(event.loops for event in events) else (),
+        guarded=tuple(number for number, _ in formulas.guards),
         kernels=tuple(formulas.kernel(name, each) for name, each in every.items() if each),
         uses_velocity=any(value.free_symbols.intersection(formulas.v) for each in every.values() for value in each),
         changed=tuple(index for indices, _ in formulas.changes for index in indices),

@@ -109,7 +109,7 @@ class EventSearch:
         nodes: (d + 1,) fractions of a part of a step at which they are evaluated.
         coefficients: (d + 1, d + 1) from values there to coefficients of powers of x in [-1, 1].
         doubts: factors of the last two coefficients in the error estimate.
-        guarded: index of the event of each condition of crossings.
+        guarded: index of the function of each condition of crossings; of arrays of run-time sizes of its event.
         impacts: 1 for each event that is the wall of an impact, else 0.
         controlled: whether the integrator has adaptive steps.
         factored: whether its runs contain factors of the linear part of a step.
@@ -118,6 +118,7 @@ class EventSearch:
         uses_velocity: whether v occurs in the formulas.
         changed: index among (q, p, v) of the variable of each value of the changes.
         first_values: index of the first value of each function, and the number of values.
+        elements: number of functions of each event if some are ``for`` elements of loops of known sizes; else empty.
         arrays: the functions of arrays of run-time sizes, which have no kernels of all coordinates.
     """
 
@@ -136,6 +137,7 @@ class EventSearch:
     uses_velocity: bool = False
     changed: tuple[int, ...] = ()
     first_values: tuple[int, ...] = ()
+    elements: tuple[int, ...] = ()
     arrays: ArrayEvents | None = None
 
 

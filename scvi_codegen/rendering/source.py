@@ -240,6 +240,7 @@ class Interface:
         conserves_energy: whether energy is a first integral; unknown for folders of version 0.1.
         arrays: declarations of arrays of known sizes, first those whose entries are the coordinates in order, then
             those whose entries are parameters; none without arrays.
+        indices: sizes and index tables of these arrays, ``"N = 3"``, ``"pairs = [[0, 1], [1, 2]]"``.
         solver: of the stage equations, as in ``compile_stepper``, with or without a fallback; unknown for folders of
             version 0.1.
         rotations: declarations of rotations, directions and spins, ``"rotation R omega"``, ``"direction n"``, ``"spin
@@ -273,6 +274,7 @@ class Interface:
     conserves_energy: bool = False
     solver: str = ""
     arrays: tuple[str, ...] = ()
+    indices: tuple[str, ...] = ()
     rotations: tuple[str, ...] = ()
     layout: ArrayLayout = ArrayLayout()
     variables: tuple[str, ...] = ()
@@ -281,6 +283,11 @@ class Interface:
     def dimension(self) -> int:
         """Degrees of freedom m."""
         return len(self.coordinates)
+
+    @property
+    def index_values(self) -> dict[str, Any]:
+        """:attr:`indices` by name: whole numbers, and rows of whole numbers."""
+        return {name: json.loads(value) for name, value in (each.split(" = ") for each in self.indices)}
 
     def about(self) -> dict[str, str]:
         """Return title, system, method, and version of this package, to accompany every computed number."""
@@ -312,6 +319,8 @@ class Interface:
             if each.name in arguments and not KINDS[str(each.type)](arguments[each.name]):
                 raise ValueError(f"{each.name} is {arguments[each.name]!r:.60}: it must be of type {each.type}")
         interface = cls(**arguments)
+        if not all(isinstance(value, int | list) for value in interface.index_values.values()):
+            raise ValueError(f"indices is {interface.indices!r:.60}: it must contain whole numbers")
         kinds = [kind for kind, *_ in map(str.split, filter(DECLARED.fullmatch, interface.rotations))]
         if len(kinds) < len(interface.rotations) or sum(COMPONENTS[kind] for kind in kinds) > interface.dimension:
             raise ValueError(f"rotations is {interface.rotations!r:.60}: it must declare some of the coordinates")

@@ -12,6 +12,7 @@ from style import check_style
 from scvi_codegen import SVI, Gauss, LagrangianSystem, Model, StoermerVerlet, compile_stepper, load_model, load_package
 from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.native.building import PORTABLE_FLAGS
+from scvi_codegen.runtime.events.event import Event, impact
 from scvi_codegen.runtime.inputs.segments import checked_inputs, parameters_of, prepared_segments
 
 KNOTS, VALUES = (0.0, 0.37, 0.9, 1.41, 2.05, 2.6), (0.0, 1.2, -0.7, 0.4, 1.9, -1.0)
@@ -67,6 +68,22 @@ def test_adaptive_steps_end_at_breakpoints(model, tmp_path):
     stepper = compile_stepper(model.system, model.method)
     run = stepper.integrate(model.q, velocity=model.velocity, inputs=dict(model.inputs), t_end=2.3)
     assert_allclose(states[-1, :3], [2.3, run.q[-1, 0], run.p[-1, 0]], rtol=0, atol=3e-13)
+
+
+@pytest.mark.parametrize("h", [0.03, None])
+@pytest.mark.parametrize("restitution", [0.8, None])
+def test_events_of_a_system_with_inputs(model, h, restitution, tmp_path):
+    """Impacts and crossings, where inputs end steps, are those of Python."""
+    event = Event("q_dot") if restitution is None else impact("2/5 - q", restitution)
+    model = replace(model, h=h, events=(event,))
+    folder = generate_package(model, tmp_path / "pushed")
+    states, printed = states_printed(folder)
+    plan = {"t_end": 2.3} | ({"h": h} if h else {})
+    run = load_package(folder).integrate(model.q, velocity=model.velocity, inputs=dict(model.inputs), **plan)
+    found = [float(t) for t in re.findall(r"# event .* at t = (\S+)", printed)]
+    assert len(found) == len(run.events[0]) > 0
+    assert_allclose(found, run.events[0].t, rtol=0, atol=1e-11)
+    assert_allclose(states[-1, :3], [2.3, run.q[-1, 0], run.p[-1, 0]], rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize("seed", range(6))

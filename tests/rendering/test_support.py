@@ -95,9 +95,9 @@ int main(void)
   high[EVENT_DEGREE] = 1;
   for (int i = 0; i < 5; i++)
     for (int k = 0; k < 2; k++) {{
-      double extrema[EVENT_DEGREE];
-      int count;
-      printf("%.6f ", {prefix}_uncertain_abscissa(all[i], doubts[i][k], extrema, &count));
+      double extrema[EVENT_DEGREE], zeros[EVENT_DEGREE];
+      int count, zero_count;
+      printf("%.6f ", {prefix}_uncertain_abscissa(all[i], doubts[i][k], extrema, &count, zeros, &zero_count));
     }}
   return 0;
 }}

@@ -24,7 +24,6 @@ from scvi_codegen.errors import (
     EventWarning,
     MethodError,
     ModelFileError,
-    PackageError,
     StateError,
     SystemDefinitionError,
 )
@@ -996,13 +995,6 @@ def test_generated_programs_print_events(tmp_path, steps):
         for times, each in zip(found, made.events, strict=True):
             assert np.abs(times - each.t).max() < 1e-13
         assert np.abs(last - np.hstack([made.t[-1], made.q[-1], made.p[-1]])).max() < 1e-13
-
-
-def test_packages_with_events_have_no_inputs(tmp_path):
-    inputs = "inputs = ['u']\n[inputs.u]\nt = [0.0, 9.0]\nvalues = [0.0, 1.0]\n[parameters]"
-    driven = MODEL.replace("- g*y", "- g*y + u*x").replace("[parameters]", inputs)
-    with pytest.raises(PackageError, match="has no inputs"):
-        generate_package(parse_model(driven), tmp_path / "driven")
 
 
 def test_events_of_the_command_line_add_to_those_of_the_file(tmp_path):

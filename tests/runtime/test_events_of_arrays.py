@@ -78,6 +78,16 @@ def test_discs_exchange_momentum_in_pairs(gas):
     assert abs(np.sum(p**2) / np.sum(v**2) - 1.0) < 1e-14
 
 
+def test_impacts_pass_through_discs_that_touch(gas):
+    """Newton's cradle: the first disc stops, the last one leaves with its velocity, in one step and at once."""
+    r, v = np.array([[0.0, 0.5], [0.5, 0.5], [0.75, 0.5], [1.0, 0.5]]), np.array([[1.0, 0.0], *[[0.0, 0.0]] * 3])
+    row = impact("r[i+1, 0] - r[i, 0] - d for i in N-1")
+    run = gas.integrate({"r": r}, velocity={"r": v}, h=0.3, steps=2, events=row)
+    assert np.abs(run.p["r"][-1] - v[::-1]).max() < 1e-15
+    assert sorted(run.events[0].element) == [0, 1, 2]
+    assert np.ptp(run.events[0].t) == 0.0
+
+
 def test_more_impacts_in_a_step_than_memory_for_them(gas, monkeypatch):
     """A step whose crossings do not fit is repeated: 20 impacts at different times in one step, and memory for 8."""
     monkeypatch.setattr(detection, "INITIAL_CAPACITY", 8)
@@ -107,6 +117,9 @@ def test_an_event_of_every_element_equals_events_of_entries():
         two = known.integrate(q, velocity=v, events=single, **plan)
         assert [len(each) for each in one.events] == [sum(map(len, two.events[:n])), sum(map(len, two.events[n:]))]
         assert min(map(len, one.events)) > 0
+        same = known.integrate(q, velocity=v, events=loops, **plan)
+        assert np.array_equal(same.q["q"], two.q["q"])
+        assert [each.element.tolist() for each in same.events] == [each.element.tolist() for each in one.events]
         assert np.abs(one.q["q"][-1] - np.asarray(two.q)[-1]).max() < (1e-13 if "h" in plan else 1e-8)
     runs = [
         stepper.integrate(q, velocity=v, h=0.1, steps=30, events=impact("13/10 + b - q[i] for i in N", "e")),
@@ -114,6 +127,41 @@ def test_an_event_of_every_element_equals_events_of_entries():
     ]
     tangents = [np.asarray(run.tangent()[-1]) for run in runs]
     assert np.abs(tangents[0] - tangents[1]).max() < 1e-11 * np.abs(tangents[1]).max()
+
+
+@pytest.mark.parametrize("of_known_sizes", [False, pytest.param(True, marks=pytest.mark.full)])
+def test_gradients_through_events_of_elements(of_known_sizes):
+    """The adjoint equals the tangents to round-off, and extrapolated differences of the run."""
+    stepper, n = compile_stepper(CHAIN, "svi:4", flags=FLAGS), 4
+    stepper = stepper.with_sizes(N=n) if of_known_sizes else stepper
+    loops = [
+        impact("13/10 + b - q[i] for i in N", "e"),
+        Event("q[i] + 1/2 for i in 1..N-1", -1, then={"p_q[i]": "-e*p_q[i] + q[i-1]/99"}),
+    ]
+    q, w = np.linspace(0.2, 1.0, n), np.cos(np.arange(2 * n) + 1.0)
+    x = np.concatenate([q, 1.5 * np.cos(3.0 * np.arange(n)), [1.5, 0.9, 0.1]])
+
+    def run_from(x):
+        known = dict(zip(("m", "e", "b"), x[2 * n :], strict=True))
+        return stepper.integrate(x[:n], p=x[n : 2 * n], parameters=known, events=loops, h=0.1, steps=50)
+
+    def differences(d):
+        ends = [
+            np.hstack([each.q[-1], each.p[-1]]) for each in map(run_from, x + d * np.vstack([np.eye(11), -np.eye(11)]))
+        ]
+        return (np.array(ends[:11]) - ends[11:]) @ w / (2 * d)
+
+    run = run_from(x)
+    assert min(map(len, run.events)) > 0
+    cotangents = np.zeros((len(run.t), 2 * n))
+    cotangents[-1] = w
+    gradient, sensitivity = run.pullback(cotangents), run.sensitivity()
+    adjoint = np.concatenate([np.ravel(each) for each in (gradient.q, gradient.p, gradient.parameters)])
+    tangent = w @ np.hstack([sensitivity.state[-1], sensitivity.parameters[-1]])
+    assert np.abs(adjoint - tangent).max() < 1e-13 * np.abs(tangent).max()
+    one, two, three = (differences(d) for d in (2e-4, 1e-4, 5e-5))
+    extrapolated = (64 * three - 20 * two + one) / 45
+    assert np.abs(adjoint - extrapolated).max() < 1e-8 * np.abs(tangent).max()
 
 
 def test_memory_of_a_wall_has_all_its_entries(gas):
@@ -127,14 +175,102 @@ def test_memory_of_a_wall_has_all_its_entries(gas):
     assert abs(radius[-1] - (2.0 - np.linalg.norm(r) * (1.0 + 3 * 0.7))) < 1e-13
 
 
-@pytest.mark.full
-def test_states_of_crossings_of_many_coordinates_are_not_saved(gas):
+def test_states_of_crossings_have_a_limit_of_memory(gas, monkeypatch):
+    """At most ``MOST_BYTES`` of states are kept; times and elements always are."""
     random = np.random.default_rng(5)
-    r, v = random.random((3000, 2)), 0.1 * random.normal(size=(3000, 2))
-    run = gas.integrate({"r": r}, velocity={"r": v}, h=1e-2, steps=5, save_every=5, events=BOX)
-    assert np.abs(run.q["r"][-1] - folded(r, v, 0.05)).max() < 1e-14
-    assert len(run.events[0]) > 2
+    r, v = random.random((1100, 2)), 0.02 * random.normal(size=(1100, 2))
+    start, plan = ({"r": r}, {"velocity": {"r": v}}), {"h": 1e-2, "steps": 4, "save_every": 4, "events": BOX}
+    saved = gas.integrate(*start[:1], **start[1], **plan)
+    for each, wall in zip(saved.events, (0.0, 1.0), strict=True):
+        places = each.q["r"].reshape(len(each), -1)[np.arange(len(each)), each.element]
+        assert len(each) > 0
+        assert np.abs(places - wall).max() < 1e-14
+    monkeypatch.setattr(detection, "MOST_BYTES", 10_000)
+    with pytest.warns(sc.errors.EventWarning, match="are not kept: run.events has times and elements"):
+        run = gas.integrate(*start[:1], **start[1], **plan)
+    assert np.abs(run.q["r"][-1] - folded(r, v, 0.04)).max() < 1e-14
+    assert [each.element.tolist() for each in run.events] == [each.element.tolist() for each in saved.events]
     assert np.isnan(run.events[0].q["r"]).all()
+
+
+GRAINS = LagrangianSystem.from_text(
+    name="grains",
+    coordinates=["r[N, 2]"],
+    parameters={"g": 1.0},
+    inputs=["u"],
+    lagrangian="sum(i in N, (r_dot[i, 0]**2 + r_dot[i, 1]**2)/2 - g*r[i, 1])",
+    forces={"r[i, 0]": "u - r_dot[i, 0]/10"},
+)
+AROUND = [
+    impact("r[i, 1] + r[i, 0]**2/20 for i in N", 0.8),
+    impact("2 + sin(t)/5 - r[i, 0] for i in N"),
+    impact("r[i, 0] + 1 for i in N", where="r[i, 1] < 3"),
+    Event("r_dot[i, 1] for i in N", -1),
+]
+
+
+@pytest.mark.parametrize("of_known_sizes", [False, pytest.param(True, marks=pytest.mark.full)])
+@pytest.mark.parametrize("h", [0.05, None])
+def test_ensembles_with_inputs_and_events_equal_single_runs(of_known_sizes, h):
+    """Moving walls, walls of finite size, inputs whose breakpoints end steps; known sizes equal any size."""
+    stepper, random = compile_stepper(GRAINS, "svi:4", flags=FLAGS, events=AROUND), np.random.default_rng(0)
+    r = np.stack([random.uniform(-0.9, 1.8, 4), random.uniform(0.5, 2.0, 4)], axis=1)
+    v, plan = random.normal(size=(4, 2)), {"t_end": 3.0} | ({"h": h} if h else {"tolerance": 1e-10})
+    given = {"inputs": {"u": ([-1.0, 1.31, 2.7, 9.0], [0.0, 1.0, -1.0, 0.5])}, **plan}
+    starts = np.stack([r, r + 0.01])
+    chosen = stepper.with_sizes(N=4).with_events(AROUND) if of_known_sizes else stepper
+    several = chosen.integrate_ensemble({"r": starts}, velocity={"r": np.stack([v, v])}, **given)
+    assert list(several.status) == ["ok", "ok"]
+    for (t, q, *_), start in zip(several.each(), starts, strict=True):
+        run = stepper.integrate({"r": start}, velocity={"r": v}, **given)
+        assert min(map(len, run.events)) > 0
+        assert t[-1] == run.t[-1] == 3.0
+        assert np.abs(np.asarray(q)[-1] - np.asarray(run.q)[-1]).max() < (1e-8 if of_known_sizes else 1e-15)
+
+
+def test_cloth_in_wind_at_a_wall():
+    """Constraints of arrays, forces that depend on velocities, and impacts: order 2, rods and pins to round-off."""
+    squares = [f"(r[{{0}}, {k}] - r[i, j, {k}])**2" for k in range(3)]
+    along, across = (" + ".join(squares).format(each) for each in ("i+1, j", "i, j+1"))
+    cloth = LagrangianSystem.from_text(
+        name="cloth",
+        coordinates=["r[N, N, 3]"],
+        parameters={"l": 0.25, "y[N]": 0.0},
+        lagrangian="sum(i in N, j in N, (r_dot[i,j,0]**2 + r_dot[i,j,1]**2 + r_dot[i,j,2]**2)/2 - 10*r[i,j,2])",
+        forces={"r[i, j, 0]": "0.6*(1 + sin(t)) - 0.4*r_dot[i,j,0]", "r[i, j, 2]": "-0.4*r_dot[i,j,2]"},
+        constraints=[
+            "r[0, j, 0] = 0 for j in N",
+            "r[0, j, 1] = y[j] for j in N",
+            "r[0, j, 2] = 0 for j in N",
+            f"{along} = l**2 for i in N-1, j in N",
+            f"{across} = l**2 for i in 1..N-1, j in N-1",
+        ],
+    )
+    stepper, n = compile_stepper(cloth, "stoermer-verlet", flags=FLAGS), 5
+    i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    r, given = np.stack([0 * i, 0.25 * j, -0.25 * i], axis=-1), {"t_end": 1.0, "parameters": {"y": 0.25 * np.arange(n)}}
+    wall = impact("1/10 - r[i, j, 0] for i in N, j in N", 0.5)
+    runs = [stepper.integrate({"r": r}, h=h, events=wall, **given) for h in (0.01, 0.005, 0.0025)]
+    ends = [run.q["r"][-1] for run in runs]
+    assert len(runs[0].events[0]) > 5
+    assert {len(run.events[0]) for run in runs} == {len(runs[0].events[0])}
+    assert np.abs(np.linalg.norm(np.diff(ends[-1], axis=0), axis=-1) - 0.25).max() < 1e-14
+    assert np.abs(ends[-1][0] - r[0]).max() < 1e-14
+    one, two = np.abs(ends[0] - ends[1]).max(), np.abs(ends[1] - ends[2]).max()
+    assert 1.8 < np.log2(one / two) < 2.2
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("tolerance", [None, 1e-9])
+def test_certificates_of_known_sizes_measure_impacts(tolerance):
+    """Adaptive steps, and sites with Hamiltonians of their own, which are verified at known sizes."""
+    sites = "-4*sum(i in N, sqrt(1 - q_dot[i]**2/4)) - sum(i in N-1, (q[i+1] - q[i])**2/2)"
+    system = CHAIN if tolerance else LagrangianSystem.from_text(name="sites", coordinates=["q[N]"], lagrangian=sites)
+    walls = [impact("q[i] + 1 for i in N"), impact("3/2 - q[i] for i in N")]
+    stepper = compile_stepper(system, "svi:2", flags=FLAGS, events=walls)
+    certificate = sc.verify(system, "svi:2", [0.1, 0.5], [1.0, 0.2], h=0.1, stepper=stepper, tolerance=tolerance)
+    names = {"event surfaces", "saltation", "impacts", "symplecticity, impacts", "reversal, impacts"}
+    assert names <= {each.name for each in certificate.checks if each.outcome is Outcome.SATISFIED}
 
 
 @pytest.mark.full
@@ -166,4 +302,4 @@ def test_a_recorded_run_has_its_events(gas, tmp_path):
     run = gas.with_events(BOX).start({"r": r}, velocity={"r": v}, h=0.1)
     recorded = sc.record_run(run, tmp_path / "run", steps=25)
     assert np.abs(recorded.q[-1] - folded(r, v, 2.5)).max() < 1e-14
-    assert [len(each) for each in recorded.events] == [0, 1, 1, 0]
+    assert [each.element.tolist() for each in recorded.events] == [[1], [0]]

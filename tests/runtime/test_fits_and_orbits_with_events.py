@@ -103,6 +103,45 @@ def test_fit_of_restitution_and_wall_from_bounces():
         sc.fit(ended, t, heights, **given)
 
 
+@pytest.fixture(scope="module")
+def billiard() -> Stepper:
+    """Point without forces in a plane."""
+    system = LagrangianSystem.from_text(
+        name="billiard", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 + 0*w", parameters={"w": 0.5}
+    )
+    return compile_stepper(system, "svi:1", flags=FLAGS)
+
+
+def test_derivatives_through_impacts_at_the_ends_of_steps(billiard):
+    """Impacts within roundings of the end of a step: x(T) = 2 w - x - v T, T = 12 h, by (x, y, v), w, t and h."""
+    walled = billiard.with_events(impact("w - x"))
+    for v, h, n in ((1.0, 0.1, 7), (1.0, 1 / 3, 2), (0.99, 0.1, 10), (0.49, 0.37, 11)):
+        x = billiard.integrate([0.0, 0.0], [v, 0.3], h=h, steps=n).q[-1, 0]
+        for k in range(-6, 7):
+            known = {"w": x + k * np.spacing(x)}
+            run = walled.integrate([0.0, 0.0], [v, 0.3], h=h, steps=12, parameters=known)
+            s = run.sensitivity()
+            by = np.concatenate([np.ravel(each[-1][0]) for each in (s.state, s.parameters, s.t, s.h)])
+            assert abs(by - [-1, 0, -12 * h, 0, 2, 0, -12 * v]).max() < 1e-12
+
+
+def test_an_unstable_orbit_with_impacts_by_multiple_shooting(billiard):
+    """The triangle of three discs of radius 1 at distance 6: its multiplier is -11.77145519638 for each impact.
+
+    P. Cvitanovic et al., *Chaos: Classical and Quantum*, table of the 3-disk cycles (a : R = 1 : 6).
+    """
+    angles = np.pi / 2 + 2 * np.pi * np.arange(3) / 3
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    discs = [impact(f"(x - ({x!r}))**2 + (y - ({y!r}))**2 - 1") for x, y in (np.sqrt(12) * directions).tolist()]
+    hits = (np.sqrt(12) - 1) * directions
+    q, p = (hits[0] + hits[1]) / 2, (hits[1] - hits[0]) / (3 * (2 - 3**-0.5))
+    for seed in (1, 2, 4):  # one segment does not converge from these
+        dq, dp = np.random.default_rng(seed).normal(size=(2, 2)) / 1000
+        orbit = sc.periodic_orbit(billiard.with_events(discs), q + dq, p + dp, period=12.8, steps=24, energy=0.5)
+        assert abs(orbit.period / 3 - 4.267949192431) < 1e-11
+        assert abs(abs(orbit.multipliers).max() / 11.77145519638**3 - 1) < 1e-11
+
+
 def test_fits_and_orbits_of_arrays():
     """A chain that bounces on its end: a fit of array coordinates, and the orbit of one ball by its distance."""
     chain = LagrangianSystem.from_text(

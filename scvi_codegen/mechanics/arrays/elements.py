@@ -49,6 +49,7 @@ def unrolled_fields(
         "inputs": system.inputs,
         "damping": system.damping,
         "arrays": tuple(known_array(array, sizes) for array in (*system.positions, *system.fields)),
+        "indices": {**sizes, **{name: table.tolist() for name, table in written.tables.items()}},
         "definition": {} if system.sizes else system.definition,
         **_formulas(system, written, constants),
     }

@@ -81,8 +81,6 @@ def generate_package(
         MethodError: for a solver that does not support the method, and for a number beyond single precision.
         StateError: if the initial velocities have no momenta.
     """
-    if model.events and model.inputs:
-        raise PackageError("a generated package with events has no inputs: omit [inputs], or the events")
     target = Path(folder)
     prefix = prefix_of(target)
     model = model if solver == "auto" else replace(model, solver=solver)
@@ -139,6 +137,7 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
     from scvi_codegen.pipeline import generate_source
     from scvi_codegen.rendering.program_source import render_example
 
+    written = model_texts(model if model.events else model.with_known_sizes())  # events may contain loops over arrays
     model = model.with_known_sizes()
     source, interface = generate_source(
         model.system,
@@ -153,7 +152,6 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
     source = source.single_file() if single_file else source.specialised()
     texts = source.files
     texts |= render_example(interface, example_of(model, controlled=ADVANCE_TO in source.header), embedded or "double")
-    written = model_texts(model)
     texts |= written
     texts["README.md"] = readme_text(
         interface, model.events, with_model=bool(written), embedded=embedded, controlled=ADVANCE_TO in source.header

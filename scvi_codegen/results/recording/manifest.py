@@ -41,7 +41,8 @@ class Chunk:
         piece: the states.
         step: number of steps at the checkpoint.
         memory: memory of the run, as returned by :meth:`Run.checkpoint`.
-        crossings: (k, 2 + 2m) crossings of events in these steps: number of the event, t, q, p.
+        crossings: (k, 2 + 2m) crossings of events in these steps: number of the event (plus the number of events
+            times that of the element of its loops), t, q, p.
     """
 
     piece: Piece

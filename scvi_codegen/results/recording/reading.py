@@ -120,9 +120,10 @@ class RecordedRun(AttitudeHistory):
         rows = [*(self._read(path).crossings for path in paths if events), self._last.crossings]
         e, t, *states = np.concatenate(rows).T
         q, p = np.split(np.transpose(states), 2, axis=1)
-        every, none = enumerate(events), np.zeros(len(t), np.int64)
+        elements, numbers = np.divmod(e.astype(np.int64), max(1, len(events)))
         return tuple(
-            Crossings(event=event, t=t[e == k], q=q[e == k], p=p[e == k], element=none[e == k]) for k, event in every
+            Crossings(event=event, t=t[mine], q=q[mine], p=p[mine], element=elements[mine])
+            for event, mine in ((event, numbers == k) for k, event in enumerate(events))
         )
 
     @cached_property

@@ -282,7 +282,8 @@ class _Recorder:
         """Store states from row ``first`` on and memory in one assignment, consistent after an interruption."""
         run, (pieces, crossings, *_) = self.run, self.pending
         piece = trajectory.t[first:], trajectory.q[first:], trajectory.p[first:], trajectory.iterations[first:]
-        columns = [(np.full(len(each), k), each.t, each.q, each.p) for k, each in enumerate(trajectory.events)]
+        events = trajectory.events
+        columns = [(k + len(events) * each.element, each.t, each.q, each.p) for k, each in enumerate(events)]
         crossings = np.concatenate([crossings, *map(np.column_stack, columns)])
         self.pending = ([*pieces, piece], crossings, run.steps, run.t, run.checkpoint())
 

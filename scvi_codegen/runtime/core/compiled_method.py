@@ -26,7 +26,7 @@ from scvi_codegen.runtime.arrays.any_size import (
 from scvi_codegen.runtime.arrays.binding import ArrayBinding
 from scvi_codegen.runtime.arrays.interface import RunSizes
 from scvi_codegen.runtime.core.validation import Array, flat_state, named, shapes_of
-from scvi_codegen.runtime.events.array_events import EventBinding, events_of_entries
+from scvi_codegen.runtime.events.array_events import EventBinding
 from scvi_codegen.runtime.events.event import Event, EventLike, as_events
 
 MOST_EVENT_SETS = 16
@@ -169,9 +169,7 @@ class CompiledMethod:
             raise MethodError(f"omit threads: this system is compiled with the sizes of each call. {self._reason}")
         bound = self.with_sizes(problem.sizes, tables=problem.places) if self._reason else self._bound_to(problem)
         if self.events:
-            rotations = bound.interface.rotations
-            each = events_of_entries(self.interface, problem, self.events, rotations) if self._reason else self.events
-            bound = bound.with_events(each)
+            bound = bound.with_events(self.events)
         return bound, q if bound.interface.rotations or bound.interface.variables else flat_state(
             bound.interface, q, "q"
         )
@@ -216,16 +214,15 @@ class CompiledMethod:
 
     @property
     def _known_with_events(self) -> Self:
-        """:attr:`known` with the events, in the names of its coordinates."""
-        return self.known.with_events([each for event in self.events for each in self._events_of_entries(event)])
+        """:attr:`known` with the events."""
+        return self.known.with_events(self.events)
 
     def _events_of_entries(self, event: Event) -> tuple[Event, ...]:
         """Return the events of :attr:`known` that an event in index notation defines, one for each element."""
-        if self.problem is None or self.origin is None:
-            return (event,)
         if event not in self._entries:
-            of = self.origin.interface, self.problem, (event,)
-            self._entries[event] = events_of_entries(*of, self.interface.rotations)
+            from scvi_codegen.rendering.events import EventFormulas  # here, because it imports SymPy
+
+            self._entries[event] = cast("tuple[Event, ...]", tuple(EventFormulas(self.known.interface, [event]).events))
         return self._entries[event]
 
     def with_sizes(

@@ -42,6 +42,7 @@ from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.global_error import GlobalError
 from scvi_codegen.runtime.run.step_plan import StepPlan, checked_plan
+from scvi_codegen.runtime.run.times import WHOLE
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import checked_count
@@ -265,7 +266,7 @@ class Ensemble:
             "options": self.options,
             "progress": check_stop,
         }
-        if self.t_eval is not None:
+        if self.t_eval is not None and not (plan.h and self.inputs):
             arguments["t_eval"] = self.t_eval[np.abs(self.t_eval - self.t0) <= abs(plan.t_end - self.t0)]
         stepper = self.stepper if self.stepper.changes_states else self.stepper.with_events(())
         integrate: Callable[..., Trajectory] = stepper.integrate
@@ -285,7 +286,12 @@ class Ensemble:
                 states, status = cast(Trajectory, failure.trajectory), EVENT_FAILED
             except StateError:  # a sum of finite terms has overflowed
                 return SavedLane(np.array([self.t0]), q[np.newaxis], p[np.newaxis], "not finite", 0)
-        return SavedLane(states.t, states.q, states.p, status, states.steps)
+        rows = slice(None)
+        if self.t_eval is not None and plan.h and self.inputs:  # ends of steps, after changes of the state
+            times = states.forward * states.t
+            wanted = states.forward * self.t_eval + WHOLE * abs(plan.h)
+            rows = np.searchsorted(times, wanted[wanted < times[-1] + 2 * WHOLE * abs(plan.h)], side="right") - 1
+        return SavedLane(states.t[rows], states.q[rows], states.p[rows], status, states.steps)
 
     def result(self) -> EnsembleTrajectory:
         """Return the trajectories; those neither completed nor failed have the status ``"interrupted"``."""

@@ -1,16 +1,10 @@
-"""Events in index notation, over arrays of run-time sizes.
-
-The compiled search evaluates their functions in loops. A system that is compiled with the sizes of each call has
-coordinates q_0, q_1, .., of which :func:`events_of_entries` makes the formulas.
-"""
+"""Events in index notation over arrays of run-time sizes: the compiled search evaluates their functions in loops."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partialmethod
-from itertools import repeat
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -23,66 +17,8 @@ from scvi_codegen.runtime.arrays.binding import REPORTED, ArrayBinding
 from scvi_codegen.runtime.arrays.interface import Numbers, RunSizes, check_accesses
 from scvi_codegen.runtime.events.event import Event
 
-if TYPE_CHECKING:
-    from sympy import Expr
-
 LARGEST_NUMBER = 2**31 - 1
 """Largest number of functions of events, and of variables that a function changes."""
-
-
-def events_of_entries(
-    interface: Interface, problem: RunSizes, events: tuple[Event, ...], rotations: Sequence[str]
-) -> tuple[Event, ...]:
-    """Return events in index notation as events of the entries of arrays, q_0, q_1, .., one for each element.
-
-    Args:
-        interface: of the stepper of any size.
-        problem: sizes and index tables.
-        events: with formulas in index notation.
-        rotations: declarations of the entries of arrays of rotations, directions and spins.
-
-    Raises:
-        EventError: if a formula is invalid, or an index leaves its array.
-    """
-    from scvi_codegen.formulas.array_entries import EntryRules, entry_names, formula_of_entries  # here: imports SymPy
-    from scvi_codegen.formulas.array_statements import parse_constraint
-    from scvi_codegen.formulas.rotations.arrays import entries_in_formulas
-    from scvi_codegen.formulas.rotations.names import RotationNames
-    from scvi_codegen.rendering.array_events import array_events
-
-    known, sizes = array_events(interface, ()), problem.sizes
-    arrays = [*known.positions, *known.rates]
-    turning = entries_in_formulas(arrays, RotationNames.members_of(rotations), sizes)
-    names = {array.name: entry_names(array, sizes) for array in known.positions}
-    names |= {array.name: entries for array, entries in turning.items()}
-    rules = EntryRules(sizes, cast("Any", problem.places), names)
-    grammar = (*arrays, *turning), known.symbols, interface.layout.tables
-
-    def formulas(text: Any, event: Event) -> Iterator[Expr]:
-        whole = f"{text}{event.loops}" if text is not event.function else str(text)
-        try:
-            if event.loops:
-                term = parse_constraint(whole, *grammar)
-                yield from (term.formula.xreplace(rule) for _, rule in rules.rules(term))
-            else:
-                yield formula_of_entries(whole, *grammar, rules)
-        except ScviCodegenError as error:
-            raise EventError(f"the formula '{text}' of the event '{event.function}': {error}") from error
-
-    def elements(event: Event) -> Iterator[Event]:
-        changes = [(formulas(name, event), formulas(value, event)) for name, value in event.changes]
-        conditions = [formulas(each, event) for each in event.conditions]
-        restitutions = repeat(None) if event.restitution is None else formulas(event.restitution, event)
-        for function in formulas(event.function, event):
-            yield replace(
-                event,
-                function=function,
-                then={str(next(name)): next(value) for name, value in changes} or None,
-                where=tuple(cast("Any", next(each)) >= 0 for each in conditions) or None,
-                restitution=next(restitutions),
-            )
-
-    return tuple(each for event in events for each in elements(event))
 
 
 class EventBinding(ArrayBinding):
@@ -120,13 +56,13 @@ class EventBinding(ArrayBinding):
             return self._ffi.new(f"{self._prefix}_watch *", {"history": int(self._first[-1])})
         return super().new(what)
 
-    def records(self, structs: Any) -> NDArray[np.void]:
-        """Return a copy of crossings, by the names of their fields."""
+    def records(self, structs: Any, count: int | None = None) -> NDArray[np.void]:
+        """Return a copy of the first of several crossings, by the names of their fields."""
         fields = {"t": float, "fraction": float, "function": np.int32, "direction": np.int32, "element": np.int64}
-        records = np.zeros(len(structs), [*fields.items(), *((name, float, (self.count,)) for name in "qp")])
-        for record, crossing in zip(records, structs, strict=True):
-            if crossing.q == self.null:
-                break
+        count = len(structs) if count is None else count
+        records = np.empty(count, [*fields.items(), *((name, float, (self.count,)) for name in "qp")])
+        for k in range(count):
+            record, crossing = records[k], structs[k]
             record["q"], record["p"] = self.vector(crossing.q), self.vector(crossing.p)
             for name in fields:
                 record[name] = getattr(crossing, name)
@@ -139,7 +75,8 @@ class EventBinding(ArrayBinding):
         host, made = self.new("event_host *"), super(ArrayBinding, self).new("report *")
         size = self.constant("EVENT_STATES") * n + self.constant("EVENT_VALUES") * functions
         work, values, places = np.empty(size), np.empty(self._changes + n), np.zeros(self._changes, np.int32)
-        self._rows[found] = np.empty((room, 2 * n))
+        if found not in self._rows:
+            self._rows[found] = np.empty((room, 2 * n))
         host.count, host.functions, host.changes, host.first = n, functions, self._changes, self._first.tolist()
         host.memory, host.states = self.pointer(work), self.pointer(self._rows[found])
         host.values, host.places = self.pointer(values), self.pointer(places)

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import EventError, EventWarning, StateError, warn
 from scvi_codegen.native.options import step_failure
-from scvi_codegen.runtime.arrays.any_size import MOST_COORDINATES
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.events.event import ACCUMULATED, BEHIND, JAMMED, THROUGH, UNDEFINED, Crossings
 from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
@@ -18,8 +17,10 @@ from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
 if TYPE_CHECKING:
     from scvi_codegen.runtime.run.memory import Memory
 
-INITIAL_CAPACITY, LEAST_CAPACITY, CROSSING_NUMBERS = 256, 16, 2**21
-"""Initial number of crossings that one call can return, doubled when exceeded; fewer of more than 8192 coordinates."""
+INITIAL_CAPACITY, LEAST_CAPACITY, CROSSING_NUMBERS = 256, 16, 2**24
+"""Initial number of crossings that one call can return, doubled when exceeded; fewer of over 65,536 coordinates."""
+MOST_BYTES = 2**30
+"""Largest memory for the states of crossings of a run; if they exceed it, none is kept."""
 
 
 class CrossingSearch:
@@ -45,7 +46,7 @@ class CrossingSearch:
             self.watch.direction[number] = event.direction
             self.watch.acts[number] = terminal and event.changes_state
             self.watch.remaining[number] = terminal and int(event.terminal)
-        self._discards_states = stepper.dimension > MOST_COORDINATES and any(event.loops for event in stepper.events)
+        self._bytes, self._buffers = 0, (None, [np.empty(0)])
         self._capacity = min(INITIAL_CAPACITY, max(LEAST_CAPACITY, CROSSING_NUMBERS // stepper.dimension))
 
     @property
@@ -95,10 +96,15 @@ class CrossingSearch:
         """
         plan, binding, number = run._plan, self.binding, run.steps
         most = 2 * size + self._capacity
-        rows = [np.empty((most + 1, *shape)) for shape in ((), run._q.shape, run._p.shape, ())]
+        crossings, rows = self._buffers  # kept for later calls, as new memory of large states is slow
+        if crossings is None or len(crossings) != self._capacity:
+            crossings = binding.new(f"crossing[{self._capacity}]")
+        if len(rows[0]) != most + 1:
+            rows = [np.empty((most + 1, *shape)) for shape in ((), run._q.shape, run._p.shape, ())]
+        self._buffers = crossings, rows
         rows[0][0], rows[1][0], rows[2][0] = run.t, run._q, run._p
         iterations, numbers = np.zeros(most + 1, np.int32), np.full(most + 1, number, np.int64)
-        crossings, filled = binding.new(f"crossing[{self._capacity}]"), binding.numbers("long long *")
+        filled = binding.numbers("long long *")
         arguments = self.watch, plan.t_end, plan.tau or plan.tolerance, size, *run._arguments, most
         states = *(binding.pointer(each[1:]) for each in rows), binding.integers(iterations[1:])
         to = self._capacity, crossings, filled, run._report, run._workspace
@@ -114,11 +120,21 @@ class CrossingSearch:
         return (t, q, p, iterations[:count]), sizes, numbers[:count], failure
 
     def _record(self, crossings: Any, count: int) -> None:
-        """Record the first crossings of an array, without states if these would be too many."""
-        records = self.binding.records(crossings)[:count].copy()
+        """Record the first crossings of an array; discard all states if these would exceed ``MOST_BYTES``."""
+        records = self.binding.records(crossings, count)
         if count:
             self.last = float(records["t"][-1]), records["q"][-1], records["p"][-1]
-        self.recorded.append(records[["t", "function", "element"]].copy() if self._discards_states else records)
+        before, self._bytes = self._bytes, self._bytes + records.nbytes
+        self.recorded.append(records)
+        if self._bytes > MOST_BYTES:
+            names: Any = [name for name in ("t", "function", "element") if name in (records.dtype.names or ())]
+            self.recorded = [each[names].copy() if each.dtype.names != (*names,) else each for each in self.recorded]
+        if before <= MOST_BYTES < self._bytes:
+            warn(
+                f"the states of crossings until t = {self.last[0]:.6g} exceed {MOST_BYTES / 2**30:g} GiB and are not "
+                "kept: run.events has times and elements. Integrate in parts, or compute states with run.at(t)",
+                EventWarning,
+            )
 
     def _failure(self, status: int, report: Any, step: int, h: float) -> Exception:
         behind = getattr(self.watch, "behind", 0.0)
@@ -143,15 +159,15 @@ class CrossingSearch:
 
     def crossings(self) -> tuple[Crossings, ...]:
         """Return the crossings by event."""
-        none, named = self.binding.records(self.binding.new("crossing[1]"))[:0], self.stepper.named
-        records: Any = np.concatenate(self.recorded or [none])
+        none, named = self.binding.records(self.binding.new("crossing[1]"), 0), self.stepper.named
+        records: Any = np.concatenate(self.recorded) if len(self.recorded) > 1 else [*self.recorded, none][0]
         crossings = []
         for number, event in enumerate(self.stepper.events):
-            mine = records[records["function"] == number]
-            values = {name: mine[name].copy() for name in ("t", "q", "p", "element") if name in mine.dtype.names}
-            unknown = np.broadcast_to(np.nan, (len(mine), self.stepper.dimension))
+            mine, names = records["function"] == number, records.dtype.names
+            values = {name: records[name][mine] for name in ("t", "q", "p", "element") if name in names}
+            unknown = np.broadcast_to(np.nan, (len(values["t"]), self.stepper.dimension))
             values |= {name: named(values.get(name, unknown)) for name in "qp"}
-            values.setdefault("element", np.zeros(len(mine), np.int64))
+            values.setdefault("element", np.zeros(len(unknown), np.int64))
             crossings.append(Crossings(event=event, **values))
         return tuple(crossings)
 

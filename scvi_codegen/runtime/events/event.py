@@ -209,7 +209,7 @@ class Crossings:
     Attributes:
         event: the event.
         t: (k,) times.
-        q, p: (k, m) states; NaN for an event with ``for`` of more than 2000 coordinates.
+        q, p: (k, m) states; NaN, with an :class:`~scvi_codegen.errors.EventWarning`, if those of a run exceed 1 GiB.
         element: (k,) numbers of the elements of its loops, 0 without loops; i for ``"q[i] for i in N"``.
     """
 

@@ -26,7 +26,7 @@ from scvi_codegen.runtime.constraints.projection import projected
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.runtime.run.times import WHOLE
-from scvi_codegen.runtime.trajectory.recomputation import changes_by_events
+from scvi_codegen.runtime.trajectory.recomputation import changes_by_events, steps_after
 
 if TYPE_CHECKING:
     from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
@@ -104,9 +104,10 @@ def _jump(
     start = np.concatenate([starts.q[k - 1], starts.p[k - 1]])
     arrival = products(start, float(starts.h[k - 1]), float(starts.t[k - 1]), np.eye(size)[-1:])[:, 0]
     at_end = row + 1 == len(states)
-    h = SMALL_STEP * abs(states.h) if at_end else float(states.t[row + 1] - t)
+    h = SMALL_STEP * abs(states.h) if at_end else float(steps_after(states, row, row + 1)[0])
     # 1 if the next step is the rest of a step of size h, whose variation belongs to the first part
-    rest = float(not at_end and states.plan.fixed and abs(h) < (1.0 - WHOLE) * abs(states.h))
+    partial = abs(h) < (1.0 - WHOLE) * abs(states.h) or abs(starts.h[k - 1]) < WHOLE * abs(states.h)
+    rest = float(not at_end and states.plan.fixed and partial)
     step = products(after, h, t, np.eye(size))
     departure, basis = np.zeros(2 * m), np.eye(2 * m)
     if stepper.constraints:  # tangent vectors are admissible: departure + the range of the derivative of the projection

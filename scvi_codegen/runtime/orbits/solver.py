@@ -26,6 +26,7 @@ from scvi_codegen.runtime.estimation.measurements import state_names
 from scvi_codegen.runtime.orbits.periodic_orbit import PeriodicOrbit
 from scvi_codegen.runtime.rotations.reduction import Reduction
 from scvi_codegen.runtime.rotations.states import checked_pair, homogeneous_state
+from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.run.times import steps_within, times_after
 from scvi_codegen.runtime.sensitivity.fixed_steps import tangents_along
 from scvi_codegen.validation import checked_count, checks_arguments
@@ -198,24 +199,38 @@ class _OrbitSearch:
         *Introduction to Numerical Analysis*, 7.3.5). The first nodes are those of half a period forward and half a
         period backward from the guess: an error of the guess grows by the square root of the growth in a period.
         """
-        if self.stepper.changes_states:  # derivatives through events require runs forward in time
-            return guess, self._closing(guess), 0
         half, start = self.steps // 2, guess[:-1]
-        forward = self._segment(start, 0, half, guess[-1])
-        backward = self._segment(start, 0, self.steps - half, -guess[-1])
         inward = self.reduction.inward(*np.split(start, 2))
-        forth, back = (self._leaving(each) @ each.monodromy @ inward for each in (forward, backward))
-        monodromy = np.linalg.solve(back.T, forth.T).T
+        if self.stepper.changes_states:  # derivatives through events require runs forward in time
+            forward = self._segment(start, 0, self.steps, guess[-1])
+            monodromy = self._leaving(forward) @ forward.monodromy @ inward
+            later = self._states_before(start, guess[-1])
+        else:
+            forward = self._segment(start, 0, half, guess[-1])
+            backward = self._segment(start, 0, self.steps - half, -guess[-1])
+            forth, back = (self._leaving(each) @ each.monodromy @ inward for each in (forward, backward))
+            later, monodromy = backward.states, np.asarray(np.linalg.solve(back.T, forth.T).T)
         growth = float(np.abs(np.linalg.eigvals(monodromy)).max())
         if growth <= EASY:
             return guess, self._closing(guess), 0
         count = min(2 * int(np.ceil(np.log(growth) / np.log(GROWTH) / 2.0)), self.steps)
-        later = backward.states + np.append(self.gain, np.zeros(len(self.gain)))
-        path = np.vstack([start, forward.states, later[-2::-1]])
+        later = later + np.append(self.gain, np.zeros(len(self.gain)))
+        path = np.vstack([start, forward.states[: self.steps - len(later)], later[-2::-1]])
         nodes = np.append(path[self._bounds(count)[:-1]], guess[-1])
         z, _, iterations = self._iterated(nodes, self._closing(nodes), 0)
         nearer = np.append(z[: len(start)], z[-1])
         return nearer, self._closing(nearer), iterations
+
+    def _states_before(self, start: Array, period: float) -> Array:
+        """Return the states before a state, in steps backward over half a period, of impacts that can be undone."""
+        plan, steps, (q, p) = StepPlan(h=-period / self.steps), self.steps - self.steps // 2, np.split(start, 2)
+        if not any(event.changes for event in self.stepper.events):
+            run = self.stepper._started(q, p, None, plan, self.t, self.parameters, self.options)
+            with suppress(EventError, StepFailedError):
+                motion, ends = run._recorded(steps), self.t + plan.h * np.arange(1, steps + 1)
+                rows = np.searchsorted(-motion.t, -ends + 0.5**30 * period, side="right") - 1
+                return np.concatenate([motion.q, motion.p], axis=1)[rows]
+        return start[np.newaxis]
 
     def _bounds(self, count: int) -> NDArray[np.intp]:
         """Return the (count + 1,) numbers of the steps at which segments begin and end."""

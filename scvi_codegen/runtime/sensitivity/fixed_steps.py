@@ -12,8 +12,9 @@ from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.run.times import times_after
-from scvi_codegen.runtime.sensitivity.gradients import SAME_STEP_SIZE, forward
+from scvi_codegen.runtime.sensitivity.gradients import forward
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
+from scvi_codegen.runtime.trajectory.recomputation import SAME_STEP_SIZE
 
 
 def tangents_along(

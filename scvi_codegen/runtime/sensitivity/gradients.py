@@ -19,13 +19,11 @@ from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.events.saltation import Jump, jumps_within
 from scvi_codegen.runtime.sensitivity.step_derivatives import LinearisedMethod, Sensitivity, Starts
 from scvi_codegen.runtime.sensitivity.transformed_derivatives import time_of
-from scvi_codegen.runtime.trajectory.recomputation import check_recomputed, steps_between
+from scvi_codegen.runtime.trajectory.recomputation import SAME_STEP_SIZE, check_recomputed, steps_after, steps_between
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 
 MOST_STEPS = 1024
 """Largest number of steps of a segment processed at once."""
-SAME_STEP_SIZE = 1e-9
-"""Relative difference of step sizes that rounding of times may cause."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -176,7 +174,8 @@ def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], ve
 
 def pieces(states: SavedStates) -> Iterator[tuple[int, int]]:
     """Yield the first and last index of segments whose steps are all saved, or of two consecutive saved states."""
-    spans, lengths = np.diff(states.stepped), states.step_sizes[:-1]
+    lengths = states.step_sizes[:-1]
+    spans = steps_after(states, 0, len(states) - 1)
     several = ~(np.abs(spans) < 1.5 * np.abs(lengths))
     first = 0
     while first < len(spans):
@@ -191,10 +190,10 @@ def pieces(states: SavedStates) -> Iterator[tuple[int, int]]:
 def starts_of(states: SavedStates, first: int, last: int) -> tuple[Starts, NDArray[np.intp]]:
     """Return the steps of a segment, and (steps + 1,) indices of the saved states at their ends, -1 if not saved."""
     length, span = float(states.step_sizes[first]), float(states.stepped[last] - states.stepped[first])
-    count = steps_between(length, span) if last == first + 1 else 1
+    taken = last > first + 1 or steps_after(states, first, last)[0] == length
+    count = 1 if taken else steps_between(length, span)
     if count == 1:
-        spans, lengths = np.diff(states.stepped[first : last + 1]), states.step_sizes[first:last]
-        h = np.where(np.abs(spans - lengths) < SAME_STEP_SIZE * np.abs(lengths), lengths, spans)
+        h = steps_after(states, first, last)
         of = slice(first, last + 1)
         starts = Starts(states.t[first:last].copy(), h, states.q[of].copy(), states.p[of].copy())
         return starts, np.arange(first, last + 1)

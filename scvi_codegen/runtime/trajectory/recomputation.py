@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import StateError
 from scvi_codegen.runtime.events.event import Crossings
 from scvi_codegen.runtime.trajectory.dense_output import whole_steps
-from scvi_codegen.runtime.trajectory.saved_states import STEP_END_TOLERANCE, Array, SavedStates
+from scvi_codegen.runtime.trajectory.saved_states import ROUNDINGS, STEP_END_TOLERANCE, Array, SavedStates
 
+SAME_STEP_SIZE = 1e-9
+"""Largest relative difference of step sizes that are equal."""
 SAME_STATE = 1e-6
 """Largest deviation of a recomputed state, relative to its largest entry; other roots are further away."""
 
@@ -33,13 +35,14 @@ def work_and_impulses_until(states: SavedStates) -> Array:
     ends = np.concatenate([states.q, states.p], axis=1)
     for crossings, rows in changes_by_events(states):
         ends[rows] = np.concatenate([crossings.q, crossings.p], axis=1)
-    for k, (start, length, end) in enumerate(
-        zip(states.t[:-1].tolist(), states.step_sizes[:-1].tolist(), states.t[1:].tolist(), strict=True)
+    spans = steps_after(states, 0, len(states) - 1).tolist()
+    for k, (start, length, span) in enumerate(
+        zip(states.t[:-1].tolist(), states.step_sizes[:-1].tolist(), spans, strict=True)
     ):
-        count, q, p = steps_between(length, end - start), states.q[k], states.p[k]
+        count, q, p = steps_between(length, span), states.q[k], states.p[k]
         total[k + 1] = total[k]
         for j in range(count):
-            q, p, output = step(q, p, length if count > 1 else end - start, start + j * length)
+            q, p, output = step(q, p, length if count > 1 else span, start + j * length)
             total[k + 1] += output
         recomputed = np.concatenate([q, p])[np.newaxis]
         check_recomputed(states.t[k : k + 1], recomputed, ends[k + 1 : k + 2], ends[k : k + 1])
@@ -53,10 +56,27 @@ def changes_by_events(states: SavedStates) -> Iterator[tuple[Crossings, NDArray[
         times = states.forward * crossings.t
         here = (t[0] <= times) & (times <= t[-1])
         rows = np.searchsorted(t, times[here])
+        chosen = crossings.chosen(here)
+        # the time of a crossing near the end of a step is that of two states: the first may be the one before it
+        after, (q, p) = np.minimum(rows + 1, len(t) - 1), (np.asarray(each) for each in (chosen.q, chosen.p))
+        apart = [np.abs(states.q[k] - q).sum(axis=1) + np.abs(states.p[k] - p).sum(axis=1) for k in (rows, after)]
+        rows = np.where((t[after] == times[here]) & (apart[0] < 0.5 * apart[1]), after, rows)
         if crossings.event.changes_state:
             if not np.array_equal(t[rows], times[here]):
                 raise StateError("this requires the states after changes by events: save all states (save_every=1)")
-            yield crossings.chosen(here), rows
+            if np.isnan(np.asarray(chosen.q)).any():
+                raise StateError("this requires the states of crossings, which exceed 1 GiB: integrate in parts")
+            yield chosen, rows
+
+
+def steps_after(states: SavedStates, first: int, last: int) -> Array:
+    """Return the sizes of the steps from saved states to the next ones: as taken, or the differences of times.
+
+    Times are rounded; a crossing can be closer than that to the end of a step.
+    """
+    spans, lengths = np.diff(states.stepped[first : last + 1]), states.step_sizes[first:last]
+    rounding = ROUNDINGS * np.finfo(float).eps * np.abs(states.stepped[first + 1 : last + 1])
+    return np.where(np.abs(spans - lengths) < SAME_STEP_SIZE * np.abs(lengths) + rounding, lengths, spans)
 
 
 def steps_between(length: float, span: float) -> int:

@@ -74,7 +74,10 @@ def verify_arrays(
     parameters = dict(zip(stepper.interface.parameters, arrays.numbers, strict=True))
     if stepper.source is None or system.coupled_terms or tolerance is not None or system.constraints:
         known = unroll_sums(system, arrays.sizes, tables=arrays.places, parameters={**parameters, **arrays.fields})
-        return of_known_sizes(known, chosen, run.q, run.p, h=run.h, t=run.t, tolerance=tolerance, flags=flags)
+        of: dict[str, Any] = {"h": run.h, "t": run.t, "tolerance": tolerance, "flags": flags}
+        if watched.events:
+            of["stepper"] = compile_stepper(known, chosen, flags=watched.flags, events=watched.events)
+        return of_known_sizes(known, chosen, run.q, run.p, **of)
     start = WholeStart(system, chosen, stepper, arrays, run.stepper.arrays(run.p), run.h, run.t)
     tested = _subject(start)
     checks = (

@@ -44,7 +44,8 @@ static int perform_step(run_memory *run, const problem *given, const work_arrays
   status = solve(&step, &data, history_in(&step), &run->guess, work->dq, work->dp, options, report, NULL);
   if (status != OK)
     return status;
-  status = observe_error(run, &step, &data, work->dq, work->dp, options, NULL);
+  if (run->error < INFINITY) /* else a partial step, of a search for events */
+    status = observe_error(run, &step, &data, work->dq, work->dp, options, NULL);
   if (status == OK)
     continue_steps(run, &step, work->dq, work->dp);
   else

@@ -47,9 +47,9 @@ static int changes_by(const event_step *step, int e, const event_sample *at, eve
   event_changes(u, at->t, step->parameters, value);
   wall->n = value + FIRST_VALUE[e];
   wall->place = CHANGED + FIRST_VALUE[e];
-  wall->count = FIRST_VALUE[e + 1] - FIRST_VALUE[e] - 2 * IS_IMPACT[e];
+  wall->count = FIRST_VALUE[e + 1] - FIRST_VALUE[e] - 2 * IS_IMPACT[EVENT_OF(e)];
   wall->by_time = wall->restitution = 0.0;
-  if (IS_IMPACT[e]) {
+  if (IS_IMPACT[EVENT_OF(e)]) {
     wall->by_time = wall->n[wall->count];
     wall->restitution = wall->n[wall->count + 1];
   }
@@ -154,7 +154,7 @@ static int evaluate_changes(const event_step *step, int e, const event_sample *a
     const int k = wall->place[i];
     wall->rate += wall->n[i] * v[k];
     wall->size += fabs(wall->n[i] * v[k]);
-    wall->slack += fabs(wall->n[i]) * (fabs(at->q[k]) + fabs(v[k] * step->h));
+    wall->slack += fabs(wall->n[i]) * (fabs(at->q[k]) + fabs(v[k] * step->whole));
   }
   wall->slack *= CHANGE_SAFETY * DBL_EPSILON;
   wall->rate *= step->h < 0.0 ? -1.0 : 1.0;
@@ -307,6 +307,7 @@ static int change_state(const event_step *step, int e, event_sample *at)
   const int is_impact = IS_IMPACT[EVENT_OF(e)];
   int status = changes_at(step, e, at, &wall);
   if (status == OK && is_impact && wall.rate < 0.0) {
+    step->watch->history[e].slack = wall.slack;
     step->watch->history[e].rounding = wall.slack / -wall.rate;
     status = impact(step, at, &wall);
     if (status == NOT_CONVERGED)
@@ -385,6 +386,19 @@ static int refine_crossing(const event_step *step, long long first, event_sample
   return status;
 }
 
+/* Whether function e may be within rounding of zero at the state of a change, by bounds 2^20 times as large: of the
+ * effect of rounding, and of its change along the step. Saves the gradients of most of many functions. */
+static int may_be_touched(const event_step *step, int e)
+{
+  const real value = values_at(step, EVENT_DEGREE + 1)[e];
+  real range = 0.0;
+  if (EVENTS <= EVENT_FEW)
+    return 1;
+  for (int j = 0; j <= EVENT_DEGREE; j++)
+    range = fmax(range, fabs(values_at(step, j)[e] - value));
+  return fabs(value) <= 0x1p-20 * range + 0x1p26 * values_at(step, EVENT_DEGREE + 2)[e];
+}
+
 /* Changes the state at the crossings from `first` on, which have one state, then at all walls that it touches within
  * rounding and approaches, in their order, until there is none; walls that are met there are crossings, too. */
 static int change_at_crossings(const event_step *step, long long first, event_sample *at)
@@ -407,7 +421,7 @@ static int change_at_crossings(const event_step *step, long long first, event_sa
       const int event = EVENT_OF(e);
       event_wall wall;
       int open = 0, known = 0;
-      if (!IS_IMPACT[event] || !step->watch->acts[event])
+      if (!IS_IMPACT[event] || !step->watch->acts[event] || !may_be_touched(step, e))
         continue;
       status = evaluate_changes(step, e, at, v, &wall);
       if (status == OK && fabs(value[e]) <= wall.slack && wall.rate < -CHANGE_SAFETY * DBL_EPSILON * wall.size)
@@ -431,8 +445,8 @@ static int change_at_crossings(const event_step *step, long long first, event_sa
       step->found[*step->filled] = step->found[first];
       step->found[*step->filled].function = event;
       step->found[*step->filled].direction = -1;
+      SET_ELEMENT(step->found + *step->filled, e);
 #ifdef EVENTS_OF_ANY_SIZE
-      step->found[*step->filled].element = e - event_host->first[event];
       step->found[*step->filled].acted = 0;
 #endif
       ends_search(step->watch, step->found + *step->filled);
@@ -462,9 +476,10 @@ static int check_walls(const event_step *step, const event_sample *left, const e
       status = evaluate_changes(step, e, left ? left : right, v, &wall);
     if (status == OK && left)
       status = conditions(e, right->t, right->q, right->p, step->parameters, &open, step->workspace);
+    wall.slack = fmax(wall.slack, step->watch->history[e].slack); /* the velocity after an impact may be 0 */
 #if EVENT_GUARDS > 0
     for (int i = 0; !left && i < EVENT_GUARDS; i++)
-      open &= GUARDED[i] != event;
+      open &= GUARDED[i] != GUARD_OF(e);
 #endif
     if (status == OK && open && (!left || before[e] >= -wall.slack) && after[e] < -wall.slack) {
       step->watch->through = event + 1;
@@ -537,6 +552,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     status = evaluate_functions(step, &right, values_at(step, EVENT_DEGREE));
     if (status == OK)
       status = search_step(step, &left, &right);
+    step->rounding_known |= !step->watch->started;
     if (status == OK)
       status = settle_crossings(step, first);
     if (status == NOT_CONVERGED && step->watch->accumulated) {
@@ -563,6 +579,10 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
         set_run(run, run->t, &right);
       status = check_walls(step, &left, &right);
       return status == OK ? store_state(to, &right, length, iterations, run->step, step->report) : status;
+    }
+    if (status == OK && EVENTS > EVENT_FEW && !step->rounding_known) {
+      status = rounding_of(step, &left);
+      step->rounding_known = 1;
     }
     if (status == OK)
       status = change_at_crossings(step, group, &at);
@@ -672,7 +692,7 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, r
     const event_watch watched = *watch;
     const long long kept = report->stored, crossed = *filled;
     event_step step = {0.0, 0.0, 0.0, NULL, NULL, parameters, options, watch, found, room, filled, report, workspace,
-        memory, memory + 15 * M, &horizon};
+        memory, memory + 15 * M, 0, &horizon};
     real size;
     int count = 0;
 #ifdef EVENTS_OF_ANY_SIZE

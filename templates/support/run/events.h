@@ -55,13 +55,15 @@ enum {
 };
 
 #define EVENT_TIE 0x1p-30 /* relative to the step: closer crossings may coincide */
-#define EVENT_AT_ZERO (16.0 * DBL_EPSILON) /* relative to the range of a function on a step: residual of a located
-                                            * zero */
+#define EVENT_AT_ZERO (16.0 * DBL_EPSILON) /* relative to the range of a function on a whole step: residual of a
+                                            * located zero */
 #define EVENT_UNCHANGED (4.0 * DBL_EPSILON) /* relative to the range of a function on a step: a change that may be
                                            * rounding */
 #define EVENT_SMALL_PART 0.03 /* a polynomial whose error estimate is less than this part of its range is accepted */
 #define EVENT_FAR 32.0 /* a function is far from zero beyond so many times its range at the nodes: polynomials and their
                         * error estimates deviate by at most 22 of them */
+#define EVENT_FEW 16 /* functions that are all examined after a change */
+#define EVENT_OVERSHOOT 0x1p-10 /* part of a secant step by which it is longer, so that the sign changes */
 #define EVENT_STEEPNESS 8.0 /* a zero is simple if the derivative exceeds so many error estimates */
 
 typedef NAME(watch) event_watch;
@@ -75,14 +77,20 @@ typedef NAME(crossing) event_crossing;
 #endif
 
 #ifndef EVENT_GUARDS
-#define EVENT_GUARDS 0 /* conditions of crossings, each of the event GUARDED: values of the kernel event_guards */
+#define EVENT_GUARDS 0 /* conditions of crossings, of the function GUARDED: values of the kernel event_guards */
+#endif
+#ifdef EVENT_FIRST /* index notation: an event has a function for each element of its loops */
+#define FUNCTION_OF(crossing) ((int)(EVENT_FIRST[(crossing)->function] + (crossing)->element))
+#define SET_ELEMENT(crossing, e) ((crossing)->element = (e) - EVENT_FIRST[(crossing)->function])
+#else
+#define EVENT_OF(e) (e) /* event of a function */
+#define FUNCTION_OF(crossing) ((crossing)->function)
+#define SET_ELEMENT(crossing, e) ((void)(e))
 #endif
 #ifdef EVENTS_OF_ANY_SIZE
-#define FUNCTION_OF(crossing) ((int)(event_host->first[(crossing)->function] + (crossing)->element))
+#define GUARD_OF(e) EVENT_OF(e) /* conditions are those of an event */
 #else
-#define EVENT_OF(e) (e) /* event of a function; in index notation an event has one for each element of its loops */
-#define FUNCTION_OF(crossing) ((crossing)->function)
-
+#define GUARD_OF(e) (e) /* those of a function */
 /* Arguments (q, p, v) of the kernels of events at a state. */
 static int event_arguments(real t, const real *q, const real *p, const real *parameters, real *u, real *workspace)
 {
@@ -165,6 +173,7 @@ typedef struct {
   real *workspace;
   real *memory; /* state of the last sample (2 M), work (5 M), state of the horizon (2 M); those of changes */
   real *values; /* of the functions (EVENT_VALUES EVENTS) */
+  int rounding_known; /* whether the effect of rounding on this step is */
   event_sample *horizon; /* first known crossing that changes the state; later ones are not located */
 } event_step;
 
@@ -290,61 +299,71 @@ static real nearer_middle(real a, real b)
 }
 
 /* Abscissa, nearest to the middle, where the sign of the polynomial c or the simplicity of a zero is uncertain, or 2 if
- * there is none; also returns the extrema, ascending. */
-static real uncertain_abscissa(const real *c, real doubt, real *extrema, int *count)
+ * there is none; also returns the extrema and zeros, ascending. */
+static real uncertain_abscissa(const real *c, real doubt, real *extrema, int *count, real *zeros, int *zero_count)
 {
-  real derivative[EVENT_DEGREE], zeros[EVENT_DEGREE], place = 2.0;
-  const int zero_count = polynomial_crossings(c, EVENT_DEGREE, zeros);
+  real derivative[EVENT_DEGREE], place = 2.0;
+  *zero_count = polynomial_crossings(c, EVENT_DEGREE, zeros);
   for (int k = 1; k <= EVENT_DEGREE; k++)
     derivative[k - 1] = k * c[k];
   *count = polynomial_crossings(derivative, EVENT_DEGREE - 1, extrema);
-  for (int i = 0; i < zero_count; i++)
-    if (fabs(polynomial(derivative, EVENT_DEGREE - 1, zeros[i])) <= EVENT_STEEPNESS * doubt)
+  for (int i = 0; i < *zero_count; i++) {
+    const real slope = polynomial(derivative, EVENT_DEGREE - 1, zeros[i]);
+    if (fabs(slope) <= EVENT_STEEPNESS * doubt)
       place = nearer_middle(zeros[i], place);
+    else
+      zeros[i] -= polynomial(c, EVENT_DEGREE, zeros[i]) / slope; /* from the error of bisection to rounding */
+  }
   for (int i = 0; i < *count; i++)
     if (fabs(polynomial(c, EVENT_DEGREE, extrema[i])) <= doubt)
       place = nearer_middle(extrema[i], place);
   return place;
 }
 
-/* Narrows a sign change to neighbouring fractions; high is the later end. After a secant step the end that it moved is
- * advanced by steps of doubling size until the sign changes. */
-static int enclose_crossing(const event_step *step, int e, event_sample low, event_sample *high)
+/* Narrows a sign change to neighbouring fractions; high is the later end, `guess` its approximation or NAN. Secant
+ * steps from the end nearer to zero pass the crossing by a small part, so that both ends approach it; an interval that
+ * is not halved by two of them is bisected. *sampled is the fraction of the last sample. */
+static int enclose_crossing(const event_step *step, int e, event_sample low, event_sample *high, real guess,
+    real *sampled)
 {
   const real least = 2.0 * DBL_EPSILON;
-  real moved = 0.0;
-  int beyond = 0; /* 1: low is advanced, -1: high is */
+  real slope = 0.0, wide = INFINITY, wider = INFINITY;
   for (int k = 0; k < EVENT_TRIALS && high->g != 0.0 && high->fraction - low.fraction > 2.0 * least; k++) {
-    const real width = high->fraction - low.fraction, leap = fmin(2.0 * moved, 0.5 * width);
-    real fraction = low.fraction + low.g / (low.g - high->g) * width;
+    const real width = high->fraction - low.fraction, mean = (high->g - low.g) / width;
+    const event_sample near = fabs(high->g) < fabs(low.g) ? *high : low;
+    real fraction = guess;
     event_sample now;
     int status;
-    if (beyond)
-      fraction = beyond > 0 ? low.fraction + leap : high->fraction - leap;
+    if (k > 0 || !(guess > low.fraction && guess < high->fraction)) {
+      const real move = -near.g / (slope * mean > 0.0 ? slope : mean);
+      fraction = near.fraction + move + copysign(fmax(1.5 * least, EVENT_OVERSHOOT * fabs(move)), move);
+    }
+    if (width > 0.5 * wider)
+      fraction = low.fraction + 0.5 * width;
+    wider = wide;
+    wide = width;
     fraction = fmin(fmax(fraction, low.fraction + least), high->fraction - least);
     status = take_sample(step, e, fraction, &now);
     if (status != OK)
       return status;
-    if (changes_sign(low.g, now.g)) {
-      moved = high->fraction - fraction;
-      beyond = beyond > 0 ? 0 : -1;
+    *sampled = fraction;
+    slope = (now.g - near.g) / (fraction - near.fraction);
+    if (changes_sign(low.g, now.g))
       *high = now;
-    } else {
-      moved = fraction - low.fraction;
-      beyond = beyond < 0 ? 0 : 1;
+    else
       low = now;
-    }
   }
   return OK;
 }
 
 /* Adds the crossing between two samples if its direction is requested and it is not behind the horizon, which is then
  * the crossing if it changes the state. */
-static int add_crossing(const event_step *step, int e, const event_sample *from, const event_sample *to)
+static int add_crossing(const event_step *step, int e, const event_sample *from, const event_sample *to, real guess)
 {
   const int direction = from->g < 0.0 ? 1 : -1, event = EVENT_OF(e);
   event_sample at = *to, *const horizon = step->horizon;
   event_crossing *crossing = step->found + *step->filled;
+  real sampled = NAN;
   int open, status = OK;
   if (step->watch->direction[event] == -direction || from->fraction >= horizon->fraction)
     return OK;
@@ -356,8 +375,8 @@ static int add_crossing(const event_step *step, int e, const event_sample *from,
   }
   if (*step->filled == step->room)
     return EVENT_NO_ROOM;
-  status = enclose_crossing(step, e, *from, &at);
-  if (status == OK && at.q == step->memory)
+  status = enclose_crossing(step, e, *from, &at, guess, &sampled);
+  if (status == OK && at.q == step->memory && at.fraction != sampled)
     status = take_sample(step, e, at.fraction, &at);
   if (status == OK)
     status = conditions(e, at.t, at.q, at.p, step->parameters, &open, step->workspace);
@@ -368,12 +387,12 @@ static int add_crossing(const event_step *step, int e, const event_sample *from,
     return EVENT_NO_ROOM;
   crossing->q = event_host->states + 2 * M * step->watch->used++;
   crossing->p = crossing->q + M;
-  crossing->element = e - event_host->first[event];
   crossing->acted = 0;
 #endif
   crossing->t = at.t;
   crossing->fraction = at.fraction;
   crossing->function = event;
+  SET_ELEMENT(crossing, e);
   crossing->direction = direction;
   copy_state(crossing->q, crossing->p, at.q, at.p);
   ++*step->filled;
@@ -385,19 +404,29 @@ static int add_crossing(const event_step *step, int e, const event_sample *from,
   return OK;
 }
 
-/* Adds the crossings of one function between two samples, with samples at the extrema between them. */
+/* Adds the crossings of one function between two samples, with samples at the extrema between them; zeros: fractions of
+ * the crossings of the polynomial, at most one between neighbouring extrema. */
 static int add_crossings(const event_step *step, int e, const event_sample *left, const event_sample *right,
-    const real *extrema, int count)
+    const real *extrema, int count, const real *zeros, int zero_count)
 {
   event_sample from = *left, to;
   for (int i = 0; i <= count; i++) {
     int status = OK;
-    if (i < count)
+    if (i < count && extrema[i] < step->horizon->fraction) {
       status = take_sample(step, e, extrema[i], &to);
-    else
+    } else if (i < count) { /* later crossings are not required */
+      i = count;
+      to = *step->horizon;
+      status = evaluate_function(step, e, &to);
+    } else {
       to = *right;
-    if (status == OK && changes_sign(from.g, to.g))
-      status = add_crossing(step, e, &from, &to);
+    }
+    if (status == OK && changes_sign(from.g, to.g)) {
+      real guess = NAN;
+      for (int k = 0; k < zero_count; k++)
+        guess = zeros[k] > from.fraction && zeros[k] < to.fraction ? zeros[k] : guess;
+      status = add_crossing(step, e, &from, &to, guess);
+    }
     if (status != OK)
       return status;
     from = to;
@@ -412,8 +441,9 @@ static int search_part(const event_step *step, int e, const event_sample *left, 
     const real *known, int splits)
 {
   const real half = 0.5 * (right->fraction - left->fraction), middle = left->fraction + half;
-  real g[EVENT_DEGREE + 1], c[EVENT_DEGREE + 1], extrema[EVENT_DEGREE], doubt, range, split, before = left->g;
-  int count, follows, crossed = 0, status = OK;
+  real g[EVENT_DEGREE + 1], c[EVENT_DEGREE + 1], extrema[EVENT_DEGREE], zeros[EVENT_DEGREE];
+  real doubt, range, split, before = left->g;
+  int count, zero_count, follows, crossed = 0, status = OK;
   event_sample sample;
   if (left->fraction >= step->horizon->fraction)
     return OK;
@@ -431,7 +461,7 @@ static int search_part(const event_step *step, int e, const event_sample *left, 
   follows = doubt <= EVENT_SMALL_PART * range;
   if (fabs(c[0]) > range + (follows ? doubt : range))
     return status; /* far from zero */
-  split = uncertain_abscissa(c, doubt, extrema, &count);
+  split = uncertain_abscissa(c, doubt, extrema, &count, zeros, &zero_count);
   if (split < 1.0 || !follows)
     split = split > 1.0 ? 0.0 : fmin(fmax(split, -0.5), 0.5);
   for (int i = 0; i <= count; i++) {
@@ -441,8 +471,10 @@ static int search_part(const event_step *step, int e, const event_sample *left, 
     if (i < count)
       extrema[i] = middle + half * extrema[i];
   }
+  for (int i = 0; i < zero_count; i++)
+    zeros[i] = middle + half * zeros[i];
   if (split > 1.0 || splits == 0)
-    return crossed || split < 1.0 ? add_crossings(step, e, left, right, extrema, count) : status;
+    return crossed || split < 1.0 ? add_crossings(step, e, left, right, extrema, count, zeros, zero_count) : status;
   status = take_sample(step, e, middle + half * split, &sample);
   if (status == OK)
     status = search_part(step, e, left, &sample, NULL, splits - 1);
@@ -541,7 +573,7 @@ static int leave_zero(const event_step *step, int e, const event_sample *left, r
   event_sample next;
   real noise = values_at(step, EVENT_DEGREE + 2)[e], change, doubt;
   int sign, place = EVENT_FIRST_PROBE, away = 0, event = EVENT_OF(e), status;
-  if (fabs(left->g) > EVENT_AT_ZERO * range + 8.0 * noise)
+  if (fabs(left->g) > EVENT_AT_ZERO * range * fabs(step->whole / step->h) + 8.0 * noise)
     return OK;
   status = first_change(step, e, left, noise, &change, &doubt);
   if (status != OK) {
@@ -555,7 +587,7 @@ static int leave_zero(const event_step *step, int e, const event_sample *left, r
   status = take_sample(step, e, ldexp(1.0, -EVENT_LAST_PROBE), &next);
   if (status == OK && sign * next.g >= ldexp(0.5 * fabs(change), -EVENT_LAST_PROBE) && sign * next.g > 8.0 * noise) {
     if (changes_sign(from->g, next.g) && !JUST_CHANGED(step->watch, e))
-      status = add_crossing(step, e, from, &next);
+      status = add_crossing(step, e, from, &next, NAN);
     from->g = sign * fabs(from->g);
     return status;
   }
@@ -572,7 +604,7 @@ static int leave_zero(const event_step *step, int e, const event_sample *left, r
     }
     away = 1;
     if (changes_sign(from->g, next.g) && !(from->fraction == 0.0 && JUST_CHANGED(step->watch, e)))
-      status = add_crossing(step, e, from, &next);
+      status = add_crossing(step, e, from, &next, NAN);
     if (status != OK)
       return status;
     *from = next;
@@ -580,13 +612,35 @@ static int leave_zero(const event_step *step, int e, const event_sample *left, r
   return OK;
 }
 
+/* Marks the functions that are far from zero along a step, as search_part would find, in a loop over all of them. */
+static void mark_far(const event_step *step, real *far)
+{
+  const long long count = EVENTS;
+  const real at_zero = EVENT_AT_ZERO * fabs(step->whole / step->h);
+  const real *const value = values_at(step, 0), *const noise = values_at(step, EVENT_DEGREE + 2);
+  for (long long e = 0; e < count; e++) {
+    real c[EVENT_DEGREE + 1], range = 0.0, doubt;
+    for (int k = 0; k <= EVENT_DEGREE; k++) {
+      c[k] = 0.0;
+      for (int j = 0; j <= EVENT_DEGREE; j++)
+        c[k] += EVENT_COEFFICIENTS[k][j] * value[j * count + e];
+      range += k > 0 ? fabs(c[k]) : 0.0;
+    }
+    doubt = EVENT_DOUBTS[0] * fabs(c[EVENT_DEGREE - 1]) + EVENT_DOUBTS[1] * fabs(c[EVENT_DEGREE]);
+    far[e] = fabs(c[0]) > (1.0 + EVENT_TIE) * range + (doubt <= EVENT_SMALL_PART * range ? doubt : range) ? 1.0 : 0.0;
+  }
+  for (long long e = 0; e < count && !step->watch->started; e++)
+    if (fabs(value[e]) <= at_zero * fabs(value[EVENT_DEGREE / 2 * count + e]) + 8.0 * noise[e])
+      far[e] = 0.0;
+}
+
 /* Function that changes the state and first changes its sign, by the values at the nodes; -1: none. */
-static int first_to_change(const event_step *step)
+static int first_to_change(const event_step *step, const real *far)
 {
   int first = -1;
   real least = INFINITY;
   for (int e = 0; e < EVENTS; e++)
-    for (int j = step->watch->acts[EVENT_OF(e)] ? 1 : EVENT_DEGREE + 1; j <= EVENT_DEGREE; j++) {
+    for (int j = far[e] == 0.0 && step->watch->acts[EVENT_OF(e)] ? 1 : EVENT_DEGREE + 1; j <= EVENT_DEGREE; j++) {
       const real from = values_at(step, j - 1)[e], to = values_at(step, j)[e];
       const real fraction = EVENT_NODES[j - 1] + from / (from - to) * (EVENT_NODES[j] - EVENT_NODES[j - 1]);
       if (changes_sign(from, to) && fraction < least) {
@@ -625,6 +679,7 @@ static int search_function(const event_step *step, int e, const event_sample *le
  * one that changes the state is located first, as no later one is needed. */
 static int search_step(const event_step *step, const event_sample *left, const event_sample *right)
 {
+  real *const far = values_at(step, EVENT_DEGREE + 1);
   int status = OK, first;
   event_sample sample;
   step->horizon->fraction = INFINITY;
@@ -633,15 +688,16 @@ static int search_step(const event_step *step, const event_sample *left, const e
     if (status == OK)
       status = evaluate_functions(step, &sample, values_at(step, j));
   }
-  if (status == OK && !step->watch->started)
+  if (status == OK && !step->watch->started && !step->rounding_known)
     status = rounding_of(step, left);
   if (status != OK)
     return status;
-  first = first_to_change(step);
+  mark_far(step, far);
+  first = first_to_change(step, far);
   if (first >= 0)
     status = search_function(step, first, left, right);
   for (int e = 0; e < EVENTS && status == OK; e++)
-    if (e != first)
+    if (e != first && far[e] == 0.0)
       status = search_function(step, e, left, right);
   return status;
 }
@@ -705,7 +761,7 @@ int NAME(crossings)(event_watch *watch, long long count, const real *h, const re
   for (long long k = 0; k < count && !watch->ended; k++) {
     const long long start = k > 0 ? k - 1 : 0, first = *filled;
     const event_step step = {t[start], h[start], h[start], q + start * M, p + start * M, parameters, options, watch,
-        found, room, filled, report, workspace, memory, memory + 9 * M, &horizon};
+        found, room, filled, report, workspace, memory, memory + 9 * M, 0, &horizon};
     int status;
     report->t = t[start];
     right.fraction = k > 0 ? 1.0 : 0.0;
