@@ -305,6 +305,18 @@ def test_maps_in_both_directions_act_once_at_each_crossing(ball):
     assert np.abs(slow.events[0].t - math.sqrt(1.4) * np.array([1.0, 1.02, 1.0202])).max() < 1e-12
 
 
+@pytest.mark.parametrize(("y0", "e", "h"), [(1.0, 0.01, 0.3), (0.4875, 0.1545, 0.0562), (1.9522, 0.00775, 0.1552)])
+def test_slow_departures_from_zeros_located_at_high_speed(ball, y0, e, h):
+    """The residual of a located zero is that of the fast arrival, not of the slow departure after the map."""
+    reverse = Event("y", then={"y_dot": f"-{e}*y_dot"})
+    fall = math.sqrt(2 * y0)
+    t = fall * (1 + 2 * e + e * e)  # at the top of the second flight
+    for steps in ({"h": h}, {}):
+        run = ball.integrate([y0], velocity=[0.0], t_end=t, events=reverse, **steps)
+        assert len(run.events[0]) == 2
+        assert abs(run.q[-1, 0] - (fall * e * e) ** 2 / 2) < 1e-13
+
+
 DROP = LagrangianSystem.from_text(
     name="drop",
     coordinates=["x", "y"],

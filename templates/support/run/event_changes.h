@@ -313,6 +313,8 @@ static int change_state(const event_step *step, int e, event_sample *at)
     if (status == NOT_CONVERGED)
       step->watch->jammed = EVENT_OF(e) + 1; /* such as of prescribed motion, whose momenta no impulse changes */
   } else if (status == OK && !is_impact) {
+    if (evaluate_function(step, e, at) == OK)
+      step->watch->history[e].slack = fabs(at->g);
     status = apply_map(step, at, &wall);
     if (status == OK)
       status = satisfy_constraints(step, at->t, at->q, at->p, 1);

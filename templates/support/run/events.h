@@ -72,8 +72,10 @@ typedef NAME(crossing) event_crossing;
 /* Whether the state where a search starts is that of the last change by function e, within rounding of its zero. */
 #ifdef EVENT_CHANGES
 #define JUST_CHANGED(watch, e) ((watch)->history[e].hits > 0 && (watch)->history[e].last == (watch)->time)
+#define RESIDUAL(watch, e) (JUST_CHANGED(watch, e) ? 2.0 * (watch)->history[e].slack : 0.0) /* of the located zero */
 #else
 #define JUST_CHANGED(watch, e) 0
+#define RESIDUAL(watch, e) 0.0
 #endif
 
 #ifndef EVENT_GUARDS
@@ -573,7 +575,7 @@ static int leave_zero(const event_step *step, int e, const event_sample *left, r
   event_sample next;
   real noise = values_at(step, EVENT_DEGREE + 2)[e], change, doubt;
   int sign, place = EVENT_FIRST_PROBE, away = 0, event = EVENT_OF(e), status;
-  if (fabs(left->g) > EVENT_AT_ZERO * range * fabs(step->whole / step->h) + 8.0 * noise)
+  if (fabs(left->g) > EVENT_AT_ZERO * range * fabs(step->whole / step->h) + 8.0 * noise + RESIDUAL(step->watch, e))
     return OK;
   status = first_change(step, e, left, noise, &change, &doubt);
   if (status != OK) {
