@@ -6,6 +6,7 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen import ExpressionError, FieldSystem, LagrangianSystem, SystemDefinitionError
+from scvi_codegen.native.binding import Binding
 
 RING = LagrangianSystem.from_text(
     "ring",
@@ -175,3 +176,37 @@ def test_derivatives_by_transforms_or_matrices_are_chosen_by_size():
     assert chosen == {31: 2, 32: 1, 63: 2, 65: 1, 200: 1, 16: 2, 16384: 1}
     with pytest.raises(SystemDefinitionError, match='is "fft" or "dense"'):
         field.discretise("fourier", points=32, derivative="fast")
+
+
+LARGE = {
+    "membrane": ("sqrt(1 + u_x**2)", (128,)),
+    "products": ("(1 + u**2/4)*u_x**2/2 + u**2/2", (128,)),
+    "pairs": ("u_x**2/2 - cos(u)", (128,)),
+    "plane": ("sqrt(1 + u_x**2 + u_y**2) + u_xx**2/500", (40, 36)),
+}
+
+
+@pytest.mark.parametrize("name", ["membrane", *(pytest.param(each, marks=pytest.mark.full) for each in [*LARGE][1:])])
+def test_products_of_large_steps_are_bounded(name):
+    """Steps of 20 and 100 times the limit of the fixed-point iteration, with the Fourier preconditioner."""
+    density, sizes = LARGE[name]
+    axes = dict(zip("xy", sizes, strict=False))
+    space, boundary = ({axis: value for axis in axes} for value in ((0, "2*pi"), "periodic"))
+    field = FieldSystem.from_text(name, ["u"], space, f"u_t**2/2 - ({density})", boundary=boundary)
+    mesh = field.discretise("fourier", points=axes, derivative="fft")
+    start = {"u": 0.4 * np.sin(sum(mesh.points.values()))}
+    limit = mesh.largest_step("svi:4")
+    stepper, explicit = (
+        sc.compile_stepper(mesh.system, method, flags=QUICK_FLAGS, **options)
+        for method, options in (("svi:4", {"solver": "newton"}), ("composition:8", {}))
+    )
+    for ratio in (8, 20) if name == "plane" else (20, 100):
+        run = stepper.start(start, h=ratio * limit)
+        memory, binding = run._memory, run.stepper.binding
+        report = Binding.new(binding, "report *")
+        call = Binding.function(binding, "advance")
+        assert call(memory, 4, 0, binding._arrays[memory].problem, *[binding.null] * 5, report) == 0
+        assert report.products / 4 <= (16 if ratio < 100 and name != "plane" else 32)
+    end = stepper.integrate(start, h=4 * limit, steps=8).q["u"][-1]
+    exact = explicit.integrate(start, h=limit / 2, steps=64).q["u"][-1]
+    np.testing.assert_allclose(end, exact, rtol=0, atol=1e-6)

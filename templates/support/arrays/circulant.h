@@ -275,7 +275,47 @@ static void multiply_by_plan(const transforms *in, const circulant *by, const pl
   give_lines(run, &along, halves, x, n, factor, Y + by->start, behind);
 }
 
+#ifdef CIRCULANT_MODES
+/* Replaces the values of all places of a lattice by their mean, of each component. */
+static void average_places(const run_memory *run, const problem *given, lanes *F, long long n)
+{
+  lattice all[LATTICES];
+  describe_lattices(given, all);
+  for (const lattice *one = all; one < all + LATTICES && (!run->thread_barrier || run->part == 0); one++)
+    for (long long k = 0; k < GROUPS * one->components; k++) {
+      const long long places = positions_of(one), count = one->components;
+      lanes *at = F + k / count * n + one->first + k % count, sum = lanes_of(0.0);
+      for (long long i = 0; i < places; i++)
+        sum += at[i * count];
+      for (long long i = 0; i < places; i++)
+        at[i * count] = sum * (1.0 / (double)places);
+    }
+  wait_at_barrier(run);
+}
+
+/* Index in the plan of the eigenvalue that belongs to a place of an array in Fourier space. */
+static inline long long mode_of(const circulant *by, long long place)
+{
+  const long long k = (place - by->start) / by->inner % by->size;
+  return 2 * k <= by->size ? k : by->size - k;
+}
+#endif
+
 #ifdef PAIRS
+#ifdef CIRCULANT_MODES
+/* Adds the eigenvalues f L_k of a sum over pairs to F. */
+static void add_modes_of_pairs(const transforms *in, const circulant *by, const lanes *factor, lanes *F, long long n)
+{
+  const plan of = shared_plan(in, by);
+  const section own = share_of(in->run, *of.usable ? by->outer * by->size * by->inner : 0);
+  const double unit = (double)(by->size % 2 ? by->size : 2 * by->size);
+  for (int group = 0; group < GROUPS; group++)
+    for (long long i = by->start + own.first; i < by->start + own.end; i++)
+      F[group * n + i] += unit * of.re[mode_of(by, i)] * factor[group];
+  wait_at_barrier(in->run);
+}
+#endif
+
 /* Adds the forces f C x of a sum over pairs, or its diagonal, if X is NULL, to F, whose groups are n numbers apart; x:
  * groups `apart`. Returns 0 if the pairs have to be summed. */
 static int add_pairs(const transforms *in, const circulant *by, const lanes *X, long long apart, const lanes *factor,
@@ -466,6 +506,36 @@ static void add_diagonals(const transforms *in, const problem *given, lanes *F, 
   wait_at_barrier(in->run);
 }
 
+#endif
+
+#ifdef CIRCULANT_MODES
+/* Adds the eigenvalues |L_k|^2 times the mean derivative D of C^T D C to F, for each C. */
+static void add_modes(const transforms *in, const problem *given, lanes *F, long long n)
+{
+  const long long length = STATES * in->count;
+  convolution all[CONVOLUTIONS];
+  describe_convolutions(given, all);
+  for (int kind = 0; kind < KINDS; kind++)
+    average_places(in->run, given, sums_at(in, 1, 0) + kind * length, KINDS * length);
+  for (const convolution *one = all; one < all + CONVOLUTIONS; one++) {
+    const circulant *by = one->stages;
+    const section own = share_of(in->run, by->outer * by->size * by->inner);
+    plan of[MOST_STAGES];
+    for (int k = 0; k < one->count; k++)
+      of[k] = shared_plan(in, by + k);
+    for (long long i = by->start + own.first; i < by->start + own.end && one->target; i++) {
+      double square = 1.0;
+      for (int k = 0; k < one->count; k++) {
+        const long long mode = mode_of(by + k, i);
+        const double unit = (double)(by[k].size % 2 ? by[k].size : 2 * by[k].size);
+        square *= unit * unit * (of[k].re[mode] * of[k].re[mode] + of[k].im[mode] * of[k].im[mode]);
+      }
+      for (int group = 0; group < GROUPS; group++)
+        F[group * n + i] += square * sums_at(in, 1, group)[one->number * length + i];
+    }
+  }
+  wait_at_barrier(in->run);
+}
 #endif
 
 /* Returns all convolutions of a single state in new memory, NULL without memory. */

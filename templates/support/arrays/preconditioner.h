@@ -7,12 +7,90 @@
 /* Preconditioner for Newton-GMRES: factors of F' (envelope.h), and unless FACTORS_ALONE Fourier modes (ON_LATTICES) or
  * the diagonal of F'. */
 #ifdef ON_LATTICES
+/* Fourier preconditioner for Newton-GMRES on lattices: the mean of F' over a lattice, a circulant matrix, which is
+ * diagonal in Fourier space (T. F. Chan, SIAM J. Sci. Stat. Comput. 9, 1988, 766). It is accurate if the couplings
+ * are uniform and boundaries few; otherwise the diagonal of F' is used. */
+
+enum { SPACING = 2 * FARTHEST + 1 };
+
+#define COUPLED 0.1 /* relative to the diagonal: weaker couplings do not justify the Fourier preconditioner */
+
+/* Describes the lattices and the location of their roots of unity; returns 0 if one cannot be transformed or is too
+ * small for stencil probing. */
+static int find_lattices(const linear_system *of, lattice *all)
+{
+  double *next = of->work->roots;
+  int sound = 1;
+  describe_lattices(of->step->given, all);
+  for (lattice *one = all; one < all + LATTICES; one++)
+    for (int a = 0; a < one->axes; a++) {
+      const long long size = one->size[a];
+      const roots of_one = {next, next + size};
+      one->of_one[a] = of_one;
+      next += 2 * size;
+      sound &= can_be_transformed(size) && size >= SPACING * COMPONENTS;
+    }
+  return sound;
+}
+
+/* exp(-2 pi i k / size) for all axes. */
+static void find_roots(const linear_system *of, const lattice *all)
+{
+  for (const lattice *one = all; one < all + LATTICES; one++)
+    for (int a = 0; a < one->axes; a++) {
+      const long long size = one->size[a];
+      const section own = share_of(of->run, size);
+      fill_roots(one->of_one[a], size, own.first, own.end);
+    }
+}
+
+/* Fourier transform along all axes of a lattice, in place in x; y is overwritten. */
+static void transform_lattice(const linear_system *of, const lattice *one, complex_lanes *x, complex_lanes *y)
+{
+  long long inner = one->components, outer = positions_of(one);
+  for (int a = one->axes - 1; a >= 0; a--) {
+    axis along = {one->first, outer / one->size[a], one->size[a], inner, one->of_one[a]};
+    transform(of->run, &along, x, y, of->n);
+    inner *= one->size[a], outer /= one->size[a];
+  }
+}
+
+/* The Fourier modes of a lattice that belong to this thread. */
+static section modes_of(const linear_system *of, const lattice *one)
+{
+  section own = share_of(of->run, positions_of(one) * one->components);
+  own.first += one->first, own.end += one->first;
+  return own;
+}
+
+#ifdef CIRCULANT_MODES
+/* Computes the inverses of the Fourier modes of the mean of h^2 F' / m; returns 0 if a lattice cannot be transformed. */
+static int invert_modes(linear_system *of)
+{
+  lattice all[LATTICES];
+  if (!find_lattices(of, all))
+    return 0;
+  find_roots(of, all);
+  jacobian_modes(of->step, of->points->X, of->work->forces);
+  for (const lattice *one = all; one < all + LATTICES; one++) {
+    const double places = (double)positions_of(one), count = places * (double)one->components;
+    const section own = modes_of(of, one);
+    double unit = 0.0;
+    for (long long i = one->first; (double)(i - one->first) < count; i++)
+      unit += unit_of(of->points, i) / count;
+    for (long long i = own.first; i < own.end; i++) {
+      const double derivative = mean_derivative(of, of->work->forces, i) / unit_of(of->points, i);
+      keep_inverse(of, i, unit * derivative, 1.0 / places);
+    }
+  }
+  wait_at_barrier(of->run);
+  return 1;
+}
+#else
 /* Mean stencil of h^2 F' / m on a lattice by stencil probing: probes are placed so far apart that their responses do
  * not overlap or reach a boundary, and F' is multiplied by all of them at once. Requires: lattice_transform.h,
  * describe_lattices; FARTHEST, the stencil radius on an axis, and COMPONENTS, the number of components of all
  * lattices. */
-
-enum { SPACING = 2 * FARTHEST + 1 };
 
 /* Probes: on each axis the first index, their distance and number. */
 typedef struct {
@@ -128,60 +206,6 @@ static double off_diagonal_ratio(const linear_system *of, const lattice *all, co
   return largest;
 }
 
-/* Fourier preconditioner for Newton-GMRES on lattices: the mean of F' over a lattice, a circulant matrix, which is
- * diagonal in Fourier space (T. F. Chan, SIAM J. Sci. Stat. Comput. 9, 1988, 766). It is accurate if the couplings
- * are uniform and boundaries few; otherwise the diagonal of F' is used. */
-
-#define COUPLED 0.1 /* relative to the diagonal: weaker couplings do not justify the Fourier preconditioner */
-
-/* Describes the lattices and the location of their roots of unity; returns 0 if one cannot be transformed or is too
- * small for stencil probing. */
-static int find_lattices(const linear_system *of, lattice *all)
-{
-  double *next = of->work->roots;
-  int sound = 1;
-  describe_lattices(of->step->given, all);
-  for (lattice *one = all; one < all + LATTICES; one++)
-    for (int a = 0; a < one->axes; a++) {
-      const long long size = one->size[a];
-      const roots of_one = {next, next + size};
-      one->of_one[a] = of_one;
-      next += 2 * size;
-      sound &= can_be_transformed(size) && size >= SPACING * COMPONENTS;
-    }
-  return sound;
-}
-
-/* exp(-2 pi i k / size) for all axes. */
-static void find_roots(const linear_system *of, const lattice *all)
-{
-  for (const lattice *one = all; one < all + LATTICES; one++)
-    for (int a = 0; a < one->axes; a++) {
-      const long long size = one->size[a];
-      const section own = share_of(of->run, size);
-      fill_roots(one->of_one[a], size, own.first, own.end);
-    }
-}
-
-/* Fourier transform along all axes of a lattice, in place in x; y is overwritten. */
-static void transform_lattice(const linear_system *of, const lattice *one, complex_lanes *x, complex_lanes *y)
-{
-  long long inner = one->components, outer = positions_of(one);
-  for (int a = one->axes - 1; a >= 0; a--) {
-    axis along = {one->first, outer / one->size[a], one->size[a], inner, one->of_one[a]};
-    transform(of->run, &along, x, y, of->n);
-    inner *= one->size[a], outer /= one->size[a];
-  }
-}
-
-/* The Fourier modes of a lattice that belong to this thread. */
-static section modes_of(const linear_system *of, const lattice *one)
-{
-  section own = share_of(of->run, positions_of(one) * one->components);
-  own.first += one->first, own.end += one->first;
-  return own;
-}
-
 /* Computes the inverses of the Fourier modes of the mean stencil; returns 0 if a lattice cannot be transformed or
  * couplings are negligible. */
 static int invert_modes(linear_system *of)
@@ -206,6 +230,7 @@ static int invert_modes(linear_system *of)
   wait_at_barrier(of->run);
   return 1;
 }
+#endif
 
 /* y = the inverses of the Fourier modes times x, by transforms; the result is in the real parts. */
 static void apply_modes(const linear_system *of, const lanes *x, lanes *y)
