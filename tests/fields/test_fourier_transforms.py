@@ -200,7 +200,7 @@ def test_products_of_large_steps_are_bounded(name):
     """Steps of 20 and 100 times the limit of the fixed-point iteration, with the Fourier preconditioner."""
     density, sizes = LARGE[name]
     axes = dict(zip("xy", sizes, strict=False))
-    space, boundary = ({axis: value for axis in axes} for value in ((0, "2*pi"), "periodic"))
+    space, boundary = (dict.fromkeys(axes, value) for value in ((0, "2*pi"), "periodic"))
     field = FieldSystem.from_text(name, ["u"], space, f"u_t**2/2 - ({density})", boundary=boundary)
     mesh = field.discretise("fourier", points=axes, derivative="fft")
     start = {"u": 0.4 * np.sin(sum(mesh.points.values()))}

@@ -39,7 +39,7 @@ def load_run(folder: str | os.PathLike[str], *, mesh: Any = None) -> RecordedRun
 
     Args:
         folder: the folder.
-        mesh: of the fields of a density, which the folder does not contain: for :meth:`RecordedRun.unresolved`.
+        mesh: of the fields of a density, by default that of the recording (before version 0.2 there is none).
 
     Raises:
         RecordingError: if there is none, or a file of it is missing or damaged.
@@ -56,12 +56,12 @@ class RecordedRun(AttitudeHistory):
     Attributes:
         folder: the folder.
         manifest: description of the run.
-        mesh: of the fields of a density, or ``None``.
+        mesh: of the fields of a density (:class:`~scvi_codegen.fields.mesh.MeshSystem`), or ``None``.
         t, q, p, iterations: lazy arrays of shapes (n,), (n, m), (n, m), (n,); ``numpy.asarray`` reads them in full.
     """
 
     def __init__(self, folder: Path, mesh: Any = None) -> None:
-        self.folder, self.manifest, self.mesh = folder, read_manifest(folder), mesh
+        self.folder, self.manifest, self._mesh = folder, read_manifest(folder), mesh
         try:
             self._paths = chunk_paths(folder)
         except OSError as error:
@@ -95,6 +95,16 @@ class RecordedRun(AttitudeHistory):
             return float(self.t[k]), self.q[k], self.p[k]
         wanted = self.rows(rows)
         return self._trajectory(tuple(self.gather(wanted, range(len(COLUMNS)))), wanted)
+
+    @cached_property
+    def mesh(self) -> Any:
+        """Mesh of the fields of a density, or ``None``."""
+        return self.manifest.mesh_of_fields(self.folder) if self._mesh is None else self._mesh
+
+    @property
+    def fields(self) -> dict[str, Array]:
+        """Fields of a density at the points of the mesh, (n, shape of the fields), by name; empty without a mesh."""
+        return {} if self.mesh is None else self.mesh.fields_of(np.asarray(self.q), np.asarray(self.p))
 
     @cached_property
     def stepper(self) -> Stepper:
@@ -225,7 +235,7 @@ class RecordedRun(AttitudeHistory):
         """Return (n,) parts of the squared amplitude of fields in the highest modes, as :meth:`Trajectory.unresolved`.
 
         Raises:
-            MethodError: if there is no mesh: pass ``load_run(folder, mesh=mesh)``.
+            MethodError: if the fields are not those of a density.
         """
         return np.concatenate([piece.unresolved() for piece in self.pieces()])
 

@@ -114,6 +114,7 @@ def record_run(
         model=model,
         certificate=_certificate(certificate),
         builds=(Build.of(run.stepper, 0),),
+        mesh=_mesh(run),
     )
     recorder = _Recorder(target, manifest, run, *_checked_checkpoints(checkpoint_seconds, checkpoint_steps))
     with recorder.reporting_recovery():
@@ -185,6 +186,14 @@ def resume_run(
             write_manifest(target, continued)  # fails early if the folder cannot be written
         recorder.advance(progress, stop)
     return _checked(target, run)
+
+
+def _mesh(run: Run) -> dict[str, Any] | None:
+    """Return the mesh of the fields of a density for the manifest."""
+    if (mesh := run.stepper.interface.layout.mesh) is None:
+        return None
+    values = dict(zip(run.stepper.interface.parameters, map(float, run.parameters), strict=True))
+    return {"field": mesh.to_section(), "parameters": {str(x): values[str(x)] for x in mesh.field_system.parameters}}
 
 
 def _checked(folder: Path, run: Run) -> RecordedRun:

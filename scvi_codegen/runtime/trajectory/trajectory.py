@@ -268,8 +268,8 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
         """
         if (parts := unresolved_parts(self.stepper, self.q)) is None:
             raise MethodError(
-                "the system is not discretised from a density: unresolved() requires a mesh (of a recorded run, pass "
-                "load_run(folder, mesh=mesh))"
+                "the system is not discretised from a density: unresolved() requires a mesh (of a run recorded before "
+                "version 0.2, pass load_run(folder, mesh=mesh))"
             )
         return parts
 
