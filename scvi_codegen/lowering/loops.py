@@ -123,12 +123,14 @@ def _shown(of: ArrayTerm | ArrayForce) -> str:
 def _jacobian(
     system: ArraySystem, potentials: Sequence[tuple[ArrayTerm, int | None]]
 ) -> tuple[tuple[LoopedKernel, ...], tuple[LoopedKernel, ...]]:
-    """Return the Jacobian of the forces times a direction, by term groups; of forces of positions also its diagonal."""
+    """Return the Jacobian of the forces times a direction, by term groups; by term groups also its diagonal."""
     forces = [(force_of(term, system.state), axis) for term, axis in potentials]
     forces += [(force, None) for force in system.applied_forces]
     derived = [_derived(system, *force, number) for number, force in enumerate(forces)]
     pairs = [pair for pair in derived if pair]
-    diagonals = () if system.momenta or system.velocities else tuple(diagonal for _, diagonal in pairs)
+    circulant = any(axis is not None or any(access.sums for access, _ in force.targets) for force, axis in forces)
+    modes = not system.velocities and (circulant or not system.momenta)
+    diagonals = tuple(diagonal for _, diagonal in pairs) if modes else ()
     return tuple(product for product, _ in pairs), diagonals
 
 

@@ -219,3 +219,27 @@ def test_products_of_large_steps_are_bounded(name):
     end = stepper.integrate(start, h=4 * limit, steps=8).q["u"][-1]
     exact = explicit.integrate(start, h=limit / 2, steps=64).q["u"][-1]
     np.testing.assert_allclose(end, exact, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("method", "names"), [("svi:1", "x"), pytest.param("gauss:3", "xy", marks=pytest.mark.full)])
+def test_large_steps_of_first_order_fields(method, names):
+    """A complex field: corrections depend on h alone, and states are those of fixed-point iterations."""
+    axes = dict.fromkeys(names, (0, "2*pi"))
+    squares = "+".join(f"a_{name}**2 + b_{name}**2" for name in names)
+    density, boundary = f"({squares})/2 + (a**2 + b**2)**2/4 + a**2/5", dict.fromkeys(axes, "periodic")
+    field = FieldSystem.from_text("nls", ["a"], axes, momenta=["b"], hamiltonian=density, boundary=boundary)
+    counts = []
+    for points in ({"x": 32, "y": 20}, {"x": 16, "y": 9}):
+        mesh = field.discretise("fourier", points=points, derivative="fft")
+        x, y = mesh.points["x"], mesh.points[names[-1]]
+        start = {"a": np.cos(x) + np.sin(2 * y) / 2}, {"a": mesh.weights * np.sin(x + 2 * y)}
+        stepper = sc.compile_stepper(mesh.system, method, solver="newton", flags=QUICK_FLAGS)
+        assert mesh.largest_step(method) < 0.03
+        runs = [stepper.integrate(*start, h=0.1, steps=4, threads=threads) for threads in (1, 3)]
+        np.testing.assert_array_equal(*(run.q["a"] for run in runs))
+        counts.append(runs[0].iterations.sum() / 4)
+    assert max(counts) < min(20, 1.3 * min(counts))
+    plain = sc.compile_stepper(mesh.system, method, flags=QUICK_FLAGS)
+    ends = [each.integrate(*start, h=0.004, steps=8).q["a"][-1] for each in (stepper, plain)]
+    np.testing.assert_allclose(*ends, rtol=0, atol=1e-13)
+    assert np.abs(ends[0] - start[0]["a"]).max() > 0.01

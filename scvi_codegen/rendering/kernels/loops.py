@@ -140,7 +140,7 @@ def _step_work(program: Program) -> int:
     newton = (1 + momenta + velocities) * NEWTON_VECTORS + program.fixed_point.lanes
     linear = newton if program.loops.products else 0
     roots = 2 * max(map(_axes, program.layout.coordinates))  # of unity, of every axis
-    waves = FOURIER_VECTORS * program.fixed_point.lanes + roots if _on_lattices(program) else 0
+    waves = (1 + momenta) * FOURIER_VECTORS * program.fixed_point.lanes + roots if _on_lattices(program) else 0
     return (own + linear) * program.fixed_point.lanes + waves + STEP_VECTORS
 
 

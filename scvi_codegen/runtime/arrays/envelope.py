@@ -39,7 +39,7 @@ def envelope_of(layout: ArrayLayout, arrays: RunSizes) -> Envelope | None:
         StateError: if a linear part that is not symmetric has more couplings than factors can have, since there is no
             other preconditioner.
     """
-    if not layout.couplings:
+    if not layout.couplings or (layout.momenta and _has_modes(layout)):
         return None
     found = _envelope(layout, arrays)
     if found is None and not layout.symmetric:
@@ -49,6 +49,18 @@ def envelope_of(layout: ArrayLayout, arrays: RunSizes) -> Envelope | None:
             "solver='fixed-point', finite differences or spectral elements, or fewer points across"
         )
     return found
+
+
+def _has_modes(layout: ArrayLayout) -> bool:
+    """Return whether circulant matrices couple no array of the state to another: the linear part has Fourier modes."""
+    names, found = {array.name for array in (*layout.coordinates, *layout.momenta)}, False
+    for term in layout.couplings:
+        if any(access.sums or any(place.minus for place in access.places) for _, access in term.slots):
+            found, moving = True, [(slot, x.array.name) for slot, x in term.slots if x.array.name in names]
+            pairs = ((a, b) for a, one in moving for b, other in moving if one < other)
+            if any(term.formula.diff(a, b) != 0 for a, b in pairs):
+                return False
+    return found and not layout.tables
 
 
 def _envelope(layout: ArrayLayout, arrays: RunSizes) -> Envelope | None:

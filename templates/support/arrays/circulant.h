@@ -338,15 +338,16 @@ static void multiply_by_plan(const transforms *in, const circulant *by, const pl
 }
 
 #ifdef CIRCULANT_MODES
-/* Replaces the values of all places of a lattice by their mean, of each component. */
+/* Replaces the values of all places of a lattice by their mean, of each component; groups of F are n numbers apart. */
 static void average_places(const run_memory *run, const problem *given, lanes *F, long long n)
 {
+  const long long half = NAME(coordinates)(given);
   lattice all[LATTICES];
   describe_lattices(given, all);
   for (const lattice *one = all; one < all + LATTICES && (!run->thread_barrier || run->part == 0); one++)
-    for (long long k = 0; k < GROUPS * one->components; k++) {
+    for (long long k = 0; k < GROUPS * STATES * one->components; k++) {
       const long long places = positions_of(one), count = one->components;
-      lanes *at = F + k / count * n + one->first + k % count, sum = lanes_of(0.0);
+      lanes *at = F + k / count / STATES * n + k / count % STATES * half + one->first + k % count, sum = lanes_of(0.0);
       for (long long i = 0; i < places; i++)
         sum += at[i * count];
       for (long long i = 0; i < places; i++)
@@ -365,16 +366,19 @@ static inline long long mode_of(const circulant *by, long long place)
 
 #ifdef PAIRS
 #ifdef CIRCULANT_MODES
-/* Adds the eigenvalues f L_k of a sum over pairs to F. */
-static void add_modes_of_pairs(const transforms *in, const circulant *by, const lanes *factor, lanes *F, long long n)
+/* Adds the eigenvalues f L_k of a sum over pairs to F; returns 0 if C is not circulant. */
+static int add_modes_of_pairs(const transforms *in, const circulant *by, const lanes *factor, lanes *F, long long n)
 {
   const plan of = shared_plan(in, by);
-  const section own = share_of(in->run, *of.usable ? by->outer * by->size * by->inner : 0);
+  const section own = share_of(in->run, by->outer * by->size * by->inner);
   const double unit = (double)(by->size % 2 ? by->size : 2 * by->size);
+  if (*of.usable == 0.0)
+    return 0;
   for (int group = 0; group < GROUPS; group++)
     for (long long i = by->start + own.first; i < by->start + own.end; i++)
       F[group * n + i] += unit * of.re[mode_of(by, i)] * factor[group];
   wait_at_barrier(in->run);
+  return 1;
 }
 #endif
 
