@@ -70,7 +70,7 @@ class Mesh:
         return result if velocity is None else result | split(velocity, [str(each) for each in system.rates])
 
     def to_section(self) -> dict[str, Any]:
-        """Return ``[field]`` of a model file: the density as text, and its discretisation; :func:`mesh_of` reads it."""
+        """Return the section ``[field]`` of a model file: the density as text, and its discretisation."""
         density = self.field_system
         boundary = {
             axis: ends

@@ -323,13 +323,6 @@ class FieldSystem(Density):
         return differences(axis, (start, end), options["points"], options["order"], fixed, second=second)
 
 
-def mesh_of(section: Mapping[str, Any], parameters: Mapping[str, float]) -> MeshSystem:
-    """Return the mesh of a section of :meth:`Mesh.to_section`, with values of the parameters of the density."""
-    arguments = dict(section)
-    options = arguments.pop("discretisation")
-    return FieldSystem.from_text(**arguments, parameters=parameters).discretise(**options)
-
-
 def _check_derivative(name: str, field: str, axes: Sequence[str], parameters: Mapping[str, float]) -> None:
     """Raise an error for a derivative of a field that densities cannot contain."""
     if name in {*derivatives_of([field], axes), f"{field}_{TIME}", *parameters}:

@@ -201,10 +201,12 @@ class Manifest:
         """Return the mesh of the fields of a density, or ``None``."""
         if self.mesh is None:
             return None
-        from scvi_codegen.fields.system import mesh_of  # here, because it imports SymPy
+        from scvi_codegen.fields.system import FieldSystem  # here, because it imports SymPy
 
         try:
-            return mesh_of(self.mesh["field"], self.mesh["parameters"])
+            section = dict(self.mesh["field"])
+            options = section.pop("discretisation")
+            return FieldSystem.from_text(**section, parameters=self.mesh["parameters"]).discretise(**options)
         except (ValueError, LookupError, TypeError, AttributeError) as error:
             raise RecordingError(f"the mesh in '{folder / MANIFEST}' is damaged: {error}") from error
 

@@ -190,10 +190,10 @@ def resume_run(
 
 def _mesh(run: Run) -> dict[str, Any] | None:
     """Return the mesh of the fields of a density for the manifest."""
-    if (mesh := run.stepper.interface.layout.mesh) is None:
-        return None
-    values = dict(zip(run.stepper.interface.parameters, map(float, run.parameters), strict=True))
-    return {"field": mesh.to_section(), "parameters": {str(x): values[str(x)] for x in mesh.field_system.parameters}}
+    mesh, names = run.stepper.interface.layout.mesh, run.stepper.interface.parameters
+    values = dict(zip(names, map(float, run.parameters), strict=True))
+    known = () if mesh is None else map(str, mesh.field_system.parameters)
+    return mesh and {"field": mesh.to_section(), "parameters": {name: values[name] for name in known}}
 
 
 def _checked(folder: Path, run: Run) -> RecordedRun:
