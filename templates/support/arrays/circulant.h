@@ -72,7 +72,8 @@ static plan plan_at(double *memory, long long size)
   const long long half = size / 2;
   double *re = memory + 1 + size, *im = re + half + 1, *next = im + half + 1;
   double *first = size % 8 == 0 ? next + 2 * half + 2 * size : NULL; /* then the radix is 4 or 8 */
-  const plan of = {memory, memory + 1, re, im, {next, next + half, first}, {next + 2 * half, next + 2 * half + size, NULL}};
+  const roots of_half = {next, next + half, first}, of_size = {next + 2 * half, next + 2 * half + size, NULL};
+  const plan of = {memory, memory + 1, re, im, of_half, of_size};
   return of;
 }
 
@@ -87,9 +88,9 @@ static void transform_coefficients(const plan *of, long long size, const double 
   transform(&alone, &along, x, &y, size);
 }
 
-/* Computes the eigenvalues of sums over pairs; returns 0 if C is not circulant or has a large prime factor. By sin^2 d x
- * / sin^2 x = d + 2 sum_(m < d) (d - m) cos 2 m x (Fejer) they are 2 sin^2(pi k / size) times the transform of
- * e[m] = sum_(d > m) (d - m) c[d], which keeps the relative accuracy of small eigenvalues. */
+/* Computes the eigenvalues of sums over pairs; returns 0 if C is not circulant or has a large prime factor. By
+ * sin^2 d x / sin^2 x = d + 2 sum_(m < d) (d - m) cos 2 m x (Fejer) they are 2 sin^2(pi k / size) times the transform
+ * of e[m] = sum_(d > m) (d - m) c[d], which keeps the relative accuracy of small eigenvalues. */
 static int find_eigenvalues_of_pairs(const plan *of, long long size, lanes *spare)
 {
   complex_lanes x = {spare, spare + GROUPS * size};

@@ -15,8 +15,8 @@ typedef struct {
   lanes *re, *im;
 } complex_lanes;
 
-/* exp(-2 pi i k / size), k = 0 .. size - 1, real and imaginary parts; coefficients of the first pass in the order of its
- * places, or NULL. */
+/* exp(-2 pi i k / size), k = 0 .. size - 1, real and imaginary parts; coefficients of the first pass in the order of
+ * its places, or NULL. */
 typedef struct {
   double *cosine, *sine, *first;
 } roots;
@@ -100,8 +100,8 @@ static inline void transform_four(lanes *re, lanes *im)
   re[3] = gap - turn, im[3] = gap_i - turn_i;
 }
 
-/* Butterflies of radix 4 or 8 of `count` values, whose factors are `apart`, from x to y, `next` apart, those of the next
- * value `behind`. */
+/* Butterflies of radix 4 or 8 of `count` values: from numbers that are `apart` to numbers that are `next` apart, those
+ * of the next value `behind`. */
 static inline __attribute__((always_inline)) void butterflies(int factor, const lanes *restrict re,
     const lanes *restrict im, long long apart, lanes *restrict to_re, lanes *restrict to_im, long long next,
     long long behind, coefficients by, long long count)

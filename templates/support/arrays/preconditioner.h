@@ -111,7 +111,8 @@ static void apply_inverses_of_modes(const linear_system *of, lanes *x, section o
   }
 }
 #else
-/* Computes the inverses of the Fourier modes of the mean of h^2 F' / m; returns 0 if a lattice cannot be transformed. */
+/* Computes the inverses of the Fourier modes of the mean of h^2 F' / m; returns 0 if a lattice cannot be transformed.
+ */
 static int invert_modes(linear_system *of)
 {
   lattice all[LATTICES];
