@@ -217,7 +217,7 @@ def reach_of(arrays: Iterable[Array], term_groups: Iterable[LoopedKernel]) -> in
         0 if no places are coupled, if an array is no lattice, or if a term group couples places by a table, all pairs
         or a convolution.
     """
-    if not all(is_lattice(array) for array in arrays) or any(each.sums for one in term_groups for each in one.reads):
+    if not all(array.is_lattice for array in arrays) or any(each.sums for one in term_groups for each in one.reads):
         return 0
     pairs = [
         (target, slot)
@@ -231,12 +231,6 @@ def reach_of(arrays: Iterable[Array], term_groups: Iterable[LoopedKernel]) -> in
         return 0
     own = any(_distance(*pair) for pair in pairs if pair[0].array == pair[1].array)
     return max(_distance(*pair) for pair in pairs) if own else 0
-
-
-def is_lattice(array: Array) -> bool:
-    """Return whether an array has named axes, all before those of integer size."""
-    named = [bool(axis.name) for axis in array.axes]
-    return bool(named) and named[0] and named == sorted(named, reverse=True)
 
 
 def _same_loops(one: Access, other: Access) -> bool:

@@ -10,7 +10,6 @@ from scvi_codegen.indices import MOST_THREADS, Array, Convolution
 from scvi_codegen.ir.equations import ConstrainedSteps
 from scvi_codegen.ir.kernel import Kernel, LoopedKernel, is_divided
 from scvi_codegen.ir.program import Program
-from scvi_codegen.lowering.loops import is_lattice
 from scvi_codegen.rendering.kernels.functions import kernel_text
 from scvi_codegen.rendering.kernels.loop_nests import (
     DIRECTION,
@@ -330,7 +329,7 @@ def _constraint_texts(program: Program, condition: LoopedKernel, curvature: Loop
 
 def _on_lattices(program: Program) -> bool:
     """Return whether Newton's method has the Fourier preconditioner: places in stencils, or circulant matrices."""
-    alike = all(map(is_lattice, program.layout.coordinates)) and not program.layout.tables
+    alike = all(array.is_lattice for array in program.layout.coordinates) and not program.layout.tables
     return bool(program.loops.reach or (program.loops.diagonals and _plans(program) and alike))
 
 

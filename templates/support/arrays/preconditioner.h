@@ -92,14 +92,14 @@ static int invert_modes(linear_system *of)
   return 1;
 }
 
-/* Solves x - h A J H'' x = y, times `by`, for the modes of this thread, in eigenvectors of A. */
-static void apply_inverses_of_modes(const linear_system *of, lanes *x, section own, double by)
+/* Solves x - h A J H'' x = y / places for the modes of this thread, in eigenvectors of A. */
+static void apply_inverses_of_modes(const linear_system *of, lanes *x, section own, double places)
 {
   const envelope all = {.stride = X_VECTORS * of->n};
   for (long long i = own.first; i < own.end; i++) {
     const double *rates = rates_of_mode(of, i);
     const complex_shifts mu = {shifts_at(MU), shifts_at(MU + SHIFTS)}, square = product_of(mu, mu);
-    const complex_shifts q = to_shifts(&all, x + i, by), p = to_shifts(&all, x + of->n + i, by);
+    const complex_shifts q = to_shifts(&all, x + i, 1.0 / places), p = to_shifts(&all, x + of->n + i, 1.0 / places);
     const complex_shifts from_q = product_of(mu, q), from_p = product_of(mu, p);
     const shifts re = 1.0 - rates[0] * rates[1] * square.re, im = -(rates[0] * rates[1]) * square.im;
     const shifts size = 1.0 / (re * re + im * im);
@@ -294,8 +294,8 @@ static void apply_modes(const linear_system *of, const lanes *x, lanes *y)
     complex_lanes modes = {y, of->work->forces}, spare = {of->work->spare, of->work->spare + of->count}, turned, other;
     transform_lattice(of, one, &modes, &spare);
 #ifdef FACTORS_ALONE
-    apply_inverses_of_modes(of, modes.re, own, 1.0 / (double)positions_of(one));
-    apply_inverses_of_modes(of, modes.im, own, 1.0 / (double)positions_of(one));
+    apply_inverses_of_modes(of, modes.re, own, (double)positions_of(one));
+    apply_inverses_of_modes(of, modes.im, own, (double)positions_of(one));
 #else
     apply_inverses(of, modes.re, modes.re, own);
     apply_inverses(of, modes.im, modes.im, own);
