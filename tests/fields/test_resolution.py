@@ -63,8 +63,7 @@ def test_recordings_report_the_unresolved_part_and_warn_of_it(tmp_path):
     with pytest.warns(AccuracyWarning, match="does not resolve the fields"):
         expected = stepper.with_sizes(Nx=6).integrate(start, {"u": np.zeros(6)}, h=0.01, steps=4).unresolved()
     np.testing.assert_array_equal(recorded.unresolved(), expected)
-    for options in ({}, {"mesh": mesh}):
-        np.testing.assert_array_equal(sc.load_run(tmp_path / "run", **options).unresolved(), expected)
+    np.testing.assert_array_equal(sc.load_run(tmp_path / "run").unresolved(), expected)
 
 
 def test_recordings_contain_their_mesh(tmp_path):

@@ -34,17 +34,16 @@ PIECES_IN_MEMORY = 2
 
 
 @checks_arguments()
-def load_run(folder: str | os.PathLike[str], *, mesh: Any = None) -> RecordedRun:
+def load_run(folder: str | os.PathLike[str]) -> RecordedRun:
     """Return the run recorded in a folder, as far as it goes; another process may still be recording it.
 
     Args:
         folder: the folder.
-        mesh: of the fields of a density, by default that of the recording (before version 0.2 there is none).
 
     Raises:
         RecordingError: if there is none, or a file of it is missing or damaged.
     """
-    return RecordedRun(Path(folder), mesh)
+    return RecordedRun(Path(folder))
 
 
 class RecordedRun(AttitudeHistory):
@@ -60,8 +59,8 @@ class RecordedRun(AttitudeHistory):
         t, q, p, iterations: lazy arrays of shapes (n,), (n, m), (n, m), (n,); ``numpy.asarray`` reads them in full.
     """
 
-    def __init__(self, folder: Path, mesh: Any = None) -> None:
-        self.folder, self.manifest, self._mesh = folder, read_manifest(folder), mesh
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.manifest = folder, read_manifest(folder)
         try:
             self._paths = chunk_paths(folder)
         except OSError as error:
@@ -99,7 +98,7 @@ class RecordedRun(AttitudeHistory):
     @cached_property
     def mesh(self) -> Any:
         """Mesh of the fields of a density, or ``None``."""
-        return self.manifest.mesh_of_fields(self.folder) if self._mesh is None else self._mesh
+        return self.manifest.mesh_of_fields(self.folder)
 
     @property
     def fields(self) -> dict[str, Array]:

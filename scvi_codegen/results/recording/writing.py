@@ -140,7 +140,6 @@ def resume_run(
     checkpoint_steps: int | None = None,
     progress: Callable[[int], None] | None = None,
     stop: Callable[[], bool] | None = None,
-    mesh: Any = None,
 ) -> RecordedRun:
     """Restart a recorded run from its last checkpoint, bitwise equal to an uninterrupted run.
 
@@ -150,7 +149,6 @@ def resume_run(
         t_end: new target time of an adaptive run, not before its current time. A run that had arrived continues from
             there; its shortened last step remains.
         checkpoint_seconds, checkpoint_steps, progress, stop: as of :func:`record_run`.
-        mesh: as of :func:`load_run`.
 
     Returns:
         The recorded run.
@@ -167,7 +165,7 @@ def resume_run(
     target = Path(folder)
     read_manifest(target)  # a folder without one is not locked
     with _locked(target):
-        recorded = load_run(target, mesh=mesh)
+        recorded = load_run(target)
         run, manifest = recorded.resumed(), recorded.manifest
         continued = manifest.continued_by(Build.of(run.stepper, run.steps))
         if len(continued.builds) > len(manifest.builds):
@@ -198,7 +196,7 @@ def _mesh(run: Run) -> dict[str, Any] | None:
 
 def _checked(folder: Path, run: Run) -> RecordedRun:
     """Return the run in a folder, with the accuracy warnings of a run in memory."""
-    recorded = load_run(folder, mesh=run.stepper.interface.layout.mesh)
+    recorded = load_run(folder)
     if not run._leaving:
         warn_of_large_steps(cast(Any, run))
     warn_of_energy_error(recorded[:: max(1, len(recorded) - 1)], run)
