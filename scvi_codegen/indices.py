@@ -81,6 +81,12 @@ class Array:
         """Names of the symbolic axis sizes."""
         return tuple(axis.name for axis in self.axes if axis.name)
 
+    @property
+    def is_lattice(self) -> bool:
+        """Whether there are axes with names, all before those of integer size."""
+        named = [bool(axis.name) for axis in self.axes]
+        return bool(named) and named[0] and named == sorted(named, reverse=True)
+
     def __str__(self) -> str:
         return f"{self.name}[{', '.join(map(str, self.axes))}]" if self.axes else self.name
 

@@ -16,6 +16,7 @@ from scvi_codegen.fields.density import Density
 from scvi_codegen.fields.derivation import FieldDerivation, derivation_of
 from scvi_codegen.fields.laws import chosen_laws
 from scvi_codegen.fields.local import FieldHistory, LocalLaw, local_law
+from scvi_codegen.formulas.array_notation import array_text
 from scvi_codegen.formulas.symbols import TIME, symbol
 from scvi_codegen.lowering.arrays import one_coordinate
 from scvi_codegen.methods import as_method
@@ -67,6 +68,26 @@ class Mesh:
         if system.momenta:
             return result | {name: values / self.weights for name, values in split(p, system.momenta).items()}
         return result if velocity is None else result | split(velocity, [str(each) for each in system.rates])
+
+    def to_section(self) -> dict[str, Any]:
+        """Return the section ``[field]`` of a model file: the density as text, and its discretisation."""
+        density = self.field_system
+        boundary = {
+            axis: ends
+            if ends == PERIODIC
+            else [end if end == NATURAL else {each: array_text(x) for each, x in end.items()} for end in ends]
+            for axis, ends in density.boundary.items()
+        }
+        section: dict[str, Any] = {"name": density.name, "fields": [*density.fields]}
+        section |= {"momenta": [*density.momenta]} if density.momenta else {}
+        section |= {"space": {axis: [*ends] for axis, ends in density.space.items()}, "boundary": boundary}
+        section["hamiltonian" if density.momenta else "density"] = array_text(density.density)
+        section |= {} if density.dissipation == 0 else {"dissipation": array_text(density.dissipation)}
+        if density.point_lagrangians:
+            section["scalars"] = [*density.scalars]
+            places = [{**place, "lagrangian": array_text(formula)} for place, formula in density.point_lagrangians]
+            section["point_lagrangians"] = places
+        return {**section, "discretisation": _plain(self.discretisation)}
 
     def integral(self, values: ArrayLike) -> Any:
         """Return the integral over space of values at the points, (.., shape of the fields), by quadrature."""
@@ -231,6 +252,11 @@ class MeshSystem(Mesh):
     system: Any
 
     __repr__ = summary("system")
+
+
+def _plain(value: Any) -> Any:
+    """Return options with arrays as lists."""
+    return {key: _plain(x) for key, x in value.items()} if isinstance(value, Mapping) else np.asarray(value).tolist()
 
 
 def _stability_limit(kicks: Sequence[Any], drifts: Sequence[Any]) -> float:

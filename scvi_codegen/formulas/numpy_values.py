@@ -107,6 +107,7 @@ class Elements:
         if not subscript.index:
             return subscript.base.at(self.sizes)
         loop, moved = self.loops[subscript.index], self.index[subscript.index] + subscript.base.number
+        moved = moved - self.index[subscript.minus] if subscript.minus else moved
         return moved % loop.end.at(self.sizes) if loop.periodic else moved
 
     def values(

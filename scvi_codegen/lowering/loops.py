@@ -123,12 +123,14 @@ def _shown(of: ArrayTerm | ArrayForce) -> str:
 def _jacobian(
     system: ArraySystem, potentials: Sequence[tuple[ArrayTerm, int | None]]
 ) -> tuple[tuple[LoopedKernel, ...], tuple[LoopedKernel, ...]]:
-    """Return the Jacobian of the forces times a direction, by term groups; of forces of positions also its diagonal."""
+    """Return the Jacobian of the forces times a direction, by term groups; by term groups also its diagonal."""
     forces = [(force_of(term, system.state), axis) for term, axis in potentials]
     forces += [(force, None) for force in system.applied_forces]
     derived = [_derived(system, *force, number) for number, force in enumerate(forces)]
     pairs = [pair for pair in derived if pair]
-    diagonals = () if system.momenta or system.velocities else tuple(diagonal for _, diagonal in pairs)
+    circulant = any(axis is not None or any(access.sums for access, _ in force.targets) for force, axis in forces)
+    modes = not system.velocities and (circulant or not system.momenta)
+    diagonals = tuple(diagonal for _, diagonal in pairs) if modes else ()
     return tuple(product for product, _ in pairs), diagonals
 
 
@@ -215,7 +217,7 @@ def reach_of(arrays: Iterable[Array], term_groups: Iterable[LoopedKernel]) -> in
         0 if no places are coupled, if an array is no lattice, or if a term group couples places by a table, all pairs
         or a convolution.
     """
-    if not all(is_lattice(array) for array in arrays) or any(each.sums for one in term_groups for each in one.reads):
+    if not all(array.is_lattice for array in arrays) or any(each.sums for one in term_groups for each in one.reads):
         return 0
     pairs = [
         (target, slot)
@@ -229,12 +231,6 @@ def reach_of(arrays: Iterable[Array], term_groups: Iterable[LoopedKernel]) -> in
         return 0
     own = any(_distance(*pair) for pair in pairs if pair[0].array == pair[1].array)
     return max(_distance(*pair) for pair in pairs) if own else 0
-
-
-def is_lattice(array: Array) -> bool:
-    """Return whether an array has named axes, all before those of integer size."""
-    named = [bool(axis.name) for axis in array.axes]
-    return bool(named) and named[0] and named == sorted(named, reverse=True)
 
 
 def _same_loops(one: Access, other: Access) -> bool:

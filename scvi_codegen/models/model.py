@@ -63,6 +63,7 @@ class Model(TimeSpan):
         fields: arrays of parameters by name, for array sizes known at run time; others keep their default value.
         tables: index tables of shape (rows, columns) by name, for array sizes known at run time.
         events: zero crossings that runs record, which may change the state.
+        mesh: of the fields of a density with known sizes.
 
     Raises:
         ModelFileError: naming the field, unless exactly one of p and velocity, at most one of h, tolerance and error,
@@ -80,6 +81,7 @@ class Model(TimeSpan):
     fields: Mapping[str, Any] = field(default_factory=dict)
     tables: Mapping[str, Any] = field(default_factory=dict)
     events: tuple[Event, ...] = ()
+    mesh: Any = field(default=None, compare=False, repr=False)
 
     __repr__ = summary("system", "method", "h", "span", "steps")
 
@@ -138,7 +140,9 @@ class Model(TimeSpan):
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Model):
             return NotImplemented
-        return all(_equal(getattr(self, each.name), getattr(other, each.name)) for each in fields_of(self))
+        return all(
+            _equal(getattr(self, each.name), getattr(other, each.name)) for each in fields_of(self) if each.compare
+        )
 
     def __hash__(self) -> int:
         return hash((self.system, self.method, self.h, self.tolerance, self.span, self.steps, self.t))
@@ -197,7 +201,7 @@ class Model(TimeSpan):
         if len(vectors) == 1 and not any(each.declaration.startswith("spin") for each in known.rotations):
             vectors["p" if known.auxiliaries else "velocity"] = (0.0,) * known.dimension
         changed: dict[str, Any] = {"fields": {}, "tables": {}, **vectors}
-        return replace(self, system=known, **changed)
+        return replace(self, system=known, mesh=system.mesh, **changed)
 
     @property
     def ends_at_time(self) -> bool:
@@ -239,6 +243,8 @@ class Model(TimeSpan):
         stepper = compile_stepper(
             self.system, self.method, solver=self.solver, time_transformation=self.time_transformation
         )
+        if self.mesh is not None:
+            stepper.interface = replace(stepper.interface, layout=replace(stepper.interface.layout, mesh=self.mesh))
         return stepper.with_events(self.events) if self.events else stepper
 
     def momenta(self, stepper: Stepper) -> Array:

@@ -6,6 +6,7 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen import ExpressionError, FieldSystem, LagrangianSystem, SystemDefinitionError
+from scvi_codegen.native.binding import Binding
 
 RING = LagrangianSystem.from_text(
     "ring",
@@ -45,6 +46,15 @@ def test_sums_over_pairs_of_any_size_and_coefficients():
         potential = 0.25 * np.sum(q**4) - 0.25 * q @ (matrix @ q - matrix.sum(1) * q)
         assert run.energy()[0] == pytest.approx(potential, rel=1e-13)
         np.testing.assert_allclose(run.q["q"][-1], leapfrog(force, q, 0.02, 5), rtol=0, atol=2e-13)
+
+
+def test_energies_of_long_waves_on_many_points_are_accurate():
+    """A wave of energy pi/2 whose eigenvalue is 4e6 times smaller than the largest."""
+    waves = FieldSystem.from_text("waves", ["u"], {"x": (0, "2*pi")}, "(u_t**2 - u_x**2)/2", boundary={"x": "periodic"})
+    mesh = waves.discretise("fourier", points=4096)
+    stepper = sc.compile_stepper(mesh.system, "stoermer-verlet", flags=QUICK_FLAGS)
+    run = stepper.integrate({"u": np.sin(mesh.points["x"])}, h=1e-9, steps=1)
+    assert run.energy()[0] == pytest.approx(np.pi / 2, rel=1e-11)
 
 
 def test_two_axes_are_transformed_as_by_numpy():
@@ -175,3 +185,61 @@ def test_derivatives_by_transforms_or_matrices_are_chosen_by_size():
     assert chosen == {31: 2, 32: 1, 63: 2, 65: 1, 200: 1, 16: 2, 16384: 1}
     with pytest.raises(SystemDefinitionError, match='is "fft" or "dense"'):
         field.discretise("fourier", points=32, derivative="fast")
+
+
+LARGE = {
+    "membrane": ("sqrt(1 + u_x**2)", (128,)),
+    "products": ("(1 + u**2/4)*u_x**2/2 + u**2/2", (128,)),
+    "pairs": ("u_x**2/2 - cos(u)", (128,)),
+    "plane": ("sqrt(1 + u_x**2 + u_y**2) + u_xx**2/500", (40, 36)),
+}
+
+
+@pytest.mark.parametrize("name", ["membrane", *(pytest.param(each, marks=pytest.mark.full) for each in [*LARGE][1:])])
+def test_products_of_large_steps_are_bounded(name):
+    """Steps of 20 and 100 times the limit of the fixed-point iteration, with the Fourier preconditioner."""
+    density, sizes = LARGE[name]
+    axes = dict(zip("xy", sizes, strict=False))
+    space, boundary = (dict.fromkeys(axes, value) for value in ((0, "2*pi"), "periodic"))
+    field = FieldSystem.from_text(name, ["u"], space, f"u_t**2/2 - ({density})", boundary=boundary)
+    mesh = field.discretise("fourier", points=axes, derivative="fft")
+    start = {"u": 0.4 * np.sin(sum(mesh.points.values()))}
+    limit = mesh.largest_step("svi:4")
+    stepper, explicit = (
+        sc.compile_stepper(mesh.system, method, flags=QUICK_FLAGS, **options)
+        for method, options in (("svi:4", {"solver": "newton"}), ("composition:8", {}))
+    )
+    for ratio in (8, 20) if name == "plane" else (20, 100):
+        run = stepper.start(start, h=ratio * limit)
+        memory, binding = run._memory, run.stepper.binding
+        report = Binding.new(binding, "report *")
+        call = Binding.function(binding, "advance")
+        assert call(memory, 4, 0, binding._arrays[memory].problem, *[binding.null] * 5, report) == 0
+        assert report.products / 4 <= (16 if ratio < 100 and name != "plane" else 32)
+    end = stepper.integrate(start, h=4 * limit, steps=8).q["u"][-1]
+    exact = explicit.integrate(start, h=limit / 2, steps=64).q["u"][-1]
+    np.testing.assert_allclose(end, exact, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("method", "names"), [("svi:1", "x"), pytest.param("gauss:3", "xy", marks=pytest.mark.full)])
+def test_large_steps_of_first_order_fields(method, names):
+    """A complex field: corrections depend on h alone, and states are those of fixed-point iterations."""
+    axes = dict.fromkeys(names, (0, "2*pi"))
+    squares = "+".join(f"a_{name}**2 + b_{name}**2" for name in names)
+    density, boundary = f"({squares})/2 + (a**2 + b**2)**2/4 + a**2/5", dict.fromkeys(axes, "periodic")
+    field = FieldSystem.from_text("nls", ["a"], axes, momenta=["b"], hamiltonian=density, boundary=boundary)
+    counts = []
+    for points in ({"x": 32, "y": 20}, {"x": 16, "y": 9}):
+        mesh = field.discretise("fourier", points=points, derivative="fft")
+        x, y = mesh.points["x"], mesh.points[names[-1]]
+        start = {"a": np.cos(x) + np.sin(2 * y) / 2}, {"a": mesh.weights * np.sin(x + 2 * y)}
+        stepper = sc.compile_stepper(mesh.system, method, solver="newton", flags=QUICK_FLAGS)
+        assert mesh.largest_step(method) < 0.03
+        runs = [stepper.integrate(*start, h=0.1, steps=4, threads=threads) for threads in (1, 3)]
+        np.testing.assert_array_equal(*(run.q["a"] for run in runs))
+        counts.append(runs[0].iterations.sum() / 4)
+    assert max(counts) < min(20, 1.3 * min(counts))
+    plain = sc.compile_stepper(mesh.system, method, flags=QUICK_FLAGS)
+    ends = [each.integrate(*start, h=0.004, steps=8).q["a"][-1] for each in (stepper, plain)]
+    np.testing.assert_allclose(*ends, rtol=0, atol=1e-13)
+    assert np.abs(ends[0] - start[0]["a"]).max() > 0.01

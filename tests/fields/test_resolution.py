@@ -1,5 +1,7 @@
 """Resolution monitor of runs, largest step sizes of meshes, and derivatives that densities cannot contain."""
 
+import warnings
+
 import numpy as np
 import pytest
 from samples import QUICK_FLAGS
@@ -61,9 +63,39 @@ def test_recordings_report_the_unresolved_part_and_warn_of_it(tmp_path):
     with pytest.warns(AccuracyWarning, match="does not resolve the fields"):
         expected = stepper.with_sizes(Nx=6).integrate(start, {"u": np.zeros(6)}, h=0.01, steps=4).unresolved()
     np.testing.assert_array_equal(recorded.unresolved(), expected)
-    loaded = sc.load_run(tmp_path / "run", mesh=mesh)
-    np.testing.assert_array_equal(loaded.unresolved(), expected)
-    with pytest.raises(MethodError, match=r"load_run\(folder, mesh=mesh\)"):
+    np.testing.assert_array_equal(sc.load_run(tmp_path / "run").unresolved(), expected)
+
+
+def test_recordings_contain_their_mesh(tmp_path):
+    """A driven end, elements of several sizes, a parameter, a momentum and its weights: all from the folder."""
+    field = FieldSystem.from_text(
+        "schroedinger",
+        ["a"],
+        {"x": (0, "pi")},
+        momenta=["b"],
+        hamiltonian="(a_x**2 + b_x**2)/4 + k*x*(a**2 + b**2)/2",
+        boundary={"x": ({"a": "sin(k*t)", "b": 0}, "natural")},
+        parameters={"k": 2.0},
+    )
+    mesh = field.discretise("spectral-elements", degree=2, elements=[0, 1, np.pi])
+    stepper = sc.compile_stepper(mesh.system, "svi:1", flags=QUICK_FLAGS)
+    x = mesh.points["x"]
+    start = stepper.start({"a": np.sin(x)}, {"a": mesh.weights * np.cos(x)}, h=0.01, parameters={"k": 3.0})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AccuracyWarning)  # the mesh is coarse
+        sc.record_run(start, tmp_path / "run", steps=2)
+    recorded = sc.load_run(tmp_path / "run")
+    np.testing.assert_array_equal(recorded.mesh.points["x"], x)
+    fields = recorded.fields
+    assert [*fields] == ["a", "b"]
+    assert fields["b"].shape == (3, *x.shape)
+    np.testing.assert_allclose(fields["b"][0], np.cos(x), rtol=1e-15)
+    assert recorded.mesh.field_system.defaults == (3.0,)
+    assert recorded.mesh.highest_frequency() == mesh.highest_frequency(k=3.0)
+    manifest = tmp_path / "run" / "manifest.json"
+    key = '"hamiltonian": "'
+    manifest.write_text(manifest.read_text().replace(key, f"{key}__import__('os').getcwd() + "))
+    with pytest.raises(sc.RecordingError, match=r"the mesh in .* is damaged"):
         sc.load_run(tmp_path / "run").unresolved()
 
 

@@ -122,6 +122,12 @@ def test_state_is_that_of_the_formulas():
     assert (model.parameters["k"], model.array_system.defaults) == (2.0, (2.0,))
 
 
+def test_models_with_known_sizes_keep_the_mesh():
+    model = parse_model(SCHROEDINGER).with_known_sizes()
+    assert model.stepper().interface.layout.mesh is model.mesh is not None
+    assert model == parse_model(SCHROEDINGER).with_known_sizes()
+
+
 def test_long_states_are_written_to_tables(tmp_path):
     model = parse_model(SCHROEDINGER.replace("points = 48", "points = 1200"))
     sc.save_model(model, tmp_path / "long.toml")

@@ -30,7 +30,8 @@ FLOORS = """
     methods native pictures
     lowering exact runtime
     pipeline
-    compiler fields frameworks results
+    compiler fields frameworks
+    results
     derivation models advice verification
     benchmark reproduce
     package distributed __init__

@@ -61,10 +61,8 @@ def _system_and_state(
     if as_arrays and system.definition:
         state = {"t": model.t, **_state_by_array(model, names)}
         if model.array_system is not None and (mesh := model.array_system.mesh) is not None:
-            from scvi_codegen.models.model_files.field_section import field_section  # not needed for other systems
-
             numbers = {name: value for name, value in model.parameters.items() if name not in model.fields}
-            return {"field": field_section(mesh)}, numbers, motion | {"initial": state}
+            return {"field": mesh.to_section()}, numbers, motion | {"initial": state}
         return _definition(system), _declared_parameters(model), motion | {"initial": state}
     return _formulas(system, names), model.parameters, motion
 

@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.errors import ModelFileError
-from scvi_codegen.fields.axes import NATURAL, PERIODIC
 from scvi_codegen.fields.mesh import Mesh
 from scvi_codegen.fields.system import FieldSystem
-from scvi_codegen.formulas.array_notation import array_text
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.numpy_values import array_value
 from scvi_codegen.formulas.symbols import TIME, symbol
@@ -67,29 +65,3 @@ def _values(value: Any, where: str, mesh: Mesh, names: Mapping[str, Any]) -> Any
     with np.errstate(all="ignore"):
         values = array_value(formula, {symbol(name): number for name, number in names.items()})
     return np.broadcast_to(np.asarray(values, float), mesh.weights.shape).tolist()
-
-
-def field_section(mesh: Mesh) -> dict[str, Any]:
-    """Return the section of a semi-discrete system."""
-    density = mesh.field_system
-    boundary = {
-        axis: ends
-        if ends == PERIODIC
-        else [end if end == NATURAL else {each: array_text(x) for each, x in end.items()} for end in ends]
-        for axis, ends in density.boundary.items()
-    }
-    section: dict[str, Any] = {"name": density.name, "fields": [*density.fields]}
-    section |= {"momenta": [*density.momenta]} if density.momenta else {}
-    section |= {"space": {axis: [*ends] for axis, ends in density.space.items()}, "boundary": boundary}
-    section["hamiltonian" if density.momenta else "density"] = array_text(density.density)
-    section |= {} if density.dissipation == 0 else {"dissipation": array_text(density.dissipation)}
-    if density.point_lagrangians:
-        section["scalars"] = [*density.scalars]
-        places = [{**place, "lagrangian": array_text(formula)} for place, formula in density.point_lagrangians]
-        section["point_lagrangians"] = places
-    return {**section, "discretisation": _plain(mesh.discretisation)}
-
-
-def _plain(value: Any) -> Any:
-    """Return options with arrays as lists."""
-    return {key: _plain(x) for key, x in value.items()} if isinstance(value, Mapping) else np.asarray(value).tolist()

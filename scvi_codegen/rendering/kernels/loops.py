@@ -80,7 +80,7 @@ def loop_context(program: Program) -> dict[str, Any]:
         and iteration_source(fixed_point, POINTS, kernels=[each.kernel for each in loops.applied]),
         "work": _step_work(program) + _transform_work(program),
         "hot": "static",
-        "waves": _lattice_context(program) if loops.reach else None,
+        "waves": _lattice_context(program) if _on_lattices(program) else None,
         **_constraint_context(program, constrained),
     }
 
@@ -139,7 +139,7 @@ def _step_work(program: Program) -> int:
     newton = (1 + momenta + velocities) * NEWTON_VECTORS + program.fixed_point.lanes
     linear = newton if program.loops.products else 0
     roots = 2 * max(map(_axes, program.layout.coordinates))  # of unity, of every axis
-    waves = FOURIER_VECTORS * program.fixed_point.lanes + roots if program.loops.reach else 0
+    waves = (1 + momenta) * FOURIER_VECTORS * program.fixed_point.lanes + roots if _on_lattices(program) else 0
     return (own + linear) * program.fixed_point.lanes + waves + STEP_VECTORS
 
 
@@ -325,6 +325,12 @@ def _constraint_texts(program: Program, condition: LoopedKernel, curvature: Loop
         *(f"now->place[now->entries++] = (int)({place});" for place in places),
     ]
     yield _function(program, bare, f"place_{name}", [now], lines, values=0, source="")
+
+
+def _on_lattices(program: Program) -> bool:
+    """Return whether Newton's method has the Fourier preconditioner: places in stencils, or circulant matrices."""
+    alike = all(array.is_lattice for array in program.layout.coordinates) and not program.layout.tables
+    return bool(program.loops.reach or (program.loops.diagonals and _plans(program) and alike))
 
 
 def _lattice_context(program: Program) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -176,6 +177,7 @@ class Manifest:
         certificate: verification report as JSON, if there is one.
         builds: the build at the start, then each that continued the run.
         events: events of the run, which the source does not contain.
+        mesh: density and mesh of fields as texts and numbers (``Mesh.to_section``), with the values of its parameters.
     """
 
     source: Source
@@ -194,6 +196,20 @@ class Manifest:
     builds: tuple[Build, ...]
     fallback: Source | None = None
     events: tuple[Event, ...] = ()
+    mesh: Mapping[str, Any] | None = None
+
+    def mesh_of_fields(self, folder: Path) -> Any:
+        """Return the mesh of the fields of a density, or ``None``."""
+        if self.mesh is None:
+            return None
+        from scvi_codegen.fields.system import FieldSystem  # here, because it imports SymPy
+
+        try:
+            section = dict(self.mesh["field"])
+            options = section.pop("discretisation")
+            return FieldSystem.from_text(**section, parameters=self.mesh["parameters"]).discretise(**options)
+        except (ValueError, LookupError, TypeError, AttributeError) as error:
+            raise RecordingError(f"the mesh in '{folder / MANIFEST}' is damaged: {error}") from error
 
     def stepper(self, mesh: Any = None) -> Stepper:
         """Return the integrator, compiled or loaded from the cache; ``mesh``: of the fields of a density."""
@@ -258,6 +274,7 @@ class Manifest:
             "source": self.source.to_record(),
             **({"fallback": self.fallback.to_record()} if self.fallback else {}),
             **({"events": [event.table for event in self.events]} if self.events else {}),
+            **({"mesh": self.mesh} if self.mesh else {}),
         }
         return json.dumps(document, indent=1) + "\n"
 
@@ -281,6 +298,7 @@ class Manifest:
             source=Source.from_record(document["source"]),
             fallback=Source.from_record(document["fallback"]) if "fallback" in document else None,
             events=tuple(Event(**table) for table in document.get("events", ())),
+            mesh=document.get("mesh"),
         )
         manifest.check()
         return manifest

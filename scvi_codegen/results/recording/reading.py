@@ -34,17 +34,16 @@ PIECES_IN_MEMORY = 2
 
 
 @checks_arguments()
-def load_run(folder: str | os.PathLike[str], *, mesh: Any = None) -> RecordedRun:
+def load_run(folder: str | os.PathLike[str]) -> RecordedRun:
     """Return the run recorded in a folder, as far as it goes; another process may still be recording it.
 
     Args:
         folder: the folder.
-        mesh: of the fields of a density, which the folder does not contain: for :meth:`RecordedRun.unresolved`.
 
     Raises:
         RecordingError: if there is none, or a file of it is missing or damaged.
     """
-    return RecordedRun(Path(folder), mesh)
+    return RecordedRun(Path(folder))
 
 
 class RecordedRun(AttitudeHistory):
@@ -56,12 +55,12 @@ class RecordedRun(AttitudeHistory):
     Attributes:
         folder: the folder.
         manifest: description of the run.
-        mesh: of the fields of a density, or ``None``.
+        mesh: of the fields of a density (:class:`~scvi_codegen.fields.mesh.MeshSystem`), or ``None``.
         t, q, p, iterations: lazy arrays of shapes (n,), (n, m), (n, m), (n,); ``numpy.asarray`` reads them in full.
     """
 
-    def __init__(self, folder: Path, mesh: Any = None) -> None:
-        self.folder, self.manifest, self.mesh = folder, read_manifest(folder), mesh
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.manifest = folder, read_manifest(folder)
         try:
             self._paths = chunk_paths(folder)
         except OSError as error:
@@ -95,6 +94,16 @@ class RecordedRun(AttitudeHistory):
             return float(self.t[k]), self.q[k], self.p[k]
         wanted = self.rows(rows)
         return self._trajectory(tuple(self.gather(wanted, range(len(COLUMNS)))), wanted)
+
+    @cached_property
+    def mesh(self) -> Any:
+        """Mesh of the fields of a density, or ``None``."""
+        return self.manifest.mesh_of_fields(self.folder)
+
+    @property
+    def fields(self) -> dict[str, Array]:
+        """Fields of a density at the points of the mesh, (n, shape of the fields), by name; empty without a mesh."""
+        return {} if self.mesh is None else self.mesh.fields_of(np.asarray(self.q), np.asarray(self.p))
 
     @cached_property
     def stepper(self) -> Stepper:
@@ -226,7 +235,7 @@ class RecordedRun(AttitudeHistory):
         """Return (n,) parts of the squared amplitude of fields in the highest modes, as :meth:`Trajectory.unresolved`.
 
         Raises:
-            MethodError: if there is no mesh: pass ``load_run(folder, mesh=mesh)``.
+            MethodError: if the fields are not those of a density.
         """
         return np.concatenate([piece.unresolved() for piece in self.pieces()])
 

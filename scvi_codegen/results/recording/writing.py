@@ -114,6 +114,7 @@ def record_run(
         model=model,
         certificate=_certificate(certificate),
         builds=(Build.of(run.stepper, 0),),
+        mesh=_mesh(run),
     )
     recorder = _Recorder(target, manifest, run, *_checked_checkpoints(checkpoint_seconds, checkpoint_steps))
     with recorder.reporting_recovery():
@@ -139,7 +140,6 @@ def resume_run(
     checkpoint_steps: int | None = None,
     progress: Callable[[int], None] | None = None,
     stop: Callable[[], bool] | None = None,
-    mesh: Any = None,
 ) -> RecordedRun:
     """Restart a recorded run from its last checkpoint, bitwise equal to an uninterrupted run.
 
@@ -149,7 +149,6 @@ def resume_run(
         t_end: new target time of an adaptive run, not before its current time. A run that had arrived continues from
             there; its shortened last step remains.
         checkpoint_seconds, checkpoint_steps, progress, stop: as of :func:`record_run`.
-        mesh: as of :func:`load_run`.
 
     Returns:
         The recorded run.
@@ -166,7 +165,7 @@ def resume_run(
     target = Path(folder)
     read_manifest(target)  # a folder without one is not locked
     with _locked(target):
-        recorded = load_run(target, mesh=mesh)
+        recorded = load_run(target)
         run, manifest = recorded.resumed(), recorded.manifest
         continued = manifest.continued_by(Build.of(run.stepper, run.steps))
         if len(continued.builds) > len(manifest.builds):
@@ -187,9 +186,17 @@ def resume_run(
     return _checked(target, run)
 
 
+def _mesh(run: Run) -> dict[str, Any] | None:
+    """Return the mesh of the fields of a density for the manifest."""
+    mesh, names = run.stepper.interface.layout.mesh, run.stepper.interface.parameters
+    values = dict(zip(names, map(float, run.parameters), strict=True))
+    known = () if mesh is None else map(str, mesh.field_system.parameters)
+    return mesh and {"field": mesh.to_section(), "parameters": {name: values[name] for name in known}}
+
+
 def _checked(folder: Path, run: Run) -> RecordedRun:
     """Return the run in a folder, with the accuracy warnings of a run in memory."""
-    recorded = load_run(folder, mesh=run.stepper.interface.layout.mesh)
+    recorded = load_run(folder)
     if not run._leaving:
         warn_of_large_steps(cast(Any, run))
     warn_of_energy_error(recorded[:: max(1, len(recorded) - 1)], run)

@@ -39,7 +39,7 @@ def envelope_of(layout: ArrayLayout, arrays: RunSizes) -> Envelope | None:
         StateError: if a linear part that is not symmetric has more couplings than factors can have, since there is no
             other preconditioner.
     """
-    if not layout.couplings:
+    if not layout.couplings or (layout.momenta and _has_modes(layout)):
         return None
     found = _envelope(layout, arrays)
     if found is None and not layout.symmetric:
@@ -51,12 +51,26 @@ def envelope_of(layout: ArrayLayout, arrays: RunSizes) -> Envelope | None:
     return found
 
 
+def _has_modes(layout: ArrayLayout) -> bool:
+    """Return whether circulant matrices couple no array of the state to another: the linear part has Fourier modes."""
+    names, found = {array.name for array in (*layout.coordinates, *layout.momenta)}, False
+    for term in layout.couplings:
+        if any(access.sums or any(place.minus for place in access.places) for _, access in term.slots):
+            found, moving = True, [(slot, x.array.name) for slot, x in term.slots if x.array.name in names]
+            pairs = ((a, b) for a, one in moving for b, other in moving if one < other)
+            if any(term.formula.diff(a, b) != 0 for a, b in pairs):
+                return False
+    return found and not layout.tables
+
+
 def _envelope(layout: ArrayLayout, arrays: RunSizes) -> Envelope | None:
     """Return the envelope; ``None`` with too many couplings."""
-    pairs = _coupled_pairs(layout, arrays)
+    shapes = [array.shape(arrays.sizes) for array in (*layout.coordinates, *layout.momenta)]
+    per_row = MOST_PER_ROW if layout.tables or not layout.symmetric else MOST_WITHOUT_TABLES
+    most = min(MOST_ENTRIES, per_row * sum(int(np.prod(shape)) for shape in shapes))
+    pairs = _coupled_pairs(layout, arrays, most)
     if pairs is None:
         return None
-    shapes = [array.shape(arrays.sizes) for array in (*layout.coordinates, *layout.momenta)]
     order, apart = _order(shapes, pairs)
     n, position = len(order), np.empty(len(order), np.int64)
     position[order] = np.arange(n)
@@ -67,8 +81,7 @@ def _envelope(layout: ArrayLayout, arrays: RunSizes) -> Envelope | None:
     np.minimum.at(first, row, column)
     lengths = np.arange(n) - first + 1
     entries = int(lengths.sum())
-    alone = layout.tables or not layout.symmetric
-    if entries > min(MOST_ENTRIES, (MOST_PER_ROW if alone else MOST_WITHOUT_TABLES) * n):
+    if entries > most:
         return None
     near = row < n - apart
     width = 2 * int((row - column)[near].max(initial=0)) + 1
@@ -85,8 +98,11 @@ def _envelope(layout: ArrayLayout, arrays: RunSizes) -> Envelope | None:
     return Envelope(np.concatenate(parts).astype(np.int32), n + (1 if layout.symmetric else 2) * entries)
 
 
-def _coupled_pairs(layout: ArrayLayout, arrays: RunSizes) -> NDArray[np.int64] | None:
-    """Return the indices of pairs of coordinates that occur in the same element of a term, (2, n)."""
+def _coupled_pairs(layout: ArrayLayout, arrays: RunSizes, most: int) -> NDArray[np.int64] | None:
+    """Return the indices of pairs of coordinates that occur in the same element of a term, (2, n).
+
+    ``None`` if a term has too many, or if a sum over pairs or convolutions couple more than ``most``.
+    """
     from scvi_codegen.formulas.arrays import ArrayTerm  # here, because it imports SymPy
     from scvi_codegen.formulas.numpy_values import Elements
     from scvi_codegen.formulas.symbols import DOT
@@ -106,13 +122,14 @@ def _coupled_pairs(layout: ArrayLayout, arrays: RunSizes) -> NDArray[np.int64] |
             names = {access.array.name for access in accesses}
             entries = np.concatenate([firsts[name] + np.arange(int(np.prod(shapes[name]))) for name in sorted(names)])
             count += len(entries) ** 2
-            if count > MOST_COUPLINGS:
+            if count > MOST_COUPLINGS or len(entries) * (len(entries) - 1) > 2 * most:
                 return None
             found.append(entries[np.stack(np.triu_indices(len(entries), 1))])
             continue
         size = np.prod([float(loop.end.at(arrays.sizes) - loop.first.at(arrays.sizes)) for loop in term.loops])
         count += int(size) * len(accesses) ** 2
-        if count > MOST_COUPLINGS:
+        all_pairs = any(loop.behind for loop in term.loops) and len(accesses) > 1
+        if count > MOST_COUPLINGS or (all_pairs and size > 4 * most):
             return None
         elements = Elements(term.loops, arrays.sizes, arrays.places)
         rows = next((len(index) for index in elements.index.values()), 1)

@@ -267,10 +267,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
             MethodError: if the system is not that of a mesh.
         """
         if (parts := unresolved_parts(self.stepper, self.q)) is None:
-            raise MethodError(
-                "the system is not discretised from a density: unresolved() requires a mesh (of a recorded run, pass "
-                "load_run(folder, mesh=mesh))"
-            )
+            raise MethodError("the system is not discretised from a density: unresolved() requires a mesh")
         return parts
 
     @property

@@ -71,53 +71,64 @@ static plan plan_at(double *memory, long long size)
 {
   const long long half = size / 2;
   double *re = memory + 1 + size, *im = re + half + 1, *next = im + half + 1;
-  const plan of = {memory, memory + 1, re, im, {next, next + half}, {next + 2 * half, next + 2 * half + size}};
+  double *first = size % 8 == 0 ? next + 2 * half + 2 * size : NULL; /* then the radix is 4 or 8 */
+  const roots of_half = {next, next + half, first}, of_size = {next + 2 * half, next + 2 * half + size, NULL};
+  const plan of = {memory, memory + 1, re, im, of_half, of_size};
   return of;
 }
 
-/* Returns eigenvalue k of sums over pairs from the squares sin^2(pi j / size), which are those of j modulo size. */
-static double eigenvalue(const double *coefficients, const double *squares, long long k, long long size)
+/* Computes the transform of real coefficients in every number of x. */
+static void transform_coefficients(const plan *of, long long size, const double *coefficients, complex_lanes *x)
 {
-  double sum = 0.0;
-  for (long long d = 1, place = k; 2 * d <= size; d++) {
-    sum += (2 * d < size ? 4.0 : 2.0) * coefficients[d] * squares[place]; /* c[d] = c[size - d] */
-    place += k - (place + k < size ? 0 : size);
-  }
-  return sum;
+  const run_memory alone = {0};
+  const axis along = {0, 1, size, 1, of->of_size};
+  complex_lanes y = {x->re + 2 * GROUPS * size, x->re + 3 * GROUPS * size};
+  for (long long j = 0; j < GROUPS * size; j++)
+    x->re[j] = lanes_of(coefficients[j % size]), x->im[j] = lanes_of(0.0);
+  transform(&alone, &along, x, &y, size);
 }
 
-/* Computes the eigenvalues of sums over pairs; returns 0 if C is not circulant or has a large prime factor. */
-static int find_eigenvalues_of_pairs(const plan *of, long long size)
+/* Computes the eigenvalues of sums over pairs; returns 0 if C is not circulant or has a large prime factor. By
+ * sin^2 d x / sin^2 x = d + 2 sum_(m < d) (d - m) cos 2 m x (Fejer) they are 2 sin^2(pi k / size) times the transform
+ * of e[m] = sum_(d > m) (d - m) c[d], which keeps the relative accuracy of small eigenvalues. */
+static int find_eigenvalues_of_pairs(const plan *of, long long size, lanes *spare)
 {
-  double *squares = of->of_size.sine;
+  complex_lanes x = {spare, spare + GROUPS * size};
+  double *sums = of->re, *whole = (double *)(spare + 2 * GROUPS * size);
+  compensated sum = {0.0, 0.0}, twice = {0.0, 0.0};
   int usable = can_be_transformed(size % 2 ? size : size / 2);
   for (long long d = 1; 2 * d < size; d++)
     usable &= of->coefficients[d] == of->coefficients[size - d];
-  for (long long j = 0; j < size && usable; j++)
-    squares[j] = sin(3.141592653589793 * (double)j / (double)size) * sin(3.141592653589793 * (double)j / (double)size);
-  for (long long k = 0; 2 * k <= size && usable; k++) {
-    of->re[k] = eigenvalue(of->coefficients, squares, k, size);
+  if (!usable)
+    return 0;
+  for (long long d = size / 2; d >= 0; d--) {
+    sums[d] = twice.sum + twice.rest;
+    add_to_sum(&sum, d == 0 ? 0.0 : (2 * d < size ? 2.0 : 1.0) * of->coefficients[d]); /* c[d] = c[size - d] */
+    add_to_sum(&twice, sum.sum), add_to_sum(&twice, sum.rest);
+  }
+  for (long long d = 0; d < size; d++)
+    whole[d] = sums[2 * d <= size ? d : size - d];
+  transform_coefficients(of, size, whole, &x);
+  for (long long k = 0; 2 * k <= size; k++) {
+    const double s = sin(3.141592653589793 * (double)k / (double)size);
+    of->re[k] = 2.0 * s * s * *(const double *)&x.re[k];
     of->im[k] = 0.0;
   }
-  return usable;
+  return 1;
 }
 
 /* Computes the eigenvalues of a power of a convolution by a transform; those of symmetric coefficients are real, those
  * of antisymmetric ones imaginary. */
 static void find_eigenvalues(const plan *of, const circulant *by, lanes *spare)
 {
-  const run_memory alone = {0};
   const long long size = by->size;
-  const axis along = {0, 1, size, 1, of->of_size};
-  complex_lanes x = {spare, spare + GROUPS * size}, y = {spare + 2 * GROUPS * size, spare + 3 * GROUPS * size};
+  complex_lanes x = {spare, spare + GROUPS * size};
   int even = 1, odd = of->coefficients[0] == 0.0;
   for (long long d = 1; d < size; d++) {
     even &= of->coefficients[d] == of->coefficients[size - d];
     odd &= of->coefficients[d] == -of->coefficients[size - d];
   }
-  for (long long j = 0; j < GROUPS * size; j++)
-    x.re[j] = lanes_of(of->coefficients[j % size]), x.im[j] = lanes_of(0.0);
-  transform(&alone, &along, &x, &y, size);
+  transform_coefficients(of, size, of->coefficients, &x);
   for (long long k = 0; 2 * k <= size; k++) {
     const double re = odd ? 0.0 : *(const double *)&x.re[k];
     const double im = even || k == 0 || 2 * k == size ? 0.0 : -*(const double *)&x.im[k];
@@ -138,11 +149,14 @@ static void make_plan(const plan *of, const circulant *by, lanes *spare)
   if (memcmp(of->coefficients, by->coefficients, sizeof(double) * (size_t)size) == 0)
     return;
   memcpy(of->coefficients, by->coefficients, sizeof(double) * (size_t)size);
-  *of->usable = by->power > 0 || find_eigenvalues_of_pairs(of, size);
+  fill_all_roots(of->of_size, size);
+  *of->usable = by->power > 0 || find_eigenvalues_of_pairs(of, size, spare);
   if (*of->usable == 0.0)
     return;
-  fill_roots(of->of_size, size, 0, size);
-  fill_roots(of->of_half, half, 0, half);
+  for (long long k = 0; k < half; k++) /* of even sizes */
+    of->of_half.cosine[k] = of->of_size.cosine[2 * k], of->of_half.sine[k] = of->of_size.sine[2 * k];
+  if (of->of_half.first)
+    fill_first(of->of_half, half);
   if (by->power > 0)
     find_eigenvalues(of, by, spare);
   for (long long k = 0; k <= half; k++)
@@ -172,18 +186,41 @@ static inline void multiply_modes(const plan *of, long long half, long long k, d
   }
 }
 
+/* Multiplies the modes k = first to end - 1, which are not half / 2 or 0, and half - k of a line. */
+static inline __attribute__((always_inline)) void multiply_range(const plan *of, long long half, section here,
+    double turn, long long inner, lanes *restrict re, lanes *restrict im, lanes *restrict high, lanes *restrict high_i)
+{
+  for (long long k = here.first; k < here.end; k++)
+    for (long long b = 0; b < inner; b++) {
+      const long long one = k * inner + b, other = b - k * inner;
+      multiply_modes(of, half, k, turn, re + one, im + one, high + other, high_i + other);
+    }
+}
+
 /* Multiplies the modes of this thread, of lines of half the size. */
 static inline void multiply_half_lines(const run_memory *run, const axis *along, const plan *of, double turn,
     complex_lanes z, long long n)
 {
-  const long long half = along->size, modes = half / 2 + 1;
+  const long long half = along->size, modes = half / 2 + 1, inner = along->inner;
   const section own = share_of(run, along->outer * modes);
   for (int group = 0; group < GROUPS; group++)
-    for (long long at = own.first; at < own.end; at++) {
-      const long long k = at % modes, line = group * n + at / modes * half * along->inner;
-      const long long one = line + k * along->inner, other = line + (half - k) % half * along->inner;
-      for (long long b = 0; b < along->inner; b++)
-        multiply_modes(of, half, k, turn, z.re + one + b, z.im + one + b, z.re + other + b, z.im + other + b);
+    for (long long at = own.first, k = at % modes, end; at < own.end; at += end - k, k = 0) {
+      const long long line = group * n + at / modes * half * inner;
+      lanes *re = z.re + line, *im = z.im + line, *high = re + half * inner, *high_i = im + half * inner;
+      section here = {k > 1 ? k : 1, 0};
+      end = between(0, k + own.end - at, modes);
+      here.end = between(0, end, (half + 1) / 2);
+      for (long long b = 0; b < inner; b++) { /* modes that are their own partners */
+        if (k == 0)
+          multiply_modes(of, half, 0, turn, re + b, im + b, re + b, im + b);
+        if (end == modes && half % 2 == 0)
+          multiply_modes(of, half, half / 2, turn, re + half / 2 * inner + b, im + half / 2 * inner + b,
+              re + half / 2 * inner + b, im + half / 2 * inner + b);
+      }
+      if (inner == 1)
+        multiply_range(of, half, here, turn, 1, re, im, high, high_i);
+      else
+        multiply_range(of, half, here, turn, inner, re, im, high, high_i);
     }
 }
 
@@ -205,36 +242,62 @@ static void multiply_whole_lines(const run_memory *run, const axis *along, const
     }
 }
 
-/* Copies places of x to z, of axes of even size even and odd ones as real and imaginary parts. */
+/* Copies places of x to z, of axes of even size even and odd ones as real and imaginary parts, or places of z to y;
+ * with a factor f adds f z to them. */
+static inline __attribute__((always_inline)) void take_places(long long places, long long inner, int halves,
+    const lanes *restrict x, lanes *restrict re, lanes *restrict im)
+{
+  for (long long place = 0; place < places; place++)
+    for (long long b = 0; b < inner; b++) {
+      re[place * inner + b] = x[(1 + halves) * place * inner + b];
+      im[place * inner + b] = halves ? x[(1 + halves) * place * inner + inner + b] : lanes_of(0.0);
+    }
+}
+
+static inline __attribute__((always_inline)) void give_places(long long places, long long inner, int halves, int adds,
+    lanes factor, const lanes *restrict re, const lanes *restrict im, lanes *restrict y)
+{
+  for (long long place = 0; place < places; place++)
+    for (long long b = 0; b < inner; b++) {
+      lanes *to = y + (1 + halves) * place * inner + b;
+      to[0] = adds ? to[0] + factor * re[place * inner + b] : re[place * inner + b];
+      if (halves)
+        to[inner] = adds ? to[inner] + factor * im[place * inner + b] : im[place * inner + b];
+    }
+}
+
 static void take_lines(const run_memory *run, const axis *along, int halves, complex_lanes z, long long n,
     const lanes *x, long long apart)
 {
   const long long inner = along->inner;
   const section own = share_of(run, along->outer * along->size);
-  for (int group = 0; group < GROUPS; group++)
-    for (long long place = own.first; place < own.end; place++) {
-      const long long at = group * n + place * inner, from = group * apart + (1 + halves) * place * inner;
-      for (long long b = 0; b < inner; b++)
-        z.re[at + b] = x[from + b], z.im[at + b] = halves ? x[from + inner + b] : lanes_of(0.0);
-    }
+  for (int group = 0; group < GROUPS; group++) {
+    const long long at = group * n + own.first * inner, places = own.end - own.first;
+    const lanes *from = x + group * apart + (1 + halves) * own.first * inner;
+    if (inner == 1 && halves)
+      take_places(places, 1, 1, from, z.re + at, z.im + at);
+    else
+      take_places(places, inner, halves, from, z.re + at, z.im + at);
+  }
   wait_at_barrier(run);
 }
 
-/* Copies z to places of y, or with factors f adds f z to them. */
 static void give_lines(const run_memory *run, const axis *along, int halves, complex_lanes z, long long n,
     const lanes *factor, lanes *y, long long apart)
 {
   const long long inner = along->inner;
   const section own = share_of(run, along->outer * along->size);
-  for (int group = 0; group < GROUPS; group++)
-    for (long long place = own.first; place < own.end; place++) {
-      const long long at = group * n + place * inner, to = group * apart + (1 + halves) * place * inner;
-      for (long long b = 0; b < inner; b++) {
-        y[to + b] = factor ? y[to + b] + factor[group] * z.re[at + b] : z.re[at + b];
-        if (halves)
-          y[to + inner + b] = factor ? y[to + inner + b] + factor[group] * z.im[at + b] : z.im[at + b];
-      }
-    }
+  for (int group = 0; group < GROUPS; group++) {
+    const long long at = group * n + own.first * inner, places = own.end - own.first;
+    lanes *to = y + group * apart + (1 + halves) * own.first * inner;
+    if (inner == 1 && halves && factor)
+      give_places(places, 1, 1, 1, factor[group], z.re + at, z.im + at, to);
+    else if (inner == 1 && halves)
+      give_places(places, 1, 1, 0, lanes_of(0.0), z.re + at, z.im + at, to);
+    else
+      give_places(places, inner, halves, factor != NULL, factor ? factor[group] : lanes_of(0.0), z.re + at, z.im + at,
+          to);
+  }
   wait_at_barrier(run);
 }
 
@@ -264,7 +327,7 @@ static void multiply_by_plan(const transforms *in, const circulant *by, const pl
   if (!halves)
     multiply_whole_lines(run, &along, of, turn, x, n);
   else if (by->power == 0)
-    multiply_half_lines(run, &along, of, 0.0, x, n);
+    multiply_half_lines(run, &along, of, 0.0, x, n); /* real eigenvalues */
   else
     multiply_half_lines(run, &along, of, turn, x, n);
   wait_at_barrier(run);
@@ -275,7 +338,51 @@ static void multiply_by_plan(const transforms *in, const circulant *by, const pl
   give_lines(run, &along, halves, x, n, factor, Y + by->start, behind);
 }
 
+#ifdef CIRCULANT_MODES
+/* Replaces the values of all places of a lattice by their mean, of each component; groups of F are n numbers apart. */
+static void average_places(const run_memory *run, const problem *given, lanes *F, long long n)
+{
+  const long long half = NAME(coordinates)(given);
+  lattice all[LATTICES];
+  describe_lattices(given, all);
+  for (const lattice *one = all; one < all + LATTICES && (!run->thread_barrier || run->part == 0); one++)
+    for (long long k = 0; k < GROUPS * STATES * one->components; k++) {
+      const long long places = positions_of(one), count = one->components;
+      lanes *at = F + k / count / STATES * n + k / count % STATES * half + one->first + k % count, sum = lanes_of(0.0);
+      for (long long i = 0; i < places; i++)
+        sum += at[i * count];
+      for (long long i = 0; i < places; i++)
+        at[i * count] = sum * (1.0 / (double)places);
+    }
+  wait_at_barrier(run);
+}
+
+/* Index in the plan of the eigenvalue that belongs to a place of an array in Fourier space. */
+static inline long long mode_of(const circulant *by, long long place)
+{
+  const long long k = (place - by->start) / by->inner % by->size;
+  return 2 * k <= by->size ? k : by->size - k;
+}
+#endif
+
 #ifdef PAIRS
+#ifdef CIRCULANT_MODES
+/* Adds the eigenvalues f L_k of a sum over pairs to F; returns 0 if C is not circulant. */
+static int add_modes_of_pairs(const transforms *in, const circulant *by, const lanes *factor, lanes *F, long long n)
+{
+  const plan of = shared_plan(in, by);
+  const section own = share_of(in->run, by->outer * by->size * by->inner);
+  const double unit = (double)(by->size % 2 ? by->size : 2 * by->size);
+  if (*of.usable == 0.0)
+    return 0;
+  for (int group = 0; group < GROUPS; group++)
+    for (long long i = by->start + own.first; i < by->start + own.end; i++)
+      F[group * n + i] += unit * of.re[mode_of(by, i)] * factor[group];
+  wait_at_barrier(in->run);
+  return 1;
+}
+#endif
+
 /* Adds the forces f C x of a sum over pairs, or its diagonal, if X is NULL, to F, whose groups are n numbers apart; x:
  * groups `apart`. Returns 0 if the pairs have to be summed. */
 static int add_pairs(const transforms *in, const circulant *by, const lanes *X, long long apart, const lanes *factor,
@@ -466,6 +573,36 @@ static void add_diagonals(const transforms *in, const problem *given, lanes *F, 
   wait_at_barrier(in->run);
 }
 
+#endif
+
+#ifdef CIRCULANT_MODES
+/* Adds the eigenvalues |L_k|^2 times the mean derivative D of C^T D C to F, for each C. */
+static void add_modes(const transforms *in, const problem *given, lanes *F, long long n)
+{
+  const long long length = STATES * in->count;
+  convolution all[CONVOLUTIONS];
+  describe_convolutions(given, all);
+  for (int kind = 0; kind < KINDS; kind++)
+    average_places(in->run, given, sums_at(in, 1, 0) + kind * length, KINDS * length);
+  for (const convolution *one = all; one < all + CONVOLUTIONS; one++) {
+    const circulant *by = one->stages;
+    const section own = share_of(in->run, by->outer * by->size * by->inner);
+    plan of[MOST_STAGES];
+    for (int k = 0; k < one->count; k++)
+      of[k] = shared_plan(in, by + k);
+    for (long long i = by->start + own.first; i < by->start + own.end && one->target; i++) {
+      double square = 1.0;
+      for (int k = 0; k < one->count; k++) {
+        const long long mode = mode_of(by + k, i);
+        const double unit = (double)(by[k].size % 2 ? by[k].size : 2 * by[k].size);
+        square *= unit * unit * (of[k].re[mode] * of[k].re[mode] + of[k].im[mode] * of[k].im[mode]);
+      }
+      for (int group = 0; group < GROUPS; group++)
+        F[group * n + i] += square * sums_at(in, 1, group)[one->number * length + i];
+    }
+  }
+  wait_at_barrier(in->run);
+}
 #endif
 
 /* Returns all convolutions of a single state in new memory, NULL without memory. */

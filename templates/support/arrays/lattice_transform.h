@@ -15,9 +15,10 @@ typedef struct {
   lanes *re, *im;
 } complex_lanes;
 
-/* exp(-2 pi i k / size), k = 0 .. size - 1, real and imaginary parts. */
+/* exp(-2 pi i k / size), k = 0 .. size - 1, real and imaginary parts; coefficients of the first pass in the order of
+ * its places, or NULL. */
 typedef struct {
-  double *cosine, *sine;
+  double *cosine, *sine, *first;
 } roots;
 
 /* An axis of a lattice: `outer` lines of `size` places with `inner` numbers each. */
@@ -36,6 +37,17 @@ static void fill_roots(roots of_one, long long size, long long first, long long 
   }
 }
 
+/* Sets all roots of a size: those of a quarter, if there is one, are turned. */
+static void fill_all_roots(roots of_one, long long size)
+{
+  const long long quarter = size % 4 == 0 ? size / 4 : size;
+  fill_roots(of_one, size, 0, quarter);
+  for (long long k = quarter; k < size; k++) {
+    of_one.cosine[k] = of_one.sine[k - quarter];
+    of_one.sine[k] = -of_one.cosine[k - quarter];
+  }
+}
+
 /* A pass: `left` places of a line are not yet transformed, each of `done` numbers; `factor` of them are combined. */
 typedef struct {
   const axis *along;
@@ -43,9 +55,11 @@ typedef struct {
   int factor;
 } pass;
 
+/* The factor of the next pass: 8 or 4, but not 8 before a factor 2. */
 static int factor_of(long long size)
 {
-  int factor = size % 4 == 0 ? 4 : 2;
+  int factor = size % 8 == 0 && size % 32 != 16 ? 8 : size % 4 == 0 ? 4
+                                                                    : 2;
   while (size % factor)
     factor++;
   return factor;
@@ -58,72 +72,148 @@ static int can_be_transformed(long long size)
   return size == 1;
 }
 
-/* Radix-4 butterfly from x to y with the twiddle factors k, 2 k, 3 k. */
-static inline void four_to_four(complex_lanes x, complex_lanes y, long long apart, long long next, const roots *of_one,
-    long long k)
+/* Sets the coefficients of the first pass of radix 4 or 8, 2 size numbers at most. */
+static void fill_first(roots of_one, long long size)
 {
-  const lanes even = x.re[0] + x.re[2 * apart], even_i = x.im[0] + x.im[2 * apart];
-  const lanes odd = x.re[apart] + x.re[3 * apart], odd_i = x.im[apart] + x.im[3 * apart];
-  const lanes gap = x.re[0] - x.re[2 * apart], gap_i = x.im[0] - x.im[2 * apart];
-  const lanes turn = x.im[apart] - x.im[3 * apart], turn_i = x.re[3 * apart] - x.re[apart];
-  const lanes re[3] = {gap + turn, even - odd, gap - turn}, im[3] = {gap_i + turn_i, even_i - odd_i, gap_i - turn_i};
-  y.re[0] = even + odd, y.im[0] = even_i + odd_i;
-  for (int r = 1; r < 4; r++) {
-    const double c = of_one->cosine[r * k], s = of_one->sine[r * k];
-    y.re[r * next] = c * re[r - 1] - s * im[r - 1];
-    y.im[r * next] = c * im[r - 1] + s * re[r - 1];
+  const long long factor = factor_of(size), together = size / factor;
+  double *next = of_one.first;
+  for (long long r = 1; r < factor; r++, next += 2 * together)
+    for (long long place = 0; place < together; place++)
+      next[place] = of_one.cosine[r * place], next[together + place] = of_one.sine[r * place];
+}
+
+/* Coefficients of `factor` - 1 values, real parts and imaginary parts `width` numbers behind, those of the next value
+ * `width` numbers behind that and those of the next place `step` numbers behind. */
+typedef struct {
+  const double *values;
+  long long width, step;
+} coefficients;
+
+/* Transform of four numbers. */
+static inline void transform_four(lanes *re, lanes *im)
+{
+  const lanes even = re[0] + re[2], even_i = im[0] + im[2], odd = re[1] + re[3], odd_i = im[1] + im[3];
+  const lanes gap = re[0] - re[2], gap_i = im[0] - im[2], turn = im[1] - im[3], turn_i = re[3] - re[1];
+  re[0] = even + odd, im[0] = even_i + odd_i;
+  re[1] = gap + turn, im[1] = gap_i + turn_i;
+  re[2] = even - odd, im[2] = even_i - odd_i;
+  re[3] = gap - turn, im[3] = gap_i - turn_i;
+}
+
+/* Butterflies of radix 4 or 8 of `count` values: from numbers that are `apart` to numbers that are `next` apart, those
+ * of the next value `behind`. */
+static inline __attribute__((always_inline)) void butterflies(int factor, const lanes *restrict re,
+    const lanes *restrict im, long long apart, lanes *restrict to_re, lanes *restrict to_im, long long next,
+    long long behind, coefficients by, long long count)
+{
+  const double half = 0.7071067811865476; /* exp(-pi i / 4) = half - i half */
+  const int odd = factor == 8;
+#ifndef __clang__
+#pragma GCC ivdep /* places differ, which the compiler cannot know */
+#endif
+  for (long long b = 0; b < count; b++) {
+    lanes x[8], y[8];
+    for (int k = 0; k < factor; k++)
+      x[k] = re[k * apart + b], y[k] = im[k * apart + b];
+    for (int k = 0; odd && k < 4; k++) {
+      const lanes other = x[k + 4], other_i = y[k + 4];
+      x[k + 4] = x[k] - other, y[k + 4] = y[k] - other_i;
+      x[k] += other, y[k] += other_i;
+    }
+    if (odd) {
+      const lanes one = x[5], two = x[6], three = x[7];
+      x[5] = half * (one + y[5]), y[5] = half * (y[5] - one);
+      x[6] = y[6], y[6] = -two;
+      x[7] = half * (y[7] - three), y[7] = -half * (y[7] + three);
+      transform_four(x + 4, y + 4);
+    }
+    transform_four(x, y);
+    to_re[b * behind] = x[0], to_im[b * behind] = y[0];
+    for (int r = 1; r < factor; r++) {
+      const int k = odd ? r / 2 + r % 2 * 4 : r;
+      const double *at = by.values + 2 * (r - 1) * by.width + b * by.step;
+      const double c = at[0], s = at[by.width];
+      to_re[r * next + b * behind] = c * x[k] - s * y[k];
+      to_im[r * next + b * behind] = c * y[k] + s * x[k];
+    }
   }
 }
 
-/* Butterfly of any radix. */
-static inline void some_to_some(complex_lanes x, complex_lanes y, long long apart, long long next, const pass *now,
-    long long k)
+/* Butterflies of any radix, with the coefficients of place k. */
+static void butterflies_of_any_radix(const pass *now, complex_lanes x, long long apart, complex_lanes y, long long next,
+    long long k, long long count)
 {
   const axis *along = now->along;
   for (long long r = 0; r < now->factor; r++) {
-    lanes re = lanes_of(0.0), im = lanes_of(0.0);
+    lanes *restrict re = y.re + r * next, *restrict im = y.im + r * next;
     long long root = r * k;
+    memset(re, 0, sizeof(lanes) * (size_t)count);
+    memset(im, 0, sizeof(lanes) * (size_t)count);
     for (long long q = 0; q < now->factor; q++) {
       const double c = along->of_one.cosine[root], s = along->of_one.sine[root];
-      re += c * x.re[q * apart] - s * x.im[q * apart];
-      im += c * x.im[q * apart] + s * x.re[q * apart];
+      const lanes *from = x.re + q * apart, *from_i = x.im + q * apart;
+      for (long long b = 0; b < count; b++) {
+        re[b] += c * from[b] - s * from_i[b];
+        im[b] += c * from_i[b] + s * from[b];
+      }
       root += r * (along->size / now->factor);
       root -= root < along->size ? 0 : along->size;
     }
-    y.re[r * next] = re, y.im[r * next] = im;
   }
 }
 
-/* Transforms the numbers of a section of a place, for one group. */
-static void transform_places(const pass *now, complex_lanes x, complex_lanes y, long long place, section here)
+/* Transforms a section of the numbers of a place, for one group. */
+static void transform_place(const pass *now, complex_lanes x, complex_lanes y, long long place, section here)
 {
-  const long long together = now->left / now->factor, apart = together * now->done;
-  const long long k = place * (now->along->size / now->left);
-  for (long long b = here.first; b < here.end; b++) {
-    const long long at = place * now->done + b, to = place * now->factor * now->done + b;
-    const complex_lanes from = {x.re + at, x.im + at}, into = {y.re + to, y.im + to};
-    if (now->factor == 4)
-      four_to_four(from, into, apart, now->done, &now->along->of_one, k);
-    else
-      some_to_some(from, into, apart, now->done, now, k);
+  const long long together = now->left / now->factor, apart = together * now->done, next = now->done;
+  const long long k = place * (now->along->size / now->left), at = place * next + here.first;
+  const long long to = place * now->factor * next + here.first, count = here.end - here.first;
+  const complex_lanes from = {x.re + at, x.im + at}, into = {y.re + to, y.im + to};
+  double values[14];
+  const coefficients by = {values, 1, 0};
+  if (now->factor != 4 && now->factor != 8) {
+    butterflies_of_any_radix(now, from, apart, into, next, k, count);
+    return;
   }
+  for (int r = 1; r < now->factor; r++)
+    values[2 * r - 2] = now->along->of_one.cosine[r * k], values[2 * r - 1] = now->along->of_one.sine[r * k];
+  if (now->factor == 8)
+    butterflies(8, from.re, from.im, apart, into.re, into.im, next, 1, by, count);
+  else
+    butterflies(4, from.re, from.im, apart, into.re, into.im, next, 1, by, count);
+}
+
+/* Transforms a section of the places of a line in its first pass, for one group. */
+static void transform_places(const pass *now, complex_lanes x, complex_lanes y, section here)
+{
+  const long long apart = now->left / now->factor, count = here.end - here.first, to = here.first * now->factor;
+  const coefficients by = {now->along->of_one.first + here.first, apart, 1};
+  if (now->factor == 8)
+    butterflies(8, x.re + here.first, x.im + here.first, apart, y.re + to, y.im + to, 1, 8, by, count);
+  else
+    butterflies(4, x.re + here.first, x.im + here.first, apart, y.re + to, y.im + to, 1, 4, by, count);
 }
 
 /* Performs this thread's part of a pass from x to y. */
 static void make_pass(const run_memory *run, const pass *now, complex_lanes x, complex_lanes y, long long n)
 {
   const axis *along = now->along;
+  const int first = now->done == 1 && along->of_one.first;
   const long long places = now->left / now->factor, line = along->size * along->inner;
   const section own = share_of(run, along->outer * places * now->done);
   for (int g = 0; g < GROUPS; g++) {
-    long long place = own.first / now->done % places, shift = g * n + along->first;
-    section here = {own.first % now->done, 0};
+    const long long within = first ? places : now->done; /* numbers that are transformed together */
+    long long place = own.first / within % (first ? 1 : places), shift = g * n + along->first;
+    section here = {own.first % within, 0};
     shift += own.first / now->done / places * line;
     for (long long k = own.first; k < own.end; k += here.end - here.first, here.first = 0) {
       const complex_lanes from = {x.re + shift, x.im + shift}, into = {y.re + shift, y.im + shift};
-      here.end = between(0, here.first + own.end - k, now->done);
-      transform_places(now, from, into, place, here);
-      if (++place == places)
+      here.end = between(0, here.first + own.end - k, within);
+      if (first)
+        transform_places(now, from, into, here);
+      else
+        transform_place(now, from, into, place, here);
+      if (first || ++place == places)
         place = 0, shift += line;
     }
   }

@@ -230,6 +230,7 @@ static int solve(const step_data *step, const solver_data *data, history past, l
       .own = own_part(step),
       .by_factors = step->run->pattern != NULL};
   progress now = before_iterations();
+  const int direct = of.by_factors || X_VECTORS == 2; /* corrections by the preconditioner without GMRES */
   int status, slow = 0; /* iterations with the factors that reduced the change too little */
   (void)workspace;
   first_points(&w, past, *guess);
@@ -240,11 +241,12 @@ static int solve(const step_data *step, const solver_data *data, history past, l
   for (int k = 0; needs_iteration(&now); k++) {
     double change, size, left;
     find_residual(&of, &w);
-    if (!of.by_factors ? now.last > REFRESHED /* also before the first iteration */
-                       : !has_factors(&of) || slow == 1 || (k == 0 && step->first == COMPARISON))
+    if (!direct             ? now.last > REFRESHED /* also before the first iteration */
+            : of.by_factors ? !has_factors(&of) || slow == 1 || (k == 0 && step->first == COMPARISON)
+                            : k == 0 || slow == 1)
       find_inverses(&of);
     left = 0.0;
-    if (of.by_factors && slow < 2)
+    if (direct && slow < 2)
       precondition(&of, of.work->residual, of.work->correction);
     else
       left = find_correction(&of, report);
@@ -258,7 +260,7 @@ static int solve(const step_data *step, const solver_data *data, history past, l
     size = options->absolute ? of.scale[0] * of.scale[0] : of.state * of.state;
     slow += k > 0 && relative_change(change, size) > larger(SLOW * now.last, PROGRESS_LEVEL);
     take_change(&now, relative_change(change, size), options, k, report);
-    if (now.status > 0 && of.by_factors && leaves_more(&now, options))
+    if (now.status > 0 && direct && leaves_more(&now, options))
       now.status = 0;
     if (now.status > 0 && !(left <= UNSOLVED * of.state)) /* an unsolved linear system does not count as a small
                                                            * correction */

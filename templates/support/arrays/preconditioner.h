@@ -4,15 +4,142 @@
 #include "array_newton.h"
 #include "envelope.h"
 
-/* Preconditioner for Newton-GMRES: factors of F' (envelope.h), and unless FACTORS_ALONE Fourier modes (ON_LATTICES) or
- * the diagonal of F'. */
+/* Preconditioner for Newton-GMRES: factors of F' (envelope.h), Fourier modes (ON_LATTICES), or unless FACTORS_ALONE the
+ * diagonal of F'. */
 #ifdef ON_LATTICES
+/* Fourier preconditioner for Newton-GMRES on lattices: the mean of F' over a lattice, a circulant matrix, which is
+ * diagonal in Fourier space (T. F. Chan, SIAM J. Sci. Stat. Comput. 9, 1988, 766). It is accurate if the couplings
+ * are uniform and boundaries few; otherwise the diagonal of F' is used. */
+
+enum { SPACING = 2 * FARTHEST + 1 };
+
+#define COUPLED 0.1 /* relative to the diagonal: weaker couplings do not justify the Fourier preconditioner */
+
+/* Describes the lattices and the location of their roots of unity; returns 0 if one cannot be transformed or is too
+ * small for stencil probing. */
+static int find_lattices(const linear_system *of, lattice *all)
+{
+  double *next = of->work->roots;
+  int sound = 1;
+  describe_lattices(of->step->given, all);
+  for (lattice *one = all; one < all + LATTICES; one++)
+    for (int a = 0; a < one->axes; a++) {
+      const long long size = one->size[a];
+      const roots of_one = {next, next + size};
+      one->of_one[a] = of_one;
+      next += 2 * size;
+      sound &= can_be_transformed(size) && size >= SPACING * COMPONENTS;
+    }
+  return sound;
+}
+
+/* exp(-2 pi i k / size) for all axes. */
+static void find_roots(const linear_system *of, const lattice *all)
+{
+  for (const lattice *one = all; one < all + LATTICES; one++)
+    for (int a = 0; a < one->axes; a++) {
+      const long long size = one->size[a];
+      const section own = share_of(of->run, size);
+      fill_roots(one->of_one[a], size, own.first, own.end);
+    }
+}
+
+/* Fourier transform along all axes of a lattice of all parts of the state, in place in x; y is overwritten. */
+static void transform_lattice(const linear_system *of, const lattice *one, complex_lanes *x, complex_lanes *y)
+{
+  complex_lanes from = *x, into = *y;
+  for (int part = 0; part < X_VECTORS; part++) {
+    long long inner = one->components, outer = positions_of(one);
+    from = *x, into = *y;
+    for (int a = one->axes - 1; a >= 0; a--) {
+      axis along = {one->first + part * of->n, outer / one->size[a], one->size[a], inner, one->of_one[a]};
+      transform(of->run, &along, &from, &into, X_VECTORS * of->n);
+      inner *= one->size[a], outer /= one->size[a];
+    }
+  }
+  *x = from, *y = into;
+}
+
+/* The Fourier modes of a lattice that belong to this thread. */
+static section modes_of(const linear_system *of, const lattice *one)
+{
+  section own = share_of(of->run, positions_of(one) * one->components);
+  own.first += one->first, own.end += one->first;
+  return own;
+}
+
+#ifdef CIRCULANT_MODES
+#ifdef FACTORS_ALONE
+/* Numbers of this thread for a coordinate: h times the derivatives -H_qq and H_pp of its Fourier mode. */
+static inline double *rates_of_mode(const linear_system *of, long long i)
+{
+  return of->work->inverse + 2 * i;
+}
+
+/* Computes the Fourier modes of the mean of h J H'' without H_qp; returns 0 if a lattice cannot be transformed. */
+static int invert_modes(linear_system *of)
+{
+  lattice all[LATTICES];
+  if (!find_lattices(of, all))
+    return 0;
+  find_roots(of, all);
+  jacobian_modes(of->step, of->points->X, of->work->forces);
+  for (long long i = of->own.first; i < of->own.end; i++) {
+    rates_of_mode(of, i)[0] = mean_derivative(of, of->work->forces, i + of->n);
+    rates_of_mode(of, i)[1] = mean_derivative(of, of->work->forces, i);
+  }
+  wait_at_barrier(of->run);
+  return 1;
+}
+
+/* Solves x - h A J H'' x = y / places for the modes of this thread, in eigenvectors of A. */
+static void apply_inverses_of_modes(const linear_system *of, lanes *x, section own, double places)
+{
+  const envelope all = {.stride = X_VECTORS * of->n};
+  for (long long i = own.first; i < own.end; i++) {
+    const double *rates = rates_of_mode(of, i);
+    const complex_shifts mu = {shifts_at(MU), shifts_at(MU + SHIFTS)}, square = product_of(mu, mu);
+    const complex_shifts q = to_shifts(&all, x + i, 1.0 / places), p = to_shifts(&all, x + of->n + i, 1.0 / places);
+    const complex_shifts from_q = product_of(mu, q), from_p = product_of(mu, p);
+    const shifts re = 1.0 - rates[0] * rates[1] * square.re, im = -(rates[0] * rates[1]) * square.im;
+    const shifts size = 1.0 / (re * re + im * im);
+    const complex_shifts inverse = {re * size, -im * size};
+    const complex_shifts position = {q.re + rates[1] * from_p.re, q.im + rates[1] * from_p.im};
+    const complex_shifts momentum = {p.re + rates[0] * from_q.re, p.im + rates[0] * from_q.im};
+    from_shifts(&all, product_of(inverse, position), x + i);
+    from_shifts(&all, product_of(inverse, momentum), x + of->n + i);
+  }
+}
+#else
+/* Computes the inverses of the Fourier modes of the mean of h^2 F' / m; returns 0 if a lattice cannot be transformed.
+ */
+static int invert_modes(linear_system *of)
+{
+  lattice all[LATTICES];
+  if (!find_lattices(of, all))
+    return 0;
+  find_roots(of, all);
+  jacobian_modes(of->step, of->points->X, of->work->forces);
+  for (const lattice *one = all; one < all + LATTICES; one++) {
+    const double places = (double)positions_of(one), count = places * (double)one->components;
+    const section own = modes_of(of, one);
+    double unit = 0.0;
+    for (long long i = one->first; (double)(i - one->first) < count; i++)
+      unit += unit_of(of->points, i) / count;
+    for (long long i = own.first; i < own.end; i++) {
+      const double derivative = mean_derivative(of, of->work->forces, i) / unit_of(of->points, i);
+      keep_inverse(of, i, unit * derivative, 1.0 / places);
+    }
+  }
+  wait_at_barrier(of->run);
+  return 1;
+}
+#endif
+#else
 /* Mean stencil of h^2 F' / m on a lattice by stencil probing: probes are placed so far apart that their responses do
  * not overlap or reach a boundary, and F' is multiplied by all of them at once. Requires: lattice_transform.h,
  * describe_lattices; FARTHEST, the stencil radius on an axis, and COMPONENTS, the number of components of all
  * lattices. */
-
-enum { SPACING = 2 * FARTHEST + 1 };
 
 /* Probes: on each axis the first index, their distance and number. */
 typedef struct {
@@ -128,60 +255,6 @@ static double off_diagonal_ratio(const linear_system *of, const lattice *all, co
   return largest;
 }
 
-/* Fourier preconditioner for Newton-GMRES on lattices: the mean of F' over a lattice, a circulant matrix, which is
- * diagonal in Fourier space (T. F. Chan, SIAM J. Sci. Stat. Comput. 9, 1988, 766). It is accurate if the couplings
- * are uniform and boundaries few; otherwise the diagonal of F' is used. */
-
-#define COUPLED 0.1 /* relative to the diagonal: weaker couplings do not justify the Fourier preconditioner */
-
-/* Describes the lattices and the location of their roots of unity; returns 0 if one cannot be transformed or is too
- * small for stencil probing. */
-static int find_lattices(const linear_system *of, lattice *all)
-{
-  double *next = of->work->roots;
-  int sound = 1;
-  describe_lattices(of->step->given, all);
-  for (lattice *one = all; one < all + LATTICES; one++)
-    for (int a = 0; a < one->axes; a++) {
-      const long long size = one->size[a];
-      const roots of_one = {next, next + size};
-      one->of_one[a] = of_one;
-      next += 2 * size;
-      sound &= can_be_transformed(size) && size >= SPACING * COMPONENTS;
-    }
-  return sound;
-}
-
-/* exp(-2 pi i k / size) for all axes. */
-static void find_roots(const linear_system *of, const lattice *all)
-{
-  for (const lattice *one = all; one < all + LATTICES; one++)
-    for (int a = 0; a < one->axes; a++) {
-      const long long size = one->size[a];
-      const section own = share_of(of->run, size);
-      fill_roots(one->of_one[a], size, own.first, own.end);
-    }
-}
-
-/* Fourier transform along all axes of a lattice, in place in x; y is overwritten. */
-static void transform_lattice(const linear_system *of, const lattice *one, complex_lanes *x, complex_lanes *y)
-{
-  long long inner = one->components, outer = positions_of(one);
-  for (int a = one->axes - 1; a >= 0; a--) {
-    axis along = {one->first, outer / one->size[a], one->size[a], inner, one->of_one[a]};
-    transform(of->run, &along, x, y, of->n);
-    inner *= one->size[a], outer /= one->size[a];
-  }
-}
-
-/* The Fourier modes of a lattice that belong to this thread. */
-static section modes_of(const linear_system *of, const lattice *one)
-{
-  section own = share_of(of->run, positions_of(one) * one->components);
-  own.first += one->first, own.end += one->first;
-  return own;
-}
-
 /* Computes the inverses of the Fourier modes of the mean stencil; returns 0 if a lattice cannot be transformed or
  * couplings are negligible. */
 static int invert_modes(linear_system *of)
@@ -206,6 +279,7 @@ static int invert_modes(linear_system *of)
   wait_at_barrier(of->run);
   return 1;
 }
+#endif
 
 /* y = the inverses of the Fourier modes times x, by transforms; the result is in the real parts. */
 static void apply_modes(const linear_system *of, const lanes *x, lanes *y)
@@ -219,8 +293,13 @@ static void apply_modes(const linear_system *of, const lanes *x, lanes *y)
     const section own = modes_of(of, one);
     complex_lanes modes = {y, of->work->forces}, spare = {of->work->spare, of->work->spare + of->count}, turned, other;
     transform_lattice(of, one, &modes, &spare);
+#ifdef FACTORS_ALONE
+    apply_inverses_of_modes(of, modes.re, own, (double)positions_of(one));
+    apply_inverses_of_modes(of, modes.im, own, (double)positions_of(one));
+#else
     apply_inverses(of, modes.re, modes.re, own);
     apply_inverses(of, modes.im, modes.im, own);
+#endif
     wait_at_barrier(of->run);
     turned.re = modes.im, turned.im = modes.re; /* inverse transform: real and imaginary parts exchanged */
     other.re = spare.im, other.im = spare.re;
@@ -234,23 +313,27 @@ static void apply_modes(const linear_system *of, const lanes *x, lanes *y)
 
 static void precondition(const linear_system *of, const lanes *x, lanes *y)
 {
-#ifndef FACTORS_ALONE
-  if (of->by_fourier) {
+  if (of->by_fourier)
     apply_modes(of, x, y);
-    return;
-  }
-  if (!of->by_factors) {
+  else if (of->by_factors)
+    apply_factors(of, x, y);
+  else
+#ifdef FACTORS_ALONE
+    set_multiple(of, y, 1.0, x);
+#else
     apply_inverses(of, x, y, of->own);
-    return;
-  }
 #endif
-  apply_factors(of, x, y);
 }
 
 /* Computes the preconditioner, at the first points of a step the Fourier one if coordinates are coupled. */
 static void find_inverses(linear_system *of)
 {
-#ifndef FACTORS_ALONE
+#ifdef FACTORS_ALONE
+  if (!of->by_factors) {
+    of->by_fourier = invert_modes(of);
+    return;
+  }
+#else
   if (!of->by_factors) {
     of->by_fourier = (of->tried == 0 || of->by_fourier) && invert_modes(of);
     if (!of->by_fourier)
@@ -265,6 +348,10 @@ static void find_inverses(linear_system *of)
  * diagonal for one cycle, then keeps the better one. */
 static void choose_preconditioner(linear_system *of, double left)
 {
+#ifdef FACTORS_ALONE
+  (void)of, (void)left;
+  return;
+#endif
   if (of->tried == 0 && of->by_fourier) {
     of->tried = 1, of->left = left;
     of->by_fourier = 0;

@@ -47,7 +47,7 @@ static work_arrays bind_work_arrays(const run_memory *run, long long n)
   of.basis = next_array(&rest, X_VECTORS * (BASIS + 1) * POINTS * n);
 #endif
 #ifdef ON_LATTICES
-  of.spare = next_array(&rest, 2 * POINTS * n);
+  of.spare = next_array(&rest, 2 * X_VECTORS * POINTS * n);
   of.roots = next_array(&rest, 2 * AXES * n);
 #endif
   for (size_t k = 0; k < sizeof vectors / sizeof *vectors; k++)
