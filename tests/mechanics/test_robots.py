@@ -232,7 +232,11 @@ CHANGES = {
     "numbers": (lambda text: text.replace("1 2 -2", "1 2"), "3 finite numbers"),
     "text": (lambda text: text.replace("1 2 -2", "1 2 x"), "must be numbers"),
     "infinite": (lambda text: text.replace("1 2 -2", "1 2 inf"), "finite numbers"),
-    "negative": (lambda text: text.replace('mass value="1.2"', 'mass value="-1.2"'), "none may be < 0"),
+    "negative": (
+        lambda text: text.replace('mass value="1.2"', 'mass value="-1.2"'),
+        "mass -1.2, which must not be < 0",
+    ),
+    "negative moment": (lambda text: text.replace('ixx="0.05"', 'ixx="-0.05"'), "'upper', with the links fixed to it,"),
     "twice": (lambda text: text.replace('link name="tool"', 'link name="base"'), "is defined twice"),
     "no value": (lambda text: text.replace('<mass value="1.2"/>', "<mass/>"), "has no attribute 'value'"),
     "follows": (lambda text: text.replace('mimic joint="shoulder"', 'mimic joint="sholder"'), "'sholder', which is no"),
@@ -246,6 +250,15 @@ def test_malformed_urdf_is_refused_by_name(change, tmp_path):
     file.write_text(edit((ROBOTS / "arm.urdf").read_text()))
     with pytest.raises(SystemDefinitionError, match=re.escape(message)):
         sc.LagrangianSystem.from_urdf(file)
+
+
+def test_moments_of_inertia_are_checked_with_fixed_links(tmp_path):
+    text, file = (ROBOTS / "arm.urdf").read_text(), tmp_path / "arm.urdf"
+    negative = text.replace('ixx="0.001"', 'ixx="-0.001"')  # of the sensor: its sum with that of the arm is positive
+    rounded = negative.replace('"0.0001"', '"-5.4e-20"').replace('"0.0002"', '"0"')
+    file.write_text(rounded)
+    assert rounded != negative != text
+    assert len(sc.LagrangianSystem.from_urdf(file).coordinates) == 2
 
 
 MUJOCO_CHANGES = {
