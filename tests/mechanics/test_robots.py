@@ -303,6 +303,39 @@ def test_included_files_are_read_and_total_masses_scaled(tmp_path):
         sc.LagrangianSystem.from_mjcf(tmp_path / "all.xml")
 
 
+def test_nested_includes_flags_and_groups_of_geoms_are_read(tmp_path):
+    text, file = (ROBOTS / "ball.xml").read_text(), tmp_path / "all.xml"
+    inside = re.search("<worldbody>(.*)</worldbody>", text, re.DOTALL).group(1)
+    (tmp_path / "body.xml").write_text(f"<mujocoinclude>{inside}</mujocoinclude>")
+    one = sc.LagrangianSystem.from_mjcf(ROBOTS / "ball.xml")
+    file.write_text(text.replace(inside, '<frame><include file="body.xml"/></frame>'))
+    assert sc.LagrangianSystem.from_mjcf(file).lagrangian == one.lagrangian
+    still = '<option><flag gravity="disable" spring="disable" damper="disable"/></option><worldbody>'
+    file.write_text(text.replace("<worldbody>", still))
+    free = sc.LagrangianSystem.from_mjcf(file)
+    state, at_rest = {"R_ball": np.eye(3), "swing": 0.3}, {"omega_ball": np.zeros(3), "swing": 0.0}
+    assert value(free, state, at_rest) == 0.0 != value(one, state, at_rest)
+    pin = '<mujoco><compiler {}/><worldbody><body><joint/><geom size="0.1" pos="1 0 0"/>{}</body></worldbody></mujoco>'
+    seen = []
+    for setting, geom in (("", ""), ('inertiagrouprange="0 2"', '<geom size="0.2" group="3"/>')):
+        file.write_text(pin.format(setting, geom))
+        seen.append(sc.LagrangianSystem.from_mjcf(file).lagrangian)
+    assert seen[0] == seen[1]
+    file.write_text(text.replace("<worldbody>", '<compiler boundmass="0.1"/><worldbody>'))
+    with pytest.raises(SystemDefinitionError, match="has boundmass, which is not read"):
+        sc.LagrangianSystem.from_mjcf(file)
+
+
+def test_joints_with_dry_friction_are_named_in_one_warning(tmp_path):
+    file = tmp_path / "arm.urdf"
+    text = (ROBOTS / "arm.urdf").read_text().replace("<dynamics", '<dynamics friction="0.1"')
+    file.write_text(text.replace('<limit lower="-1"', '<dynamics friction="0.2"/><limit lower="-1"'))
+    with pytest.warns(UserWarning, match=r"dry friction of .*, rail-1 is not read") as caught:
+        sc.LagrangianSystem.from_urdf(file)
+    assert len(caught) == 1
+    assert Path(caught[0].filename).name == "test_robots.py"
+
+
 def test_robot_in_which_nothing_moves_is_refused(tmp_path):
     file = tmp_path / "still.urdf"
     file.write_text('<robot name="still"><link name="base"/></robot>')
