@@ -28,7 +28,7 @@ from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.tables.precision import DIGITS, ZERO, mp
+from scvi_codegen.tables.precision import DIGITS, mp
 
 SMALLEST = S(10) ** -300
 """Added to the square of an angle, so that sin(x)/x and its derivative have values at 0."""
@@ -160,8 +160,6 @@ def _body(first: int, v: Sequence[Expr], p: Sequence[Expr], system: MechanicalSy
     if inverse.free_symbols:
         return "products of inertia depend on parameters (write them as numbers, or choose principal axes as body axes)"
     values, axes = mp.eigsy(mp.matrix([[str(x.evalf(DIGITS)) for x in row] for row in inverse.tolist()]))
-    for i, j in pairwise(range(3)):  # equal moments
-        values[j] = values[i] if values[j] - values[i] < ZERO * values[j] else values[j]
     axes *= mp.sign(mp.det(axes))
     moments, *rows = ([Float(str(x), DIGITS) for x in row] for row in (values, *axes.tolist()))
     return *_axes(first, moments, system), Matrix(rows)
