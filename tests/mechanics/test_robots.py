@@ -321,6 +321,9 @@ def test_nested_includes_flags_and_groups_of_geoms_are_read(tmp_path):
         file.write_text(pin.format(setting, geom))
         seen.append(sc.LagrangianSystem.from_mjcf(file).lagrangian)
     assert seen[0] == seen[1]
+    base = '<body name="base"><geom type="mesh" mesh="m"/>'  # fixed to the world
+    file.write_text(text.replace(inside, f"{base}{inside}</body>"))
+    assert sc.LagrangianSystem.from_mjcf(file).lagrangian == one.lagrangian
     file.write_text(text.replace("<worldbody>", '<compiler boundmass="0.1"/><worldbody>'))
     with pytest.raises(SystemDefinitionError, match="has boundmass, which is not read"):
         sc.LagrangianSystem.from_mjcf(file)

@@ -56,6 +56,7 @@ class _MujocoModel:
         flags = (flag.node for section in self.inside("option") for flag in section.children("flag"))
         self.disabled = {name for flag in flags for name, value in flag.items() if value == "disable"}
         self.rough: list[str] = []
+        self.still: set[int] = set()
         self.classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
         for section in self.sections:
             if section.node.tag == "compiler":
@@ -129,7 +130,9 @@ class _MujocoModel:
             self.links.append(Link(label, parent, self.joint(joint, label, place, frame, parent), Inertia()))
             parent, pose, anchor = len(self.links) - 1, Pose(), at
         carried = Joint(name=name, kind="fixed", pose=pose @ Pose(-anchor))
-        inertia = self.inertia(body, inherited).compensated(body.number("gravcomp", 0))
+        fixed = (parent < 0 or parent in self.still) and "settotalmass" not in self.settings  # to the world
+        inertia = Inertia() if fixed else self.inertia(body, inherited).compensated(body.number("gravcomp", 0))
+        self.still |= {len(self.links)} if fixed else set()
         self.links.append(Link(name, parent, carried, inertia))
         return len(self.links) - 1
 
