@@ -237,7 +237,7 @@ class _RotatingParser(Parser):
     def name(self, name: str, column: int) -> Expr:
         entries = [each for each in (f"{name}_11", f"{name}_1") if each in self.symbols and name not in self.symbols]
         if entries:
-            self.refuse(f"'{name}' is no number: write one of its components, as {entries[0]}", column)
+            self.refuse(f"'{name}' is not a scalar: write one of its components, as {entries[0]}", column)
         if name not in ROTATING and name.removeprefix("un").startswith("rotate"):
             self.refuse(f"'{name}' is not a function: known are {', '.join(ROTATING)}", column)
         if name not in ROTATING:
