@@ -159,6 +159,7 @@ KINDS = {
     r"Sequence\[str\] \| Mapping\[str, Any\]": TABLES,
     r"Sequence\[Mapping\[str, Any\]\]": MAPPINGS,
     r"Sequence\[Expr( \| str)?\]": FORMULAS,
+    r"Mapping\[str, str\]": of("a mapping from names to names, as {'R': 'omega'}", Mapping),
     r"Mapping\[str, [^|]+\]": MAPPING,
     r"Mapping\[(Any|Expr|Symbol)( \| str)?, [^|]+\]": MAPPED,
     r"Callable\[.*\]": FUNCTION,

@@ -12,7 +12,7 @@ import numpy as np
 import sympy
 from sympy import Expr, Symbol
 
-from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.fields.assembly import Assembly
 from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis, fourier, spectral_elements
 from scvi_codegen.fields.density import Density, derivatives_of
@@ -201,7 +201,7 @@ class FieldSystem(Density):
         kinds = dict(boundary or {})
         for axis in kinds:
             if axis not in space:
-                raise SystemDefinitionError(f"there is a boundary for '{axis}'{closest(axis, [*space])}")
+                raise SystemDefinitionError(f"there is no axis '{axis}', as in boundary. Axes: {', '.join(space)}")
         prescribed = {each: known[each] for each in (TIME, *values)}
         natural = (NATURAL, NATURAL)
         return cls(

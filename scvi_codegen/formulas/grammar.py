@@ -50,7 +50,7 @@ _SPACE = re.compile(r"[ \t\r\n\f]*")
 
 _HINTS = {
     ".": "attribute access is not part of the grammar",
-    "[": "subscripts require arrays, declared among the coordinates or parameters, as q[N]",
+    "[": "subscripts require arrays, declared among the coordinates or parameters, as q[N] (of a rotation: R_11)",
     "^": "powers are written x**2",
     "=": "comparisons, assignments and keyword arguments are not part of the grammar",
     "<": "comparisons are not part of the grammar",

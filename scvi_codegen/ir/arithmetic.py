@@ -25,26 +25,8 @@ from scvi_codegen.formulas.expressions import rint, unit_step
 from scvi_codegen.formulas.intermediates import Intermediate, intermediates
 from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation, exact_number
 
-FUNCTIONS = {
-    sympy.sin: "sin",
-    sympy.cos: "cos",
-    sympy.tan: "tan",
-    sympy.asin: "asin",
-    sympy.acos: "acos",
-    sympy.atan: "atan",
-    sympy.atan2: "atan2",
-    sympy.sinh: "sinh",
-    sympy.cosh: "cosh",
-    sympy.tanh: "tanh",
-    sympy.asinh: "asinh",
-    sympy.acosh: "acosh",
-    sympy.atanh: "atanh",
-    sympy.exp: "exp",
-    sympy.log: "log",
-    rint: "rint",
-}
-
-
+CIRCULAR = ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh")
+FUNCTIONS = {getattr(sympy, name): name for name in (*CIRCULAR, "atan2", "exp", "log")} | {rint: "rint"}
 INVERSE_ROOTS = {k: f"inverse_root_{k}" for k in (1, 3, 5, 7)}
 
 

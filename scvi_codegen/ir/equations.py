@@ -323,6 +323,7 @@ class Splitting:
         bodies: of rigid bodies, whose quaternions turn in closed form, the index of the first component of the
             quaternion and the axes j and k (:mod:`scvi_codegen.mechanics.splitting`).
         turning: a_i, a_j - a_i and a_k - a_i of each body (no arguments), or ``None``.
+        principal: of each body the principal axes as columns, row by row; empty if they are the body axes.
     """
 
     kicks: tuple[Number, ...]
@@ -333,6 +334,7 @@ class Splitting:
     by_masses: bool
     bodies: tuple[tuple[int, ...], ...] = ()
     turning: Kernel | None = None
+    principal: NumberTable = ()
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:

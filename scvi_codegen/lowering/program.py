@@ -104,6 +104,7 @@ def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
     if not method.fractions or system.constraints or isinstance(split := kinetic_splitting(system), str):
         return None
     moved, (kicks, drifts) = split.system, kicks_and_drifts(method, split)
+    turned = any(not each.is_diagonal() for each in split.axes)
     turning = system_kernel(moved, "turning", sum(split.rates, ()), of=(), purpose="a_i, a_j - a_i, a_k - a_i.")
     if split.velocity:
         drift = system_kernel(moved, "drift_velocity", split.velocity, of=moved.auxiliaries, purpose="H_p at u = p.")
@@ -118,6 +119,7 @@ def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
         by_masses=not split.velocity,
         bodies=tuple((first, *axes) for first, _, *axes in split.bodies),
         turning=turning if split.bodies else None,
+        principal=lower_matrix(tuple(tuple(map(mp.mpf, map(str, each))) for each in split.axes if turned)),
     )
 
 

@@ -160,6 +160,7 @@ class LagrangianSystem(MechanicalSystem):
         forces: Mapping[Expr | str, Any] | None = None,
         torques: Mapping[str, Sequence[Expr]] | None = None,
         torques_space: Mapping[str, Sequence[Expr]] | None = None,
+        point_forces: Sequence[Mapping[str, Any]] = (),
         dissipation: Expr | None = None,
         damping: Expr | float | None = None,
         constraints: Sequence[Expr] = (),
@@ -176,7 +177,7 @@ class LagrangianSystem(MechanicalSystem):
             name: name of the system.
             lagrangian: L.
             coordinates: symbols, or functions of time such as ``dynamicsymbols`` returns.
-            rotations, directions, torques, torques_space: as of :meth:`from_text`; the names in formulas are symbols,
+            rotations, directions, torques, torques_space, point_forces: as of :meth:`from_text`; names are symbols,
                 ``Symbol("R_33")``, ``Symbol("omega_1")``. A frame ``B.orient_quaternion(N, ..)`` is declared by
                 ``{B: N}``: its rotation is called as the frame, and its angular velocity ``omega``, or ``omega_B`` if
                 there are several frames.
@@ -204,27 +205,12 @@ class LagrangianSystem(MechanicalSystem):
         from scvi_codegen.mechanics.first_order import system_of
         from scvi_codegen.mechanics.reading import system_from_sympy
 
-        system: LagrangianSystem = system_from_sympy(
-            partial(system_of, cls),
-            "Lagrangian",
-            lagrangian,
-            name=name,
-            coordinates=coordinates,
-            velocities=velocities,
-            time=time,
-            parameters=parameters,
-            forces=forces,
-            dissipation=dissipation,
-            damping=damping,
-            constraints=constraints,
-            inputs=inputs,
-            tables=tables,
-            neighbours=neighbours,
-            rotations=rotations,
-            directions=directions,
-            torques=torques,
-            torques_space=torques_space,
-        )
+        known: dict[str, Any] = {"name": name, "coordinates": coordinates, "velocities": velocities, "time": time}
+        known |= {"parameters": parameters, "inputs": inputs, "tables": tables, "neighbours": neighbours}
+        known |= {"forces": forces, "dissipation": dissipation, "damping": damping, "constraints": constraints}
+        known |= {"rotations": rotations, "directions": directions, "point_forces": point_forces}
+        known |= {"torques": torques, "torques_space": torques_space}
+        system: LagrangianSystem = system_from_sympy(partial(system_of, cls), "Lagrangian", lagrangian, **known)
         return system
 
     @classmethod

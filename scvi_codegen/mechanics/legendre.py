@@ -28,6 +28,8 @@ from scvi_codegen.validation import TEXTS, checks_arguments, of
 
 LARGEST_INVERSE = 3
 """Largest number of coupled momenta (velocities) whose quadratic form is inverted symbolically."""
+LONGEST_EXPANDED = 200
+"""Operations of a matrix whose determinants are expanded; those of directions take minutes."""
 NEGLIGIBLE = mp.mpf(10) ** -30
 
 
@@ -75,10 +77,12 @@ def inverse_form(hessian_entries: Mapping[tuple[int, int], Expr], block: Sequenc
             "as it is"
         )
     size = len(block)
-    matrix = sympy.Matrix(size, size, lambda a, b: hessian_entries.get((block[a], block[b]), 0))
+    entries = sympy.Matrix(size, size, lambda a, b: hessian_entries.get((block[a], block[b]), 0))
+    long = sympy.count_ops(tuple(entries)) > LONGEST_EXPANDED
+    matrix = sympy.Matrix(size, size, lambda a, b: sympy.Dummy(f"C_{a}{b}")) if long else entries
     adjugate, determinant = matrix.adjugate(), matrix.det(method="berkowitz")
     terms = [adjugate[a, b] * y[i] * y[j] for a, i in enumerate(block) for b, j in enumerate(block)]
-    return sympy.Add(*terms) / (2 * determinant)
+    return (sympy.Add(*terms) / (2 * determinant)).xreplace(dict(zip(matrix, entries, strict=True)) if long else {})
 
 
 def _inverse_derivative(

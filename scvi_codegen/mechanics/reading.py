@@ -172,7 +172,14 @@ def system_from_sympy(
         for each in TORQUES
     )
     friction = None if dissipation is None else expression_of(dissipation, "dissipation")
-    acted = [f for each in (applied, torques, torques_space) for f in each.values()]
+    points = [
+        {
+            k: _components(f, f"{k} of point_forces", expression_of) if k not in ("body", "frame") else str(f)
+            for k, f in each.items()
+        }
+        for each in turning.get("point_forces") or ()
+    ]
+    acted = [f for each in (applied, torques, torques_space, *points) for f in each.values() if not isinstance(f, str)]
     rate = damping_rate(damping, lambda each: sympy_expression(each, "damping"))
     conditions = constraints_of(constraints, lambda g: expression_of(g, "constraint"))
     input_names = tuple(name_of_key(each) for each in inputs)
@@ -196,7 +203,7 @@ def system_from_sympy(
     ordinary = [q.name for q in translation.coordinates]
     if names.members:
         check_names(ordinary, tuple(constants), (), (*names.coordinates, *names.symbols))
-    acting = _acting(names, ordinary, reader("forces"), by_name, (torques, torques_space), friction)
+    acting = _acting(names, ordinary, reader("forces"), by_name, (torques, torques_space), friction, points)
     expression, conditions = reader(function)(formula), constraints_of(conditions, reader("constraints"))
     return _system(
         cls,

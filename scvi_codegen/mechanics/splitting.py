@@ -5,19 +5,21 @@ V changes the momenta only. T is the kinetic energy of bodies with the principal
     T = T_x(p_x) + sum (a_1 Pi_1^2 + a_2 Pi_2^2 + a_3 Pi_3^2)/2,      Pi = E(q)^T p/2.
 
 Its exact flow q <- q g, p <- p g with a unit quaternion g conserves |q| and q . p, the gauge, and the angular momentum
-in space to round-off. If two moments are equal, a_i = a_j, g is the product exp(t a_i Pi/2) exp(t (a_k - a_i) Pi_k
-e_k/2) (E. J. Routh, Advanced Rigid Dynamics). Otherwise g contains Jacobi's elliptic functions and an elliptic integral
-of the third kind (E. Celledoni, F. Fasso, N. Saefstroem, A. Zanna, SIAM J. Sci. Comput. 30 (2008), 2084-2112), in the
-form of ``free_rotation.h``. The C code computes them by doubling the argument or by arithmetic-geometric means; the
-expressions of this module, from which the derivatives of a step are computed, by doubling the argument.
+in space to round-off. Pi and the vector part of g are written in principal axes, the eigenvectors of an inertia matrix
+of numbers if it is not diagonal. If two moments are equal, a_i = a_j, g is the product exp(t a_i Pi/2)
+exp(t (a_k - a_i) Pi_k e_k/2) (E. J. Routh, Advanced Rigid Dynamics). Otherwise g contains Jacobi's elliptic functions
+and an elliptic integral of the third kind (E. Celledoni, F. Fasso, N. Saefstroem, A. Zanna, SIAM J. Sci. Comput. 30
+(2008), 2084-2112), in the form of ``free_rotation.h``. The C code computes them by doubling the argument or by
+arithmetic-geometric means; the expressions of this module, from which derivatives of a step are computed, by doubling.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise, permutations
+from typing import Any
 
-from sympy import Add, Expr, Quaternion, S, atan2, cos, expand, sin, sqrt
+from sympy import Add, Expr, Float, Matrix, Quaternion, S, atan2, cos, expand, eye, sin, sqrt, zeros
 
 from scvi_codegen.formulas.expressions import jacobian
 from scvi_codegen.formulas.intermediates import intermediate
@@ -26,6 +28,7 @@ from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.tables.precision import DIGITS, mp
 
 SMALLEST = S(10) ** -300
 """Added to the square of an angle, so that sin(x)/x and its derivative have values at 0."""
@@ -41,6 +44,7 @@ class KineticSplitting:
         system: the form that is split, the equivalent Lagrangian if its masses are constant (``velocity`` is empty).
         bodies: of each rigid body, the index of the first component of its quaternion and the axes i, j, k from 0.
         rates: of each body a_i, a_j - a_i, a_k - a_i.
+        axes: of each body the rotation matrix whose columns are its principal axes.
         velocity: m velocities in p of the ordinary coordinates, 0 for quaternions.
         force: m forces in q and t.
     """
@@ -50,23 +54,25 @@ class KineticSplitting:
     velocity: tuple[Expr, ...] = ()
     bodies: tuple[tuple[int, ...], ...] = ()
     rates: tuple[tuple[Expr, ...], ...] = ()
+    axes: tuple[Matrix, ...] = ()
 
     def flow(self, u: Sequence[Expr]) -> tuple[list[Expr], list[Expr]]:
         """Return q and u = t p after the flow of T in the time t, as functions of q and u, symbols as many as p."""
         q, p = self.system.coordinates, self.system.auxiliaries
         moved = [a + v.xreplace(dict(zip(p, u, strict=True))) for a, v in zip(q, self.velocity, strict=True)]
         turned = list(u)
-        for (first, _, j, k), (common, outer, inner) in zip(self.bodies, self.rates, strict=True):
+        for (first, _, j, k), (common, outer, inner), axes in zip(self.bodies, self.rates, self.axes, strict=True):
             own = slice(first, first + 4)
             pair = [Quaternion(*q[own]), Quaternion(*u[own])]
-            momentum = [intermediate(x / 2) for x in (pair[0].conjugate() * pair[1]).args[1:]]
+            momentum = [intermediate(x / 2) for x in axes.T * Matrix((pair[0].conjugate() * pair[1]).args[1:])]
             if outer == 0:
                 around = [inner * x / 2 if n == k else S.Zero for n, x in enumerate(momentum)]
                 g = _turn([common * x / 2 for x in momentum]) * _turn(around)
             else:
                 offsets = {j: outer, k: inner}
                 g = _elliptic_turn(j, [intermediate(common + offsets.get(n, S.Zero)) for n in range(3)], momentum)
-            moved[own], turned[own] = (list((x * Quaternion(*map(intermediate, g.args))).args) for x in pair)
+            g = Quaternion(*map(intermediate, (g.a, *(axes * Matrix(g.args[1:])))))
+            moved[own], turned[own] = (list((x * g).args) for x in pair)
         return moved, turned
 
 
@@ -129,9 +135,9 @@ def kinetic_splitting(system: MechanicalSystem) -> KineticSplitting | str:
     velocity = [expand(each.xreplace(upright)) if members else each for each in forms.legendre]
     if jacobian(velocity, (*q, system.time)):
         return "the kinetic energy has coefficients that depend on coordinates or time"
-    inverse = {i: velocity[i].diff(p[i]) for i in turning}
-    if any(expand(velocity[i] - inverse[i] * p[i]) != 0 for i in turning):
-        return "the kinetic energy couples angular velocities with each other or with other velocities"
+    bodies = [_body(k, velocity[k : k + 4], p[k + 1 : k + 4], system) for k in places]
+    if reasons := [each for each in bodies if isinstance(each, str)]:
+        return reasons[0]
     at_rest = dict.fromkeys(p, S.Zero)
     if members:
         energy = Add(*(v * x / 2 for v, x in zip(velocity, p, strict=True))).xreplace(dict(zip(p, values, strict=True)))
@@ -140,9 +146,23 @@ def kinetic_splitting(system: MechanicalSystem) -> KineticSplitting | str:
     force = [each.xreplace(at_rest) for each in forms.force] if members else forms.force
     if jacobian(system.forces if members else force, (*system.velocities, *p)):
         return "there are forces or torques that depend on velocities"
-    bodies = [_axes(k, [4 * inverse[k + n] for n in (1, 2, 3)], system) for k in places]
     ordinary = tuple(S.Zero if i in turning else each for i, each in enumerate(velocity))
     return KineticSplitting(system, tuple(force), ordinary, *map(tuple, zip(*bodies, strict=True)))
+
+
+def _body(first: int, v: Sequence[Expr], p: Sequence[Expr], system: MechanicalSystem) -> tuple[Any, ...] | str:
+    """Return (first, i, j, k), the rates and the principal axes of a body, or the reason why there are none."""
+    inverse = 4 * Matrix(v[1:]).jacobian(p)
+    if (Matrix(v) - zeros(1, 1).col_join(inverse * Matrix(p) / 4)).expand() != zeros(4, 1):
+        return "the kinetic energy couples angular velocities with those of other bodies or with other velocities"
+    if inverse.is_diagonal():
+        return *_axes(first, inverse.diagonal(), system), eye(3)
+    if inverse.free_symbols:
+        return "products of inertia depend on parameters (write them as numbers, or choose principal axes as body axes)"
+    values, axes = mp.eigsy(mp.matrix([[str(x.evalf(DIGITS)) for x in row] for row in inverse.tolist()]))
+    axes *= mp.sign(mp.det(axes))
+    moments, *rows = ([Float(str(x), DIGITS) for x in row] for row in (values, *axes.tolist()))
+    return *_axes(first, moments, system), Matrix(rows)
 
 
 def _axes(first: int, inverse: Sequence[Expr], system: MechanicalSystem) -> tuple[tuple[int, ...], tuple[Expr, ...]]:

@@ -26,7 +26,7 @@ def leapfrog_system(system: MechanicalSystem, method: Method) -> StageSystem:
     if isinstance(split, str):
         raise MethodError(
             f"{method.name} requires a separable system, L = sum m_i v_i^2 / 2 - V(q, t) with constant masses, "
-            "H = T(p) + V(q, t), or rigid bodies with constant moments of inertia about the axes of their rotations, "
+            "H = T(p) + V(q, t), or rigid bodies with constant moments and products of inertia, "
             f"without damping; '{system.name}' is not separable, because {split}: use an SVI"
         )
     kicks, drifts = kicks_and_drifts(method, split)

@@ -8,14 +8,8 @@ from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.rendering.text import MAX_ITERATIONS, TOLERANCE
 from scvi_codegen.validation import checked_count
 
-STATUS = {
-    1: "not converged",
-    2: "singular",
-    3: "not finite",
-    4: "step size underflow",
-    5: "spurious solution",
-    6: "no memory",
-}
+OUTCOMES = ("not converged", "singular", "not finite", "step size underflow", "spurious solution", "no memory")
+STATUS = dict(enumerate(OUTCOMES, 1))
 REASONS = {
     1: "the iteration did not converge",
     2: "a matrix is singular",

@@ -182,9 +182,10 @@ class EventFormulas:
         indices = [named.get(name, -1) for name in new]
         for index, (name, value) in zip(indices, new.items(), strict=True):
             if index < 0:
+                known = [str(x) for each in self._turning.rotations for x in (*each.rates, *each.momenta)] + [*named]
                 raise EventError(
                     f"then={{'{name}': '{value}'}} of the event '{event.function}': '{name}' is not a coordinate, a "
-                    f"momentum or a velocity{closest(name, named)} An event can set: {', '.join(named)}"
+                    f"momentum or a velocity{closest(name, known)} An event can set: {', '.join(known)}"
                 )
         if {index // len(self.q) for index in indices} >= {1, 2}:
             raise EventError(f"the event '{event.function}' sets momenta and velocities: set one or the other")

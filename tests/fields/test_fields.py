@@ -363,7 +363,7 @@ PROBLEMS = {
     "no bounds": ({"space": {"x": None}}, "lower and an upper bound"),
     "one bound": ({"space": {"x": (1,)}}, "lower and an upper bound"),
     "four axes": ({"space": dict.fromkeys("xyzw", (0, 1))}, "one to three"),
-    "axis": ({"boundary": {"y": "periodic"}}, "boundary for 'y'"),
+    "axis": ({"boundary": {"y": "periodic"}}, "no axis 'y'"),
     "boundary": ({"boundary": {"x": "open"}}, 'must be "periodic"'),
     "derivative at a boundary": ({"boundary": {"x": ({"u": 0, "u_x": 1}, 0)}}, "not of"),
     "field of a boundary": ({"boundary": {"x": ({"v": 0}, 0)}}, "not of"),
@@ -428,6 +428,8 @@ def test_korteweg_de_vries_needs_fourier_modes():
 
 
 def test_wrong_shapes_and_axes_are_refused():
+    with pytest.raises(SystemDefinitionError, match=r"no axis 'y', as in boundary\. Axes: x"):
+        string(boundary={"y": "periodic"})
     mesh = string(boundary={"x": "periodic"}).discretise("fourier", points=8)
     with pytest.raises(StateError, match="must have the shape"):
         mesh.integral(np.zeros(7))

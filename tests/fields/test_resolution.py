@@ -53,6 +53,15 @@ def test_recorded_pieces_and_ensembles_warn_of_unresolved_fields():
         stepper.integrate_ensemble({"u": members}, velocity={"u": 0 * members}, h=0.01, steps=4)
 
 
+def test_small_states_at_the_start_do_not_warn(recwarn):
+    mesh = ring().discretise("finite-differences", order=2, points=16)
+    rough, smooth = (-1.0) ** np.arange(16), np.cos(mesh.points["x"])
+    stepper = sc.compile_stepper(mesh.system, "stoermer-verlet", flags=QUICK_FLAGS)
+    run = stepper.integrate({"u": 1e-6 * rough}, velocity={"u": smooth}, h=0.01, steps=100)
+    assert run.unresolved()[0] == pytest.approx(1.0)
+    assert not recwarn.list
+
+
 @pytest.mark.full
 def test_recordings_report_the_unresolved_part_and_warn_of_it(tmp_path):
     mesh = ring().discretise("fourier", points=6)

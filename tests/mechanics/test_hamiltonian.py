@@ -335,3 +335,23 @@ def test_parameters_are_assumed_positive_if_their_values_are():
         parameters={"a": 1.0, "b": 0.0, "c": -1.0},
     )
     assert [given.name for given in positive_parameters(system)] == ["a"]
+
+
+def test_energy_error_is_relative_to_the_action_if_the_energy_starts_at_0():
+    pair = HamiltonianSystem.from_text("two spins", spins=["a", "b"], hamiltonian="a_1*b_1 + a_2*b_2")
+    run = compile_stepper(pair, SVI(2)).integrate({"a": [1, 0, 0], "b": [0, 0.6, 0.8]}, h=0.1, steps=50)
+    assert abs(run.energy()[0]) < 1e-15
+    assert run.energy_error() < 1e-13
+
+
+def test_the_hamiltonian_of_a_direction_has_its_energy():
+    pendulum = LagrangianSystem.from_text(
+        "spherical pendulum", directions=["n"], lagrangian="(n_1_dot**2 + n_2_dot**2 + n_3_dot**2)/2 - n_3"
+    )
+    hamiltonian = hamiltonian_of(pendulum).hamiltonian  # expanded determinants took minutes
+    n, v = np.array([0.36, 0.48, 0.8]), np.array([0.8, -0.6, 0.0])
+    values = {f"n_{x}": a for x, a in zip("xyz", n, strict=True)} | {
+        f"p_n_{x}": a for x, a in zip("xyz", v, strict=True)
+    }
+    energy = hamiltonian.subs({s: values[s.name] for s in hamiltonian.free_symbols})
+    assert float(energy) == pytest.approx(0.5 + 0.8, rel=1e-14)

@@ -232,7 +232,11 @@ CHANGES = {
     "numbers": (lambda text: text.replace("1 2 -2", "1 2"), "3 finite numbers"),
     "text": (lambda text: text.replace("1 2 -2", "1 2 x"), "must be numbers"),
     "infinite": (lambda text: text.replace("1 2 -2", "1 2 inf"), "finite numbers"),
-    "negative": (lambda text: text.replace('mass value="1.2"', 'mass value="-1.2"'), "none may be < 0"),
+    "negative": (
+        lambda text: text.replace('mass value="1.2"', 'mass value="-1.2"'),
+        "mass -1.2, which must not be < 0",
+    ),
+    "negative moment": (lambda text: text.replace('ixx="0.05"', 'ixx="-0.05"'), "'upper', with the links fixed to it,"),
     "twice": (lambda text: text.replace('link name="tool"', 'link name="base"'), "is defined twice"),
     "no value": (lambda text: text.replace('<mass value="1.2"/>', "<mass/>"), "has no attribute 'value'"),
     "follows": (lambda text: text.replace('mimic joint="shoulder"', 'mimic joint="sholder"'), "'sholder', which is no"),
@@ -246,6 +250,15 @@ def test_malformed_urdf_is_refused_by_name(change, tmp_path):
     file.write_text(edit((ROBOTS / "arm.urdf").read_text()))
     with pytest.raises(SystemDefinitionError, match=re.escape(message)):
         sc.LagrangianSystem.from_urdf(file)
+
+
+def test_moments_of_inertia_are_checked_with_fixed_links(tmp_path):
+    text, file = (ROBOTS / "arm.urdf").read_text(), tmp_path / "arm.urdf"
+    negative = text.replace('ixx="0.001"', 'ixx="-0.001"')  # of the sensor: its sum with that of the arm is positive
+    rounded = negative.replace('"0.0001"', '"-5.4e-20"').replace('"0.0002"', '"0"')
+    file.write_text(rounded)
+    assert rounded != negative != text
+    assert len(sc.LagrangianSystem.from_urdf(file).coordinates) == 2
 
 
 MUJOCO_CHANGES = {
@@ -288,6 +301,42 @@ def test_included_files_are_read_and_total_masses_scaled(tmp_path):
     (tmp_path / "body.xml").write_text('<mujocoinclude><include file="body.xml"/></mujocoinclude>')
     with pytest.raises(SystemDefinitionError, match="nested deeper"):
         sc.LagrangianSystem.from_mjcf(tmp_path / "all.xml")
+
+
+def test_nested_includes_flags_and_groups_of_geoms_are_read(tmp_path):
+    text, file = (ROBOTS / "ball.xml").read_text(), tmp_path / "all.xml"
+    inside = re.search("<worldbody>(.*)</worldbody>", text, re.DOTALL).group(1)
+    (tmp_path / "body.xml").write_text(f"<mujocoinclude>{inside}</mujocoinclude>")
+    one = sc.LagrangianSystem.from_mjcf(ROBOTS / "ball.xml")
+    file.write_text(text.replace(inside, '<frame><include file="body.xml"/></frame>'))
+    assert sc.LagrangianSystem.from_mjcf(file).lagrangian == one.lagrangian
+    still = '<option><flag gravity="disable" spring="disable" damper="disable"/></option><worldbody>'
+    file.write_text(text.replace("<worldbody>", still))
+    free = sc.LagrangianSystem.from_mjcf(file)
+    state, at_rest = {"R_ball": np.eye(3), "swing": 0.3}, {"omega_ball": np.zeros(3), "swing": 0.0}
+    assert value(free, state, at_rest) == 0.0 != value(one, state, at_rest)
+    pin = '<mujoco><compiler {}/><worldbody><body><joint/><geom size="0.1" pos="1 0 0"/>{}</body></worldbody></mujoco>'
+    seen = []
+    for setting, geom in (("", ""), ('inertiagrouprange="0 2"', '<geom size="0.2" group="3"/>')):
+        file.write_text(pin.format(setting, geom))
+        seen.append(sc.LagrangianSystem.from_mjcf(file).lagrangian)
+    assert seen[0] == seen[1]
+    base = '<body name="base"><geom type="mesh" mesh="m"/>'  # fixed to the world
+    file.write_text(text.replace(inside, f"{base}{inside}</body>"))
+    assert sc.LagrangianSystem.from_mjcf(file).lagrangian == one.lagrangian
+    file.write_text(text.replace("<worldbody>", '<compiler boundmass="0.1"/><worldbody>'))
+    with pytest.raises(SystemDefinitionError, match="has boundmass, which is not read"):
+        sc.LagrangianSystem.from_mjcf(file)
+
+
+def test_joints_with_dry_friction_are_named_in_one_warning(tmp_path):
+    file = tmp_path / "arm.urdf"
+    text = (ROBOTS / "arm.urdf").read_text().replace("<dynamics", '<dynamics friction="0.1"')
+    file.write_text(text.replace('<limit lower="-1"', '<dynamics friction="0.2"/><limit lower="-1"'))
+    with pytest.warns(UserWarning, match=r"dry friction of .*, rail-1 is not read") as caught:
+        sc.LagrangianSystem.from_urdf(file)
+    assert len(caught) == 1
+    assert Path(caught[0].filename).name == "test_robots.py"
 
 
 def test_robot_in_which_nothing_moves_is_refused(tmp_path):

@@ -317,6 +317,21 @@ def test_constraint_violation_is_independent_of_units(unit):
         assert found[0] == found[1]
 
 
+@pytest.mark.parametrize(("coordinates", "a", "b"), [(["a", "b"], "a", "b"), (["q[N]"], "q[0]", "q[1]")])
+def test_residuals_at_rounding_near_the_origin_are_accepted(coordinates, a, b):
+    velocities = "sum(i in N, q_dot[i]**2)" if "[" in a else "a_dot**2 + b_dot**2"
+    system = LagrangianSystem.from_text(
+        "near the origin",
+        coordinates,
+        f"({velocities})/2",
+        constraints=[f"cos({a}) + cos({b})/5 + sin({a}) - 1.2 + 2e-16 = 0"],
+    )
+    stepper = compile_stepper(system, lobatto(1))
+    for start in ([0.0, 0.0], [6e-17, 0.0], [1e-17, -3e-17]):
+        run = stepper.integrate(np.array(start), velocity=np.array([0.0, 1.0]), h=0.01, steps=10)
+        assert np.ravel(run.q[-1]) == pytest.approx([1e-3, 0.1], rel=2e-3)
+
+
 def test_dense_output_events_and_adaptive_steps_with_constraints():
     stepper = compile_stepper(rod(), lobatto(4))
     run = stepper.integrate(on_circle(1.3), [0.0, 0.0], h=0.05, steps=40, events="x")

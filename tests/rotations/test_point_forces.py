@@ -47,6 +47,18 @@ def test_force_in_the_body_frame_is_turned():
     assert np.abs(end_of(point_forces=[force]) - by_hand).max() < 1e-14
 
 
+def test_sympy_expressions_give_the_same_forces():
+    x, y, z, c, t = sympy.symbols("x y z c t")
+    force = [sympy.sin(t), c * sympy.Symbol("x_dot"), -y]
+    entries = {"body": "R", "origin": [x, y, z], "point": [sympy.Rational(1, 5), 0, c], "force": force, "frame": "body"}
+    texts = {"point": ["0.2", "0", "c"], "force": IN_SPACE, "origin": ["x", "y", "z"]}
+    text = sc.LagrangianSystem.from_text("body", **BODY, point_forces=[entries | texts])
+    formula = sympy.sympify(BODY["lagrangian"])
+    given = BODY | {"lagrangian": formula, "coordinates": [x, y, z]}
+    same = sc.LagrangianSystem.from_sympy(name="body", **given, point_forces=[entries])
+    assert all(sympy.expand(one - other) == 0 for one, other in zip(text.forces, same.forces, strict=True))
+
+
 def test_two_forces_and_others_on_the_same_body_are_added():
     force = {"body": "R", "point": POINT, "force": IN_SPACE}
     both = end_of(point_forces=[force, force], torques={"R": ["0", "c", "0"]}, forces={"x": "-c*x_dot"})

@@ -422,7 +422,13 @@ def test_initial_velocities_and_momenta_are_those_of_either_frame():
         ({"rotations": {"R": "omega"}, "lagrangian": "rotate_1(S, 1, 0, 0)"}, "needs a rotation first, not 'S'"),
         ({"rotations": {"R": "omega"}, "lagrangian": "rotate_1(R, 1, 0)"}, "three components, not 2"),
         ({"rotations": {"R": "omega", "S": "omega"}, "lagrangian": "omega_1**2"}, "'omega_1' has two meanings"),
-        ({"rotations": ["R"], "lagrangian": "omega_1**2"}, "rotations must be a mapping"),
+        ({"rotations": ["R"], "lagrangian": "omega_1**2"}, r"rotations must be a mapping .* \{'R': 'omega'\}"),
+        ({"rotations": {"R": "omega"}, "lagrangian": "omega**2"}, "'omega' is not a scalar: write .* as omega_1"),
+        ({"rotations": {"R": "omega"}, "lagrangian": "omega_1**2 - R"}, "'R' is not a scalar: write .* as R_11"),
+        (
+            {"rotations": {"R": "omega"}, "lagrangian": "rotate(R, 0, 0, 1)"},
+            "'rotate' is not a function: known are rotate_1",
+        ),
         (
             {"rotations": {"R": "omega"}, "lagrangian": "R_33", "parameters": {"R_33": 1}},
             "'R_33' is the name of both an entry of a rotation, direction or spin and parameter 'R_33'",
@@ -460,6 +466,12 @@ def test_wrong_rotations_are_rejected_by_name(arguments, message):
 def test_wrong_states_are_rejected_by_name(q, velocity, message):
     with pytest.raises(StateError, match=message):
         compiled(TOP, "svi:4").integrate(q, velocity=velocity, h=0.1, steps=2)
+
+
+def test_events_can_set_rates_of_rotations_according_to_the_message():
+    event = sc.Event("R_33", then={"omega_4": "0"})
+    with pytest.raises(sc.EventError, match="An event can set: omega_1, omega_2, omega_3, p_R_1, p_R_2, p_R_3, "):
+        compiled(TOP, "svi:4").integrate({"R": ATTITUDE}, velocity={"omega": OMEGA}, h=0.1, steps=2, events=event)
 
 
 def test_states_by_name_are_those_of_numbers_in_every_function_of_a_state():

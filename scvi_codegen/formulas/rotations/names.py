@@ -235,6 +235,11 @@ class _RotatingParser(Parser):
         self.rotations = rotations
 
     def name(self, name: str, column: int) -> Expr:
+        entries = [each for each in (f"{name}_11", f"{name}_1") if each in self.symbols and name not in self.symbols]
+        if entries:
+            self.refuse(f"'{name}' is not a scalar: write one of its components, as {entries[0]}", column)
+        if name not in ROTATING and name.removeprefix("un").startswith("rotate"):
+            self.refuse(f"'{name}' is not a function: known are {', '.join(ROTATING)}", column)
         if name not in ROTATING:
             return super().name(name, column)
         opening = self.accept("(")

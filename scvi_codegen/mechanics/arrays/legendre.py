@@ -71,17 +71,8 @@ def site_hamiltonian(system: ArraySystem) -> SiteHamiltonian | None:
 
 
 COMMON = (
-    "name",
-    "coordinates",
-    "time",
-    "parameters",
-    "defaults",
-    "fields",
-    "field_defaults",
-    "tables",
-    "neighbours",
-    "forces",
-    "inputs",
+    *("name", "coordinates", "time", "parameters", "defaults", "fields", "field_defaults", "tables"),
+    *("neighbours", "forces", "inputs"),
 )
 """Fields that a Lagrangian and its Hamiltonian have in common."""
 

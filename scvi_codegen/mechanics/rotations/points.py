@@ -90,7 +90,7 @@ def _three(formulas: Any, what: str, read: Callable[[Any], Expr]) -> Matrix:
         return zeros(3, 1)
     if not isinstance(formulas, Sequence) or isinstance(formulas, str) or len(formulas) != len(AXES):
         raise SystemDefinitionError(f"{what} must have three components, not {formulas!r}")
-    return Matrix([read(str(each)) for each in formulas])
+    return Matrix([read(each if isinstance(each, Expr) else str(each)) for each in formulas])
 
 
 def torque_of(matrix: Matrix, derivatives: Matrix) -> Matrix:

@@ -49,18 +49,8 @@ from scvi_codegen.models.problems import Problem
 from scvi_codegen.validation import checks_arguments, of
 
 SYSTEM_KEYS = (
-    *(
-        "name",
-        "coordinates",
-        *TURNING,
-        "momenta",
-        *FORMULAS,
-        "inputs",
-        "neighbours",
-        "catalogue",
-        "time_transformation",
-    ),
-    "point_forces",
+    *("name", "coordinates", *TURNING, "momenta", *FORMULAS, "inputs", "neighbours", "catalogue"),
+    *("time_transformation", "point_forces"),
 )
 RUN_KEYS = ("step", "tolerance", "error", "controller", "span", "steps", "save_every")
 FIELD_KEYS = (
@@ -69,18 +59,8 @@ FIELD_KEYS = (
 )
 KEYS = {"system": SYSTEM_KEYS, "field": FIELD_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
 SECTIONS = (
-    "system",
-    "field",
-    "forces",
-    *TORQUES,
-    "inputs",
-    "sizes",
-    "parameters",
-    "tables",
-    "initial",
-    "events",
-    "method",
-    "run",
+    *("system", "field", "forces", *TORQUES, "inputs", "sizes", "parameters", "tables", "initial"),
+    *("events", "method", "run"),
 )
 ARRAY_SECTIONS = ("sizes", "tables")
 """Sections of systems with arrays."""

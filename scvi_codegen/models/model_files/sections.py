@@ -55,11 +55,8 @@ Section = Mapping[str, Any]
 Document = Mapping[str, Section]
 
 ALTERNATIVES = (
-    {"lagrangian", "hamiltonian"},
-    {"density", "hamiltonian"},
-    {"p", "q_dot"},
-    {"step", "tolerance", "error"},
-    {"span", "steps"},
+    *({"lagrangian", "hamiltonian"}, {"density", "hamiltonian"}, {"p", "q_dot"}),
+    *({"step", "tolerance", "error"}, {"span", "steps"}),
 )
 """Groups of alternative keys, of which one is given."""
 INHERITED = ("degree", "quadrature", "nodes", "stages")

@@ -359,7 +359,9 @@ class ArrayBinding(Binding):
         for k, pair in enumerate(((q, q1), (p, p1))):
             before, after = map(self.vector, pair)
             size = float(max(np.abs(before).max(initial=0.0), np.abs(after).max(initial=0.0)))
-            result[k] = float(np.abs(after - before).max(initial=0.0)) / (size or 1.0)
+            apart = float(np.abs(after - before).max(initial=0.0))
+            rounded = k == 0 and apart <= 1024 * np.finfo(float).eps  # near q = 0, as in constraints.h
+            result[k] = min(apart / (size or 1.0), 1e-6 if rounded else np.inf)
         return 0
 
     def _states(self, count: int, t: Any, q: Any, p: Any, parameters: Any) -> Iterator[tuple[int, Any]]:

@@ -151,7 +151,11 @@ def _unresolved(stepper: Integrator, t: Array, q: Array, h: float, where: str = 
     stride = -(-max(len(t) - 1, 1) // count)
     rows = slice((len(t) - 1) % stride, None, stride)
     parts = unresolved_parts(stepper, q[rows]) if warnings_wanted() else None
-    if parts is None or parts.max() <= UNRESOLVED:
+    if parts is None:
+        return False
+    sizes = np.abs(np.asarray(q[rows])).max(axis=1)  # a wave that enters a mesh at rest is small at first
+    parts = parts * (sizes / (sizes.max() or 1.0)) ** 2
+    if parts.max() <= UNRESOLVED:
         return False
     first = int(np.argmax(~(parts <= UNRESOLVED)))
     phase = abs(h) * stepper.interface.layout.mesh.highest_frequency()

@@ -177,10 +177,15 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
         return self._joined(lambda piece: piece.stepper._energy_parts(piece.q, piece.p, piece.t, piece.parameters))
 
     def energy_error(self) -> float:
-        """Return the largest change of the energy, relative to the largest sum of its absolute parts if known."""
-        energies = np.abs(self.energies)
-        sizes = energies[:, :2].sum(axis=1) if np.isfinite(energies[0, 0]) else energies[:, 2]
-        return float(np.max(np.abs(self.energy() - self.energy()[0]))) / (float(np.max(sizes)) or 1.0)
+        """Return the largest change of the energy, relative to the largest sum of its absolute parts if known.
+
+        Otherwise it is relative to the largest energy or, if that is less than 1e-8 of p.v, to the largest p.v.
+        """
+        energies, parts = np.abs(self.energies), np.isfinite(self.energies[0, 0])
+        size = float(np.max(energies[:, :2].sum(axis=1) if parts else energies[:, 2]))
+        if not parts and size < 1e-8 * (action := float(np.abs(np.sum(self.p * self.velocity, axis=-1)).max())):
+            size = action
+        return float(np.max(np.abs(self.energy() - self.energy()[0]))) / (size or 1.0)
 
     def momentum_maps(self) -> Array:
         """Return (n, k) conserved quantities, in the order of ``stepper.momentum_map_names``."""

@@ -17,6 +17,7 @@
 #define SETTLED_UPDATE REAL(1e-9)
 /* relative to the state: accepted size of the last update where rounding prevents a smaller residual */
 #define ACCEPTED_UPDATE REAL(1e-6)
+#define ROUNDED_UPDATE (1024 * REAL_EPSILON) /* near q = 0, where a relative distance is undefined */
 #define BEYOND REAL(1e6) /* times an update: where g is still linear, rounding limits |g| */
 #define SLOW REAL(0.01) /* reduction of |g|^2 by an update that indicates rounding */
 
@@ -257,6 +258,10 @@ int NAME(apart)(real t, const real *q0, const real *p0, const real *q1, const re
   times_mass(mass, x[0], y[0]);
   times_mass(mass, x[1], y[1]);
   apart[0] = part_of(x, y);
+  for (int i = 0; i < M; i++)
+    p[i] = q1[i] - q0[i];
+  if (largest_of(p) <= ROUNDED_UPDATE && apart[0] > ACCEPTED_UPDATE)
+    apart[0] = ACCEPTED_UPDATE;
   return all_finite(apart, 2) ? OK : NOT_FINITE;
 }
 

@@ -243,9 +243,24 @@ static void turn_asymmetric(const free_body *body, real t, const real *restrict 
   g[0] = g[0] > 0 ? -sine / (whole * (whole + g[0])) : g[0] / whole - 1;
 }
 
+/* Multiplies a vector by the matrix C, or by its transpose, and restores the length, so that it does not drift. */
+static inline void turn_axes(const real *C, int transposed, real *v)
+{
+  real u[3], before = REAL_MIN, after = REAL_MIN;
+  for (int i = 0; i < 3; i++) {
+    u[i] = 0;
+    for (int j = 0; j < 3; j++)
+      u[i] += C[transposed ? 3 * j + i : 3 * i + j] * v[j];
+    before += v[i] * v[i];
+    after += u[i] * u[i];
+  }
+  for (int i = 0; i < 3; i++)
+    v[i] = u[i] + u[i] * ((before - after) / (before + after));
+}
+
 /* Adds the changes of q and p in the time t to the increments dq and dp, with which they are q0 + dq and p; `axis` is
- * that of symmetry, if there is one. */
-static inline void turn_body(const step_data *step, int first, int axis, const free_body *body, real t,
+ * that of symmetry, if there is one, and C contains the principal axes as columns, NULL for those of the body. */
+static inline void turn_body(const step_data *step, int first, int axis, const free_body *body, const real *C, real t,
     const real *restrict p, real *restrict dq, real *restrict dp)
 {
   real q[4], Pi[3], g[4], changes[2][4];
@@ -254,10 +269,14 @@ static inline void turn_body(const step_data *step, int first, int axis, const f
   Pi[0] = (q[0] * p[1] - q[1] * p[0] + q[3] * p[2] - q[2] * p[3]) / 2;
   Pi[1] = (q[0] * p[2] - q[2] * p[0] + q[1] * p[3] - q[3] * p[1]) / 2;
   Pi[2] = (q[0] * p[3] - q[3] * p[0] + q[2] * p[1] - q[1] * p[2]) / 2;
+  if (C)
+    turn_axes(C, 1, Pi);
   if (body->lm == 0 && body->s == axis)
     turn_symmetric(axis, body, t, Pi, g);
   else
     turn_asymmetric(body, t, Pi, g);
+  if (C)
+    turn_axes(C, 0, g + 1);
   multiply(q, g, changes[0]);
   multiply(p, g, changes[1]);
   for (int i = 0; i < 4; i++) {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from os import PathLike
@@ -84,6 +85,13 @@ class Element:
     def refuse(self, what: str) -> NoReturn:
         """Raise an error that names the file and the element."""
         raise SystemDefinitionError(f"{self.file}: <{self.node.tag}> '{self.name}' {what}")
+
+
+def warn_of_dry_friction(path: str | PathLike[str], joints: Sequence[str]) -> None:
+    """Warn that dry friction of joints is not read."""
+    if joints:
+        message = f"{path}: dry friction of {', '.join(joints)} is not read: it is no smooth force"
+        warnings.warn(message, stacklevel=5)
 
 
 def root_of(path: str | PathLike[str], *tags: str) -> Element:

@@ -16,13 +16,15 @@ import numpy as np
 from scvi_codegen.errors import closest
 from scvi_codegen.formulas.rotations.members import matrix_of
 from scvi_codegen.mechanics.multibody.trees.closures import Closure, Coupling, at_reference
-from scvi_codegen.mechanics.multibody.trees.document import Element, root_of
+from scvi_codegen.mechanics.multibody.trees.document import Element, root_of, warn_of_dry_friction
 from scvi_codegen.mechanics.multibody.trees.shapes import SHAPES
 from scvi_codegen.mechanics.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about
 
 REFUSED = ("attach", "replicate", "composite", "flexcomp", "plugin")
 """Elements inside bodies that are not read, and without which the model would be another one."""
 WEIGHTLESS = ("plane", "hfield")
+CHANGES = {"boundmass": "0", "boundinertia": "0", "balanceinertia": "false"}
+"""Settings that change inertias and are not read, with their defaults."""
 ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 MOST_INCLUDED = 20
 AXES = dict(zip("xyz", np.eye(3), strict=True))
@@ -38,6 +40,7 @@ def links_of_mjcf(path: str | PathLike[str]) -> tuple[str, list[Link], Vector, l
     model = _MujocoModel(root_of(path, "mujoco"))
     for body in model.inside("worldbody"):
         model.read(body, -1, Pose(), "main")
+    warn_of_dry_friction(path, model.rough)
     name, closures = model.root.node.get("model", Path(path).stem), [*model.closures()]
     return name, model.scaled(), model.gravity, closures
 
@@ -50,6 +53,10 @@ class _MujocoModel:
         self.sections = [*_sections(root, 0)]
         self.settings: dict[str, str] = {}
         options: dict[str, str] = {}
+        flags = (flag.node for section in self.inside("option") for flag in section.children("flag"))
+        self.disabled = {name for flag in flags for name, value in flag.items() if value == "disable"}
+        self.rough: list[str] = []
+        self.still: set[int] = set()
         self.classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
         for section in self.sections:
             if section.node.tag == "compiler":
@@ -65,7 +72,7 @@ class _MujocoModel:
                     if tendon.has("stiffness"):
                         tendon.refuse("has a stiffness, which is not read")
         option = Element(root.file, root.node, options)
-        self.gravity = option.vector("gravity", (0, 0, -9.81))
+        self.gravity = option.vector("gravity", (0, 0, -9.81)) * ("gravity" not in self.disabled)
         if any(option.number(each, 0) != 0 for each in ("density", "viscosity")):
             warnings.warn(f"{root.file}: forces of the medium (density, viscosity) are not read", stacklevel=5)
         self.turn = 1.0 if self.settings.get("angle", "degree") == "radian" else np.pi / 180
@@ -123,7 +130,9 @@ class _MujocoModel:
             self.links.append(Link(label, parent, self.joint(joint, label, place, frame, parent), Inertia()))
             parent, pose, anchor = len(self.links) - 1, Pose(), at
         carried = Joint(name=name, kind="fixed", pose=pose @ Pose(-anchor))
-        inertia = self.inertia(body, inherited).compensated(body.number("gravcomp", 0))
+        fixed = (parent < 0 or parent in self.still) and "settotalmass" not in self.settings  # to the world
+        inertia = Inertia() if fixed else self.inertia(body, inherited).compensated(body.number("gravcomp", 0))
+        self.still |= {len(self.links)} if fixed else set()
         self.links.append(Link(name, parent, carried, inertia))
         return len(self.links) - 1
 
@@ -144,7 +153,7 @@ class _MujocoModel:
         for section in self.inside("equality"):
             for node in section.node:
                 each = self.with_defaults(Element(section.file, node), "main")
-                if each.text("active", "true") == "false":
+                if each.text("active", "true") == "false" or "equality" in self.disabled:
                     continue
                 if node.tag == "joint":
                     yield self.coupling(each)
@@ -194,18 +203,20 @@ class _MujocoModel:
             joint.refuse("is free, but its body is inside another body")
         turn = self.turn if kind == "hinge" else 1.0
         stiffness, rest, zero = (joint.number(each, 0) for each in ("stiffness", "springref", "ref"))
+        if joint.vector("springdamper", (0, 0), (2,)).any():
+            joint.refuse("has springdamper, which is not read: give its stiffness and damping")
         if kind in ("ball", "free") and stiffness != 0:
             joint.refuse("has a stiffness, which is read for hinges and slides only")
         if kind != "free" and joint.number("frictionloss", 0) != 0:
-            warnings.warn(f"dry friction of joint '{name}' is not read: it is no smooth force", stacklevel=8)
+            self.rough.append(name)
         bare = joint.node.tag == "freejoint"
         return Joint(
             name=name,
             kind=kind,
             pose=pose,
             axis=frame.rotation @ joint.unit("axis", (0, 0, 1)) if kind in SINGLE else np.zeros(3),
-            damping=0.0 if bare else joint.number("damping", 0),
-            stiffness=stiffness,
+            damping=0.0 if bare or "damper" in self.disabled else joint.number("damping", 0),
+            stiffness=0.0 if "spring" in self.disabled else stiffness,
             rest=rest * turn,
             armature=0.0 if bare else joint.number("armature", 0),
             zero=zero * turn if kind in SINGLE else 0.0,
@@ -218,8 +229,11 @@ class _MujocoModel:
         if rule == "false" or (rule == "auto" and inertial is not None):
             return Inertia() if inertial is None else self.inertial(inertial)
         total = Inertia()
+        low, high = Element(self.root.file, self.root.node, self.settings).vector("inertiagrouprange", (0, 5), (2,))
         for element, frame in self.contents(body, "geom"):
-            total += self.geom(self.with_defaults(element, inherited)).seen_from(frame)
+            geom = self.with_defaults(element, inherited)
+            if low <= geom.number("group", 0) <= high:
+                total += self.geom(geom).seen_from(frame)
         return total
 
     def inertial(self, inertial: Element) -> Inertia:
@@ -291,7 +305,10 @@ class _MujocoModel:
 
     def scaled(self) -> list[Link]:
         """Return the links, with inertias scaled to ``settotalmass``."""
-        total = Element(self.root.file, self.root.node, self.settings).number("settotalmass", -1)
+        settings = Element(self.root.file, self.root.node, self.settings)
+        if changed := [each for each, usual in CHANGES.items() if settings.text(each, usual) != usual]:
+            settings.refuse(f"has {changed[0]}, which is not read: remove it and adapt the inertias")
+        total = settings.number("settotalmass", -1)
         masses = sum(link.inertia.mass for link in self.links)
         if total <= 0 or masses == 0:
             return self.links
@@ -299,10 +316,12 @@ class _MujocoModel:
 
 
 def _sections(root: Element, depth: int) -> Iterator[Element]:
-    """Yield the sections of a document and of those that it includes."""
+    """Yield the sections of a document and of those that it includes, in place of nested elements, too."""
     for node in root.node:
         section = Element(root.file, node)
         if node.tag != "include":
+            if next(node.iter("include"), None) is not None:
+                node[:] = [each.node for each in _sections(section, depth)]
             yield section
         elif depth == MOST_INCLUDED:
             section.refuse(f"is nested deeper than {MOST_INCLUDED} files")

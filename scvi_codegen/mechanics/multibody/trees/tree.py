@@ -140,6 +140,13 @@ def without_fixed(links: Sequence[Link]) -> list[Link]:
             moving.append(replace(link, parent=carrier, joint=replace(link.joint, pose=pose)))
     if not moving:
         raise SystemDefinitionError("all joints are fixed, so that nothing moves: floating=True frees the base")
+    for link in moving:
+        mass, moments = link.inertia.mass, np.linalg.eigvalsh(link.inertia.matrix)
+        if moments[0] < -1e-9 * abs(moments).max() - 1e-12 * mass:  # rounded in files
+            raise SystemDefinitionError(
+                f"link '{link.name}', with the links fixed to it, has the mass {mass:g} and the moments of inertia "
+                f"{moments}, which must not be < 0: correct its <inertial>"
+            )
     return moving
 
 

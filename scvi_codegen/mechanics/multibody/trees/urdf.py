@@ -4,13 +4,12 @@ Meshes, collisions, transmissions, joint limits and dry friction are not read. A
 https://docs.ros.org/en/rolling/p/urdfdom: ``rpy`` are rotations about the fixed axes x, y, z, in this order.
 """
 
-import warnings
 from os import PathLike
 
 import numpy as np
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.mechanics.multibody.trees.document import Element, root_of
+from scvi_codegen.mechanics.multibody.trees.document import Element, root_of, warn_of_dry_friction
 from scvi_codegen.mechanics.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about
 
 KINDS = {"fixed": "fixed", "revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free"}
@@ -55,6 +54,8 @@ def links_of_urdf(path: str | PathLike[str], *, floating: bool) -> tuple[str, li
                 order.append(child)
     if len(order) < len(links):
         raise SystemDefinitionError(f"{path}: the links {sorted(set(links) - set(order))} form a circle")
+    dynamics = {each.name: each.child("dynamics") for each in joints.values()}
+    warn_of_dry_friction(path, [name for name, each in dynamics.items() if each and each.number("friction", 0) != 0])
     return robot.name, tree
 
 
@@ -80,8 +81,6 @@ def _joint(joint: Element) -> Joint:
     if kind not in KINDS:
         joint.refuse(f"is of type '{kind}', which is not read; possible: {', '.join(KINDS)}")
     axis, dynamics, mimic = (joint.child(each) for each in ("axis", "dynamics", "mimic"))
-    if dynamics is not None and dynamics.number("friction", 0) != 0:
-        warnings.warn(f"dry friction of joint '{joint.name}' is not read: it is no smooth force", stacklevel=6)
     follows = None
     if mimic is not None:
         follows = (mimic.text("joint"), mimic.number("multiplier", 1), mimic.number("offset", 0))
@@ -105,8 +104,8 @@ def _inertia(link: Element) -> Inertia:
     )
     matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     value = 0.0 if mass is None else mass.number("value")
-    if value < 0 or np.linalg.eigvalsh(matrix)[0] < -1e-9 * abs(matrix).max(initial=0):
-        link.refuse(f"has the mass {value:g} and the moments of inertia {np.linalg.eigvalsh(matrix)}: none may be < 0")
+    if value < 0:
+        link.refuse(f"has the mass {value:g}, which must not be < 0")
     return Inertia(value, matrix=matrix).seen_from(_pose(inertial))
 
 
