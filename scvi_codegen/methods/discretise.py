@@ -94,7 +94,7 @@ def _turned(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn]
     """Return the equations followed by turns of bodies: V is their change of q by h, P the momentum before them."""
     q, size = system.coordinates, len(stages.rows)
     u, v = (tuple(Symbol(f"{name}_{i}", real=True) for i in range(len(q))) for name in ("turn", "change"))
-    changes = [(turn.change(q, angle), turn.change(u, angle)) for turn in turns for angle in [turn.angle(q, u)]]
+    changes = [(turn.change(q, g), turn.change(u, g)) for turn in turns for g in [turn.rotation(q, u)]]
     moved, pushed = (tuple(map(Add, *each)) for each in zip(*changes, strict=True))
     one, minus, none = Table.constant(1, 1, 1), Table.constant(1, 1, -1), Table.constant(1, 1)
     before, others = Table.joined(stages.end_position, none, none), Table.constant(1, size)
