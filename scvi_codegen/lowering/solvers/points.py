@@ -64,7 +64,7 @@ from scvi_codegen.lowering.solvers.tables import (
 from scvi_codegen.lowering.stage_groups import damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.rotations.axial import Turn, axial_turns, joined, rates_in_frame
+from scvi_codegen.mechanics.rotations.axial import Frame, Turn, axial_turns, moving_frame
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_structure import Accelerations, Velocities
 from scvi_codegen.tables.basis import matrix_product, transpose
@@ -172,53 +172,60 @@ def hamiltonian_iteration(problem: StepProblem) -> FixedPointIteration | None:
         return None
     of, turning = forms.legendre_arguments, bool(system.rotations)
     joint = turning and lanes > 2 and sum(len(each.coordinates) for each in system.rotations) == system.dimension
-    kernel = partial(system_kernel, system, of=of, paired=turning)
-    frame = rates_in_frame(problem.system)
-    velocity, force = frame or (forms.legendre, forms.force)
+    functions = _functions(turns)
+    rates, m = moving_frame(problem.system, functions), system.dimension
+    moving, of = bool(rates), (*of, *functions) if rates else of
+    rates = rates or (*forms.legendre, *forms.force)
+    kernel, u = partial(system_kernel, system, of=of, paired=turning), "u = (Q, tau P, ..)" if moving else "u = (q, p)"
     return _point_iteration(
         "Hamiltonian",
         tables,
         lanes,
         (
-            kernel("velocity_lanes", velocity, purpose="H_p at all points, u = (q, p)."),
-            kernel("force_lanes", force, purpose="-H_q at all points, u = (q, p)."),
-            kernel("rate_lanes", (*velocity, *force), purpose="(H_p, -H_q) at all points, u = (q, p).")
-            if joint
-            else None,
+            kernel("velocity_lanes", rates[:m], purpose=f"H_p at all points, {u}."),
+            kernel("force_lanes", rates[m:], purpose=f"-H_q at all points, {u}."),
+            kernel("rate_lanes", rates, purpose=f"(H_p, -H_q) at all points, {u}.") if joint else None,
             integrand_kernel(system, "integrand_lanes", of),
-            _turn_kernel(system, turns) if turns else None,
+            _angle_kernel(system, turns) if moving else None,
+            _turn_kernel(system, turns, lanes=True, moving=moving),
         ),
-        constant_mass=_rotation_kernel(system, turns, moving=frame is not None) if turns else None,
-        forces=() if joint else ("force_lanes",),
+        constant_mass=_turn_kernel(system, turns, lanes=False, moving=moving),
+        forces=() if joint or moving else ("force_lanes",),
         stored=4 * lanes,
-        parts=("point_weights", "hamiltonian_iteration"),
+        parts=("point_weights", *(("moving_frame",) if moving else ()), "hamiltonian_iteration"),
         macros=tuple(
             (name, value)
-            for name, value in (("JOINT_RATES", int(joint)), ("TURNS", len(turns)), ("MOVING_FRAME", int(frame is not None)))
+            for name, value in (("JOINT_RATES", int(joint)), ("TURNS", len(turns)), ("MOVING_FRAME", int(moving)))
             if value
         ),
         matrix=tables.position if _nearly_equal(tables.position, tables.momentum) else (),
     )
 
 
-def _rotation_kernel(system: MechanicalSystem, turns: Sequence[Turn], *, moving: bool) -> Kernel:
-    """Return the kernel of the rotations that end a step; in the moving frame also of predictors, and at the start."""
-    q, u = (tuple(Symbol(f"{name}_{i}", real=True) for i in range(system.dimension)) for name in "qp")
-    values, purpose = [turn.rotation(q, u) for turn in turns], "g - 1 of the turns after a step, u = (q, h p)."
-    if moving:
-        halves = [turn.free_rotation(q, tuple(x / 2 for x in u)) for turn in turns]
-        ends = [joined(half, turn) for half, turn in zip(halves, values, strict=True)]
-        values = [*ends, *map(joined, halves, ends), *halves]
-        purpose = "g - 1 of the rotations at the end of a step, of a predictor, and at the start, u = (q, h p)."
-    return system_kernel(system, "rotations", sum(values, ()), of=(*q, *u), purpose=purpose)
+def _functions(turns: Sequence[Turn]) -> tuple[Symbol, ...]:
+    """Return the symbols of S, C - 1 and D of each body."""
+    return tuple(Symbol(f"{name}_{k}", real=True) for k in range(len(turns)) for name in ("sine", "cosine", "rest"))
 
 
-def _turn_kernel(system: MechanicalSystem, turns: Sequence[Turn]) -> Kernel:
-    """Return the kernel of the changes of vectors by rotations."""
+def _angle_kernel(system: MechanicalSystem, turns: Sequence[Turn]) -> Kernel:
+    """Return the kernel of the squares of angles of the free rotation."""
+    q, p = system.coordinates, system.auxiliaries
+    squares = [Frame(turn, q, p).y for turn in turns]
+    return system_kernel(system, "angle_lanes", squares, of=(*q, *p), purpose="Squares y of angles, u = (q, tau p).")
+
+
+def _turn_kernel(system: MechanicalSystem, turns: Sequence[Turn], *, lanes: bool, moving: bool) -> Kernel | None:
+    """Return the kernel of the rotations that end a step, or of their effect on vectors; ``None`` without turns."""
     q, p = (tuple(Symbol(f"{name}_{i}", real=True) for i in range(system.dimension)) for name in "qp")
+    if not turns:
+        return None
+    if not lanes:
+        values = [turn.rotation(q, p) for turn in turns] + [turn.half_rotation(q, p) for turn in turns if moving]
+        purpose = f"exp(kappa h Pi_k e_k/2) - 1{', and h Pi/(4 A)' * moving}, u = (q, h p)."
+        return system_kernel(system, "rotations", sum(values, ()), of=(*q, *p), purpose=purpose)
     rotations = [tuple(Symbol(f"g_{k}_{i}", real=True) for i in range(4)) for k in range(len(turns))]
     changes = ((*t.change(q, g), *t.change(p, g)) for t, g in zip(turns, rotations, strict=True))
-    purpose = "q (g - 1) and p (g - 1), u = (q, p, g - 1)."
+    purpose = "Changes q (g - 1) and p (g - 1) of vectors by rotations, u = (q, p, g - 1)."
     return system_kernel(system, "turn_lanes", map(Add, *changes), of=(*q, *p, *sum(rotations, ())), purpose=purpose)
 
 

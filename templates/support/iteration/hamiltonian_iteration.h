@@ -51,64 +51,32 @@ static inline void measure_ends(lanes (*x)[M], const solver_options *options, do
 }
 
 #ifdef MOVING_FRAME
-/* Kernels have u = (Q, tau P) as arguments in place of (q, p), tau = t - t0 - h/2, and compute H_p / tau. */
-static inline lanes frame_time(const step_data *step, int n)
-{
-  return step->h * (ABSCISSA[n] - 0.5);
-}
-
-static inline lanes *arguments(const step_data *step, int n, const lanes *u, lanes *at)
-{
-  for (int i = 0; i < M; i++) {
-    at[i] = u[i];
-    at[M + i] = frame_time(step, n) * u[M + i];
-  }
-  return at;
-}
-
-static inline void rescale(const step_data *step, int n, lanes *velocity)
-{
-  for (int i = 0; i < M; i++)
-    velocity[i] *= frame_time(step, n);
-}
-
-/* Sizes of quaternions in place of their components. */
-static inline void measure_quaternions(lanes (*u)[2 * M], int first, const solver_options *options, double unit,
-    double *inverse_size)
-{
-  for (int i = 0; i < M; i += 4) {
-    double square = DBL_MIN;
-    for (int j = first + i; j < first + i + 4; j++)
-      square += at_point(&u[0][j], 0, 0) * at_point(&u[0][j], 0, 0);
-    for (int j = i; j < i + 4; j++)
-      inverse_size[j] = options->absolute ? unit : 0.5 * unit / sqrt(square);
-  }
-}
+enum { ARGUMENTS = FRAME };
+#define KERNEL_ARGUMENTS(step, n, u, at) in_frame(step, n, u, at)
 #else
-#define arguments(step, n, u, at) ((void)(at), (u))
+enum { ARGUMENTS = 2 * M };
+#define KERNEL_ARGUMENTS(step, n, u, at) ((void)(at), (u))
 #define rescale(step, n, velocity)
 #endif
 
 /* Forces at the points. */
 static inline void forces(const step_data *step, lanes (*u)[2 * M], lanes (*force)[M])
 {
-  lanes at[2 * M];
+  lanes at[ARGUMENTS];
   for (int n = 0; n < GROUPS; n++)
-    force_lanes(arguments(step, n, u[n], at), step->t + step->h * ABSCISSA[n], step->parameters, force[n]);
+    force_lanes(KERNEL_ARGUMENTS(step, n, u[n], at), step->t + step->h * ABSCISSA[n], step->parameters, force[n]);
 }
 
-#ifdef TURNS
-/* Rotations of bodies, q <- q g, p <- p g, after a step of the other terms of H: turns about axes of symmetry, with
- * which they commute, and with MOVING_FRAME the second half of the free rotation, the first of which is at the start.
- * Requires: TURNS, the kernels rotations and turn_lanes. */
-enum { ROTATION = 4 * TURNS };
+#if defined(TURNS) && !defined(MOVING_FRAME)
+/* Turns of bodies about axes of symmetry, q <- q g, p <- p g, g = exp(kappa h Pi_k e_k/2), after a step of the other
+ * terms of H, with which they commute. Requires: TURNS, the kernels rotations and turn_lanes. */
 
-/* Rotates vectors x and y at the points. */
+/* Turns vectors x and y at the points. */
 static inline void turn_vectors(const step_data *step, const double *g, lanes (*x)[M], lanes (*y)[M])
 {
   for (int n = 0; n < GROUPS; n++) {
-    lanes u[2 * M + ROTATION], change[2 * M];
-    for (int k = 0; k < ROTATION; k++)
+    lanes u[2 * M + 4 * TURNS], change[2 * M];
+    for (int k = 0; k < 4 * TURNS; k++)
       u[2 * M + k] = lanes_of(g[k]);
     memcpy(u, x[n], sizeof x[n]);
     memcpy(u + M, y[n], sizeof y[n]);
@@ -120,97 +88,32 @@ static inline void turn_vectors(const step_data *step, const double *g, lanes (*
   }
 }
 
-/* sum = x + y, rounded; returns the rest. */
-static inline double rest_of_sum(double x, double y, double *sum)
-{
-  const double total = x + y, part = total - x;
-  *sum = total;
-  return (x - (total - part)) + (y - part);
-}
-
-/* (|g|^2 - 1)/2 of d = g - 1, whose rounding errors are the same in every step: sums of products without rounding. */
-static inline double excess(const double *d)
-{
-  double sum = 2.0 * d[0], rest = 0.0;
-  for (int k = 0; k < 4; k++) {
-    const double square = d[k] * d[k];
-    rest += fma(d[k], d[k], -square) + rest_of_sum(sum, square, &sum);
-  }
-  return 0.5 * (sum + rest);
-}
-
-/* Computes the rotations at the state (q, p), and adds its change by those from index k on, in two words. */
-static inline void turn_state(const step_data *step, const double *q, const double *p, int k, double *g, double *dq,
-    double *dp)
-{
-  double u[2 * M];
-  lanes state[2 * M + ROTATION], change[2 * M];
-  for (int i = 0; i < M; i++) {
-    state[i] = lanes_of(u[i] = q[i]);
-    state[M + i] = lanes_of(p[i]);
-    u[M + i] = step->h * p[i];
-  }
-  rotations(u, step->t, step->parameters, g);
-  for (int j = 0; j < ROTATION; j++)
-    state[2 * M + j] = lanes_of(g[k + j]);
-  turn_lanes(state, lanes_of(step->t), step->parameters, change);
-  for (int i = 0; i < M; i++) {
-    const double of_q = at_first(&change[i]), of_p = at_first(&change[M + i]);
-#ifdef MOVING_FRAME
-    const double longer = excess(g + k + i / 4 * 4);
-    dq[M + i] += rest_of_sum(dq[i], of_q, &dq[i]) - longer * (q[i] + of_q);
-    dp[M + i] += rest_of_sum(dp[i], of_p, &dp[i]) - longer * (p[i] + of_p);
-#else
-    dq[i] += of_q;
-    dp[i] += of_p;
-#endif
-  }
-}
-
-/* Adds the rotations to the increments, and rotates the values of this step and of the last one for the predictor. */
+/* Adds the turns to the increments, and turns the values of this step and of the last one for the predictor. */
 static inline void turn_step(const step_data *step, history past, lanes (*z)[M], lanes (*force)[M], double *dq,
     double *dp)
 {
-  lanes last[GROUPS][M], last_force[GROUPS][M];
-  double q[M], p[M], g[3 * ROTATION];
-#ifdef MOVING_FRAME
-  const double *next = g + ROTATION;
-#else
-  const double *next = g;
-#endif
+  lanes last[GROUPS][M], last_force[GROUPS][M], change[2 * M], end[2 * M + 4 * TURNS];
+  double u[2 * M], g[4 * TURNS];
   for (int i = 0; i < M; i++) {
-    q[i] = step->q0[i] + (step->carry_q[i] + dq[i]);
-    p[i] = step->p0[i] + (step->carry_p[i] + dp[i]);
+    const double q = step->q0[i] + (step->carry_q[i] + dq[i]), p = step->p0[i] + (step->carry_p[i] + dp[i]);
+    end[i] = lanes_of(u[i] = q);
+    end[M + i] = lanes_of(p);
+    u[M + i] = step->h * p;
   }
-  turn_state(step, q, p, 0, g, dq, dp);
-  turn_vectors(step, next, z, force);
+  rotations(u, step->t, step->parameters, g);
+  for (int k = 0; k < 4 * TURNS; k++)
+    end[2 * M + k] = lanes_of(g[k]);
+  turn_lanes(end, lanes_of(step->t), step->parameters, change);
+  for (int i = 0; i < M; i++) {
+    dq[i] += at_first(&change[i]);
+    dp[i] += at_first(&change[M + i]);
+  }
+  turn_vectors(step, g, z, force);
   lanes_load(past, last);
   lanes_load(past + 2 * M * POINTS, last_force);
-  turn_vectors(step, next, last, last_force);
+  turn_vectors(step, g, last, last_force);
   lanes_store(last, past);
   lanes_store(last_force, past + 2 * M * POINTS);
-}
-#endif
-
-#ifdef MOVING_FRAME
-/* State in the moving frame, after half of the free rotation, and its change in two words. */
-typedef struct {
-  double q[M], p[M], carry_q[M], carry_p[M], dq[2 * M], dp[2 * M];
-} frame_state;
-
-static inline step_data into_frame(const step_data *step, frame_state *to)
-{
-  step_data moving = *step;
-  double g[3 * ROTATION];
-  memset(to->dq, 0, sizeof to->dq);
-  memset(to->dp, 0, sizeof to->dp);
-  turn_state(step, step->q0, step->p0, 2 * ROTATION, g, to->dq, to->dp);
-  for (int i = 0; i < M; i++) {
-    to->carry_q[i] = step->carry_q[i] + (rest_of_sum(step->q0[i], to->dq[i], &to->q[i]) + to->dq[M + i]);
-    to->carry_p[i] = step->carry_p[i] + (rest_of_sum(step->p0[i], to->dp[i], &to->p[i]) + to->dp[M + i]);
-  }
-  moving.q0 = to->q, moving.p0 = to->p, moving.carry_q = to->carry_q, moving.carry_p = to->carry_p;
-  return moving;
 }
 #endif
 
@@ -225,21 +128,20 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
   progress now = before_iterations();
   int status = OK;
 #ifdef MOVING_FRAME
-  frame_state start;
-  const step_data moving = into_frame(step, &start), *fixed = step;
+  frame_state state;
+  const step_data moving = into_frame(step, &state), *fixed = step;
   step = &moving;
-#endif
+  memset(z, 0, sizeof z);
+  memset(force, 0, sizeof force);
+#else
   if (*steps > 0) {
     continue_curve(step, past, *steps, z);
     continue_curve(step, past + 2 * M * POINTS, *steps, force);
   } else {
-#ifdef MOVING_FRAME
-    memset(z, 0, sizeof z);
-#else
     status = start_velocities(step, z);
-#endif
     memset(force, 0, sizeof force);
   }
+#endif
   if (status != OK)
     return status;
   push(step, data, force, u);
@@ -253,8 +155,8 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
     if (joint) {
       push(step, data, force, u);
       for (int n = 0; n < GROUPS; n++) {
-        lanes rates[2 * M], at[2 * M];
-        rate_lanes(arguments(step, n, u[n], at), step->t + step->h * ABSCISSA[n], step->parameters, rates);
+        lanes rates[2 * M], at[ARGUMENTS];
+        rate_lanes(KERNEL_ARGUMENTS(step, n, u[n], at), step->t + step->h * ABSCISSA[n], step->parameters, rates);
         rescale(step, n, rates);
         for (int i = 0; i < M; i++) {
           value[n][i] = rates[i];
@@ -267,23 +169,23 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
       forces(step, u, force);
       push(step, data, force, u);
       for (int n = 0; n < GROUPS; n++) {
-        lanes at[2 * M];
-        velocity_lanes(arguments(step, n, u[n], at), step->t + step->h * ABSCISSA[n], step->parameters, value[n]);
+        lanes at[ARGUMENTS];
+        velocity_lanes(KERNEL_ARGUMENTS(step, n, u[n], at), step->t + step->h * ABSCISSA[n], step->parameters, value[n]);
         rescale(step, n, value[n]);
       }
     }
-    if (k == 0) {
 #ifdef MOVING_FRAME
-      measure_quaternions(u, 0, options, fabs(step->h), velocity_size);
-      measure_quaternions(u, M, options, 1.0, momentum_size);
+    if (k < 2)
+      measure_quaternions(u, options, step->h, velocity_size, momentum_size);
 #else
+    if (k == 0) {
       for (int n = 0; n < GROUPS; n++)
         for (int i = 0; i < M; i++)
           momentum[n][i] = u[n][M + i];
       measure_ends(value, options, fabs(step->h), velocity_size);
       measure_ends(momentum, options, 1.0, momentum_size);
-#endif
     }
+#endif
     for (int n = 0; n < GROUPS; n++)
       for (int i = 0; i < M; i++) {
         const lanes correction = value[n][i] - z[n][i], moved = correction * velocity_size[i];
@@ -312,18 +214,9 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
     dp[i] = weigh(POINT_END_MOMENTUM, momentum, i);
   }
 #ifdef MOVING_FRAME
-  for (int i = 0; i < M; i++)
-    dq[M + i] = dp[M + i] = 0.0;
-#endif
-#ifdef TURNS
+  out_of_frame(step = fixed, &state, dq, dp);
+#elif defined(TURNS)
   turn_step(step, past, z, force, dq, dp);
-#endif
-#ifdef MOVING_FRAME
-  step = fixed;
-  for (int i = 0; i < M; i++) {
-    dq[M + i] += rest_of_sum(dq[i], start.dq[i], &dq[i]) + start.dq[M + i];
-    dp[M + i] += rest_of_sum(dp[i], start.dp[i], &dp[i]) + start.dp[M + i];
-  }
 #endif
   if (!accept(step, dq, dp, report))
     return NOT_FINITE;
