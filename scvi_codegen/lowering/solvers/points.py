@@ -37,7 +37,7 @@ once and used in stages and updates alike, and A_nj / w_j = 1 - mu_jn, exact sin
 rounded map still has a generating function: its energy error does not drift.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from itertools import chain
 from typing import Any
@@ -186,10 +186,10 @@ def hamiltonian_iteration(problem: StepProblem) -> FixedPointIteration | None:
             kernel("force_lanes", rates[m:], purpose=f"-H_q at all points, {u}."),
             kernel("rate_lanes", rates, purpose=f"(H_p, -H_q) at all points, {u}.") if joint else None,
             integrand_kernel(system, "integrand_lanes", of),
-            _angle_kernel(system, turns) if moving else None,
-            _turn_kernel(system, turns, lanes=True, moving=moving),
+            *(_frame_kernels(system, turns) if moving else ()),
+            _turn_kernel(system, turns, lanes=True),
         ),
-        constant_mass=_turn_kernel(system, turns, lanes=False, moving=moving),
+        constant_mass=_turn_kernel(system, turns, lanes=False),
         forces=() if joint or moving else ("force_lanes",),
         stored=4 * lanes,
         parts=("point_weights", *(("moving_frame",) if moving else ()), "hamiltonian_iteration"),
@@ -207,21 +207,23 @@ def _functions(turns: Sequence[Turn]) -> tuple[Symbol, ...]:
     return tuple(Symbol(f"{name}_{k}", real=True) for k in range(len(turns)) for name in ("sine", "cosine", "rest"))
 
 
-def _angle_kernel(system: MechanicalSystem, turns: Sequence[Turn]) -> Kernel:
-    """Return the kernel of the squares of angles of the free rotation."""
+def _frame_kernels(system: MechanicalSystem, turns: Sequence[Turn]) -> Iterator[Kernel]:
+    """Yield the kernels of the free rotation: squares of angles, and half of the rotation."""
     q, p = system.coordinates, system.auxiliaries
     squares = [Frame(turn, q, p).y for turn in turns]
-    return system_kernel(system, "angle_lanes", squares, of=(*q, *p), purpose="Squares y of angles, u = (q, tau p).")
+    yield system_kernel(system, "angle_lanes", squares, of=(*q, *p), purpose="Squares y of angles, u = (q, tau p).")
+    halves = [x for turn in turns for x in turn.half_rotation(q, p)]
+    yield system_kernel(system, "axis_lanes", halves, of=(*q, *p), purpose="h Pi/(4 A), u = (q, h p).")
 
 
-def _turn_kernel(system: MechanicalSystem, turns: Sequence[Turn], *, lanes: bool, moving: bool) -> Kernel | None:
+def _turn_kernel(system: MechanicalSystem, turns: Sequence[Turn], *, lanes: bool) -> Kernel | None:
     """Return the kernel of the rotations that end a step, or of their effect on vectors; ``None`` without turns."""
     q, p = (tuple(Symbol(f"{name}_{i}", real=True) for i in range(system.dimension)) for name in "qp")
     if not turns:
         return None
     if not lanes:
-        values = [turn.rotation(q, p) for turn in turns] + [turn.half_rotation(q, p) for turn in turns if moving]
-        purpose = f"exp(kappa h Pi_k e_k/2) - 1{', and h Pi/(4 A)' * moving}, u = (q, h p)."
+        values = [turn.rotation(q, p) for turn in turns]
+        purpose = "exp(kappa h Pi_k e_k/2) - 1, u = (q, h p)."
         return system_kernel(system, "rotations", sum(values, ()), of=(*q, *p), purpose=purpose)
     rotations = [tuple(Symbol(f"g_{k}_{i}", real=True) for i in range(4)) for k in range(len(turns))]
     changes = ((*t.change(q, g), *t.change(p, g)) for t, g in zip(turns, rotations, strict=True))

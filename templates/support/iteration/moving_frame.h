@@ -140,26 +140,40 @@ static inline void rotate(const step_data *step, frame_state *at, const double *
   }
 }
 
+/* f <- f g for f - 1 and g - 1. */
+static inline void join(double *f, const double *g)
+{
+  const double a = f[0], b = f[1], c = f[2], d = f[3];
+  f[0] += g[0] + (a * g[0] - b * g[1] - c * g[2] - d * g[3]);
+  f[1] += g[1] + (a * g[1] + b * g[0] + c * g[3] - d * g[2]);
+  f[2] += g[2] + (a * g[2] - b * g[3] + c * g[0] + d * g[1]);
+  f[3] += g[3] + (a * g[3] + b * g[2] - c * g[1] + d * g[0]);
+}
+
 /* Free rotation during half of the step, and at its end the turns about axes of symmetry. */
 static inline void rotate_freely(const step_data *step, frame_state *at, int end)
 {
-  double u[2 * M], value[7 * TURNS], g[4 * TURNS];
+  lanes u[2 * M], m[3 * TURNS];
+  double scalar[2 * M], g[4 * TURNS], turn[4 * TURNS];
   for (int i = 0; i < M; i++) {
-    u[i] = at->q[i];
-    u[M + i] = step->h * at->p[i];
+    u[i] = lanes_of(scalar[i] = at->q[i]);
+    u[M + i] = lanes_of(scalar[M + i] = step->h * at->p[i]);
   }
-  rotations(u, step->t, step->parameters, value);
+  axis_lanes(u, lanes_of(step->t), step->parameters, m);
   for (int k = 0; k < TURNS; k++) {
-    const double *m = value + 4 * TURNS + 3 * k;
+    const lanes *v = m + 3 * k;
     lanes of[3];
-    frame_functions(lanes_of(m[0] * m[0] + m[1] * m[1] + m[2] * m[2]), of);
+    frame_functions(v[0] * v[0] + v[1] * v[1] + v[2] * v[2], of);
     g[4 * k] = at_first(&of[1]);
     for (int j = 0; j < 3; j++)
-      g[4 * k + 1 + j] = at_first(&of[0]) * m[j];
+      g[4 * k + 1 + j] = at_first(&of[0]) * at_first(&v[j]);
+  }
+  if (end) {
+    rotations(scalar, step->t, step->parameters, turn);
+    for (int k = 0; k < 4 * TURNS; k += 4)
+      join(g + k, turn + k);
   }
   rotate(step, at, g);
-  if (end)
-    rotate(step, at, value);
 }
 
 /* Returns the step from the state in the moving frame, which is stored in `at`. */
