@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import sympy
-from sympy import Add, Symbol
+from sympy import Add, Expr, Symbol
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.expressions import gradient_tuple
@@ -23,7 +23,7 @@ from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, fo
 from scvi_codegen.mechanics.forces import nonholonomic_expressions
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.rotations.axial import Turn, axial_turns
+from scvi_codegen.mechanics.rotations.axial import Turn, axial_turns, moving_frame
 from scvi_codegen.mechanics.rotations.hamiltonian import hamiltonian_of_rotations
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.time_transformation import reparametrise
@@ -32,7 +32,7 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_structure import Velocities
 from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table
 from scvi_codegen.tables.basis import identity_matrix, next_step
-from scvi_codegen.tables.precision import Matrix, Vector, mp
+from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
 
 NUMBERS = {"34a": "35a", "34c": "35c", "34d": "35d", "34e": "35e"}
 """Equation numbers of the paper for the shooting method in phase space, by those for Lagrangians."""
@@ -72,30 +72,126 @@ def discretise(system: MechanicalSystem, method: Method) -> StageSystem:
             'method supports damping as forces, "-gamma*p", but then areas do not shrink by exactly '
             "exp(-gamma h)"
         )
-    return _completed(system, stages, method)
+    return _completed(system, stages, method, moving=in_moving_frame(system, method))
+
+
+def in_moving_frame(system: MechanicalSystem, method: Method) -> bool:
+    """Return whether the method is applied in the moving frame of bodies: if its points determine the momenta."""
+    return bool(moving_frame(system)) and isinstance(method.stage_system(axial_turns(system)[0]).shape, Velocities)
 
 
 def paper_equations(system: MechanicalSystem, method: Method) -> StageSystem:
     """Return the equations in the paper's notation. Raises as :func:`discretise`."""
     check_regular(method, system)
-    return _completed(system, method.paper_form(axial_turns(system)[0]), method)
+    moving = in_moving_frame(system, method)
+    return _completed(system, method.paper_form(axial_turns(system)[0]), method, moving=moving)
 
 
-def _completed(system: MechanicalSystem, stages: StageSystem, method: Method) -> StageSystem:
-    """Add auxiliary variables, constraints, damping, and the turns of axially symmetric bodies to the equations."""
-    system, turns = axial_turns(system)
-    completed = with_auxiliaries(system, stages)
-    completed = with_constraints(system, completed, method.name) if system.constraints else completed
-    completed = replace(completed, damping=system.damping)
-    return _turned(system, completed, turns) if turns else completed
+def _completed(system: MechanicalSystem, stages: StageSystem, method: Method, *, moving: bool) -> StageSystem:
+    """Add auxiliary variables, constraints, damping, and the rotations of axially symmetric bodies to the equations."""
+    core, turns = axial_turns(system)
+    completed = with_auxiliaries(core, stages)
+    completed = with_constraints(core, completed, method.name) if core.constraints else completed
+    completed = replace(completed, damping=core.damping)
+    completed = _framed(core, completed, turns, moving_frame(system)) if moving else completed
+    return _turned(core, completed, turns, moving=moving) if turns else completed
 
 
-def _turned(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn]) -> StageSystem:
-    """Return the equations followed by turns of bodies: V is their change of q by h, P the momentum before them."""
-    q, size = system.coordinates, len(stages.rows)
-    u, v = (tuple(Symbol(f"{name}_{i}", real=True) for i in range(len(q))) for name in ("turn", "change"))
-    changes = [(turn.change(q, g), turn.change(u, g)) for turn in turns for g in [turn.rotation(q, u)]]
-    moved, pushed = (tuple(map(Add, *each)) for each in zip(*changes, strict=True))
+def _symbols(count: int) -> tuple[tuple[Symbol, ...], ...]:
+    """Return the symbols of u = h p and of changes of q."""
+    return tuple(tuple(Symbol(f"{name}_{i}", real=True) for i in range(count)) for name in ("turn", "change"))
+
+
+def _framed(
+    system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn], rates: Sequence[Expr]
+) -> StageSystem:
+    """Return the equations in the moving frame, with the first half of the free rotation as further unknowns.
+
+    W depends on u_n = (c_n - 1/2) h P_n. At the start V is the change of q by h, P the momentum before it.
+    """
+    q, size, (u, v) = system.coordinates, len(stages.rows), _symbols(len(system.coordinates))
+    by_u = dict(zip(system.auxiliaries, u, strict=True))
+    velocity, force = (tuple(x.xreplace(by_u) for x in part) for part in (rates[: len(q)], rates[len(q) :]))
+    groups = [
+        replace(wide, gathers=tuple(replace(x, table=_following(x.table)) for x in wide.gathers))
+        for wide in (each.widened(2) for each in stages.stage_groups)
+    ]
+    for k, group in enumerate(groups):
+        if system.auxiliaries not in (each.arguments for each in group.gathers):
+            continue
+        (at,) = (each for each in group.gathers if each.arguments == system.auxiliaries)
+        first, momentum, rate = group.scatters
+        times = [c - mp.mpf(1) / 2 for c in group.abscissae]
+        groups[k] = replace(
+            group,
+            gathers=(*group.gathers, replace(at, arguments=u, table=_timed(at.table, times), power=at.power + 1)),
+            scatters=(
+                replace(first, results=force),
+                momentum,
+                replace(rate, results=system.velocities),
+                Scatter(results=tuple(-x for x in velocity), table=_timed(rate.table, times), power=rate.power + 1),
+            ),
+            scalar=None,
+            in_action=False,
+        )
+    changes = zip(*(turn.changes(q, u, free=True, turned=False) for turn in turns), strict=True)
+    moved, pushed = (tuple(map(Add, *each)) if len(turns) > 1 else each[0] for each in changes)
+    one, minus, none = Table.constant(1, 1, 1), Table.constant(1, 1, -1), Table.constant(1, 1)
+    others = Table.constant(1, size)
+    into = Table.named("", [(*(row.momentum for row in stages.rows), mp.zero, mp.zero, stages.end_momentum)])
+    start = StageGroup(
+        name="frame",
+        abscissae=(mp.zero,),
+        gathers=(
+            Gather(arguments=q, table=Table.joined(one, others, none, none), power=0),
+            Gather(arguments=u, table=Table.joined(none, others, one, none), power=0),
+            Gather(arguments=v, table=Table.joined(none, others, none, one), power=0),
+        ),
+        scatters=(
+            Scatter(
+                results=tuple(a - b for a, b in zip(moved, v, strict=True)),
+                table=Table.joined(others, none, one, none),
+                power=-1,
+            ),
+            Scatter(results=pushed, table=into, power=-1),
+            Scatter(results=u, table=Table.joined(others, minus, none, none), power=-1),
+        ),
+        computes="Changes of q and u = h p by half of the free rotation, less v, and u",
+    )
+    still = (mp.zero, mp.zero)
+    return replace(
+        stages,
+        blocks=(
+            *(replace(each, straight=still) if each.moves else each for each in stages.blocks),
+            Block(name="P_start", power=1, straight=still, momentum=1, moves=False),
+            Block(name="V_start", power=1, straight=still),
+        ),
+        rows=(
+            *stages.rows,
+            Row(number="P_start", kind="stage", momentum=mp.one),
+            Row(number="V_start", kind="stage", momentum=mp.zero),
+        ),
+        stage_groups=(start, *groups),
+        end_position=_following(Table.joined(stages.end_position, none, none)),
+        extrapolation=stages.extrapolation and _diagonal([stages.extrapolation, identity_matrix(2)]),
+    )
+
+
+def _following(table: Table) -> Table:
+    """Return a table in which the last block, a change of q0, has the coefficients of q0."""
+    return table.columns([*range(len(table.entries[0]) - 1), 0])
+
+
+def _timed(table: Table, times: Sequence[Number]) -> Table:
+    """Return the rows of a table times numbers."""
+    return Table.named("tau", [[t * x for x in line] for t, line in zip(times, table.entries, strict=True)])
+
+
+def _turned(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn], *, moving: bool) -> StageSystem:
+    """Return the equations followed by rotations of bodies: V is their change of q by h, P the momentum before them."""
+    q, size, (u, v) = system.coordinates, len(stages.rows), _symbols(len(system.coordinates))
+    changes = zip(*(turn.changes(q, u, free=moving, turned=True) for turn in turns), strict=True)
+    moved, pushed = (tuple(map(Add, *each)) if len(turns) > 1 else each[0] for each in changes)
     one, minus, none = Table.constant(1, 1, 1), Table.constant(1, 1, -1), Table.constant(1, 1)
     before, others = Table.joined(stages.end_position, none, none), Table.constant(1, size)
     results = (tuple(a - b for a, b in zip(moved, v, strict=True)), (minus, none, none)), (pushed, (none, none, one))
@@ -111,7 +207,7 @@ def _turned(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn]
             Scatter(results=each, table=Table.joined(others, *columns), power=-1)
             for each, columns in (*results, (u, (none, minus, none)))
         ),
-        computes="Changes of q and u = h p by turns about axes of symmetry, less v, and u",
+        computes="Changes of q and u = h p by rotations, less v, and u",
     )
     still = (mp.zero, mp.zero)
     spin = Block(name="V_spin", power=1, straight=still)

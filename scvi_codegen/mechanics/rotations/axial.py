@@ -79,6 +79,19 @@ class Turn:
         """Return m = h Pi/(4A) of the free rotation exp(m) during h/2, where u = h p."""
         return tuple(self.rate * x / 4 for x in self.momentum(q, u))
 
+    def changes(self, q: Sequence[Expr], u: Sequence[Expr], *, free: bool, turned: bool) -> list[tuple[Expr, ...]]:
+        """Return the changes of q and u = h p by the free rotation during h/2, and then by the turn."""
+        m = [intermediate(x) for x in self.half_rotation(q, u)]
+        sine, less, _ = _functions(_dot(m, m))
+        rotations = [(less, *(sine * x for x in m))] * free + [self.rotation(q, u)] * turned
+        changes = []
+        for x in (q, u):
+            moved = tuple(x)
+            for g in rotations:
+                moved = tuple(map(intermediate, map(Add, moved, self.change(moved, tuple(map(intermediate, g))))))
+            changes.append(tuple(a - b for a, b in zip(moved, x, strict=True)))
+        return changes
+
     def is_symmetry(self, system: HamiltonianSystem) -> bool:
         """Return whether H does not change along (q e_k, p e_k), at random states, so that Pi_k is conserved."""
         variables = (*system.coordinates, *system.momenta)
@@ -116,12 +129,7 @@ class Frame:
         self.norm, self.along, self.square = _dot(self.q, self.q), _dot(self.q, self.v), _dot(self.v, self.v)
         self.y = intermediate(self.norm * self.square - self.along**2)
         self.b = [intermediate(self.norm * y - self.along * x) for x, y in zip(self.q, self.v, strict=True)]
-        if functions:
-            self.S, self.less, self.D = functions
-        else:
-            angle = intermediate(sqrt(self.y + SMALLEST))
-            self.S, self.less = intermediate(sin(angle) / angle), intermediate(-2 * sin(angle / 2) ** 2)
-            self.D = intermediate((1 + self.less - self.S) / angle**2)
+        self.S, self.less, self.D = functions or _functions(self.y)
         self.moved = [intermediate(x + self.less * x + self.S * b) for x, b in zip(self.q, self.b, strict=True)]
 
     def rates(self, g: Sequence[Expr]) -> tuple[list[Expr], list[Expr]]:
@@ -133,6 +141,13 @@ class Frame:
         by_v, parts = intermediate(sqg + by_y * self.along), list(zip(g, self.q, self.v, self.b, strict=True))
         velocity = [self.scale * (sn * x - sqg * q + by_y * b) for x, q, _, b in parts]
         return velocity, [by_v * v - by_g * x - by_q * q for x, q, v, _ in parts]
+
+
+def _functions(y: Expr) -> tuple[Expr, ...]:
+    """Return S, C - 1 and D at y."""
+    angle = intermediate(sqrt(y + SMALLEST))
+    sine, less = intermediate(sin(angle) / angle), intermediate(-2 * sin(angle / 2) ** 2)
+    return sine, less, intermediate((1 + less - sine) / angle**2)
 
 
 def _dot(x: Sequence[Expr], y: Sequence[Expr]) -> Expr:
