@@ -10,7 +10,7 @@ and one such pair of rows per node where a multiplied residual is made stationar
 the method equals that of the Lagrangian, step for step: (35f) is the Legendre transform at the points.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -19,11 +19,12 @@ from sympy import Add, Expr, Symbol
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.expressions import gradient_tuple
+from scvi_codegen.formulas.intermediates import intermediate
 from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, forms_of
 from scvi_codegen.mechanics.forces import nonholonomic_expressions
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.rotations.axial import Turn, axial_turns, moving_frame
+from scvi_codegen.mechanics.rotations.axial import Turn, axial_turns, frame_potential, rotated
 from scvi_codegen.mechanics.rotations.hamiltonian import hamiltonian_of_rotations
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.time_transformation import reparametrise
@@ -72,152 +73,131 @@ def discretise(system: MechanicalSystem, method: Method) -> StageSystem:
             'method supports damping as forces, "-gamma*p", but then areas do not shrink by exactly '
             "exp(-gamma h)"
         )
-    return _completed(system, stages, method, moving=in_moving_frame(system, method))
+    return _completed(system, stages, method)
 
 
-def in_moving_frame(system: MechanicalSystem, method: Method) -> bool:
-    """Return whether the method is applied in the moving frame of bodies: if its points determine the momenta."""
-    return bool(moving_frame(system)) and isinstance(method.stage_system(axial_turns(system)[0]).shape, Velocities)
+def _potential(system: MechanicalSystem, method: Method) -> Expr | None:
+    """Return the potential if the method is applied in the moving frame of bodies: its points determine the momenta."""
+    core = axial_turns(system)[0]
+    return frame_potential(system) if isinstance(method.stage_system(core).shape, Velocities) else None
 
 
 def paper_equations(system: MechanicalSystem, method: Method) -> StageSystem:
     """Return the equations in the paper's notation. Raises as :func:`discretise`."""
     check_regular(method, system)
-    moving = in_moving_frame(system, method)
-    return _completed(system, method.paper_form(axial_turns(system)[0]), method, moving=moving)
+    return _completed(system, method.paper_form(axial_turns(system)[0]), method)
 
 
-def _completed(system: MechanicalSystem, stages: StageSystem, method: Method, *, moving: bool) -> StageSystem:
+def _completed(system: MechanicalSystem, stages: StageSystem, method: Method) -> StageSystem:
     """Add auxiliary variables, constraints, damping, and the rotations of axially symmetric bodies to the equations."""
     core, turns = axial_turns(system)
     completed = with_auxiliaries(core, stages)
     completed = with_constraints(core, completed, method.name) if core.constraints else completed
     completed = replace(completed, damping=core.damping)
-    completed = _framed(core, completed, turns, moving_frame(system)) if moving else completed
-    return _turned(core, completed, turns, moving=moving) if turns else completed
+    if turns and (potential := _potential(system, method)) is not None:
+        completed = _after_start(core, _framed(core, completed, turns, potential), turns)
+        return _turned(core, completed, turns, Turn.free_rotation, Turn.rotation)
+    return _turned(core, completed, turns, Turn.rotation) if turns else completed
 
 
-def _symbols(count: int) -> tuple[tuple[Symbol, ...], ...]:
+def _symbols(system: MechanicalSystem) -> tuple[tuple[Symbol, ...], ...]:
     """Return the symbols of u = h p and of changes of q."""
-    return tuple(tuple(Symbol(f"{name}_{i}", real=True) for i in range(count)) for name in ("turn", "change"))
+    return tuple(tuple(Symbol(f"{n}_{i}", real=True) for i in range(system.dimension)) for n in ("turn", "change"))
 
 
-def _framed(
-    system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn], rates: Sequence[Expr]
-) -> StageSystem:
-    """Return the equations in the moving frame, with the first half of the free rotation as further unknowns.
+def _framed(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn], potential: Expr) -> StageSystem:
+    """Return the equations of W(Q, u_n), u_n = (c_n - 1/2) h P_n, in place of H: in the moving frame."""
+    q, u = system.coordinates, _symbols(system)[0]
+    moved = map(Add, q, rotated(turns, q, [2 * x for x in u], Turn.free_rotation)[0])
+    W, groups = potential.xreplace(dict(zip(q, map(intermediate, moved), strict=True))), []
+    for group in stages.stage_groups:
+        at = next((each for each in group.gathers if each.arguments == system.auxiliaries), None)
+        if at is not None:
+            force, momentum, rate = group.scatters
+            placed = [
+                Table.named("tau", [[(c - 0.5) * x for x in line] for c, line in zip(group.abscissae, table.entries)])
+                for table in (at.table, rate.table)
+            ]
+            velocity, push = (tuple(-x for x in gradient_tuple(W, variables)) for variables in (u, q))
+            rates = replace(rate, results=system.velocities), Scatter(results=velocity, table=placed[1], power=1)
+            gathers = (*group.gathers, Gather(arguments=u, table=placed[0], power=at.power + 1))
+            scatters = (replace(force, results=push), momentum, *rates)
+            group = replace(group, gathers=gathers, scatters=scatters, scalar=None, in_action=False)
+        groups.append(group)
+    still = [replace(each, straight=(mp.zero,) * 2) if each.moves else each for each in stages.blocks]
+    return replace(stages, blocks=tuple(still), stage_groups=tuple(groups))
 
-    W depends on u_n = (c_n - 1/2) h P_n. At the start V is the change of q by h, P the momentum before it.
-    """
-    q, size, (u, v) = system.coordinates, len(stages.rows), _symbols(len(system.coordinates))
-    by_u = dict(zip(system.auxiliaries, u, strict=True))
-    velocity, force = (tuple(x.xreplace(by_u) for x in part) for part in (rates[: len(q)], rates[len(q) :]))
-    groups = [
-        replace(wide, gathers=tuple(replace(x, table=_following(x.table)) for x in wide.gathers))
-        for wide in (each.widened(2) for each in stages.stage_groups)
-    ]
-    for k, group in enumerate(groups):
-        if system.auxiliaries not in (each.arguments for each in group.gathers):
-            continue
-        (at,) = (each for each in group.gathers if each.arguments == system.auxiliaries)
-        first, momentum, rate = group.scatters
-        times = [c - mp.mpf(1) / 2 for c in group.abscissae]
-        groups[k] = replace(
-            group,
-            gathers=(*group.gathers, replace(at, arguments=u, table=_timed(at.table, times), power=at.power + 1)),
-            scatters=(
-                replace(first, results=force),
-                momentum,
-                replace(rate, results=system.velocities),
-                Scatter(results=tuple(-x for x in velocity), table=_timed(rate.table, times), power=rate.power + 1),
-            ),
-            scalar=None,
-            in_action=False,
-        )
-    changes = zip(*(turn.changes(q, u, free=True, turned=False) for turn in turns), strict=True)
-    moved, pushed = (tuple(map(Add, *each)) if len(turns) > 1 else each[0] for each in changes)
-    one, minus, none = Table.constant(1, 1, 1), Table.constant(1, 1, -1), Table.constant(1, 1)
-    others = Table.constant(1, size)
+
+def _after_start(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn]) -> StageSystem:
+    """Return the equations after half of the free rotation, with its change of q by h as a block like q0."""
+    columns = [*range(len(stages.rows) + 1), 0, -1]
+    groups = (each.widened(2) for each in stages.stage_groups)
+    following = tuple(
+        replace(group, gathers=tuple(replace(x, table=x.table.columns(columns)) for x in group.gathers))
+        for group in groups
+    )
+    none = Table.constant(1, 2)
+    start = Table.joined(Table.constant(1, 1, 1), Table.constant(1, len(stages.rows)), none)
     into = Table.named("", [(*(row.momentum for row in stages.rows), mp.zero, mp.zero, stages.end_momentum)])
-    start = StageGroup(
-        name="frame",
-        abscissae=(mp.zero,),
-        gathers=(
-            Gather(arguments=q, table=Table.joined(one, others, none, none), power=0),
-            Gather(arguments=u, table=Table.joined(none, others, one, none), power=0),
-            Gather(arguments=v, table=Table.joined(none, others, none, one), power=0),
-        ),
-        scatters=(
-            Scatter(
-                results=tuple(a - b for a, b in zip(moved, v, strict=True)),
-                table=Table.joined(others, none, one, none),
-                power=-1,
-            ),
-            Scatter(results=pushed, table=into, power=-1),
-            Scatter(results=u, table=Table.joined(others, minus, none, none), power=-1),
-        ),
-        computes="Changes of q and u = h p by half of the free rotation, less v, and u",
-    )
-    still = (mp.zero, mp.zero)
-    return replace(
-        stages,
-        blocks=(
-            *(replace(each, straight=still) if each.moves else each for each in stages.blocks),
-            Block(name="P_start", power=1, straight=still, momentum=1, moves=False),
-            Block(name="V_start", power=1, straight=still),
-        ),
-        rows=(
-            *stages.rows,
-            Row(number="P_start", kind="stage", momentum=mp.one),
-            Row(number="V_start", kind="stage", momentum=mp.zero),
-        ),
-        stage_groups=(start, *groups),
-        end_position=_following(Table.joined(stages.end_position, none, none)),
-        extrapolation=stages.extrapolation and _diagonal([stages.extrapolation, identity_matrix(2)]),
-    )
+    end = Table.joined(stages.end_position, none).columns(columns)
+    changes = rotated(turns, system.coordinates, _symbols(system)[0], Turn.free_rotation)
+    return _rotated(system, stages, changes, "start", following, start, into, mp.one, end)
 
 
-def _following(table: Table) -> Table:
-    """Return a table in which the last block, a change of q0, has the coefficients of q0."""
-    return table.columns([*range(len(table.entries[0]) - 1), 0])
+def _turned(
+    system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn], *rotations: Callable[..., tuple[Expr, ...]]
+) -> StageSystem:
+    """Return the equations followed by rotations of bodies."""
+    size, one, none = len(stages.rows), Table.constant(1, 1, 1), Table.constant(1, 1)
+    groups = tuple(_reaching(each, size) for each in stages.stage_groups)
+    before, into = Table.joined(stages.end_position, none, none), Table.joined(Table.constant(1, size), none, none, one)
+    changes = rotated(turns, system.coordinates, _symbols(system)[0], *rotations)
+    end = Table.joined(stages.end_position, one, none)
+    return _rotated(system, stages, changes, "spin", groups, before, into, stages.end_momentum, end)
 
 
-def _timed(table: Table, times: Sequence[Number]) -> Table:
-    """Return the rows of a table times numbers."""
-    return Table.named("tau", [[t * x for x in line] for t, line in zip(times, table.entries, strict=True)])
-
-
-def _turned(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn], *, moving: bool) -> StageSystem:
-    """Return the equations followed by rotations of bodies: V is their change of q by h, P the momentum before them."""
-    q, size, (u, v) = system.coordinates, len(stages.rows), _symbols(len(system.coordinates))
-    changes = zip(*(turn.changes(q, u, free=moving, turned=True) for turn in turns), strict=True)
-    moved, pushed = (tuple(map(Add, *each)) if len(turns) > 1 else each[0] for each in changes)
-    one, minus, none = Table.constant(1, 1, 1), Table.constant(1, 1, -1), Table.constant(1, 1)
-    before, others = Table.joined(stages.end_position, none, none), Table.constant(1, size)
-    results = (tuple(a - b for a, b in zip(moved, v, strict=True)), (minus, none, none)), (pushed, (none, none, one))
+def _rotated(
+    system: MechanicalSystem,
+    stages: StageSystem,
+    changes: Sequence[tuple[Expr, ...]],
+    name: str,
+    groups: tuple[StageGroup, ...],
+    before: Table,
+    into: Table,
+    momentum: Number,
+    end: Table,
+) -> StageSystem:
+    """Return the equations with rotations of bodies: V is their change of q by h, P the momentum before them."""
+    (u, v), minus = _symbols(system), Table.constant(1, 1, -1)
+    one, none, others = Table.constant(1, 1, 1), Table.constant(1, 1), Table.constant(1, len(stages.rows))
+    change = tuple(a - b for a, b in zip(changes[0], v, strict=True))
+    tables = Table.joined(others, minus, none, none), into, Table.joined(others, none, minus, none)
     group = StageGroup(
-        name="spin",
-        abscissae=(mp.one,),
+        name=name,
+        abscissae=(mp.mpf(name == "spin"),),
         gathers=(
-            Gather(arguments=q, table=before, power=0),
+            Gather(arguments=system.coordinates, table=before, power=0),
             Gather(arguments=u, table=Table.joined(none, others, none, one), power=0),
             Gather(arguments=v, table=Table.joined(none, others, one, none), power=0),
         ),
         scatters=tuple(
-            Scatter(results=each, table=Table.joined(others, *columns), power=-1)
-            for each, columns in (*results, (u, (none, minus, none)))
+            Scatter(results=each, table=table, power=-1)
+            for each, table in zip((change, changes[1], u), tables, strict=True)
         ),
-        computes="Changes of q and u = h p by rotations, less v, and u",
+        computes="Changes of q and u = h p by rotations of bodies, less v, and u",
     )
     still = (mp.zero, mp.zero)
-    spin = Block(name="V_spin", power=1, straight=still)
-    last = Row(number="P_spin", kind="IDEL", momentum=stages.end_momentum)
+    last = Block(name=f"P_{name}", power=1, straight=still, momentum=1, moves=False)
+    rows = (
+        Row(number=f"V_{name}", kind="stage", momentum=mp.zero),
+        Row(number=f"P_{name}", kind="IDEL", momentum=momentum),
+    )
     return replace(
         stages,
-        blocks=(*stages.blocks, spin, Block(name="P_spin", power=1, straight=still, momentum=1, moves=False)),
-        rows=(*stages.rows, Row(number="V_spin", kind="stage", momentum=mp.zero), last),
-        stage_groups=(*(_reaching(each, size) for each in stages.stage_groups), group),
-        end_position=Table.joined(stages.end_position, one, none),
+        blocks=(*stages.blocks, Block(name=f"V_{name}", power=1, straight=still), last),
+        rows=(*stages.rows, *rows),
+        stage_groups=(*groups, group),
+        end_position=end,
         extrapolation=stages.extrapolation and _diagonal([stages.extrapolation, identity_matrix(2)]),
     )
 

@@ -37,7 +37,7 @@ once and used in stages and updates alike, and A_nj / w_j = 1 - mu_jn, exact sin
 rounded map still has a generating function: its energy error does not drift.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from itertools import chain
 from typing import Any
@@ -45,7 +45,7 @@ from typing import Any
 import sympy
 from sympy import Add, Expr, Symbol
 
-from scvi_codegen.formulas.expressions import jacobian
+from scvi_codegen.formulas.expressions import gradient_tuple, jacobian
 from scvi_codegen.formulas.intermediates import inner_of
 from scvi_codegen.ir.equations import FixedPointIteration, IterationName, IterationTable, StoredValues
 from scvi_codegen.ir.kernel import Kernel
@@ -64,7 +64,7 @@ from scvi_codegen.lowering.solvers.tables import (
 from scvi_codegen.lowering.stage_groups import damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.rotations.axial import Frame, Turn, axial_turns, moving_frame
+from scvi_codegen.mechanics.rotations.axial import Turn, axial_turns, frame_potential
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_structure import Accelerations, Velocities
 from scvi_codegen.tables.basis import matrix_product, transpose
@@ -172,48 +172,46 @@ def hamiltonian_iteration(problem: StepProblem) -> FixedPointIteration | None:
         return None
     of, turning = forms.legendre_arguments, bool(system.rotations)
     joint = turning and lanes > 2 and sum(len(each.coordinates) for each in system.rotations) == system.dimension
-    functions = _functions(turns)
-    rates, m = moving_frame(problem.system, functions), system.dimension
-    moving, of = bool(rates), (*of, *functions) if rates else of
-    rates = rates or (*forms.legendre, *forms.force)
-    kernel, u = partial(system_kernel, system, of=of, paired=turning), "u = (Q, tau P, ..)" if moving else "u = (q, p)"
+    kernel, potential = partial(system_kernel, system, of=of, paired=turning), frame_potential(problem.system)
+    moving = potential is not None
+    rates = (
+        kernel("velocity_lanes", forms.legendre, purpose="H_p at all points, u = (q, p)."),
+        kernel("force_lanes", forms.force, purpose="-H_q at all points, u = (q, p)."),
+        kernel("rate_lanes", (*forms.legendre, *forms.force), purpose="(H_p, -H_q) at all points, u = (q, p).")
+        if joint
+        else None,
+        integrand_kernel(system, "integrand_lanes", of),
+        _turn_kernel(system, turns, lanes=True),
+    )
     return _point_iteration(
         "Hamiltonian",
         tables,
         lanes,
-        (
-            kernel("velocity_lanes", rates[:m], purpose=f"H_p at all points, {u}."),
-            kernel("force_lanes", rates[m:], purpose=f"-H_q at all points, {u}."),
-            kernel("rate_lanes", rates, purpose=f"(H_p, -H_q) at all points, {u}.") if joint else None,
-            integrand_kernel(system, "integrand_lanes", of),
-            *(_frame_kernels(system, turns) if moving else ()),
-            _turn_kernel(system, turns, lanes=True),
-        ),
+        rates if potential is None else (_frame_kernel(system, turns, potential),),
         constant_mass=_turn_kernel(system, turns, lanes=False),
         forces=() if joint or moving else ("force_lanes",),
         stored=4 * lanes,
         parts=("point_weights", *(("moving_frame",) if moving else ()), "hamiltonian_iteration"),
         macros=tuple(
             (name, value)
-            for name, value in (("JOINT_RATES", int(joint)), ("TURNS", len(turns)), ("MOVING_FRAME", int(moving)))
+            for name, value in (
+                ("JOINT_RATES", int(joint or moving)),
+                ("TURNS", len(turns)),
+                ("MOVING_FRAME", int(moving)),
+            )
             if value
         ),
         matrix=tables.position if _nearly_equal(tables.position, tables.momentum) else (),
     )
 
 
-def _functions(turns: Sequence[Turn]) -> tuple[Symbol, ...]:
-    """Return the symbols of S, C - 1 and D of each body."""
-    return tuple(Symbol(f"{name}_{k}", real=True) for k in range(len(turns)) for name in ("sine", "cosine", "rest"))
-
-
-def _frame_kernels(system: MechanicalSystem, turns: Sequence[Turn]) -> Iterator[Kernel]:
-    """Yield the kernels of the free rotation: squares of angles, and half of the rotation."""
-    q, p = system.coordinates, system.auxiliaries
-    squares = [Frame(turn, q, p).y for turn in turns]
-    yield system_kernel(system, "angle_lanes", squares, of=(*q, *p), purpose="Squares y of angles, u = (q, tau p).")
-    halves = [x for turn in turns for x in turn.half_rotation(q, p)]
-    yield system_kernel(system, "axis_lanes", halves, of=(*q, *p), purpose="h Pi/(4 A), u = (q, h p).")
+def _frame_kernel(system: MechanicalSystem, turns: Sequence[Turn], potential: Expr) -> Kernel:
+    """Return the kernel of the gradient of the potential and of the factors of angles, as a function of q and |q|^2."""
+    q, squares = system.coordinates, [Symbol(f"square_{k}", real=True) for k in range(len(turns))]
+    sums = {Add(*(x**2 for x in q[4 * k : 4 * k + 4])): each for k, each in enumerate(squares)}
+    values = [each.xreplace(sums) for each in gradient_tuple(potential, q)] + [turn.rate / 4 for turn in turns]
+    purpose = "V_q and 1/(4 A) at all points, u = (q, |q|^2 of each body)."
+    return system_kernel(system, "frame_lanes", values, of=(*q, *squares), paired=True, purpose=purpose)
 
 
 def _turn_kernel(system: MechanicalSystem, turns: Sequence[Turn], *, lanes: bool) -> Kernel | None:

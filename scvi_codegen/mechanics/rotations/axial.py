@@ -23,14 +23,14 @@ and the turn: symplectic, symmetric, of the order of the method, and exact witho
 with h^2 V'' in place of h |Pi|/(2A).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import product
 
 from sympy import Add, Expr, Quaternion, S, cos, expand, sin, sqrt
 from sympy.core.function import AppliedUndef
 
-from scvi_codegen.formulas.expressions import gradient_tuple
 from scvi_codegen.formulas.intermediates import intermediate
 from scvi_codegen.formulas.rotations.members import Rotation
 from scvi_codegen.formulas.symbols import symbol
@@ -61,8 +61,8 @@ class Turn:
 
     def change(self, x: Sequence[Expr], rotation: Sequence[Expr]) -> tuple[Expr, ...]:
         """Return x (g - 1) for the quaternion in x and the four components of g - 1; 0 for the other entries."""
-        product = (Quaternion(*x[self.first : self.first + 4]) * Quaternion(*rotation)).args
-        return (*(S.Zero,) * self.first, *product, *(S.Zero,) * (len(x) - self.first - 4))
+        own = (Quaternion(*x[self.first : self.first + 4]) * Quaternion(*rotation)).args
+        return (*(S.Zero,) * self.first, *own, *(S.Zero,) * (len(x) - self.first - 4))
 
     def momentum(self, q: Sequence[Expr], p: Sequence[Expr]) -> tuple[Expr, ...]:
         """Return Pi = Im(conj(q) p)/2."""
@@ -75,22 +75,11 @@ class Turn:
         along = (2 * sin(half) * cos(half) if k == self.axis else S.Zero for k in range(3))
         return (-2 * sin(half) ** 2, *along)
 
-    def half_rotation(self, q: Sequence[Expr], u: Sequence[Expr]) -> tuple[Expr, ...]:
-        """Return m = h Pi/(4A) of the free rotation exp(m) during h/2, where u = h p."""
-        return tuple(self.rate * x / 4 for x in self.momentum(q, u))
-
-    def changes(self, q: Sequence[Expr], u: Sequence[Expr], *, free: bool, turned: bool) -> list[tuple[Expr, ...]]:
-        """Return the changes of q and u = h p by the free rotation during h/2, and then by the turn."""
-        m = [intermediate(x) for x in self.half_rotation(q, u)]
-        sine, less, _ = _functions(_dot(m, m))
-        rotations = [(less, *(sine * x for x in m))] * free + [self.rotation(q, u)] * turned
-        changes = []
-        for x in (q, u):
-            moved = tuple(x)
-            for g in rotations:
-                moved = tuple(map(intermediate, map(Add, moved, self.change(moved, tuple(map(intermediate, g))))))
-            changes.append(tuple(a - b for a, b in zip(moved, x, strict=True)))
-        return changes
+    def free_rotation(self, q: Sequence[Expr], u: Sequence[Expr]) -> tuple[Expr, ...]:
+        """Return exp(h Pi/(4A)) - 1, that of the free rotation during h/2, where u = h p."""
+        half = [intermediate(self.rate * x / 4) for x in self.momentum(q, u)]
+        angle = intermediate(sqrt(Add(SMALLEST, *(x**2 for x in half))))
+        return (-2 * sin(angle / 2) ** 2, *(intermediate(sin(angle) / angle) * x for x in half))
 
     def is_symmetry(self, system: HamiltonianSystem) -> bool:
         """Return whether H does not change along (q e_k, p e_k), at random states, so that Pi_k is conserved."""
@@ -111,67 +100,29 @@ def axial_turns(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Turn,
     return replace(system, hamiltonian=Add(system.hamiltonian, *removed)), turns
 
 
-class Frame:
-    """Free rotation of a quaternion, Q <- C Q + S b, by the momentum u = tau P, and a gradient in the moving frame.
-
-    With v = u/(4A), b = |Q|^2 v - (Q . v) Q and y = |Q|^2 |v|^2 - (Q . v)^2, the functions are C = cos(sqrt(y)),
-    S = sin(sqrt(y))/sqrt(y) and D = (C - S)/y, so that dC/dy = -S/2 and dS/dy = D/2.
-
-    Args:
-        turn: the body.
-        q, u: positions and momenta of the system.
-        functions: symbols of S, C - 1 and D, or nothing.
-    """
-
-    def __init__(self, turn: Turn, q: Sequence[Expr], u: Sequence[Expr], functions: Sequence[Expr] = ()) -> None:
-        self.first, self.scale, self.q = turn.first, turn.rate / 4, q[turn.first : turn.first + 4]
-        self.v = [intermediate(self.scale * x) for x in u[turn.first : turn.first + 4]]
-        self.norm, self.along, self.square = _dot(self.q, self.q), _dot(self.q, self.v), _dot(self.v, self.v)
-        self.y = intermediate(self.norm * self.square - self.along**2)
-        self.b = [intermediate(self.norm * y - self.along * x) for x, y in zip(self.q, self.v, strict=True)]
-        self.S, self.less, self.D = functions or _functions(self.y)
-        self.moved = [intermediate(x + self.less * x + self.S * b) for x, b in zip(self.q, self.b, strict=True)]
-
-    def rates(self, g: Sequence[Expr]) -> tuple[list[Expr], list[Expr]]:
-        """Return W_u and -W_Q from the gradient g = V_q at the rotated quaternion."""
-        qg, vg = _dot(self.q, g), _dot(self.v, g)
-        by_y = intermediate(self.D * (self.norm * vg - self.along * qg) - self.S * qg)
-        sqg, sn = intermediate(self.S * qg), intermediate(self.S * self.norm)
-        by_g, by_q = intermediate(1 + self.less - self.S * self.along), intermediate(2 * self.S * vg + by_y * self.square)
-        by_v, parts = intermediate(sqg + by_y * self.along), list(zip(g, self.q, self.v, self.b, strict=True))
-        velocity = [self.scale * (sn * x - sqg * q + by_y * b) for x, q, _, b in parts]
-        return velocity, [by_v * v - by_g * x - by_q * q for x, q, v, _ in parts]
-
-
-def _functions(y: Expr) -> tuple[Expr, ...]:
-    """Return S, C - 1 and D at y."""
-    angle = intermediate(sqrt(y + SMALLEST))
-    sine, less = intermediate(sin(angle) / angle), intermediate(-2 * sin(angle / 2) ** 2)
-    return sine, less, intermediate((1 + less - sine) / angle**2)
-
-
-def _dot(x: Sequence[Expr], y: Sequence[Expr]) -> Expr:
-    return intermediate(Add(*(a * b for a, b in zip(x, y, strict=True))))
-
-
 @lru_cache(maxsize=64)
-def moving_frame(system: MechanicalSystem, functions: tuple[Expr, ...] = ()) -> tuple[Expr, ...]:
-    """Return W_u and -W_Q, with the symbols of p for u; nothing if H_0 is not T + V(q), of symmetric bodies alone."""
+def frame_potential(system: MechanicalSystem) -> Expr | None:
+    """Return V if H_0 = T + V(q) of symmetric bodies alone; else ``None``."""
     core, turns = axial_turns(system)
     if not isinstance(core, HamiltonianSystem) or 4 * len(turns) != core.dimension:
-        return ()
+        return None
     q, p = core.coordinates, core.momenta
-    potential = core.hamiltonian.xreplace(dict.fromkeys(p, S.Zero))
-    frames = [Frame(turn, q, p, functions[3 * k : 3 * k + 3]) for k, turn in enumerate(turns)]
-    energies = (-x.y / (2 * x.scale) for x in frames)
-    if not sums_to_zero([core.hamiltonian, -potential, *energies], (*q, *p, *core.parameters, core.time)):
-        return ()
-    moved: dict[Expr, Expr] = {Add(*(x**2 for x in each.q)): each.norm for each in frames}
-    for each in frames:
-        moved |= zip(each.q, each.moved, strict=True)
-    g = [intermediate(x.xreplace(moved)) for x in gradient_tuple(potential, q)]
-    rates = [each.rates(g[each.first : each.first + 4]) for each in frames]
-    return tuple(x for part in zip(*rates, strict=True) for each in part for x in each)
+    potential: Expr = core.hamiltonian.xreplace(dict.fromkeys(p, S.Zero))
+    energies = (-turn.rate * x**2 / 2 for turn in turns for x in turn.momentum(q, p))
+    alone = sums_to_zero([core.hamiltonian, -potential, *energies], (*q, *p, *core.parameters, core.time))
+    return potential if alone else None
+
+
+def rotated(
+    turns: Sequence[Turn], q: Sequence[Expr], u: Sequence[Expr], *rotations: Callable[..., tuple[Expr, ...]]
+) -> tuple[tuple[Expr, ...], ...]:
+    """Return the changes of q and u by rotations in turn, functions of a turn, q and u = h p."""
+    changes = ((S.Zero,) * len(q),) * 2
+    for turn, rotation in product(turns, rotations):
+        g = tuple(map(intermediate, rotation(turn, q, u)))
+        now = [tuple(map(Add, x, change)) for x, change in zip((q, u), changes, strict=True)]
+        changes = tuple(tuple(map(Add, d, turn.change(x, g))) for x, d in zip(now, changes, strict=True))
+    return changes
 
 
 def _turns(system: HamiltonianSystem) -> Iterator[Turn]:

@@ -50,22 +50,14 @@ static inline void measure_ends(lanes (*x)[M], const solver_options *options, do
   invert_sizes(options, absolute, inverse_size);
 }
 
-#ifdef MOVING_FRAME
-enum { ARGUMENTS = FRAME };
-#define KERNEL_ARGUMENTS(step, n, u, at) in_frame(step, n, u, at)
-#else
-enum { ARGUMENTS = 2 * M };
-#define KERNEL_ARGUMENTS(step, n, u, at) ((void)(at), (u))
-#define rescale(step, n, velocity)
-#endif
-
+#ifndef MOVING_FRAME
 /* Forces at the points. */
 static inline void forces(const step_data *step, lanes (*u)[2 * M], lanes (*force)[M])
 {
-  lanes at[ARGUMENTS];
   for (int n = 0; n < GROUPS; n++)
-    force_lanes(KERNEL_ARGUMENTS(step, n, u[n], at), step->t + step->h * ABSCISSA[n], step->parameters, force[n]);
+    force_lanes(u[n], step->t + step->h * ABSCISSA[n], step->parameters, force[n]);
 }
+#endif
 
 #if defined(TURNS) && !defined(MOVING_FRAME)
 /* Turns of bodies about axes of symmetry, q <- q g, p <- p g, g = exp(kappa h Pi_k e_k/2), after a step of the other
@@ -155,25 +147,27 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
     if (joint) {
       push(step, data, force, u);
       for (int n = 0; n < GROUPS; n++) {
-        lanes rates[2 * M], at[ARGUMENTS];
-        rate_lanes(KERNEL_ARGUMENTS(step, n, u[n], at), step->t + step->h * ABSCISSA[n], step->parameters, rates);
-        rescale(step, n, rates);
+        lanes rates[2 * M];
+#ifdef MOVING_FRAME
+        rate_in_frame(step, n, u[n], rates);
+#else
+        rate_lanes(u[n], step->t + step->h * ABSCISSA[n], step->parameters, rates);
+#endif
         for (int i = 0; i < M; i++) {
           value[n][i] = rates[i];
           force[n][i] = rates[M + i];
         }
       }
-    } else
+    }
 #endif
-    {
+#ifndef MOVING_FRAME
+    if (!joint) {
       forces(step, u, force);
       push(step, data, force, u);
-      for (int n = 0; n < GROUPS; n++) {
-        lanes at[ARGUMENTS];
-        velocity_lanes(KERNEL_ARGUMENTS(step, n, u[n], at), step->t + step->h * ABSCISSA[n], step->parameters, value[n]);
-        rescale(step, n, value[n]);
-      }
+      for (int n = 0; n < GROUPS; n++)
+        velocity_lanes(u[n], step->t + step->h * ABSCISSA[n], step->parameters, value[n]);
     }
+#endif
 #ifdef MOVING_FRAME
     if (k < 2)
       measure_quaternions(u, options, step->h, velocity_size, momentum_size);
@@ -203,10 +197,12 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
   status = outcome(&now, report);
   if (status != OK)
     return status;
+#ifndef MOVING_FRAME
   if (!joint) {
     place(step, data, z, u);
     forces(step, u, force);
   }
+#endif
   scale(data->position_weight, z, value);
   scale(data->momentum_weight, force, momentum);
   for (int i = 0; i < M; i++) {
@@ -229,11 +225,15 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
 HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, double *dq,
     double *dp, const solver_options *options, solver_report *report)
 {
+#ifdef MOVING_FRAME
+  return iterate(step, data, past, steps, dq, dp, options, report, 1);
+#else
 #ifdef JOINT_RATES
   if (*steps > 0 && iterate(step, data, past, steps, dq, dp, options, report, 1) == OK)
     return OK;
 #endif
   return iterate(step, data, past, steps, dq, dp, options, report, 0);
+#endif
 }
 
 #ifdef TIME_TRANSFORMATION

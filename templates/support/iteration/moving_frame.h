@@ -5,11 +5,12 @@
 #include "../core/step.h"
 #include "convergence.h"
 
-/* Method in the moving frame of bodies with axes of symmetry: z = Phi_tau(Z) with the free rotation Phi, tau = t - t0 -
- * h/2, leaves K = V(Phi_tau(Z)) = W(Q, tau P). Kernels have u = (Q, tau P, functions of y for each body) as arguments in
- * place of (q, p), and compute K_P / tau in place of H_p. A step begins and ends with half of the free rotation.
- * Requires: points.h, step.h, TURNS, the number of bodies, the kernels angle_lanes, rotations, turn_lanes. */
-enum { FRAME = 2 * M + 3 * TURNS };
+/* Method in the moving frame of bodies with axes of symmetry: z = Phi_tau(Z) with their free rotation Phi, tau = t - t0 -
+ * h/2, leaves the Hamiltonian V(Phi_tau(Z)) = W(Q, u), u = tau P. A step begins and ends with half of the free rotation.
+ * With v = u/(4A), m = Im(conj(Q) v), y = |m|^2 and the functions S, C, D of y below, positions are Q r, r = C + S m, and
+ * with g = V_q there, G = conj(Q) g and w = S Im(G) + (D Im(G) . m - S Re(G)) m (products of quaternions)
+ *   W_u = Q w/(4A),      W_Q = g conj(r) - v w.
+ * Requires: points.h, step.h, TURNS, the number of bodies, the kernels frame_lanes, rotations. */
 
 #define LARGEST_IN_SERIES 4.0 /* 2^2: angles up to which the series are correct to round-off */
 
@@ -42,30 +43,81 @@ static inline void frame_functions(lanes y, lanes *of)
     }
 }
 
-/* Adds the functions of y to u = (q, tau p). */
-static inline void add_functions(const step_data *step, lanes *u, lanes *y)
+/* z = x w for a vector w. */
+static inline void times_vector(const lanes *x, const lanes *w, lanes *z)
 {
-  angle_lanes(u, lanes_of(step->t), step->parameters, y);
-  for (int k = 0; k < TURNS; k++)
-    frame_functions(y[k], &u[2 * M + 3 * k]);
+  z[0] = -(x[1] * w[0] + x[2] * w[1] + x[3] * w[2]);
+  z[1] = x[0] * w[0] + (x[2] * w[2] - x[3] * w[1]);
+  z[2] = x[0] * w[1] + (x[3] * w[0] - x[1] * w[2]);
+  z[3] = x[0] * w[2] + (x[1] * w[1] - x[2] * w[0]);
 }
 
-/* Arguments of the kernels at the points of a group. */
-static inline const lanes *in_frame(const step_data *step, int n, const lanes *u, lanes *at)
+/* z = conj(x) y. */
+static inline void conjugate_times(const lanes *x, const lanes *y, lanes *z)
 {
-  lanes y[TURNS];
-  for (int i = 0; i < M; i++) {
-    at[i] = u[i];
-    at[M + i] = step->h * (ABSCISSA[n] - 0.5) * u[M + i];
+  z[0] = (x[0] * y[0] + x[1] * y[1]) + (x[2] * y[2] + x[3] * y[3]);
+  z[1] = (x[0] * y[1] - x[1] * y[0]) - (x[2] * y[3] - x[3] * y[2]);
+  z[2] = (x[0] * y[2] - x[2] * y[0]) - (x[3] * y[1] - x[1] * y[3]);
+  z[3] = (x[0] * y[3] - x[3] * y[0]) - (x[1] * y[2] - x[2] * y[1]);
+}
+
+/* Free rotation of a body by u: v = u/(4A), m after a real part, and the functions of y. */
+typedef struct {
+  lanes scale, v[4], m[4], of[3];
+} free_rotation;
+
+static inline free_rotation rotation_by(const lanes *q, const lanes *p, lanes tau, lanes scale)
+{
+  free_rotation by;
+  const lanes *m = by.m + 1;
+  by.scale = scale;
+  for (int i = 0; i < 4; i++)
+    by.v[i] = scale * tau * p[i];
+  conjugate_times(q, by.v, by.m);
+  frame_functions(m[0] * m[0] + (m[1] * m[1] + m[2] * m[2]), by.of);
+  return by;
+}
+
+/* value = V_q at the positions, and 1/(4A) of each body, which does not depend on them; squares are |q|^2. */
+static inline void potential_rates(const step_data *step, int n, const lanes *q, const lanes *square, lanes *value)
+{
+  lanes u[M + TURNS];
+  memcpy(u, q, sizeof(lanes) * M);
+  memcpy(u + M, square, sizeof(lanes) * TURNS);
+  frame_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, value);
+}
+
+/* (tau W_u, -W_Q) at the points of a group. */
+static inline void rate_in_frame(const step_data *step, int n, const lanes *u, lanes *rates)
+{
+  const lanes tau = step->h * (ABSCISSA[n] - 0.5);
+  lanes q[M], square[TURNS], value[M + TURNS], turned[4], w[3];
+  free_rotation by[TURNS];
+  potential_rates(step, n, u, u, value);
+  for (int k = 0; k < TURNS; k++) {
+    const lanes *own = u + 4 * k;
+    square[k] = (own[0] * own[0] + own[1] * own[1]) + (own[2] * own[2] + own[3] * own[3]);
+    by[k] = rotation_by(own, u + M + 4 * k, tau, value[M + k]);
+    times_vector(own, by[k].m + 1, turned);
+    for (int i = 0; i < 4; i++)
+      q[4 * k + i] = own[i] + (by[k].of[1] * own[i] + by[k].of[0] * turned[i]);
   }
-  add_functions(step, at, y);
-  return at;
-}
-
-static inline void rescale(const step_data *step, int n, lanes *velocity)
-{
-  for (int i = 0; i < M; i++)
-    velocity[i] *= step->h * (ABSCISSA[n] - 0.5);
+  potential_rates(step, n, q, square, value);
+  for (int k = 0; k < TURNS; k++) {
+    const lanes *g = value + 4 * k, *m = by[k].m + 1, *of = by[k].of;
+    lanes G[4], velocity[4], back[4], along;
+    conjugate_times(u + 4 * k, g, G);
+    along = of[2] * (G[1] * m[0] + (G[2] * m[1] + G[3] * m[2])) - of[0] * G[0];
+    for (int i = 0; i < 3; i++)
+      w[i] = of[0] * G[1 + i] + along * m[i];
+    times_vector(u + 4 * k, w, velocity);
+    times_vector(by[k].v, w, back);
+    times_vector(g, m, turned);
+    for (int i = 0; i < 4; i++) {
+      rates[4 * k + i] = by[k].scale * tau * velocity[i];
+      rates[M + 4 * k + i] = back[i] - (g[i] + (of[1] * g[i] - of[0] * turned[i]));
+    }
+  }
 }
 
 /* 1 / the size of quaternions in place of their components, of positions in units of h times their velocities. */
@@ -118,24 +170,24 @@ static inline double excess(const double *d)
 /* q <- q g, p <- p g for g - 1 of each body, whose length is corrected: high words are in one lane, low ones in another. */
 static inline void rotate(const step_data *step, frame_state *at, const double *g)
 {
-  lanes u[2 * M + 4 * TURNS], change[2 * M];
-  for (int i = 0; i < M; i++) {
-    lane_view q = {lanes_of(at->q[i])}, p = {lanes_of(at->p[i])};
-    q.lane[1] = at->low_q[i];
-    p.lane[1] = at->low_p[i];
-    u[i] = q.all;
-    u[M + i] = p.all;
-  }
-  for (int k = 0; k < 4 * TURNS; k++)
-    u[2 * M + k] = lanes_of(g[k]);
-  turn_lanes(u, lanes_of(step->t), step->parameters, change);
   for (int i = 0; i < M; i += 4) {
-    const double longer = excess(g + i);
-    for (int j = i; j < i + 4; j++) {
-      add_change(&at->q[j], &at->low_q[j], at_point(&change[j], 0, 0), at_point(&change[j], 0, 1));
-      add_change(&at->p[j], &at->low_p[j], at_point(&change[M + j], 0, 0), at_point(&change[M + j], 0, 1));
-      at->low_q[j] -= longer * at->q[j];
-      at->low_p[j] -= longer * at->p[j];
+    const lanes w[3] = {lanes_of(g[i + 1]), lanes_of(g[i + 2]), lanes_of(g[i + 3])};
+    lanes x[2][4], turned[4];
+    for (int j = 0; j < 4; j++) {
+      lane_view q = {lanes_of(at->q[i + j])}, p = {lanes_of(at->p[i + j])};
+      q.lane[1] = at->low_q[i + j];
+      p.lane[1] = at->low_p[i + j];
+      x[0][j] = q.all;
+      x[1][j] = p.all;
+    }
+    for (int half = 0; half < 2; half++) {
+      double *high = half ? at->p : at->q, *low = half ? at->low_p : at->low_q, longer = excess(g + i);
+      times_vector(x[half], w, turned);
+      for (int j = 0; j < 4; j++) {
+        const lanes change = g[i] * x[half][j] + turned[j];
+        add_change(&high[i + j], &low[i + j], at_point(&change, 0, 0), at_point(&change, 0, 1));
+        low[i + j] -= longer * high[i + j];
+      }
     }
   }
 }
@@ -153,23 +205,22 @@ static inline void join(double *f, const double *g)
 /* Free rotation during half of the step, and at its end the turns about axes of symmetry. */
 static inline void rotate_freely(const step_data *step, frame_state *at, int end)
 {
-  lanes u[2 * M], m[3 * TURNS];
-  double scalar[2 * M], g[4 * TURNS], turn[4 * TURNS];
+  lanes q[M], p[M], value[M + TURNS];
+  double u[2 * M], g[4 * TURNS], turn[4 * TURNS];
   for (int i = 0; i < M; i++) {
-    u[i] = lanes_of(scalar[i] = at->q[i]);
-    u[M + i] = lanes_of(scalar[M + i] = step->h * at->p[i]);
+    q[i] = lanes_of(u[i] = at->q[i]);
+    p[i] = lanes_of(at->p[i]);
+    u[M + i] = step->h * at->p[i];
   }
-  axis_lanes(u, lanes_of(step->t), step->parameters, m);
+  potential_rates(step, 0, q, q, value);
   for (int k = 0; k < TURNS; k++) {
-    const lanes *v = m + 3 * k;
-    lanes of[3];
-    frame_functions(v[0] * v[0] + v[1] * v[1] + v[2] * v[2], of);
-    g[4 * k] = at_first(&of[1]);
-    for (int j = 0; j < 3; j++)
-      g[4 * k + 1 + j] = at_first(&of[0]) * at_first(&v[j]);
+    const free_rotation by = rotation_by(q + 4 * k, p + 4 * k, lanes_of(0.5 * step->h), value[M + k]);
+    g[4 * k] = at_first(&by.of[1]);
+    for (int j = 1; j < 4; j++)
+      g[4 * k + j] = at_first(&by.of[0]) * at_first(&by.m[j]);
   }
   if (end) {
-    rotations(scalar, step->t, step->parameters, turn);
+    rotations(u, step->t, step->parameters, turn);
     for (int k = 0; k < 4 * TURNS; k += 4)
       join(g + k, turn + k);
   }
