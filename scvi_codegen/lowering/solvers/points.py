@@ -191,7 +191,7 @@ def hamiltonian_iteration(problem: StepProblem) -> FixedPointIteration | None:
         constant_mass=_turn_kernel(system, turns, lanes=False),
         forces=() if joint or moving else ("force_lanes",),
         stored=4 * lanes,
-        parts=("point_weights", *(("moving_frame",) if moving else ()), "hamiltonian_iteration"),
+        parts=("point_weights", "hamiltonian_iteration"),
         macros=tuple(
             (name, value)
             for name, value in (

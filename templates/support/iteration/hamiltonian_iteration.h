@@ -42,6 +42,10 @@ static inline void push(const step_data *step, const iteration_data *data, lanes
   integrate(MOMENTUM, data->momentum_weight, force, step->p0, step->carry_p, u, M);
 }
 
+#ifdef MOVING_FRAME
+#include "moving_frame.h"
+#else
+
 /* 1 / the size of x at both ends of the step, which makes its changes relative, or `absolute`. */
 static inline void measure_ends(lanes (*x)[M], const solver_options *options, double absolute, double *inverse_size)
 {
@@ -50,16 +54,14 @@ static inline void measure_ends(lanes (*x)[M], const solver_options *options, do
   invert_sizes(options, absolute, inverse_size);
 }
 
-#ifndef MOVING_FRAME
 /* Forces at the points. */
 static inline void forces(const step_data *step, lanes (*u)[2 * M], lanes (*force)[M])
 {
   for (int n = 0; n < GROUPS; n++)
     force_lanes(u[n], step->t + step->h * ABSCISSA[n], step->parameters, force[n]);
 }
-#endif
 
-#if defined(TURNS) && !defined(MOVING_FRAME)
+#ifdef TURNS
 /* Turns of bodies about axes of symmetry, q <- q g, p <- p g, g = exp(kappa h Pi_k e_k/2), after a step of the other
  * terms of H, with which they commute. Requires: TURNS, the kernels rotations and turn_lanes. */
 
@@ -119,13 +121,6 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
   double velocity_size[M], momentum_size[M];
   progress now = before_iterations();
   int status = OK;
-#ifdef MOVING_FRAME
-  frame_state state;
-  const step_data moving = into_frame(step, &state), *fixed = step;
-  step = &moving;
-  memset(z, 0, sizeof z);
-  memset(force, 0, sizeof force);
-#else
   if (*steps > 0) {
     continue_curve(step, past, *steps, z);
     continue_curve(step, past + 2 * M * POINTS, *steps, force);
@@ -133,7 +128,6 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
     status = start_velocities(step, z);
     memset(force, 0, sizeof force);
   }
-#endif
   if (status != OK)
     return status;
   push(step, data, force, u);
@@ -148,30 +142,20 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
       push(step, data, force, u);
       for (int n = 0; n < GROUPS; n++) {
         lanes rates[2 * M];
-#ifdef MOVING_FRAME
-        rate_in_frame(step, n, u[n], rates);
-#else
         rate_lanes(u[n], step->t + step->h * ABSCISSA[n], step->parameters, rates);
-#endif
         for (int i = 0; i < M; i++) {
           value[n][i] = rates[i];
           force[n][i] = rates[M + i];
         }
       }
-    }
+    } else
 #endif
-#ifndef MOVING_FRAME
-    if (!joint) {
+    {
       forces(step, u, force);
       push(step, data, force, u);
       for (int n = 0; n < GROUPS; n++)
         velocity_lanes(u[n], step->t + step->h * ABSCISSA[n], step->parameters, value[n]);
     }
-#endif
-#ifdef MOVING_FRAME
-    if (k < 2)
-      measure_quaternions(u, options, step->h, velocity_size, momentum_size);
-#else
     if (k == 0) {
       for (int n = 0; n < GROUPS; n++)
         for (int i = 0; i < M; i++)
@@ -179,7 +163,6 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
       measure_ends(value, options, fabs(step->h), velocity_size);
       measure_ends(momentum, options, 1.0, momentum_size);
     }
-#endif
     for (int n = 0; n < GROUPS; n++)
       for (int i = 0; i < M; i++) {
         const lanes correction = value[n][i] - z[n][i], moved = correction * velocity_size[i];
@@ -197,21 +180,17 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
   status = outcome(&now, report);
   if (status != OK)
     return status;
-#ifndef MOVING_FRAME
   if (!joint) {
     place(step, data, z, u);
     forces(step, u, force);
   }
-#endif
   scale(data->position_weight, z, value);
   scale(data->momentum_weight, force, momentum);
   for (int i = 0; i < M; i++) {
     dq[i] = weigh(POINT_END_POSITION, value, i);
     dp[i] = weigh(POINT_END_MOMENTUM, momentum, i);
   }
-#ifdef MOVING_FRAME
-  out_of_frame(step = fixed, &state, dq, dp);
-#elif defined(TURNS)
+#ifdef TURNS
   turn_step(step, past, z, force, dq, dp);
 #endif
   if (!accept(step, dq, dp, report))
@@ -225,15 +204,11 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
 HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, double *dq,
     double *dp, const solver_options *options, solver_report *report)
 {
-#ifdef MOVING_FRAME
-  return iterate(step, data, past, steps, dq, dp, options, report, 1);
-#else
 #ifdef JOINT_RATES
   if (*steps > 0 && iterate(step, data, past, steps, dq, dp, options, report, 1) == OK)
     return OK;
 #endif
   return iterate(step, data, past, steps, dq, dp, options, report, 0);
-#endif
 }
 
 #ifdef TIME_TRANSFORMATION
@@ -256,6 +231,8 @@ static inline void integrals_of_iteration(const step_data *step, const iteration
   for (int k = 0; k < INTEGRALS; k++)
     sum[k] = points_total(part[k]);
 }
+#endif
+
 #endif
 
 #endif

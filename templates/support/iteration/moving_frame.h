@@ -1,16 +1,18 @@
 #ifndef SUPPORT_MOVING_FRAME_H
 #define SUPPORT_MOVING_FRAME_H
 
-#include "../core/points.h"
-#include "../core/step.h"
-#include "convergence.h"
+#include "../core/progress.h"
+#include "one_trajectory.h"
+#include "point_weights.h"
 
 /* Method in the moving frame of bodies with axes of symmetry: z = Phi_tau(Z) with their free rotation Phi, tau = t - t0 -
  * h/2, leaves the Hamiltonian V(Phi_tau(Z)) = W(Q, u), u = tau P. A step begins and ends with half of the free rotation.
  * With v = u/(4A), m = Im(conj(Q) v), y = |m|^2 and the functions S, C, D of y below, positions are Q r, r = C + S m, and
  * with g = V_q there, G = conj(Q) g and w = S Im(G) + (D Im(G) . m - S Re(G)) m (products of quaternions)
  *   W_u = Q w/(4A),      W_Q = g conj(r) - v w.
- * Requires: points.h, step.h, TURNS, the number of bodies, the kernels frame_lanes, rotations. */
+ * The
+ * rates at the points, h-weighted as in hamiltonian_iteration.h, are updated together. Requires: hamiltonian_iteration.h,
+ * TURNS, the number of bodies, the kernels frame_lanes, rotations. */
 
 #define LARGEST_IN_SERIES 4.0 /* 2^2: angles up to which the series are correct to round-off */
 
@@ -18,10 +20,12 @@
 static inline void frame_functions(lanes y, lanes *of)
 {
   const lanes y2 = y * y, y4 = y2 * y2;
-  double largest = 0.0;
-  for (int j = 0; j < LANES; j++)
-    largest = larger(largest, at_point(&y, 0, j));
-  if (largest <= LARGEST_IN_SERIES) {
+  lane_view largest = {y};
+#pragma GCC unroll 16
+  for (int n = LANES / 2; n > 0; n /= 2)
+    for (int j = 0; j < n; j++)
+      largest.lane[j] = larger(largest.lane[j], largest.lane[n + j]);
+  if (largest.lane[0] <= LARGEST_IN_SERIES) {
     const lanes sine = ((y * (1.0 / 120.0) - 1.0 / 6.0) + y2 * (y * (1.0 / 362880.0) - 1.0 / 5040.0)) +
         y4 * (((y * (1.0 / 6227020800.0) - 1.0 / 39916800.0) +
                   y2 * (y * (1.0 / 355687428096000.0) - 1.0 / 1307674368000.0)) +
@@ -88,7 +92,7 @@ static inline void potential_rates(const step_data *step, int n, const lanes *q,
 }
 
 /* (tau W_u, -W_Q) at the points of a group. */
-static inline void rate_in_frame(const step_data *step, int n, const lanes *u, lanes *rates)
+static inline __attribute__((always_inline)) void rate_in_frame(const step_data *step, int n, const lanes *u, lanes *rates)
 {
   const lanes tau = step->h * (ABSCISSA[n] - 0.5);
   lanes q[M], square[TURNS], value[M + TURNS], turned[4], w[3];
@@ -100,7 +104,7 @@ static inline void rate_in_frame(const step_data *step, int n, const lanes *u, l
     by[k] = rotation_by(own, u + M + 4 * k, tau, value[M + k]);
     times_vector(own, by[k].m + 1, turned);
     for (int i = 0; i < 4; i++)
-      q[4 * k + i] = own[i] + (by[k].of[1] * own[i] + by[k].of[0] * turned[i]);
+      q[4 * k + i] = (own[i] + by[k].of[1] * own[i]) + by[k].of[0] * turned[i];
   }
   potential_rates(step, n, q, square, value);
   for (int k = 0; k < TURNS; k++) {
@@ -115,12 +119,12 @@ static inline void rate_in_frame(const step_data *step, int n, const lanes *u, l
     times_vector(g, m, turned);
     for (int i = 0; i < 4; i++) {
       rates[4 * k + i] = by[k].scale * tau * velocity[i];
-      rates[M + 4 * k + i] = back[i] - (g[i] + (of[1] * g[i] - of[0] * turned[i]));
+      rates[M + 4 * k + i] = back[i] - ((g[i] + of[1] * g[i]) - of[0] * turned[i]);
     }
   }
 }
 
-/* 1 / the size of quaternions in place of their components, of positions in units of h times their velocities. */
+/* h / the size of quaternions in place of their components: factors of changes of velocities and forces. */
 static inline void measure_quaternions(lanes (*u)[2 * M], const solver_options *options, double h,
     double *velocity_size, double *momentum_size)
 {
@@ -132,7 +136,7 @@ static inline void measure_quaternions(lanes (*u)[2 * M], const solver_options *
     }
     for (int j = i; j < i + 4; j++) {
       velocity_size[j] = options->absolute ? fabs(h) : 0.5 * fabs(h) / sqrt(q);
-      momentum_size[j] = options->absolute ? 1.0 : 0.5 / sqrt(p);
+      momentum_size[j] = options->absolute ? fabs(h) : 0.5 * fabs(h) / sqrt(p);
     }
   }
 }
@@ -252,6 +256,56 @@ static inline void out_of_frame(const step_data *step, frame_state *at, double *
     dq[M + i] = rest_of_sum(at->q[i], -step->q0[i], &dq[i]) + (at->low_q[i] - step->carry_q[i]);
     dp[M + i] = rest_of_sum(at->p[i], -step->p0[i], &dp[i]) + (at->low_p[i] - step->carry_p[i]);
   }
+}
+
+/* Computes the increments of one step by fixed-point iteration from W = 0: there is no predictor, as the rates vary with
+ * the nutation. On failure the increments are undefined. */
+HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, double *dq,
+    double *dp, const solver_options *options, solver_report *report)
+{
+  lanes z[GROUPS][M], force[GROUPS][M], u[GROUPS][2 * M], scaled[GROUPS][M];
+  double velocity_size[M], momentum_size[M];
+  frame_state state;
+  const step_data moving = into_frame(step, &state);
+  progress now = before_iterations();
+  int status;
+  memset(z, 0, sizeof z);
+  memset(force, 0, sizeof force);
+  for (int k = 0; needs_iteration(&now); k++) {
+    lanes change = lanes_of(0.0);
+    place(&moving, data, z, u);
+    push(&moving, data, force, u);
+    if (k < 2)
+      measure_quaternions(u, options, step->h, velocity_size, momentum_size);
+    for (int n = 0; n < GROUPS; n++) {
+      lanes rates[2 * M];
+      rate_in_frame(&moving, n, u[n], rates);
+      for (int i = 0; i < M; i++) {
+        const lanes moved = (rates[i] - z[n][i]) * velocity_size[i];
+        const lanes pushed = (rates[M + i] - force[n][i]) * momentum_size[i];
+        change += moved * moved + pushed * pushed;
+        z[n][i] = rates[i];
+        force[n][i] = rates[M + i];
+      }
+    }
+    take_change(&now, total_change(change), options, k, report);
+  }
+  status = outcome(&now, report);
+  if (status != OK)
+    return status;
+  scale(data->position_weight, z, scaled);
+  for (int i = 0; i < M; i++)
+    dq[i] = weigh(POINT_END_POSITION, scaled, i);
+  scale(data->momentum_weight, force, scaled);
+  for (int i = 0; i < M; i++)
+    dp[i] = weigh(POINT_END_MOMENTUM, scaled, i);
+  out_of_frame(step, &state, dq, dp);
+  if (!accept(step, dq, dp, report))
+    return NOT_FINITE;
+  remember_curve(z, past);
+  remember_curve(force, past + 2 * M * POINTS);
+  *steps = next_guess(*steps, &now, report);
+  return OK;
 }
 
 #endif
