@@ -288,7 +288,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
         force[n][i] = rates[M + i];
       }
     }
-    take_change(&now, total_change(change), options, k, report);
+    take_change(&now, total_change(change) / POINTS, options, k, report);
   }
   status = outcome(&now, report);
   if (status != OK)
