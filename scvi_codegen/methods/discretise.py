@@ -33,7 +33,7 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_structure import Velocities
 from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table
 from scvi_codegen.tables.basis import identity_matrix, next_step
-from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
+from scvi_codegen.tables.precision import Matrix, Vector, mp
 
 NUMBERS = {"34a": "35a", "34c": "35c", "34d": "35d", "34e": "35e"}
 """Equation numbers of the paper for the shooting method in phase space, by those for Lagrangians."""
@@ -76,12 +76,6 @@ def discretise(system: MechanicalSystem, method: Method) -> StageSystem:
     return _completed(system, stages, method)
 
 
-def _potential(system: MechanicalSystem, method: Method) -> Expr | None:
-    """Return the potential if the method is applied in the moving frame of bodies: its points determine the momenta."""
-    core = axial_turns(system)[0]
-    return frame_potential(system) if isinstance(method.stage_system(core).shape, Velocities) else None
-
-
 def paper_equations(system: MechanicalSystem, method: Method) -> StageSystem:
     """Return the equations in the paper's notation. Raises as :func:`discretise`."""
     check_regular(method, system)
@@ -90,91 +84,74 @@ def paper_equations(system: MechanicalSystem, method: Method) -> StageSystem:
 
 def _completed(system: MechanicalSystem, stages: StageSystem, method: Method) -> StageSystem:
     """Add auxiliary variables, constraints, damping, and the rotations of axially symmetric bodies to the equations."""
-    core, turns = axial_turns(system)
-    completed = with_auxiliaries(core, stages)
-    completed = with_constraints(core, completed, method.name) if core.constraints else completed
-    completed = replace(completed, damping=core.damping)
-    if turns and (potential := _potential(system, method)) is not None:
-        completed = _after_start(core, _framed(core, completed, turns, potential), turns)
-        return _turned(core, completed, turns, Turn.free_rotation, Turn.rotation)
-    return _turned(core, completed, turns, Turn.rotation) if turns else completed
+    system, turns, potential = *axial_turns(system), frame_potential(system)
+    completed = with_auxiliaries(system, stages)
+    completed = with_constraints(system, completed, method.name) if system.constraints else completed
+    completed = replace(completed, damping=system.damping)
+    if potential is None or not isinstance(method.stage_system(system).shape, Velocities):
+        return _rotated(system, completed, turns, Turn.rotation) if turns else completed
+    completed = _rotated(system, _framed(system, completed, turns, potential), turns, Turn.free_rotation, first=True)
+    return _rotated(system, completed, turns, Turn.free_rotation, Turn.rotation)
 
 
-def _symbols(system: MechanicalSystem) -> tuple[tuple[Symbol, ...], ...]:
-    """Return the symbols of u = h p and of changes of q."""
-    return tuple(tuple(Symbol(f"{n}_{i}", real=True) for i in range(system.dimension)) for n in ("turn", "change"))
+def _symbols(name: str, system: MechanicalSystem) -> tuple[Symbol, ...]:
+    return tuple(Symbol(f"{name}_{i}", real=True) for i in range(system.dimension))
 
 
 def _framed(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn], potential: Expr) -> StageSystem:
     """Return the equations of W(Q, u_n), u_n = (c_n - 1/2) h P_n, in place of H: in the moving frame."""
-    q, u = system.coordinates, _symbols(system)[0]
+    q, u, groups = system.coordinates, _symbols("turn", system), []
     moved = map(Add, q, rotated(turns, q, [2 * x for x in u], Turn.free_rotation)[0])
-    W, groups = potential.xreplace(dict(zip(q, map(intermediate, moved), strict=True))), []
+    W = potential.xreplace(dict(zip(q, map(intermediate, moved), strict=True)))
+    velocity, push = (tuple(-x for x in gradient_tuple(W, variables)) for variables in (u, q))
     for group in stages.stage_groups:
-        at = next((each for each in group.gathers if each.arguments == system.auxiliaries), None)
+        (at,) = [each for each in group.gathers if each.arguments == system.auxiliaries] or (None,)
         if at is not None:
             force, momentum, rate = group.scatters
-            placed = [
-                Table.named("tau", [[(c - 0.5) * x for x in line] for c, line in zip(group.abscissae, table.entries)])
-                for table in (at.table, rate.table)
-            ]
-            velocity, push = (tuple(-x for x in gradient_tuple(W, variables)) for variables in (u, q))
-            rates = replace(rate, results=system.velocities), Scatter(results=velocity, table=placed[1], power=1)
-            gathers = (*group.gathers, Gather(arguments=u, table=placed[0], power=at.power + 1))
+            tau = [c - mp.mpf(1) / 2 for c in group.abscissae]
+            timed, back = (
+                Table.named("tau", [[t * x for x in line] for t, line in zip(tau, each.table.entries, strict=True)])
+                for each in (at, rate)
+            )
+            rates = replace(rate, results=system.velocities), Scatter(results=velocity, table=back, power=1)
+            gathers = (*group.gathers, Gather(arguments=u, table=timed, power=at.power + 1))
             scatters = (replace(force, results=push), momentum, *rates)
             group = replace(group, gathers=gathers, scatters=scatters, scalar=None, in_action=False)
         groups.append(group)
-    still = [replace(each, straight=(mp.zero,) * 2) if each.moves else each for each in stages.blocks]
+    still = (replace(each, straight=(mp.zero,) * 2) if each.moves else each for each in stages.blocks)
     return replace(stages, blocks=tuple(still), stage_groups=tuple(groups))
-
-
-def _after_start(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn]) -> StageSystem:
-    """Return the equations after half of the free rotation, with its change of q by h as a block like q0."""
-    columns = [*range(len(stages.rows) + 1), 0, -1]
-    groups = (each.widened(2) for each in stages.stage_groups)
-    following = tuple(
-        replace(group, gathers=tuple(replace(x, table=x.table.columns(columns)) for x in group.gathers))
-        for group in groups
-    )
-    none = Table.constant(1, 2)
-    start = Table.joined(Table.constant(1, 1, 1), Table.constant(1, len(stages.rows)), none)
-    into = Table.named("", [(*(row.momentum for row in stages.rows), mp.zero, mp.zero, stages.end_momentum)])
-    end = Table.joined(stages.end_position, none).columns(columns)
-    changes = rotated(turns, system.coordinates, _symbols(system)[0], Turn.free_rotation)
-    return _rotated(system, stages, changes, "start", following, start, into, mp.one, end)
-
-
-def _turned(
-    system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn], *rotations: Callable[..., tuple[Expr, ...]]
-) -> StageSystem:
-    """Return the equations followed by rotations of bodies."""
-    size, one, none = len(stages.rows), Table.constant(1, 1, 1), Table.constant(1, 1)
-    groups = tuple(_reaching(each, size) for each in stages.stage_groups)
-    before, into = Table.joined(stages.end_position, none, none), Table.joined(Table.constant(1, size), none, none, one)
-    changes = rotated(turns, system.coordinates, _symbols(system)[0], *rotations)
-    end = Table.joined(stages.end_position, one, none)
-    return _rotated(system, stages, changes, "spin", groups, before, into, stages.end_momentum, end)
 
 
 def _rotated(
     system: MechanicalSystem,
     stages: StageSystem,
-    changes: Sequence[tuple[Expr, ...]],
-    name: str,
-    groups: tuple[StageGroup, ...],
-    before: Table,
-    into: Table,
-    momentum: Number,
-    end: Table,
+    turns: Sequence[Turn],
+    *rotations: Callable[..., tuple[Expr, ...]],
+    first: bool = False,
 ) -> StageSystem:
-    """Return the equations with rotations of bodies: V is their change of q by h, P the momentum before them."""
-    (u, v), minus = _symbols(system), Table.constant(1, 1, -1)
-    one, none, others = Table.constant(1, 1, 1), Table.constant(1, 1), Table.constant(1, len(stages.rows))
-    change = tuple(a - b for a, b in zip(changes[0], v, strict=True))
+    """Return the equations with rotations of bodies at the end, or ``first``.
+
+    V is their change of q by h, P the momentum before them.
+    """
+    size, u, v = len(stages.rows), _symbols("turn", system), _symbols("change", system)
+    moved, pushed = rotated(turns, system.coordinates, u, *rotations)
+    name, others = "start" if first else "spin", Table.constant(1, size)
+    one, minus, none = Table.constant(1, 1, 1), Table.constant(1, 1, -1), Table.constant(1, 1)
+    end, momentum = Table.joined(stages.end_position, none, none), stages.end_momentum
+    before, into = end, Table.joined(others, none, none, one)
+    groups = [each.widened(2) if first else _reaching(each, size) for each in stages.stage_groups]
+    if first:
+        columns = [*range(size + 1), 0, -1]
+        groups = [
+            replace(x, gathers=tuple(replace(y, table=y.table.columns(columns)) for y in x.gathers)) for x in groups
+        ]
+        into = Table.named("", [(*(row.momentum for row in stages.rows), mp.zero, mp.zero, momentum)])
+        before, end, momentum = Table.joined(one, others, none, none), end.columns(columns), mp.one
+    change = tuple(a - b for a, b in zip(moved, v, strict=True))
     tables = Table.joined(others, minus, none, none), into, Table.joined(others, none, minus, none)
     group = StageGroup(
         name=name,
-        abscissae=(mp.mpf(name == "spin"),),
+        abscissae=(mp.mpf(not first),),
         gathers=(
             Gather(arguments=system.coordinates, table=before, power=0),
             Gather(arguments=u, table=Table.joined(none, others, none, one), power=0),
@@ -182,22 +159,18 @@ def _rotated(
         ),
         scatters=tuple(
             Scatter(results=each, table=table, power=-1)
-            for each, table in zip((change, changes[1], u), tables, strict=True)
+            for each, table in zip((change, pushed, u), tables, strict=True)
         ),
         computes="Changes of q and u = h p by rotations of bodies, less v, and u",
     )
-    still = (mp.zero, mp.zero)
-    last = Block(name=f"P_{name}", power=1, straight=still, momentum=1, moves=False)
-    rows = (
-        Row(number=f"V_{name}", kind="stage", momentum=mp.zero),
-        Row(number=f"P_{name}", kind="IDEL", momentum=momentum),
-    )
+    still = Block(name=f"V_{name}", power=1, straight=(mp.zero, mp.zero))
+    last = Row(number=f"P_{name}", kind="IDEL", momentum=momentum)
     return replace(
         stages,
-        blocks=(*stages.blocks, Block(name=f"V_{name}", power=1, straight=still), last),
-        rows=(*stages.rows, *rows),
+        blocks=(*stages.blocks, still, replace(still, name=f"P_{name}", momentum=1, moves=False)),
+        rows=(*stages.rows, Row(number=f"V_{name}", kind="stage", momentum=mp.zero), last),
         stage_groups=(*groups, group),
-        end_position=end,
+        end_position=end if first else Table.joined(stages.end_position, one, none),
         extrapolation=stages.extrapolation and _diagonal([stages.extrapolation, identity_matrix(2)]),
     )
 

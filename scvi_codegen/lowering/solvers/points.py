@@ -173,8 +173,7 @@ def hamiltonian_iteration(problem: StepProblem) -> FixedPointIteration | None:
     of, turning = forms.legendre_arguments, bool(system.rotations)
     joint = turning and lanes > 2 and sum(len(each.coordinates) for each in system.rotations) == system.dimension
     kernel, potential = partial(system_kernel, system, of=of, paired=turning), frame_potential(problem.system)
-    moving = potential is not None
-    rates = (
+    in_space = (
         kernel("velocity_lanes", forms.legendre, purpose="H_p at all points, u = (q, p)."),
         kernel("force_lanes", forms.force, purpose="-H_q at all points, u = (q, p)."),
         kernel("rate_lanes", (*forms.legendre, *forms.force), purpose="(H_p, -H_q) at all points, u = (q, p).")
@@ -183,24 +182,17 @@ def hamiltonian_iteration(problem: StepProblem) -> FixedPointIteration | None:
         integrand_kernel(system, "integrand_lanes", of),
         _turn_kernel(system, turns, lanes=True),
     )
+    macros = {"JOINT_RATES": int(joint), "TURNS": len(turns), "MOVING_FRAME": int(potential is not None)}
     return _point_iteration(
         "Hamiltonian",
         tables,
         lanes,
-        rates if potential is None else (_frame_kernel(system, turns, potential),),
+        in_space if potential is None else (_frame_kernel(system, turns, potential),),
         constant_mass=_turn_kernel(system, turns, lanes=False),
-        forces=() if joint or moving else ("force_lanes",),
+        forces=() if joint or potential is not None else ("force_lanes",),
         stored=4 * lanes,
         parts=("point_weights", "hamiltonian_iteration"),
-        macros=tuple(
-            (name, value)
-            for name, value in (
-                ("JOINT_RATES", int(joint or moving)),
-                ("TURNS", len(turns)),
-                ("MOVING_FRAME", int(moving)),
-            )
-            if value
-        ),
+        macros=tuple((name, value) for name, value in macros.items() if value),
         matrix=tables.position if _nearly_equal(tables.position, tables.momentum) else (),
     )
 
@@ -220,9 +212,10 @@ def _turn_kernel(system: MechanicalSystem, turns: Sequence[Turn], *, lanes: bool
     if not turns:
         return None
     if not lanes:
-        values = [turn.rotation(q, p) for turn in turns]
-        purpose = "exp(kappa h Pi_k e_k/2) - 1, u = (q, h p)."
-        return system_kernel(system, "rotations", sum(values, ()), of=(*q, *p), purpose=purpose)
+        values = sum((turn.rotation(q, p) for turn in turns), ())
+        return system_kernel(
+            system, "rotations", values, of=(*q, *p), purpose="exp(kappa h Pi_k e_k/2) - 1, u = (q, h p)."
+        )
     rotations = [tuple(Symbol(f"g_{k}_{i}", real=True) for i in range(4)) for k in range(len(turns))]
     changes = ((*t.change(q, g), *t.change(p, g)) for t, g in zip(turns, rotations, strict=True))
     purpose = "Changes q (g - 1) and p (g - 1) of vectors by rotations, u = (q, p, g - 1)."
