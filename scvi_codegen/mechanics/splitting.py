@@ -62,21 +62,21 @@ class KineticSplitting:
             momentum = [intermediate(x / 2) for x in (pair[0].conjugate() * pair[1]).args[1:]]
             if outer == 0:
                 around = [inner * x / 2 if n == k else S.Zero for n, x in enumerate(momentum)]
-                g = _turn([common * x / 2 for x in momentum]) * _turn(around)
+                g = exponential([common * x / 2 for x in momentum]) * exponential(around)
             else:
                 offsets = {j: outer, k: inner}
-                g = _elliptic_turn(j, [intermediate(common + offsets.get(n, S.Zero)) for n in range(3)], momentum)
+                g = _ellipticexponential(j, [intermediate(common + offsets.get(n, S.Zero)) for n in range(3)], momentum)
             moved[own], turned[own] = (list((x * Quaternion(*map(intermediate, g.args))).args) for x in pair)
         return moved, turned
 
 
-def _turn(half: Sequence[Expr]) -> Quaternion:
+def exponential(half: Sequence[Expr]) -> Quaternion:
     """Return exp(v) for a vector v, half of a rotation vector."""
     angle = intermediate(sqrt(Add(SMALLEST, *(x**2 for x in half))))
     return Quaternion(cos(angle), *(sin(angle) / angle * x for x in half))
 
 
-def _elliptic_turn(m: int, a: Sequence[Expr], momentum: Sequence[Expr]) -> Quaternion:
+def _ellipticexponential(m: int, a: Sequence[Expr], momentum: Sequence[Expr]) -> Quaternion:
     """Return g of a body with the inverse moments a, of which a_m is between the others, for t Pi."""
     left, right = (m + 2) % 3, (m + 1) % 3
     x, y, z = (momentum[axis] for axis in (left, m, right))

@@ -100,26 +100,22 @@ def _symbols(name: str, system: MechanicalSystem) -> tuple[Symbol, ...]:
 
 def _framed(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn], potential: Expr) -> StageSystem:
     """Return the equations of W(Q, u_n), u_n = (c_n - 1/2) h P_n, in place of H: in the moving frame."""
-    q, u, groups = system.coordinates, _symbols("turn", system), []
+    q, u, (group,) = system.coordinates, _symbols("turn", system), stages.stage_groups
     moved = map(Add, q, rotated(turns, q, [2 * x for x in u], Turn.free_rotation)[0])
     W = potential.xreplace(dict(zip(q, map(intermediate, moved), strict=True)))
     velocity, push = (tuple(-x for x in gradient_tuple(W, variables)) for variables in (u, q))
-    for group in stages.stage_groups:
-        (at,) = [each for each in group.gathers if each.arguments == system.auxiliaries] or (None,)
-        if at is not None:
-            force, momentum, rate = group.scatters
-            tau = [c - mp.mpf(1) / 2 for c in group.abscissae]
-            timed, back = (
-                Table.named("tau", [[t * x for x in line] for t, line in zip(tau, each.table.entries, strict=True)])
-                for each in (at, rate)
-            )
-            rates = replace(rate, results=system.velocities), Scatter(results=velocity, table=back, power=1)
-            gathers = (*group.gathers, Gather(arguments=u, table=timed, power=at.power + 1))
-            scatters = (replace(force, results=push), momentum, *rates)
-            group = replace(group, gathers=gathers, scatters=scatters, scalar=None, in_action=False)
-        groups.append(group)
+    *others, at, (force, momentum, rate) = *group.gathers, group.scatters
+    tau = [c - mp.mpf(1) / 2 for c in group.abscissae]
+    timed, back = (
+        Table.named("tau", [[t * x for x in line] for t, line in zip(tau, each.table.entries, strict=True)])
+        for each in (at, rate)
+    )
+    gathers = (*others, at, Gather(arguments=u, table=timed, power=at.power + 1))
+    rates = replace(rate, results=system.velocities), Scatter(results=velocity, table=back, power=1)
+    scatters = (replace(force, results=push), momentum, *rates)
     still = (replace(each, straight=(mp.zero,) * 2) if each.moves else each for each in stages.blocks)
-    return replace(stages, blocks=tuple(still), stage_groups=tuple(groups))
+    group = replace(group, gathers=gathers, scatters=scatters, scalar=None, in_action=False)
+    return replace(stages, blocks=tuple(still), stage_groups=(group,))
 
 
 def _rotated(

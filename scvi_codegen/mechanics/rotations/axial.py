@@ -18,8 +18,8 @@ picture). With the flow Phi_t of T, q <- q exp(t Pi/(2A)), p <- p exp(t Pi/(2A))
 
     z = Phi_tau(Z),    tau = t - t0 - h/2,    K(Z, tau) = V(Phi_tau(Z)) = W(Q, tau P)
 
-leaves the Hamiltonian K, since T is constant along its own flow. A step is Phi_h/2, a step of the method for K, Phi_h/2,
-and the turn: symplectic, symmetric, of the order of the method, and exact without V. Its fixed-point iteration contracts
+leaves the Hamiltonian K, since T is constant along its flow. A step is Phi_h/2, a step of the method for K, Phi_h/2 and
+the turn: symplectic, symmetric, of the order of the method, and exact without V. Its fixed-point iteration contracts
 with h^2 V'' in place of h |Pi|/(2A).
 """
 
@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
 
-from sympy import Add, Expr, Quaternion, S, cos, expand, sin, sqrt
+from sympy import Add, Expr, Quaternion, S, cos, expand, sin
 from sympy.core.function import AppliedUndef
 
 from scvi_codegen.formulas.intermediates import intermediate
@@ -36,11 +36,8 @@ from scvi_codegen.formulas.rotations.members import Rotation
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.arrays.symmetry import sums_to_zero
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.splitting import exponential
 from scvi_codegen.mechanics.system import MechanicalSystem
-
-
-SMALLEST = S(10) ** -40
-"""Added to the square of an angle, so that sin(x)/x and its derivative have values at 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,9 +74,8 @@ class Turn:
 
     def free_rotation(self, q: Sequence[Expr], u: Sequence[Expr]) -> tuple[Expr, ...]:
         """Return exp(h Pi/(4A)) - 1, that of the free rotation during h/2, where u = h p."""
-        half = [intermediate(self.rate * x / 4) for x in self.momentum(q, u)]
-        angle = intermediate(sqrt(Add(SMALLEST, *(x**2 for x in half))))
-        return (-2 * sin(angle / 2) ** 2, *(intermediate(sin(angle) / angle) * x for x in half))
+        g = exponential([intermediate(self.rate * x / 4) for x in self.momentum(q, u)])
+        return (g.a - 1, g.b, g.c, g.d)
 
     def is_symmetry(self, system: HamiltonianSystem) -> bool:
         """Return whether H does not change along (q e_k, p e_k), at random states, so that Pi_k is conserved."""
@@ -117,7 +113,7 @@ def rotated(
     turns: Sequence[Turn], q: Sequence[Expr], u: Sequence[Expr], *rotations: Callable[..., tuple[Expr, ...]]
 ) -> tuple[tuple[Expr, ...], ...]:
     """Return the changes of q and u by rotations in turn, functions of a turn, q and u = h p."""
-    changes = ((S.Zero,) * len(q),) * 2
+    changes: tuple[tuple[Expr, ...], ...] = ((S.Zero,) * len(q),) * 2
     for turn, rotation in product(turns, rotations):
         g = tuple(map(intermediate, rotation(turn, q, u)))
         now = [tuple(map(Add, x, change)) for x, change in zip((q, u), changes, strict=True)]
