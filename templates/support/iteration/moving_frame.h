@@ -91,7 +91,7 @@ static inline void potential_rates(const step_data *step, int n, const lanes *q,
   frame_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, value);
 }
 
-/* (tau W_u, -W_Q) at the points of a group. */
+/* (tau W_u, -W_Q, h W_u / 2) at the points of a group. */
 static inline __attribute__((always_inline)) void rate_in_frame(const step_data *step, int n, const lanes *u, lanes *rates)
 {
   const lanes tau = step->h * (ABSCISSA[n] - 0.5);
@@ -119,6 +119,7 @@ static inline __attribute__((always_inline)) void rate_in_frame(const step_data 
     times_vector(g, m, turned);
     for (int i = 0; i < 4; i++) {
       rates[4 * k + i] = by[k].scale * tau * velocity[i];
+      rates[2 * M + 4 * k + i] = 0.5 * step->h * by[k].scale * velocity[i];
       rates[M + 4 * k + i] = back[i] - ((g[i] + of[1] * g[i]) - of[0] * turned[i]);
     }
   }
@@ -263,7 +264,7 @@ static inline void out_of_frame(const step_data *step, frame_state *at, double *
 HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, double *dq,
     double *dp, const solver_options *options, solver_report *report)
 {
-  lanes z[GROUPS][M], force[GROUPS][M], u[GROUPS][2 * M], scaled[GROUPS][M];
+  lanes z[GROUPS][M], force[GROUPS][M], u[GROUPS][2 * M], scaled[GROUPS][M], curve[GROUPS][M];
   double velocity_size[M], momentum_size[M];
   frame_state state;
   const step_data moving = into_frame(step, &state);
@@ -278,7 +279,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
     if (k < 2)
       measure_quaternions(u, options, step->h, velocity_size, momentum_size);
     for (int n = 0; n < GROUPS; n++) {
-      lanes rates[2 * M];
+      lanes rates[3 * M];
       rate_in_frame(&moving, n, u[n], rates);
       for (int i = 0; i < M; i++) {
         const lanes moved = (rates[i] - z[n][i]) * velocity_size[i];
@@ -286,6 +287,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
         change += moved * moved + pushed * pushed;
         z[n][i] = rates[i];
         force[n][i] = rates[M + i];
+        curve[n][i] = rates[2 * M + i];
       }
     }
     take_change(&now, total_change(change) / POINTS, options, k, report);
@@ -302,7 +304,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   out_of_frame(step, &state, dq, dp);
   if (!accept(step, dq, dp, report))
     return NOT_FINITE;
-  remember_curve(z, past);
+  remember_curve(curve, past);
   remember_curve(force, past + 2 * M * POINTS);
   *steps = next_guess(*steps, &now, report);
   return OK;
