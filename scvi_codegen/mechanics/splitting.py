@@ -27,8 +27,8 @@ from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
 
-SMALLEST = S(10) ** -300
-"""Added to the square of an angle, so that sin(x)/x and its derivative have values at 0."""
+SMALLEST = S(10) ** -40
+"""Added to the square of an angle, so that sin(x)/x and its derivatives have values at 0."""
 DOUBLINGS = 20
 """Doublings of the argument of elliptic functions: series of 4 terms at 2^-20 are correct to 45 digits."""
 
