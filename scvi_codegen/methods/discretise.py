@@ -73,22 +73,28 @@ def discretise(system: MechanicalSystem, method: Method) -> StageSystem:
             'method supports damping as forces, "-gamma*p", but then areas do not shrink by exactly '
             "exp(-gamma h)"
         )
-    return _completed(system, stages, method)
+    return _completed(system, stages, method, moving=in_moving_frame(system, method))
 
 
 def paper_equations(system: MechanicalSystem, method: Method) -> StageSystem:
     """Return the equations in the paper's notation. Raises as :func:`discretise`."""
     check_regular(method, system)
-    return _completed(system, method.paper_form(axial_turns(system)[0]), method)
+    return _completed(system, method.paper_form(axial_turns(system)[0]), method, moving=False)
 
 
-def _completed(system: MechanicalSystem, stages: StageSystem, method: Method) -> StageSystem:
+def in_moving_frame(system: MechanicalSystem, method: Method) -> bool:
+    """Return whether the method is applied in the moving frame of bodies: its points determine the momenta."""
+    core = axial_turns(system)[0]
+    return frame_potential(system) is not None and isinstance(method.stage_system(core).shape, Velocities)
+
+
+def _completed(system: MechanicalSystem, stages: StageSystem, method: Method, *, moving: bool) -> StageSystem:
     """Add auxiliary variables, constraints, damping, and the rotations of axially symmetric bodies to the equations."""
     system, turns, potential = *axial_turns(system), frame_potential(system)
     completed = with_auxiliaries(system, stages)
     completed = with_constraints(system, completed, method.name) if system.constraints else completed
     completed = replace(completed, damping=system.damping)
-    if potential is None or not isinstance(method.stage_system(system).shape, Velocities):
+    if potential is None or not moving:
         return _rotated(system, completed, turns, Turn.rotation) if turns else completed
     completed = _rotated(system, _framed(system, completed, turns, potential), turns, Turn.free_rotation, first=True)
     return _rotated(system, completed, turns, Turn.free_rotation, Turn.rotation)
