@@ -44,11 +44,8 @@ from scvi_codegen.validation import checks_arguments
 if TYPE_CHECKING:
     from scvi_codegen.derivation.arrays import ArrayStepEquations
 
-MOVING_FRAME = (
-    "moving frame: in place of H - kappa Pi_k^2/2 the equations have V(Phi_tau(Q, P)), tau = (c_n - 1/2) h, between two "
-    "steps of h/2 of the free rotation Phi_t: q, p <- q, p exp(t Pi/(2 A))"
-)
-"""Heading of equations in the moving frame of axially symmetric bodies (:mod:`scvi_codegen.mechanics.rotations`)."""
+MOVING_FRAME = "moving frame: V(Phi_tau(Q, P)) in place of H_0, tau = (c_n - 1/2) h, between two steps of h/2 of Phi_t:"
+FREE_ROTATION = "Phi_t: q, p <- q, p exp(t Pi/(2 A)), flow of the kinetic energy of H_0 = H - kappa Pi_k^2/2"
 MOST_SHOWN = 12
 """Largest number of equations that a notebook shows."""
 
@@ -127,7 +124,7 @@ class StepEquations:
         yield f"{self.system.name}: {self.method.title}"
         yield from (each.description for each in (*self.system.rotations, *axial_turns(self.system)[1]))
         if in_moving_frame(self.system, self.method):
-            yield MOVING_FRAME
+            yield from (MOVING_FRAME, FREE_ROTATION)
         yield f"{'H' if self.system.auxiliaries else 'L'} = {format_expression(self.system.formula)}"
         for g in self.system.constraints:
             yield f"0 = {format_expression(g)}"

@@ -116,12 +116,16 @@ def _framed(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn]
         Table.named("tau", [[t * x for x in line] for t, line in zip(tau, each.table.entries, strict=True)])
         for each in (at, rate)
     )
-    gathers = (*others, at, Gather(arguments=u, table=timed, power=at.power + 1))
     rates = replace(rate, results=system.velocities), Scatter(results=velocity, table=back, power=1)
-    scatters = (replace(force, results=push), momentum, *rates)
+    framed = replace(
+        group,
+        gathers=(*others, at, Gather(arguments=u, table=timed, power=at.power + 1)),
+        scatters=(replace(force, results=push), momentum, *rates),
+        scalar=None,
+        in_action=False,
+    )
     still = (replace(each, straight=(mp.zero,) * 2) if each.moves else each for each in stages.blocks)
-    group = replace(group, gathers=gathers, scatters=scatters, scalar=None, in_action=False)
-    return replace(stages, blocks=tuple(still), stage_groups=(group,))
+    return replace(stages, blocks=tuple(still), stage_groups=(framed,))
 
 
 def _rotated(
