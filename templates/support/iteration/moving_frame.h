@@ -5,14 +5,15 @@
 #include "one_trajectory.h"
 #include "point_weights.h"
 
-/* Method in the moving frame of bodies with axes of symmetry: z = Phi_tau(Z) with their free rotation Phi, tau = t - t0 -
- * h/2, leaves the Hamiltonian V(Phi_tau(Z)) = W(Q, u), u = tau P. A step begins and ends with half of the free rotation.
- * With v = u/(4A), m = Im(conj(Q) v), y = |m|^2 and the functions S, C, D of y below, positions are Q r, r = C + S m, and
- * with g = V_q there, G = conj(Q) g and w = S Im(G) + (D Im(G) . m - S Re(G)) m (products of quaternions)
+/* Method in the moving frame of bodies with axes of symmetry: z = Phi_tau(Z) with their free rotation Phi,
+ * tau = t - t0 - h/2, leaves the Hamiltonian V(Phi_tau(Z)) = W(Q, u), u = tau P. A step begins and ends with half of the
+ * free rotation. With v = u/(4A), m = Im(conj(Q) v), y = |m|^2 and the functions S, C, D of y below, positions are Q r,
+ * r = C + S m, and with g = V_q there, G = conj(Q) g and w = S Im(G) + (D Im(G) . m - S Re(G)) m
+ * (products of quaternions)
  *   W_u = Q w/(4A),      W_Q = g conj(r) - v w.
- * The
- * rates at the points, h-weighted as in hamiltonian_iteration.h, are updated together. Requires: hamiltonian_iteration.h,
- * TURNS, the number of bodies, the kernels frame_lanes, rotations. */
+ * All
+ * rates at the points are updated together. Requires: hamiltonian_iteration.h, which includes this header, TURNS, the
+ * number of bodies, the kernels frame_lanes and rotations. */
 
 #define LARGEST_IN_SERIES 4.0 /* 2^2: angles up to which the series are correct to round-off */
 
@@ -26,16 +27,16 @@ static inline void frame_functions(lanes y, lanes *of)
     for (int j = 0; j < n; j++)
       largest.lane[j] = larger(largest.lane[j], largest.lane[n + j]);
   if (largest.lane[0] <= LARGEST_IN_SERIES) {
-    const lanes sine = ((y * (1.0 / 120.0) - 1.0 / 6.0) + y2 * (y * (1.0 / 362880.0) - 1.0 / 5040.0)) +
-        y4 * (((y * (1.0 / 6227020800.0) - 1.0 / 39916800.0) +
-                  y2 * (y * (1.0 / 355687428096000.0) - 1.0 / 1307674368000.0)) +
-                 y4 * ((y * (1.0 / 51090942171709440000.0) - 1.0 / 121645100408832000.0) -
-                          y2 * (1.0 / 25852016738884976640000.0)));
-    of[2] = ((y * (4.0 / 120.0) - 2.0 / 6.0) + y2 * (y * (8.0 / 362880.0) - 6.0 / 5040.0)) +
-        y4 * (((y * (12.0 / 6227020800.0) - 10.0 / 39916800.0) +
-                  y2 * (y * (16.0 / 355687428096000.0) - 14.0 / 1307674368000.0)) +
-                 y4 * ((y * (20.0 / 51090942171709440000.0) - 18.0 / 121645100408832000.0) -
-                          y2 * (22.0 / 25852016738884976640000.0)));
+    const lanes a = y * (1.0 / 120.0) - 1.0 / 6.0, b = y * (1.0 / 362880.0) - 1.0 / 5040.0;
+    const lanes c = y * (1.0 / 6227020800.0) - 1.0 / 39916800.0;
+    const lanes d = y * (1.0 / 355687428096000.0) - 1.0 / 1307674368000.0;
+    const lanes e = y * (1.0 / 51090942171709440000.0) - 1.0 / 121645100408832000.0;
+    const lanes sine = (a + y2 * b) + y4 * ((c + y2 * d) + y4 * (e - y2 * (1.0 / 25852016738884976640000.0)));
+    const lanes f = y * (4.0 / 120.0) - 2.0 / 6.0, g = y * (8.0 / 362880.0) - 6.0 / 5040.0;
+    const lanes h = y * (12.0 / 6227020800.0) - 10.0 / 39916800.0;
+    const lanes k = y * (16.0 / 355687428096000.0) - 14.0 / 1307674368000.0;
+    const lanes l = y * (20.0 / 51090942171709440000.0) - 18.0 / 121645100408832000.0;
+    of[2] = (f + y2 * g) + y4 * ((h + y2 * k) + y4 * (l - y2 * (22.0 / 25852016738884976640000.0)));
     of[0] = 1.0 + y * sine;
     of[1] = y * (sine + of[2]);
   } else
@@ -92,7 +93,8 @@ static inline void potential_rates(const step_data *step, int n, const lanes *q,
 }
 
 /* (tau W_u, -W_Q, h W_u / 2) at the points of a group. */
-static inline __attribute__((always_inline)) void rate_in_frame(const step_data *step, int n, const lanes *u, lanes *rates)
+static inline __attribute__((always_inline)) void rate_in_frame(const step_data *step, int n, const lanes *u,
+    lanes *rates)
 {
   const lanes tau = step->h * (ABSCISSA[n] - 0.5);
   lanes q[M], square[TURNS], value[M + TURNS], turned[4], w[3];
@@ -145,7 +147,7 @@ static inline void measure_quaternions(lanes (*u)[2 * M], const solver_options *
 /* sum = x + y, rounded; returns the rest. */
 static inline double rest_of_sum(double x, double y, double *sum)
 {
-  __asm__("" : "+x"(x), "+x"(y)); const double total = x + y, part = total - x;
+  const double total = x + y, part = total - x;
   *sum = total;
   return (x - (total - part)) + (y - part);
 }
@@ -164,15 +166,16 @@ static inline void add_change(double *x, double *low, double change, double low_
 /* (|g|^2 - 1)/2 of d = g - 1, whose rounding errors are similar in every step: sums of products without rounding. */
 static inline double excess(const double *d)
 {
-  double sum = 2.0 * d[0], rest = 0.0;
-  for (int k = 0; k < 4; k++) {
-    const double square = d[k] * d[k];
-    rest += fma(d[k], d[k], -square) + rest_of_sum(sum, square, &sum);
-  }
+  double sum = 2.0 * d[0], rest = 0.0, square[4];
+  for (int k = 0; k < 4; k++)
+    square[k] = d[k] * d[k];
+  IN_MEMORY(square); /* rounded, not part of fused operations */
+  for (int k = 0; k < 4; k++)
+    rest += fma(d[k], d[k], -square[k]) + rest_of_sum(sum, square[k], &sum);
   return 0.5 * (sum + rest);
 }
 
-/* q <- q g, p <- p g for g - 1 of each body, whose length is corrected: high words are in one lane, low ones in another. */
+/* q <- q g, p <- p g for g - 1 of each body, whose length is corrected: high words in one lane, low words in another. */
 static inline void rotate(const step_data *step, frame_state *at, const double *g)
 {
   for (int i = 0; i < M; i += 4) {
@@ -259,7 +262,7 @@ static inline void out_of_frame(const step_data *step, frame_state *at, double *
   }
 }
 
-/* Computes the increments of one step by fixed-point iteration from W = 0: there is no predictor, as the rates vary with
+/* Computes the increments of one step by fixed-point iteration from W = 0: there is no predictor, as rates vary with
  * the nutation. On failure the increments are undefined. */
 HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, double *dq,
     double *dp, const solver_options *options, solver_report *report)
