@@ -2,18 +2,18 @@
 #define SUPPORT_MOVING_FRAME_H
 
 #include "../core/progress.h"
+#include "hamiltonian_iteration.h"
 #include "one_trajectory.h"
 #include "point_weights.h"
 
 /* Method in the moving frame of bodies with axes of symmetry: z = Phi_tau(Z) with their free rotation Phi,
- * tau = t - t0 - h/2, leaves the Hamiltonian V(Phi_tau(Z)) = W(Q, u), u = tau P. A step begins and ends with half of the
- * free rotation. With v = u/(4A), m = Im(conj(Q) v), y = |m|^2 and the functions S, C, D of y below, positions are Q r,
- * r = C + S m, and with g = V_q there, G = conj(Q) g and w = S Im(G) + (D Im(G) . m - S Re(G)) m
- * (products of quaternions)
+ * tau = t - t0 - h/2, leaves the Hamiltonian V(Phi_tau(Z)) = W(Q, u), u = tau P. A step begins and ends with half of
+ * the free rotation. With v = u/(4A), m = Im(conj(Q) v), y = |m|^2 and the functions S, C, D of y below, positions are
+ * Q r, r = C + S m (products of quaternions). With g = V_q there, G = conj(Q) g and w = S Im(G) + (D Im(G) . m - S
+ * Re(G)) m,
  *   W_u = Q w/(4A),      W_Q = g conj(r) - v w.
- * All
- * rates at the points are updated together. Requires: hamiltonian_iteration.h, which includes this header, TURNS, the
- * number of bodies, the kernels frame_lanes and rotations. */
+ * All rates at the points are updated together. Requires: hamiltonian_iteration.h, which includes this header, TURNS,
+ * the number of bodies, the kernels frame_lanes and rotations. */
 
 #define LARGEST_IN_SERIES 4.0 /* 2^2: angles up to which the series are correct to round-off */
 
@@ -175,7 +175,7 @@ static inline double excess(const double *d)
   return 0.5 * (sum + rest);
 }
 
-/* q <- q g, p <- p g for g - 1 of each body, whose length is corrected: high words in one lane, low words in another. */
+/* q <- q g, p <- p g for g - 1 of each body; its length is corrected. High words are in one lane, low in another. */
 static inline void rotate(const step_data *step, frame_state *at, const double *g)
 {
   for (int i = 0; i < M; i += 4) {
