@@ -149,12 +149,12 @@ def test_a_reversed_run_of_20_000_steps_returns_to_its_start(top):
 
 
 def test_energy_and_momenta_over_100_000_steps(top):
-    run = top.integrate(START, velocity=OMEGA, h=0.2, steps=100_000, save_every=500)
+    run = top.integrate(START, velocity={"omega": [0.1, 0, 10]}, h=0.5, steps=100_000, save_every=500)
     energy, maps = run.energy(), run.momentum_maps()
     error = abs(energy / energy[0] - 1)
     assert error[-40:].max() < 1.2 * error[:40].max() + 1e-13
-    assert abs(maps / maps[0] - 1).max() < 1e-12
-    assert abs(np.sum(run.q**2, axis=1) / np.sum(run.q[0] ** 2) - 1).max() < 1e-12
+    assert abs(maps / maps[0] - 1).max() < 3e-13
+    assert abs(np.sum(run.q**2, axis=1) / np.sum(run.q[0] ** 2) - 1).max() < 3e-13
 
 
 @pytest.mark.parametrize("h", [0.01, 3.0, 400.0])
