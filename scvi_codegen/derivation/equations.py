@@ -34,7 +34,7 @@ from scvi_codegen.mechanics.rotations.axial import axial_turns
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, symmetries
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import as_method
-from scvi_codegen.methods.discretise import discretised_form, paper_equations
+from scvi_codegen.methods.discretise import discretised_form, in_moving_frame, paper_equations
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import Block, Row, StageGroup, StageSystem, Table
 from scvi_codegen.representation import LONGEST, clipped
@@ -44,6 +44,8 @@ from scvi_codegen.validation import checks_arguments
 if TYPE_CHECKING:
     from scvi_codegen.derivation.arrays import ArrayStepEquations
 
+MOVING_FRAME = "moving frame: V(Phi_tau(Q, P)) in place of H_0, tau = (c_n - 1/2) h, between two steps of h/2 of Phi_t:"
+FREE_ROTATION = "Phi_t: q, p <- q, p exp(t Pi/(2 A)), flow of the kinetic energy of H_0 = H - kappa Pi_k^2/2"
 MOST_SHOWN = 12
 """Largest number of equations that a notebook shows."""
 
@@ -121,6 +123,8 @@ class StepEquations:
         q, p = self.state
         yield f"{self.system.name}: {self.method.title}"
         yield from (each.description for each in (*self.system.rotations, *axial_turns(self.system)[1]))
+        if in_moving_frame(self.system, self.method):
+            yield from (MOVING_FRAME, FREE_ROTATION)
         yield f"{'H' if self.system.auxiliaries else 'L'} = {format_expression(self.system.formula)}"
         for g in self.system.constraints:
             yield f"0 = {format_expression(g)}"

@@ -30,8 +30,8 @@ from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import DIGITS, mp
 
-SMALLEST = S(10) ** -300
-"""Added to the square of an angle, so that sin(x)/x and its derivative have values at 0."""
+SMALLEST = S(10) ** -40
+"""Added to the square of an angle, so that sin(x)/x and its derivatives have values at 0."""
 DOUBLINGS = 20
 """Doublings of the argument of elliptic functions: series of 4 terms at 2^-20 are correct to 45 digits."""
 
@@ -67,7 +67,7 @@ class KineticSplitting:
             momentum = [intermediate(x / 2) for x in axes.T * Matrix((pair[0].conjugate() * pair[1]).args[1:])]
             if outer == 0:
                 around = [inner * x / 2 if n == k else S.Zero for n, x in enumerate(momentum)]
-                g = _turn([common * x / 2 for x in momentum]) * _turn(around)
+                g = exponential([common * x / 2 for x in momentum]) * exponential(around)
             else:
                 offsets = {j: outer, k: inner}
                 g = _elliptic_turn(j, [intermediate(common + offsets.get(n, S.Zero)) for n in range(3)], momentum)
@@ -76,7 +76,7 @@ class KineticSplitting:
         return moved, turned
 
 
-def _turn(half: Sequence[Expr]) -> Quaternion:
+def exponential(half: Sequence[Expr]) -> Quaternion:
     """Return exp(v) for a vector v, half of a rotation vector."""
     angle = intermediate(sqrt(Add(SMALLEST, *(x**2 for x in half))))
     return Quaternion(cos(angle), *(sin(angle) / angle * x for x in half))

@@ -10,20 +10,21 @@ and one such pair of rows per node where a multiplied residual is made stationar
 the method equals that of the Lagrangian, step for step: (35f) is the Legendre transform at the points.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import sympy
-from sympy import Add, Symbol
+from sympy import Add, Expr, Symbol
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.expressions import gradient_tuple
+from scvi_codegen.formulas.intermediates import intermediate
 from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, forms_of
 from scvi_codegen.mechanics.forces import nonholonomic_expressions
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.rotations.axial import Turn, axial_turns
+from scvi_codegen.mechanics.rotations.axial import Turn, axial_turns, frame_potential, rotated
 from scvi_codegen.mechanics.rotations.hamiltonian import hamiltonian_of_rotations
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.time_transformation import reparametrise
@@ -72,56 +73,110 @@ def discretise(system: MechanicalSystem, method: Method) -> StageSystem:
             'method supports damping as forces, "-gamma*p", but then areas do not shrink by exactly '
             "exp(-gamma h)"
         )
-    return _completed(system, stages, method)
+    return _completed(system, stages, method, moving=in_moving_frame(system, method))
 
 
 def paper_equations(system: MechanicalSystem, method: Method) -> StageSystem:
     """Return the equations in the paper's notation. Raises as :func:`discretise`."""
     check_regular(method, system)
-    return _completed(system, method.paper_form(axial_turns(system)[0]), method)
+    return _completed(system, method.paper_form(axial_turns(system)[0]), method, moving=False)
 
 
-def _completed(system: MechanicalSystem, stages: StageSystem, method: Method) -> StageSystem:
-    """Add auxiliary variables, constraints, damping, and the turns of axially symmetric bodies to the equations."""
-    system, turns = axial_turns(system)
+def in_moving_frame(system: MechanicalSystem, method: Method) -> bool:
+    """Return whether the method is applied in the moving frame of bodies: its points determine the momenta."""
+    core = axial_turns(system)[0]
+    return frame_potential(system) is not None and isinstance(method.stage_system(core).shape, Velocities)
+
+
+def _completed(system: MechanicalSystem, stages: StageSystem, method: Method, *, moving: bool) -> StageSystem:
+    """Add auxiliary variables, constraints, damping, and the rotations of axially symmetric bodies to the equations."""
+    system, turns, potential = *axial_turns(system), frame_potential(system)
     completed = with_auxiliaries(system, stages)
     completed = with_constraints(system, completed, method.name) if system.constraints else completed
     completed = replace(completed, damping=system.damping)
-    return _turned(system, completed, turns) if turns else completed
+    if potential is None or not moving:
+        return _rotated(system, completed, turns, Turn.rotation) if turns else completed
+    completed = _rotated(system, _framed(system, completed, turns, potential), turns, Turn.free_rotation, first=True)
+    return _rotated(system, completed, turns, Turn.free_rotation, Turn.rotation)
 
 
-def _turned(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn]) -> StageSystem:
-    """Return the equations followed by turns of bodies: V is their change of q by h, P the momentum before them."""
-    q, size = system.coordinates, len(stages.rows)
-    u, v = (tuple(Symbol(f"{name}_{i}", real=True) for i in range(len(q))) for name in ("turn", "change"))
-    changes = [(turn.change(q, angle), turn.change(u, angle)) for turn in turns for angle in [turn.angle(q, u)]]
-    moved, pushed = (tuple(map(Add, *each)) for each in zip(*changes, strict=True))
+def _symbols(name: str, system: MechanicalSystem) -> tuple[Symbol, ...]:
+    return tuple(Symbol(f"{name}_{i}", real=True) for i in range(system.dimension))
+
+
+def _framed(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn], potential: Expr) -> StageSystem:
+    """Return the equations of W(Q, u_n), u_n = (c_n - 1/2) h P_n, in place of H: in the moving frame."""
+    q, u, (group,) = system.coordinates, _symbols("turn", system), stages.stage_groups
+    moved = map(Add, q, rotated(turns, q, [2 * x for x in u], Turn.free_rotation)[0])
+    W = potential.xreplace(dict(zip(q, map(intermediate, moved), strict=True)))
+    velocity, push = (tuple(-x for x in gradient_tuple(W, variables)) for variables in (u, q))
+    *others, at, (force, momentum, rate) = *group.gathers, group.scatters
+    tau = [c - mp.mpf(1) / 2 for c in group.abscissae]
+    timed, back = (
+        Table.named("tau", [[t * x for x in line] for t, line in zip(tau, each.table.entries, strict=True)])
+        for each in (at, rate)
+    )
+    rates = replace(rate, results=system.velocities), Scatter(results=velocity, table=back, power=1)
+    framed = replace(
+        group,
+        gathers=(*others, at, Gather(arguments=u, table=timed, power=at.power + 1)),
+        scatters=(replace(force, results=push), momentum, *rates),
+        scalar=None,
+        in_action=False,
+    )
+    still = (replace(each, straight=(mp.zero,) * 2) if each.moves else each for each in stages.blocks)
+    return replace(stages, blocks=tuple(still), stage_groups=(framed,))
+
+
+def _rotated(
+    system: MechanicalSystem,
+    stages: StageSystem,
+    turns: Sequence[Turn],
+    *rotations: Callable[..., tuple[Expr, ...]],
+    first: bool = False,
+) -> StageSystem:
+    """Return the equations with rotations of bodies at the end, or ``first``.
+
+    V is their change of q by h, P the momentum before them.
+    """
+    size, u, v = len(stages.rows), _symbols("turn", system), _symbols("change", system)
+    moved, pushed = rotated(turns, system.coordinates, u, *rotations)
+    name, others = "start" if first else "spin", Table.constant(1, size)
     one, minus, none = Table.constant(1, 1, 1), Table.constant(1, 1, -1), Table.constant(1, 1)
-    before, others = Table.joined(stages.end_position, none, none), Table.constant(1, size)
-    results = (tuple(a - b for a, b in zip(moved, v, strict=True)), (minus, none, none)), (pushed, (none, none, one))
+    end, momentum = Table.joined(stages.end_position, none, none), stages.end_momentum
+    before, into = end, Table.joined(others, none, none, one)
+    groups = [each.widened(2) if first else _reaching(each, size) for each in stages.stage_groups]
+    if first:
+        columns = [*range(size + 1), 0, -1]
+        groups = [
+            replace(x, gathers=tuple(replace(y, table=y.table.columns(columns)) for y in x.gathers)) for x in groups
+        ]
+        into = Table.named("", [(*(row.momentum for row in stages.rows), mp.zero, mp.zero, momentum)])
+        before, end, momentum = Table.joined(one, others, none, none), end.columns(columns), mp.one
+    change = tuple(a - b for a, b in zip(moved, v, strict=True))
+    tables = Table.joined(others, minus, none, none), into, Table.joined(others, none, minus, none)
     group = StageGroup(
-        name="spin",
-        abscissae=(mp.one,),
+        name=name,
+        abscissae=(mp.mpf(not first),),
         gathers=(
-            Gather(arguments=q, table=before, power=0),
+            Gather(arguments=system.coordinates, table=before, power=0),
             Gather(arguments=u, table=Table.joined(none, others, none, one), power=0),
             Gather(arguments=v, table=Table.joined(none, others, one, none), power=0),
         ),
         scatters=tuple(
-            Scatter(results=each, table=Table.joined(others, *columns), power=-1)
-            for each, columns in (*results, (u, (none, minus, none)))
+            Scatter(results=each, table=table, power=-1)
+            for each, table in zip((change, pushed, u), tables, strict=True)
         ),
-        computes="Changes of q and u = h p by turns about axes of symmetry, less v, and u",
+        computes="Changes of q and u = h p by rotations of bodies, less v, and u",
     )
-    still = (mp.zero, mp.zero)
-    spin = Block(name="V_spin", power=1, straight=still)
-    last = Row(number="P_spin", kind="IDEL", momentum=stages.end_momentum)
+    still = Block(name=f"V_{name}", power=1, straight=(mp.zero, mp.zero))
+    last = Row(number=f"P_{name}", kind="IDEL", momentum=momentum)
     return replace(
         stages,
-        blocks=(*stages.blocks, spin, Block(name="P_spin", power=1, straight=still, momentum=1, moves=False)),
-        rows=(*stages.rows, Row(number="V_spin", kind="stage", momentum=mp.zero), last),
-        stage_groups=(*(_reaching(each, size) for each in stages.stage_groups), group),
-        end_position=Table.joined(stages.end_position, one, none),
+        blocks=(*stages.blocks, still, replace(still, name=f"P_{name}", momentum=1, moves=False)),
+        rows=(*stages.rows, Row(number=f"V_{name}", kind="stage", momentum=mp.zero), last),
+        stage_groups=(*groups, group),
+        end_position=end if first else Table.joined(stages.end_position, one, none),
         extrapolation=stages.extrapolation and _diagonal([stages.extrapolation, identity_matrix(2)]),
     )
 

@@ -25,7 +25,7 @@ from scvi_codegen.native import building
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.rotations.states import homogeneous_state, members_of
 
-TOLERANCES = (1e-6, 1e-8, 1e-9, 1e-10, 3e-11, 1e-11, 3e-12, 1e-12, 5e-13, 3e-13, 2e-13, 1e-13)
+TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-8, 1e-9, 1e-10, 3e-11, 1e-11, 3e-12, 1e-12, 5e-13, 3e-13, 2e-13, 1e-13)
 """Tolerances for which a step size is recommended; the errors reached are measured."""
 
 QUICK_TOLERANCES = (1e-8, 1e-10, 1e-12)

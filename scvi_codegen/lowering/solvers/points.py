@@ -45,7 +45,7 @@ from typing import Any
 import sympy
 from sympy import Add, Expr, Symbol
 
-from scvi_codegen.formulas.expressions import jacobian
+from scvi_codegen.formulas.expressions import gradient_tuple, jacobian
 from scvi_codegen.formulas.intermediates import inner_of
 from scvi_codegen.ir.equations import FixedPointIteration, IterationName, IterationTable, StoredValues
 from scvi_codegen.ir.kernel import Kernel
@@ -64,7 +64,7 @@ from scvi_codegen.lowering.solvers.tables import (
 from scvi_codegen.lowering.stage_groups import damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.rotations.axial import Turn, axial_turns
+from scvi_codegen.mechanics.rotations.axial import Turn, axial_turns, frame_potential
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_structure import Accelerations, Velocities
 from scvi_codegen.tables.basis import matrix_product, transpose
@@ -172,43 +172,54 @@ def hamiltonian_iteration(problem: StepProblem) -> FixedPointIteration | None:
         return None
     of, turning = forms.legendre_arguments, bool(system.rotations)
     joint = turning and lanes > 2 and sum(len(each.coordinates) for each in system.rotations) == system.dimension
-    kernel = partial(system_kernel, system, of=of, paired=turning)
+    kernel, potential = partial(system_kernel, system, of=of, paired=turning), frame_potential(problem.system)
+    in_space = (
+        kernel("velocity_lanes", forms.legendre, purpose="H_p at all points, u = (q, p)."),
+        kernel("force_lanes", forms.force, purpose="-H_q at all points, u = (q, p)."),
+        kernel("rate_lanes", (*forms.legendre, *forms.force), purpose="(H_p, -H_q) at all points, u = (q, p).")
+        if joint
+        else None,
+        integrand_kernel(system, "integrand_lanes", of),
+        _turn_kernel(system, turns, lanes=True),
+    )
+    macros = {"JOINT_RATES": int(joint), "TURNS": len(turns), "MOVING_FRAME": int(potential is not None)}
     return _point_iteration(
         "Hamiltonian",
         tables,
         lanes,
-        (
-            kernel("velocity_lanes", forms.legendre, purpose="H_p at all points, u = (q, p)."),
-            kernel("force_lanes", forms.force, purpose="-H_q at all points, u = (q, p)."),
-            kernel("rate_lanes", (*forms.legendre, *forms.force), purpose="(H_p, -H_q) at all points, u = (q, p).")
-            if joint
-            else None,
-            integrand_kernel(system, "integrand_lanes", of),
-            _turn_kernel(system, turns, lanes=True),
-        ),
+        in_space if potential is None else (_frame_kernel(system, turns, potential),),
         constant_mass=_turn_kernel(system, turns, lanes=False),
-        forces=() if joint else ("force_lanes",),
+        forces=() if joint or potential is not None else ("force_lanes",),
         stored=4 * lanes,
         parts=("point_weights", "hamiltonian_iteration"),
-        macros=((("JOINT_RATES", 1),) if joint else ()) + ((("TURNS", len(turns)),) if turns else ()),
+        macros=tuple((name, value) for name, value in macros.items() if value),
         matrix=tables.position if _nearly_equal(tables.position, tables.momentum) else (),
     )
 
 
+def _frame_kernel(system: MechanicalSystem, turns: Sequence[Turn], potential: Expr) -> Kernel:
+    """Return the kernel of the gradient of the potential and of the factors of angles, as a function of q and |q|^2."""
+    q, squares = system.coordinates, [Symbol(f"square_{k}", real=True) for k in range(len(turns))]
+    sums = {Add(*(x**2 for x in q[4 * k : 4 * k + 4])): each for k, each in enumerate(squares)}
+    values = [each.xreplace(sums) for each in gradient_tuple(potential, q)] + [turn.rate / 4 for turn in turns]
+    purpose = "V_q and 1/(4 A) at all points, u = (q, |q|^2 of each body)."
+    return system_kernel(system, "frame_lanes", values, of=(*q, *squares), paired=True, purpose=purpose)
+
+
 def _turn_kernel(system: MechanicalSystem, turns: Sequence[Turn], *, lanes: bool) -> Kernel | None:
-    """Return the kernel of the angles of turns that end a step, or of turns of vectors; ``None`` without turns."""
+    """Return the kernel of the rotations that end a step, or of their effect on vectors; ``None`` without turns."""
     q, p = (tuple(Symbol(f"{name}_{i}", real=True) for i in range(system.dimension)) for name in "qp")
     if not turns:
         return None
     if not lanes:
-        purpose = "(cos a - 1, sin a) of the turns by a = kappa h Pi_k/2 after a step, u = (q, h p)."
+        values = sum((turn.rotation(q, p) for turn in turns), ())
         return system_kernel(
-            system, "angles", sum((turn.angle(q, p) for turn in turns), ()), of=(*q, *p), purpose=purpose
+            system, "rotations", values, of=(*q, *p), purpose="exp(kappa h Pi_k e_k/2) - 1, u = (q, h p)."
         )
-    angles = [tuple(Symbol(f"{name}_{k}", real=True) for name in ("cosine", "sine")) for k in range(len(turns))]
-    changes = ((*t.change(q, angle), *t.change(p, angle)) for t, angle in zip(turns, angles, strict=True))
-    purpose = "Changes of vectors q and p by the turns, u = (q, p, angles)."
-    return system_kernel(system, "turn_lanes", map(Add, *changes), of=(*q, *p, *sum(angles, ())), purpose=purpose)
+    rotations = [tuple(Symbol(f"g_{k}_{i}", real=True) for i in range(4)) for k in range(len(turns))]
+    changes = ((*t.change(q, g), *t.change(p, g)) for t, g in zip(turns, rotations, strict=True))
+    purpose = "Changes q (g - 1) and p (g - 1) of vectors by rotations, u = (q, p, g - 1)."
+    return system_kernel(system, "turn_lanes", map(Add, *changes), of=(*q, *p, *sum(rotations, ())), purpose=purpose)
 
 
 def _nearly_equal(one: Matrix, other: Matrix) -> bool:

@@ -42,6 +42,10 @@ static inline void push(const step_data *step, const iteration_data *data, lanes
   integrate(MOMENTUM, data->momentum_weight, force, step->p0, step->carry_p, u, M);
 }
 
+#ifdef MOVING_FRAME
+#include "moving_frame.h"
+#else
+
 /* 1 / the size of x at both ends of the step, which makes its changes relative, or `absolute`. */
 static inline void measure_ends(lanes (*x)[M], const solver_options *options, double absolute, double *inverse_size)
 {
@@ -58,16 +62,16 @@ static inline void forces(const step_data *step, lanes (*u)[2 * M], lanes (*forc
 }
 
 #ifdef TURNS
-/* Turns of bodies about axes of symmetry, q <- q exp(a e_k), p <- p exp(a e_k), a = kappa h Pi_k/2, after a step of the
- * other terms of H, with which they commute. Requires: TURNS, the kernels angles and turn_lanes. */
+/* Turns of bodies about axes of symmetry, q <- q g, p <- p g, g = exp(kappa h Pi_k e_k/2), after a step of the other
+ * terms of H, with which they commute. Requires: TURNS, the kernels rotations and turn_lanes. */
 
 /* Turns vectors x and y at the points. */
-static inline void turn_vectors(const step_data *step, const double *angle, lanes (*x)[M], lanes (*y)[M])
+static inline void turn_vectors(const step_data *step, const double *g, lanes (*x)[M], lanes (*y)[M])
 {
   for (int n = 0; n < GROUPS; n++) {
-    lanes u[2 * M + 2 * TURNS], change[2 * M];
-    for (int k = 0; k < 2 * TURNS; k++)
-      u[2 * M + k] = lanes_of(angle[k]);
+    lanes u[2 * M + 4 * TURNS], change[2 * M];
+    for (int k = 0; k < 4 * TURNS; k++)
+      u[2 * M + k] = lanes_of(g[k]);
     memcpy(u, x[n], sizeof x[n]);
     memcpy(u + M, y[n], sizeof y[n]);
     turn_lanes(u, lanes_of(step->t), step->parameters, change);
@@ -82,26 +86,26 @@ static inline void turn_vectors(const step_data *step, const double *angle, lane
 static inline void turn_step(const step_data *step, history past, lanes (*z)[M], lanes (*force)[M], double *dq,
     double *dp)
 {
-  lanes last[GROUPS][M], last_force[GROUPS][M], change[2 * M], end[2 * M + 2 * TURNS];
-  double u[2 * M], angle[2 * TURNS];
+  lanes last[GROUPS][M], last_force[GROUPS][M], change[2 * M], end[2 * M + 4 * TURNS];
+  double u[2 * M], g[4 * TURNS];
   for (int i = 0; i < M; i++) {
     const double q = step->q0[i] + (step->carry_q[i] + dq[i]), p = step->p0[i] + (step->carry_p[i] + dp[i]);
     end[i] = lanes_of(u[i] = q);
     end[M + i] = lanes_of(p);
     u[M + i] = step->h * p;
   }
-  angles(u, step->t, step->parameters, angle);
-  for (int k = 0; k < 2 * TURNS; k++)
-    end[2 * M + k] = lanes_of(angle[k]);
+  rotations(u, step->t, step->parameters, g);
+  for (int k = 0; k < 4 * TURNS; k++)
+    end[2 * M + k] = lanes_of(g[k]);
   turn_lanes(end, lanes_of(step->t), step->parameters, change);
   for (int i = 0; i < M; i++) {
     dq[i] += at_first(&change[i]);
     dp[i] += at_first(&change[M + i]);
   }
-  turn_vectors(step, angle, z, force);
+  turn_vectors(step, g, z, force);
   lanes_load(past, last);
   lanes_load(past + 2 * M * POINTS, last_force);
-  turn_vectors(step, angle, last, last_force);
+  turn_vectors(step, g, last, last_force);
   lanes_store(last, past);
   lanes_store(last_force, past + 2 * M * POINTS);
 }
@@ -227,6 +231,8 @@ static inline void integrals_of_iteration(const step_data *step, const iteration
   for (int k = 0; k < INTEGRALS; k++)
     sum[k] = points_total(part[k]);
 }
+#endif
+
 #endif
 
 #endif
