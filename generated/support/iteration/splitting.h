@@ -62,8 +62,12 @@ static inline void drift(const step_data *step, const solver_data *data, real pa
 #ifdef ROTATING_BODIES
   for (int k = 0; k < BODIES; k++) {
     const int first = BODY[k][0];
+    const real *axes = NULL;
+#ifdef PRODUCTS_OF_INERTIA
+    axes = PRINCIPAL_AXES[k];
+#endif
     turn_body(
-        step, first, BODY[k][2], data->bodies + k, step->h * part, p + first, dq + first, dp + first);
+        step, first, BODY[k][2], data->bodies + k, axes, step->h * part, p + first, dq + first, dp + first);
   }
 #else
   (void)data;
