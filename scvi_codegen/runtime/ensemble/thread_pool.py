@@ -8,8 +8,6 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from scvi_codegen.validation import checked_count
 
 PROGRESS_SECONDS = 0.1
-MOST_JOBS = 4096
-"""Largest number of jobs of a pool; waiting for a million futures would be slow."""
 
 StopCheck = Callable[[int], None]
 """Callback for long work, with any number: it raises if another job failed."""
@@ -29,28 +27,28 @@ def run_jobs(
         threads: number of threads, by default one per core.
     """
     argument = 0 if threads is None else checked_count(threads, "threads", least=1)
-    workers, stop = (argument or os.cpu_count() or 1), threading.Event()
-    pieces, done = min(count, MOST_JOBS), 0
+    workers, stop = min(count, argument or os.cpu_count() or 1), threading.Event()
+    jobs, completed = iter(range(count)), [0] * workers
 
     def check_stop(_: int) -> None:
         if stop.is_set():
             raise _Stopped
 
-    def take(piece: int) -> int:
-        each = range(piece, count, pieces)
-        for j in each:
+    def take(worker: int) -> None:
+        for j in jobs:  # of all workers
             check_stop(j)
             work(j, check_stop)
-        return len(each)
+            completed[worker] += 1
 
-    with ThreadPoolExecutor(workers) as pool:
+    with ThreadPoolExecutor(max(1, workers)) as pool:
         try:
-            pending = {pool.submit(take, piece) for piece in range(pieces)}
+            pending = {pool.submit(take, worker) for worker in range(workers)}
             while pending:
                 finished, pending = wait(pending, PROGRESS_SECONDS, FIRST_EXCEPTION)
-                done += sum(future.result() for future in finished)
+                for future in finished:
+                    future.result()
                 if progress is not None:
-                    progress(done)
+                    progress(sum(completed))
         finally:
             stop.set()
             pool.shutdown(cancel_futures=True)
