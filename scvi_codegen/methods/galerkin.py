@@ -114,12 +114,12 @@ class SVI(NodalMethod):
 
     @property
     def order(self) -> int | None:
-        """min(2s, q, 2 (q - s + 1)), q the order of the quadrature; ``None`` with too few points, and for trigonometric
-        curves.
+        """Order min(2s, q, 2 (q - s + 1)) with the order q of the quadrature.
 
-        The last bound is attained by rules whose order hardly exceeds their number of points (Clenshaw-Curtis, Fejer):
-        stationarity conditions integrate products with variations of degree s, which do not get smoother with h.
-        """  # noqa: D205
+        ``None`` with too few points, and for trigonometric curves. The last bound is attained by rules whose order
+        hardly exceeds their number of points (Clenshaw-Curtis, Fejer): stationarity conditions integrate products with
+        variations of degree s, which do not get smoother with h.
+        """
         best, q = self.curves.order(self.degree), self.rule.order
         if best is None or self.rule.conditions < self.curves.dimension(self.degree):
             return None

@@ -69,6 +69,16 @@ static section modes_of(const linear_system *of, const lattice *one)
 }
 
 #ifdef CIRCULANT_MODES
+/* Finds the lattices and the Fourier modes of their mean Jacobian; returns 0 if a lattice cannot be transformed. */
+static int find_modes(linear_system *of, lattice *all)
+{
+  if (!find_lattices(of, all))
+    return 0;
+  find_roots(of, all);
+  jacobian_modes(of->step, of->points->X, of->work->forces);
+  return 1;
+}
+
 #ifdef FACTORS_ALONE
 /* Numbers of this thread for a coordinate: h times the derivatives -H_qq and H_pp of its Fourier mode. */
 static inline double *rates_of_mode(const linear_system *of, long long i)
@@ -80,10 +90,8 @@ static inline double *rates_of_mode(const linear_system *of, long long i)
 static int invert_modes(linear_system *of)
 {
   lattice all[LATTICES];
-  if (!find_lattices(of, all))
+  if (!find_modes(of, all))
     return 0;
-  find_roots(of, all);
-  jacobian_modes(of->step, of->points->X, of->work->forces);
   for (long long i = of->own.first; i < of->own.end; i++) {
     rates_of_mode(of, i)[0] = mean_derivative(of, of->work->forces, i + of->n);
     rates_of_mode(of, i)[1] = mean_derivative(of, of->work->forces, i);
@@ -116,10 +124,8 @@ static void apply_inverses_of_modes(const linear_system *of, lanes *x, section o
 static int invert_modes(linear_system *of)
 {
   lattice all[LATTICES];
-  if (!find_lattices(of, all))
+  if (!find_modes(of, all))
     return 0;
-  find_roots(of, all);
-  jacobian_modes(of->step, of->points->X, of->work->forces);
   for (const lattice *one = all; one < all + LATTICES; one++) {
     const double places = (double)positions_of(one), count = places * (double)one->components;
     const section own = modes_of(of, one);

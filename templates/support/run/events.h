@@ -310,11 +310,11 @@ static real uncertain_abscissa(const real *c, real doubt, real *extrema, int *co
     derivative[k - 1] = k * c[k];
   *count = polynomial_crossings(derivative, EVENT_DEGREE - 1, extrema);
   for (int i = 0; i < *zero_count; i++) {
-    const real slope = polynomial(derivative, EVENT_DEGREE - 1, zeros[i]);
-    if (fabs(slope) <= EVENT_STEEPNESS * doubt)
+    const real rate = polynomial(derivative, EVENT_DEGREE - 1, zeros[i]);
+    if (fabs(rate) <= EVENT_STEEPNESS * doubt)
       place = nearer_middle(zeros[i], place);
     else
-      zeros[i] -= polynomial(c, EVENT_DEGREE, zeros[i]) / slope; /* from the error of bisection to rounding */
+      zeros[i] -= polynomial(c, EVENT_DEGREE, zeros[i]) / rate; /* from the error of bisection to rounding */
   }
   for (int i = 0; i < *count; i++)
     if (fabs(polynomial(c, EVENT_DEGREE, extrema[i])) <= doubt)
@@ -329,7 +329,7 @@ static int enclose_crossing(const event_step *step, int e, event_sample low, eve
     real *sampled)
 {
   const real least = 2.0 * DBL_EPSILON;
-  real slope = 0.0, wide = INFINITY, wider = INFINITY;
+  real quotient = 0.0, wide = INFINITY, wider = INFINITY;
   for (int k = 0; k < EVENT_TRIALS && high->g != 0.0 && high->fraction - low.fraction > 2.0 * least; k++) {
     const real width = high->fraction - low.fraction, mean = (high->g - low.g) / width;
     const event_sample near = fabs(high->g) < fabs(low.g) ? *high : low;
@@ -337,7 +337,7 @@ static int enclose_crossing(const event_step *step, int e, event_sample low, eve
     event_sample now;
     int status;
     if (k > 0 || !(guess > low.fraction && guess < high->fraction)) {
-      const real move = -near.g / (slope * mean > 0.0 ? slope : mean);
+      const real move = -near.g / (quotient * mean > 0.0 ? quotient : mean);
       fraction = near.fraction + move + copysign(fmax(1.5 * least, EVENT_OVERSHOOT * fabs(move)), move);
     }
     if (width > 0.5 * wider)
@@ -349,7 +349,7 @@ static int enclose_crossing(const event_step *step, int e, event_sample low, eve
     if (status != OK)
       return status;
     *sampled = fraction;
-    slope = (now.g - near.g) / (fraction - near.fraction);
+    quotient = (now.g - near.g) / (fraction - near.fraction);
     if (changes_sign(low.g, now.g))
       *high = now;
     else
