@@ -20,6 +20,7 @@ extensions = [
     "sphinx.ext.intersphinx",
     "mathml",
     "public_names",
+    "search_words",
 ]
 exclude_patterns = ["_extensions"]
 

@@ -75,6 +75,7 @@ static void mass(const double *u, double t, const double *parameters, double *va
   value[0] = parameters[0] * (parameters[1] * parameters[1]);
 }
 
+#define SPLITTING static inline
 #include "support/iteration/splitting.h"
 
 #include "support/run/run.h"

@@ -25,7 +25,7 @@ from scvi_codegen.errors import MethodError, SizesRequiredError
 from scvi_codegen.files.cache import cached_source, key_of
 from scvi_codegen.indices import SIZES_REQUIRED
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods import as_method
+from scvi_codegen.methods import SVI, StoermerVerlet, as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.rendering.source import Interface, Source
@@ -97,7 +97,10 @@ def compile_stepper(
         from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES
 
         check_kind(SYMMETRIES, symmetries, "symmetries")
-    mesh = getattr(system, "mesh", None)
+    drawn: dict[str, Any] = {
+        "mesh": getattr(system, "mesh", None),
+        "links": () if hasattr(system, "_text") else getattr(system, "links", ()),
+    }
     if sizes is not None or tables is not None:
         system, time_transformation = _at_sizes(system, time_transformation, sizes or {}, tables)
     if known_sizes := not hasattr(system, "REQUIRES_SIZES"):
@@ -107,13 +110,14 @@ def compile_stepper(
             raise MethodError(f"symmetries= is unavailable for '{system.name}': {SIZES_REQUIRED}")
         method = as_method(method)
     sources = CachedSources(system, method, solver, prefix, symmetries, time_transformation)
-    variants = Variants(make=sources.variant)
+    variants = Variants(make=sources.variant, lacking=lambda name: name == "second_derivatives" and system.damping != 0)
     if not known_sizes:
         source, interface, reason = sources.of_any_size()
+        rattle = system.constraints and isinstance(method, StoermerVerlet)
         of_sizes = partial(
             compile_stepper,
             system,
-            method,
+            SVI(1, "gauss-lobatto:2") if rattle else method,  # the name of RATTLE for known sizes
             solver=solver,
             flags=flags,
             prefix=prefix,
@@ -122,7 +126,7 @@ def compile_stepper(
         further: dict[str, Any] = {"events": as_events(events), "of_sizes": of_sizes, "reason": reason}
         return Stepper(source, interface, variants=variants, flags=flags, **further)
     source, interface = sources.integrator()
-    interface = replace(interface, layout=replace(interface.layout, mesh=mesh))
+    interface = replace(interface, layout=replace(interface.layout, **drawn))
     cast(MechanicalSystem, system).store_key()
     return Stepper(source, interface, variants=variants, flags=flags, events=as_events(events))
 

@@ -80,7 +80,7 @@ class MethodWarning(UserWarning):
 
 
 class SystemDefinitionWarning(UserWarning):
-    """A definition that is probably a mistake: a parameter without effect, or a mass that its default makes negative.
+    """A definition that is probably a mistake, or not read entirely: a parameter without effect, limits of a robot.
 
     The system can be compiled and run as it is written. Parameters that only events use are reported by
     definitions in Python, which do not contain the events; model files are examined with their events.

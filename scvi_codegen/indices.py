@@ -18,16 +18,21 @@ derivatives are taken with respect to these symbols.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any
+
+from scvi_codegen.errors import SystemDefinitionError
 
 SIZES_REQUIRED = (
     "the sizes of its arrays are known at run time only. Give them when compiling, "
     "compile_stepper(system, method, sizes={'N': 8}), or use unroll_sums(system, {'N': 8})"
 )
 """Reason why arrays of run-time sizes lack a feature, with the remedy."""
+MOST_ELEMENTS = 10**6
+"""Largest number of entries of an array of known sizes, each of which has a name."""
 MOST_THREADS = 64
 """Largest number of threads that share a step: the largest number of blocks of coordinates."""
 
@@ -98,6 +103,11 @@ class Array:
     @property
     def elements(self) -> tuple[str, ...]:
         """Names of the entries of an array of known sizes, ``q_0``, .., the last axis running fastest."""
+        if (count := math.prod(self.shape({}))) > MOST_ELEMENTS:
+            raise SystemDefinitionError(
+                f"{self} has {count} entries, more than the {MOST_ELEMENTS} that are supported as named coordinates: "
+                f"declare it with a name for the size, {self.name}[N], and give the size to runs"
+            )
         ranges: list[Iterable[Any]] = [*map(range, self.shape({}))]
         if self.letters:
             ranges[-1] = self.letters

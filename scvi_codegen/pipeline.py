@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -31,6 +32,7 @@ from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.arrays import check_solver as check_solver_of_arrays
 from scvi_codegen.lowering.control import control_of, density_of
 from scvi_codegen.lowering.derivatives import derivatives_of
+from scvi_codegen.lowering.error_growth import error_growth_of
 from scvi_codegen.lowering.loops import with_sums
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.mechanics.arrays.legendre import SiteHamiltonian, site_hamiltonian
@@ -136,12 +138,15 @@ def describe(
         constraints=program.constraints.formulas if program.constraints else (),
         inputs=system.inputs,
         conserves_energy=not system.changes_energy and not system.inputs,
+        changes_energy=system.changes_energy or "inputs act" * bool(system.inputs),
+        balances_energy=system.balances_energy,
         arrays=_arrays_of(system),
         indices=tuple(f"{name} = {value}" for name, value in system.indices.items()),
         rotations=tuple(each.declaration for each in system.rotations),
         energy_parameter=system.clock.energy.name if system.clock else "",
         solver=_solver_of(program),
         variables=tuple(each.name for each in getattr(system, "variables", ())),
+        lengths=system.lengths,
     )
 
 
@@ -195,8 +200,11 @@ def describe_arrays(
         defaults=system.defaults,
         inputs=system.inputs,
         conserves_energy=not (system.momenta or system.changes_energy or system.inputs),
+        changes_energy=system.changes_energy or "inputs act" * bool(system.inputs),
+        balances_energy=(bool(system.forces) or system.damping != 0) and not system.depends_on_time,
         solver="rattle" if system.constraints else solver,
         layout=layout,
+        lengths=tuple(length for near in system.neighbours for length in near.lengths),
     )
 
 
@@ -272,6 +280,8 @@ class Sources:
         """
         program = self.program()
         control = control_of(program) if self.g is None else density_of(self.system, self.g)
+        if control and controlled and not (self.of_arrays or self.g):
+            control = replace(control, growth=error_growth_of(self.system, program))
         fallback: Fallback | None = "external" if self.uses_fallback_library else None
         return render(program, control if controlled else None, fallback=fallback), self.interface
 
@@ -282,16 +292,12 @@ class Sources:
     def tangent(self, *, second: bool = False) -> Source | None:
         """Return the source with first, or also second, derivatives of steps with respect to all their arguments.
 
-        Second derivatives are unavailable in transformed time and for damped systems.
+        Second derivatives are unavailable in transformed time, for damped and for first-order systems, and derivatives
+        of first-order systems in transformed time.
         """
-        if second and (self.system.integrands or self.system.damping):
+        excluding = second, bool(self.system.clock), bool(forms_of(self.system).one_form)  # each excludes the others
+        if sum(excluding) > 1 or (second and self.system.damping):
             return None
-        if forms_of(self.system).one_form and (second or self.system.clock):
-            raise MethodError(
-                f"{'second derivatives' if second else 'derivatives in transformed time'} of steps are not available "
-                f"for the first-order system '{self.system.name}': use "
-                f"{'first derivatives and differences of them' if second else 'the system in physical time'}"
-            )
         program = self.program(fallback=True)
         if not program.newton:  # explicit steps
             program = self._derived(solver="newton")

@@ -182,7 +182,6 @@ def check_kind(kind: ArgumentType, value: Any, name: str, error: type[ScviCodege
 
 
 def _check_sizes(kind: ArgumentType, value: Any, function: str, error: type[ScviCodegenError]) -> None:
-    """Raise an error for a value of the kind but for its sizes, which are unknown."""
     reason = getattr(type(value), "REQUIRES_SIZES", "")
     if reason and not kind.accepts(value):
         raise error(f"{function}() is not available for {value!r:.60}: {reason}")

@@ -12,8 +12,9 @@ import hypothesis
 import programs
 import pytest
 from browsing import chromium
+from record_tiers import COSTS_VARIABLE
 from samples import UNOPTIMISED, Sample, compile_quickly, sample_named, stepper_for
-from tiers import DEFAULT, long_ones_first, mark_the_rest_full
+from tiers import UNOPTIMISED_TIERS, long_ones_first, mark_the_rest_full, mark_the_rest_second
 
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.method import Method
@@ -29,7 +30,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
     The results of the C code do not depend on the optimisation. New examples are drawn with ``-m full`` or a seed.
     """
-    if config.option.markexpr == DEFAULT:
+    if config.option.markexpr in UNOPTIMISED_TIERS:
         os.environ.setdefault(FLAGS_VARIABLE, " ".join(UNOPTIMISED))
         hypothesis.settings.register_profile("default", derandomize=config.getoption("hypothesis_seed", None) is None)
         hypothesis.settings.load_profile("default")
@@ -38,6 +39,17 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup() -> None:
     programs.forget()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Append the processor time of each test to a file, for ``tools/record_tiers.py``."""
+    begin = sum(os.times()[:4])
+    result = yield
+    if path := os.environ.get(COSTS_VARIABLE):
+        with Path(path).open("a", encoding="utf-8") as file:
+            print(f"{sum(os.times()[:4]) - begin:.2f} {item.nodeid}", file=file)
+    return result
 
 
 SKIPPED_VARIABLE = "SCVI_CODEGEN_TESTS_SKIPPED"
@@ -60,9 +72,11 @@ def _record_skipped(report: pytest.TestReport | pytest.CollectReport) -> None:
             print(report.nodeid, file=file)
 
 
-@pytest.hookimpl(tryfirst=True)  # before those of the full tier are left out
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+@pytest.hookimpl(tryfirst=True)  # before those of other tiers are left out
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     mark_the_rest_full(items)
+    if not any("::" in argument for argument in config.args):  # tests that are named run in any tier but the full one
+        mark_the_rest_second(items)
     long_ones_first(items)
 
 
@@ -73,8 +87,8 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Distribute the default tier by file, so that shared fixtures are made once."""
-    if config.option.markexpr != DEFAULT or config.args_source is not config.ArgsSource.TESTPATHS:
+    """Distribute the quick and the second tier by file, so that shared fixtures are made once."""
+    if config.option.markexpr not in UNOPTIMISED_TIERS or config.args_source is not config.ArgsSource.TESTPATHS:
         return None
     from xdist.scheduler import LoadFileScheduling
 

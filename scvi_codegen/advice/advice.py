@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from scvi_codegen.advice.pilot import EXPONENTIAL_POWER, Pilot, run_pilot
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.display.cards import Html, card, grid, plain
-from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.errors import ArgumentError, MethodError, StateError
 from scvi_codegen.mechanics.arrays.rolling import unrolled_at
 from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -114,10 +114,11 @@ def advise(
     system: MechanicalSystem | ArraySystem,
     method: Method | str,
     q: States,
-    p: States,
-    span: float,
-    tolerance: float,
+    p: States | None = None,
+    span: float | None = None,
+    tolerance: float | None = None,
     *,
+    velocity: States | None = None,
     parameters: Mapping[str, float] | Sequence[float] | None = None,
     t: float = 0.0,
     degree: bool = False,
@@ -136,9 +137,9 @@ def advise(
     Args:
         system: mechanical system; arrays of run-time sizes have the sizes of q.
         method: method, or its name, as ``"svi:8"``.
-        q, p: (m,) initial positions and momenta, or arrays by name.
-        span: duration of the run, negative to integrate backward.
-        tolerance: wanted error ``|q - q_exact| / |q|`` at the end; the step size aims at half of it.
+        q, p, velocity: (m,) initial positions with one of momenta and velocities, or arrays by name.
+        span: duration of the run, negative to integrate backward; required.
+        tolerance: required: wanted error ``|q - q_exact| / |q|`` at the end; the step size aims at half of it.
         parameters: values by name (others keep their defaults), or all in order.
         t: initial time.
         degree: also choose the degree (or number of stages) among 2, 4, ..., 12: the one with the fewest evaluations in
@@ -161,12 +162,8 @@ def advise(
         raise MethodError(
             f"'{known.name}' is in transformed time: no step size is recommended; use largest_step or try h"
         )
-    length, target = checked_number(span, "the span"), checked_number(tolerance, "the tolerance")
-    if length == 0.0:
-        raise StateError("the span is 0: it must be positive, or negative to integrate backward")
-    if target <= 0.0:
-        raise StateError(f"the tolerance must be positive, not {tolerance!r}")
-    state = {"p": p, "t": t, "parameters": parameters, "options": options}
+    length, target = _checked_request(span, tolerance)
+    state = {"p": p, "velocity": velocity, "t": t, "parameters": parameters, "options": options}
     result: list[tuple[float, Advice]] = []
     failures: list[StateError] = []
     for candidate in _candidates(method) if degree else [method]:
@@ -184,6 +181,18 @@ def advise(
     return min(met, key=lambda pair: pair[0])[1] if met else min(result, key=lambda pair: pair[1].expected_error)[1]
 
 
+def _checked_request(span: float | None, tolerance: float | None) -> tuple[float, float]:
+    for name, value, words in (("span", span, "duration of the run"), ("tolerance", tolerance, "error at the end")):
+        if value is None:
+            raise ArgumentError(f"advise requires {name}, the {words}: advise(system, method, q, p, {name}=...)")
+    length, target = checked_number(span, "the span"), checked_number(tolerance, "the tolerance")
+    if length == 0.0:
+        raise StateError("the span is 0: it must be positive, or negative to integrate backward")
+    if target <= 0.0:
+        raise StateError(f"the tolerance must be positive, not {tolerance!r}")
+    return length, target
+
+
 def _advised(
     stepper: Stepper,
     method: Method,
@@ -194,11 +203,12 @@ def _advised(
     tolerance: float,
 ) -> tuple[float, Advice]:
     """Return the cost of a unit of time with the recommendation for one stepper, and the recommendation."""
-    start = stepper.start(q, state["p"], h=1.0, t=state["t"], parameters=state["parameters"])  # checks the arguments
+    initial = {name: state[name] for name in ("p", "velocity", "t", "parameters")}
+    start = stepper.start(q, **initial, h=1.0)  # checks the arguments
     points = _points(method)
     most = min(max(FEWEST, NUMBERS // (points * stepper.dimension)), MOST)
     pilot = run_pilot(
-        partial(stepper.integrate, **{**state, "p": start.p}),
+        partial(stepper.integrate, **{**state, "p": start.p, "velocity": None}),
         method,
         start.q,
         span,
@@ -219,7 +229,6 @@ def _steppers(system: MechanicalSystem, method: Method, solver: str) -> Iterator
 
 
 def _candidates(method: Method) -> list[Method]:
-    """Return the method with each degree."""
     specification = dict(method.specification())
     sized = [name for name in ("degree", "stages") if name in ARGUMENTS[str(specification["method"])]]
     if not sized:

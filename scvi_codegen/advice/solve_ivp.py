@@ -115,7 +115,7 @@ def solve_ivp(
         tolerance: instead of ``h``: error ``|q - q_exact| / |q|`` at the end, for which :func:`advise` chooses ``h``.
             ``success`` is False if the run misses it.
         rtol: relative local error of adaptive steps, relative to the state as a whole; by default round-off.
-        error: bound on the relative global error of the whole run with adaptive steps, as of :meth:`Stepper.integrate`;
+        error: bound on the relative global error of the whole run, as of :meth:`Stepper.integrate`;
             ``trajectory.global_error`` and ``confirmed_until`` report the estimate. ``success`` is False if the bound
             is not confirmed.
         time_transformation: time-rescaling function g of :func:`reparametrise`: equal steps of tau, dt = g dtau,
@@ -141,8 +141,7 @@ def solve_ivp(
     q, p0 = (y0, None) if velocity is not None or isinstance(y0, Mapping) else _halves(y0)
     requested_times = None if t_eval is None else times_of_run(t_eval, start, end)
     if error is not None:
-        others = {"time_transformation": time_transformation, "controller": controller}
-        checked_error(error, {"h": h, "tolerance": tolerance, "rtol": rtol, **others})
+        checked_error(error, {"h": h, "tolerance": tolerance, "rtol": rtol})
     request = _StepRequest(h, rtol, tolerance, error)
     known: MechanicalSystem | Stepper
     if isinstance(system, Stepper):

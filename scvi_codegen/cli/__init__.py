@@ -36,7 +36,6 @@ cannot be written; 2 if the command line or a model is invalid; 130 after Ctrl-C
 """
 
 ABOUT = {
-    "bench": "Compare speed and accuracy with other integrators.",
     "cache": "Show or clear the cache of compiled integrators.",
     "derive": "Print the equations of one step of MODEL.",
     "doctor": "Check compiler and libraries of this machine.",

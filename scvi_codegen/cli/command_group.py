@@ -105,23 +105,30 @@ class Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; convert errors into messages and exit statuses."""
-        try:
-            with _warnings_as_lines():
-                return super().invoke(ctx)
-        except (StepFailedError, BuildError, RecordingError) as error:
-            raise CommandFailure(str(error), FAILURE) from error
-        except ScviCodegenError as error:
-            cause = error.__cause__
-            unwritten = isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError)
-            raise CommandFailure(str(error), FAILURE if unwritten else USAGE) from error
-        except BrokenPipeError:
-            raise
-        except OSError as error:
-            raise CommandFailure(str(error), FAILURE) from error
-        except MemoryError as error:
-            raise CommandFailure("not enough memory", FAILURE) from error
-        except KeyboardInterrupt as error:
-            raise CommandFailure("interrupted", INTERRUPTED) from error
+        with errors_as_messages():
+            return super().invoke(ctx)
+
+
+@contextmanager
+def errors_as_messages() -> Iterator[None]:
+    """Convert errors that a user can cause into one message and an exit status, and warnings into lines."""
+    try:
+        with _warnings_as_lines():
+            yield
+    except (StepFailedError, BuildError, RecordingError) as error:
+        raise CommandFailure(str(error), FAILURE) from error
+    except ScviCodegenError as error:
+        cause = error.__cause__
+        unwritten = isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError)
+        raise CommandFailure(str(error), FAILURE if unwritten else USAGE) from error
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise CommandFailure(str(error), FAILURE) from error
+    except MemoryError as error:
+        raise CommandFailure("not enough memory", FAILURE) from error
+    except KeyboardInterrupt as error:
+        raise CommandFailure("interrupted", INTERRUPTED) from error
 
 
 @contextmanager

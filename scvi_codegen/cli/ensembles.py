@@ -4,12 +4,12 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from scvi_codegen.cli.reports import counted, duration, momentum_report
 from scvi_codegen.cli.supervision import check_memory, interruptions, progress_bar
+from scvi_codegen.files.energy import energy_reason
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.ensemble_file import EnsembleStates
 from scvi_codegen.native.options import FAILURES, SolverOptions
@@ -78,20 +78,9 @@ def integrate_states(states: EnsembleStates, *, options: SolverOptions | None = 
 def _work(model: Model, stepper: Stepper, states: EnsembleStates, options: SolverOptions | None) -> Ensemble:
     """Return the compiled ensemble; Ctrl-C still ends the process here."""
     start = stepper, states.q, states.momenta(stepper)
-    common: dict[str, Any] = {
-        "save_every": model.save_every,
-        "t": model.t,
-        "parameters": states.parameters,
-        "options": options,
-    }
-    if model.system.inputs or model.has_shorter_last_step:
-        inputs = model.all_inputs()
-        return Ensemble(*start, inputs=inputs, h=model.step, t_end=model.end, **common)
-    if model.h is None:
-        return Ensemble(*start, t_end=model.t + model.covered, tolerance=model.tolerance, **common)
-    work = Ensemble(*start, h=model.h, steps=model.step_count, **common)
-    assert work.common is not None
-    work.common.blocks()
+    work = Ensemble(*start, parameters=states.parameters, options=options, **model._run_arguments())
+    if work.common is not None:
+        work.common.blocks()
     return work
 
 
@@ -109,7 +98,7 @@ def ensemble_summary(model: Model, outcome: EnsembleOutcome) -> str:
         f"prepared in {outcome.preparation:.2f} s",
         ", ".join(f"{number} {status}" for status, number in [("ok", counts.pop("ok", 0)), *sorted(counts.items())]),
     ]
-    return "\n".join([*lines, *_failures(result), _energy_report(model, result), *momentum_report(result)])
+    return "\n".join([*lines, *_failures(result), _energy_report(result), *momentum_report(result)])
 
 
 def _describe_steps(model: Model, result: EnsembleTrajectory) -> str:
@@ -131,11 +120,11 @@ def _failures(result: EnsembleTrajectory) -> Iterator[str]:
         yield f"  and {len(lost) - SHOWN_FAILURES} more"
 
 
-def _energy_report(model: Model, result: EnsembleTrajectory) -> str:
+def _energy_report(result: EnsembleTrajectory) -> str:
     """Return one line: the largest change of the energy among all trajectories."""
     energies = result.energy()
     sizes = np.abs(energies[0])
-    why = model.system.changes_energy
+    why = energy_reason(result.stepper)
     relative = bool((sizes > 0.0).all()) and not why
     changes = np.abs(energies - energies[0]) / (sizes if relative else 1.0)
     if not np.isfinite(changes).any():

@@ -9,9 +9,9 @@ import numpy as np
 from scvi_codegen.advice.tolerance_check import Known
 from scvi_codegen.cli.ensembles import EnsembleOutcome
 from scvi_codegen.cli.recording import RecordedOutcome
-from scvi_codegen.cli.reports import Balance
 from scvi_codegen.cli.running import RunOutcome
 from scvi_codegen.errors import StateError
+from scvi_codegen.files.energy import EnergyAccount
 from scvi_codegen.models.model import Model
 from scvi_codegen.results.recording import RecordedRun
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
@@ -19,7 +19,7 @@ from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 
 def run_numbers(
-    model: Model, outcome: RunOutcome, known: Known | None, balance: Balance | None = None
+    model: Model, outcome: RunOutcome, known: Known | None, account: EnergyAccount | None = None
 ) -> dict[str, Any]:
     """Return the numbers of a run in memory."""
     run, trajectory = outcome.run, outcome.trajectory
@@ -34,8 +34,8 @@ def run_numbers(
         "seconds": outcome.seconds,
         "preparation_seconds": outcome.preparation,
         **_conserved(trajectory),
-        "work": None if balance is None else balance.work,
-        "energy_balance": None if balance is None else balance.error,
+        "work": None if account is None or account.work is None else float(account.work[-1]),
+        "energy_balance": None if account is None or account.work is None else _largest(account.values),
         "step_error": trajectory.step_error,
         "worst_step_time": trajectory.worst_step_time,
         "final": {"t": t, "q": _named(model, q), "p": _named(model, p)},

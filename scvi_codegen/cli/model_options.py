@@ -3,7 +3,7 @@
 import math
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,21 +12,30 @@ from click.shell_completion import CompletionItem
 
 from scvi_codegen.cli.command_group import Command
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.mechanics.time_transformation import CONTROLLERS
 from scvi_codegen.methods import ARGUMENTS, METHODS, size_of, specification_of
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.model_file import catalogue_model, load_model
 from scvi_codegen.models.model_files.sections import event_entry
+from scvi_codegen.models.options import (
+    ASSIGNMENTS,
+    COUNT,
+    EVENTS,
+    INPUTS,
+    METHOD,
+    METHOD_KEYS,
+    NUMBER,
+    NUMBERS,
+    NUMBERS_OR_NAME,
+    OPTIONS,
+    SIZES,
+    SWITCH,
+    Option,
+    excluded,
+)
 from scvi_codegen.models.problems import PROBLEMS, problem
 
-METHOD_CHOICES = (
-    *("method", "degree", "stages", "order", "nodes", "quadrature", "space", "form", "variational", "abscissae"),
-)
-"""Options that specify the method."""
 MOST_COORDINATES = 2000
 """Largest number of coordinates of an array model that is compiled with its sizes: its equations are unrolled."""
-INITIAL = {"q": "q", "p": "p", "q_dot": "velocity", "t": "time"}
-"""Options of the initial state by the key of the section."""
 Choices = Mapping[str, Any]
 """Options of the command line that override MODEL, by name; ``None`` or an empty tuple for options that are absent."""
 OFFERED_SIZES = range(1, 17)
@@ -35,23 +44,19 @@ OFFERED_SIZES = range(1, 17)
 
 def sections_of(choices: Choices) -> dict[str, dict[str, Any]]:
     """Return the options as sections of a model file."""
-    solver = choices.get("solver", "auto")
-    named: dict[str, dict[str, Any]] = {
-        "system": {"time_transformation": choices.get("time_transformation")},
-        "initial": {key: choices.get(name) for key, name in INITIAL.items()},
-        "method": {name: choices.get(name) for name in METHOD_CHOICES}
-        | {"solver": None if solver == "auto" else solver},
-        "run": {name: choices.get(name) for name in ("step", "span", "steps", "save_every", "controller")},
-        "parameters": dict(choices.get("parameter", ())),
-        "inputs": dict(choices.get("inputs") or ()),
-        "sizes": dict(choices.get("size") or ()),
-    }
-    arguments = {
-        name: {key: list(x) if isinstance(x, tuple) else x for key, x in section.items() if x is not None}
-        for name, section in named.items()
-    }
-    events: dict[str, Any] = {"events": [event_entry(text) for text in choices.get("event") or ()]}
-    return {name: section for name, section in (arguments | events).items() if section}
+    document: dict[str, Any] = {}
+    for option in OPTIONS:
+        value = choices.get(option.name)
+        if value in (None, (), option.default):
+            continue
+        if option.kind == EVENTS:
+            document[option.section] = [event_entry(text) for text in value]
+        elif option.is_section:
+            document[option.section] = dict(value)
+        elif option.section:
+            section = document.setdefault(option.section, {})
+            section[option.key] = list(value) if isinstance(value, tuple) else value
+    return document
 
 
 def _numbers(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[float, ...] | None:
@@ -125,107 +130,50 @@ def complete_model(context: click.Context, parameter: click.Parameter, incomplet
     return [CompletionItem(incomplete, type="file"), *names]
 
 
-METHOD_OPTIONS = (
-    click.option(
-        "--method",
-        metavar="NAME",
-        shell_complete=complete_method,
-        help="Method, with its degree or number of stages: svi:6, gauss:3, .. (see 'scvi-codegen methods').",
-    ),
-    click.option("--degree", type=int, metavar="N", help="Degree of the trial curve (svi, scvi, sc), as in svi:N."),
-    click.option("--stages", type=int, metavar="N", help="Number of stages (gauss, radau-iia, ..), as in gauss:N."),
-    click.option("--order", type=int, metavar="N", help="Order of a composition of Stoermer-Verlet: 2, 4, 6, 8 or 10."),
-    click.option("--quadrature", metavar="NAME:N", help="Quadrature, as in gauss-legendre:8 or clenshaw-curtis:9."),
-    click.option("--nodes", metavar="NAME", help="Nodes: chebyshev-lobatto, legendre-lobatto or equispaced."),
-    click.option(
-        "--space",
-        metavar="NAME",
-        help="Trial space of an SVI: polynomials, trigonometric:RADIANS_A_STEP[:HARMONICS] or splines:PIECES.",
-    ),
-    click.option("--form", metavar="NAME", help="phase-space or position (sc and Runge-Kutta methods)."),
-    click.option(
-        "--variational/--printed",
-        default=None,
-        help="SCVI: the variational method, or the form printed in the paper, which is not symplectic.",
-    ),
-    click.option(
-        "--abscissae",
-        metavar="C1,C2,..",
-        callback=_numbers_or_name,
-        help="Abscissae in [0, 1] (collocation, scvi); scvi also: gauss, radau-iia, lobatto-iiia, ..",
-    ),
-)
-STATE_OPTIONS = (
-    click.option(
-        "--parameter",
-        multiple=True,
-        metavar="NAME=VALUE",
-        callback=_assignments,
-        help="Value of a parameter; may be repeated.",
-    ),
-    click.option(
-        "--input",
-        "inputs",
-        multiple=True,
-        metavar="NAME=FILE[:KIND]",
-        callback=_input_files,
-        help="Tabulated input: columns t and value of a .csv or .npz file, interpolated constant, linear (default) or "
-        "cubic; or a number, NAME=NUMBER; may be repeated.",
-    ),
-    click.option(
-        "--size",
-        multiple=True,
-        metavar="NAME=N",
-        callback=_sizes,
-        help="Array size of an array model, as N=1000; may be repeated.",
-    ),
-    click.option(
-        "--event",
-        multiple=True,
-        metavar="G[; NAME=VALUE]..",
-        help="Zero crossing of G that changes the state, as 'y; direction=-1; p_y=-0.8*p_y', or of a wall, as "
-        "'y; restitution=0.8; where=x > 0'; terminal=N ends the run at the N-th; may be repeated.",
-    ),
-    click.option("--q", metavar="Q1,Q2,..", callback=_numbers, help="Initial coordinates."),
-    click.option("--p", metavar="P1,P2,..", callback=_numbers, help="Initial momenta."),
-    click.option("--velocity", metavar="V1,V2,..", callback=_numbers, help="Initial velocities, instead of momenta."),
-    click.option("--time", type=float, metavar="T", help="Initial time."),
-    click.option(
-        "--step", type=float, metavar="H", help="Fixed step size (of tau, if transformed); negative: backward."
-    ),
-    click.option("--span", type=float, metavar="T", help="Duration of the run."),
-    click.option("--steps", type=int, metavar="N", help="Number of steps, instead of --span."),
-    click.option("--save-every", type=int, metavar="N", help="Save every N-th state."),
-    click.option(
-        "--time-transformation",
-        metavar="G",
-        help="Time transformation dt = G dtau: frequency, distance, potential, arclength or a formula.",
-    ),
-    click.option(
-        "--controller",
-        type=click.Choice(CONTROLLERS),
-        help="With --time-transformation: symplectic (default; energy must be conserved), or reversible (any system).",
-    ),
-)
+PARSERS: Mapping[str, Mapping[str, Any]] = {
+    NUMBER: {"type": float},
+    COUNT: {"type": int},
+    SWITCH: {"default": None},
+    METHOD: {"shell_complete": complete_method},
+    NUMBERS: {"callback": _numbers},
+    NUMBERS_OR_NAME: {"callback": _numbers_or_name},
+    ASSIGNMENTS: {"multiple": True, "callback": _assignments},
+    INPUTS: {"multiple": True, "callback": _input_files},
+    SIZES: {"multiple": True, "callback": _sizes},
+    EVENTS: {"multiple": True},
+}
+"""Arguments of :func:`click.option` by kind of option."""
 
 
-SOLVER_OPTION = click.option(
-    "--solver",
-    type=click.Choice(["auto", "fixed-point", "newton", "explicit"]),
-    default="auto",
-    show_default=True,
-    help="Solver of the stage equations; auto: explicit or fixed-point iteration if possible, Newton as fallback; "
-    "by default that of the model file.",
-)
+def _flag(option: Option) -> Callable[[Command], Command]:
+    """Return the decorator that adds the flag of an option to a command."""
+    further = dict(PARSERS.get(option.kind, {}))
+    if option.choices:
+        further["type"] = click.Choice(option.choices)
+    if option.default is not None:
+        further |= {"default": option.default, "show_default": True}
+    return click.option(option.flag, option.name, metavar=option.metavar or None, help=option.help, **further)
 
 
-def model_arguments(command: Command, *, required: bool = True) -> Command:
-    """Add the argument MODEL and the options that override it to a command."""
-    for option in reversed((*METHOD_OPTIONS, *STATE_OPTIONS)):
-        command = option(command)
-    return click.argument(
-        "model_name", metavar="MODEL" if required else "[MODEL]", required=required, shell_complete=complete_model
-    )(command)
+def model_arguments(*further: str, required: bool = True) -> Callable[[Command], Command]:
+    """Return the decorator that adds the argument MODEL, the options that override it, and further ones by name."""
+
+    def decorated(command: Command) -> Command:
+        for option in reversed(OPTIONS):
+            if option.common or option.name in further:
+                command = _flag(option)(command)
+        return click.argument(
+            "model_name", metavar="MODEL" if required else "[MODEL]", required=required, shell_complete=complete_model
+        )(command)
+
+    return decorated
+
+
+def check_exclusive(choices: Choices) -> None:
+    """Reject options that exclude each other."""
+    given = [name for name, value in choices.items() if value is not None]
+    if pair := next(excluded(given, "initial", "run"), None):
+        raise click.UsageError(f"{pair[0].flag} and {pair[1].flag} exclude each other")
 
 
 def _check_method(choices: Choices) -> None:
@@ -235,10 +183,10 @@ def _check_method(choices: Choices) -> None:
         return
     message = specification_of(method)
     taken = ARGUMENTS[message["method"]]
-    for option in METHOD_CHOICES[1:]:
+    for option in METHOD_KEYS[1:]:
         value = choices.get(option)
         if value is not None and option not in taken:
-            takes = ", ".join(f"--{one}" for one in taken if one in METHOD_CHOICES) or "no options"
+            takes = ", ".join(f"--{one}" for one in taken if one in METHOD_KEYS) or "no options"
             raise click.UsageError(f"--method {method} takes no --{option}; it takes {takes}")
         if value is not None and message.get(option, value) != value:
             raise click.UsageError(
@@ -253,10 +201,7 @@ def read_model(name: str, choices: Choices) -> Model:
         click.UsageError: if options exclude or contradict each other, or are not options of the chosen method.
         ScviCodegenError: as reading and building the model do.
     """
-    if choices.get("p") is not None and choices.get("velocity") is not None:
-        raise click.UsageError("--p and --velocity exclude each other")
-    if choices.get("span") is not None and choices.get("steps") is not None:
-        raise click.UsageError("--span and --steps exclude each other")
+    check_exclusive(choices)
     _check_method(choices)
     path = Path(name)
     if path.suffix.lower() == ".toml" or os.sep in name or path.is_file():

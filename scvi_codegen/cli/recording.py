@@ -12,6 +12,7 @@ from typing import Any
 import click
 import numpy as np
 
+from scvi_codegen.cli.model_options import check_exclusive
 from scvi_codegen.cli.reports import counted, duration
 from scvi_codegen.cli.running import conserved, event_counts, final_state
 from scvi_codegen.cli.supervision import interruptions, progress_bar
@@ -42,11 +43,10 @@ def check_format(output: str, *, ensemble: bool) -> None:
     Raises:
         click.BadParameter: for an unknown format.
     """
-    known = tuple(export.WRITERS)
-    if Path(output).suffix.lower() not in known:
-        what = f"an ensemble is written as {', '.join(known)}"
+    if Path(output).suffix.lower() not in export.WRITERS:
+        what = f"an ensemble is written as {export.FORMATS}"
         if not ensemble:
-            what = f"a trajectory is written as {', '.join(known)} or into a folder {SUFFIX}"
+            what = f"a trajectory is written as {export.FORMATS} or into a folder {SUFFIX}"
         raise click.BadParameter(f"{what}, not as '{output}'", param_hint="'-o'")
     export.check_format(output)
 
@@ -94,12 +94,11 @@ class RecordedOutcome:
 
     def _conserved(self) -> list[str]:
         """Return lines on conserved quantities if the folder names a model that determines them."""
-        text = self.recorded.manifest.model
-        if text is None or not self.run.steps:
+        if self.recorded.manifest.model is None or not self.run.steps:
             return []
         stride = -(-len(self.recorded) // MAX_STATES)
         with np.errstate(all="ignore"):
-            lines = list(conserved(parse_model(text), self.recorded[::stride]))
+            lines = list(conserved(self.recorded[::stride]))
         return [f"in every {stride}th saved state:", *lines] if stride > 1 else lines
 
     def continuation(self) -> str:
@@ -155,8 +154,7 @@ class Recording:
 
     def resume(self, folder: str, *, steps: int | None, span: float | None) -> RecordedOutcome:
         """Continue the run in a folder; raises as :func:`resume_run`."""
-        if steps is not None and span is not None:
-            raise click.UsageError("--span and --steps exclude each other")
+        check_exclusive({"steps": steps, "span": span})
         recorded = load_run(folder)
         manifest, further = recorded.manifest, dict[str, Any]()
         if manifest.plan and span is not None:

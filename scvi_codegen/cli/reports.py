@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scvi_codegen.errors import MethodWarning, ScviCodegenError, StateError, warn
+from scvi_codegen.errors import MethodWarning, StateError, warn
+from scvi_codegen.files.energy import EnergyAccount, energy_account
 from scvi_codegen.runtime.core.validation import Array
 
 if TYPE_CHECKING:
-    from scvi_codegen.mechanics.system import MechanicalSystem
     from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
     from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
@@ -51,49 +51,27 @@ MAX_LISTED = 12
 """Largest number of momentum maps that are listed one by one."""
 LARGE_ERROR, NOT_CONSERVED = 1e-3, 0.1
 """Relative errors from which a quantity is reported as hardly conserved, and as not conserved."""
-MAX_BALANCE_STEPS, MAX_BALANCE_COORDINATES = 10_000, 12
-"""Limits for computing the energy balance: Newton's iteration recomputes each step, some tens of microseconds each."""
 
 
-class Balance(NamedTuple):
-    """Work W of forces and damping over a run, and the largest |E - E0 - W| of its states."""
-
-    work: float
-    error: float
-
-
-def energy_balance(system: MechanicalSystem, trajectory: Trajectory, steps: int) -> Balance | None:
-    """Return the energy balance of a run; ``None`` if the method has none or computing it would take long.
-
-    Args:
-        system: system that was integrated.
-        trajectory: saved states; the steps between two of them are repeated to sum up the work.
-        steps: number of steps.
-    """
-    short = 0 < steps <= MAX_BALANCE_STEPS and system.dimension <= MAX_BALANCE_COORDINATES
-    if not (short and system.balances_energy):
-        return None
+def known_account(trajectory: Trajectory) -> EnergyAccount | None:
+    """Return the account of the energy of a run; ``None`` outside the domain of L."""
     try:
-        energy, work = trajectory.energy(), trajectory.work()
-    except ScviCodegenError:
-        return None  # the method or the states do not determine the work, or there is no compiler
-    return Balance(float(work[-1]), float(np.abs(energy - energy[0] - work).max()))
+        return energy_account(trajectory, limited=True)
+    except StateError:
+        return None
 
 
-def energy_report(system: MechanicalSystem, trajectory: Trajectory, balance: Balance | None = None) -> str:
+def energy_report(trajectory: Trajectory, account: EnergyAccount | None = None) -> str:
     """Return one line: largest relative energy error and its linear drift, or the energy balance of forces."""
-    energy = trajectory.energy()
-    scale = abs(float(energy[0]))
-    error = (energy - energy[0]) / (scale or 1.0)
-    what = "relative energy error" if scale else "energy error"
-    if trajectory.stepper.changes_states:
-        return f"energy: events change the state, it changed by {np.abs(energy - energy[0]).max():.3g} at most"
-    if why := system.changes_energy:
-        changed = f"energy: {why}, it changed by {np.abs(energy - energy[0]).max():.3g} at most"
-        return changed if balance is None else f"{changed}; energy balance |E - E0 - W| {balance.error:.1e} at most"
-    largest = np.abs(error).max()
-    drift = f"drift {_drift(trajectory.t, error):+.1e} over the run"
-    return f"{what}: {largest:.2e} at most, {drift}{_verdict(largest) if scale else ''}"
+    account = account or energy_account(trajectory, limited=True)
+    largest = float(np.abs(account.values).max()) / account.scale
+    if account.reason:
+        changed = f"energy: {account.reason}, it changed by {np.abs(account.change).max():.3g} at most"
+        if account.work is None:
+            return changed
+        return f"{changed}; energy balance |E - E0 - W| {np.abs(account.values).max():.1e} at most"
+    drift = f"drift {_drift(trajectory.t, account.values / account.scale):+.1e} over the run"
+    return f"{account.title}: {largest:.2e} at most, {drift}{_verdict(largest) if account.initial else ''}"
 
 
 def _verdict(error: float) -> str:

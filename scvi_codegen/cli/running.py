@@ -2,28 +2,27 @@
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from scvi_codegen.advice.tolerance_check import SECOND_RUN, Known, known_digits
-from scvi_codegen.cli.reports import Balance, counted, duration, energy_report, in_known_digits, momentum_report
+from scvi_codegen.cli.reports import counted, duration, energy_report, in_known_digits, momentum_report
 from scvi_codegen.cli.supervision import BAR_LENGTH, check_memory, check_run_memory, interruptions, progress_bar
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
+from scvi_codegen.files.energy import EnergyAccount
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.events.event import Crossings
-from scvi_codegen.runtime.inputs.segments import with_final_state
+from scvi_codegen.runtime.inputs.segments import record_segments
 from scvi_codegen.runtime.run.accuracy import TOLERABLE_ERROR, without_accuracy_warnings
 from scvi_codegen.runtime.run.largest_step import accuracy_message
-from scvi_codegen.runtime.run.observation import Observation
 from scvi_codegen.runtime.run.run import Run
-from scvi_codegen.runtime.run.run_loop import record
-from scvi_codegen.runtime.trajectory.joining import joined
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 SHOWN_COORDINATES = 6
@@ -78,7 +77,9 @@ def integrate_model(model: Model, *, options: SolverOptions | None = None, threa
     preparation = time.perf_counter() - began
     by_time = model.ends_at_time or bool(model.system.inputs)  # the number of steps is not known in advance
     length = BAR_LENGTH if by_time else model.step_count
-    began, stopped, failure, recorder = time.perf_counter(), False, None, _FileRecorder(model, run)
+    if model.in_transformed_time and model.ends_at_time:
+        run.plan = replace(run.plan, t_end=model.t + model.covered)
+    began, stopped, failure = time.perf_counter(), False, None
     with interruptions() as caught, progress_bar(length) as show_progress:
 
         def look(_: int) -> None:
@@ -88,17 +89,18 @@ def integrate_model(model: Model, *, options: SolverOptions | None = None, threa
 
         def stop() -> bool:
             nonlocal stopped
-            stopped = bool(caught) and not recorder.ended
+            stopped = bool(caught)
             return stopped
 
+        recorded = partial(run._recorded, save_every=model.save_every, progress=look, stop=stop)
+        segments = model.segments(run)
         try:
-            for steps in model.segments(run):
-                recorder.record(steps, look, stop)
-                if stopped or recorder.ended:
-                    break
+            if model.has_segments:
+                trajectory = record_segments(run, segments, recorded, lambda: stopped)
+            else:
+                trajectory = recorded(next(segments))
         except StepFailedError as error:
-            failure = error
-    trajectory = recorder.trajectory()
+            failure, trajectory = error, Trajectory.before(error)
     return RunOutcome(
         trajectory=trajectory,
         run=run,
@@ -110,42 +112,6 @@ def integrate_model(model: Model, *, options: SolverOptions | None = None, threa
     )
 
 
-class _FileRecorder:
-    """Recorder of a trajectory of each segment; in transformed time of one to the end of the time span."""
-
-    def __init__(self, model: Model, run: Run) -> None:
-        self.model, self.run, self.pieces = model, run, list[Trajectory]()
-        self.observed: Observation | None = None
-        if model.in_transformed_time and model.ends_at_time:
-            run.plan = replace(run.plan, t_end=model.t + model.covered)
-            self.observed = Observation(run, save_every=model.save_every)
-
-    @property
-    def ended(self) -> bool:
-        """Return whether the time span ended within a step."""
-        return self.observed is not None and self.observed.ended
-
-    def record(self, steps: int | None, look: Callable[[int], None], stop: Callable[[], bool]) -> None:
-        try:
-            if self.model.events:
-                self.observed = Observation(self.run, save_every=self.model.save_every)
-            if self.observed is not None:
-                piece = self.observed.advance(steps, look, stop)
-            else:
-                piece = record(self.run, steps, save_every=self.model.save_every, progress=look, stop=stop)
-        except StepFailedError as error:
-            self._add(Trajectory.before(error))
-            raise
-        self._add(piece)
-
-    def _add(self, piece: Trajectory) -> None:
-        self.pieces.append(with_final_state(piece, self.run) if self.model.has_segments else piece)
-
-    def trajectory(self) -> Trajectory:
-        pieces = self.pieces or [record(self.run, 0)]
-        return joined(pieces) if self.model.has_segments else pieces[0]
-
-
 def _missed(model: Model, trajectory: Trajectory) -> str | None:
     """Return a message if later steps exceed the error for which the step of tau was chosen at the start."""
     allowed = model.allowed_error
@@ -154,7 +120,7 @@ def _missed(model: Model, trajectory: Trajectory) -> str | None:
     return accuracy_message(trajectory.step_error, trajectory.worst_step_time, allowed)
 
 
-def summary(model: Model, outcome: RunOutcome, known: Known | None, balance: Balance | None = None) -> str:
+def summary(model: Model, outcome: RunOutcome, known: Known | None, account: EnergyAccount | None = None) -> str:
     """Return a summary of a run in a few lines; shorter if no step was completed."""
     run, trajectory, method, arrays = outcome.run, outcome.trajectory, model.method, model.array_system
     order = "no order claimed" if method.order is None else f"order {method.order}"
@@ -169,7 +135,7 @@ def summary(model: Model, outcome: RunOutcome, known: Known | None, balance: Bal
     if run.steps:
         lines.append(f"{_speed(outcome, model)}; prepared in {outcome.preparation:.2f} s")
         with np.errstate(all="ignore"):
-            lines += conserved(model, trajectory, balance)
+            lines += conserved(trajectory, account)
         lines += worst_step(trajectory)
     return "\n".join(
         [*lines, *event_counts(trajectory.events), *final_state(run.stepper.interface, *outcome.end[1:], known)]
@@ -224,10 +190,10 @@ def _speed(outcome: RunOutcome, model: Model) -> str:
     return f"{text}, {int(np.sum(trajectory.iterations)) / watched:.2f} iterations a step" if watched else text
 
 
-def conserved(model: Model, trajectory: Trajectory, balance: Balance | None = None) -> Iterator[str]:
+def conserved(trajectory: Trajectory, account: EnergyAccount | None = None) -> Iterator[str]:
     """Yield a line for each quantity that should be conserved, with its error."""
     try:
-        yield energy_report(model.system, trajectory, balance)
+        yield energy_report(trajectory, account)
     except StateError as error:
         yield f"energy: {error}"
     yield from momentum_report(trajectory)

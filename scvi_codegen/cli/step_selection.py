@@ -12,6 +12,7 @@ from scvi_codegen.cli.reports import duration
 from scvi_codegen.errors import AccuracyWarning, StateError
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.core.features import refusal, require
 from scvi_codegen.runtime.run.global_error import GlobalError
 from scvi_codegen.validation import check_tolerance
 
@@ -37,19 +38,20 @@ def model_with_adaptive_steps(model: Model, tolerance: float) -> Model:
 def model_with_global_error(
     model: Model, error: float, *, options: SolverOptions | None, threads: int | None = None
 ) -> tuple[Model, GlobalError]:
-    """Return the model with a local tolerance that meets a global error bound, and the estimate of that error.
+    """Return the model with the steps that meet a global error bound, and the estimate of that error.
 
-    The estimate compares runs with different steps and is printed. Adaptive steps of one tolerance are reproducible to
-    the last bit, so that the run that follows is the one whose error was estimated.
+    The estimate compares runs with different steps and is printed. Steps of one tolerance are reproducible to the last
+    bit, so that the run that follows is the one whose error was estimated.
 
     Raises:
-        StateError: unless the error is positive and below 1, and for steps of tau (a time transformation).
+        StateError: unless the error is positive and below 1.
     """
     wanted = replace(model, h=None, tolerance=None, error=error, steps=None, span=model.covered)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AccuracyWarning)  # reported in the line printed below
         result = wanted.confirmed(wanted.stepper(), options=options, threads=threads)
-    local = f"{result.tolerance:.1e}" if result.tolerance else "round-off"
+    local = f"local tolerance of {result.tolerance:.1e}" if result.tolerance else "local tolerance of round-off"
+    local = f"step of tau of {result.h:.6g}" if result.h else local
     numbers = {
         "requested": error,
         "estimate": result.estimate,
@@ -57,14 +59,18 @@ def model_with_global_error(
         "confirmed": result.confirmed,
         "confirmed_until": result.confirmed_until,
         "tolerance": result.tolerance,
+        "h": result.h,
         "runs": result.runs,
     }
     tell(
         f"global error: estimated at {result.estimate:.1e} (relative) from {result.runs} runs; the bound {error:g} "
-        f"is confirmed until t = {result.confirmed_until:g}, with a local tolerance of {local}",
+        f"is confirmed until t = {result.confirmed_until:g}, with a {local}",
         global_error=numbers,
     )
-    return replace(wanted, tolerance=result.local_tolerance, error=None), result
+    if result.h:
+        signed = math.copysign(result.h, wanted.covered)
+        return replace(wanted, h=signed, span=abs(wanted.covered), error=None), result
+    return replace(wanted, tolerance=result.steps["tolerance"], error=None), result
 
 
 def model_with_advised_step(model: Model, tolerance: float, *, options: SolverOptions | None) -> Model:
@@ -73,13 +79,14 @@ def model_with_advised_step(model: Model, tolerance: float, *, options: SolverOp
     Prints the recommendation and its pilot runs to stdout, warnings to stderr.
 
     Raises:
-        StateError: with a time transformation, if the tolerance is not positive, if every pilot run fails, or if more
+        MethodError: with a time transformation, or events that change the state.
+        StateError: if the tolerance is not positive, if every pilot run fails, or if more
             than ``MAX_STEPS`` steps are needed.
     """
     if model.has_time_transformation:
-        raise StateError("--advise is not available with a time transformation: use --tolerance (local error)")
+        raise refusal("advice", "with a time transformation")
     stepper = model.stepper()
-    stepper._check_no_changes("--advise")
+    require(stepper, "advice")
     advice = advise(
         model.system,
         model.method,

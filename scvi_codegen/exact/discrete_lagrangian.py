@@ -175,7 +175,6 @@ class _Problem:
         self.motion = ExactMotion(system, list(_parameter_values(system, parameters).values()))
 
     def vector(self, values: Any, name: str) -> Array:
-        """Return (m,) numbers."""
         if isinstance(values, Mapping):
             arrays = [values[name] for name in self.arrays if name in values]
             values = [entry for array in arrays for entry in np.asarray(array, dtype=object).flat]

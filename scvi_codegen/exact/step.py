@@ -23,7 +23,7 @@ from scvi_codegen.exact.newton import NotConvergedError, Solve, newton
 from scvi_codegen.exact.solution import Numbers, exact_motion, numbers
 from scvi_codegen.formulas.expressions import Tape
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.discretise import discretise, paper_equations
+from scvi_codegen.methods.discretise import MIDDLE, discretise, reference_equations
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_structure import Velocities
 from scvi_codegen.methods.stage_system import StageGroup, StageSystem, straight
@@ -65,7 +65,7 @@ class DerivedStep:
 
     def __init__(self, system: MechanicalSystem, stages: StageSystem) -> None:
         self.system, self.stages, self.motion = system, stages, exact_motion(system)
-        symbols = [(*group.arguments, system.time, *system.parameters) for group in stages.stage_groups]
+        symbols = [(*group.arguments, system.time, *system.parameters, MIDDLE) for group in stages.stage_groups]
         self.kernels = [
             Tape(group.results, arguments) for group, arguments in zip(stages.stage_groups, symbols, strict=True)
         ]
@@ -220,7 +220,8 @@ class DerivedStep:
         return total
 
     def _point(self, group: StageGroup, n: int, arguments: Numbers, known: _Known) -> list[Number]:
-        return [*arguments, known.t + group.abscissae[n] * known.h, *self.motion.parameters]
+        time, middle = (known.t + c * known.h for c in (group.abscissae[n], mp.mpf("0.5")))
+        return [*arguments, time, *self.motion.parameters, middle]
 
     def _kernel(self, f: int, n: int, arguments: Numbers, known: _Known) -> Numbers:
         return np.array(self.kernels[f](self._point(self.stages.stage_groups[f], n, arguments, known)), dtype=object)
@@ -308,7 +309,7 @@ def _slices(sizes: Sequence[int]) -> tuple[slice, ...]:
 @lru_cache(maxsize=64)
 def derived_step(system: MechanicalSystem, method: Method) -> DerivedStep:
     """Return the paper's equations of a method for a system, cached."""
-    return DerivedStep(system, paper_equations(system, method))
+    return DerivedStep(system, reference_equations(system, method))
 
 
 @lru_cache(maxsize=64)

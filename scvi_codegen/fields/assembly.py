@@ -286,8 +286,9 @@ class Assembly:
                 entries = entries[int(k)]
             return digits(entries)
         name = f"weights_{axis}" if order is None else f"D{order if order > 1 else ''}_{axis}"
-        values = np.array([list(map(float, row)) for row in entries] if order else list(map(float, entries)))
-        self.used[name] = (", ".join(map(str, values.shape)), values)
+        if name not in self.used:
+            values = np.array([list(map(float, row)) for row in entries] if order else list(map(float, entries)))
+            self.used[name] = (", ".join(map(str, values.shape)), values)
         return f"{name}[{', '.join(index)}]"
 
     def quadrature_weight(self, axis: str, chosen: Mapping[str, Cells], k: str) -> str:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -377,6 +378,17 @@ def fourier(name: str, start: float, end: float, points: int, derivative: str | 
         rates=np.concatenate([[0.0], half, np.zeros(1 - count % 2), -half[::-1]]),
         stiffness=tuple(float(np.abs(k).max()) ** (2 * power) for power in (1, 2)),
     )
+
+
+def held_ends(boundary: Any) -> tuple[bool, bool] | None:
+    """Return whether values are prescribed at the ends of an axis with this boundary; ``None`` if it is periodic."""
+    return None if boundary == PERIODIC else (boundary[0] != NATURAL, boundary[1] != NATURAL)
+
+
+def clamped_ends(boundary: Any, derivative: str) -> tuple[bool, bool]:
+    """Return whether a derivative of this name is prescribed at the ends of an axis with this boundary."""
+    held = held_ends(boundary) or (False, False)
+    return held[0] and derivative in boundary[0], held[1] and derivative in boundary[1]
 
 
 def point_count_of(axis: str, points: int, *, least: int, most: int = 10**9) -> int:

@@ -7,7 +7,8 @@ Values at end points that elements share are means weighted by length.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ import sympy
 from numpy.typing import NDArray
 from sympy import Add, Expr
 
-from scvi_codegen.errors import StateError
+from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
 from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis
 from scvi_codegen.fields.laws import ConservationLaw, names_of
 from scvi_codegen.formulas.symbols import TIME, symbol
@@ -23,6 +24,8 @@ from scvi_codegen.representation import summary
 
 Array = NDArray[np.float64]
 
+RESOLVED, DOUBTFUL = 1e-9, 1e-3
+"""Relative errors of derivatives in time up to which states suffice, and from which there is a warning."""
 WINDOW = 9
 """States of the differences in time, of order 8 between equidistant states."""
 
@@ -37,7 +40,8 @@ class LocalLaw:
         density: (n, shape of the fields) conserved density at the points.
         flux: of the same shape, by axis.
         residual: d/dt density + sum over axes of d/dx flux, of the same shape; the derivative in time is that of the
-            polynomial through 9 neighbouring states, the derivatives in space are spectral.
+            polynomial through 9 neighbouring states, or states of dense output where these are too far apart; the
+            derivatives in space are spectral.
         total: (n,) integral of the density over space.
     """
 
@@ -60,27 +64,50 @@ def local_law(history: FieldHistory, law: ConservationLaw) -> LocalLaw:
         t=history.t,
         density=history.at_points(density),
         flux={axis: history.at_points(history.values(part)) for axis, part in law.flux.items()},
-        residual=history.at_points(time_derivative(history.t, density) + divergence),
+        residual=history.at_points(_rate(history, law, density) + divergence),
         total=history.integral(density),
     )
 
 
-def time_derivative(t: Array, values: Array) -> Array:
-    """Return the derivative in time of values (n, ..), by polynomials through neighbouring states."""
+def _rate(history: FieldHistory, law: ConservationLaw, density: Array) -> Array:
+    """Return the derivative of a density in time: by the states if they are close enough, else by dense output."""
+    rate = time_derivative(history.t, density)
+    error = np.abs(rate - time_derivative(history.t, density, WINDOW - 2)).max()
+    largest = np.abs(rate).max()
+    if error <= RESOLVED * largest:
+        return rate
+    try:
+        times, between = history.between
+    except (StateError, StepFailedError) as failure:
+        if error > DOUBTFUL * largest:
+            warn(
+                f"the residual of the law '{law.name}' is uncertain by {error:.1e}: the states are too far apart in "
+                f"time, and there is no dense output ({failure})",
+                AccuracyWarning,
+            )
+        return rate
+    values = between.values(law.density).reshape(*times.shape, *density.shape[1:])
+    return np.array([_derivative(*each) for each in zip(times, values, history.t, strict=True)])
+
+
+def time_derivative(t: Array, values: Array, most: int = WINDOW) -> Array:
+    """Return the derivative in time of values (n, ..), by polynomials through ``most`` neighbouring states."""
     if (count := len(t)) < 2:
         raise StateError("the residual of a conservation law needs at least two states")
-    width = min(WINDOW, count)
-    result = np.empty_like(values)
-    for k in range(count):
-        first = min(max(k - width // 2, 0), count - width)
-        window = slice(first, first + width)
-        distance = t[window] - t[k]
-        scaled = distance / np.abs(distance).max()
-        moments = np.zeros(width)
-        moments[1] = 1 / np.abs(distance).max()
-        weights = np.linalg.solve(np.vander(scaled, increasing=True).T, moments)
-        result[k] = np.tensordot(weights, values[window], 1)
-    return result
+    width = min(most, count)
+    firsts = [min(max(k - width // 2, 0), count - width) for k in range(count)]
+    windows = [slice(first, first + width) for first in firsts]
+    return np.array([_derivative(t[each], values[each], at) for each, at in zip(windows, t, strict=True)])
+
+
+def _derivative(t: Array, values: Array, at: float) -> Array:
+    """Return the derivative at a time of the polynomial through values (k, ..) at times (k,)."""
+    distance = t - at
+    scaled = distance / np.abs(distance).max()
+    moments = np.zeros(len(t))
+    moments[1] = 1 / np.abs(distance).max()
+    weights = np.linalg.solve(np.vander(scaled, increasing=True).T, moments)
+    return np.asarray(np.tensordot(weights, values, 1))
 
 
 class FieldHistory:
@@ -89,7 +116,7 @@ class FieldHistory:
     def __init__(self, mesh: Any, run: Any) -> None:
         if run.observed is not None:
             raise StateError("a run with observe saves only its first and last state: run it without observe")
-        self.mesh, self.system = mesh, mesh.field_system
+        self.mesh, self.system, self.run = mesh, mesh.field_system, run
         self.t = np.asarray(run.t, float)
         velocity = None if self.system.momenta else np.asarray(run.velocity)
         self.fields: dict[str, Array] = mesh.fields_of(np.asarray(run.q), np.asarray(run.p), velocity)
@@ -99,6 +126,27 @@ class FieldHistory:
         coordinates = {TIME: self.t} | {axis.name: (axis.closed or axis).points for axis in mesh.axes}
         self.known |= zip(map(symbol, coordinates), np.ix_(*coordinates.values()), strict=True)
         self.shape = tuple(len(values) for values in coordinates.values())
+
+    @cached_property
+    def between(self) -> tuple[Array, FieldHistory]:
+        """Times (n, 9) near each state, a twentieth of the distance of states apart, and the history at these times.
+
+        Raises:
+            StateError: if the run has no dense output.
+            StepFailedError: if a partial step fails.
+        """
+        if not hasattr(self.run, "at") or self.run.pieces:
+            raise StateError("recordings and runs with inputs have none here")
+        count = len(self.t)
+        steps = np.arange(WINDOW) - np.where(np.arange(count) == 0, 0, WINDOW // 2)[:, np.newaxis]
+        steps[-1] -= WINDOW // 2
+        gaps = np.diff(self.t)
+        before, after = np.append(gaps[:1], gaps), np.append(gaps, gaps[-1:])
+        spacing = np.where(np.abs(before) < np.abs(after), before, after) / 20
+        times = self.t[:, np.newaxis] + steps * spacing[:, np.newaxis]
+        q, p = self.run.at(times.ravel())
+        changed = {"t": times.ravel(), "q": q, "p": p, "tau": None, "step_sizes": np.full(times.size, np.nan)}
+        return times, FieldHistory(self.mesh, replace(self.run, **changed, iterations=np.zeros(times.size, np.int32)))
 
     def values(self, formula: Expr) -> Array:
         """Return a formula in functions and their derivatives."""

@@ -135,7 +135,7 @@ class Mesh:
         """Return density, flux and residual of the conservation laws of the density along a run, by name.
 
         Args:
-            run: trajectory of ``system``; the residual is accurate if its states are close in time.
+            run: trajectory of ``system``; between states that are far apart in time the residual takes dense output.
             names: of some laws, ``"energy"``, ``"momentum_x"``; by default all.
 
         Raises:

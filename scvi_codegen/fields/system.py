@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
 from typing import Any
@@ -14,7 +14,7 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.fields.assembly import Assembly
-from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis, fourier, spectral_elements
+from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis, clamped_ends, fourier, held_ends, spectral_elements
 from scvi_codegen.fields.density import Density, derivatives_of
 from scvi_codegen.fields.derivation import FieldDerivation, derivation_of
 from scvi_codegen.fields.differences import differences
@@ -26,13 +26,8 @@ from scvi_codegen.validation import checked_count, checks_arguments
 
 CLAMPED = "clamped"
 MOST_AXES = 3
-DISCRETISATIONS = {
-    "spectral-elements": ("degree", "elements"),
-    "legendre": ("degree",),
-    "finite-differences": ("order", "points"),
-    "fourier": ("points", "derivative"),
-}
-"""Options by discretisation in space."""
+SHORTEST_AXIS, LONGEST_AXIS = 1e-50, 1e50
+"""Bounds of lengths, whose fourth powers must be numbers."""
 OPTIONAL = "derivative"
 
 
@@ -97,7 +92,8 @@ class FieldSystem(Density):
         if text is None or (density is not None and hamiltonian is not None):
             raise SystemDefinitionError("give exactly one of density and hamiltonian")
         first_order = hamiltonian is not None
-        for match in re.finditer(rf"\b({'|'.join((*fields, *momenta))})_((?:{'|'.join((*space, TIME))})+)\b", text):
+        variables, axes = ("|".join(map(re.escape, each)) for each in ((*fields, *momenta), (*space, TIME)))
+        for match in re.finditer(rf"\b({variables})_((?:{axes})+)\b", text):
             _check_derivative(match[0], match[1], [*space], parameters or {})
         system = cls._of(name, fields, momenta, space, boundary, parameters, first_order, text)
         for key, value in (("dissipation", dissipation), ("point_lagrangians", point_lagrangians)):
@@ -265,7 +261,7 @@ class FieldSystem(Density):
         if not isinstance(method, str) or method not in DISCRETISATIONS:
             known = ", ".join(DISCRETISATIONS)
             raise SystemDefinitionError(f"there is no discretisation '{method}'; possible: {known}")
-        needed = DISCRETISATIONS[method]
+        needed, discretised_axis = DISCRETISATIONS[method]
         for name in options:
             if name not in needed:
                 raise SystemDefinitionError(f"'{method}' has no option '{name}'; it has {' and '.join(needed)}")
@@ -280,7 +276,7 @@ class FieldSystem(Density):
                 if value is None and name != OPTIONAL:
                     raise SystemDefinitionError(f"'{method}' needs {name}= for the axis '{axis}'")
                 chosen[name] = value
-            axes[axis] = self._axis(axis, method, chosen)
+            axes[axis] = discretised_axis(self, axis, chosen)
         return Assembly(self, axes).result({"method": method, **options})
 
     def _check_canonical_pairs(self, method: str) -> None:
@@ -298,29 +294,6 @@ class FieldSystem(Density):
                         f"no lower bound: with '{method}', whose derivatives are not exactly antisymmetric and equal "
                         "at all points, errors grow until the run fails. Use 'fourier' with an odd number of points"
                     )
-
-    def _axis(self, axis: str, method: str, options: Mapping[str, Any]) -> Axis:
-        start, end = self.space[axis]
-        boundary = self.boundary[axis]
-        places = [place[axis] for place, _ in self.point_lagrangians]
-        fixed = None if boundary == PERIODIC else (boundary[0] != NATURAL, boundary[1] != NATURAL)
-        if "degree" in options:
-            derivative = f"{self.fields[0]}_{axis}"
-            clamped = [fixed is not None and fixed[k] and derivative in boundary[k] for k in range(2)]
-            breaks = _breaks(axis, start, end, options.get("elements", 1), places if "elements" in options else ())
-            return spectral_elements(axis, breaks, options["degree"], fixed, (clamped[0], clamped[1]))
-        if method == "fourier":
-            if boundary != PERIODIC:
-                raise SystemDefinitionError(
-                    f"'fourier' needs a periodic axis, and '{axis}' has ends: use \"spectral-elements\" or "
-                    '"finite-differences"'
-                )
-            return fourier(axis, start, end, **options)
-        second = any(
-            orders.get(axis) == 2 and symbol(name) in self.density.free_symbols
-            for name, (_, orders) in self.derivatives.items()
-        )
-        return differences(axis, (start, end), options["points"], options["order"], fixed, second=second)
 
 
 def _check_derivative(name: str, field: str, axes: Sequence[str], parameters: Mapping[str, float]) -> None:
@@ -345,6 +318,11 @@ def _bounds(axis: str, ends: Any) -> tuple[float, float]:
     lower, upper = (float(parse_expression(str(each), {})) for each in ends)
     if not (isfinite(lower) and isfinite(upper) and lower < upper):
         raise SystemDefinitionError(f"the bounds of the axis '{axis}' must be finite and ascending, not {ends!r}")
+    if not SHORTEST_AXIS <= upper - lower <= LONGEST_AXIS:
+        raise SystemDefinitionError(
+            f"the axis '{axis}' has the length {upper - lower:g}, and must have one from {SHORTEST_AXIS:g} to "
+            f"{LONGEST_AXIS:g}: choose other units of length"
+        )
     return lower, upper
 
 
@@ -408,3 +386,38 @@ def _breaks(axis: str, start: float, end: float, elements: Any, places: Sequence
     ):
         raise SystemDefinitionError(f"the ends of the elements of '{axis}' must ascend from {start:g} to {end:g}")
     return np.union1d(breaks, places)
+
+
+def _elements(system: FieldSystem, axis: str, options: Mapping[str, Any]) -> Axis:
+    places = [place[axis] for place, _ in system.point_lagrangians] if "elements" in options else []
+    breaks = _breaks(axis, *system.space[axis], options.get("elements", 1), places)
+    boundary = system.boundary[axis]
+    clamped = clamped_ends(boundary, f"{system.fields[0]}_{axis}")
+    return spectral_elements(axis, breaks, options["degree"], held_ends(boundary), clamped)
+
+
+def _fourier(system: FieldSystem, axis: str, options: Mapping[str, Any]) -> Axis:
+    if system.boundary[axis] != PERIODIC:
+        raise SystemDefinitionError(
+            f"'fourier' needs a periodic axis, and '{axis}' has ends: use \"spectral-elements\" or "
+            '"finite-differences"'
+        )
+    return fourier(axis, *system.space[axis], **options)
+
+
+def _differences(system: FieldSystem, axis: str, options: Mapping[str, Any]) -> Axis:
+    second = any(
+        orders.get(axis) == 2 and symbol(name) in system.density.free_symbols
+        for name, (_, orders) in system.derivatives.items()
+    )
+    fixed = held_ends(system.boundary[axis])
+    return differences(axis, system.space[axis], options["points"], options["order"], fixed, second=second)
+
+
+DISCRETISATIONS: Mapping[str, tuple[Sequence[str], Callable[[FieldSystem, str, Mapping[str, Any]], Axis]]] = {
+    "spectral-elements": (("degree", "elements"), _elements),
+    "legendre": (("degree",), _elements),
+    "finite-differences": (("order", "points"), _differences),
+    "fourier": (("points", "derivative"), _fourier),
+}
+"""Options of each discretisation in space, and the function that discretises an axis of a field system with them."""

@@ -1,7 +1,9 @@
-"""Atomic writes: files are written to a temporary name in the same folder, then renamed."""
+"""Atomic writes, to a temporary name in the same folder that is then renamed, and reads of regular files alone."""
 
+import errno
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -80,3 +82,18 @@ def remove(path: Path) -> None:
     else:
         with suppress(OSError):
             path.unlink()
+
+
+def regular(path: str | os.PathLike[str]) -> Path:
+    """Return a path; raise OSError for a device, pipe or socket, which could be read without end, and for no path."""
+    if "\0" in os.fsdecode(path):
+        raise OSError(errno.EINVAL, "a path contains no null character", repr(path))
+    mode = (target := Path(path)).stat().st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise OSError(errno.EINVAL, "it is not a regular file", str(target))
+    return target
+
+
+def read_text(path: str | os.PathLike[str], encoding: str) -> str:
+    """Return the text of a regular file."""
+    return regular(path).read_text(encoding=encoding)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, imported, missing
-from scvi_codegen.files.atomic import replaced
+from scvi_codegen.files.atomic import regular, replaced
 from scvi_codegen.files.labelled_arrays import CHUNK_BYTES, Labelled, NamedQuantity, write_hdf5, write_zarr
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def loaded(file: Any | IO[bytes]) -> Iterator[Any]:
         ValueError: for any failure on a damaged file: of zipfile, zlib, the header parser, or memory.
     """
     try:
-        content = np.load(file, allow_pickle=False)
+        content = np.load(regular(file) if isinstance(file, str | os.PathLike) else file, allow_pickle=False)
         try:
             yield content
         finally:
@@ -150,8 +150,7 @@ def check_format(path: str | os.PathLike[str]) -> None:
     """
     suffix = Path(path).suffix.lower()
     if suffix not in WRITERS:
-        known = ", ".join(WRITERS)
-        raise StateError(f"the format of a trajectory is the suffix of its file, one of {known}, not {str(path)!r}")
+        raise StateError(f"the format of a trajectory is the suffix of its file, one of {FORMATS}, not {str(path)!r}")
     library = LIBRARIES.get(suffix)
     if library is not None and importlib.util.find_spec(library) is None:
         raise missing(library, "data")
@@ -251,9 +250,16 @@ def _write_labelled(states: States, path: Path, *, write: Callable[[Labelled, Pa
     write(states.labelled(), path)
 
 
-LABELLED = {".h5": write_hdf5, ".hdf5": write_hdf5, ".nc": write_hdf5, ".zarr": write_zarr}
-"""Formats with named dimensions and units."""
+LABELLED: Mapping[str, Callable[[Labelled, Path], None]] = {
+    ".h5": write_hdf5,
+    ".hdf5": write_hdf5,
+    ".nc": write_hdf5,
+    ".zarr": write_zarr,
+}
+"""Formats with named dimensions and units, of trajectories and ensembles."""
 WRITERS: Mapping[str, Callable[[States, Path], None]] = {".npz": _write_npz, ".csv": _write_csv} | {
     suffix: partial(_write_labelled, write=write) for suffix, write in LABELLED.items()
 }
+FORMATS = ", ".join(WRITERS)
+"""Suffixes of trajectories and ensembles."""
 LIBRARIES = {".h5": "h5netcdf", ".hdf5": "h5netcdf", ".nc": "h5netcdf", ".zarr": "zarr"}

@@ -60,7 +60,6 @@ class _Loops(ArrayParser):
     """Parser for loops alone, ``b in B, k in 0..N-2``."""
 
     def read(self) -> list[Loop]:
-        """Parse all loops."""
         loops = self.loop()
         self.in_scope |= {loop.index: loop for loop in loops}
         while self.accept(","):
@@ -135,7 +134,6 @@ class _Target(ArrayParser):
     """Parser for the target of a force: an array entry whose indices run over whole axes."""
 
     def read(self) -> dict[str, Size]:
-        """Return the axis of each index."""
         token = self.take_name("an array of coordinates")
         if token.text not in self.arrays:
             known = ", ".join(map(str, self.arrays.values()))
@@ -165,7 +163,6 @@ class _Target(ArrayParser):
         self.expect("]")
 
     def index_along(self, axis: Size, bounds: dict[str, Size]) -> None:
-        """Parse an index of its own along an axis."""
         place = self.peek()
         self.check_index(place)
         if place.text in bounds:

@@ -13,6 +13,7 @@ from sympy import Expr, Symbol
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import check_name
+from scvi_codegen.formulas.translation import format_expression
 from scvi_codegen.indices import Array
 
 MAX_COMPONENTS = 3
@@ -41,6 +42,12 @@ class Neighbours:
     def components(self) -> int:
         """Number of components of a position."""
         return self.array.axes[1].number if len(self.array.axes) > 1 else 1
+
+    @property
+    def lengths(self) -> tuple[str, ...]:
+        """Lengths as texts, ``"near cutoff 5*s/2"``, the cutoff first, for the checks of every run."""
+        named = [("cutoff", self.cutoff), ("skin", self.skin), *(("box", period) for period in self.box)]
+        return tuple(f"{self.name} {kind} {format_expression(length)}" for kind, length in named)
 
     def inside(self, one: str, other: str) -> str:
         """Return the formula that is 1 for points of two indices closer than the cutoff, else 0."""

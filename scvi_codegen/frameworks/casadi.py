@@ -135,7 +135,6 @@ class EndConditions:
         return self._updated("by_v", q=q, v=self.ca.DM.zeros(*q.shape), p=p, t=t, parameters=parameters)
 
     def _updated(self, derivative: str, **values: Any) -> Any:
-        """Return the result of one Newton update from 0."""
         result = self._legendre_derivatives(**values)
         return -self.ca.solve(result[derivative], result["residual"], "qr")
 
@@ -264,7 +263,6 @@ class _StageExpressions:
         self.columns = ((0, self.q), *zip(powers, blocks, strict=True))
 
     def rows(self) -> list[Any]:
-        """Return the residuals of all rows, and p1."""
         sizes = self.stages.row_sizes(self.system.dimension)
         momenta = (*(row.momentum for row in self.stages.rows), self.stages.end_momentum)
         powers = (*(row.power for row in self.stages.rows), 0)
@@ -289,7 +287,6 @@ class _StageExpressions:
         return self.ca.exp(float(abscissa) * rate(*self.ca.vertsplit(self.parameters))[0] * self.h)
 
     def end_position(self) -> Any:
-        """Return q1."""
         return self._gathered(self.stages.end_position, 0, power=0, scale=1.0)
 
     def along(self, texts: Sequence[str]) -> tuple[Any, Any]:
@@ -322,7 +319,6 @@ class _StageExpressions:
         return numeric(self.ca, results, (*group.arguments, self.system.time, *self.system.parameters))
 
     def _arguments(self, group: StageGroup, n: int) -> list[Any]:
-        """Return the arguments of the kernel of a stage group at its point n."""
         parts = [self._gathered(g.table, n, power=g.power, scale=float(g.scale)) for g in group.gathers]
         return list(self.ca.vertsplit(self.ca.vertcat(*parts)))
 

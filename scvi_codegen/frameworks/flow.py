@@ -20,6 +20,7 @@ from scvi_codegen.native.binding import Binding
 from scvi_codegen.rendering.flow import XLA_PARTS, XLA_SECOND_ORDER, with_flow_of_rows, with_xla_flow
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.representation import LONGEST, clipped
+from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import check_inputs_given, parameter_index
 from scvi_codegen.validation import checked_count, checks_arguments, of
@@ -47,9 +48,8 @@ class Flow:
             MethodError: for a stepper without derivatives, without fixed steps or of arrays of any size.
             StateError: for invalid numbers of steps.
         """
+        require(stepper, "flow")
         stepper = stepper.known
-        stepper._check_fixed_steps("a flow")
-        stepper._check_no_changes("a flow")
         steps = checked_count(steps, "steps", least=1)
         save_every = 0 if save_every is None else checked_count(save_every, "save_every", least=1)
         if save_every and steps % save_every:
@@ -151,7 +151,6 @@ class ArrayFlow(Flow):
         return result[..., :m], result[..., m:]
 
     def _number(self, value: Any, name: str) -> Any:
-        """Return a number as an array (.., 1)."""
         return self._binary64(value, name)[..., None]
 
     def _vector(self, value: Any, length: int, name: str) -> Any:

@@ -171,7 +171,6 @@ class _Graph:
         return self.node(("*", (self._by_roots(x, halves), quarter))) if halves else quarter
 
     def _by_roots(self, x: int, halves: int) -> int:
-        """Return the node of x^(halves / 2), halves != 0."""
         if -halves in INVERSE_ROOTS:
             return self.node((INVERSE_ROOTS[-halves], (x,)))
         whole, half = divmod(halves, 2)

@@ -212,7 +212,7 @@ class FixedPointIteration:
     Attributes:
         name: of the equations: separable, Hamiltonian, coupled, collocation or shooting.
         points: real points; lanes beyond repeat the last one and have weight 0.
-        lanes: a power of two, the number of points or more.
+        lanes: the number of points or more: up to 16, or in one vector, a power of two; otherwise a multiple of 8.
         own_tables: padded to ``lanes``, in the order in which they are printed, without those of the predictor.
         guess: predictor of the stored values.
         kernels: evaluated on SIMD lanes.
@@ -357,12 +357,40 @@ class Control:
         stage_growth: factor of the error estimate per level for Newton's method; 0 if there is no estimate.
         density: 1/g and -d(log g)/dt at (q, v), or (q, p) of a Hamiltonian, of a time transformation g; instead of the
             predictor.
+        growth: of errors, measured along runs; ``None`` if it is not.
     """
 
     mantissas: tuple[float, ...] = ()
     predictor: AdaptivePredictor | None = None
     stage_growth: float = 0.0
     density: Kernel | None = None
+    growth: ErrorGrowth | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ErrorGrowth:
+    """Explicit Runge-Kutta-Nystroem scheme for a tangent vector (:mod:`scvi_codegen.lowering.error_growth`).
+
+    Attributes:
+        partials: distinct derivatives F_q at the points, on lanes.
+        product: at u = (x, these) the product F_q x, on lanes.
+        which: (n,) indices of the nodes among the points of a step; ``nodes``: their abscissae.
+        position: (n, n + 1) from a_0 and the stages to the displacements at the nodes.
+        end_position, end_velocity, end_acceleration: (n,) from the stages to the end of the step.
+        from_nodes: (n, lanes) from the stages to the displacements at all points.
+        at_end: (lanes,) extrapolation from all points to the end.
+    """
+
+    partials: Kernel
+    product: Kernel
+    which: tuple[int, ...]
+    nodes: tuple[Number, ...]
+    position: NumberTable
+    end_position: tuple[Number, ...]
+    end_velocity: tuple[Number, ...]
+    end_acceleration: tuple[Number, ...]
+    from_nodes: NumberTable
+    at_end: tuple[Number, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -152,7 +152,8 @@ class Quantities:
         momentum_kernel: their values at (q, p), then the sums of the squares of their terms; ``None`` if there are
             none.
         integrals: functions integrated along a run, or ``None``; the first one gives the time.
-        first_order_rates: velocities at (q, y) of a first-order system, whose ``legendre`` is theta(q, y), or ``None``.
+        first_order_rates: H_y at (q, y) of a first-order system, or ``None``: velocities solve theta_y^T q' = H_y,
+            where ``legendre`` is theta(q, y).
         work_and_impulses: names of work and impulses of forces: of the energy, and momentum maps; none without forces.
     """
 

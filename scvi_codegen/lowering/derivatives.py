@@ -140,21 +140,28 @@ def point_derivatives_of(system: MechanicalSystem, fixed_point: FixedPointIterat
 
 def _separable(system: LagrangianSystem) -> PointDerivatives:
     """Return the derivatives of forces at u = q, and those of constant masses with respect to parameters."""
-    forms, q = forms_of(system), tuple(system.coordinates)
-    partials = jacobian(forms.force, q) or NOTHING
-    different = tuple(dict.fromkeys(partials.values()))
+    forms = forms_of(system)
     masses = jacobian(tuple(forms.mass.values()), system.parameters)
     purpose = "Derivatives of the constant masses with respect to parameters."
     kernel = system_kernel(system, "mass_by_inputs", masses.values(), of=(), purpose=purpose)
+    partials, products = force_derivatives(system)
     return PointDerivatives(
-        partials=system_kernel(
-            system, "point_derivatives", different, of=q, purpose="The distinct entries of L_qq at all points."
-        ),
+        partials=partials,
         beside=0,
-        products=_products(system, partials, different, size=len(q)),
-        given=_at_points_by_inputs(system, forms.force, q),
+        products=products,
+        given=_at_points_by_inputs(system, forms.force, system.coordinates),
         masses=InputDerivatives(entries=tuple(masses), kernel=kernel) if masses else None,
     )
+
+
+def force_derivatives(system: LagrangianSystem) -> tuple[Kernel, tuple[Kernel, Kernel]]:
+    """Return the kernel of the distinct derivatives of forces at u = q, and those of their products with vectors."""
+    q = tuple(system.coordinates)
+    partials = jacobian(forms_of(system).force, q) or NOTHING
+    different = tuple(dict.fromkeys(partials.values()))
+    purpose = "The distinct entries of L_qq at all points."
+    kernel = system_kernel(system, "point_derivatives", different, of=q, purpose=purpose)
+    return kernel, _products(system, partials, different, size=len(q))
 
 
 def _coupled(system: LagrangianSystem) -> PointDerivatives:

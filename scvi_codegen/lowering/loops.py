@@ -189,7 +189,6 @@ def with_sums(program: Program, of: SplitSystem) -> Program | None:
 def _over_terms(
     system: MechanicalSystem, name: str, group: TermGroup, values: Sequence[Expr], targets: tuple[tuple[int, ...], ...]
 ) -> LoopedKernel:
-    """Return the loop over the terms of a group."""
     kernel = lower_kernel(
         name,
         arguments=(*group.slots, *group.constants),

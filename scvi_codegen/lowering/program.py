@@ -12,6 +12,7 @@ from functools import partial
 import sympy
 
 from scvi_codegen.errors import MethodError
+from scvi_codegen.formulas.expressions import gradient_tuple
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.indices import Array
 from scvi_codegen.ir.equations import FixedPointIteration, Splitting
@@ -45,7 +46,7 @@ from scvi_codegen.lowering.stage_groups import (
 )
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.first_order import FirstOrderSystem, velocities_of_form
+from scvi_codegen.mechanics.first_order import FirstOrderSystem
 from scvi_codegen.mechanics.splitting import kinetic_splitting
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, work_rates
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -191,7 +192,6 @@ def lower(
 
 
 def _layout(system: MechanicalSystem | ArraySystem) -> Layout:
-    """Return the arrays and parameters of a system."""
     numbers = {"parameters": tuple(each.name for each in system.parameters), "defaults": system.defaults}
     if isinstance(system, ArraySystem):
         kinds = ("coordinates", "momenta", "velocities", "sums", "fields", "tables", "sizes")
@@ -354,11 +354,12 @@ def _inverse_legendre_kernel(system: MechanicalSystem) -> Kernel | None:
 
 
 def _rates_of_first_order(system: MechanicalSystem) -> Kernel | None:
-    """Return the kernel of the velocities of a first-order system, ``None`` for other systems."""
+    """Return the kernel of the right-hand side of the velocities of a first-order system, ``None`` for others."""
     if not isinstance(system, FirstOrderSystem) or system.is_canonical:
         return None
-    of, rates = forms_of(system).legendre_arguments, velocities_of_form(system)
-    return system_kernel(system, "first_order_rates", rates, of=of, purpose="Velocities q' at u = (q, y).")
+    right = gradient_tuple(system.hamiltonian, system.momenta)
+    of = forms_of(system).legendre_arguments
+    return system_kernel(system, "first_order_rates", right, of=of, purpose="H_y = theta_y^T q' at u = (q, y).")
 
 
 def _momentum_kernel(system: MechanicalSystem, symmetries: Sequence[Symmetry]) -> Kernel | None:

@@ -268,7 +268,6 @@ def lowered_stage_group(system: MechanicalSystem, group: StageGroup, sites: Unkn
 
 
 def _results(group: StageGroup, names: tuple[str, ...]) -> str:
-    """Return a description of the results of a kernel."""
     if group.computes:
         return group.computes
     if group.name == "node":

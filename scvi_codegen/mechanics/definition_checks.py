@@ -54,8 +54,9 @@ def warn_of_unused(
     occurring = reduce(set.union, parts.values(), set[Symbol]())
     kinds += [f"parameter '{each}'" for each in parameters if each not in used and each not in occurring]
     for kind in kinds:
-        where = f"the {function}, the forces or the constraints of '{name}'"
-        warn(f"{kind} is not used in {where}; remove it, unless events use it.", SystemDefinitionWarning)
+        where = f"the {function}, the forces and the constraints of '{name}'"
+        remedy = "remove it, unless events or a time transformation, which are not known here, contain it"
+        warn(f"{kind} does not occur in {where}: {remedy}.", SystemDefinitionWarning)
     return bool(kinds)
 
 

@@ -382,6 +382,11 @@ def _structural_rank(entries: Entries, size: int) -> int:
     return int(structural_rank(csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(size, size))))
 
 
+def inverse_by_minors(matrix: Matrix) -> Matrix:
+    """Return adjugate / determinant: undefined only where a matrix is singular, while pivots may vanish elsewhere."""
+    return matrix.adjugate() / matrix.det(method="berkowitz")
+
+
 def coupled_blocks(entries: Entries, size: int) -> list[list[int]]:
     """Return the connected components of the variables, coupled by non-zero entries, as lists of indices."""
     return [sorted(block) for block in connected_components((range(size), list(entries)))]

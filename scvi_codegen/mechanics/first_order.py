@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 import sympy
-from sympy import Expr, Matrix, Symbol
+from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.expressions import Tape, hessian
@@ -108,6 +108,11 @@ class FirstOrderSystem(HamiltonianSystem):
         """Return the values of all variables by name, in the order of the user."""
         values = dict(zip((*self.coordinates, *self.momenta), (*q, *y), strict=True))
         return {each.name: values[each] for each in self.variables}
+
+    @property
+    def depends_on_time(self) -> bool:
+        """True if time occurs in theta or H: along trajectories dH/dt = H_t - theta_t . q'."""
+        return self.time in self.lagrangian.free_symbols
 
     @property
     def is_canonical(self) -> bool:
@@ -298,9 +303,10 @@ def first_order_form(form: OneForm) -> dict[str, Any]:
     }
 
 
-def shear(form: OneForm) -> tuple[Symbol, Expr, tuple[str, ...]] | None:
+def shear(form: OneForm) -> tuple[Symbol, Expr, tuple[str, ...], Expr] | None:
     """Return s, g and half of the variables between which omega vanishes if s - g(z) is put in the place of s.
 
+    The fourth value is omega(s, u): the shear is valid where it is not 0.
     This replaces omega(k, u) by omega(k, u) - g_k omega(s, u), which is zero if g_k is the ratio of the two and does
     not depend on u and s: b_k / b_s of a guiding centre with the parallel velocity u.
     """
@@ -318,7 +324,7 @@ def shear(form: OneForm) -> tuple[Symbol, Expr, tuple[str, ...]] | None:
         sheared = replace(form, lagrangian=form.lagrangian.subs({z[s]: z[s] - g, v[s]: rate}, simultaneous=True))
         for chosen in sheared.choices():
             if sheared.integral(chosen) is not None:
-                return z[s], g, tuple(z[i].name for i in chosen)
+                return z[s], g, tuple(z[i].name for i in chosen), form.omega(s, u)
     return None
 
 
@@ -342,23 +348,18 @@ def _refusal(form: OneForm, refused: Sequence[Sequence[int]]) -> str:
     found = shear(form)
     remedy = "Use other coordinates, such as flux coordinates of a magnetic field, or canonical ones"
     if found:
-        s, g, chosen = found
+        s, g, chosen, pivot = found
         remedy = (
             f"Put {format_expression(s - g)} in the place of {s}, and its time derivative in that of {s}_dot: then "
             f"omega vanishes between {' and '.join(chosen)}"
         )
+        if pivot.free_symbols & {*z} and pivot.count_ops() < MOST_SHOWN:
+            remedy += f". This is valid as long as {format_expression(pivot)} is not 0 along the trajectory"
     return (
         f"{start}{half} coordinates are required between which the two-form omega = d theta vanishes; it vanishes "
         f"{'only between ' + pairs if pairs else 'between no two coordinates'}{': ' * bool(shown)}"
         f"{', '.join(shown[:3])}. {remedy}"
     )
-
-
-def velocities_of_form(system: FirstOrderSystem) -> tuple[Expr, ...]:
-    """Return x' = (d theta_x / d y)^-T H_y, the Euler-Lagrange equations of y."""
-    derivatives = Matrix([[theta.diff(y) for theta in system.one_form] for y in system.momenta])
-    right = Matrix([system.hamiltonian.diff(y) for y in system.momenta])
-    return tuple(derivatives.LUsolve(right))
 
 
 def translations(system: FirstOrderSystem) -> list[tuple[int, ...]]:

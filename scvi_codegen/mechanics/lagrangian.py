@@ -42,6 +42,7 @@ class LagrangianSystem(MechanicalSystem):
         reduced: of a system with rotations or directions, its formulas in the names of these.
         dual_energy: the kinetic energy as a function of coordinates and momenta if that takes fewer operations than the
             mass matrix, which then is not computed, else 0.
+        links: of a robot from a file, the geometry of its moving links, for pictures.
 
     Raises:
         SystemDefinitionError: naming the symbol at fault, if a name is invalid or used twice, L contains an unknown
@@ -52,6 +53,7 @@ class LagrangianSystem(MechanicalSystem):
     lagrangian: Expr
     reduced: Reduced | None = None
     dual_energy: Expr = field(default_factory=zero)
+    links: tuple[Any, ...] = field(default=(), compare=False, repr=False)
 
     __repr__ = summary("name", "coordinates")
 
@@ -323,8 +325,9 @@ class LagrangianSystem(MechanicalSystem):
         Revolute, continuous and prismatic joints are coordinates with the name of the joint. A floating base has the
         position ``x_BASE``, ``y_BASE``, ``z_BASE`` of its frame, the rotation ``R_BASE`` and the angular velocity
         ``omega_BASE`` in its frame, where ``BASE`` is the name of its link. Links of fixed joints are merged. Joints
-        with ``mimic`` follow theirs. Meshes, collisions, limits and dry friction are not read; angles ``rpy`` that
-        differ from a multiple of pi/2 by less than 5e-6 are this multiple, since files print them with few digits.
+        with ``mimic`` follow theirs. A warning lists what is not part of the motion: limits, dry friction, collisions,
+        actuators. Angles ``rpy`` that differ from a multiple of pi/2 by less than 5e-6 are this multiple, since files
+        print them with few digits.
 
         Args:
             path: the file.
@@ -334,7 +337,7 @@ class LagrangianSystem(MechanicalSystem):
             name: name of the system; by default that of the robot.
 
         Raises:
-            SystemDefinitionError: naming file and element, if something is malformed or not read.
+            SystemDefinitionError: naming file and element, if something is malformed, unknown or not read.
         """
         from scvi_codegen.mechanics.multibody.trees.urdf import links_of_urdf
 
@@ -351,16 +354,16 @@ class LagrangianSystem(MechanicalSystem):
         Hinges and slides are coordinates with the name of the joint. A ball joint is a rotation ``R_JOINT`` relative to
         the parent with the angular velocity ``omega_JOINT`` in the frame of the body; a free joint has the position
         ``x_JOINT``, ``y_JOINT``, ``z_JOINT`` as well. A joint without a name has that of its body. Inertias of bodies
-        follow from their ``inertial`` or geoms. Equalities of bodies, sites and joints are constraints. Contacts,
-        limits, actuators, sensors and dry friction are not read.
+        follow from their ``inertial`` or geoms. Equalities of bodies, sites and joints are constraints. A warning lists
+        what is not part of the motion: limits, dry friction, contacts, actuators.
 
         Args:
             path, actuated: see :meth:`from_urdf`.
             name: name of the system; by default that of the model.
 
         Raises:
-            SystemDefinitionError: naming file and element, if something is malformed, or changes the mechanics and is
-                not read: equalities of tendons, tendons with stiffness, inertias of meshes.
+            SystemDefinitionError: naming file and element, if something is malformed or unknown, or changes the motion
+                and is not read: equalities of tendons, tendons with stiffness, inertias of meshes.
         """
         from scvi_codegen.mechanics.multibody.trees.closures import conditions_of
         from scvi_codegen.mechanics.multibody.trees.mjcf import links_of_mjcf
@@ -392,4 +395,4 @@ class LagrangianSystem(MechanicalSystem):
             velocity: rf"\dot{{{latex(coordinate)}}}"
             for coordinate, velocity in zip(self.coordinates, self.velocities, strict=True)
         }
-        return rf"$\displaystyle L = {latex(self.lagrangian, symbol_names=dotted)}$"
+        return rf"$\displaystyle L = {latex(self._shown_formula, symbol_names=dotted)}$"

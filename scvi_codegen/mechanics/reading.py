@@ -219,7 +219,6 @@ def system_from_sympy(
 
 
 def _components(force: Any, what: str, read: Callable[[Any, str], Expr]) -> Any:
-    """Return a force as an expression, or its components as a tuple."""
     return tuple(read(f, what) for f in force) if isinstance(force, tuple | list) else read(force, what)
 
 

@@ -57,10 +57,13 @@ class KineticSplitting:
     axes: tuple[Matrix, ...] = ()
 
     def flow(self, u: Sequence[Expr]) -> tuple[list[Expr], list[Expr]]:
-        """Return q and u = t p after the flow of T in the time t, as functions of q and u, symbols as many as p."""
+        """Return the changes of q and u = t p by the flow of T in the time t, in q and u, symbols as many as p.
+
+        g - 1 is computed without cancellation from |g| = 1: short steps add up.
+        """
         q, p = self.system.coordinates, self.system.auxiliaries
-        moved = [a + v.xreplace(dict(zip(p, u, strict=True))) for a, v in zip(q, self.velocity, strict=True)]
-        turned = list(u)
+        moved = [v.xreplace(dict(zip(p, u, strict=True))) for v in self.velocity]
+        turned: list[Expr] = [S.Zero] * len(u)
         for (first, _, j, k), (common, outer, inner), axes in zip(self.bodies, self.rates, self.axes, strict=True):
             own = slice(first, first + 4)
             pair = [Quaternion(*q[own]), Quaternion(*u[own])]
@@ -71,8 +74,10 @@ class KineticSplitting:
             else:
                 offsets = {j: outer, k: inner}
                 g = _elliptic_turn(j, [intermediate(common + offsets.get(n, S.Zero)) for n in range(3)], momentum)
-            g = Quaternion(*map(intermediate, (g.a, *(axes * Matrix(g.args[1:])))))
-            moved[own], turned[own] = (list((x * g).args) for x in pair)
+            vector = [intermediate(each) for each in axes * Matrix(g.args[1:])]
+            real, size = intermediate(g.a), intermediate(sqrt(SMALLEST + g.a**2))
+            less = intermediate(real - size - Add(*(x**2 for x in vector)) / (1 + size))
+            moved[own], turned[own] = (list((x * Quaternion(less, *vector)).args) for x in pair)
         return moved, turned
 
 

@@ -164,6 +164,7 @@ class MechanicalSystem(Deferred, ABC):
             (:mod:`scvi_codegen.mechanics.forces`).
         arrays: declarations of the arrays of known sizes whose entries are coordinates and parameters.
         indices: sizes and index tables of these arrays by name, for events in index notation.
+        lengths: cutoffs and periods of lists of neighbours (:class:`~scvi_codegen.formulas.neighbours.Neighbours`).
         definition: the text with arrays or rotations that the system was read from, for model files; else empty.
         rotations: rotations, directions and spins, whose coordinates follow the ordinary ones
             (:mod:`scvi_codegen.formulas.rotations.members`).
@@ -183,6 +184,7 @@ class MechanicalSystem(Deferred, ABC):
     indices: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
     definition: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
     rotations: tuple[Homogeneous, ...] = ()
+    lengths: tuple[str, ...] = ()
 
     @property
     @abstractmethod
@@ -228,7 +230,7 @@ class MechanicalSystem(Deferred, ABC):
     @property
     def _common_fields(self) -> dict[str, Any]:
         """Fields that a Lagrangian and its Hamiltonian have in common, by name."""
-        names = "name", "coordinates", "time", "parameters", "defaults", "damping", "inputs", "rotations"
+        names = "name", "coordinates", "time", "parameters", "defaults", "damping", "inputs", "rotations", "lengths"
         return {name: getattr(self, name) for name in names}
 
     @property
@@ -268,8 +270,13 @@ class MechanicalSystem(Deferred, ABC):
         return any(self.time in g.free_symbols for g in self.constraints) or any(g.xreplace(at_rest) for g in rolling)
 
     def to_text(self) -> str:
-        """Return the function as text that ``from_text`` accepts."""
-        return self.text_of(self.formula)
+        """Return the function as text that ``from_text`` accepts, in the names of rotations and directions."""
+        return self.text_of(self._shown_formula)
+
+    @property
+    def _shown_formula(self) -> Expr:
+        reduced = getattr(self, "reduced", None)
+        return reduced.lagrangian if reduced else self.formula
 
     def text_of(self, formula: Expr) -> str:
         """Return a formula of the system as text, with its inputs by their names."""
@@ -303,15 +310,17 @@ class MechanicalSystem(Deferred, ABC):
         from scvi_codegen.formulas.intermediates import LONGEST_WRITTEN, written_out, written_size
 
         letter = "H" if self.auxiliaries else "L"
-        short = written_size(self.formula) <= LONGEST_WRITTEN
-        size = count_ops(self.formula) if short else written_size(self.formula)
-        formula = mathml_terms(written_out(self.formula), Symbol(letter)) if size <= MAX_OPERATIONS else ()
+        shown = self._shown_formula
+        short = written_size(shown) <= LONGEST_WRITTEN
+        size = count_ops(shown) if short else written_size(shown)
+        formula = mathml_terms(written_out(shown), Symbol(letter)) if size <= MAX_OPERATIONS else ()
         written = " ".join(formula) or plain(f"{letter}: {size} operations")
         parameters = [f"{parameter.name} = {value:g}" for parameter, value in self.constants.items()]
         return card(
             self.name,
             (
                 ("coordinates", listed([q.name for q in self.coordinates])),
+                *([("rotations", listed([each.declaration for each in self.rotations]))] if self.rotations else []),
                 *([("momenta", listed([p.name for p in self.auxiliaries]))] if self.auxiliaries else []),
                 ("parameters", listed(parameters)),
                 *self._force_facts(),
@@ -321,9 +330,11 @@ class MechanicalSystem(Deferred, ABC):
 
     def _force_facts(self) -> Iterator[tuple[str, Html]]:
         """Yield forces, damping and constraints as rows of a notebook's card."""
-        for q, force in zip(self.coordinates, self.forces, strict=False):
-            if force != 0:
-                yield f"force on {q.name}", plain(self.text_of(force))
+        reduced = getattr(self, "reduced", None)
+        forces = reduced.forces if reduced else zip([q.name for q in self.coordinates], zip(self.forces), strict=False)
+        for name, components in forces:
+            if any(components):
+                yield f"force on {name}", plain(", ".join(map(self.text_of, components)))
         if self.damping != 0:
             yield "damping", plain(self.text_of(self.damping))
         for g in self.constraint_texts:

@@ -145,7 +145,6 @@ def rolled(system: MechanicalSystem) -> SplitSystem | None:
 
 
 def _merged(groups: Sequence[TermGroup]) -> tuple[TermGroup, ...]:
-    """Merge groups with the same indices."""
     merged: dict[tuple[tuple[int, ...], ...], TermGroup] = {}
     for group in groups:
         other = merged.setdefault(group.places, group)
@@ -161,7 +160,6 @@ def _merged(groups: Sequence[TermGroup]) -> tuple[TermGroup, ...]:
 
 
 def _stem(name: str, parameters: Sequence[Symbol]) -> str:
-    """Return a prefix of symbol names that no parameter has."""
     stem = f"{name}_"
     while any(parameter.name.startswith(stem) for parameter in parameters):
         stem += "_"
@@ -203,7 +201,6 @@ class _Leaves:
     constants: list[Expr] = field(default_factory=list)
 
     def key(self, formula: Expr) -> str:
-        """Return the structure of a formula with numbered leaves."""
         if formula.is_Pow:
             exponent = str(formula.exp) if formula.exp.is_Number else self.key(formula.exp)
             return f"({self.key(formula.base)})**({exponent})"
@@ -238,7 +235,6 @@ class _Leaves:
         return bool(formula.is_Number) or formula in self.names
 
     def substituted(self, formula: Expr, slot: Callable[[str, int], Symbol], constants: Sequence[Expr]) -> Expr:
-        """Return the formula with symbols of slots, and with other constants."""
         if formula.args:
             fixed = formula.args[1:] if formula.is_Pow and formula.exp.is_Number else ()
             parts = formula.args[: len(formula.args) - len(fixed)]

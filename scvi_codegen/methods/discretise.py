@@ -39,6 +39,8 @@ NUMBERS = {"34a": "35a", "34c": "35c", "34d": "35d", "34e": "35e"}
 """Equation numbers of the paper for the shooting method in phase space, by those for Lagrangians."""
 BLOCK_NAMES = {"quadrature": "P", "derivative": "P", "stage": "P", "node": "N", "start": "S", "end": "E", "drift": "P"}
 """Names of the momenta at the points, by group of points."""
+MIDDLE = Symbol("t_middle", real=True)
+"""Time in the middle of a step in :func:`reference_equations`."""
 
 
 def discretised_form(system: MechanicalSystem, method: Method) -> MechanicalSystem:
@@ -82,6 +84,26 @@ def paper_equations(system: MechanicalSystem, method: Method) -> StageSystem:
     return _completed(system, method.paper_form(axial_turns(system)[0]), method, moving=False)
 
 
+def reference_equations(system: MechanicalSystem, method: Method) -> StageSystem:
+    """Return the paper's equations of the compiled step: in the moving frame of bodies those for K(Z, t).
+
+    ``MIDDLE`` is the time t0 + h/2 at which the moving frame is that at rest.
+    """
+    if not in_moving_frame(system, method):
+        return paper_equations(system, method)
+    (core, turns), potential = axial_turns(system), frame_potential(system)
+    assert isinstance(core, HamiltonianSystem)
+    assert potential is not None
+    u = [(system.time - MIDDLE) * p for p in core.momenta]
+    framed = replace(
+        core,
+        hamiltonian=potential.xreplace(_into_frame(turns, core.coordinates, u)),
+        parameters=(*core.parameters, MIDDLE),
+        defaults=(*core.defaults, 0.0),
+    )
+    return _between_rotations(core, with_auxiliaries(framed, method.paper_form(framed)), turns)
+
+
 def in_moving_frame(system: MechanicalSystem, method: Method) -> bool:
     """Return whether the method is applied in the moving frame of bodies: its points determine the momenta."""
     core = axial_turns(system)[0]
@@ -96,8 +118,19 @@ def _completed(system: MechanicalSystem, stages: StageSystem, method: Method, *,
     completed = replace(completed, damping=system.damping)
     if potential is None or not moving:
         return _rotated(system, completed, turns, Turn.rotation) if turns else completed
-    completed = _rotated(system, _framed(system, completed, turns, potential), turns, Turn.free_rotation, first=True)
-    return _rotated(system, completed, turns, Turn.free_rotation, Turn.rotation)
+    return _between_rotations(system, _framed(system, completed, turns, potential), turns)
+
+
+def _between_rotations(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn]) -> StageSystem:
+    """Return equations in the moving frame as those of a step that begins and ends at rest."""
+    stages = _rotated(system, stages, turns, Turn.free_rotation, first=True)
+    return _rotated(system, stages, turns, Turn.free_rotation, Turn.rotation)
+
+
+def _into_frame(turns: Sequence[Turn], q: Sequence[Expr], u: Sequence[Expr]) -> dict[Expr, Expr]:
+    """Return the coordinates after the free rotation by u = tau p, as functions of those in the moving frame."""
+    moved = map(Add, q, rotated(turns, q, [2 * x for x in u], Turn.free_rotation)[0])
+    return dict(zip(q, map(intermediate, moved), strict=True))
 
 
 def _symbols(name: str, system: MechanicalSystem) -> tuple[Symbol, ...]:
@@ -107,8 +140,7 @@ def _symbols(name: str, system: MechanicalSystem) -> tuple[Symbol, ...]:
 def _framed(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn], potential: Expr) -> StageSystem:
     """Return the equations of W(Q, u_n), u_n = (c_n - 1/2) h P_n, in place of H: in the moving frame."""
     q, u, (group,) = system.coordinates, _symbols("turn", system), stages.stage_groups
-    moved = map(Add, q, rotated(turns, q, [2 * x for x in u], Turn.free_rotation)[0])
-    W = potential.xreplace(dict(zip(q, map(intermediate, moved), strict=True)))
+    W = potential.xreplace(_into_frame(turns, q, u))
     velocity, push = (tuple(-x for x in gradient_tuple(W, variables)) for variables in (u, q))
     *others, at, (force, momentum, rate) = *group.gathers, group.scatters
     tau = [c - mp.mpf(1) / 2 for c in group.abscissae]
@@ -279,7 +311,6 @@ def _extended(
 
 
 def _diagonal(blocks: Sequence[Matrix]) -> Matrix:
-    """Return the block diagonal matrix."""
     size, offset = sum(map(len, blocks)), 0
     lines: list[Vector] = []
     for block in blocks:

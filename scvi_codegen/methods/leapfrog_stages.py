@@ -69,8 +69,12 @@ def _rotating_group(split: KineticSplitting, moving: Vector) -> StageGroup:
             Gather(arguments=v, table=Table.joined(last, durations, none), power=0),
         ),
         scatters=(
-            Scatter(results=tuple(moved[i] - q[i] - v[i] for i in m), table=Table.joined(rates, none, last), power=-1),
-            Scatter(results=tuple(turned[i] - u[i] for i in m), table=Table.joined(none, later), power=-1),
+            Scatter(
+                results=tuple(x - y for x, y in zip(moved, v, strict=True)),
+                table=Table.joined(rates, none, last),
+                power=-1,
+            ),
+            Scatter(results=tuple(turned), table=Table.joined(none, later), power=-1),
             Scatter(results=u, table=Table.joined(none, rates, last), power=-1),
         ),
         computes="Changes of q and u by the flow of the kinetic energy, less v, and u",

@@ -190,7 +190,6 @@ class NodalMethod(Method):
 
 
 def _resolved(value: object, kind: type[Kind], by_name: Callable[[str], Kind], what: str, example: str) -> Kind:
-    """Return an object of a kind, or the one of a name."""
     found = by_name(value) if isinstance(value, str) else value
     if not isinstance(found, kind):
         raise MethodError(f"{what} {kind.__name__}, or a name such as '{example}', not {found!r}")

@@ -182,7 +182,6 @@ class SCVI(NodalMethod):
 
     @property
     def _line(self) -> SVI:
-        """Equivalent SVI for degree 1."""
         return SVI(1, self.rule, self.node_set)
 
     def stage_system(self, system: MechanicalSystem) -> StageSystem:

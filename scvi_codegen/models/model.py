@@ -19,8 +19,9 @@ from scvi_codegen.mechanics.first_order import FirstOrderSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import Method, as_method
 from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.models.options import STATE, real
 from scvi_codegen.models.problems import Problem
-from scvi_codegen.models.time_span import TimeSpan, check_length, check_one_of, real
+from scvi_codegen.models.time_span import TIME_FIELDS, TimeSpan, check_length, check_one_of
 from scvi_codegen.representation import summary
 from scvi_codegen.validation import check_kind
 
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
 
 DEFAULT_METHOD = SVI(8)
 """Default method for the problems of the catalogue."""
-STATE = ("q", "p", "velocity")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -63,7 +63,7 @@ class Model(TimeSpan):
         fields: arrays of parameters by name, for array sizes known at run time; others keep their default value.
         tables: index tables of shape (rows, columns) by name, for array sizes known at run time.
         events: zero crossings that runs record, which may change the state.
-        mesh: of the fields of a density with known sizes.
+        mesh: of the fields of a density.
 
     Raises:
         ModelFileError: naming the field, unless exactly one of p and velocity, at most one of h, tolerance and error,
@@ -88,6 +88,8 @@ class Model(TimeSpan):
     def __post_init__(self) -> None:
         check_kind(SYSTEM_OR_ARRAYS, self.system, "system", ModelFileError)
         arrays = self.array_system
+        if arrays is not None and self.mesh is None:
+            object.__setattr__(self, "mesh", arrays.mesh)
         object.__setattr__(self, "method", as_method(self.method, one_coordinate(arrays) if arrays else self.system))
         if isinstance(self.system, FirstOrderSystem) and self.p is self.velocity is None:
             for name, half in zip(("q", "p"), self.system.halves(self.q), strict=True):
@@ -95,7 +97,7 @@ class Model(TimeSpan):
         if arrays is None:
             self._take_attitudes()
             check_one_of("p", self.p, "velocity (q_dot)", self.velocity)
-            for name in STATE:
+            for name in STATE.values():
                 if (vector := getattr(self, name)) is not None:
                     object.__setattr__(self, name, self._vector(name, vector))
         else:
@@ -108,7 +110,7 @@ class Model(TimeSpan):
                 f"the reversible controller of the time transformation {self.time_transformation} requires a time "
                 "span (give span, not steps), and a system without a time transformation"
             )
-        self._check_time_span(has_time_transformation=self.has_time_transformation)
+        self._check_time_span()
         if self.inputs:
             from scvi_codegen.models.model_files.input_tables import checked_tables  # not needed for reading a model
 
@@ -124,7 +126,7 @@ class Model(TimeSpan):
             state = state_by_name(self.system, self.q, self.p, self.velocity)
         except StateError as error:
             raise ModelFileError(str(error)) from error
-        for name, vector in zip(STATE, state, strict=True):
+        for name, vector in zip(STATE.values(), state, strict=True):
             object.__setattr__(self, name, vector)
 
     def _check_arrays(self) -> None:
@@ -194,7 +196,7 @@ class Model(TimeSpan):
         if (system := self.array_system) is None:
             return self
         known = unroll_sums(system, self.sizes, tables=self.tables, parameters=self.fields)
-        vectors = {name: getattr(self, name) for name in STATE if getattr(self, name) is not None}
+        vectors = {name: getattr(self, name) for name in STATE.values() if getattr(self, name) is not None}
         if not system.rotations:
             order = [array.name for array in system.coordinates]
             vectors = {key: [x for name in order for x in np.ravel(each[name])] for key, each in vectors.items()}
@@ -243,7 +245,7 @@ class Model(TimeSpan):
         stepper = compile_stepper(
             self.system, self.method, solver=self.solver, time_transformation=self.time_transformation
         )
-        if self.mesh is not None:
+        if self.mesh is not None and stepper.interface.layout.mesh is None:
             stepper.interface = replace(stepper.interface, layout=replace(stepper.interface.layout, mesh=self.mesh))
         return stepper.with_events(self.events) if self.events else stepper
 
@@ -258,7 +260,7 @@ class Model(TimeSpan):
         """Return the arguments of :meth:`Stepper.start` for the initial state: q, p or velocity, t, and tables."""
         if self.array_system is None:
             return {"q": self.q, "p": self.momenta(stepper), "t": self.t}
-        return {"t": self.t, "tables": self.tables, **{name: getattr(self, name) for name in STATE}}
+        return {"t": self.t, "tables": self.tables, **{name: getattr(self, name) for name in STATE.values()}}
 
     def parameters_at_start(self, stepper: Stepper) -> Mapping[str, Any] | Array:
         """Return the initial parameters, including components of inputs if these are given."""
@@ -325,7 +327,11 @@ class Model(TimeSpan):
         """
         stepper = stepper or self.stepper()
         state, h, common = self.initial_state(stepper), self.h, self._common(options, threads)
-        if h is None and self.has_time_transformation:
+        tolerance = self.tolerance
+        if self.error is not None:
+            steps = self.confirmed(stepper, options=options, threads=threads).steps
+            h, tolerance = steps.get("h"), steps.get("tolerance")
+        elif h is None and self.has_time_transformation:
             from scvi_codegen.runtime.run.largest_step import largest_step  # imported here: not needed for reading
 
             if self.system.inputs:
@@ -335,9 +341,6 @@ class Model(TimeSpan):
             arguments: dict[str, Any] = {"t": self.t, "parameters": self.parameters, "options": options}
             h = largest_step(stepper, self.q, state["p"], self.covered, self.tolerance or 0.0, **arguments)
         to_end = h is None or self.time_transformation is not None
-        tolerance = self.tolerance
-        if self.error is not None:
-            tolerance = self.confirmed(stepper, options=options, threads=threads).local_tolerance
         return stepper.start(
             **state,
             h=abs(h) if h is not None and to_end else h,
@@ -350,9 +353,9 @@ class Model(TimeSpan):
     def confirmed(
         self, stepper: Stepper, *, options: SolverOptions | None = None, threads: int | None = None
     ) -> GlobalError:
-        """Return the local tolerance for :attr:`error`, confirmed by runs with other tolerances.
+        """Return the local tolerance (or step of tau) for :attr:`error`, confirmed by runs with other steps.
 
-        Steps with that tolerance are bitwise equal to those that were confirmed.
+        A run with it is bitwise equal to the one that was confirmed.
         """
         arguments = {**self.initial_state(stepper), **self._common(options, threads), "parameters": self.parameters}
         if self.system.inputs:
@@ -363,18 +366,21 @@ class Model(TimeSpan):
 
     def integrate(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> Trajectory:
         """Integrate over the whole span; raises as :meth:`Stepper.integrate`."""
-        stepper, h = self.stepper(), self.h
-        if h is None and self.has_time_transformation:
-            h = self.start(stepper).h
-        arguments = {**self.initial_state(stepper), **self._common(None, threads), "parameters": self.parameters}
+        stepper, arguments = self.stepper(), self._run_arguments()
+        if self.h is None and self.has_time_transformation and self.error is None:
+            arguments |= {"h": self.start(stepper).h, "tolerance": None}
+        arguments |= {**self.initial_state(stepper), **self._common(None, threads), "parameters": self.parameters}
+        trajectory: Trajectory = stepper.integrate(**arguments, progress=progress)
+        return trajectory
+
+    def _run_arguments(self) -> dict[str, Any]:
+        """Return the arguments of :meth:`Stepper.integrate` and ensembles for time, steps, saved states and inputs."""
+        arguments = {option.field: getattr(self, option.field) for option in TIME_FIELDS if option.field != "span"}
         if self.system.inputs:
             arguments["inputs"] = self.all_inputs()
-        if h is None:
-            arguments |= {"tolerance": self.tolerance} if self.error is None else {"error": self.error}
-        to_end = self.ends_at_time or self.has_shorter_last_step
-        arguments |= {"t_end": self.t + self.covered} if to_end else {"steps": self.step_count}
-        trajectory: Trajectory = stepper.integrate(**arguments, h=h, save_every=self.save_every, progress=progress)
-        return trajectory
+        if self.ends_at_time or self.has_shorter_last_step or (self.system.inputs and self.span is not None):
+            return arguments | {"t_end": self.t + self.covered, "steps": None}
+        return arguments | {"steps": self.step_count}
 
     def _common(self, options: SolverOptions | None, threads: int | None) -> dict[str, Any]:
         if threads is not None and self.array_system is None:

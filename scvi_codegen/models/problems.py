@@ -68,7 +68,6 @@ class Problem:
 
 
 def _entry(name: str) -> Problem:
-    """Return a problem of the table."""
     fields: dict[str, Any] = dict(_TABLE[name])
     definition = fields.pop("system", None)
     fields |= {key: tuple(fields[key]) for key in ("q", "velocity", "p") if key in fields}

@@ -3,11 +3,12 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from numbers import Real
-from typing import Any
 
 from scvi_codegen.errors import MethodWarning, ModelFileError, warn
-from scvi_codegen.validation import LARGEST_COUNT, check_tolerance, checked_count
+from scvi_codegen.models.options import FIELDS, STATE
+from scvi_codegen.validation import LARGEST_COUNT, check_tolerance
+
+TIME_FIELDS = tuple(option for option in FIELDS if option.key not in STATE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -20,7 +21,7 @@ class TimeSpan:
         tolerance: relative error allowed to each adaptive step, below 1, or ``None`` for round-off. With a time
             transformation, :func:`largest_step` chooses the step size in tau for it.
         error: instead of both, bound of the relative global error of all states: runs choose their local tolerance as
-            ``integrate(error=)`` does, and warn if the bound is not confirmed. Requires adaptive steps.
+            ``integrate(error=)`` does, and warn if the bound is not confirmed.
         span: time span, positive, or ``None`` if ``steps`` is given. With adaptive steps negative for a run backward.
         steps: number of fixed steps, or ``None`` if ``span`` is given.
         save_every: stride of saved states, in steps.
@@ -38,21 +39,18 @@ class TimeSpan:
     t: float = 0.0
     time_transformation: str | None = None
 
-    def _check_time_span(self, *, has_time_transformation: bool) -> None:
+    def _check_time_span(self) -> None:
         """Raise :class:`ModelFileError`, naming the field, for invalid values, and convert the others."""
         check_at_most_one(self.h, self.tolerance, self.error)
         check_one_of("span", self.span, "steps", self.steps)
-        for name in ("h", "tolerance", "error", "t", "span"):
-            if (value := getattr(self, name)) is not None:
-                object.__setattr__(self, name, real(value, name))
+        for option in TIME_FIELDS:
+            if (value := getattr(self, option.field)) is not None:
+                object.__setattr__(self, option.field, option.read(value, option.field))
         if self.h is None:
             check_adaptive(self.tolerance, self.span)
-            check_error(self.error, has_time_transformation=has_time_transformation)
+            check_error(self.error)
         else:
             check_step(self.h, self.span)
-        for name, least in (("steps", 0), ("save_every", 1)):
-            if (count := getattr(self, name)) is not None:
-                object.__setattr__(self, name, checked_count(count, name, least=least, error=ModelFileError))
 
     @property
     def ends_at_time(self) -> bool:
@@ -170,31 +168,13 @@ def check_at_most_one(h: float | None, tolerance: float | None, error: float | N
         )
 
 
-def check_error(error: float | None, *, has_time_transformation: bool) -> None:
-    """Raise an error for an invalid bound of the global error, and for one with a time transformation."""
+def check_error(error: float | None) -> None:
+    """Raise an error for an invalid bound of the global error."""
     if error is not None and not 0.0 < error < 1.0:
         raise ModelFileError(f"error is {error:g}: the bound of the relative global error must be between 0 and 1")
-    if error is not None and has_time_transformation:
-        raise ModelFileError(
-            f"error = {error:g} requires adaptive steps, but a time transformation has fixed steps in "
-            "tau: give tolerance or step instead"
-        )
 
 
 def check_one_of(one: str, first: object, other: str, second: object) -> None:
     """Raise an error unless exactly one of two fields is given."""
     if (first is None) == (second is None):
         raise ModelFileError(f"give exactly one of {one} and {other}")
-
-
-def real(value: Any, where: str) -> float:
-    """Return a finite number, or raise an error that begins with ``where``."""
-    if isinstance(value, bool) or not isinstance(value, Real):
-        raise ModelFileError(f"{where} must be a number, not {value!r}")
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise ModelFileError(f"{where} is {number}: it must be a finite number")
-    return number

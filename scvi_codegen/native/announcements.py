@@ -21,7 +21,6 @@ def _print(what: str) -> None:
 
 
 def _print_on_terminal(what: str) -> None:
-    """Print a line on stderr if it is a terminal."""
     if sys.stderr is not None and sys.stderr.isatty():
         _print(what)
 

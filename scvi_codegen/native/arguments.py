@@ -2,6 +2,7 @@
 
 import math
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,12 +42,26 @@ def real_array(value: ArrayLike, name: str) -> NDArray[np.float64]:
 
 
 def _shown(value: Any, kind: np.dtype[Any] | None = None) -> str:
-    """Return a value, or its beginning, with the kind of its entries; for text with the advice to remove the quotes."""
+    """Return a value, or its beginning, with the kind of its entries; for text with advice."""
     shown_value = repr(value)
     shown_value = shown_value if len(shown_value) <= LONGEST_SHOWN else f"{shown_value[:LONGEST_SHOWN]} .."
     if kind is None:
         return shown_value
-    return f"text: {shown_value}, write it without quotes" if kind.kind in "US" else f"{kind.name}: {shown_value}"
+    if kind.kind not in "US":
+        return f"{kind.name}: {shown_value}"
+    return f"text: {shown_value}, {_advice_for_text(np.asarray(value).ravel().tolist())}"
+
+
+def _advice_for_text(entries: list[Any]) -> str:
+    """Return the advice to remove the quotes of numbers, to read a file, or to give values."""
+    try:
+        for entry in entries:
+            float(entry)
+    except ValueError:
+        if len(entries) == 1 and Path(str(entries[0])).suffix:
+            return f"read the file first, as by numpy.loadtxt({entries[0]!r}, delimiter=',', skiprows=1)"
+        return "give numbers"
+    return "write it without quotes"
 
 
 def empty_array(shape: tuple[int, ...]) -> NDArray[np.float64]:

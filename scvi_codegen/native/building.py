@@ -176,7 +176,6 @@ def _binding(entry: Path) -> Path:
 
 
 def _checksum(entry: Path) -> str:
-    """Return the checksum of the library and its binding."""
     return hashlib.sha256(_library(entry).read_bytes() + _binding(entry).read_bytes()).hexdigest()
 
 
@@ -279,7 +278,10 @@ def _write_binding(declarations: str, folder: Path) -> None:
     from cffi.recompiler import make_py_source  # called by FFI.emit_python_code, without its message on stdout
 
     binding = FFI()
-    binding.cdef(declarations)
+    try:
+        binding.cdef(declarations)
+    except Exception as error:  # of the parser, of many types: the declarations come from a generated folder
+        raise BuildError(f"the declarations of the C code cannot be read: {error}") from error
     binding.set_source(folder.name, None)
     make_py_source(binding, folder.name, str(_binding(folder)), verbose=False)
 

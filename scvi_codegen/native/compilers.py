@@ -179,7 +179,6 @@ def compiler_version(compiler: tuple[str, ...]) -> str:
 
 
 def _version_output(compiler: tuple[str, ...]) -> str:
-    """Return the version that the compiler prints."""
     settings: dict[str, Any] = {"capture_output": True, "text": True, "errors": "replace", "timeout": 60}
     try:
         return str(subprocess.run([*compiler, "--version"], check=False, **settings).stdout)

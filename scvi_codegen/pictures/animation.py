@@ -8,9 +8,11 @@ from __future__ import annotations
 import math
 import os
 import re
+import sys
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +23,20 @@ from scvi_codegen.files.atomic import replaced
 from scvi_codegen.mechanics.symmetry.sampling import bodies
 from scvi_codegen.pictures.arrays import array_values, mesh_of
 from scvi_codegen.pictures.attitudes import solids
-from scvi_codegen.pictures.canvas import COLORS, MOTION, Array, DrawnMotion, check_plot_path, color, plain, style
+from scvi_codegen.pictures.canvas import (
+    COLORS,
+    MOTIONS,
+    Array,
+    DrawnMotion,
+    Motions,
+    at_times,
+    check_plot_path,
+    color,
+    plain,
+    several,
+    style,
+)
+from scvi_codegen.pictures.robots import links_of, skeleton
 from scvi_codegen.representation import summary
 from scvi_codegen.validation import REAL, checks_arguments
 
@@ -45,6 +60,7 @@ class MovingPoints:
         points: function from q and p (n, m) to (n, k, d) positions of k points in the plane or in space.
         joined: draw a line through the points of a state.
         solids: slices of points that a line joins each, or none.
+        joints: mark the points of solids.
         trails: indices of the points whose paths are drawn.
         labels: labels of the d axes.
         names: names of the points, or none.
@@ -55,6 +71,7 @@ class MovingPoints:
     labels: tuple[str, ...]
     joined: bool = False
     solids: tuple[slice, ...] = ()
+    joints: bool = False
     trails: tuple[int, ...] = ()
     names: tuple[str, ...] = ()
     equal: bool = True
@@ -80,6 +97,9 @@ def shape_of(motion: DrawnMotion, positions: Callable[[Array], Array] | None = N
             labels=tuple("xyz"[: tried[2]]),
             trails=tuple(range(tried[1])),
         )
+    if links_of(motion):
+        points, parts, tips = skeleton(motion)
+        return MovingPoints(points=lambda q, p: points, labels=tuple("xyz"), solids=parts, trails=tips, joints=True)
     if motion.stepper.interface.rotations:
         return _solids(motion)
     if result := bodies(coordinates):
@@ -192,30 +212,38 @@ FILMS = (".gif", ".html", ".mp4")
 FRAMES_PER_SECOND = 25
 TRAIL = 0.15
 """Duration of a trail relative to the film."""
+STATES_PER_FRAME = 10
+"""Number of states of dense output per frame, for smooth trails."""
+QUIET_SECONDS = 1.0
+"""Time after which the progress of a film is shown on a terminal."""
 TRAIL_POINTS = 400
 MARGIN = 0.06
 SIZE = 4.8
 """Width and height of the figure in inches."""
 
 
-@checks_arguments(trajectory=MOTION, seconds=REAL)
+@checks_arguments(trajectory=MOTIONS, seconds=REAL)
 def animate(
-    trajectory: DrawnMotion,
+    trajectory: Motions,
     path: str | os.PathLike[str] | None = None,
     *,
     seconds: float = 8.0,
     positions: Callable[[Array], Array] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Film:
-    """Animate a trajectory: bodies, pendulums, chains, fields on meshes, or a point in the plane of its coordinates.
+    """Animate trajectories: bodies, pendulums, robots, chains, fields, or a point in the plane of the coordinates.
 
     Bodies are recognised by coordinate names (x, y or sun_x, sun_y, ..), pendulums by their potential energy, with rod
     lengths from parameters named l, or l1, l2, .., for example. Other numbered coordinates are a chain.
 
     Args:
-        trajectory: trajectory to animate; its states at equidistant times are the frames.
+        trajectory: trajectory to animate, or several of the same system, together; states at equidistant times are the
+            frames, of adaptive steps by dense output.
         path: file .gif, .html or .mp4 (with ffmpeg); ``None`` to write none.
         seconds: duration of the animation.
         positions: function from q (n, m) to (n, k, 2) or (n, k, 3) positions of k points, instead of those recognised.
+        progress: function called with the number of frames drawn and that of all; by default they are shown on stderr
+            if that is a terminal and the animation takes more than a second.
 
     Returns:
         The film, which a notebook displays.
@@ -228,7 +256,8 @@ def animate(
         check_plot_path(path, FILMS)
     if not 0.0 < seconds < float("inf"):
         raise StateError(f"seconds must be a positive number, not {seconds!r}")
-    film = Film(trajectory, shape_of(trajectory, positions), float(seconds))
+    film = Film(trajectory, float(seconds), positions, progress or _shown_on_terminal())
+    film.shapes  # noqa: B018  (checks positions)
     if path is not None:
         film.save(path)
     return film
@@ -239,21 +268,39 @@ class Film:
     """Animation, drawn when it is displayed or saved.
 
     Attributes:
-        trajectory: animated trajectory.
-        shape: how a state is drawn.
+        trajectory: animated trajectory, or several.
         seconds: duration.
+        positions, progress: as of :func:`animate`.
     """
 
-    trajectory: DrawnMotion
-    shape: MovingPoints
+    trajectory: Motions
     seconds: float
+    positions: Callable[[Array], Array] | None = None
+    progress: Callable[[int, int], None] | None = None
 
     __repr__ = summary("seconds", "trajectory")
 
     @cached_property
+    def shown(self) -> tuple[DrawnMotion, ...]:
+        """Trajectories with the states that are drawn: all, or those of dense output at common times."""
+        motions = several(self.trajectory)
+        longest = max(motions, key=lambda each: abs(float(each.t[-1] - each.t[0])))
+        common = all(len(each.t) == len(longest.t) and (each.t == longest.t).all() for each in motions)
+        if common and all(plan is None or plan.fixed for plan in (getattr(each, "plan", None) for each in motions)):
+            return tuple(motions)
+        count = max(1, round(self.seconds * FRAMES_PER_SECOND) - 1) * STATES_PER_FRAME + 1
+        times = np.linspace(longest.t[0], longest.t[-1], count)
+        return tuple(at_times(each, times) for each in motions)
+
+    @cached_property
+    def shapes(self) -> tuple[MovingPoints, ...]:
+        """Points, lines and labels that represent the states of each trajectory."""
+        return tuple(shape_of(each, self.positions) for each in self.shown)
+
+    @cached_property
     def frames(self) -> Any:
         """Indices (k,) of the states shown."""
-        times = np.abs(self.trajectory.t - self.trajectory.t[0])
+        times = np.abs(self.shown[0].t - self.shown[0].t[0])
         count = min(len(times), max(1, round(self.seconds * FRAMES_PER_SECOND)))
         return np.searchsorted(times, np.linspace(0.0, times[-1], count) * (1.0 + 1e-12), side="right") - 1
 
@@ -265,12 +312,17 @@ class Film:
 
         with style():
             figure = Figure(figsize=(SIZE, SIZE), layout="constrained")
-            scene = _Scene(figure, self.trajectory, self.shape)
+            scene = _Scene(figure, self.shown, self.shapes, partial(self._report, [0]))
             scene.show(0)
             figure.draw_without_rendering()
             figure.set_layout_engine("none")  # the layout is fixed; recomputing it for every frame is slow
             interval = 1000.0 * self.seconds / len(self.frames)
             return FuncAnimation(figure, scene.show, frames=self.frames, interval=interval, blit=False)
+
+    def _report(self, done: list[int]) -> None:
+        done[0] += 1
+        if self.progress is not None:
+            self.progress(min(done[0], len(self.frames)), len(self.frames))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a file .gif, .html or .mp4 atomically; raises as :func:`animate`."""
@@ -292,12 +344,28 @@ class Film:
         return html
 
 
-class _Scene:
-    """Axes with points, a line through them, and trails, which show one state at a time."""
+def _shown_on_terminal() -> Callable[[int, int], None]:
+    """Return a function that shows the number of frames drawn on stderr, if that is a terminal, after a second."""
+    begin = time.monotonic()
 
-    def __init__(self, figure: Any, motion: DrawnMotion, shape: MovingPoints) -> None:
-        self.motion, self.shape = motion, shape
-        self.drawn_points = shape.points(motion.q, motion.p)
+    def show(done: int, count: int) -> None:
+        if sys.stderr.isatty() and time.monotonic() - begin > QUIET_SECONDS:
+            sys.stderr.write(f"\ranimating: frame {done} of {count}" if done < count else "\r\x1b[K")
+            sys.stderr.flush()
+
+    return show
+
+
+class _Scene:
+    """Axes with points, a line through them, and trails, which show one state of each trajectory at a time."""
+
+    def __init__(
+        self, figure: Any, motions: Sequence[DrawnMotion], shapes: Sequence[MovingPoints], report: Callable[[], None]
+    ) -> None:
+        self.motion, self.shape, self.report = motions[0], shapes[0], report
+        parts = [each.points(motion.q, motion.p) for each, motion in zip(shapes, motions, strict=True)]
+        self.drawn_points = np.concatenate(parts, axis=1)
+        shape, count, alone = shapes[0], parts[0].shape[1], len(motions) == 1
         dimension = self.drawn_points.shape[2]
         self.axes: Axes = figure.add_subplot(projection="3d" if dimension == 3 else None)
         flat = self.drawn_points.reshape(-1, dimension)
@@ -312,34 +380,39 @@ class _Scene:
         if self.shape.equal:
             self.axes.set_aspect("equal")
         nothing: list[list[float]] = [[]] * dimension
-        self.trails = [self.axes.plot(*nothing, color=color(k), linewidth=1.0, alpha=0.5)[0] for k in shape.trails]
-        alone: list[Any] = [slice(None)] if shape.joined else list(range(self.drawn_points.shape[1]))
-        marks = list(shape.solids) or alone
-        names = shape.names or ("",) * len(marks)
+        single = [slice(0, count)] if shape.joined else [slice(k, k + 1) for k in range(count)]
+        marks = list(shape.solids) or single
+        names = shape.names if shape.names and alone else ("",) * len(marks)
         few = len(marks) <= len(COLORS)  # a surface has one colour
-        line = "-" if shape.solids else "o-" if shape.joined else "o"
-        self.marks = [
-            (which, self.axes.plot(*nothing, line, color=color(k * few), markersize=5, linewidth=1.2, label=name)[0])
-            for k, (which, name) in enumerate(zip(marks, names, strict=True))
-        ]
-        if shape.names:
+        line = "o-" if shape.joined or shape.joints else "-" if shape.solids else "o"
+        form = {"markersize": 3 if shape.joints else 5, "linewidth": 1.2}
+        self.trails, self.marks = [], []
+        for number in range(len(motions)):
+            for k in shape.trails:
+                drawn = color(k if alone and not shape.joints else number)
+                trail = self.axes.plot(*nothing, color=drawn, linewidth=1.0, alpha=0.5)[0]
+                self.trails.append((number * count + k, trail))
+            for k, (which, name) in enumerate(zip(marks, names, strict=True)):
+                drawn = color(k * few if alone else number)
+                mark = self.axes.plot(*nothing, line, color=drawn, label=name, **form)[0]
+                self.marks.append((slice(number * count + which.start, number * count + which.stop), mark))
+        if any(names):
             self.axes.legend(loc="upper right", fontsize=8)
 
     def show(self, frame: int) -> list[Any]:
-        """Show the state of a frame, and its trails."""
         first = max(0, frame - round(TRAIL * len(self.drawn_points)))
         rows = np.arange(first, frame + 1)[:: max(1, (frame - first) // TRAIL_POINTS)]
-        for k, trail in zip(self.shape.trails, self.trails, strict=True):
+        for k, trail in self.trails:
             _set(trail, np.concatenate([self.drawn_points[rows, k], self.drawn_points[frame : frame + 1, k]]))
         for which, mark in self.marks:
-            _set(mark, np.atleast_2d(self.drawn_points[frame, which]))
+            _set(mark, self.drawn_points[frame, which])
         interface = self.motion.stepper.interface
         self.axes.set_title(plain(f"{interface.system}, t = {self.motion.t[frame]:.6g}"))
-        return [*self.trails, *(mark for _, mark in self.marks)]
+        self.report()
+        return [line for _, line in (*self.trails, *self.marks)]
 
 
 def _set(line: Any, points: Array) -> None:
-    """Set the points (n, 2) or (n, 3) of a line."""
     if points.shape[1] == 3:
         line.set_data_3d(*points.T)
     else:

@@ -127,6 +127,7 @@ def plot_spectrum(
             modes = axis.modes(np.moveaxis(values[[0, -1]], k + 1, -1)).max(axis=-2)
             for row, line in ((0, ":"), (-1, "-")):
                 spectrum = modes[row].reshape(-1, modes.shape[-1]).max(axis=0)
+                spectrum = np.fmax(spectrum, spectrum[spectrum > 0.0].min(initial=spectrum.max() or 1.0) / 2)
                 label = f"{axis.name}, t = {trajectory.t[row]:g}"
                 drawn.semilogy(np.arange(1, len(spectrum) + 1), spectrum, line, color=color(k), label=label)
         drawn.set(xlabel="number of the mode", ylabel=plain(f"squared amplitude of {name}"))

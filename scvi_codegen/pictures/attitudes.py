@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.pictures.canvas import MOTION, Array, DrawnMotion, color, panel, plain
+from scvi_codegen.pictures.canvas import MOTIONS, Array, DrawnMotion, Motions, color, panel, plain, several, smooth
 from scvi_codegen.validation import CANVAS, WHOLE, checks_arguments
 
 if TYPE_CHECKING:
@@ -33,15 +33,15 @@ def unit_vectors(motion: DrawnMotion, axis: int = 3) -> dict[str, Array]:
     return result
 
 
-@checks_arguments(trajectory=MOTION, axis=WHOLE, ax=CANVAS)
+@checks_arguments(trajectory=MOTIONS, axis=WHOLE, ax=CANVAS)
 def plot_attitude(
-    trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None, *, axis: int = 3, ax: Axes | None = None
+    trajectory: Motions, path: str | os.PathLike[str] | None = None, *, axis: int = 3, ax: Axes | None = None
 ) -> Axes:
     """Draw the path of a body axis of each rotation, and of directions and spins, on the unit sphere.
 
     Args:
-        trajectory: trajectory to draw.
-        path: file for the picture, .png or .svg; ``None`` to write none.
+        trajectory: trajectory to draw, or several of the same system.
+        path: file for the picture, .png, .svg or .pdf; ``None`` to write none.
         axis: number of the body axis, 1 to 3.
         ax: three-dimensional axes to draw on; ``None`` for new ones.
 
@@ -54,8 +54,12 @@ def plot_attitude(
     """
     if axis not in (1, 2, 3):
         raise StateError(f"axis must be 1, 2 or 3, not {axis}")
-    if not (vectors := unit_vectors(trajectory, axis)):
-        raise StateError(f"'{trajectory.stepper.interface.system}' has no rotation, direction or spin to draw")
+    motions = several(trajectory)
+    system = motions[0].stepper.interface.system
+    if not motions[0].stepper.interface.rotations:
+        raise StateError(f"'{system}' has no rotation, direction or spin to draw")
+    curves = [curve for motion in motions for curve in unit_vectors(smooth(motion), axis).items()]
+    names = len(curves) // len(motions)
     with panel(path, ax, (4.8, 4.8), "3d") as drawn:
         for latitude in np.deg2rad(np.arange(-60, 90, 30)):
             radius, height = np.cos(latitude), np.full(len(CIRCLE), np.sin(latitude))
@@ -65,20 +69,22 @@ def plot_attitude(
             drawn.plot(
                 across * np.cos(longitude), across * np.sin(longitude), np.sin(CIRCLE), color="0.85", linewidth=0.5
             )
-        for number, (label, curve) in enumerate(vectors.items()):
-            drawn.plot(*curve.T, color=color(number), linewidth=0.9, label=plain(label))
+        for number, (label, curve) in enumerate(curves):
+            shown = plain(label) if number < names else None
+            drawn.plot(*curve.T, color=color(number), linewidth=0.9, label=shown)
             drawn.plot(*curve[-1:].T, "o", color=color(number), markersize=4)
-        drawn.set(xlabel="x", ylabel="y", zlabel="z", title=plain(trajectory.stepper.interface.system))
+        drawn.set(xlabel="x", ylabel="y", zlabel="z", title=plain(system))
         drawn.set_aspect("equal")
         drawn.legend(loc="upper right", fontsize=8)
     return drawn
 
 
-def draw_unit_vectors(axes: Axes, motion: DrawnMotion, plane: tuple[int, int]) -> None:
+def draw_unit_vectors(axes: Axes, motion: DrawnMotion, plane: tuple[int, int], which: int | None = None) -> None:
     """Draw the projections of body axes, directions and spins to a plane of space, in the unit circle."""
     axes.plot(np.cos(CIRCLE), np.sin(CIRCLE), color="0.7", linewidth=0.6)
     for number, (label, curve) in enumerate(unit_vectors(motion).items()):
-        axes.plot(*curve[:, plane].T, color=color(number), linewidth=0.8, label=plain(label))
+        drawn, shown = (number, plain(label)) if which is None else (which, None if which else plain(label))
+        axes.plot(*curve[:, plane].T, color=color(drawn), linewidth=0.8, label=shown)
     axes.set(xlabel="xyz"[plane[0]], ylabel="xyz"[plane[1]], title="body axes")
     axes.legend(fontsize=8)
     axes.set_aspect("equal")

@@ -9,13 +9,14 @@ import importlib.util
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import PlotError, StateError
+from scvi_codegen.errors import PlotError, StateError, StepFailedError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.validation import ArgumentType
 
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
     from scvi_codegen.rendering.source import Interface
 
-PICTURES = (".png", ".svg")
+PICTURES = (".png", ".svg", ".pdf")
 COLORS = ("#1f5fa8", "#d1495b", "#2e8b57", "#b8860b", "#7a4fa3", "#2b8c9e", "#8c564b", "#555555")
 STYLE = {
     "font.size": 10,
@@ -104,9 +105,9 @@ def save(figure: Any, path: str | os.PathLike[str]) -> None:
 
 
 def write_figure(figure: Any, file: IO[bytes], kind: str) -> None:
-    """Write a figure in a format, ``"svg"`` or ``"png"``; equal figures give equal bytes."""
-    metadata = {"Date": None} if kind == "svg" else {"Software": None}
-    figure.savefig(file, format=kind, dpi=150, metadata=metadata)
+    """Write a figure in a format, ``"svg"``, ``"pdf"`` or ``"png"``; equal figures give equal bytes."""
+    undated = {"svg": "Date", "pdf": "CreationDate", "png": "Software"}
+    figure.savefig(file, format=kind, dpi=150, metadata={undated[kind]: None})
 
 
 def color(number: int) -> str:
@@ -198,6 +199,38 @@ def several(motions: Drawn | Sequence[Drawn]) -> Sequence[Drawn]:
     if not result:
         raise StateError("there is no trajectory to draw")
     return result
+
+
+SMOOTH = 2000
+"""Number of points of a curve up to which states between adaptive steps are added."""
+MOST_NUMBERS = 4_000_000
+"""Largest number of coordinates of all points of such a curve."""
+
+
+def smooth(motion: Any) -> Any:
+    """Return a trajectory of adaptive steps with states between its saved ones, by dense output; others as they are."""
+    plan, n = getattr(motion, "plan", None), len(motion.t)
+    if plan is None or (plan.fixed and motion.tau is None) or motion.observed is not None or n < 2:
+        return motion
+    parts = min(64, SMOOTH // (n - 1), MOST_NUMBERS // motion.q.size)
+    return (
+        motion
+        if parts < 2
+        else at_times(motion, np.interp(np.arange(n * parts - parts + 1) / parts, range(n), motion.t))
+    )
+
+
+def at_times(motion: Any, times: Array) -> Any:
+    """Return a trajectory with the states at times, by dense output, else the saved states before them."""
+    inside = np.clip(times, *sorted((motion.t[0], motion.t[-1])))
+    try:
+        q, p = motion.at(inside)
+    except (AttributeError, StateError, StepFailedError):  # a recording, or states within steps
+        ahead = np.sign(motion.t[-1] - motion.t[0])
+        rows = np.searchsorted(ahead * motion.t, ahead * inside, side="right") - 1
+        q, p = (motion.stepper.named(np.asarray(each)[rows]) for each in (motion.q, motion.p))
+    unknown = {"iterations": np.zeros(len(q), np.int32), "step_sizes": np.full(len(q), np.nan), "tau": None}
+    return replace(motion, t=times, q=q, p=p, **unknown, pieces=(), observed=None, conserved=None)
 
 
 def column(interface: Interface, states: Any, name: str) -> Array:

@@ -10,17 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.pictures.canvas import (
-    HISTORIES,
-    MOTION,
-    Array,
-    DrawnMotion,
-    EnergyHistory,
-    color,
-    panel,
-    plain,
-    several,
-)
+from scvi_codegen.files.energy import energy_account
+from scvi_codegen.pictures.canvas import HISTORIES, MOTIONS, Array, EnergyHistory, Motions, color, panel, plain, several
 from scvi_codegen.validation import CANVAS, checks_arguments
 
 if TYPE_CHECKING:
@@ -44,7 +35,7 @@ class ResidualPlot:
     names: tuple[str, ...]
 
     def __call__(self, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
-        """Draw on the axes ``ax`` or on new ones; write a .png or .svg if a path is passed."""
+        """Draw on the axes ``ax`` or on new ones; write a .png, .svg or .pdf if a path is passed."""
         with panel(path, ax) as drawn:
             curves = zip(self.names, self.residuals.T, self.deviations, strict=True)
             for number, (name, column, deviation) in enumerate(curves):
@@ -57,6 +48,8 @@ class ResidualPlot:
 
 
 BINS = 600
+LOWEST = 1e-16
+"""Error drawn on a logarithmic axis if all are 0."""
 
 
 @checks_arguments(trajectories=HISTORIES, ax=CANVAS)
@@ -68,6 +61,9 @@ def plot_energy(
 ) -> Axes:
     """Draw the energy error ``|H - H_0| / |H_0|`` over time (absolute if H_0 = 0), a colour a trajectory.
 
+    Where forces, damping or impacts change the energy it is that of the balance E - E0 - W, if W is known; otherwise
+    the change of the energy is drawn. The title says which.
+
     Args:
         trajectories: one or several trajectories, also of array systems.
         path, ax: as of :func:`~scvi_codegen.pictures.overview.plot_motion`.
@@ -78,48 +74,43 @@ def plot_energy(
     with panel(path, ax) as drawn:
         draw_energy_error(drawn, several(trajectories)[0])
         for number, motion in enumerate(several(trajectories)[1:], 1):
-            _draw_error(drawn, motion.t, _energy_error(motion)[0], number)
+            account = energy_account(motion, limited=True)
+            _draw_error(drawn, motion.t, np.abs(account.values) / account.scale, number)
     return drawn
 
 
-@checks_arguments(trajectory=MOTION, ax=CANVAS)
+@checks_arguments(trajectory=MOTIONS, ax=CANVAS)
 def plot_momentum_maps(
-    trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None
+    trajectory: Motions, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None
 ) -> Axes:
     """Draw the change of each momentum map over time, relative to the largest size of its terms.
 
     Args:
-        trajectory: trajectory of a system with symmetries.
+        trajectory: trajectory of a system with symmetries, or several.
         path, ax: as of :func:`~scvi_codegen.pictures.overview.plot_motion`.
 
     Raises:
         StateError, PlotError: as :func:`~scvi_codegen.pictures.overview.plot_motion`; StateError without a symmetry.
     """
-    names = trajectory.stepper.interface.map_names
-    if not names:
-        raise StateError(
-            f"'{trajectory.stepper.interface.system}' has no known symmetry, and therefore no momentum maps"
-        )
-    errors = np.abs(trajectory.momentum_errors())
+    motions = several(trajectory)
+    interface = motions[0].stepper.interface
+    if not interface.map_names:
+        raise StateError(f"'{interface.system}' has no known symmetry, and therefore no momentum maps")
     with panel(path, ax) as drawn:
-        for number, name in enumerate(names):
-            _draw_error(drawn, trajectory.t, errors[:, number], number, name)
+        for which, motion in enumerate(motions):
+            errors = np.abs(motion.momentum_errors())
+            for number, name in enumerate(interface.map_names):
+                _draw_error(drawn, motion.t, errors[:, number], number, None if which else name)
         drawn.set(xlabel="t", title="relative change of momentum maps")
         drawn.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, fontsize=8)
     return drawn
 
 
 def draw_energy_error(axes: Axes, motion: EnergyHistory) -> None:
-    """Draw the energy error of one trajectory, with the title."""
-    error, scaled = _energy_error(motion)
-    _draw_error(axes, motion.t, error, 0)
-    axes.set(xlabel="t", title="relative energy error" if scaled else "energy error")
-
-
-def _energy_error(motion: EnergyHistory) -> tuple[Array, bool]:
-    energy = motion.energy()
-    scale = abs(energy[0])
-    return np.abs(energy - energy[0]) / (scale or 1.0), bool(scale)
+    """Draw the energy error, balance or change of one trajectory, with the title."""
+    account = energy_account(motion, limited=True)
+    _draw_error(axes, motion.t, np.abs(account.values) / account.scale, 0)
+    axes.set(xlabel="t", title=account.title)
 
 
 def _draw_error(axes: Axes, t: Array, error: Array, number: int, label: str | None = None) -> None:
@@ -129,15 +120,15 @@ def _draw_error(axes: Axes, t: Array, error: Array, number: int, label: str | No
     axes.set_yscale("log")
     drawn = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in axes.get_lines()])
     positive = drawn[np.isfinite(drawn) & (drawn > 0.0)]
-    if not positive.size:
-        positive = np.array([1e-16])
+    positive = positive if positive.size else np.array([LOWEST])
     low = 10.0 ** np.floor(np.log10(positive.min()) - 0.3)
     axes.set_ylim(low, max(10.0 ** np.ceil(np.log10(positive.max()) + 0.3), 10.0 * low))
 
 
 def largest_in_bins(t: Array, error: Array) -> tuple[Array, Array]:
-    """Return (k,) times and the largest error from each to the next; zeros become NaN for a log axis."""
+    """Return (k,) times and the largest error from each to the next; zeros are half of the smallest positive error."""
     size = max(1, len(t) // BINS)
     starts = np.arange(0, len(t), size)
     largest: Any = np.maximum.reduceat(error, starts)
-    return t[starts], np.where(largest > 0.0, largest, np.nan)
+    positive = largest[largest > 0.0]
+    return t[starts], np.where(largest == 0.0, positive.min() / 2 if positive.size else LOWEST, largest)

@@ -12,7 +12,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from scvi_codegen.pictures.arrays import plot_arrays, plot_spectrum
 from scvi_codegen.pictures.attitudes import draw_unit_vectors, plot_attitude
 from scvi_codegen.pictures.canvas import (
     COLORS,
-    MOTION,
     MOTIONS,
     Array,
     DrawnMotion,
@@ -35,22 +34,24 @@ from scvi_codegen.pictures.canvas import (
     plain,
     save,
     several,
+    smooth,
     style,
 )
-from scvi_codegen.pictures.conserved import draw_energy_error, plot_energy, plot_momentum_maps
+from scvi_codegen.pictures.conserved import plot_energy, plot_momentum_maps
+from scvi_codegen.pictures.robots import draw_robot, links_of
 from scvi_codegen.validation import CANVAS, NAMES, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-@checks_arguments(trajectory=MOTION)
-def plot_trajectory(trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None) -> tuple[Axes, ...]:
+@checks_arguments(trajectory=MOTIONS)
+def plot_trajectory(trajectory: Motions, path: str | os.PathLike[str] | None = None) -> tuple[Axes, ...]:
     """Draw the path of a trajectory on the left, its relative energy error over time on the right.
 
     Args:
-        trajectory: trajectory to draw.
-        path: file for the picture, .png or .svg, written atomically; equal trajectories give equal bytes.
+        trajectory: trajectory to draw, or several of the same system, a colour each.
+        path: file for the picture, .png, .svg or .pdf, written atomically; equal trajectories give equal bytes.
 
     Returns:
         The axes, from left to right.
@@ -61,18 +62,20 @@ def plot_trajectory(trajectory: DrawnMotion, path: str | os.PathLike[str] | None
     """
     if path is not None:
         check_plot_path(path)
-    count = 1 + path_panels(trajectory)
+    motions = several(trajectory)
+    interface, count = motions[0].stepper.interface, 1 + path_panels(motions[0])
     with style():
         figure = new_figure(path, (4.6 * count, 4.4))
-        axes: tuple[Axes, ...] = tuple(figure.subplots(1, count))
-        draw_paths(axes[:-1], trajectory)
-        draw_energy_error(axes[-1], trajectory)
-        named = len(bodies(trajectory.stepper.interface.coordinates))
-        if 1 < named <= len(COLORS):
+        kinds = [_projection(motions[0]), *[None] * (count - 1)]
+        axes = tuple(figure.add_subplot(1, count, k + 1, projection=kind) for k, kind in enumerate(kinds))
+        draw_paths(axes[:-1], motions)
+        plot_energy(motions, ax=axes[-1])
+        named = len(bodies(interface.coordinates))
+        if 1 < named <= len(COLORS) and len(motions) == 1:
             figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=named)
         for each in axes:
             each.locator_params(axis="x", nbins=5)
-        figure.suptitle(plain(trajectory.stepper.interface.title), fontsize=11)
+        figure.suptitle(plain(interface.title), fontsize=11)
         if path is not None:
             save(figure, path)
     return axes
@@ -95,7 +98,7 @@ def plot_section(
 
     Args:
         trajectories: one or several trajectories of the same system, integrated with ``events``.
-        path: file for the picture, .png or .svg; ``None`` to write none.
+        path: file for the picture, .png, .svg or .pdf; ``None`` to write none.
         axes: two names of coordinates or momenta (``p_`` before the coordinate, or as the Hamiltonian names it).
         event: index of the event that defines the surface.
         ax: axes to draw on; ``None`` for new ones.
@@ -133,10 +136,11 @@ Path = str | os.PathLike[str] | None
 class Plots:
     """Pictures of one trajectory: ``run.plot()``, ``run.plot.energy()``, ``run.plot.phase("orbit.png")``.
 
-    Each draws on the axes ``ax`` or on new ones, writes to a .png or .svg if a path is given, and returns the axes.
+    Each draws on the axes ``ax`` or on new ones, writes to a .png, .svg or .pdf if a path is given, and returns the
+    axes. Those of an ensemble draw its trajectories together; ``field`` and ``spectrum`` require a single one.
     """
 
-    trajectory: DrawnMotion = field(repr=False)
+    trajectory: Any = field(repr=False)
 
     def __call__(self, path: Path = None) -> tuple[Axes, ...]:
         """Draw path and energy error, as :func:`scvi_codegen.plot_trajectory`."""
@@ -179,13 +183,15 @@ MAX_POINTS = 20_000
 MAX_CURVES = 6
 
 
-@checks_arguments(trajectory=MOTION, ax=CANVAS)
-def plot_motion(trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
+@checks_arguments(trajectory=MOTIONS, ax=CANVAS)
+def plot_motion(trajectory: Motions, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
     """Draw the path of a trajectory: orbits, a plane of coordinates, a phase plane, or all coordinates over time.
 
+    Between adaptive steps curves are dense output. Robots from files are drawn as links in space, at a few times.
+
     Args:
-        trajectory: trajectory to draw.
-        path: file for the picture, .png or .svg; ``None`` to write none.
+        trajectory: trajectory to draw, or several of the same system, a colour each.
+        path: file for the picture, .png, .svg or .pdf; ``None`` to write none.
         ax: axes to draw on; ``None`` for new ones.
 
     Returns:
@@ -195,8 +201,9 @@ def plot_motion(trajectory: DrawnMotion, path: str | os.PathLike[str] | None = N
         StateError: for another suffix.
         PlotError: without matplotlib.
     """
-    with panel(path, ax) as drawn:
-        draw_paths([drawn], trajectory)
+    motions = several(trajectory)
+    with panel(path, ax, projection=_projection(motions[0])) as drawn:
+        draw_paths([drawn], motions)
     return drawn
 
 
@@ -221,7 +228,7 @@ def plot_phase(
     result = several(trajectories)
     interface = result[0].stepper.interface
     names = axes or (interface.coordinates[0], interface.momenta[0])
-    curves = [[column(interface, motion, name) for name in names] for motion in result]
+    curves = [[column(interface, smooth(motion), name) for name in names] for motion in result]
     with panel(path, ax) as drawn:
         for number, (x, y) in enumerate(curves):
             _draw_curve(drawn, x, y, color(number))
@@ -229,9 +236,15 @@ def plot_phase(
     return drawn
 
 
+def _projection(motion: DrawnMotion) -> str | None:
+    return "3d" if links_of(motion) else None
+
+
 def path_panels(motion: DrawnMotion) -> int:
     """Return the number of panels of a path: two for rotations, motion in space and three to six coordinates."""
     coordinates = motion.stepper.interface.coordinates
+    if links_of(motion):
+        return 1
     if motion.stepper.interface.rotations:
         return 2
     result = bodies(coordinates)
@@ -239,38 +252,47 @@ def path_panels(motion: DrawnMotion) -> int:
     return 2 if spatial or (not result and 3 <= len(coordinates) <= MAX_CURVES) else 1
 
 
-def draw_paths(panels: Sequence[Axes], motion: DrawnMotion) -> None:
-    """Draw the path into the panels.
+def draw_paths(panels: Sequence[Axes], motions: Sequence[DrawnMotion]) -> None:
+    """Draw the paths into the panels.
 
-    One coordinate is drawn in the phase plane, bodies by their orbits, rotations by body axes, a few coordinates in
-    their first planes, many coordinates as one image over time.
+    One coordinate is drawn in the phase plane, bodies by their orbits, robots by their links, rotations by body axes, a
+    few coordinates in their first planes, many coordinates as one image over time (of the first trajectory).
     """
+    for number, motion in enumerate(motions):
+        if number == 0 or path_panels(motion) > 1 or len(motion.stepper.interface.coordinates) <= MAX_CURVES:
+            _draw_path(panels, smooth(motion), number if len(motions) > 1 else None)
+
+
+def _draw_path(panels: Sequence[Axes], motion: DrawnMotion, which: int | None) -> None:
+    """Draw one path, in one colour if it is one of several (``which``)."""
     coordinates = motion.stepper.interface.coordinates
-    result, m = bodies(coordinates), len(coordinates)
-    if motion.stepper.interface.rotations:
+    result, m, first = bodies(coordinates), len(coordinates), which or 0
+    if links_of(motion):
+        draw_robot(panels[0], motion, first)
+    elif motion.stepper.interface.rotations:
         for drawn, plane in zip(panels, combinations(range(3), 2), strict=False):
-            draw_unit_vectors(drawn, motion, plane)
+            draw_unit_vectors(drawn, motion, plane, which)
     elif m == 1:
         interface = motion.stepper.interface
-        _draw_curve(panels[0], motion.q[:, 0], motion.p[:, 0], color(0))
+        _draw_curve(panels[0], motion.q[:, 0], motion.p[:, 0], color(first))
         panels[0].set(xlabel=interface.coordinates[0], ylabel=interface.momenta[0], title="phase plane")
     elif result:
         for drawn, plane in zip(panels, combinations(range(3), 2), strict=False):
             for number, body in enumerate(result):
                 x, y = (motion.q[:, body.columns[index]] for index in plane)
-                _draw_curve(drawn, x, y, color(number), body.name or None)
+                _draw_curve(drawn, x, y, color(number if which is None else which), body.name or None)
             drawn.set(xlabel=AXES[plane[0]], ylabel=AXES[plane[1]], title="orbits" if len(result) > 1 else "orbit")
             drawn.set_aspect("equal", adjustable="datalim")
     elif m <= MAX_CURVES:
         for drawn, plane in zip(panels, combinations(range(m), 2), strict=False):
-            _draw_plane(drawn, motion, plane)
+            _draw_plane(drawn, motion, plane, first)
     else:
         _draw_image(panels[0], motion)
 
 
-def _draw_plane(axes: Axes, motion: DrawnMotion, plane: tuple[int, int]) -> None:
+def _draw_plane(axes: Axes, motion: DrawnMotion, plane: tuple[int, int], number: int) -> None:
     x, y = (motion.q[:, index] for index in plane)
-    _draw_curve(axes, x, y, color(0))
+    _draw_curve(axes, x, y, color(number))
     names = [motion.stepper.interface.coordinates[index] for index in plane]
     axes.set(xlabel=names[0], ylabel=names[1], title="configuration")
     if 0.4 < _extent(x) / max(_extent(y), np.finfo(float).tiny) < 2.5:
@@ -297,21 +319,11 @@ def _extent(values: Array) -> float:
 def _draw_image(axes: Axes, motion: DrawnMotion) -> None:
     """Draw many coordinates as an image: one row each, colour for the value."""
     every = max(1, len(motion.t) // 2000)
-    values = motion.q[::every].T
+    t, values = motion.t[::every], motion.q[::every].T
     largest = float(np.abs(values).max()) or 1.0
-    first, last = sorted((float(motion.t[0]), float(motion.t[-1])))
-    span = (first, last if last > first else first + 1.0, 0.5, values.shape[0] + 0.5)
-    drawn = values if motion.h > 0 else values[:, ::-1]
-    image = axes.imshow(
-        drawn,
-        aspect="auto",
-        origin="lower",
-        extent=span,
-        cmap="RdBu_r",
-        vmin=-largest,
-        vmax=largest,
-        interpolation="none",
-    )
+    edges = np.concatenate([t[:1], (t[1:] + t[:-1]) / 2, t[-1:] + (len(t) == 1)])
+    rows = np.arange(len(values) + 1) + 0.5
+    image = axes.pcolormesh(edges, rows, values, cmap="RdBu_r", vmin=-largest, vmax=largest, rasterized=True)
     axes.grid(visible=False)
     axes.set(xlabel="t", ylabel="coordinate", title="q over time")
     axes.figure.colorbar(image, ax=axes, shrink=0.9)

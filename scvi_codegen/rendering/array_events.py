@@ -41,7 +41,6 @@ class _Entries(Nest):
         self.code, self.within = code, within
 
     def read(self, k: int, slot: Access) -> str:
-        """Return the assignment of an argument."""
         return f"u[{k}] = at->{'qpv'[self.code.moving[slot.array.name][0]]}[{self.place_of(slot)}];"
 
     def place_of(self, access: Access) -> str:
@@ -162,7 +161,6 @@ class ArrayEvents:
         return [*lines, "to->count++;"] if to == NEXT else lines
 
     def _event(self, k: int, event: SearchedEvent) -> dict[str, Any]:
-        """Return the code of an event."""
         self._accesses = list[tuple[Access, tuple[Loop, ...]]]()
         terms = self.terms(event.function, event)
         names = [access.array.name for term in terms for _, access in term.slots]

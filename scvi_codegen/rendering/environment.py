@@ -27,13 +27,11 @@ def _numbers(context: Context, values: Sequence[Number]) -> list[str]:
 
 @pass_context
 def _vector(context: Context, name: str, values: Sequence[Number]) -> str:
-    """Return a table of numbers."""
     return table(f"static const {context['target'].scalar} {name}[{len(values)}]", _numbers(context, values))
 
 
 @pass_context
 def _matrix(context: Context, name: str, rows: Rows) -> str:
-    """Return a table of rows of numbers."""
     size = f"[{len(rows)}][{len(rows[0])}]"
     return table(f"static const {context['target'].scalar} {name}{size}", [_numbers(context, row) for row in rows])
 
@@ -45,7 +43,6 @@ def _rests(context: Context, rows: Rows) -> Rows:
 
 
 def _pairs(name: str, entries: Sequence[tuple[int, int]]) -> str:
-    """Return a table of pairs of indices."""
     return table(f"static const int {name}[{len(entries)}][2]", [f"{{{i}, {j}}}" for i, j in entries])
 
 

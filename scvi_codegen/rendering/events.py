@@ -237,7 +237,6 @@ def _names(interface: Interface) -> dict[str, Symbol]:
 def _expression(
     formula: Formula, names: Mapping[str, Symbol], what: str, read: Callable[[str, Mapping[str, Symbol]], Expr]
 ) -> Expr:
-    """Return one formula in canonical symbols."""
     if isinstance(formula, str | int | float):
         found = read(str(formula), names)
     elif isinstance(formula, Expr):

@@ -74,6 +74,8 @@ class ExampleRun:
         span: of time.
         tolerance: of adaptive steps; with a time transformation the step tau.
         controlled: whether the integrator has adaptive steps or a time transformation.
+        save_every, outputs: steps to an output and number of outputs.
+        last: steps to the last output.
         to_end: whether it continues to the end of the span, in a number of steps of tau that is not known before.
         inputs: of a system that has any, if they are set; ``parameters`` has their values at the start.
         end: of a run with inputs.
@@ -91,6 +93,7 @@ class ExampleRun:
     controlled: bool
     save_every: int
     outputs: int
+    last: int = 0
     to_end: bool = False
     inputs: tuple[ExampleInput, ...] = ()
     end: float = 0.0
@@ -279,7 +282,8 @@ def _context(
 ) -> dict[str, object]:
     kernels = program.kernels if kernels is None else kernels
     fallback, scalars = fallback or ("own" if program.newton else "none"), _scalar_kernels(program, control, kernels)
-    lanes = beside.lane_kernels if beside else ()
+    growth = control.growth if control else None
+    lanes = beside.lane_kernels if beside else (growth.partials, growth.product) if growth else ()
     return {
         "program": program,
         "target": target,
@@ -296,7 +300,7 @@ def _context(
         "unrolled_equations": unrolled_equations(program, target),
         "fallback": fallback,
         **_control_context(program, control),
-        **_lane_context(program, lanes),
+        **_lane_context(program, lanes, changes=beside is not None and bool(lanes)),
     }
 
 
@@ -308,15 +312,22 @@ def _scalar_kernels(
     return (*own, *splitting, *((control.density,) if control and control.density else ()))
 
 
-def _lane_context(program: Program, beside: Sequence[Kernel]) -> dict[str, object]:
-    """Return the template's context for the fixed-point iteration; ``beside``: kernels of its derivative."""
+def _lane_context(program: Program, beside: Sequence[Kernel], *, changes: bool) -> dict[str, object]:
+    """Return the template's context for the fixed-point iteration.
+
+    Args:
+        program: the program.
+        beside: kernels of its derivative.
+        changes: whether tangent and adjoint vectors are propagated, too.
+    """
     fixed_point = program.fixed_point
+    hot_kernels = (fixed_point or program.splitting or program).kernels
+    operations = sum(sum(kernel.operation_counts().values()) for kernel in hot_kernels)
     if fixed_point is None:
-        return {"fixed_point": None}
-    operations = sum(sum(kernel.operation_counts().values()) for kernel in fixed_point.kernels)
+        return {"fixed_point": None, "hot": "static inline" if operations <= LARGEST_INLINED else "static"}
     hot = "static inline __attribute__((always_inline))" if operations <= LARGEST_INLINED else "static"
     kernels = (*fixed_point.kernels, *beside)
-    text = iteration_source(fixed_point, POINTS, kernels=kernels, changes=bool(beside))
+    text = iteration_source(fixed_point, POINTS, kernels=kernels, changes=changes)
     return {"fixed_point": text, "hot": hot}
 
 

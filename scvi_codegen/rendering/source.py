@@ -197,6 +197,7 @@ class ArrayLayout(ArrayDeclarations):
         data: values of fields and tables by name for runs that pass none.
         neighbours: names of the lists of neighbours.
         mesh: of the fields of a density (:class:`~scvi_codegen.fields.mesh.Mesh`).
+        links: of a robot from a file.
     """
 
     field_defaults: tuple[float, ...] = ()
@@ -212,6 +213,7 @@ class ArrayLayout(ArrayDeclarations):
     data: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
     neighbours: tuple[str, ...] = ()
     mesh: Any = field(default=None, compare=False, repr=False)
+    links: tuple[Any, ...] = field(default=(), compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -238,6 +240,8 @@ class Interface:
         energy_parameter: of a time-transformed system, the parameter that is the energy of the initial state, else "".
         time_transformation: time-rescaling function g in dt = g dtau that determines its step sizes, or "".
         conserves_energy: whether energy is a first integral; unknown for folders of version 0.1.
+        changes_energy: reason why it is not conserved; empty if it is, and for folders of version 0.1.
+        balances_energy: whether it changes by the work of forces or damping only.
         arrays: declarations of arrays of known sizes, first those whose entries are the coordinates in order, then
             those whose entries are parameters; none without arrays.
         indices: sizes and index tables of these arrays, ``"N = 3"``, ``"pairs = [[0, 1], [1, 2]]"``.
@@ -248,6 +252,7 @@ class Interface:
         layout: of arrays whose sizes are known at run time; the coordinates are their names.
         variables: of a first-order system all coordinates in the order of the user, half of which are ``coordinates``
             and half of which take the place of momenta; else none.
+        lengths: cutoffs, skins and periods of lists of neighbours, ``"near cutoff 5*s/2"``, which every run checks.
     """
 
     prefix: str
@@ -272,12 +277,15 @@ class Interface:
     constraints: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()
     conserves_energy: bool = False
+    changes_energy: str = ""
+    balances_energy: bool = False
     solver: str = ""
     arrays: tuple[str, ...] = ()
     indices: tuple[str, ...] = ()
     rotations: tuple[str, ...] = ()
     layout: ArrayLayout = ArrayLayout()
     variables: tuple[str, ...] = ()
+    lengths: tuple[str, ...] = ()
 
     @property
     def dimension(self) -> int:

@@ -164,7 +164,6 @@ def over_time(*keys: str, quantity: str, title: str = "", periods: bool = False,
 
 
 def _settings(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, RunSetting]:
-    """Return the settings of the file by name."""
     settings = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MethodWarning)  # SVI with fewer Gauss points than the degree

@@ -215,7 +215,6 @@ class Trigonometric(CurveSpace):
 
 
 def _power_derivative(x: Number, j: int, derivative: int) -> Number:
-    """Return the derivative of x^j, or its integral for -1."""
     if derivative == -1:
         return x ** (j + 1) / (j + 1)
     return mp.ff(j, derivative) * x ** (j - derivative) if derivative <= j else mp.zero
@@ -323,7 +322,6 @@ def _placed(values: Vector, first: int, size: int) -> Vector:
 
 @lru_cache(maxsize=64)
 def _composite(rule: Quadrature, ends: tuple[tuple[Number, Number], ...]) -> Quadrature:
-    """Return the composite rule as one rule on [-1, 1]."""
     points = [2 * (a + (b - a) * c) - 1 for a, b in ends for c in rule.abscissae]
     weights = [2 * (b - a) * w for a, b in ends for w in rule.unit_weights]
     merged: dict[Number, Number] = {}

@@ -128,7 +128,6 @@ def _certificate(
     solver: str,
     tolerance: float | None,
 ) -> Certificate:
-    """Return the certificate of a stepper, measured at a state."""
     flags, watched, stepper = stepper.flags, stepper, stepper.with_events(())
     steps, single = stepper, at_fixed_energy(system, stepper.energy(start.q, start.p, start.t))
     if single is not system or stepper.interface.time_transformation:

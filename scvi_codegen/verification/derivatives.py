@@ -65,7 +65,6 @@ class _Map:
 
     @property
     def arguments(self) -> Array:
-        """Arguments in 60 digits."""
         values = (*self.state.z, *self.parameters, self.state.t, self.state.h)
         return np.array([mp.mpf(float(x)) for x in values], dtype=object)
 

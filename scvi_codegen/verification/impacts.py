@@ -17,22 +17,28 @@ from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.verification.certificate import Check, Finding, checked
 from scvi_codegen.verification.system_under_test import EPSILON, SystemUnderTest, linearised
 
-STEPS, ROUND_OFF = 2000, 64.0 * EPSILON
-"""Number of steps of the run; bound on relative errors of single states."""
+STEPS, ROUND_OFF, ROUNDINGS = 2000, 64.0 * EPSILON, 16.0
+"""Number of steps of the run; bounds on g relative to its terms, and on errors in units of their rounding."""
 DIVISOR, LEAST_REDUCTION = 8.0, 4.0
 """Ratio of two step sizes, and least ratio of the defects of the symplectic form, which are those of the method."""
-REVERSED, REVERSAL = 5, 2.0**12 * EPSILON
-"""Number of impacts that are undone, and the bound on the relative defect."""
+REVERSED = 5
+"""Number of impacts that are undone."""
+WIDTH = 1e-6
+"""Relative width of the differences by which the rounding of a normal is estimated."""
 SPREAD, NOISE = 100.0, 1e-9
 """Bound on deviations from finite differences, in units of their uncertainty, and besides."""
 
 
 class Change(NamedTuple):
-    """Change of the state (q, p): g relative to its terms, n = (g_q, g_t), restitution (NaN of maps)."""
+    """Change of the state (q, p): g relative to its terms, n = (g_q, g_t), restitution (NaN of maps).
+
+    ``rounding`` bounds the change of n by one rounding of each of q, t and n.
+    """
 
     t: float
     residual: float
     normal: Array
+    rounding: Array
     restitution: float
     before: tuple[Array, Array]
     after: tuple[Array, Array]
@@ -82,30 +88,54 @@ def _changes(run: Trajectory) -> list[Change]:
         for t, q, p in zip(crossings.t, np.asarray(crossings.q), np.asarray(crossings.p), strict=True):
             if crossings.event.changes_state and np.count_nonzero(np.abs(times - t) < 1.5 * abs(run.h)) == 1:
                 row, v = int(np.searchsorted(run.t, t, side="right")) - 1, run.stepper.velocity(q, p, t)
-                value, restitution, *normal = map(float, function(*q, *p, *v, t, *run.parameters))
+
+                def evaluated(at: Array, p: Array = p, v: Array = v, function: Any = function) -> Array:
+                    return np.array(function(*at[:-1], *p, *v, at[-1], *run.parameters), dtype=float)
+
+                here = np.append(q, t)
+                value, restitution, *normal = evaluated(here)
+                moved = (evaluated(here + width) for width in np.diag(WIDTH * here))
+                rounding = sum((np.abs(each[2:] - normal) for each in moved), WIDTH * np.abs(normal)) * EPSILON / WIDTH
                 size = np.abs(normal) @ np.append(np.abs(q) + np.abs(v * run.h), abs(t) + abs(run.h))
                 after = np.asarray(run.q)[row], np.asarray(run.p)[row]
-                changes.append(Change(t, abs(value) / size, np.array(normal), restitution, (q, p), after))
+                changes.append(Change(t, abs(value) / size, np.array(normal), rounding, restitution, (q, p), after))
     if not changes:
         raise StateError(f"no event alone changes the state within {STEPS} steps: give another state or step size")
     return changes
 
 
 def _impacts(run: Trajectory, changes: list[Change]) -> Finding | None:
-    """Return the largest violation of the equations of an impact, or change of a map that the wall respects."""
+    """Return the largest violation of the equations of an impact, or change of a map that the wall respects.
+
+    Each is in units of its change by one rounding of the momenta before and after, of the normal, of the approach speed
+    v . n + g_t, from which lambda is computed, and of the terms of the energy and of the maps.
+    """
     stepper, at, worst = run.stepper, run.parameters, list[float]()
-    for t, _, normal, e, (q, p), after in (each for each in changes if each.restitution >= 0.0):
-        n, jump = normal[:-1], after[1] - p
-        impulse = 2.0 / (1.0 + e) * (jump @ n) / (n @ n)
-        elastic, size = p + impulse * n, np.abs(impulse * n).max()
-        energies = [stepper.energy(q, x, t, at) for x in (p, elastic)]
-        maps = [stepper.momentum_maps(q, x, t, at) for x in (p, elastic, after[1])]
-        respected = np.abs(maps[1] - maps[0]) <= ROUND_OFF * size * (1.0 + np.abs(q).max())
-        work = abs(impulse) * (np.abs(normal) @ np.append(np.abs(stepper.velocity(q, p, t, at)), 1.0))
-        worst.append(abs(energies[1] - energies[0] + impulse * normal[-1]) / max(work, abs(energies[0])))
-        worst.append(np.abs(jump - 0.5 * (1.0 + e) * impulse * n).max() / np.abs(p).max())
-        worst.append(np.abs(maps[2] - maps[0])[respected].max(initial=0.0) / (size * (1.0 + np.abs(q).max())))
-    return Finding(float(max(worst)), ROUND_OFF, f"relative, {len(worst) // 3} impacts") if worst else None
+    for t, _, normal, rounding, e, (q, p), after in (each for each in changes if each.restitution >= 0.0):
+        n, n_rounding, jump = normal[:-1], rounding[:-1], after[1] - p
+        size, jump_rounding = np.abs(n), EPSILON * (np.abs(p) + np.abs(after[1]))
+        part, square = 0.5 * (1.0 + e), n @ n
+        impulse = jump @ n / square / part
+        elastic, pushed = p + impulse * n, abs(impulse) * size
+        energies, speeds = ([f(q, x, t, at) for x in (p, elastic)] for f in (stepper.energy, stepper.velocity))
+        speed, other = np.abs(speeds[0]), np.abs(speeds[1])
+        turned = n_rounding @ size / square
+        approach = EPSILON * (size @ speed + abs(normal[-1])) + n_rounding @ speed + rounding[-1]
+        of_impulse = (jump_rounding @ size + np.abs(jump) @ n_rounding) / square / part + 2.0 * abs(impulse) * turned
+        of_impulse += EPSILON * abs(impulse) + abs(impulse) * approach / (abs(n @ (speeds[1] - speeds[0])) or 1.0)
+        of_energy = EPSILON * (np.abs(p) @ speed + np.abs(elastic) @ other + sum(map(abs, energies)))
+        of_energy += abs(speeds[1] @ n + normal[-1]) * of_impulse + abs(impulse) * (n_rounding @ other + rounding[-1])
+        worst.append(abs(energies[1] - energies[0] + impulse * normal[-1]) / of_energy)
+        along = jump_rounding + part * (of_impulse * size + abs(impulse) * n_rounding)
+        worst.append(float((np.abs(jump - part * impulse * n) / along).max()))
+        (first, map_sizes), *others = (
+            stepper._momentum_maps_and_sizes(q[np.newaxis], x[np.newaxis], t, at) for x in (p, elastic, after[1])
+        )
+        changed = [np.abs(maps - first)[0] for maps, _ in others]
+        of_maps = (EPSILON * (map_sizes + others[0][1]))[0] + (along + EPSILON * pushed).max() * (1.0 + np.abs(q).max())
+        respected = changed[0] <= ROUNDINGS * of_maps
+        worst.append(float((changed[1] / of_maps)[respected].max(initial=0.0)))
+    return Finding(float(max(worst)), ROUNDINGS, f"in units of rounding, {len(worst) // 3} impacts") if worst else None
 
 
 def _across(run: Trajectory, change: Change, h: float) -> tuple[Array, Any]:
@@ -125,14 +155,19 @@ def _saltation(scales: Array, run: Trajectory, changes: list[Change]) -> Finding
 
 
 def _reversal(run: Trajectory, changes: list[Change]) -> Finding | None:
-    """Return the defect of steps with elastic impacts and back, relative to the state."""
+    """Return the defect of steps with elastic impacts and back, in units of one rounding of state, time and step."""
     worst = list[float]()
     for change in [each for each in changes if each.restitution == 1.0][:REVERSED]:
         start, step = _across(run, change, run.h)
-        end = step(start)
-        back = run.stepper.integrate(end.q[-1], end.p[-1], h=-run.h, steps=1, t=end.t[-1], parameters=run.parameters)
-        worst.append(np.abs(np.hstack([back.q[-1], back.p[-1]]) - start).max() / np.abs(start).max())
-    return Finding(float(max(worst)), REVERSAL, f"relative, {len(worst)} impacts") if worst else None
+        there = step(start)
+        end, t = np.hstack([there.q[-1], there.p[-1]]), there.t[-1]
+        back = run.stepper.integrate(there.q[-1], there.p[-1], h=-run.h, steps=1, t=t, parameters=run.parameters)
+        moved = np.abs(end - start) * (1.0 + abs(t / run.h))
+        forward = there.tangent()[-1]
+        reached = np.abs(end) + moved + np.abs(forward) @ (np.abs(start) + moved)
+        unit = EPSILON * (np.abs(start) + np.abs(np.linalg.inv(forward)) @ reached)
+        worst.append(float((np.abs(np.hstack([back.q[-1], back.p[-1]]) - start) / unit).max()))
+    return Finding(max(worst), ROUNDINGS, f"in units of rounding, {len(worst)} impacts") if worst else None
 
 
 def _symplecticity(run: Trajectory, changes: list[Change]) -> Finding | None:

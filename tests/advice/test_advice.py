@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError
 from functools import cache
+from itertools import count
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,6 +17,7 @@ from outer_planets import GRAVITY, MASSES, POSITIONS, VELOCITIES
 
 from scvi_codegen.advice.advice import Advice, advise
 from scvi_codegen.cli import main
+from scvi_codegen.cli.step_selection import _text
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -152,6 +154,11 @@ class TestAchievedErrors:
         )
         assert 1e-10 < abs(rough - fine)[0] < 4e-8
 
+    def test_advice_from_a_velocity_is_that_from_its_momentum(self):
+        by_p = advise(pendulum().with_parameters(m=2.0), SVI(4), [1.0], [0.4], 3.0, 1e-6)
+        by_velocity = advise(pendulum().with_parameters(m=2.0), SVI(4), [1.0], velocity=[0.2], span=3.0, tolerance=1e-6)
+        assert (by_velocity.h, by_velocity.expected_error) == (by_p.h, by_p.expected_error)
+
 
 def cost(advice: Advice, points: int) -> float:
     """Evaluations for a unit of time, with those of three iterations in addition to those of each step."""
@@ -186,6 +193,17 @@ class TestDegree:
         monkeypatch.setattr("scvi_codegen.advice.pilot.time", SimpleNamespace(perf_counter=lambda: next(times)))
         first, second = (advise(system, Gauss(4), q, p, 50.0, 1e-8, degree=True) for _ in range(2))
         assert (first.degree, first.h, first.message) == (second.degree, second.h, second.message)
+
+    def test_time_of_evidence_is_per_unit_of_time(self, monkeypatch: pytest.MonkeyPatch):
+        """Pilot runs over the whole span of one second each."""
+        times = count()
+        monkeypatch.setattr("scvi_codegen.advice.pilot.time", SimpleNamespace(perf_counter=lambda: next(times)))
+        advice = advise(pendulum(), SVI(6), [1.5], [0.0], -20.0, 1e-6)
+        assert {row.seconds for row in advice.evidence} == {1 / 20}
+        found = re.findall(r"h = (-\S+) .* (\S+ \w+) for the whole span\n", _text(advice))
+        assert [(float(h), time) for h, time in found] == [
+            (pytest.approx(row.h, rel=1e-5), "1 s") for row in advice.evidence if math.isfinite(row.error)
+        ]
 
     def test_stages_of_a_runge_kutta_method_are_its_degree(self):
         assert advise(pendulum(), Gauss(5), [1.5], [0.0], 20.0, 1e-6).degree == 5
@@ -251,6 +269,20 @@ class TestHonesty:
         assert advice.expected_error < 1e-2
         assert len(advice.warnings) == 1
         assert re.search(r"diverge tenfold every \S+ units of time \(chaos\).*uncertain", advice.warnings[0])
+
+    @pytest.mark.parametrize(("k", "direction"), [(1.0, 1), (4.0, -1)])
+    def test_growth_times_are_those_of_a_saddle(self, k: float, direction: int):
+        """Errors of a motion that decays at a saddle grow tenfold in log(10)/sqrt(k)."""
+        saddle = LagrangianSystem.from_text(
+            name="saddle", coordinates=["q"], lagrangian="q_dot**2/2 + k*q**2/2", parameters={"k": k}
+        )
+        rate, span = math.sqrt(k), direction * 30.0 / math.sqrt(k)
+        advice = advise(saddle, SVI(6), [1.0], [-direction * rate], span, 1e-6)
+        words = " ".join(advice.warnings)
+        tenfold, until = (float(re.search(rf"{x} (\S+) units", words)[1]) for x in ("every", "about"))  # type: ignore
+        assert tenfold == pytest.approx(math.log(10.0) / rate, rel=0.05)
+        assert 3e-7 < advice.expected_error * math.exp(-rate * (abs(span) - until)) < 3e-6
+        assert f"The pilot runs covered {span / 4:g} of {span:g}, where errors grew exponentially." in advice.message
 
     def test_chaotic_system_over_a_short_span_is_not_called_chaotic(self):
         entry = problem("double-pendulum")

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from scvi_codegen import load_model, problem
+from scvi_codegen import SVI, Event, LagrangianSystem, Model, StateError, compile_stepper, generate_package, load_model
 from scvi_codegen.cli import main
-from scvi_codegen.cli.reports import MAX_BALANCE_COORDINATES, MAX_BALANCE_STEPS, energy_balance
+from scvi_codegen.files.energy import MOST_BALANCED_COORDINATES, MOST_BALANCED_STEPS, energy_account
 
 MODEL = """
 [system]
@@ -77,7 +77,7 @@ def test_damping_and_inputs_have_a_work_balance():
     [
         {"(x - y)**4/4": "(2 + cos(t))*(x - y)**4/12"},
         {"svi:4": "radau-iia:2"},
-        {"steps = 70": f"steps = {MAX_BALANCE_STEPS + 1}"},
+        {"steps = 70": f"steps = {MOST_BALANCED_STEPS + 1}"},
         {'[forces]\nx = "-x_dot/10"\n': ""},
     ],
     ids=["L has time", "a method without account", "many steps", "no forces"],
@@ -93,8 +93,55 @@ def test_conservative_systems_have_no_balance(changed):
     assert found["energy_balance"] is None
 
 
-def test_many_coordinates_have_no_balance():
-    """The run is not used."""
-    system = problem("outer-solar-system").system
-    assert system.dimension > MAX_BALANCE_COORDINATES
-    assert energy_balance(system, None, 10) is None  # type: ignore[arg-type]
+def test_many_coordinates_have_no_balance_unless_it_is_asked_for():
+    system = LagrangianSystem.from_text(
+        "chain", ["q[N]"], "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)", dissipation="sum(i in N, q_dot[i]**2/20)"
+    )
+    stepper = compile_stepper(system, "svi:3", sizes={"N": MOST_BALANCED_COORDINATES + 1})
+    run = stepper.integrate({"q": [1.0] * stepper.dimension}, {"q": [0.0] * stepper.dimension}, h=0.1, steps=20)
+    assert energy_account(run, limited=True).title == "energy change |E - E0|: forces act"
+    assert energy_account(run).title == "energy balance |E - E0 - W| / |E0|"
+    assert run.energy_error() < 1e-7 < 0.1 < abs(run.energy() - run.energy()[0]).max()
+
+
+PENDULUM = "q_dot**2/2 + cos(q)"
+KINDS = {
+    "damped": ({"lagrangian": PENDULUM, "forces": {"q": "-q_dot/5"}}, {}, "energy balance"),
+    "falling": (
+        {"lagrangian": "q_dot**2/2 - q"},
+        {"events": Event("q", direction=-1, then={"p_q": "-9*p_q/10"})},
+        "energy balance",
+    ),
+    "driven": ({"lagrangian": f"{PENDULUM} + q*sin(t)"}, {}, "energy change |E - E0|: L depends on time"),
+    "driven and damped": (
+        {"lagrangian": f"{PENDULUM} + q*sin(t)", "forces": {"q": "-q_dot/5"}},
+        {},
+        "energy change |E - E0|: forces act",
+    ),
+    "free": ({"lagrangian": PENDULUM}, {}, "relative energy error"),
+}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_change_with_a_reason_is_no_error(name):
+    """Of energy_error(), plots and the generated program."""
+    fields, options, title = KINDS[name]
+    system = LagrangianSystem.from_text(name, ["q"], **fields)
+    run = compile_stepper(system, "svi:4").integrate([1.0], [0.3], h=0.05, steps=100, **options)
+    changed = abs(run.energy() - run.energy()[0]).max()
+    assert (changed > 0.05) == (name != "free")
+    axes = run.plot.energy()
+    assert axes.get_title().startswith(title)
+    shown = max(np.nanmax(line.get_ydata()) for line in axes.get_lines())
+    if title.startswith("energy change"):
+        assert shown == pytest.approx(changed)
+        with pytest.raises(StateError, match=r"changes \((L depends on time|forces act)\).* no error: use energy\(\)"):
+            run.energy_error()
+    else:
+        assert shown < 1e-6
+        assert run.energy_error() < 1e-6
+    if not options:
+        model = Model(system=system, method=SVI(2), q=(1.0,), velocity=(0.3,), h=0.05, steps=100)
+        text = (generate_package(model, Path("generated")) / "main.c").read_text()
+        assert ("energy_error" in text) == (name == "free")
+        assert ("energy_change" in text) == (name != "free")

@@ -124,8 +124,6 @@ def test_ensemble_of_runs_with_inputs(model):
     assert "3 trajectories of 24 steps of 0.1 from t = 0; 25 states saved of each" in text
     changes = max(np.abs(run.energy() - run.energy()[0]).max() for run in expected)
     assert f"it changed by {changes:.3g} at most" in text
-    Path("pushed.toml").write_text(MODEL.replace("step = 0.1", ""))
-    assert "give a step h" in invoke("--ensemble", "many.csv").stderr
 
 
 def test_runs_without_steps_and_columns_of_inputs():
@@ -166,3 +164,25 @@ def test_signal_stops_a_run_between_chunks(model, monkeypatch):
     assert outcome.failure is None
     assert 1.2 < outcome.trajectory.t[-1] < 2.0
     assert outcome.trajectory.t[0] == 0.0
+
+
+@pytest.mark.parametrize("inputs", [True, False])
+def test_terminal_event_is_the_last_saved_state(model, inputs):
+    """With several segments: of inputs, or of a last step that is shorter."""
+    words = [] if inputs else ["--input", "u=1", "--span", "2.25"]
+    output_of(*words, "--event", "q - 0.5; terminal=1", "--save-every", "7", "-o", "run.npz")
+    with np.load("run.npz") as file:
+        assert (np.diff(file["t"]) > 0.0).all()
+        assert abs(file["q"][-1] - 0.5) < 1e-13
+
+
+def test_ensemble_of_adaptive_runs_with_inputs(model):
+    text = Path("pushed.toml").read_text()
+    Path("pushed.toml").write_text(text.replace("step = 0.1", "tolerance = 1e-10"))
+    Path("grid.csv").write_text("q,p_q\n0.1,0.0\n0.2,1.0\n")
+    output_of("--ensemble", "grid.csv", "-o", "many.npz")
+    stepper = compile_stepper(model.system, model.method)
+    with np.load("many.npz") as file:
+        for j, (q, p) in enumerate([(0.1, 0.0), (0.2, 1.0)]):
+            one = stepper.integrate([q], [p], inputs=dict(model.inputs), t_end=2.3, tolerance=1e-10)
+            assert (file["q"][: len(one), j] == one.q).all()

@@ -12,8 +12,6 @@ import sympy
 from click.testing import CliRunner, Result
 
 import scvi_codegen as sc
-from scvi_codegen import benchmark
-from scvi_codegen.benchmark.report import ResultTable
 from scvi_codegen.cli import command_group, main
 from scvi_codegen.methods import specification_of
 from scvi_codegen.models.model_files.model_file import parse_model
@@ -32,11 +30,9 @@ QUIET_COMMANDS = (
     ("derive", str(Path(__file__).parents[2] / "examples" / "fput_ring.toml"), "--method", "stoermer-verlet"),
     ("verify", "planar-pendulum", "--method", "svi:1"),
     ("reproduce", "--list"),
-    ("bench", "nothing-but-this"),
     ("doctor",),
 )
 """Of every command one at least, after a run in the folder ``orbit.run``."""
-NO_TIMES = ResultTable(name="nothing", title="no times", columns={"a": ""}, rows=({"a": "b"},))
 
 
 @pytest.fixture(autouse=True)
@@ -64,8 +60,7 @@ def test_every_command_is_tested():
 
 
 @pytest.mark.parametrize("words", QUIET_COMMANDS, ids=lambda words: " ".join(words[:2]).replace("/", " "))
-def test_quiet_prints_nothing_and_json_prints_one_document(words, monkeypatch):
-    monkeypatch.setattr(benchmark, "SECTIONS", {"nothing-but-this": lambda plan, report: NO_TIMES})
+def test_quiet_prints_nothing_and_json_prints_one_document(words):
     invoke("run", *KEPLER, "-o", "orbit.run")
     assert invoke(*words).stdout
     quiet = invoke(*words, "--quiet")
@@ -122,6 +117,36 @@ def test_json_of_advice_folders_and_ensembles():
     many = document("run", *KEPLER, "--ensemble", "grid.toml")
     assert (many["trajectories"], many["statuses"], many["steps"]["most"]) == (3, {"ok": 3}, 50)
     assert len(many["energy"]) == 3
+
+
+def test_json_of_several_momentum_maps():
+    """Explicit steps do not conserve the angular momentum."""
+    Path("spiral.toml").write_text(
+        '[system]\nname = "spiral"\ncoordinates = ["z", "x", "y"]\n'
+        'lagrangian = "(x_dot**2 + y_dot**2 + z_dot**2)/2 - x**2/2 - y**2/2"\n'
+        '[method]\nmethod = "explicit-euler"\n[run]\nstep = 0.1\nsteps = 20\n'
+        "[initial]\nq = [0.1, 1.0, 0.0]\nq_dot = [0.3, 0.0, 0.7]\n"
+    )
+    found = document("run", "spiral.toml")["momentum_errors"]
+    assert found["momentum of z"] < 1e-15 > found["boost of z"]
+    assert found["angular momentum z"] > 0.1
+    run = sc.load_model("spiral.toml").integrate()
+    assert list(found) == list(run.stepper.momentum_map_names)
+    assert [*found.values()] == np.abs(run.momentum_errors()).max(axis=0).tolist()
+
+
+def test_json_of_ensembles_with_unequal_steps():
+    """Bodies that fall to the centre in pi/sqrt(8) r**1.5."""
+    Path("grid.toml").write_text("[grid]\nq1 = [2.0, 1.0, 3.0]\n")
+    falling = ("kepler", "--velocity", "0,0", "--step", "0.05", "--steps", "80", "--method", "svi:4")
+    found = document("run", *falling, "--ensemble", "grid.toml")
+    stepper = sc.compile_stepper(sc.problem("kepler").system, "svi:4")
+    with pytest.raises(sc.StepFailedError) as failed:
+        stepper.integrate([1.0, 0.0], velocity=[0.0, 0.0], h=0.05, steps=80)
+    assert found["steps"] == {"least": failed.value.trajectory.steps, "most": 80}
+    assert found["steps"]["least"] == math.floor(math.pi / 8**0.5 / 0.05)
+    assert found["statuses"]["ok"] == 1
+    assert found["energy"] == pytest.approx([-1 / 2, -1.0, -1 / 3], rel=1e-15)
 
 
 def test_json_of_lists_and_model_files():

@@ -1,4 +1,4 @@
-"""Numbers that ``bench`` and ``reproduce`` print, recomputed independently from the raw figures in the same output.
+"""Numbers of ``benchmarks`` and ``reproduce``, recomputed independently from the raw figures in the same output.
 
 Errors of positions and energies come from Runge-Kutta methods written out here and from SciPy's DOP853.
 """
@@ -11,12 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from scipy.integrate import solve_ivp
 
-from scvi_codegen.benchmark.cases.unforced import case
+from benchmarks.__main__ import main as benchmarks
+from benchmarks.cases.unforced import case
 from scvi_codegen.cli import main
 
 pytestmark = pytest.mark.long
@@ -26,8 +28,8 @@ QUICK = 0.05
 """Part of the span that --quick integrates."""
 
 
-def output_of(*words: str) -> str:
-    found = CliRunner().invoke(main, words)
+def output_of(*words: str, command: click.Command = main) -> str:
+    found = CliRunner().invoke(command, words)
     assert found.exit_code == 0, found.output
     return found.stdout
 
@@ -104,9 +106,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-def test_rows_of_bench_follow_from_its_measurements():
+def test_rows_of_benchmarks_follow_from_their_measurements():
     """Ratios at equal error, and the settings shown."""
-    text = output_of("bench", "planar-pendulum", "--quick", "--peers", "scipy", "-o", "report.json")
+    text = output_of("planar-pendulum", "--quick", "--peers", "scipy", "-o", "report.json", command=benchmarks)
     (found,) = json.loads(Path("report.json").read_text())["cases"]
     of: dict[str, list[Any]] = {row["method"]: [] for row in found["rows"]}
     for each in found["measurements"]:
@@ -131,9 +133,9 @@ def test_rows_of_bench_follow_from_its_measurements():
         assert re.search(rf"\n  {name} .* {cells} +{row['peer']:.2f} +{at_error:.1e}\b", text)
 
 
-def test_errors_of_bench_are_those_of_its_settings():
+def test_errors_of_benchmarks_are_those_of_their_settings():
     """SVI(8) with 8 Gauss points is the Gauss method of 8 stages for these Lagrangians."""
-    text = output_of("bench", "planar-pendulum", "--quick", "--peers", "", "-o", "report.json")
+    text = output_of("planar-pendulum", "--quick", "--peers", "", "-o", "report.json", command=benchmarks)
     (found,) = json.loads(Path("report.json").read_text())["cases"]
     problem = case("planar-pendulum")
     assert found["span"] == problem.span * QUICK

@@ -122,6 +122,19 @@ class TestSystem:
         assert "g = 9.81" in shown
         assert "<mi>H</mi>" in sc.hamiltonian_of(sc.problem("planar-pendulum").system)._repr_html_()
 
+    def test_lagrangian_of_rotations_is_in_their_names(self):
+        text = "(omega_1**2 + omega_2**2)/2 + omega_3**2 + x_dot**2/2 - R_33*x"
+        given = {"coordinates": ["x"], "rotations": {"R": "omega"}, "lagrangian": text, "torques": {"R": ["x"] * 3}}
+        top = sc.LagrangianSystem.from_text("top", **given)
+        assert sc.LagrangianSystem.from_text("top", **given | {"lagrangian": top.to_text()}) == top
+        assert r"\omega_{1}^{2}" in top._repr_latex_()
+        assert r"\dot{x}" in top._repr_latex_()
+        assert "R_{w}" not in top._repr_latex_()
+        shown = top._repr_html_()
+        assert "rotation R omega" in shown
+        assert "force on R" in shown
+        assert "<mi>w</mi>" not in shown
+
     def test_long_lagrangian_is_abbreviated_with_a_count(self):
         large = sc.LagrangianSystem.from_text(
             name="chain",

@@ -1,4 +1,4 @@
-"""Golden programs whose output a fault in a header of C changes: headers are exchanged in programs generated once."""
+"""Golden programs whose output a fault in a header of C changes: headers are exchanged in sources generated once."""
 
 import subprocess
 import sys
@@ -11,29 +11,45 @@ from checkout import OF_TESTS, ROOT
 
 sys.path[:0] = [str(ROOT), *(str(ROOT / name) for name in OF_TESTS)]
 
-from golden_cells import CELLS, Program, output, plain, program  # noqa: E402
+from golden_cells import CELLS, Made, Program, of_source, output  # noqa: E402
 
 
 def changed_program(header: str, faulty: str) -> str:
-    """Return the name of a golden program whose output changes; empty if there is none or it does not compile."""
-    own, other = plain(header).strip(), plain(faulty).strip()
+    """Return the name of a golden program whose output changes; empty if there is none or it does not compile.
+
+    Args:
+        header: path of the header in the checkout.
+        faulty: its text with the fault.
+    """
+    support = header.removeprefix("templates/")
     for name in CELLS:
-        made = _generated(name)
-        if own in made.code:
-            found = _output(replace(made, code=made.code.replace(own, other)))
-            if found is None:
+        source, main = _generated(name)
+        assert source is not None
+        if support not in (headers := dict(source.support)):
+            continue
+        found = of_source(replace(source, support=tuple((headers | {support: faulty}).items())), main)
+        if found.code != _program(name).code:
+            printed = _output(found)
+            if printed is None:
                 return ""
-            if found != _expected(name):
+            if printed != _expected(name):
                 return name
     return ""
 
 
-_generated = cache(program)
+@cache
+def _generated(name: str) -> Made:
+    return CELLS[name](name)
+
+
+@cache
+def _program(name: str) -> Program:
+    return of_source(*_generated(name))
 
 
 @cache
 def _expected(name: str) -> str | None:
-    return _output(_generated(name))
+    return _output(_program(name))
 
 
 def _output(made: Program) -> str | None:

@@ -109,7 +109,7 @@ def noticed(copy: Path, place: Place, reach: Reach, unfit: list[str], seconds: f
     end = _spent() + seconds
     path = copy / place.path
     text = path.read_text()
-    if place.path.startswith("templates/support") and (cell := changed_program(text, place.applied(text))):
+    if place.path.startswith("templates/support") and (cell := changed_program(place.path, place.applied(text))):
         return "golden", cell
     cases = [case for case in CERTIFIED if certifies(copy, case, place.path)][:MOST_CASES]
     path.write_text(place.applied(text))

@@ -281,6 +281,16 @@ def test_derivative_at_prescribed_ends_and_between_elements():
         (string("u_t**2 - 3*u_x**2/2 - 50*u**2", boundary={"x": "periodic"}), "fourier", {"points": 16}),
         (string(boundary={"x": "periodic"}), "finite-differences", {"order": 4, "points": 16}),
         (string("u_t**2/2 - u_xx**2/2", boundary={"x": "periodic"}), "finite-differences", {"order": 2, "points": 16}),
+        (
+            string("(1 + 9*x)*u_t**2/2 - (3 - x)*u_x**2/2", boundary={"x": (0, 0)}),
+            "finite-differences",
+            {"order": 2, "points": 32},
+        ),
+        (
+            string("(9 - 8*x)*u_t**2/2 - u_x**2/2 - (1 + 5000*x)*u**2/2"),
+            "spectral-elements",
+            {"degree": 4, "elements": 8},
+        ),
     ],
 )
 def test_highest_frequency_is_a_close_upper_bound(field, method, options):

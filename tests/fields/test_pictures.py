@@ -36,7 +36,9 @@ def test_space_time_diagram_and_image_have_the_values_of_the_field(tmp_path):
     _, run = on_a_line()
     ax = run.plot.field(tmp_path / "u.png")
     [image] = [each for each in ax.collections if each.get_array() is not None]
-    assert np.asarray(image.get_array()) == pytest.approx(run.q["u"])
+    assert np.asarray(image.get_array()) == pytest.approx(run["u"])
+    assert (run["u"] == run.q["u"]).all()
+    assert (run["u_dot"] == run.velocity["u"]).all()
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x", "t")
     assert (tmp_path / "u.png").stat().st_size > 3000
     mesh, run = in_the_plane()

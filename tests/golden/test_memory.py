@@ -7,16 +7,16 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from golden_cells import CELLS, PENDULUM, program
+from golden_cells import CELLS, PENDULUM, of_source, program
 from programs import needs
 
 SANITIZED = ("gcc", "-std=gnu99", "-O0", "-g", "-w", "-DSCVI_THREADS", "-pthread", "-fsanitize=address,undefined")
 QUICK = (
     *("swings", "forms_adaptive", "ring_newton"),
-    *("kepler_fallback", "kepler_many", "rods_newton", "vibration_adaptive", "double_tangent", "kepler_second"),
+    *("body", "kepler_fallback", "kepler_many", "rods_newton", "vibration_adaptive", "double_tangent", "kepler_second"),
 )
 """Arrays: constraints, several sizes, the Fourier preconditioner. Named coordinates: single steps and runs by both
-solvers, ensembles, constraints, adaptive steps of a Hamiltonian, first and second derivatives."""
+solvers, ensembles, constraints, adaptive steps of a Hamiltonian, first and second derivatives, a body."""
 
 FEW_UNKNOWNS = {"unrolled": partial(PENDULUM, method="svi:1", solver="newton", steps=50)}
 """Newton's iteration with few unknowns, whose equations are written without loops over tables; no golden results."""
@@ -55,7 +55,7 @@ def with_exact_arrays(main: str, *, hamiltonian: bool) -> str:
 )
 def test_runs_read_and_write_only_their_own_memory(name: str, tmp_path: Path) -> None:
     needs(SANITIZED[0])
-    made = FEW_UNKNOWNS[name](name) if name in FEW_UNKNOWNS else program(name)
+    made = of_source(*FEW_UNKNOWNS[name](name)) if name in FEW_UNKNOWNS else program(name)
     for path, text in (
         made.files | {"main.c": with_exact_arrays(made.main, hamiltonian=name.startswith("rotors"))}
     ).items():

@@ -49,10 +49,14 @@ def test_predictor_without_step_size_change_is_that_of_fixed_steps(system, degre
         assert np.allclose(found, expected, rtol=0.0, atol=1e-13 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("method", [sc.SVI(6), sc.SpectralCollocation(6)])
-def test_predictor_follows_a_polynomial_across_step_size_changes(method):
+@pytest.mark.parametrize(
+    ("method", "lanes"),
+    [(sc.SVI(6), 8), (sc.SpectralCollocation(6), 8), (sc.SVI(18), 24), (sc.SpectralCollocation(18), 32)],
+)
+def test_predictor_follows_a_polynomial_across_step_size_changes(method, lanes):
     system = sc.problem("double-pendulum").system
     fixed_point = program_of(system, method).fixed_point
+    assert fixed_point.lanes == lanes
     predictor, points = predictor_of(fixed_point), np.array(fixed_point.guess.abscissae, dtype=float)
     accelerations = fixed_point.kept is StoredValues.ACCELERATIONS  # z = h a is stored
 

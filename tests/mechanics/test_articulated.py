@@ -9,7 +9,7 @@ import pytest
 import sympy
 
 import scvi_codegen as sc
-from scvi_codegen.benchmark.cases import robots
+from benchmarks.cases import robots
 from scvi_codegen.formulas.expressions import Tape, gradient
 from scvi_codegen.formulas.intermediates import intermediate, intermediates, separated, written_out
 from scvi_codegen.ir.arithmetic import lower_kernel

@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.expressions import evaluate
 
 BOX = '<inertial pos="0.1 0 -0.2" mass="2" diaginertia="0.3 0.2 0.1"/>'
 ROD = '<inertial pos="0 0 -0.3" mass="1" diaginertia="0.1 0.12 0.02"/>'
@@ -112,6 +113,61 @@ BARS = (
     f'<joint name="b" axis="0 1 0"/>{ROD}</body></body><body name="rocker" pos="1 0 0"><joint name="c" axis="0 1 0"/>'
     f"{ROD}</body>"
 )
+
+
+@pytest.mark.parametrize(
+    ("equality", "sites", "count"),
+    [
+        ('<connect body1="one" body2="two" anchor="0.3 0 0.1"/>', False, 3),
+        ('<weld body1="one" body2="two"/>', False, 6),
+        ('<connect site1="s_one" site2="s_two"/>', True, 3),
+        ('<weld site1="s_one" site2="s_two"/>', True, 6),
+    ],
+)
+def test_closures_in_a_turned_parent(equality, sites, count, tmp_path):
+    """Bodies on a turned stand, one on a ball joint, one that is free: the equations beside poses composed by SciPy."""
+
+    def pose(position, angles):
+        result = np.eye(4)
+        result[:3, 3], result[:3, :3] = position, Rotation.from_euler("XYZ", angles).as_matrix()
+        return result
+
+    def text(values):
+        return " ".join(map(str, values))
+
+    stand = (0.1, 0.2, 0.3), (0.4, -0.3, 0.7)
+    bodies = {"one": ((0, 0.5, 0), (0.2, 0.1, 0.5)), "two": ((0.4, 0, 0.2), (-0.3, 0.5, 0.1))}
+    ends = {"one": ((0.3, 0, 0.1), (0.1, 0.2, 0.3)), "two": ((0.2, 0.3, -0.1), (0, -0.4, 0.2))}
+    axes = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
+    slides = {"one": "", "two": "".join(f'<joint name="{k}" type="slide" axis="{n}"/>' for k, n in axes.items())}
+    parts = "".join(
+        f'<body name="{name}" pos="{text(p)}" euler="{text(r)}">{slides[name]}<joint name="j_{name}" type="ball"/>{BOX}'
+        f'<site name="s_{name}" pos="{text(ends[name][0])}" euler="{text(ends[name][1])}"/></body>'
+        for name, (p, r) in bodies.items()
+    )
+    base = f'<body name="stand" pos="{text(stand[0])}" euler="{text(stand[1])}">{parts}</body>'
+    system = model(tmp_path, base, equality)
+    assert len(system.constraints) == count
+    at_rest = {name: pose(*stand) @ pose(*place) for name, place in bodies.items()}
+    turns = {"one": Rotation.from_rotvec([0.3, -0.5, 0.2]), "two": Rotation.from_rotvec([-0.1, 0.4, 0.6])}
+    values = {"x": 0.2, "y": -0.3, "z": 0.1}
+    moved = at_rest | {"two": at_rest["two"] @ pose((0.2, -0.3, 0.1), (0, 0, 0))}
+    for name, turn in turns.items():
+        moved[name] = moved[name] @ pose((0, 0, 0), turn.as_euler("XYZ"))
+        values |= dict(zip((f"R_j_{name}_{letter}" for letter in "xyzw"), turn.as_quat(), strict=True))
+    if sites:
+        frames = [moved[name] @ pose(*ends[name]) for name in bodies]
+    elif "weld" in equality:
+        frames = [moved["one"] @ np.linalg.solve(at_rest["one"], at_rest["two"]), moved["two"]]
+    else:
+        anchor = np.linalg.solve(at_rest["two"], at_rest["one"] @ pose((0.3, 0, 0.1), (0, 0, 0)))
+        frames = [moved["one"] @ pose((0.3, 0, 0.1), (0, 0, 0)), moved["two"] @ anchor]
+    relative = frames[0][:3, :3].T @ frames[1][:3, :3]
+    spin = (relative - relative.T)[[2, 0, 1], [1, 2, 0]]
+    expected = [*(frames[0] - frames[1])[:3, 3], *spin][:count]
+    symbols = {each: values[each.name] for formula in system.constraints for each in formula.free_symbols}
+    found = [float(evaluate(formula, symbols)) for formula in system.constraints]
+    np.testing.assert_allclose(np.sort(np.abs(found)), np.sort(np.abs(expected)), rtol=0, atol=1e-12)
 
 
 def test_equations_across_the_plane_of_a_mechanism_are_omitted(tmp_path):

@@ -96,6 +96,19 @@ def test_speeds_may_be_combinations_of_derivatives() -> None:
     assert [sympy.expand(a - b) for a, b in zip(found.forces, expected.forces, strict=True)] == [0, 0]
 
 
+def test_speeds_are_defined_where_a_coefficient_vanishes() -> None:
+    """Elimination would divide by sin(q1); the determinant of the kinematic equations is -1."""
+    sine, cosine = sympy.sin(Q1), sympy.cos(Q1)
+    kinematics = [Q1.diff(T) - sine * U1 - cosine * U2, Q2.diff(T) - cosine * U1 + sine * U2]
+    found = taken(kanes_method(Q1, Q2, loads=(-C * U1, -C * U2), q=(Q1, Q2), u=(U1, U2), kd=kinematics))
+    values = dict(zip((*found.coordinates, *found.velocities, *found.parameters), (0, 2, 3, 5), strict=False))
+    forces = [force.xreplace(values) for force in found.forces]
+    assert sorted(float(force.xreplace(dict.fromkeys(force.free_symbols, sympy.S.One))) for force in forces) == [
+        -5.0,
+        -3.0,
+    ]
+
+
 def test_a_speed_without_a_coordinate_gets_its_integral() -> None:
     method = kanes_method(Q1, u=(U1, U2), q=(Q1,), kd=[Q1.diff(T) - U1], slip=U2)
     with pytest.raises(SystemDefinitionError, match="singular"):

@@ -8,7 +8,10 @@ import sympy
 import scvi_codegen as sc
 from scvi_codegen.models.model_files.model_file import parse_model
 
-UNUSED = "is not used in the {}, the forces or the constraints of 'system'; remove it, unless events use it."
+UNUSED = (
+    "does not occur in the {}, the forces and the constraints of 'system': remove it, unless events or a time "
+    "transformation, which are not known here, contain it."
+)
 x, v, k, m, z = sympy.symbols("x x_dot k m z")
 
 
@@ -142,3 +145,44 @@ def test_a_model_file_of_arrays_is_examined_with_its_events(event):
     text = FILE.format("[sizes]\nN = 1", event).replace('"x"', '"q[N]"')
     text = text.replace("x_dot**2/2 - x**2/2", "sum(i in N, q_dot[i]**2/2)").replace("span", "step = 0.1\nspan")
     assert len(messages(parse_model, text)) == (not event)
+
+
+BY_FILE = """
+[system]
+name = "system"
+coordinates = ["q[N]"]
+lagrangian = "sum(i in N, q_dot[i]**2/2)"
+{system}
+[sizes]
+N = 2
+[parameters]
+k = 1.0
+{parameters}
+[initial]
+q = {q}
+q_dot = "0"
+[run]
+step = 0.1
+span = 1.0
+{more}
+"""
+
+
+@pytest.mark.parametrize(
+    ("changed", "count"),
+    [
+        ({}, 1),
+        ({"q": '"k*i"'}, 0),
+        ({"system": 'constraints = ["q[0] - k*t"]'}, 0),
+        ({"more": '[forces]\n"q[i]" = "-k*q[i]"'}, 0),
+        ({"more": "[[events]]\nfunction = 'q[0] - k'"}, 0),
+        ({"more": "[[events]]\nfunction = 'q[0]'\nthen = { 'p_q[0]' = '-k*p_q[0]' }"}, 0),
+    ],
+    ids=["unused", "initial formulas", "constraints", "forces", "events", "changes by events"],
+)
+def test_a_parameter_that_any_formula_of_a_file_contains_is_used(changed, count):
+    text = BY_FILE.format(**{"system": "", "parameters": "", "q": '"0"', "more": "", **changed})
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        parse_model(text)
+    assert [str(each.message).startswith("parameter 'k' does not occur") for each in heard] == [True] * count

@@ -11,7 +11,7 @@ import sympy
 from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
-from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.errors import SystemDefinitionError, SystemDefinitionWarning
 from scvi_codegen.formulas.expressions import evaluate
 from scvi_codegen.mechanics.multibody.trees.shapes import SHAPES
 
@@ -231,14 +231,35 @@ CHANGES = {
     "axis": (lambda text: text.replace("1 2 -2", "0 0 0"), "must not be zero"),
     "numbers": (lambda text: text.replace("1 2 -2", "1 2"), "3 finite numbers"),
     "text": (lambda text: text.replace("1 2 -2", "1 2 x"), "must be numbers"),
-    "infinite": (lambda text: text.replace("1 2 -2", "1 2 inf"), "finite numbers"),
+    "infinite": (lambda text: text.replace("1 2 -2", "1 2 inf"), "must be numbers"),
     "negative": (
         lambda text: text.replace('mass value="1.2"', 'mass value="-1.2"'),
-        "mass -1.2, which must not be < 0",
+        "has the value -1.2, which must not be < 0",
     ),
     "negative moment": (lambda text: text.replace('ixx="0.05"', 'ixx="-0.05"'), "'upper', with the links fixed to it,"),
     "twice": (lambda text: text.replace('link name="tool"', 'link name="base"'), "is defined twice"),
     "no value": (lambda text: text.replace('<mass value="1.2"/>', "<mass/>"), "has no attribute 'value'"),
+    "unknown attribute": (lambda text: text.replace("damping", "dampnig"), "'dampnig'; did you mean 'damping'?"),
+    "unknown element": (lambda text: text.replace("dynamics", "dynamcs"), "<dynamcs>; did you mean 'dynamics'?"),
+    "number of Python": (lambda text: text.replace('damping="0.25"', 'damping="1_0"'), "must be numbers"),
+    "no number": (lambda text: text.replace('damping="0.25"', 'damping="nan"'), "must be numbers"),
+    "large": (lambda text: text.replace('damping="0.25"', 'damping="1e99"'), "magnitude must be less than 1e+40"),
+    "negative damping": (lambda text: text.replace('damping="0.25"', 'damping="-1"'), "damping -1, which must not be"),
+    "impossible inertia": (lambda text: text.replace('izz="0.003"', 'izz="0.3"'), "which no body has"),
+    "two axes": (lambda text: text.replace("<limit", '<axis xyz="1 0 0"/><limit'), "is the second <axis>"),
+    "no mass": (lambda text: text.replace('<mass value="1.2"/>', ""), "needs <mass> and <inertia>"),
+    "macro": (
+        lambda text: text.replace("<link", '<xacro:if xmlns:xacro="http://wiki.ros.org/xacro"/><link', 1),
+        "write the file that xacro makes",
+    ),
+    "itself": (lambda text: text.replace('mimic joint="shoulder"', 'mimic joint="grip"'), "itself: grip, grip"),
+    "circle of joints": (
+        lambda text: text.replace(
+            'effort="10" velocity="5"/>\n    <dyn', 'effort="10" velocity="5"/>\n    <mimic joint="grip"/>\n    <dyn'
+        ),
+        "'shoulder' follows itself: shoulder, grip, shoulder",
+    ),
+    "free inside": (lambda text: text.replace('"prismatic"', '"floating"'), "is free, but its parent moves"),
     "follows": (lambda text: text.replace('mimic joint="shoulder"', 'mimic joint="sholder"'), "'sholder', which is no"),
 }
 
@@ -263,16 +284,56 @@ def test_moments_of_inertia_are_checked_with_fixed_links(tmp_path):
 
 MUJOCO_CHANGES = {
     "equality": ("</mujoco>", "<equality><weld/></equality></mujoco>", "<weld> 'weld' has no attribute 'body1'"),
-    "tendon": ("</mujoco>", '<tendon><fixed stiffness="1"/></tendon></mujoco>', "has a stiffness"),
+    "tendon": (
+        "</mujoco>",
+        '<tendon><fixed stiffness="1"/></tendon></mujoco>',
+        "has stiffness='1', which changes the motion",
+    ),
     "mesh": ('type="box"', 'type="mesh"', "give its body an <inertial>"),
     "class": ('childclass="limb"', 'childclass="lim"', "of the class 'lim'"),
     "orientations": ('quat="1 0.1 0.2 0.3"', 'quat="1 0 0 0" euler="0 0 0"', "quat and euler"),
     "free inside": ('type="ball"', 'type="free"', "inside another body"),
-    "replicate": ("</worldbody>", "<replicate/></worldbody>", "write its bodies out"),
+    "replicate": ("</worldbody>", "<replicate/></worldbody>", "write out what it makes"),
     "ball spring": (' stiffness="0"', "", "hinges and slides only"),
     "axes": ('eulerseq="zyx"', 'eulerseq="zy"', "is not three of the letters"),
     "name": ('name="slip"', 'name="flex"', "two joints are called 'flex'"),
     "include": ("<option", '<include file="none.xml"/><option', "none.xml cannot be read"),
+    "include of a device": ("<option", '<include file="/dev/zero"/><option', "must have only file, a path relative to"),
+    "include of a folder": ("<option", '<include file="."/><option', "it is no regular file"),
+    "include of itself": ("<option", '<include file="figure.xml"/><option', "is included already"),
+    "unknown attribute": ('damping="0.1"', 'dampnig="0.1"', "'dampnig'; did you mean 'damping'?"),
+    "unknown element": ("<freejoint", "<freejiont", "<freejiont>; did you mean 'freejoint'?"),
+    "keyword": ('angle="degree"', 'angle="degrees"', "which must be degree or radian; did you mean 'degree'?"),
+    "number of Python": ('damping="0.1"', 'damping="1_0"', "must be numbers"),
+    "no number": ('damping="0.1"', 'damping="nan"', "must be numbers"),
+    "large": ('size="0.05"', 'size="1e200"', "magnitude must be less than 1e+40"),
+    "negative": ('damping="0.1"', 'damping="-0.1"', "damping -0.1, which must not be < 0"),
+    "impossible inertia": ('fullinertia="0.1 0.2 0.15', 'fullinertia="0.1 0.2 1.5', "which no body has"),
+    "medium": ("<option", '<option density="1.2"', "density='1.2', which changes the motion"),
+    "tendon of a class": (
+        "</mujoco>",
+        '<default><tendon damping="1"/></default><tendon><fixed/></tendon></mujoco>',
+        "has damping='1', which changes the motion",
+    ),
+    "actuator of a tendon": (
+        "</mujoco>",
+        '<actuator><motor tendon="t" armature="1"/></actuator></mujoco>',
+        "which is read of actuators of hinges and slides only",
+    ),
+    "spring and damper": (
+        'axis="0 1 0" ref="15"',
+        'axis="0 1 0" springdamper="1 1"',
+        "springdamper='1 1', which changes",
+    ),
+    "class twice": ("</default>", '</default><default class="limb"/>', "second of the class 'limb'"),
+    "places": ('fromto="', 'pos="0 0 0" fromto="', "has pos and fromto"),
+    "parallel": ('xyaxes="0 1 0 -1 0 0.2"', 'xyaxes="0 1 0 0 2 0"', "must be two different directions"),
+    "size": ('size="0.1 0.2 0.3"', 'size="0.1 0.2"', "3 numbers > 0 are needed"),
+    "sites": (
+        "</mujoco>",
+        '<equality><weld site1="a" body1="b"/></equality></mujoco>',
+        "has site1 and body1: sites or bodies are needed",
+    ),
 }
 
 
@@ -299,7 +360,7 @@ def test_included_files_are_read_and_total_masses_scaled(tmp_path):
     masses = 3.0 + 0.5
     assert value(heavy, state, velocity) == pytest.approx(value(one, state, velocity) * 7 / masses)
     (tmp_path / "body.xml").write_text('<mujocoinclude><include file="body.xml"/></mujocoinclude>')
-    with pytest.raises(SystemDefinitionError, match="nested deeper"):
+    with pytest.raises(SystemDefinitionError, match="included already"):
         sc.LagrangianSystem.from_mjcf(tmp_path / "all.xml")
 
 
@@ -325,24 +386,127 @@ def test_nested_includes_flags_and_groups_of_geoms_are_read(tmp_path):
     file.write_text(text.replace(inside, f"{base}{inside}</body>"))
     assert sc.LagrangianSystem.from_mjcf(file).lagrangian == one.lagrangian
     file.write_text(text.replace("<worldbody>", '<compiler boundmass="0.1"/><worldbody>'))
-    with pytest.raises(SystemDefinitionError, match="has boundmass, which is not read"):
+    with pytest.raises(SystemDefinitionError, match="which changes the motion"):
         sc.LagrangianSystem.from_mjcf(file)
 
 
-def test_joints_with_dry_friction_are_named_in_one_warning(tmp_path):
+def test_limits_and_dry_friction_are_named_in_one_warning(tmp_path):
     file = tmp_path / "arm.urdf"
     text = (ROBOTS / "arm.urdf").read_text().replace("<dynamics", '<dynamics friction="0.1"')
     file.write_text(text.replace('<limit lower="-1"', '<dynamics friction="0.2"/><limit lower="-1"'))
-    with pytest.warns(UserWarning, match=r"dry friction of .*, rail-1 is not read") as caught:
+    unread = "limits of joints shoulder, rail-1; dry friction of joints shoulder, rail-1$"
+    with pytest.warns(SystemDefinitionWarning, match=unread) as caught:
         sc.LagrangianSystem.from_urdf(file)
     assert len(caught) == 1
     assert Path(caught[0].filename).name == "test_robots.py"
 
 
+def test_parts_of_models_that_are_not_read_are_named_in_one_warning(tmp_path):
+    text, file = (ROBOTS / "figure.xml").read_text(), tmp_path / "figure.xml"
+    text = text.replace('name="flex"', 'name="flex" range="-90 90" frictionloss="0.1"')
+    text = text.replace("</mujoco>", '<actuator><position name="servo" joint="flex" kp="3"/></actuator></mujoco>')
+    file.write_text(text)
+    unread = "limits of joints flex; dry friction of joints flex; actuators servo; contacts$"
+    with pytest.warns(SystemDefinitionWarning, match=unread) as caught:
+        sc.LagrangianSystem.from_mjcf(file)
+    assert len(caught) == 1
+    disabled = '<flag contact="disable" limit="disable" frictionloss="disable"/></option>'
+    file.write_text(text.replace('<option gravity="0 1 -9"/>', f"<option>{disabled}"))
+    with pytest.warns(SystemDefinitionWarning, match="without actuators servo$"):
+        sc.LagrangianSystem.from_mjcf(file)
+
+
+DEFAULTS = {
+    "orientation of geoms": (
+        '<default><geom type="box" size=".1 .2 .5" quat="1 .2 .3 .4"/></default>{hinge}<geom pos="0 .3 .1"/>{end}',
+        '{hinge}<geom type="box" size=".1 .2 .5" quat="1 .2 .3 .4" pos="0 .3 .1"/>{end}',
+    ),
+    "another orientation": (
+        '<default><geom type="box" size=".1 .2 .5" quat="1 .2 .3 .4"/></default>{hinge}<geom euler="9 8 7"/>{end}',
+        '{hinge}<geom type="box" size=".1 .2 .5" euler="9 8 7"/>{end}',
+    ),
+    "first number of a size": (
+        '<default><geom type="box" size=".1 .2 .5"/></default>{hinge}<geom size=".3"/>{end}',
+        '{hinge}<geom type="box" size=".3 .2 .5"/>{end}',
+    ),
+    "second outermost default": (
+        '<default><geom type="box"/></default><default><geom size=".1 .2 .5"/></default>{hinge}<geom/>{end}',
+        '{hinge}<geom type="box" size=".1 .2 .5"/>{end}',
+    ),
+    "class of a frame": (
+        '<default><default class="a"><geom type="box" size=".1 .2 .5"/></default></default>'
+        '{hinge}<frame childclass="a"><geom/></frame>{end}',
+        '{hinge}<geom type="box" size=".1 .2 .5"/>{end}',
+    ),
+    "inertial in a frame": (
+        '{hinge}<frame pos="1 0 0"><inertial pos="0 1 0" mass="2" diaginertia="1 1 1"/></frame>{end}',
+        '{hinge}<inertial pos="1 1 0" mass="2" diaginertia="1 1 1"/>{end}',
+    ),
+    "equality": (
+        '<default><equality active="false"/></default>{hinge}<geom size="1"/>{end}'
+        '<equality><joint joint1="q"/></equality>',
+        '{hinge}<geom size="1"/>{end}',
+    ),
+    "actuators": (
+        '<default><motor armature="2"/></default>{hinge}<geom size="1"/>{end}'
+        '<actuator><motor joint="q" damping="3" gear="2"/></actuator>',
+        '<default><joint armature="8" damping="12"/></default>{hinge}<geom size="1"/>{end}',
+    ),
+    "disabled forces": (
+        '<option><flag spring="disable" damper="disable"/></option>{hinge}<geom size="1" pos="1 0 0"/>{end}',
+        '{free}<geom size="1" pos="1 0 0"/>{end}',
+    ),
+    "disabled constraints": (
+        '<option><flag constraint="disable"/></option>{hinge}<geom size="1"/>{end}'
+        '<equality><joint joint1="q"/></equality>',
+        '{hinge}<geom size="1"/>{end}',
+    ),
+}
+
+
+@pytest.mark.parametrize("case", DEFAULTS)
+def test_defaults_are_those_of_mujoco(case, tmp_path):
+    parts = {
+        "hinge": '<worldbody><body gravcomp="0.5"><joint name="q" axis="1 0 0" stiffness="1"/>',
+        "free": '<worldbody><body><joint name="q" axis="1 0 0"/>',
+        "end": "</body></worldbody>",
+    }
+    found = []
+    for text in DEFAULTS[case]:
+        file = tmp_path / "model.xml"
+        file.write_text(f"<mujoco>{text.format(**parts)}</mujoco>")
+        system = sc.LagrangianSystem.from_mjcf(file, name="model")
+        found.append((system.lagrangian, system.forces, system.constraints))
+    assert found[0] == found[1]
+
+
+def test_included_files_are_sought_in_the_folder_of_the_main_document_first(tmp_path):
+    (tmp_path / "parts").mkdir()
+    body = '<mujocoinclude><body name="{}"><joint/><geom size="0.1" pos="1 0 0"/></body></mujocoinclude>'
+    (tmp_path / "parts" / "all.xml").write_text('<mujocoinclude><include file="arm.xml"/></mujocoinclude>')
+    (tmp_path / "parts" / "arm.xml").write_text(body.format("inner"))
+    (tmp_path / "main.xml").write_text('<mujoco><worldbody><include file="parts/all.xml"/></worldbody></mujoco>')
+    assert str(sc.LagrangianSystem.from_mjcf(tmp_path / "main.xml").coordinates[0]) == "inner"
+    (tmp_path / "arm.xml").write_text(body.format("outer"))
+    assert str(sc.LagrangianSystem.from_mjcf(tmp_path / "main.xml").coordinates[0]) == "outer"
+    (tmp_path / "arm.xml").write_text(body.format("outer").replace("geom ", "goem "))
+    with pytest.raises(SystemDefinitionError, match=r"arm\.xml: <body> 'outer' contains .*; did you mean 'geom'"):
+        sc.LagrangianSystem.from_mjcf(tmp_path / "main.xml")
+
+
+def test_deep_documents_are_read(tmp_path):
+    depth, file = 1500, tmp_path / "deep.xml"
+    inside = '<joint/><geom size="0.1" pos="1 0 0"/>'
+    frames = f"{'<frame>' * depth}{inside}{'</frame>' * depth}"
+    bodies = '<body pos="0 0 0.1">' * depth
+    file.write_text(f"<mujoco><worldbody>{bodies}{frames}{'</body>' * depth}</worldbody></mujoco>")
+    assert len(sc.LagrangianSystem.from_mjcf(file).coordinates) == 1
+
+
 def test_robot_in_which_nothing_moves_is_refused(tmp_path):
     file = tmp_path / "still.urdf"
     file.write_text('<robot name="still"><link name="base"/></robot>')
-    with pytest.raises(SystemDefinitionError, match="floating=True frees the base"):
+    with pytest.raises(SystemDefinitionError, match=r"from_urdf: floating=True, MJCF: <freejoint>"):
         sc.LagrangianSystem.from_urdf(file)
     with pytest.raises(SystemDefinitionError, match="no hinge or slide 'elbow'"):
         sc.LagrangianSystem.from_urdf(ROBOTS / "arm.urdf", actuated=["elbow"])

@@ -336,7 +336,7 @@ def test_regular_lagrangians_of_all_kinds_are_accepted(lagrangian: str) -> None:
 
 
 def test_unused_parameter_is_retained() -> None:
-    with pytest.warns(SystemDefinitionWarning, match="parameter 'spare' is not used"):
+    with pytest.warns(SystemDefinitionWarning, match="parameter 'spare' does not occur"):
         assert from_text("x", "x_dot**2", spare=3).parameters == real("spare")
 
 

@@ -122,6 +122,12 @@ def test_state_is_that_of_the_formulas():
     assert (model.parameters["k"], model.array_system.defaults) == (2.0, (2.0,))
 
 
+def test_models_have_the_mesh_of_their_density():
+    model = parse_model(SCHROEDINGER)
+    assert model.mesh is model.system.mesh is not None
+    assert model.stepper().interface.layout.mesh is not None
+
+
 def test_models_with_known_sizes_keep_the_mesh():
     model = parse_model(SCHROEDINGER).with_known_sizes()
     assert model.stepper().interface.layout.mesh is model.mesh is not None

@@ -173,7 +173,7 @@ def test_a_catalogue_reference_may_be_changed():
         ("save_every", "t_end", "unknown key 't_end' in [run]; did you mean 'span'?"),
         ("save_every", "n", "unknown key 'n' in [run]; did you mean 'steps'?"),
         ("save_every", "rtol", "unknown key 'rtol' in [run]; did you mean 'tolerance'?"),
-        ("save_every", "solver", "unknown key 'solver' in [run]; 'method' belongs in [method]."),
+        ("save_every", "solver", "unknown key 'solver' in [run]; 'solver' belongs in [method]."),
         ("save_every", "degree", "unknown key 'degree' in [run]; 'degree' belongs in [method]."),
         ("degree", "n", "unknown key 'n' in [method] for svi; did you mean 'degree'?"),
         ("lagrangian", "L", "unknown key 'L' in [system]; did you mean 'lagrangian'?"),

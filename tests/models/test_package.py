@@ -20,6 +20,7 @@ from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.model_file import load_model
 from scvi_codegen.models.packages.package import generate_package, load_package
 from scvi_codegen.models.problems import problem
+from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.tables.quadrature import Quadrature
 
 STRICT = "-O1 -std=c99 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror"
@@ -128,7 +129,8 @@ def test_make_run_requires_only_a_c_compiler_and_equals_python(compiler, name, m
     header, *lines = result.stdout.splitlines()
     lines = [line for line in lines if not line.startswith("#")]
     names = [coordinate.name for coordinate in model.system.coordinates]
-    assert header.split() == ["#", "t", *names, *(f"p_{name}" for name in names), "energy_error"]
+    energy = "energy_change" if model.system.changes_energy else "energy_error"
+    assert header.split() == ["#", "t", *names, *(f"p_{name}" for name in names), energy]
     table = np.array([line.split() for line in lines], dtype=float)
     stepper = compile_stepper(model.system, method)
     trajectory = model.start(stepper).record(model.step_count, save_every=model.step_count // 20)
@@ -204,6 +206,22 @@ def test_every_kind_of_folder_is_built_without_a_warning(words, tmp_path):
     command = ["make", "-s", "-C", str(folder), "own_main", f"CFLAGS={flags.removeprefix('CFLAGS = ')} -Werror"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (result.returncode, result.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(("steps", "lines"), [(7, 8), (20, 21), (39, 21), (41, 15)])
+def test_examples_print_at_most_twenty_states_up_to_the_end(steps, lines, tmp_path):
+    """41 steps: 13 states of 3 steps each, and one of 2."""
+    needs("make", "cc")
+    events = (Event("q1"),) if steps == 41 else ()
+    model = replace(model_of("kepler", h=0.01, span=None, steps=steps, method=SVI(2)), events=events)
+    folder = generate_package(model, tmp_path / "orbit")
+    command = ["make", "-s", "-C", str(folder), "run", f"CFLAGS={STRICT} -O0"]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    times = [float(line.split()[0]) for line in printed if line[0] != "#"]
+    assert len(times) == lines
+    assert times[0] == 0
+    assert times[-1] == pytest.approx(0.01 * steps, rel=1e-15)
+    assert np.diff(times[:-1]) == pytest.approx(times[1], rel=1e-12)
 
 
 def test_large_workspaces_are_not_on_the_stack(tmp_path):

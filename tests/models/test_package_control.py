@@ -69,6 +69,6 @@ def test_microcontroller_code_has_adaptive_steps_if_requested(model, tmp_path, p
 
 
 def test_method_without_adaptive_steps_is_reported(model, tmp_path):
-    with pytest.raises(MethodError, match="give a step h"):
+    with pytest.raises(MethodError, match="give h and steps"):
         generate_package(replace(model, method=sc.StoermerVerlet()), tmp_path / "verlet")
     assert not (tmp_path / "verlet").exists()

@@ -465,3 +465,22 @@ def test_gcc_only_passes_are_not_given_to_other_compilers(compiler, monkeypatch)
     monkeypatch.setenv("CC", compiler)
     cut = source("#define DIVIDED_KERNELS\ndouble tiny_answer(void)\n{\n  return 42.0;\n}\n")
     assert building.load(cut, flags=("-O3",)).lib.tiny_answer() == 42.0
+
+
+@pytest.mark.parametrize(
+    ("library", "machine", "flags", "vectors"),
+    [
+        (("glibc", "2.36"), "x86_64", building.TUNED_FLAGS, True),
+        (("glibc", "2.22"), "x86_64", building.TUNED_FLAGS, True),
+        (("glibc", "2.17"), "x86_64", building.TUNED_FLAGS, False),
+        (("", ""), "x86_64", building.TUNED_FLAGS, False),
+        (("glibc", "2.36"), "aarch64", building.TUNED_FLAGS, False),
+        (("glibc", "2.36"), "x86_64", ("-O2",), False),
+    ],
+)
+def test_vector_functions_are_those_of_recent_glibc(library, machine, flags, vectors, monkeypatch):
+    monkeypatch.setattr(building.platform, "libc_ver", lambda: library)
+    monkeypatch.setattr(building.platform, "machine", lambda: machine)
+    tried = building._mathematics(flags)
+    assert tried[-1] == ([], ["-lm"])
+    assert [define for define, _ in tried[:-1]] == [["-DSCVI_LIBMVEC"]] * vectors

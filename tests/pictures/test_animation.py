@@ -1,12 +1,18 @@
 """Animations: what moves is found, frames are states at equal times, files are whole."""
 
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from samples import compile_quickly
+from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
 from scvi_codegen.errors import PlotError, StateError
+from scvi_codegen.mechanics.multibody.trees.tree import identifier
 from scvi_codegen.pictures.animation import shape_of
+from scvi_codegen.pictures.robots import skeleton
 
 pytest.importorskip("matplotlib")
 
@@ -24,6 +30,50 @@ def run_with(lagrangian: str, coordinates: list[str], **parameters: float) -> sc
     )
     m = len(coordinates)
     return compile_quickly(system, sc.SVI(2)).integrate([0.1] * m, [0.2] * m, h=0.01, steps=5)
+
+
+ROBOTS = Path(__file__).parent.parent / "mechanics" / "robots"
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("name", ["figure.xml", "ball.xml"])
+def test_links_are_where_mujoco_has_them(name):
+    mujoco = pytest.importorskip("mujoco")
+    model = mujoco.MjModel.from_xml_path(str(ROBOTS / name))
+    data = mujoco.MjData(model)
+    system = sc.LagrangianSystem.from_mjcf(ROBOTS / name)
+    rng = np.random.default_rng(3)
+    data.qpos[:] = model.qpos0 + 0.3 * rng.standard_normal(model.nq)
+    mujoco.mj_normalizeQuat(model, data.qpos)
+    mujoco.mj_kinematics(model, data)
+    values, joints = {}, []
+    free, ball = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
+    for k in range(model.njnt):
+        joint = identifier(model.joint(k).name or model.body(model.jnt_bodyid[k]).name)
+        joints.append(joint)
+        first, kind = model.jnt_qposadr[k], int(model.jnt_type[k])
+        at = data.qpos[first:]
+        if kind == free:
+            values |= dict(zip((f"{axis}_{joint}" for axis in "xyz"), at, strict=False))
+        if kind in (free, ball):
+            turn = at[3:7] if kind == free else at[:4]
+            values |= dict(zip((f"R_{joint}_{axis}" for axis in "wxyz"), turn, strict=True))
+        else:
+            values[joint] = at[0]
+    layout = SimpleNamespace(links=system.links)
+    names = [q.name for q in system.coordinates]
+    interface = SimpleNamespace(coordinates=names, layout=layout)
+    q = np.array([[values[name] for name in names]])
+
+    def rotation(member: str) -> np.ndarray:
+        quaternion = [values[f"{member}_{axis}"] for axis in "xyzw"]
+        return Rotation.from_quat(quaternion).as_matrix()[np.newaxis]
+
+    motion = SimpleNamespace(q=q, stepper=SimpleNamespace(interface=interface), rotation=rotation)
+    points = skeleton(motion)[0][0]
+    for k, link in enumerate(system.links):
+        anchor = data.xanchor[joints.index(link.name)]
+        assert np.abs(points - anchor).max(axis=1).min() < 1e-9, (k, link.name)
 
 
 class TestShapes:
@@ -101,6 +151,17 @@ class TestFilm:
     def test_animation_has_a_notebook_display(self, name):
         shown = run_of(name, 3).animate(seconds=0.2)._repr_html_()
         assert shown.count("data:image/png") == 4
+
+    def test_frames_of_adaptive_steps_are_dense_output_at_equal_times(self, capsys):
+        run = run_of("kepler", 1).stepper.integrate([0.5, 0.0], [0.0, 3**0.5], t_end=6.0, tolerance=1e-5)
+        drawn = []
+        film = run.animate(seconds=1.0, progress=lambda *numbers: drawn.append(numbers))
+        (shown,) = film.shown
+        assert np.ptp(np.diff(shown.t[film.frames])) < 1e-12
+        assert shown.q[film.frames] == pytest.approx(run.at(shown.t[film.frames])[0])
+        film._repr_html_()
+        assert drawn[-1] == (25, 25)
+        assert capsys.readouterr().err == ""  # no terminal
 
     def test_animation_of_a_backward_run_is_backward(self):
         run = run_of("kepler", 10)

@@ -140,6 +140,21 @@ def test_every_method_on_every_system_agrees_with_the_oracle(sample, compiled, n
     check(sample, compiled, name, method)
 
 
+@pytest.mark.parametrize("degree", [20, *(pytest.param(s, marks=pytest.mark.full) for s in (17, 24, 28, 32))])
+@pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole"])
+def test_steps_of_more_than_16_points_agree_with_the_oracle(sample, compiled, name, degree):
+    """They are padded to whole vectors of 8. The flow is that of 8 points to round-off: fixed, adaptive, linearised."""
+    case, stepper = sample(name), compiled(name, SVI(degree))
+    q, p = case.state
+    exact = case.oracle(SVI(8), q, p, H, T)
+    for steps in ({"h": H, "steps": 1}, {"h": H / 4, "steps": 4}, {"t_end": T + H}):
+        run = stepper.integrate(q, p, t=T, **steps)
+        assert relative((run.q[-1], run.p[-1]), exact) < TOLERANCE
+    moves = 1e-5 * np.reshape(np.eye(2 * len(q)), (-1, 2, len(q)))
+    after, before = ([np.ravel(stepper.step(*(np.array([q, p]) + s * x), H, T)) for x in moves] for s in (1, -1))
+    assert relative(stepper.jacobian(q, p, H, T), np.subtract(after, before).T / 2e-5) < 1e-8
+
+
 @pytest.mark.covering
 @pytest.mark.parametrize("method", [SVI(2, "gauss-legendre:3"), SCVI(3), RadauIIA(2)], ids=lambda method: method.name)
 @pytest.mark.parametrize(("h", "t"), [(-0.11, 0.37), (0.02, -5.5), (-0.2, 100.0)])

@@ -285,6 +285,8 @@ def test_damaged_manifests_are_rejected(recorded: Path, part: int) -> None:
     path = recorded / "manifest.json"
     whole = path.read_text()
     document = json.loads(whole)
+    del document["sha256"]
+    sealed, whole = whole, json.dumps(document)
     count = 0
     try:
         for place in paths_of(document):
@@ -297,7 +299,7 @@ def test_damaged_manifests_are_rejected(recorded: Path, part: int) -> None:
                 path.write_text(json.dumps(changed))
                 count += refused(lambda: _read_whole(recorded)) is not None
     finally:
-        path.write_text(whole)
+        path.write_text(sealed)
     assert count > 60
 
 

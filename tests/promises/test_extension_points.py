@@ -64,13 +64,14 @@ def run(folder: Path, script: str) -> str:
     return found.stdout
 
 
-def test_documented_method_and_solver_need_one_file_and_one_line() -> None:
+def test_documented_additions_need_one_file_and_one_line() -> None:
     new, changes = additions()
     lines = [line for _, change in changes for line in change.splitlines() if line[:1] in "+-"]
-    assert len(new) == 2
+    of_package = [path for path, _ in new if path.startswith("scvi_codegen/")]
+    assert len(of_package) == len(new) - 1 == 5, "an observer is a file of the user"
     assert not any((ROOT / path).exists() for path, _ in new)
     assert all(line.startswith("+") for line in lines)
-    assert sum("import" not in line for line in lines) == 2
+    assert sum("import" not in line for line in lines) == len(of_package)
 
 
 def test_documented_method_is_the_midpoint_rule(extended: Path) -> None:
@@ -104,6 +105,77 @@ for solver in ("fixed-point", "newton"):
 print(abs(ends[0] - ends[1]).max() < 1e-13)
 """
     assert run(extended, script).split() == ["separable", "shooting", "True"]
+
+
+def test_documented_quadrature_has_its_order_in_a_method(extended: Path) -> None:
+    script = """
+from scvi_codegen import SVI, compile_stepper
+from scvi_codegen.models.problems import problem
+given = problem("planar-pendulum")
+rule = SVI(4, "newton-cotes:7").quadrature
+print([round(float(w) * 140 / 2 * 6) for w in rule.weights])
+exact = compile_stepper(given.system, "gauss:8").step([0.5], [0.1], 0.8)[0]
+stepper = compile_stepper(given.system, SVI(4, "newton-cotes:7"))
+errors = []
+for n in (1, 2):
+    run = stepper.integrate([0.5], [0.1], h=0.8 / n, steps=n)
+    errors.append(abs(run.q[-1] - exact).max())
+print(6.5 < __import__("math").log2(errors[0] / errors[1]) < 9.5)
+"""
+    weights, order = run(extended, script).splitlines()
+    assert weights == "[41, 216, 27, 272, 27, 216, 41]"  # Abramowitz & Stegun 25.4.17, 6 h / 840
+    assert order == "True"
+
+
+def test_documented_format_writes_trajectories_and_ensembles(extended: Path) -> None:
+    script = """
+import json
+import numpy as np
+from scvi_codegen import compile_stepper
+from scvi_codegen.models.problems import problem
+stepper = compile_stepper(problem("kepler").system, "svi:2")
+q, p = [1.0, 0.0], [0.0, 1.1]
+one = stepper.integrate(q, p, h=0.1, steps=3)
+many = stepper.integrate_ensemble([q, q], [p, p], h=0.1, steps=3)
+for result, name in ((one, "one.json"), (many, "many.json")):
+    result.save(name, units={"t": "s"})
+    read = json.loads(open(name).read())["variables"]
+    print(read["t"]["units"], *read["q"]["dimensions"], np.array_equal(read["q"]["values"], result.q))
+from scvi_codegen.cli.commands.run import run as command
+print(".json" in next(each.help for each in command.params if each.name == "output"))
+"""
+    lines = run(extended, script).splitlines()
+    assert lines == ["s t coordinate True", "s t trajectory coordinate True", "True"]
+
+
+def test_documented_discretisation_solves_a_wave(extended: Path) -> None:
+    script = """
+import numpy as np
+from scvi_codegen import FieldSystem, compile_stepper
+waves = FieldSystem.from_text("waves", ["u"], {"x": (0, 1)}, "u_t**2/2 - u_x**2/2", boundary={"x": (0, 0)})
+for ratio in (1.5, 1):
+    mesh = waves.discretise("graded-elements", degree=6, elements=4, ratio=ratio)
+    x = mesh.points["x"]
+    found = compile_stepper(mesh.system, "svi:4").integrate({"u": np.sin(np.pi * x)}, h=0.02, steps=100)  # one period
+    equal = waves.discretise("spectral-elements", degree=6, elements=4).points["x"]
+    print(abs(found.q[-1] - found.q[0]).max() < 1e-6, np.allclose(x, equal))
+"""
+    assert run(extended, script).splitlines() == ["True False", "True True"]
+
+
+def test_documented_observer_measures_the_variance(extended: Path) -> None:
+    script = """
+import numpy as np
+from moments import Variance
+from scvi_codegen import compile_stepper
+from scvi_codegen.models.problems import problem
+stepper = compile_stepper(problem("kepler").system, "svi:2")
+arguments = {"q": [1.0, 0.0], "p": [0.0, 1.1], "h": 0.1, "steps": 50}
+observed = stepper.integrate(**arguments, observe=Variance()).observed
+saved = stepper.integrate(**arguments).q
+print(observed.shape, np.allclose(observed[-1], saved.var(axis=0), rtol=1e-12))
+"""
+    assert run(extended, script).strip() == "(51, 2) True"
 
 
 def test_two_block_sizes_need_blocks_and_rows_of_each() -> None:

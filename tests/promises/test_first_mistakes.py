@@ -10,6 +10,7 @@ from samples import QUICK_FLAGS
 import scvi_codegen as sc
 from scvi_codegen.cli import main
 from scvi_codegen.errors import ScviCodegenError
+from scvi_codegen.runtime.inputs.segments import input_of
 
 TEXT = {"name": "swing", "coordinates": ["q"], "lagrangian": "q_dot**2/2 + cos(q)"}
 MODEL = """\
@@ -40,6 +41,8 @@ def stepper():
         ({"q": [1.0, 2.0], "p": [0.0]}, "q must have shape (1,) for (q), not (2,)"),
         ({"q": [1.0], "velocity": [0.0, 0.0]}, "velocity must have shape (1,) for (q), not (2,)"),
         ({"q": ["1.0"], "p": [0.0]}, "q must be real numbers, not text: ['1.0'], write it without quotes"),
+        ({"q": "q.csv", "p": [0.0]}, "read the file first, as by numpy.loadtxt('q.csv', delimiter=',', skiprows=1)"),
+        ({"q": ["one"], "p": [0.0]}, "q must be real numbers, not text: ['one'], give numbers"),
         ({"q": {"x": 1.0}, "p": [0.0]}, "there is no 'x' in q"),
         ({"q": [math.nan], "p": [0.0]}, "q[0] (q) is nan: it must be finite"),
         ({"q": [1.0], "p": [0.0], "h": 0.0}, "the step size h is 0: it must be positive, or negative to integrate"),
@@ -64,13 +67,29 @@ def test_first_mistakes_with_runs(given, message, stepper):
             "unknown name 'k'. Known here: q, q_dot, t, pi; declare a constant as a parameter",
         ),
         ({"forces": {"x": "1"}}, "there is a force on 'x', which is not a coordinate. Coordinates: q"),
+        ({"lagrangian": "q'**2/2"}, 'unexpected character "\'": write the velocity of q as q_dot'),
+        ({"lagrangian": "L = q_dot**2/2"}, "unexpected character '=': write the right-hand side only"),
+        ({"lagrangian": "|q_dot|"}, "unexpected character '|': write abs(x)"),
+        ({"lagrangian": "q_dot²/2"}, "unexpected character '²': powers are written x**2"),
     ],
-    ids=["a constant", "a force"],
+    ids=["a constant", "a force", "a prime", "an equation", "bars", "a superscript"],
 )
 def test_first_mistakes_with_systems(given, message):
     with pytest.raises(ScviCodegenError) as caught:
         sc.LagrangianSystem.from_text(**TEXT | given)
     assert message in str(caught.value)
+
+
+def test_functions_report_what_they_require(stepper):
+    kepler = sc.problem("kepler").system
+    for call, message in (
+        (lambda: sc.advise(kepler, "svi:4", [1.0, 0.0], [0.0, 1.0], 10.0), "advise requires tolerance, the error at"),
+        (lambda: sc.advise(kepler, "svi:4", [1.0, 0.0], span=10.0, tolerance=1e-6), "give either p or velocity"),
+        (lambda: sc.periodic_orbit(stepper, [0.1], [0.0], period=6.0), r"\(steps=200\).*\(h=0.05\); it got neither"),
+        (lambda: input_of("u", "torque.csv"), "the input 'u' must be .*read a file first: t, values = numpy.loadtxt"),
+    ):
+        with pytest.raises(ScviCodegenError, match=message):
+            call()
 
 
 def test_system_accepts_positional_arguments_and_scalar_states(stepper):
@@ -133,4 +152,4 @@ def test_first_mistakes_with_files_and_commands(old, new, words, message, tmp_pa
 def test_first_mistakes_with_command_names():
     result = CliRunner().invoke(main, ["runn", "kepler"])
     assert result.exit_code == 2
-    assert "there is no command 'runn'; did you mean 'run'? Known: bench," in result.stderr
+    assert "there is no command 'runn'; did you mean 'run'? Known: cache," in result.stderr

@@ -19,6 +19,7 @@ from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.run.saving import sealed
 
 Q, P = np.array([1.0, 0.25]), np.array([0.0, 1.0])
 REFUSED = (StateError, StepFailedError)
@@ -202,20 +203,21 @@ def test_wrong_types_are_rejected_by_name(call, kepler):
 
 @pytest.mark.parametrize("method", [SVI(3), StoermerVerlet()], ids=lambda method: method.name)
 def test_damaged_bytes_of_a_run_are_rejected_or_bounded(method):
+    """Behind a right checksum."""
     stepper = prepared(stepper_for("kepler", method))
     run = stepper.start(Q, P, h=0.1)
     run.record(3)
-    saved, random = run.checkpoint(), Random(5)
+    saved, random = run.snapshot, Random(5)
     for byte in (b"\0", b"\xff", b"\x7f"):
         with pytest.raises(StateError, match=r"invalid saved run|the saved run has adaptive steps"):
-            stepper.from_checkpoint(byte * len(saved))
+            stepper.from_checkpoint(sealed(byte * len(saved)))
     for _ in range(300):
         damaged = bytearray(saved)
         for _ in range(random.choice((1, 1, 8))):
             damaged[random.randrange(len(damaged))] = random.randrange(256)
         with guarded():
             try:
-                states = stepper.from_checkpoint(bytes(damaged)).record(3)
+                states = stepper.from_checkpoint(sealed(bytes(damaged))).record(3)
             except REFUSED:
                 continue
         assert np.isfinite(states.q).all()

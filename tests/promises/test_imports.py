@@ -33,7 +33,7 @@ FLOORS = """
     compiler fields frameworks
     results
     derivation models advice verification
-    benchmark reproduce
+    reproduce
     package distributed __init__
     cli
     __main__
@@ -58,13 +58,12 @@ OWNERS = {
     "jaxlib": "frameworks",
     "jinja2": "display rendering",
     "markupsafe": "display reproduce",
-    "matplotlib": "benchmark pictures reproduce",
-    "mpmath": "benchmark display tables",
-    "openmm": "benchmark",
+    "matplotlib": "pictures reproduce",
+    "mpmath": "display tables",
     "pandas": "files runtime",
     "platformdirs": "files",
-    "rebound": "benchmark frameworks",
-    "scipy": "benchmark frameworks lowering mechanics runtime",
+    "rebound": "frameworks",
+    "scipy": "frameworks lowering mechanics runtime",
     "tomli_w": "models",
     "xarray": "files runtime",
     "zarr": "files",
@@ -143,6 +142,12 @@ def test_folders_have_at_most_16_files():
 def test_imports_point_to_lower_layers_only():
     pairs = [(m, other) for m, others in used().items() for other in others if room_of(other) != room_of(m)]
     assert [pair for pair in pairs if FLOOR_OF[room_of(pair[1])] >= FLOOR_OF[room_of(pair[0])]] == []
+
+
+def test_the_package_imports_nothing_else_of_the_checkout():
+    folders = {path.name for path in PACKAGE.parent.iterdir() if path.is_dir()} - {PACKAGE.name}
+    assert {"benchmarks", "tests", "examples"} <= folders
+    assert {name for imported in names().values() for name in imported if name.split(".")[0] in folders} == set()
 
 
 def test_no_module_imports_itself_indirectly():

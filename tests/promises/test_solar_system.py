@@ -282,7 +282,7 @@ class TestRuns:
         assert (tmp_path / "solar_system.png").stat().st_size > 50_000
 
     def test_rebound_gives_the_same_trajectory(self, tmp_path):
-        pytest.importorskip("rebound", reason="needs the extra 'bench'")
+        pytest.importorskip("rebound", reason="needs rebound")
         output = output_of("beside_rebound.py", tmp_path, "1")
         apart = [float(metres) for line in output.splitlines() if "apart" in line for metres in line.split()[4:-1]]
         assert len(apart) >= 10

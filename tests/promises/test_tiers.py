@@ -7,7 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from tiers import DEFAULT, cover, first_of_each, long_ones_first
+from tiers import QUICK, cover, first_of_each, long_ones_first
 
 
 @pytest.mark.parametrize("times", [1, 2, 3])
@@ -33,6 +33,6 @@ def test_long_files_start_first_and_others_retain_their_order():
     assert "".join(item.name for item in items) == "CEabd"
 
 
-def test_the_default_tier_is_what_pytest_runs():
+def test_the_quick_tier_is_what_pytest_runs():
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))
-    assert f"-m '{DEFAULT}'" in project["tool"]["pytest"]["ini_options"]["addopts"]
+    assert f"-m '{QUICK}'" in project["tool"]["pytest"]["ini_options"]["addopts"]

@@ -7,7 +7,9 @@ import os
 import shutil
 import subprocess
 import sys
+import tarfile
 import tomllib
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +68,22 @@ def test_wheel_contents_are_complete(built):
     assert "PASSED" in output_of(sys.executable, "-m", "twine", "check", "--strict", *files, folder=built[0])
     wheel = next(name for name in files if name.endswith(".whl"))
     assert ": OK" in output_of(sys.executable, "-m", "check_wheel_contents", wheel, folder=built[0])
+    with zipfile.ZipFile(wheel) as archive:
+        packed = set(archive.namelist())
+    version = scvi_codegen.__version__
+    assert {name.split("/")[0] for name in packed} == {"scvi_codegen", f"scvi_codegen-{version}.dist-info"}
+    packed = {name.replace("scvi_codegen/templates/", "templates/") for name in packed if ".dist-info/" not in name}
+    paths = [path for folder in ("scvi_codegen", "templates") for path in (ROOT / folder).rglob("*") if path.is_file()]
+    assert packed == {str(path.relative_to(ROOT)) for path in paths if "__pycache__" not in path.parts}
+
+
+def test_tests_documentation_and_benchmarks_run_from_the_source_archive(built):
+    (archive,) = built[0].glob("*.tar.gz")
+    with tarfile.open(archive) as packed:
+        entries = {name.split("/")[1] for name in packed.getnames()}
+    assert entries >= {"scvi_codegen", "templates", "tests", "docs", "examples", "benchmarks", "generated", ".ci"}
+    assert entries >= {path.name for path in ROOT.iterdir() if path.suffix in (".md", ".toml", ".cff")}
+    assert entries >= {"LICENSE", ".clang-format", ".gitattributes", ".gitignore"}
 
 
 @pytest.fixture(scope="module")

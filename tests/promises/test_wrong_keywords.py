@@ -43,7 +43,7 @@ def test_inputs_are_arguments_of_integrate(stepper, chain):
 
 def test_states_of_runs_with_inputs_are_saved_at_steps(stepper):
     for integrate, state in ((stepper.integrate, [0.2]), (stepper.integrate_ensemble, [[0.2]])):
-        with pytest.raises(StateError, match="t_eval is not supported with inputs: omit t_eval"):
+        with pytest.raises(StateError, match="t_eval is not available with inputs: omit t_eval"):
             integrate(state, state, t_end=0.3, inputs=DATA, t_eval=[0.1])
 
 

@@ -64,6 +64,7 @@ def test_angular_velocity_in_the_body_frame_moves_the_matrix():
         (-np.eye(3), "its determinant is -1"),
         ({"euler": "zz", "angles": [1, 2]}, "Euler angles of 'R' are invalid"),
         ({"axis": [0, 0, 0], "angle": 1}, "not all zero"),
+        ({"axis": [0, np.nan, 0], "angle": 1}, "the axis of 'R' must be finite"),
         ({"angle": 1}, "has the keys angle"),
         ({"euler": "zxz", "angles": [0, np.nan, 0]}, "quaternion of 'R' must be finite"),
         ({"axis": [0, 0, 1], "angle": np.inf}, "the angle a finite number"),

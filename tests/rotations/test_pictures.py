@@ -51,7 +51,7 @@ def test_the_overview_shows_body_axes_in_the_unit_circle(run, tmp_path):
 
 
 def test_an_animation_shows_a_box_that_moves_and_turns_with_the_body(run):
-    shape = run.animate(seconds=0.2).shape
+    (shape,) = run.animate(seconds=0.2).shapes
     points, (box, arrow) = shape.points(run.q, run.p), shape.solids
     corners = points[:, box][:, :16] - run.q[:, np.newaxis, :3]
     fixed = np.einsum("nji,nkj->nki", run.rotation(), corners)

@@ -44,6 +44,16 @@ def test_tables_have_matrices_angular_velocities_and_directions_by_name(run, tmp
     np.testing.assert_allclose(table.loc[0, ["n_1_dot", "n_2_dot", "n_3_dot"]].tolist(), V["n"], rtol=0, atol=1e-15)
 
 
+def test_quantities_of_states_have_names(stepper, run):
+    together = stepper.integrate_ensemble(Q | {"x": [0.0, 0.0]}, velocity=V, h=0.1, steps=20)
+    for name, values in {"R": run.rotation(), "omega": run.angular_velocity(), "n": run.direction()}.items():
+        np.testing.assert_array_equal(run[name], values)
+        np.testing.assert_allclose(together[name][:, 1], values, rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(run["x_dot"], run.velocity[:, 0])
+    with pytest.raises(StateError, match="there is no quantity 'S' of the states"):
+        run["S"]
+
+
 def test_datasets_have_vectors_with_named_axes(stepper, run):
     pytest.importorskip("xarray")
     data = run.to_xarray()

@@ -622,3 +622,43 @@ def test_a_system_in_sympy_is_that_in_text():
         forces={"x": "-x_dot"},
     )
     assert by_sympy == by_text
+
+
+DIRECTED = ("spherical", ["q"], "(q_dot**2 + n_1_dot**2 + n_2_dot**2 + n_3_dot**2 - q**2)/2 - n_3*q")
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        (
+            {"velocity": {"q": 0, "n": [0, 0.1, 0.3]}},
+            r"velocity: 'n' = \[0\.0, 0\.1, 0\.3\] is not tangent .* is 0\.3\.",
+        ),
+        ({"p": {"q": 0, "n": [0, 0, 1e-200]}}, r"p: 'n' .* not tangent .* give an orthogonal vector"),
+        ({"q": {"q": 0, "n": [0, 0, np.nan]}}, "the direction 'n' must be finite"),
+        ({"q": {"q": 0, "n": [0, 0, 0]}}, "the direction 'n' must not be zero"),
+        ({"q": {"q": 0, "n": [0, 1]}}, "the direction 'n' must have three components"),
+    ],
+)
+def test_states_of_directions_that_are_refused(state, message):
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_text(*DIRECTED, directions=["n"]), "svi:1")
+    rest = {"velocity": {"q": 0, "n": [0.0, 0, 0]}} if "p" not in state else {}
+    with pytest.raises(StateError, match=message):
+        stepper.integrate(**{"q": {"q": 0, "n": [0, 0, 1]}, **rest, **state}, h=0.1, steps=1)
+
+
+def test_spins_and_directions_of_all_lengths_are_read():
+    """Directions have any length, spins keep theirs; a small radial part of typed digits is removed."""
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_text(*DIRECTED, directions=["n"]), "svi:1")
+    for length in (1e-310, 1e-200, 1.0, 1e200):
+        q = {"q": 0, "n": [3 * length, 0, 4 * length]}
+        run = stepper.integrate(q, velocity={"q": 0, "n": [0.8, 0, -0.6000001]}, h=0.1, steps=0)
+        assert run.direction("n")[0] == pytest.approx([0.6, 0, 0.8], rel=1e-12)
+        assert abs(run.velocity[0, 1:] @ run.q[0, 1:]) < 1e-15
+    tops = sc.HamiltonianSystem.from_text("spin", ["q"], "(p_q**2 + q**2)/2 + q*s_3 + s_1", spins=["s"])
+    stepper = sc.compile_stepper(tops, "svi:1")
+    for length in (1e-200, 1.0, 1e200):
+        run = stepper.integrate({"q": 0.1, "s": [length, 0, -2 * length]}, {"q": 0}, h=0.1, steps=0)
+        assert run.spin("s")[0] == pytest.approx([length, 0, -2 * length], rel=1e-14)
+    with pytest.raises(StateError, match="the spin 's' must be finite"):
+        stepper.integrate({"q": 0.1, "s": [0, np.nan, 0]}, {"q": 0}, h=0.1, steps=1)

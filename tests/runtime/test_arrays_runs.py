@@ -66,7 +66,7 @@ def test_slices_have_the_states_of_the_run(steppers):
         with pytest.raises(IndexError, match=r"out of range|must be ascending"):
             run[rows]
     observed = steppers[0].integrate(Q, velocity=V, h=0.1, steps=3, observe=lambda state: state.q["q"][0])
-    with pytest.raises(StateError, match="saves no states: omit observe"):
+    with pytest.raises(StateError, match="omit observe"):
         observed[0]
 
 
@@ -119,7 +119,7 @@ class TestControlledSteps:
 
     def test_unsupported_adaptive_arguments_are_rejected(self, steppers, ring):
         stepper, _ = steppers
-        with pytest.raises(MethodError, match="adaptive steps are unavailable"):
+        with pytest.raises(MethodError, match="not available without an error estimate"):
             sc.compile_stepper(ring, "stoermer-verlet").integrate(Q, t_end=1.0)
         for given, message in (
             ({}, "give either h .fixed step size. or t_end"),

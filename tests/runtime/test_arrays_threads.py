@@ -281,7 +281,7 @@ def test_invalid_thread_counts_are_rejected() -> None:
         lagrangian="sum(i in N, sum(a in 2, r_dot[i, a]**2)/2)",
         constraints=["sum(a in 2, r[i, a]**2) = 1 for i in N"],
     )
-    with pytest.raises(MethodError, match="one thread"):
+    with pytest.raises(MethodError, match="the step uses one"):
         sc.compile_stepper(rods, "stoermer-verlet").start(np.array([[1.0, 0.0]]), h=0.1, threads=2)
 
 

@@ -192,6 +192,19 @@ def test_constraints_reduce_the_number_of_tangent_vectors():
         run.chaos_indicators(directions=[0.0, 0.0, 1.0, 0.0])
 
 
+def test_ensembles_with_constraints_are_the_same_as_runs():
+    """Trajectories that no lanes are compiled for."""
+    rod = LagrangianSystem.from_text(
+        name="rod", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"]
+    )
+    stepper = compile_stepper(rod, SVI(1, "gauss-lobatto:2"))
+    q, p = np.array([[1.0, 0.0], [0.0, -1.0]]), np.array([[0.0, 0.5], [0.3, 0.0]])
+    found = stepper.chaos_indicators_ensemble(q, p, h=0.01, steps=40, save_every=1, count=1)
+    for j in range(2):
+        alone = stepper.integrate(q[j], p[j], h=0.01, steps=40).chaos_indicators(1)
+        np.testing.assert_allclose(found.log_norms[:, j], alone.log_norms, rtol=0, atol=1e-12)
+
+
 def test_ensembles_are_the_same_as_runs(galaxy):
     q, p = np.array([REGULAR[0], CHAOTIC[0], [0.0, 0.95]]), np.array([REGULAR[1], CHAOTIC[1], [0.4, 0.4]])
     done = []

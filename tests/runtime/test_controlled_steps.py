@@ -266,7 +266,7 @@ def test_invalid_argument_is_named(kepler, arguments, words):
 @pytest.mark.parametrize("method", [sc.StoermerVerlet(), sc.SVI(4, space="trigonometric:0.5")])
 def test_methods_without_a_polynomial_curve_are_reported(method):
     stepper = sc.compile_stepper(sc.problem("kepler").system, method)
-    with pytest.raises(MethodError, match="the error estimate requires"):
+    with pytest.raises(MethodError, match=r"without an error estimate .* requires"):
         stepper.integrate([1.0, 0.0], [0.0, 1.0], t_end=1.0)
 
 
@@ -306,7 +306,7 @@ def test_equal_velocities_at_both_points_give_no_error_estimate(name, solver, me
     else:
         stepper = sc.compile_stepper(system, method, solver=solver)
         start = ([0.5] * system.dimension, [0.3] * system.dimension)
-    with pytest.raises(MethodError, match="the error estimate requires"):
+    with pytest.raises(MethodError, match=r"without an error estimate .* requires"):
         stepper.integrate(*start, t_end=2.0, tolerance=1e-6)
     assert math.isnan(stepper.integrate(*start, h=0.1, steps=2).step_error)
 

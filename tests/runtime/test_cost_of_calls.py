@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from counting import TooMuchWorkError, at_most
 
-from scvi_codegen import SVI, StateError, StepFailedError, compile_stepper, problem
+from scvi_codegen import SVI, LagrangianSystem, StateError, StepFailedError, compile_stepper, problem
 from scvi_codegen.runtime.run import chunks, run_loop
 from scvi_codegen.runtime.run import run as runs
 
@@ -22,14 +22,39 @@ def stepper():
     return compile_stepper(problem("kepler").system, SVI(8))
 
 
-@pytest.mark.parametrize(("plan", "calls"), [(FIXED, 59), (ADAPTIVE, 82)])
-def test_a_call_takes_few_function_calls(stepper, plan, calls):
+@pytest.mark.parametrize("convert", [list, tuple, np.array])
+@pytest.mark.parametrize(("plan", "calls"), [(FIXED, 45), (ADAPTIVE, 70)])
+def test_a_call_takes_few_function_calls(stepper, convert, plan, calls):
     """The limit is a tenth above the present number, and does not depend on the machine."""
-    stepper.integrate(Q, P, **plan)
+    q, p = convert(Q.tolist()), convert(P.tolist())
+    stepper.integrate(q, p, **plan)
     with at_most(calls):
-        stepper.integrate(Q, P, **plan)
+        stepper.integrate(q, p, **plan)
     with pytest.raises(TooMuchWorkError), at_most(calls // 2):
-        stepper.integrate(Q, P, **plan)
+        stepper.integrate(q, p, **plan)
+
+
+def test_one_step_of_a_run_takes_few_function_calls(stepper):
+    run = stepper.start(Q, P, h=0.05)
+    with at_most(10):
+        run.advance(1)
+    assert run.steps == 1
+
+
+@pytest.mark.parametrize("values", [[1, 0], [0.4, np.float64(0.25)], (2, -0.0), [2**70, 1]])
+def test_lists_and_arrays_start_bitwise_equal_runs(stepper, values):
+    whole = np.array(values, dtype=float)
+    first, again = (stepper.integrate(q, type(q)([0.0, 2.0]) if q is values else P, **FIXED) for q in (values, whole))
+    assert first.q.tobytes() == again.q.tobytes()
+    assert first.p.tobytes() == again.p.tobytes()
+
+
+@pytest.mark.parametrize("q", [[0.4], [0.4, 0.0, 1.0], ["0.4", 1.0], [0.4, np.inf], [10**400, 0.0], [[0.4, 1]]])
+def test_invalid_lists_raise_after_valid_ones(stepper, q):
+    saved = numbers(stepper.integrate([0.4, 0.0], [0.0, 2.0], **FIXED))
+    with pytest.raises(StateError):
+        stepper.integrate(q, [0.0, 2.0], **FIXED)
+    assert saved == numbers(stepper.integrate([0.4, 0.0], [0.0, 2.0], **FIXED))
 
 
 def numbers(found):
@@ -73,6 +98,53 @@ def test_large_memory_is_freed(stepper, monkeypatch):
     monkeypatch.setattr(runs, "MOST_KEPT", 0)
     stepper.integrate(Q, P, **FIXED)
     assert not stepper._released_runs
+
+
+@pytest.fixture(scope="module")
+def chains():
+    """Chains of run-time sizes: elastic, and with fixed distances from the origin that depend on a parameter."""
+    kinetic = "sum(i in N, (x_dot[i]**2 + y_dot[i]**2)/2) - k*sum(i in 0..N-2, (x[i+1] - x[i])**2 + (y[i+1] - y[i])**2)"
+    common = {"coordinates": ["x[N]", "y[N]"], "parameters": {"k": 0.7}, "lagrangian": kinetic}
+    held = {"constraints": ["x[i]**2 + y[i]**2 - 1 for i in N"]}
+    kinds = ({}, "svi:4"), (held, "stoermer-verlet")
+    return [compile_stepper(LagrangianSystem.from_text(name="chain", **common, **each), by) for each, by in kinds]
+
+
+def test_calls_of_arrays_take_few_function_calls(chains):
+    q, p = {"x": np.arange(3.0), "y": np.zeros(3)}, np.zeros(6)
+    run = chains[0].integrate(q, p, h=0.05, steps=50)
+    chains[0].integrate(q, p, h=0.05, steps=1)
+    with at_most(550):
+        chains[0].integrate(q, p, h=0.05, steps=1)
+    run.momentum_maps()
+    with at_most(400):
+        run.momentum_maps()
+
+
+@pytest.mark.parametrize("constrained", [False, True])
+def test_runs_of_arrays_are_reused_bitwise_equally(chains, constrained):
+    angles = np.arange(3.0)
+    q, still = {"x": np.cos(angles), "y": np.sin(angles)}, np.zeros(6)
+    v = np.concatenate([-np.sin(angles), np.cos(angles)])
+    chain = chains[constrained]
+
+    def run(velocity, **others):
+        return numbers(chain.integrate(q, velocity=velocity, h=0.05, steps=20, **others))
+
+    first, other = run(v), run(v, parameters={"k": 2.0})
+    bound = chain.bind(q)[0]
+    assert len(bound._released_runs) == 1
+    for velocity, parameters, expected in [
+        (v, {}, first),
+        (still, {"k": 3.0}, None),
+        (v, {"k": 2.0}, other),
+        (v, {}, first),
+    ]:
+        found = run(velocity, parameters=parameters or None)
+        assert expected in (None, found)
+    bound._released_runs.clear()
+    assert run(v, parameters={"k": 2.0}) == other
+    assert len(bound._released_runs) == 1
 
 
 @pytest.mark.parametrize("save_every", [1, 3])

@@ -243,9 +243,9 @@ def test_derivatives_of_a_rod_in_transformed_time():
 def test_unsupported_derivatives_in_transformed_time():
     made = stepper("L")
     run = made.integrate(Q, P, h=H, steps=3)
-    with pytest.raises(MethodError, match=r"second derivatives of the steps are unavailable .* in transformed time"):
+    with pytest.raises(MethodError, match="hessian_product is not available in transformed time"):
         run.hessian_product(np.ones((4, 4)), np.eye(4))
-    with pytest.raises(MethodError, match="tangent vectors is unavailable in transformed time"):
+    with pytest.raises(MethodError, match="chaos_indicators is not available in transformed time"):
         run.lyapunov_exponents()
     with pytest.raises(StateError, match=r"shape \(4, 4\), or \(4, 5\) with those by t, or"):
         run.pullback(np.zeros((4, 6)))

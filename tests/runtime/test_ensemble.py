@@ -10,18 +10,23 @@ import threading
 import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
-from samples import sample_named, stepper_for
+from numpy.testing import assert_allclose
+from samples import pushed_pendulum, sample_named, stepper_for
+from scipy.interpolate import CubicSpline
 
-from scvi_codegen.benchmark.cases.robots import chain
+from benchmarks.cases.robots import chain
 from scvi_codegen.cli import main
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import ModelFileError, StateError, StepFailedError
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI, Gauss, Method, RadauIIA, StoermerVerlet
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.ensemble_file import load_ensemble
@@ -32,8 +37,6 @@ from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.lanes import LaneBlock
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 
-pytestmark = pytest.mark.usefixtures("as_users_compile")
-
 KINDS = {
     "separable": "kepler",
     "coupled": "double-pendulum",
@@ -43,100 +46,256 @@ KINDS = {
     "magnetic": "charged-particle",
 }
 METHODS = [SVI(5), Gauss(3), RadauIIA(2), StoermerVerlet(), SCVI(3)]
+KNOTS = np.array([0.0, 0.37, 0.9, 1.41, 2.05, 2.6])
+VALUES = np.array([0.0, 1.2, -0.7, 0.4, 1.9, -1.0])
+COUNT = 11
+"""Trajectories with inputs: more than a block of lanes, and no multiple of one."""
+OWN_VALUES = VALUES * np.random.default_rng(1).uniform(0.5, 1.5, (COUNT, 1))
+DAMPING = {"c": np.random.default_rng(4).uniform(0.1, 0.3, COUNT)}
+W = ([0.0, 3.0], [0.0, 0.3])
+ECCENTRICITIES = np.array([0.0, 0.3, 0.6, 0.9])
+ENDS = [5.0, 10.0, 20.0, 15.0]
+
+
+def coupled_with_inputs() -> LagrangianSystem:
+    """Return a system with position-dependent masses, whose iterations start with velocities."""
+    return LagrangianSystem.from_text(
+        name="coupled",
+        coordinates=["x", "y"],
+        lagrangian="(1 + x**2/4)*x_dot**2/2 + x_dot*y_dot/3 + (1 + w/5)*y_dot**2 - x**4/4 - (x - y)**2/2",
+        parameters={"c": 0.2},
+        forces={"x": "u - c*x_dot"},
+        inputs=["u", "w"],
+    )
+
+
+WITH_INPUTS = {"pushed pendulum": pushed_pendulum, "coupled with inputs": coupled_with_inputs}
+
+
+@cache
+def stepper_of(system: str, method: Method) -> Stepper:
+    if system in WITH_INPUTS:
+        solver = "newton" if isinstance(method, SCVI) else "auto"  # which has no lanes
+        return compile_stepper(WITH_INPUTS[system](), method, solver=solver)
+    return stepper_for("kepler" if system == "eccentric" else system, method)
 
 
 def states(name: str, count: int) -> tuple[np.ndarray, np.ndarray]:
     """(count, m) positions and momenta about the generic state of a system."""
+    if name == "eccentric":
+        zero, e = np.zeros(4), ECCENTRICITIES
+        return np.column_stack([1 - e, zero])[:count], np.column_stack([zero, np.sqrt((1 + e) / (1 - e))])[:count]
+    if name in WITH_INPUTS:
+        dimension = stepper_of(name, SVI(3)).dimension
+        return tuple(np.random.default_rng(2).uniform(-1, 1, (2, count, dimension)))
     q, p = sample_named(name).state
     generator = np.random.default_rng(7)
     return tuple(x * (1.0 + 0.1 * generator.uniform(-1, 1, (count, len(x)))) for x in (q, p))  # type: ignore[return-value]
 
 
-def assert_equals_single_runs(
-    stepper: Stepper, result: EnsembleTrajectory, tolerance: float, **settings: object
-) -> None:
-    assert result.ok.all()
-    for j in range(len(result)):
-        single = stepper.integrate(
-            result.q[0, j], result.p[0, j], h=result.h, parameters=result.parameters[j], **settings
+def of_one(arguments: dict[str, Any], j: int) -> dict[str, Any]:
+    """The arguments of trajectory j: rows of tables of inputs, entries of parameters, constants and end times."""
+
+    def entry(value: Any) -> Any:
+        if isinstance(value, tuple):
+            t, values, *kind = value
+            return (t, values[j] if np.ndim(values) == 2 else values, *kind)
+        return value[j] if np.ndim(value) else value
+
+    own = {name: value for name, value in arguments.items() if name != "threads"}
+    for name in own.keys() & {"parameters", "inputs"}:
+        own[name] = {key: entry(value) for key, value in own[name].items()}
+    return own | ({"t_end": entry(own["t_end"])} if "t_end" in own else {})
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """An ensemble of so many states, and the relative difference from single runs, 0 for the same bits."""
+
+    system: str
+    method: Method
+    count: int
+    arguments: dict[str, Any]
+    tolerance: float = 0.0
+
+    def run(self, **more: Any) -> EnsembleTrajectory:
+        q, p = states(self.system, self.count)
+        return stepper_of(self.system, self.method).integrate_ensemble(q, p, **self.arguments, **more)
+
+    def check(self) -> None:
+        runs, stepper = self.run(), stepper_of(self.system, self.method)
+        assert runs.ok.all()
+        assert len(runs) == self.count
+        energies, errors = runs.energy(), runs.momentum_errors()
+        for j, (t, q, p, _, steps) in enumerate(runs.each()):
+            arguments = of_one(self.arguments, j)
+            if "t_eval" in arguments:
+                arguments["t_eval"] = [time for time in arguments["t_eval"] if time <= arguments["t_end"]]
+            run = stepper.integrate(*(x[j] for x in states(self.system, self.count)), **arguments)
+            assert steps == run.steps
+            assert np.array_equal(t, run.t)
+            for found, expected in ((q, run.q), (p, run.p), (energies[: len(t), j], run.energy())):
+                assert_allclose(found, expected, rtol=0, atol=20 * self.tolerance * np.abs(expected).max())
+            for found, expected in ((q, run.q), (p, run.p)):
+                assert np.abs(found - expected).max() <= self.tolerance * np.abs(expected).max()
+            assert_allclose(errors[: len(t), j], run.momentum_errors(), rtol=0, atol=20 * self.tolerance)
+            assert np.isnan(energies[len(t) :, j]).all()
+
+
+ADAPTIVE = {"t_end": ENDS, "tolerance": 1e-10}
+INPUTS = {"u": (KNOTS, OWN_VALUES), "w": W}
+CUBIC = {"u": (KNOTS, OWN_VALUES), "w": ([0.0, 1.0, 3.0], [0.0, 0.5, 0.0], "cubic")}
+STIFF = np.where(np.arange(9) % 4 == 1, 1e6, 1.0)
+CASES = {
+    **{
+        str(count): Case(
+            "kepler",
+            SVI(5),
+            count,
+            {"h": 0.05, "steps": 40, "save_every": 3, "parameters": {"mu": np.linspace(0.8, 1.2, count)}},
+            3e-13,
         )
-        assert np.array_equal(single.t, result.t)
-        for ours, theirs in ((result.q[:, j], single.q), (result.p[:, j], single.p)):
-            assert np.abs(ours - theirs).max() <= tolerance * np.abs(theirs).max()
-
-
-class TestEqualsSingleTrajectories:
-    @pytest.mark.sampled(2)
-    @pytest.mark.covering
-    @pytest.mark.parametrize("kind", KINDS)
-    @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
-    def test_ensemble_equals_single_runs_for_systems_and_methods(self, kind: str, method: Method):
-        stepper = stepper_for(KINDS[kind], method)
-        q, p = states(KINDS[kind], 3)
-        result = stepper.integrate_ensemble(q, p, h=0.02, steps=60, save_every=20, t=0.3)
-        assert result.q.shape == (4, *q.shape)
-        assert result.steps.tolist() == [60, 60, 60]
-        # measured 2e-14: rounding of 60 steps, magnified by the motion
-        assert_equals_single_runs(stepper, result, 3e-13, steps=60, save_every=20, t=0.3)
-
-    @pytest.mark.parametrize("count", [1, 7, 8, 9, 64])
-    def test_ensemble_equals_single_runs_for_any_number_and_parameters(self, count: int):
-        stepper = stepper_for("kepler", SVI(5))
-        q, p = states("kepler", count)
-        result = stepper.integrate_ensemble(
-            q, p, h=0.05, steps=40, save_every=3, parameters={"mu": np.linspace(0.8, 1.2, count)}
+        for count in (1, 7, 8, 9, 64)
+    },
+    **{
+        f"backward {method.name}": Case("driven-duffing", method, 9, {"h": -0.02, "steps": 50, "t": 2.0}, 3e-13)
+        for method in (SVI(5), SCVI(3))
+    },
+    "newton": Case(
+        "harmonic-oscillator", SVI(5), 9, {"h": 0.5, "steps": 50, "save_every": 7, "parameters": {"k": STIFF}}, 1e-10
+    ),
+    **{
+        f"h = {h}, {threads} threads": Case("eccentric", SVI(4), 4, {"h": h, "t_end": t_end, "threads": threads}, 1e-15)
+        for h, t_end in ((0.03, 0.1), (-0.03, -0.1), (0.25, 0.1))
+        for threads in (1, 2)
+    },
+    "adaptive": Case("eccentric", SVI(4), 4, ADAPTIVE),
+    "adaptive in threads": Case("eccentric", SVI(4), 4, ADAPTIVE | {"save_every": 7, "threads": 3}),
+    "at times": Case("eccentric", SVI(4), 4, ADAPTIVE | {"t_eval": np.linspace(0.0, 20.0, 9)}),
+    "adaptive backward": Case(
+        "eccentric", SVI(4), 2, {"t_end": -3.0, "tolerance": 1e-10, "parameters": {"mu": [1.0, 1.2]}}
+    ),
+    **{
+        f"{name} constants": Case(
+            "pushed pendulum", SVI(2), 3, {"inputs": {"u": np.array([0.3, -1.2, 0.3]), "w": 0.5}, **plan}, tolerance
         )
-        assert len(result) == count
-        assert len(result.t) == 14
-        assert_equals_single_runs(stepper, result, 3e-13, steps=40, save_every=3)
+        for name, plan, tolerance in (("fixed", {"h": 0.1, "steps": 7}, 1e-14), ("adaptive", {"t_end": 0.7}, 1e-14))
+    },
+    "inputs": Case(
+        "coupled with inputs", SVI(3), COUNT, {"inputs": INPUTS, "parameters": DAMPING, "h": 0.05, "t_end": 2.3}, 2e-14
+    ),
+    "inputs without lanes": Case(
+        "pushed pendulum",
+        SCVI(2),
+        COUNT,
+        {"inputs": INPUTS, "parameters": DAMPING, "h": 0.02, "t_end": 2.3, "save_every": 4},
+    ),
+    "adaptive inputs": Case(
+        "pushed pendulum",
+        SVI(4),
+        COUNT,
+        {"inputs": CUBIC, "parameters": DAMPING, "t_end": np.linspace(0.2, 2.5, COUNT)},
+    ),
+    "adaptive inputs backward": Case(
+        "pushed pendulum",
+        SVI(4),
+        COUNT,
+        {"inputs": CUBIC, "parameters": DAMPING, "t": 2.5, "t_end": 0.0, "tolerance": 1e-6, "save_every": 5},
+    ),
+}
 
-    def test_parameters_are_named_rows_or_one_row_per_trajectory(self):
-        stepper = stepper_for("planar-pendulum", SVI(5))
-        q, p = states("planar-pendulum", 3)
-        each = stepper.integrate_ensemble(q, p, h=0.1, steps=5, parameters={"g": [1.0, 2.0, 3.0], "l": 2.0})
-        place = {name: stepper.parameters.index(name) for name in ("g", "l")}
-        assert each.parameters[:, place["g"]].tolist() == [1.0, 2.0, 3.0]
-        assert each.parameters[:, place["l"]].tolist() == [2.0] * 3
-        again = stepper.integrate_ensemble(q, p, h=0.1, steps=5, parameters=each.parameters)
-        assert np.array_equal(again.q, each.q)
-        same = stepper.integrate_ensemble(q, p, h=0.1, steps=5, parameters=each.parameters[0])
-        assert np.array_equal(same.parameters, np.tile(each.parameters[0], (3, 1)))
 
-    @pytest.mark.parametrize("method", [SVI(5), SCVI(3)], ids=lambda method: method.name)
-    def test_ensemble_equals_single_runs_backward(self, method: Method):
-        stepper = stepper_for("driven-duffing", method)
-        q, p = states("driven-duffing", 9)
-        there = stepper.integrate_ensemble(q, p, h=0.02, steps=50, t=1.0)
-        back = stepper.integrate_ensemble(there.q[-1], there.p[-1], h=-0.02, steps=50, t=2.0)
-        assert back.t[-1] == pytest.approx(1.0)
-        assert_equals_single_runs(stepper, back, 3e-13, steps=50, t=2.0)
-        if method.symmetric:
-            np.testing.assert_allclose(back.q[-1], q, rtol=1e-12)
+@pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
+@pytest.mark.parametrize("name", CASES)
+def test_each_trajectory_equals_the_single_run(name: str) -> None:
+    CASES[name].check()
 
-    def test_options_are_passed_to_the_lanes(self):
-        stepper = stepper_for("double-pendulum", SVI(5))
-        q, p = states("double-pendulum", 8)
-        loose = stepper.integrate_ensemble(q, p, h=0.05, steps=20, options=SolverOptions(tolerance=1e-4))
-        exact = stepper.integrate_ensemble(q, p, h=0.05, steps=20)
-        assert loose.ok.all()
-        assert 1e-14 < np.abs(loose.q - exact.q).max() < 1e-3
 
-    def test_energies_equal_those_of_single_runs(self):
-        stepper = stepper_for("double-pendulum", SVI(5))
-        q, p = states("double-pendulum", 9)
-        result = stepper.integrate_ensemble(q, p, h=0.02, steps=50)
-        energies = result.energy()
-        assert energies.shape == (51, 9)
-        assert np.abs(energies / energies[0] - 1).max() < 1e-9
-        assert energies[7, 8] == stepper.energy(result.q[7, 8], result.p[7, 8], result.t[7])
+@pytest.mark.sampled(2)
+@pytest.mark.covering
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
+def test_systems_and_methods_equal_single_runs(kind: str, method: Method) -> None:
+    """Measured 2e-14: rounding of 60 steps, magnified by the motion."""
+    Case(KINDS[kind], method, 3, {"h": 0.02, "steps": 60, "save_every": 20, "t": 0.3}, 3e-13).check()
 
-    def test_ensembles_with_few_or_no_steps(self):
-        stepper = stepper_for("kepler", SVI(5))
-        q, p = states("kepler", 9)
-        assert stepper.integrate_ensemble(q, p, h=0.1, steps=0).q.shape == (1, 9, 2)
-        result = stepper.integrate_ensemble(q, p, h=0.1, steps=3, save_every=5)
-        assert result.q.shape == (1, 9, 2)
-        assert result.steps.tolist() == [3] * 9
+
+@pytest.mark.sampled(3)
+@pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
+@pytest.mark.parametrize("kind", ["constant", "linear", "cubic"])
+@pytest.mark.parametrize("method", [SVI(3), StoermerVerlet(), Gauss(2)], ids=lambda method: method.name)
+def test_trajectories_with_inputs_equal_single_runs(method: Method, kind: str) -> None:
+    assert stepper_of("pushed pendulum", method).ensemble is not None
+    common = {"inputs": {"u": (KNOTS, OWN_VALUES, kind), "w": W}, "parameters": DAMPING}
+    for plan in ({"h": 0.1, "t_end": 2.3}, {"h": -0.1, "t": 2.55, "t_end": 0.02, "save_every": 3}):
+        Case("pushed pendulum", method, COUNT, common | plan, 4e-15).check()
+
+
+def test_iterations_of_coupled_systems_start_with_velocities() -> None:
+    stepper = stepper_of("coupled with inputs", SVI(3))
+    assert stepper.ensemble is not None
+    assert "_NEEDS_VELOCITIES = 1" in stepper.ensemble.header
+    assert stepper_of("pushed pendulum", SCVI(2)).ensemble is None
+
+
+def test_constant_inputs_are_parameters() -> None:
+    stepper, start = stepper_of("pushed pendulum", SVI(3)), ([0.2], [0.1])
+    for plan in ({"h": 0.1, "steps": 7}, {"t_end": 0.7}):
+        by_input = stepper.integrate(*start, inputs={"u": -1.2, "w": 0.5}, parameters={"c": 0.1}, **plan)
+        by_name = stepper.integrate(*start, parameters={"c": 0.1, "u_0": -1.2, "w_0": 0.5}, **plan)
+        assert np.array_equal(by_input.q, by_name.q)
+
+
+def test_parameters_are_named_rows_or_one_row_per_trajectory() -> None:
+    stepper = stepper_for("planar-pendulum", SVI(5))
+    q, p = states("planar-pendulum", 3)
+    each = stepper.integrate_ensemble(q, p, h=0.1, steps=5, parameters={"g": [1.0, 2.0, 3.0], "l": 2.0})
+    columns = [stepper.parameters.index(name) for name in ("g", "l")]
+    assert each.parameters[:, columns].T.tolist() == [[1.0, 2.0, 3.0], [2.0] * 3]
+    again = stepper.integrate_ensemble(q, p, h=0.1, steps=5, parameters=each.parameters)
+    assert np.array_equal(again.q, each.q)
+    same = stepper.integrate_ensemble(q, p, h=0.1, steps=5, parameters=each.parameters[0])
+    assert np.array_equal(same.parameters, np.tile(each.parameters[0], (3, 1)))
+
+
+def test_options_are_passed_to_the_lanes() -> None:
+    stepper = stepper_for("double-pendulum", SVI(5))
+    q, p = states("double-pendulum", 8)
+    loose = stepper.integrate_ensemble(q, p, h=0.05, steps=20, options=SolverOptions(tolerance=1e-4))
+    exact = stepper.integrate_ensemble(q, p, h=0.05, steps=20)
+    assert loose.ok.all()
+    assert 1e-14 < np.abs(loose.q - exact.q).max() < 1e-3
+
+
+def test_ensembles_with_few_or_no_steps() -> None:
+    stepper = stepper_for("kepler", SVI(5))
+    q, p = states("kepler", 9)
+    assert stepper.integrate_ensemble(q, p, h=0.1, steps=0).q.shape == (1, 9, 2)
+    result = stepper.integrate_ensemble(q, p, h=0.1, steps=3, save_every=5)
+    assert result.q.shape == (1, 9, 2)
+    assert result.steps.tolist() == [3] * 9
+    assert len(stepper.integrate_ensemble([1.0, 0.0], [0.0, 1.0], h=0.1, steps=5)) == 1
+    shorter_last = Case("eccentric", SVI(4), 4, {"h": 0.03, "t_end": 0.1, "save_every": 2}).run()
+    assert shorter_last.t[[0, -1]].tolist() == [0.0, 0.1]
+    still = Case("pushed pendulum", SVI(3), COUNT, {"inputs": INPUTS, "h": 0.1, "t": 0.4, "t_end": 0.4}).run()
+    assert still.t.tolist() == [0.4]
+    assert still.ok.all()
+    assert still.energy().shape == (1, COUNT)
+
+
+def test_results_have_target_times_and_are_pickled() -> None:
+    runs = CASES["adaptive"].run()
+    assert [plan.t_end for plan in runs.plans] == ENDS
+    assert runs.h == 0.0
+    times, q, _ = runs.ends
+    assert times.tolist() == ENDS
+    assert np.array_equal(q[2], list(runs.each())[2][1][-1])
+    driven = CASES["inputs"].run()
+    assert np.array_equal(pickle.loads(pickle.dumps(driven)).energy(), driven.energy())
+    stepper = stepper_for("kepler", SVI(5))
+    again, start = pickle.loads(pickle.dumps(stepper)), states("kepler", 9)
+    first, second = (each.integrate_ensemble(*start, h=0.05, steps=20) for each in (stepper, again))
+    assert np.array_equal(first.q, second.q)
 
 
 @pytest.fixture(scope="module")
@@ -182,41 +341,6 @@ class TestFailures:
         np.testing.assert_allclose(result.q[:, others], without.q, rtol=0, atol=1e-14)
         np.testing.assert_allclose(result.p[:, others], without.p, rtol=0, atol=1e-14)
 
-    def test_newton_continues_where_the_fixed_point_fails(self):
-        stepper = stepper_for("harmonic-oscillator", SVI(5))
-        q, p = states("harmonic-oscillator", 9)
-        stiffness = {"k": np.where(np.arange(9) % 4 == 1, 1e6, 1.0)}
-        result = stepper.integrate_ensemble(q, p, h=0.5, steps=50, save_every=7, parameters=stiffness)
-        assert result.steps.tolist() == [50] * 9
-        assert_equals_single_runs(stepper, result, 1e-10, steps=50, save_every=7)
-        others = stiffness["k"] == 1.0
-        calm = stepper.integrate_ensemble(q, p, h=0.5, steps=50, save_every=7)
-        assert np.abs(result.q[:, others] - calm.q[:, others]).max() < 1e-13
-
-    @pytest.mark.parametrize("h", [6e-2, 1e-2, 1e-4, 2e-14])
-    def test_lanes_converge_as_single_runs(self, h: float):
-        """Slowly, with steps repeated from another predictor, and at the level of rounding.
-
-        Changes below rounding are random, and relative to a velocity near 0 they exceed any fixed level.
-        """
-        count, steps = 32, 64
-        stepper = compile_stepper(chain(4).system, "svi:2")
-        generator = np.random.default_rng(1)
-        q, v = generator.uniform(-1, 1, (count, 4)), generator.normal(size=(count, 4))
-        p = np.array([stepper.momentum(*each) for each in zip(q, v, strict=True)])
-        runs = Ensemble(stepper, q, p, h=h, steps=steps).common
-        assert runs is not None
-        make, width = runs.blocks()
-        for first in range(0, count, width):
-            block = make(first)
-            block.advance(steps)
-            assert isinstance(block, LaneBlock)
-            assert not block.left
-        for j in range(0, count, 5):
-            single = stepper.integrate(q[j], p[j], h=h, steps=steps)
-            np.testing.assert_allclose(runs.q[-1, j], single.q[-1], rtol=0, atol=1e-12)
-            np.testing.assert_allclose(runs.p[-1, j], single.p[-1], rtol=0, atol=1e-11)
-
     def test_block_without_active_trajectories_stops(self):
         stepper = stepper_for("relativistic-particle", SVI(5))
         q, p = states("relativistic-particle", 8)
@@ -240,6 +364,15 @@ class TestFailures:
         assert 0 < last < 60
         assert np.isfinite(result.q[: last + 1, 1]).all()
         assert np.isnan(result.q[last + 1 :, 1]).all()
+
+    def test_failed_adaptive_trajectory_does_not_affect_the_others(self) -> None:
+        q, p = states("eccentric", 4)
+        p[1] = 0.0  # falls into the centre
+        runs = stepper_of("eccentric", SVI(4)).integrate_ensemble(q, p, **ADAPTIVE)
+        assert runs.ok.tolist() == [True, False, True, True]
+        assert 0.0 < runs.ends[0][1] < 1.0
+        assert runs.status[1] not in ("ok", "interrupted")
+        assert np.array_equal(runs.ends[1][3], CASES["adaptive"].run().ends[1][3])
 
 
 class TestThreadsAndInterruption:
@@ -295,44 +428,92 @@ class TestThreadsAndInterruption:
             tracemalloc.stop()
         assert peak < 1e6  # all states would take 41 MB
 
+    def test_interrupted_adaptive_runs_return_completed_states(self) -> None:
+        q, p = states("eccentric", 4)
+        work = Ensemble(stepper_of("eccentric", SVI(4)), q, p, t_end=[5.0, 5.0, 5.0, 1e7], tolerance=1e-10)
 
-class TestArguments:
-    @pytest.mark.parametrize(
-        ("changes", "message"),
-        [
-            ({"q": np.ones((3, 3))}, r"q must have shape \(k, 2\), not \(3, 3\)"),
-            ({"q": np.ones((2, 2))}, r"equal shapes, not \(2, 2\) and \(3, 2\)"),
-            ({"q": np.ones((0, 2))}, "q must have shape"),
-            ({"q": 1.0}, "q must have shape"),
-            ({"p": [[1.0, 0.0], [1.0, np.nan], [0.0, 0.0]]}, r"p\[1, 1\] \(q2\) is nan"),
-            ({"p": "fast"}, "p must be real numbers"),
-            ({"p": [[1.0], [1.0, 2.0], [3.0]]}, "p must be real numbers"),
-            ({"h": 0.0}, "the step size h is 0"),
-            ({"h": np.inf}, "the step size h is inf"),
-            ({"steps": 1.5}, "steps must be a whole number"),
-            ({"steps": -1}, "steps must be at least 0"),
-            ({"save_every": 0}, "save_every must be at least 1"),
-            ({"t": "noon"}, "the time t must be real numbers"),
-            ({"threads": -1}, "threads must be at least 1"),
-            ({"threads": 1.5}, "threads must be a whole number"),
-            ({"parameters": {"nu": 1.0}}, "there is no parameter 'nu'"),
-            (
-                {"parameters": {"mu": [1.0, 2.0]}},
-                r"the parameter mu must be one number or 3 numbers, not of shape \(2,\)",
-            ),
-            ({"parameters": {"mu": "heavy"}}, "the parameter mu must be real numbers"),
-            ({"parameters": np.ones((3, 2))}, r"parameters must have shape \(3, 1\), not \(3, 2\)"),
-            ({"parameters": ["heavy"]}, "parameters must be real numbers"),
-            ({"parameters": {"mu": [1.0, np.nan, 1.0]}}, "the parameter mu of trajectory 1 is nan"),
-        ],
-    )
-    def test_invalid_arguments_are_named(self, kepler: Stepper, changes: dict[str, object], message: str):
-        arguments: dict[str, object] = {"q": np.ones((3, 2)), "p": np.zeros((3, 2)), "h": 0.1, "steps": 5} | changes
-        with pytest.raises(StateError, match=message):
-            kepler.integrate_ensemble(**arguments)  # type: ignore[arg-type]
+        def interrupt(done: int) -> None:
+            if done:
+                raise KeyboardInterrupt
 
-    def test_one_state_is_an_ensemble_of_one(self, kepler: Stepper):
-        assert len(kepler.integrate_ensemble([1.0, 0.0], [0.0, 1.0], h=0.1, steps=5)) == 1
+        with pytest.raises(KeyboardInterrupt):
+            work.run(progress=interrupt, threads=1)
+        assert work.result().status.tolist()[::3] == ["ok", "interrupted"]
+
+
+BASE: dict[str, dict[str, Any]] = {
+    "kepler": {"q": np.ones((3, 2)), "p": np.zeros((3, 2)), "h": 0.1, "steps": 5},
+    "eccentric": dict(zip("qp", states("eccentric", 4), strict=True)),
+    "pushed pendulum": {
+        "q": np.zeros((COUNT, 1)),
+        "p": np.zeros((COUNT, 1)),
+        "inputs": {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)},
+        "h": 0.1,
+        "t_end": 2.3,
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "message"),
+    [
+        ("kepler", {"q": np.ones((3, 3))}, r"q must have shape \(k, 2\), not \(3, 3\)"),
+        ("kepler", {"q": np.ones((2, 2))}, r"equal shapes, not \(2, 2\) and \(3, 2\)"),
+        ("kepler", {"q": np.ones((0, 2))}, "q must have shape"),
+        ("kepler", {"q": 1.0}, "q must have shape"),
+        ("kepler", {"p": [[1.0, 0.0], [1.0, np.nan], [0.0, 0.0]]}, r"p\[1, 1\] \(q2\) is nan"),
+        ("kepler", {"p": "fast"}, "p must be real numbers"),
+        ("kepler", {"p": [[1.0], [1.0, 2.0], [3.0]]}, "p must be real numbers"),
+        ("kepler", {"h": 0.0}, "the step size h is 0"),
+        ("kepler", {"h": np.inf}, "the step size h is inf"),
+        ("kepler", {"steps": 1.5}, "steps must be a whole number"),
+        ("kepler", {"steps": -1}, "steps must be at least 0"),
+        ("kepler", {"save_every": 0}, "save_every must be at least 1"),
+        ("kepler", {"t": "noon"}, "the time t must be real numbers"),
+        ("kepler", {"threads": -1}, "threads must be at least 1"),
+        ("kepler", {"threads": 1.5}, "threads must be a whole number"),
+        ("kepler", {"parameters": {"nu": 1.0}}, "there is no parameter 'nu'"),
+        (
+            "kepler",
+            {"parameters": {"mu": [1.0, 2.0]}},
+            r"the parameter mu must be one number or 3 numbers, not of shape \(2,\)",
+        ),
+        ("kepler", {"parameters": {"mu": "heavy"}}, "the parameter mu must be real numbers"),
+        ("kepler", {"parameters": np.ones((3, 2))}, r"parameters must have shape \(3, 1\), not \(3, 2\)"),
+        ("kepler", {"parameters": ["heavy"]}, "parameters must be real numbers"),
+        ("kepler", {"parameters": {"mu": [1.0, np.nan, 1.0]}}, "the parameter mu of trajectory 1 is nan"),
+        ("eccentric", {}, "give either h with steps or t_end"),
+        ("eccentric", {"h": 0.1, "steps": 3, "t_end": 1.0}, "give either steps=3 or t_end with h"),
+        ("eccentric", {"h": 0.1, "t_end": -1.0}, "h = 0.1 has the wrong sign"),
+        ("eccentric", {"h": 0.1, "t_end": [1.0, 2.0, 3.0, 4.0]}, "with h all trajectories have one t_end"),
+        ("eccentric", {"h": 0.1, "t_end": 1.0, "t_eval": [0.5]}, "t_eval requires adaptive steps"),
+        ("eccentric", {"h": 0.1, "steps": 3, "tolerance": 1e-9}, "tolerance requires adaptive steps"),
+        ("eccentric", {"t_end": [1.0, 2.0]}, "one time or 4"),
+        ("eccentric", {"t_end": [1.0, 2.0, -1.0, 3.0]}, "split the ensemble"),
+        ("eccentric", {"t_end": 1.0, "tolerance": 2.0}, "must be positive and below 1"),
+        ("eccentric", {"t_end": 1.0, "t_eval": [0.5, 1.5]}, "outside"),
+        ("eccentric", {"t_end": 1.0, "t_eval": [0.5], "save_every": 2}, "not both"),
+        (
+            "pushed pendulum",
+            {"inputs": {"u": (KNOTS, np.tile(VALUES, (COUNT - 1, 1))), "w": (KNOTS, VALUES)}},
+            "for each of 11 trajectories",
+        ),
+        (
+            "pushed pendulum",
+            {"inputs": {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES, "quintic")}},
+            "constant or linear or cubic",
+        ),
+        ("pushed pendulum", {"inputs": {"u": (KNOTS, VALUES)}}, "the input 'w' is not set"),
+        ("pushed pendulum", {"t_end": 4.0}, "covers t = 0 to 2.6"),
+        ("pushed pendulum", {"t_end": None}, "t_end"),
+        ("pushed pendulum", {"save_every": 0}, "save_every"),
+        ("pushed pendulum", {"h": 0.0}, "h"),
+        ("pushed pendulum", {"inputs": {"u": np.ones(2), "w": 0.5}}, r"the input 'u' must be a number, \(t, values\)"),
+    ],
+)
+def test_invalid_arguments_are_named(name: str, changes: dict[str, object], message: str) -> None:
+    with pytest.raises(StateError, match=message):
+        stepper_of(name, SVI(3)).integrate_ensemble(**BASE[name] | changes)
 
 
 class TestFiles:
@@ -506,7 +687,6 @@ class TestCommandLine:
         ("words", "message"),
         [
             ("kepler --ensemble none.toml", "none.toml cannot be read"),
-            ("kepler --ensemble grid.toml --plot a.png", "--plot is not available with --ensemble"),
             ("kepler --ensemble grid.toml --tolerance 1e-6", "--tolerance is not available with --ensemble"),
             ("kepler --ensemble grid.toml -o runs.txt", "written as .npz, .csv, .h5"),
             ("planar-pendulum --ensemble grid.toml", "'q1' is not a coordinate"),
@@ -538,13 +718,6 @@ class TestCommandLine:
             assert file["steps"].max() > 0
 
 
-def test_pickled_stepper_has_its_lanes(kepler: Stepper):
-    q, p = states("kepler", 9)
-    again = pickle.loads(pickle.dumps(kepler))
-    first, second = (stepper.integrate_ensemble(q, p, h=0.05, steps=20) for stepper in (kepler, again))
-    assert np.array_equal(first.q, second.q)
-
-
 @pytest.mark.parametrize("name", ["kepler", "double-pendulum"])
 def test_absolute_tolerance_equals_that_of_single_trajectories(name):
     """With the absolute tolerance, lanes need as many iterations and reach the same states."""
@@ -557,3 +730,163 @@ def test_absolute_tolerance_equals_that_of_single_trajectories(name):
     exact = stepper.integrate(chosen.q, p, h=0.05, steps=20, save_every=20)
     np.testing.assert_allclose(many.q[-1, 0], single.q[-1], rtol=1e-13, atol=1e-13)
     assert not np.allclose(exact.q[-1], single.q[-1], rtol=1e-14, atol=1e-14)
+
+
+def test_diverging_trajectory_retains_its_previous_states():
+    singular = LagrangianSystem.from_text(
+        name="falling", coordinates=["x"], lagrangian="x_dot**2/2 + 1/x", forces={"x": "u"}, inputs=["u"]
+    )
+    inputs = {"u": ([0.0, 0.5, 3.0], [0.0, 0.1, 0.1])}
+    stepper = compile_stepper(singular, SVI(4))
+    runs = stepper.integrate_ensemble([[1.0], [9.0]], [[0.0], [0.0]], inputs=inputs, t_end=2.5)
+    assert runs.status.tolist() == ["step size underflow", "ok"]
+    t = next(runs.each())[0]
+    assert (t[0], 0.5 in t) == (0.0, True)
+    assert 0.9 < t[-1] < 1.3
+    assert (np.diff(t) >= 0).all()
+    with pytest.raises(StepFailedError) as failed:
+        stepper.integrate([1.0], [0.0], inputs=inputs, t_end=2.5)
+    assert np.array_equal(failed.value.trajectory.t, t)
+
+
+def test_velocities_use_the_inputs_at_the_start():
+    stepper = stepper_of("coupled with inputs", SVI(3))
+    q, v = states("coupled with inputs", COUNT)
+    inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], np.outer(np.arange(COUNT), [1.0, 0.0]))}
+    runs = stepper.integrate_ensemble(q, velocity=v, inputs=inputs, h=0.1, t_end=0.2)
+    assert_allclose(runs.p[0, :, 1], v[:, 0] / 3 + 2 * (1 + np.arange(COUNT) / 5) * v[:, 1])
+
+
+def test_splines_of_scipy_are_accepted():
+    stepper = stepper_of("pushed pendulum", SVI(3))
+    by_spline, by_values = (
+        stepper.integrate_ensemble(*states("pushed pendulum", COUNT), inputs={"u": u, "w": W}, h=0.05, steps=40)
+        for u in (CubicSpline(KNOTS, OWN_VALUES, axis=1), (KNOTS, OWN_VALUES, "cubic"))
+    )
+    assert by_values.t[-1] == 2.0
+    assert (by_values.q == by_spline.q).all()
+
+
+def test_failed_trajectory_does_not_affect_others():
+    """The third pendulum's push has no square root in the fourth piece."""
+    system = LagrangianSystem.from_text(
+        name="root", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)", forces={"q": "sqrt(u)"}, inputs=["u"]
+    )
+    stepper, u = compile_stepper(system, SVI(3)), np.abs(OWN_VALUES) + 0.1
+    fine = stepper.integrate_ensemble(*states("pushed pendulum", COUNT), inputs={"u": (KNOTS, u)}, h=0.1, t_end=2.3)
+    u[2, 4] = -3.0
+    runs = stepper.integrate_ensemble(*states("pushed pendulum", COUNT), inputs={"u": (KNOTS, u)}, h=0.1, t_end=2.3)
+    others = np.arange(COUNT) != 2
+    assert runs.ok.tolist() == others.tolist()
+    assert (runs.q[:, others] == fine.q[:, others]).all()
+    good = np.isfinite(runs.q[:, 2, 0])
+    assert 1.4 < runs.t[good][-1] < 2.05
+    assert good[: good.sum()].all()
+
+
+@pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
+def test_lane_with_failed_iteration_continues_as_scalar_across_breakpoints():
+    """Stiff from the second piece on, where Newton's iteration alone leads on."""
+    system = LagrangianSystem.from_text(
+        name="stiffening", coordinates=["q"], lagrangian="q_dot**2/2 - (1 + u)*q**2/2 - q**4/4", inputs=["u"]
+    )
+    stepper, u = compile_stepper(system, SVI(2)), np.tile(VALUES**2, (COUNT, 1))
+    u[4, 2:] = 4000.0
+    q, p = states("pushed pendulum", COUNT)
+    runs = stepper.integrate_ensemble(q, p, inputs={"u": (KNOTS, u)}, h=0.1, t_end=2.3)
+    assert runs.ok.all()
+    run = stepper.integrate(q[4], p[4], inputs={"u": (KNOTS, u[4])}, h=0.1, t_end=2.3)
+    assert_allclose(runs.q[:, 4], run.q, rtol=0, atol=1e-11)
+    assert_allclose(runs.energy()[:, 4], run.energy(), rtol=1e-10)
+
+
+def test_threads_chunks_and_save_every_do_not_change_results():
+    stepper = stepper_of("pushed pendulum", SVI(3))
+    inputs, reported = {"u": (KNOTS, OWN_VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}, []
+    arguments = {"inputs": inputs, "h": 0.001, "t_end": 2.3}
+    full = stepper.integrate_ensemble(*states("pushed pendulum", COUNT), **arguments, progress=reported.append)
+    fewer = stepper.integrate_ensemble(*states("pushed pendulum", COUNT), **arguments, save_every=100, threads=1)
+    assert reported[-1] == full.steps[0]
+    rows = np.isin(full.t, fewer.t)
+    assert rows.sum() == len(fewer.t) == 24 + 3  # breakpoints that fall between hundreds of steps
+    assert (full.q[rows] == fewer.q).all()
+    assert_allclose(full.energy()[rows], fewer.energy(), rtol=0, atol=0)
+
+
+def test_files_contain_the_energies_of_each_segment(tmp_path):
+    stepper = stepper_of("pushed pendulum", SVI(3))
+    w = np.outer(np.arange(COUNT), [0.0, 0.1])
+    runs = stepper.integrate_ensemble(
+        *states("pushed pendulum", COUNT), inputs={"u": (KNOTS, VALUES), "w": ([0.0, 3.0], w)}, h=0.05, t_end=2.3
+    )
+    table = runs.to_xarray()
+    rising = 1 + np.outer(runs.t, np.arange(COUNT)) / 30
+    assert_allclose(table["energy"], runs.p[:, :, 0] ** 2 / 2 - rising * np.cos(runs.q[:, :, 0]), rtol=0, atol=1e-14)
+    runs.save(tmp_path / "runs.csv")
+    assert (tmp_path / "runs.csv").read_text().splitlines()[0] == "trajectory,t,q,p_q"
+
+
+def test_ensemble_to_end_times_over_a_cluster() -> None:
+    pytest.importorskip("distributed")
+    from scvi_codegen.runtime.distributed import integrate_ensemble
+
+    stepper, ends = stepper_of("eccentric", SVI(4)), np.tile(ENDS, 4)
+    q, p = (np.tile(x, (4, 1)) for x in states("eccentric", 4))
+    here = stepper.integrate_ensemble(q, p, t_end=ends, tolerance=1e-10)
+    there = integrate_ensemble(stepper, q, p, t_end=ends, tolerance=1e-10, blocks=2)
+    for name in ("times", "q", "p", "steps"):
+        assert np.array_equal(getattr(here, name), getattr(there, name), equal_nan=True)
+
+
+def test_files_contain_individual_times(tmp_path: Path) -> None:
+    runs = CASES["adaptive"].run(save_every=5)
+    runs.save(tmp_path / "e.csv")
+    table = np.genfromtxt(tmp_path / "e.csv", delimiter=",", names=True)
+    assert [table["t"][table["trajectory"] == j].max() for j in range(4)] == ENDS
+    runs.save(tmp_path / "e.npz")
+    with np.load(tmp_path / "e.npz") as file:
+        assert np.array_equal(file["times"], runs.times, equal_nan=True)
+    pytest.importorskip("xarray")
+    dataset = runs.to_xarray()
+    assert np.array_equal(dataset.time, runs.times, equal_nan=True)
+    assert np.array_equal(np.isfinite(dataset.energy), np.isfinite(runs.times))
+
+
+def test_command_line_runs_a_grid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("k.toml").write_text(
+        '[system]\ncatalogue = "kepler"\n[method]\nmethod = "svi"\ndegree = 4\n[run]\ntolerance = 1e-9\nspan = 9\n'
+    )
+    Path("grid.toml").write_text("[grid]\nq1 = [0.5, 0.7]\nmu = [1.0, 1.1]\n")
+    done = CliRunner().invoke(main, ["run", "k.toml", "--ensemble", "grid.toml", "-o", "grid.npz"])
+    assert done.exit_code == 0, done.output
+    assert "adaptive steps from t = 0 to t = 9" in done.output
+    assert "4 ok" in done.output
+    with np.load("grid.npz") as file:
+        assert (np.nanmax(file["times"], axis=0) == 9.0).all()
+
+
+@pytest.mark.usefixtures("as_users_compile")
+@pytest.mark.parametrize("h", [6e-2, 1e-2, 1e-4, 2e-14])
+def test_lanes_converge_as_single_runs(h: float) -> None:
+    """Slowly, with steps repeated from another predictor, and at the level of rounding.
+
+    Changes below rounding are random, and relative to a velocity near 0 they exceed any fixed level.
+    """
+    count, steps = 32, 64
+    stepper = compile_stepper(chain(4).system, "svi:2")
+    generator = np.random.default_rng(1)
+    q, v = generator.uniform(-1, 1, (count, 4)), generator.normal(size=(count, 4))
+    p = np.array([stepper.momentum(*each) for each in zip(q, v, strict=True)])
+    runs = Ensemble(stepper, q, p, h=h, steps=steps).common
+    assert runs is not None
+    make, width = runs.blocks()
+    for first in range(0, count, width):
+        block = make(first)
+        block.advance(steps)
+        assert isinstance(block, LaneBlock)
+        assert not block.left
+    for j in range(0, count, 5):
+        single = stepper.integrate(q[j], p[j], h=h, steps=steps)
+        np.testing.assert_allclose(runs.q[-1, j], single.q[-1], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(runs.p[-1, j], single.p[-1], rtol=0, atol=1e-11)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import subprocess
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -294,8 +295,46 @@ def test_a_list_of_another_name_and_of_no_pairs() -> None:
         stepper().integrate(np.zeros((4, 2)), h=0.1, steps=1)
 
 
-@pytest.mark.parametrize("lengths", [{"box": 1.9 * CUT}, {"box": -BOX}, {"cut": -1.0}])
-def test_lengths_without_a_list_end_the_run_with_the_remedy(lengths: dict[str, float]) -> None:
+INVALID: tuple[tuple[dict[str, float], str], ...] = (
+    (
+        {"box": 3.7},
+        r"the box of the neighbours 'near'.* is box = 3.7.*: it must be at least two cutoffs, 2\*\(cut\) = 3.8",
+    ),
+    ({"box": -BOX}, r"the box .* is box = -4\..*: it must be a positive number"),
+    ({"cut": -1.0}, r"the cutoff .* is cut = -1: it must be a positive number"),
+)
+
+
+@pytest.mark.parametrize("kind", ["run-time sizes", "known sizes"])
+def test_lengths_are_checked_before_every_run(kind: str) -> None:
     points = np.array([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0], [0.0, 1.1, 0.0]])
-    with pytest.raises(sc.StepFailedError, match="Lengths of 'near' must be positive, and periods"):
-        stepper().integrate(points, h=0.001, steps=1, parameters=lengths)
+    each = stepper() if kind == "run-time sizes" else sc.compile_stepper(liquid(), "stoermer-verlet", sizes={"N": 3})
+    state, many = ({"r": points}, {"r": 0 * points}), ({"r": np.stack([points] * 2)}, {"r": np.zeros((2, 3, 3))})
+    for lengths, message in INVALID:
+        ((name, value),) = lengths.items()
+        per_trajectory = {name: [5.0 if name == "box" else 1.9, value]}
+        calls: tuple[tuple[Callable[..., Any], Any], ...] = (
+            (partial(each.integrate, *state, h=0.001, steps=1), lengths),
+            (partial(each.start, *state, h=0.001), lengths),
+            (each.start(*state, h=0.001).update, lengths),
+            (partial(each.energy, *state), lengths),
+            (partial(each.integrate_ensemble, *many, h=0.001, steps=1), lengths),
+            (partial(each.integrate_ensemble, *many, h=0.001, steps=1), per_trajectory),
+        )
+        for call, parameters in calls[: 5 if kind == "run-time sizes" else 6]:
+            with pytest.raises(StateError, match=message):
+                call(parameters=parameters)
+
+
+def test_lengths_may_be_formulas_and_defaults_are_checked() -> None:
+    near = {"near": {"of": "q", "box": "2*cell", "cutoff": "5*sqrt(s)/2"}}
+    text = "sum(i in N, q_dot[i]**2/2) - sum(i < j in near, (q[i] - q[j])**2)"
+    numbers = {"cell": 2.4, "s": 1.0}
+    line = sc.LagrangianSystem.from_text("line", ["q[N]"], text, parameters=numbers, neighbours=near)
+    each = sc.compile_stepper(line, "stoermer-verlet", sizes={"N": 2})
+    wrong = r"is 2\*cell = 4.8.* must be at least two cutoffs, 2\*\(5\*sqrt\(s\)/2\) = 5\b"
+    with pytest.raises(StateError, match=wrong):
+        each.integrate({"q": [0.0, 1.0]}, {"q": [0.0, 0.0]}, h=0.1, steps=1)
+    each.integrate({"q": [0.0, 1.0]}, {"q": [0.0, 0.0]}, h=0.1, steps=1, parameters={"s": 0.9})
+    with pytest.raises(StateError, match="must be a positive number"):
+        each.integrate({"q": [0.0, 1.0]}, {"q": [0.0, 0.0]}, h=0.1, steps=1, parameters={"s": -1})

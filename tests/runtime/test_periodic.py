@@ -9,6 +9,7 @@ from scipy.special import ellipk
 
 from scvi_codegen import (
     SVI,
+    AccuracyWarning,
     ExplicitEuler,
     LagrangianSystem,
     MethodError,
@@ -36,6 +37,18 @@ def restricted():
         parameters={"mu": EARTH_MOON},
     )
     return compile_stepper(system, SVI(6))
+
+
+@pytest.fixture(scope="module")
+def planar():
+    system = LagrangianSystem.from_text(
+        name="planar restricted three-body problem",
+        coordinates=["x", "y"],
+        lagrangian="((x_dot - y)**2 + (y_dot + x)**2)/2 + (1 - mu)/sqrt((x + mu)**2 + y**2)"
+        " + mu/sqrt((x - 1 + mu)**2 + y**2)",
+        parameters={"mu": 0.01215},
+    )
+    return compile_stepper(system, SVI(8))
 
 
 @pytest.fixture(scope="module")
@@ -174,8 +187,25 @@ def test_forced_oscillator_has_the_period_of_its_force():
     assert orbit.stable
     with pytest.raises(MethodError, match="not symplectic"):
         orbit.stability_indices  # noqa: B018  (the access is the point)
-    with pytest.raises(MethodError, match="energy cannot be prescribed"):
+    with pytest.raises(MethodError, match="not available with forces"):
         periodic_orbit(stepper, [0.5], [0.5], period=period, steps=40, energy=1.0)
+
+
+@pytest.mark.parametrize(
+    ("speed", "duration", "fixed"), [(1, 0.85, []), (1, 1.15, []), (0.85, 0.85, []), (0.85, 1, ["x", "y"])]
+)
+def test_orbits_are_found_from_a_guess_that_is_15_percent_off(planar, speed, duration, fixed):
+    q, velocity = [0.82, 0.0], [0.0, 0.1625133 * speed]
+    orbit = periodic_orbit(planar, q, velocity=velocity, period=2.780187 * duration, steps=200, fixed=fixed)
+    assert orbit.residual < 1e-9
+    assert np.ptp(orbit.run().q, axis=0).max() > 0.05  # no equilibrium
+    if fixed:
+        assert orbit.period == pytest.approx(2.780186915, abs=1e-8)
+
+
+def test_another_orbit_is_reported(planar):
+    with pytest.warns(AccuracyWarning, match=r"far from the guess: its period is .*, not 2\.78019"):
+        periodic_orbit(planar, [0.82, 0.0], velocity=[0.0, 0.18689], period=2.780187, steps=200, fixed=["x", "y"])
 
 
 def test_invalid_orbits_are_rejected(galaxy):
@@ -188,7 +218,7 @@ def test_invalid_orbits_are_rejected(galaxy):
         periodic_orbit(losing, [1.0], [0.0], period=6.0, steps=40, fixed=["q"])
     with pytest.raises(StateError, match=r"fixed names 'p_z', .*; did you mean"):
         periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5, h=0.1, fixed=["p_z"])
-    with pytest.raises(StateError, match=r"give either steps .of a period. or h"):
+    with pytest.raises(StateError, match=r"number of steps per period .steps=200. or .* it got neither"):
         periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5)
     with pytest.raises(StateError, match="the period must be positive"):
         periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=-6.5, h=0.1)
@@ -230,9 +260,9 @@ def test_missing_inputs_are_not_zero_and_time_transformations_not_fixed_steps():
     with pytest.raises(StateError, match="the input 'u' is not set"):
         periodic_orbit(compile_stepper(pushed, SVI(2)), [1.0], [0.0], period=6.28, steps=20)
     watched = compile_stepper(problem("kepler").system, SVI(2), time_transformation="frequency")
-    with pytest.raises(MethodError, match="requires fixed steps h"):
+    with pytest.raises(MethodError, match="periodic_orbit is not available with a time"):
         periodic_orbit(watched, [1.0, 0.0], [0.0, 1.0], period=6.28, steps=20)
-    with pytest.raises(MethodError, match="requires fixed steps h"):
+    with pytest.raises(MethodError, match="chaos_indicators_ensemble is not available with a time"):
         watched.chaos_indicators_ensemble([[1.0, 0.0]], [[0.0, 1.0]], h=0.1, steps=4)
 
 

@@ -10,7 +10,7 @@ from sabotage import Case
 from samples import QUICK_FLAGS
 from scipy.linalg import block_diag
 
-from scvi_codegen import SVI, LagrangianSystem, StateError, compile_stepper, problem
+from scvi_codegen import SVI, LagrangianSystem, StateError, compile_stepper
 from scvi_codegen.exact.step import DerivedStep
 from scvi_codegen.methods.discretise import is_symplectic, paper_equations
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
@@ -161,99 +161,3 @@ def test_the_adjoint_is_the_transpose(name):
     stepper._propagate(starts, back, stepper.defaults, None, transpose=True)
     assert np.abs(forward[-1]).max() > 1.0
     assert np.abs(forward[-1].T - back[0]).max() < 1e-13 * np.abs(forward[-1]).max()
-
-
-def driven(steps=60, **options):
-    """A run of a driven, damped pendulum, and its stepper."""
-    still = pushed_pendulum().with_parameters(u_1=0.0, u_2=0.0, u_3=0.0)
-    stepper = compile_stepper(still, SVI(3), flags=QUICK_FLAGS)
-    values = {"t": T, "h": 0.1, "parameters": stepper.defaults} | options
-    return stepper, stepper.integrate([0.4], [-0.8], steps=steps, **values)
-
-
-def test_sensitivities_of_runs_by_all_arguments():
-    """Against differences of whole runs, of fourth order."""
-    stepper, run = driven()
-    found = run.sensitivity()
-    columns = np.concatenate([found.state, found.parameters, found.t[..., None], found.h[..., None]], axis=2)
-    start = np.array([0.4, -0.8, *stepper.defaults, T, 0.1])
-    for k in range(len(start)):
-        ends, width = [], 1e-4
-        for steps in (1, -1, 2, -2):
-            moved = start.copy()
-            moved[k] += steps * width
-            other = stepper.integrate(moved[:1], moved[1:2], parameters=moved[2:-2], t=moved[-2], h=moved[-1], steps=60)
-            ends.append(np.concatenate([other.q, other.p], axis=1))
-        derivative = (8 * (ends[0] - ends[1]) - (ends[2] - ends[3])) / (12 * width)
-        assert_allclose(columns[:, :, k], derivative, rtol=0, atol=1e-6 * np.abs(derivative).max() + 1e-9)
-    assert_allclose(found.state, run.tangent(), rtol=0, atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [{}, {"save_every": 12}, {"h": -0.1}, {"h": None, "steps": None, "t_end": 4.0}],
-    ids=["all", "checkpoints", "backward", "own lengths"],
-)
-def test_gradients_are_the_transpose_of_sensitivities(options):
-    """For functions of all states at once, one backward pass, also with a stride."""
-    _, run = driven(**options)
-    forward = run.sensitivity()
-    seeds = np.random.default_rng(1).normal(size=(len(run), 2, 3))
-    found = run.pullback(seeds)
-    state = np.concatenate([found.q, found.p])
-    assert_allclose(state, np.einsum("nic,nij->jc", seeds, forward.state), rtol=1e-12, atol=1e-12)
-    assert_allclose(found.parameters, np.einsum("nic,nik->kc", seeds, forward.parameters), rtol=1e-12, atol=1e-11)
-    assert_allclose(found.t, np.einsum("nic,ni->c", seeds, forward.t), rtol=1e-12, atol=1e-12)
-    if options.get("t_end"):
-        assert found.h is None
-        assert forward.h is None
-    else:
-        assert_allclose(found.h, np.einsum("nic,ni->c", seeds, forward.h), rtol=1e-12, atol=1e-11)
-    one = run.pullback(seeds[:, :, 0])
-    assert_allclose(one.parameters, found.parameters[:, 0], rtol=1e-13)
-    assert one.q.shape == (1,)
-
-
-def test_gradient_with_checkpoints_equals_that_with_all_states():
-    _, whole = driven(steps=2500)
-    _, some = driven(steps=2500, save_every=500)
-    seeds = np.zeros((len(whole), 2))
-    seeds[::500] = np.random.default_rng(2).normal(size=(6, 2))
-    expected, found = whole.pullback(seeds), some.pullback(seeds[::500])
-    assert_allclose(found.parameters, expected.parameters, rtol=1e-9)
-    assert_allclose(found.q, expected.q, rtol=1e-9)
-    assert_allclose(some.sensitivity().parameters, whole.sensitivity().parameters[::500], rtol=1e-9, atol=1e-12)
-
-
-def test_the_energy_at_the_end_of_a_run_does_not_depend_on_time():
-    """The derivative by mass at the end equals that at the start: a closed form for the adjoint."""
-    entry = problem("planar-pendulum")
-    stepper = compile_stepper(entry.system, SVI(8), flags=QUICK_FLAGS)
-    run = stepper.integrate([2.0], [0.3], h=0.05, steps=400)
-    m, length, g = stepper.defaults
-    seeds = np.zeros((len(run), 2))
-    seeds[-1] = m * g * length * np.sin(run.q[-1, 0]), run.p[-1, 0] / (m * length**2)
-    found = run.pullback(seeds)
-    assert_allclose(found.q, m * g * length * np.sin(2.0), rtol=1e-9)
-    assert_allclose(found.p, 0.3 / (m * length**2), rtol=1e-9)
-    assert abs(found.h) < 1e-9
-    assert abs(found.t) < 1e-12
-
-
-def test_systems_without_a_gradient_are_rejected():
-    _, run = driven()
-    with pytest.raises(
-        StateError, match=r"cotangents, derivatives by \(q, p\) of each state, must have shape \(61, 2\)"
-    ):
-        run.pullback(np.zeros((60, 2)))
-    with pytest.raises(StateError, match="cotangents must be finite"):
-        run.pullback(np.full((61, 2), np.nan))
-    with pytest.raises(StateError, match="whole steps"):
-        driven(steps=9, t=0.0, t_eval=[0.03, 0.1])[1].sensitivity()
-
-
-def test_unreachable_state_is_rejected_for_derivatives():
-    _, run = driven()
-    run.q[30] += 1e-3
-    with pytest.raises(StateError, match=r"from t = 3\.2, computed again, end in another state"):
-        run.sensitivity()

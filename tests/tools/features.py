@@ -1,5 +1,9 @@
-"""Features of the table in docs/features.md, each as a function that uses it on one of three kinds of systems."""
+"""Features of the table in docs/features.md, each as a function that uses it on one of three kinds of systems.
 
+PYTHONPATH=tests/oracles python tests/tools/features.py      writes the names and refusals on that page.
+"""
+
+import textwrap
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -9,6 +13,7 @@ import numpy as np
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
+from scvi_codegen.runtime.core import features
 
 ENDS = {"named coordinates": ("x", "y", "z"), "known sizes": ("x", "q[2]"), "run-time sizes": ("x", "q[N]")}
 KINDS = tuple(ENDS)
@@ -24,6 +29,7 @@ class Kind:
         self.coordinates = list(ENDS[name])
         self.first = "y" if self.named else "q[0]"
         self.q = Q.get(name, {"x": 0.3, "q": [0.1, -0.2]})
+        self.used: Any = None
         self.p = {each: np.zeros(np.shape(value)) for each, value in self.q.items()}
 
     def sum(self, named: str, indexed: str) -> str:
@@ -48,11 +54,13 @@ class Kind:
 
     def sized(self) -> Any:
         """Return the stepper, compiled with its sizes."""
-        return self.stepper().with_sizes(N=2) if self.run_time else self.stepper()
+        self.used = self.stepper().with_sizes(N=2) if self.run_time else self.stepper()
+        return self.used
 
     def compiled(self, system: Any, method: Any = "svi:2", **given: Any) -> Any:
         """Return the stepper of a system."""
-        return sc.compile_stepper(system, method, flags=QUICK_FLAGS, **given)
+        self.used = sc.compile_stepper(system, method, flags=QUICK_FLAGS, **given)
+        return self.used
 
     def run(self, stepper: Any = None, **given: Any) -> Any:
         """Return a run of few steps."""
@@ -348,3 +356,48 @@ FEATURES: dict[str, Callable[[Kind, Path], Any]] = {
     "xarray, pandas, HDF5": export,
 }
 """Function of a kind of system and a folder, by row of the table."""
+
+SUPPORTS = {
+    "inputs": "inputs",
+    "adaptive steps": "adaptive",
+    "output times `t_eval`": "t_eval",
+    "dense output `at`": "dense_output",
+    "events": "events",
+    "ensembles": "ensembles",
+    "threads within a step": "threads",
+    "sizes chosen by each run": "with_sizes",
+    "reduction of states `observe`": "observe",
+    "Jacobians of steps": "jacobian",
+    "adjoint derivatives": "pullback",
+    "Hessian products": "hessian",
+    "chaos indicators": "chaos",
+    "periodic orbits": "periodic_orbit",
+    "fits": "fit",
+    "JAX": "flow",
+    "PyTorch": "flow",
+    "CasADi": "flow",
+    "momentum maps": "momentum_maps",
+    "work of forces": "work",
+    "discrete Lagrangian": "discrete_lagrangian",
+    "checkpoints": "checkpoint",
+}
+"""Name of a row of the table in ``Stepper.supports``; the others are properties of systems, or use no stepper."""
+
+
+def refusals() -> str:
+    """Return the names, and the table of what excludes them, of docs/features.md."""
+    names = (f"`{name}`" + f" ({title})" * (title.strip("=") != name) for name, title in features.OPERATIONS.items())
+    rows: dict[tuple[str, str], list[str]] = {}
+    for (operation, excluding), remedy in features.FEATURES.items():
+        rows.setdefault((excluding, remedy), []).append(f"`{operation}`")
+    lines = [f"| {excluding} | {', '.join(each)} | {remedy} |" for (excluding, remedy), each in rows.items()]
+    head = ["| property | not available | reason, remedy |", "| --- | --- | --- |"]
+    return "\n".join([textwrap.fill(f"{MARK}: {', '.join(names)}.", 120), "", *head, *lines, ""])
+
+
+MARK = "The names are"
+
+if __name__ == "__main__":
+    page = Path(__file__).parents[2] / "docs" / "features.md"
+    before = page.read_text(encoding="utf-8").partition(MARK)[0]
+    page.write_text(before + refusals(), encoding="utf-8")

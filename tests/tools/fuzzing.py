@@ -3,6 +3,8 @@
 Everything is drawn from one ``random.Random``, so that a failing input is found again by its number alone.
 """
 
+import re
+import resource
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -14,9 +16,12 @@ from typing import Any, TypeVar
 
 from counting import TooMuchWorkError, at_most
 
+from scvi_codegen.files.cache import cache_folder
+
 CORPUS = Path(__file__).parents[1] / "corpus"
 MOST_CALLS = 30_000_000
 """Of functions for one input, the same number on a slow or busy machine; the tableau of 64 stages takes 14 million."""
+MOST_MEMORY = 2**30
 SECONDS = 300
 """Of processor time: ends what runs away without calling anything."""
 
@@ -47,6 +52,8 @@ FORBIDDEN = (
     *(f"os.{name}" for name in ("remove", "rename", "mkdir", "rmdir", "link", "symlink", "chmod", "truncate")),
 )
 _watching: list[str] = []
+_opened: list[str] = []
+"""Files that were opened for reading while a guard is in force."""
 
 
 def _watch(event: str, arguments: tuple[Any, ...]) -> None:
@@ -59,6 +66,8 @@ def _watch(event: str, arguments: tuple[Any, ...]) -> None:
     if event == "compile" and str(arguments[0]).startswith("b'lambda _cls,"):
         return  # a named tuple in one of them
     writes = event == "open" and isinstance(arguments[1], str) and not set(arguments[1]).isdisjoint("wax+")
+    if event == "open" and not writes:
+        _opened.append(str(arguments[0]))
     if writes or event.startswith(FORBIDDEN):
         _watching.append(f"{event}{arguments!r:.200}")
 
@@ -78,6 +87,7 @@ def guarded(most_calls: int = MOST_CALLS, *, may_compile: bool = False) -> Itera
 
     before = signal.signal(signal.SIGVTALRM, ring)
     _watching.append("")
+    _opened.clear()
     signal.setitimer(signal.ITIMER_VIRTUAL, SECONDS)
     try:
         with at_most(most_calls):
@@ -93,6 +103,30 @@ def guarded(most_calls: int = MOST_CALLS, *, may_compile: bool = False) -> Itera
         raise RanCodeError(events[0])
 
 
+def foreign_files(folder: Path, text: str) -> list[str]:
+    """Return files opened under the last guard that are not in a folder, named in a text, or of the program."""
+    program = (sys.prefix, sys.base_prefix, *filter(None, sys.path), Path(__file__).parents[2], "/proc", cache_folder())
+    own = [str(Path(each).resolve()) for each in (folder, *program)]
+    return [
+        name
+        for name in _opened
+        if not name.isdigit() and not any(str(Path(name).resolve()).startswith(each) for each in own)
+        if Path(name).name not in text
+    ]
+
+
+@contextmanager
+def limited_memory(more: int = MOST_MEMORY) -> Iterator[None]:
+    """Refuse allocations that exceed the present size of the process by more than some bytes."""
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (size + more, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
 @cache
 def seeds(name: str) -> tuple[str, ...]:
     """Texts of ``corpus/<name>``: the files of a folder, or the lines of a file in Python's notation."""
@@ -106,6 +140,22 @@ NUMBERS = """
     0 1 2 3 64 65 0.1 .5 3. 1e-3 1e300 1e-300 1e308 1e309 1e-324 1e999 9999999999999999999 0.30000000000000004 1e0
     00 1_0 0x10 1j 1e 1e+ 10000 1e5 1e-9999999 4503599627370497
 """.split()  # noqa: SIM905  (a paragraph of words reads better)
+VALUE = re.compile(r'(?<![\w.])-?[0-9][\w.]*|"[^"\n]*"')
+"""Numbers and quoted texts of a file."""
+EXTREME = (
+    "2000000000",
+    "99999999",
+    "-1",
+    "1e-300",
+    "-1e300",
+    "inf",
+    "nan",
+    "[]",
+    "{}",
+    "true",
+    "../x.csv",
+    "/dev/zero",
+)
 NAMES = "x y z x x y t pi q q_dot p m sin exp e E I oo nan inf zoo S N Q".split()  # noqa: SIM905
 FUNCTIONS = """
     sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp log sqrt sqrt sin cos abs Abs eval __import__
@@ -159,6 +209,33 @@ def mutated(random: Random, text: str, others: tuple[str, ...]) -> str:
         )
         text = text[:start] + new + text[end:]
     return text[:4000]
+
+
+def damaged(random: Random, data: bytes, others: tuple[str, ...]) -> bytes:
+    """The bytes of a file with the end cut off, some bytes or, mostly, a value changed, or as :func:`mutated`."""
+    kind = random.random()
+    if kind < 0.05:
+        return data[: random.randrange(len(data) + 1)]
+    try:
+        text = data.decode()
+    except UnicodeDecodeError:
+        kind = 0.1
+    if kind < 0.15:
+        changed = bytearray(data)
+        for place in random.choices(range(len(data)), k=random.choice((1, 1, 2, 8))):
+            changed[place] = random.choice((0, 255, random.randrange(256), changed[place] ^ 1 << random.randrange(8)))
+        return bytes(changed)
+    start = random.randrange(max(1, len(text) - 2000))
+    part, values = text[start : start + 2000], []
+    if kind < 0.85:
+        values = list(VALUE.finditer(part))
+    for value in random.sample(values, min(len(values), 1)):
+        plain = random.choice((*NUMBERS, *EXTREME, *[random.choice(NAMES), repr(random.random()), formula(random)] * 9))
+        quoted = value[0][0] == '"' or random.random() < 0.05
+        new = f'"{random.choice((plain, plain, plain, random.choice(POISON)))}"' if quoted else plain
+        part = part[: value.start()] + new + part[value.end() :]
+    part = part if values else mutated(random, part, others)
+    return (text[:start] + part + text[start + 2000 :]).encode("utf-8", "surrogatepass")
 
 
 def quietly(call: Callable[..., Result], *arguments: Any, expected: type[Exception]) -> Result | None:

@@ -47,15 +47,20 @@ class Program:
 
 
 def of_source(source: Source | None, main: str) -> Program:
+    """Return the program in one file."""
     assert source is not None
     whole = source.amalgamated()
-    return Program(whole.prefix, whole.header, whole.code, main)
+    return Program(whole.prefix, *map(plain, (whole.header, whole.code, main)))
 
 
 def sources_of(
     system: MechanicalSystem, method: str, prefix: str, solver: str, time_transformation: str | None
 ) -> Sources:
     return Sources(system, as_method(method, system), solver, prefix, (), time_transformation)
+
+
+Made = tuple[Source | None, str]
+"""Source of an integrator, and a main program."""
 
 
 def single(
@@ -72,26 +77,26 @@ def single(
     time_transformation: str | None = None,
     tolerance: float = 0.0,
     t_end: float = 20.0,
-) -> Program:
+) -> Made:
     """A run of a system with named coordinates."""
     found = system()
     sources = sources_of(found, method, name, solver, time_transformation)
     parameters = found.defaults
     if kind == "ensemble":
         source = sources.variant("ensemble")
-        return of_source(source, ensemble_driver(f"{name}_ensemble", q, p, parameters, h, steps))
+        return source, ensemble_driver(f"{name}_ensemble", q, p, parameters, h, steps)
     if kind in ("tangent", "second"):
         second = kind == "second"
         source = sources.variant("second_derivatives" if second else "derivatives")
-        return of_source(source, tangent_driver(source.prefix, q, p, parameters, h, 4, second=second))
+        return source, tangent_driver(source.prefix, q, p, parameters, h, 4, second=second)
     if kind == "embedded":
         source = generate_source(found, as_method(method, found), prefix=name, embedded="double")[0]
-        return of_source(source, run_driver(name, q, p, parameters, h, steps))
+        return source, run_driver(name, q, p, parameters, h, steps)
     if kind == "adaptive":
         source = sources.integrator()[0]
-        return of_source(source, run_driver(name, q, p, parameters, h, steps, t_end=t_end, tolerance=tolerance))
+        return source, run_driver(name, q, p, parameters, h, steps, t_end=t_end, tolerance=tolerance)
     source = sources.variant("fallback") or sources.integrator()[0]
-    return of_source(source, run_driver(name, q, p, parameters, h, steps))
+    return source, run_driver(name, q, p, parameters, h, steps)
 
 
 def arrays(
@@ -108,7 +113,7 @@ def arrays(
     tolerance: float = 0.0,
     tables: tuple[tuple[int, ...], ...] = (),
     constrained: bool = False,
-) -> Program:
+) -> Made:
     """A run of a system with array coordinates."""
     found = system()
     sources = Sources(found, as_method(method), solver, name)
@@ -125,7 +130,7 @@ def arrays(
         tolerance=tolerance,
         constrained=constrained,
     )
-    return of_source(sources.integrator(controlled=adaptive)[0], main)
+    return sources.integrator(controlled=adaptive)[0], main
 
 
 def catalogue(name: str) -> Callable[[], MechanicalSystem]:
@@ -216,6 +221,12 @@ def swings() -> ArraySystem:
     )
 
 
+def body() -> LagrangianSystem:
+    return LagrangianSystem.from_text(
+        "body", rotations={"R": "w"}, lagrangian="(w_1**2 + w_2**2 + 2.5*w_3**2)/2 - R_33 - R_13**2"
+    )
+
+
 BONDS = (tuple(place for b in range(6) for place in (b, (3 * b + 1) % 7)),)
 KEPLER = partial(single, system=catalogue("kepler"), q=(0.4, 0.1), p=(0.0, 2.0), h=0.05)
 PENDULUM = partial(single, system=catalogue("planar-pendulum"), q=(2.0,), p=(0.1,), h=0.1)
@@ -236,13 +247,14 @@ SOLAR = partial(
 )
 DAMPED = partial(single, system=samples.damped_pendulum, q=(0.3, -0.4), p=(0.2, 0.5), h=0.05)
 RODS = partial(single, system=rods, q=(0.6, 0.8, 1.6, 0.8), p=(-0.8, 0.6, -0.4, 0.3), h=0.01)
+BODY = partial(single, system=body, q=(0.5, 0.5, -0.5, 0.5), p=(3.0, -5.0, 9.0, 12.0), h=0.4, steps=300)
 RING = partial(arrays, system=ring, sizes=(11,), h=0.1)
 FORMS = partial(arrays, system=forms, sizes=(5, 3, 7, 6), tables=BONDS, h=0.05, steps=300)
 RUBBED_RING = partial(arrays, system=rubbed_ring, sizes=(9,), h=0.1)
 ROTORS = partial(arrays, system=rotors, sizes=(10,), h=0.05)
 SWINGS = partial(arrays, system=swings, sizes=(5,), h=0.01, constrained=True)
 
-CELLS: dict[str, Callable[..., Program]] = {
+CELLS: dict[str, Callable[..., Made]] = {
     "kepler": partial(KEPLER, method="svi:8"),
     "kepler_adaptive": partial(KEPLER, method="svi:8", kind="adaptive"),
     "kepler_loose": partial(KEPLER, method="svi:4", kind="adaptive", tolerance=1e-6),
@@ -279,6 +291,7 @@ CELLS: dict[str, Callable[..., Program]] = {
     "damped": partial(DAMPED, method="svi:4", steps=300),
     "rods": partial(RODS, method="svi:1"),
     "rods_newton": partial(RODS, method="svi:3", steps=100),
+    "body": partial(BODY, method="svi:6", kind="adaptive", tolerance=1e-3),
     "ring": partial(RING, method="svi:8"),
     "ring_adaptive": partial(RING, method="svi:6", adaptive=True),
     "ring_loose": partial(RING, method="svi:4", adaptive=True, tolerance=1e-6),
@@ -297,7 +310,7 @@ CELLS: dict[str, Callable[..., Program]] = {
 }
 
 
-TIMED: dict[str, Callable[..., Program]] = {
+TIMED: dict[str, Callable[..., Made]] = {
     "fast_kepler": partial(KEPLER, method="svi:8", steps=10000),
     "fast_kepler_adaptive": partial(KEPLER, method="svi:8", kind="adaptive", t_end=2000.0, steps=100000),
     "fast_kepler_many": partial(KEPLER, method="svi:8", kind="ensemble", steps=3000),
@@ -323,8 +336,7 @@ TIMED: dict[str, Callable[..., Program]] = {
 
 def program(name: str) -> Program:
     """Generate the program of a cell."""
-    made = (CELLS | TIMED)[name](name)
-    return Program(made.prefix, *map(plain, (made.header, made.code, made.main)))
+    return of_source(*(CELLS | TIMED)[name](name))
 
 
 def plain(text: str) -> str:

@@ -74,8 +74,8 @@ class Text(NamedTuple):
 
 
 def package() -> list[Path]:
-    """Python files of the package."""
-    return sorted((ROOT / "scvi_codegen").rglob("*.py"))
+    """Python files of the package and of its benchmarks."""
+    return sorted(path for folder in ("scvi_codegen", "benchmarks") for path in (ROOT / folder).rglob("*.py"))
 
 
 def templates() -> list[Path]:
@@ -155,7 +155,8 @@ def prose() -> Iterator[Text]:
         for found in re.finditer(r"/\*.*?\*/|\{#.*?#\}|//[^\n]*", text, re.DOTALL):
             yield Text(path, text.count("\n", 0, found.start()) + 1, found[0])
     for path in pages():
-        text = re.sub(r"^(```|~~~).*?^\1", _blank, path.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+        text = re.sub(r"<!--.*?-->", _blank, path.read_text(encoding="utf-8"), flags=re.DOTALL)  # words of users
+        text = re.sub(r"^(```|~~~).*?^\1", _blank, text, flags=re.DOTALL | re.MULTILINE)
         for number, line in enumerate(re.sub(r"`[^`\n]*`", " ", text).splitlines(), 1):
             yield Text(path, number, line)
 

@@ -22,7 +22,7 @@ from samples import QUICK_FLAGS
 from scipy.optimize import brentq
 
 import scvi_codegen as sc
-from scvi_codegen.errors import StepFailedError
+from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.frameworks.flow import FlowOfRows
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.results.recording import load_run, record_run, resume_run
@@ -266,8 +266,10 @@ def slices(case: Case) -> None:
     for rows in (len(run), slice(4, 4), slice(None, None, -1)):
         with pytest.raises(IndexError, match=r"out of range|must be ascending"):
             run[rows]
-    with pytest.raises(TypeError, match=r"whole number or a slice.*not 'q'"):
-        run["q"]
+    for name in case.problem.coordinates:
+        assert np.array_equal(run[f"p_{name}"], run.p[:, case.problem.coordinates.index(name)])
+    with pytest.raises(StateError, match="there is no quantity 'none_such' of the states"):
+        run["none_such"]
 
 
 def work_and_impulses(case: Case) -> None:

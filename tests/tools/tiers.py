@@ -1,4 +1,8 @@
-"""Selection of argument combinations for the default tier; the full tier runs all.
+"""Tiers of the tests: quick (the default), second, full.
+
+The quick tier keeps every test function that is not listed in ``second_tier.txt``, of those listed the number of cases
+before their name, in the order of the file, and all cases marked ``quick``. The file is measured: ``record_tiers.py``
+writes it. The second tier is the rest of what is not marked ``full``.
 
 ``@pytest.mark.covering`` on a test with several parametrised arguments keeps few of their combinations, so that each
 value of each argument is in one; ``@pytest.mark.covering(2)`` so that each is in two (where there are as many).
@@ -10,14 +14,17 @@ begins it before others, so that no process waits for another at the end.
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Hashable, Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from scvi_codegen.methods.method import Method
 
-DEFAULT = "not full"
-"""The expression of the default tier, as in pyproject.toml."""
+QUICK, SECOND = "not full and not second", "second"
+"""Expressions of the quick tier, as in pyproject.toml, and of the second."""
+UNOPTIMISED_TIERS = (QUICK, SECOND, "not full")
+SECOND_TIER = Path(__file__).with_name("second_tier.txt")
 
 Combination = tuple[tuple[str, int], ...]
 """Which value of each argument."""
@@ -60,6 +67,28 @@ def mark_the_rest_full(items: Iterable[pytest.Item]) -> None:
         saved_cases = {short[k * len(short) // wanted] for k in range(min(wanted, len(short)))}
         for item in set(short) - saved_cases:
             item.add_marker(pytest.mark.full)
+
+
+def function_of(nodeid: str) -> str:
+    """Return the name of a test without the case, as in ``second_tier.txt``."""
+    return nodeid.partition("[")[0]
+
+
+def quick_cases() -> dict[str, int]:
+    """Return the number of cases in the quick tier by test function, of those that ``second_tier.txt`` lists."""
+    lines = (line.split() for line in SECOND_TIER.read_text(encoding="utf-8").splitlines())
+    return {name: int(count) for count, name in lines}
+
+
+def mark_the_rest_second(items: Iterable[pytest.Item]) -> None:
+    """Mark the cases of listed tests that are neither quick nor of the full tier as tests of the second tier."""
+    left = quick_cases()
+    for item in items:
+        name = function_of(item.nodeid)
+        if name in left and not item.get_closest_marker("full") and not item.get_closest_marker("quick"):
+            left[name] -= 1
+            if left[name] < 0:
+                item.add_marker(pytest.mark.second)
 
 
 def long_ones_first(items: list[pytest.Item]) -> None:

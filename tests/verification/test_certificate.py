@@ -132,6 +132,18 @@ def test_a_certificate_is_text_json_and_a_verdict(tmp_path: Path) -> None:
     assert "all measured properties are satisfied" in certificate.to_text()
 
 
+@pytest.mark.parametrize("method", ["svi:4", "svi:8"])
+def test_rounding_of_growing_motions_is_no_drift(method: str) -> None:
+    """A body falls 10^5 times its initial distance: terms of the energy and of the boost grow alike in all runs."""
+    falling = LagrangianSystem.from_text("falling", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - 9.81*y")
+    certificate = verify(falling, method, q=[0.1, 1.0], p=[0.3, 0.0], h=0.02)
+    drifts = [check for check in certificate.checks if check.name.startswith("drift")]
+    assert len(drifts) == 2
+    assert all(
+        check.outcome is Outcome.SATISFIED and check.measured is not None and check.measured < 3.5 for check in drifts
+    )
+
+
 def test_missing_state_is_generated() -> None:
     certificate = verify(problem("planar-pendulum").system, Gauss(2), flags=QUICK_FLAGS, solver="newton")
     assert certificate.passed

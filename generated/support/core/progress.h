@@ -30,6 +30,18 @@ static inline void take_change(progress *now, double change, const solver_option
   report->iterations++;
 }
 
+static inline int is_stagnant(progress *now, const solver_options *options, int k)
+{
+  return is_one_stagnant(now, options, k);
+}
+
+/* Where is_stagnant returned 1. */
+static inline double stagnant(const progress *now)
+{
+  (void)now;
+  return 1.0;
+}
+
 static inline int must_amplify(progress *now, const solver_options *options, int k)
 {
   return is_to_amplify(now, options, k);

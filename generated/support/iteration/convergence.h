@@ -17,6 +17,7 @@
 #define CERTAIN_ROUNDING 1e-28 /* changes below 1e-14 that do not decrease are rounding errors */
 #define STAGNATION 0.25 /* changes above that only if they decreased by less than half in two iterations */
 #define PROGRESS_LEVEL 1e-20 /* above 1e-10, iterations that gain less than a factor of 1.4 (two: 2) are abandoned */
+#define STAGNANT 0.8 /* changes that decrease by less, and by less than half in two iterations, stagnate */
 #define FIRST_ITERATIONS 4 /* but not among the first ones, which need not contract */
 #define LEAST_SQUARED 1e-100 /* squares of smaller numbers, or of small parts of them, may be subnormal */
 #define LARGEST_SQUARED 1e100 /* squares of larger numbers, or sums of many, may overflow */
@@ -78,11 +79,20 @@ static inline long long steps_to_continue(long long steps, double first_change)
 #define LEAST_SIZE 1e-6 /* relative to the largest coordinate: added to the size of each */
 #endif
 
+/* Added to the size of each coordinate: a little of the largest of all; in an array whose neighbouring elements forces
+ * couple, the largest of it: at a node of a standing wave forces are rounding errors of terms that cancel. */
+static inline double least_size(const coordinate_array *array, double largest_of_array, double largest)
+{
+  const double least = LEAST_SIZE * largest + DBL_MIN;
+  return array->is_field ? larger(least, largest_of_array) : least;
+}
+
 /* Replaces sizes by inverse sizes whose squared changes add up to the mean over n coordinates, so that the sum of the
  * rounding errors of many is not above the tolerance; with absolute = 1, to the 2-norm. NaN if a size is not finite. */
-static inline void invert_sizes(const solver_options *options, double largest, long long n, section here, double *size)
+static inline void invert_sizes(const solver_options *options, double largest, double least, long long n,
+    section here, double *size)
 {
-  const double unit = 1.0 / sqrt((double)n), least = LEAST_SIZE * largest + DBL_MIN;
+  const double unit = 1.0 / sqrt((double)n);
   for (long long i = here.first; i < here.end; i++)
     size[i] = (options->absolute ? 1.0 : unit / (size[i] + least)) + 0.0 * largest;
 }
@@ -103,6 +113,26 @@ static inline void invert_sizes(const solver_options *options, double absolute, 
   for (int i = 0; i < M; i++)
     size[i] =
         (options->absolute ? number_of(absolute) : 1.0 / (size[i] + (DBL_EPSILON * largest + DBL_MIN))) + 0.0 * largest;
+}
+
+/* Returns, of inverse sizes, the least where `stagnant` is 1, and those of each coordinate where it is 0. */
+static SELDOM void find_least(number stagnant, const number *inverse_size, number *found)
+{
+  number least;
+  for (int i = 0; i < M; i++)
+    found[i] = -inverse_size[i];
+  least = -largest_number(found);
+  for (int i = 0; i < M; i++)
+    found[i] = stagnant * least + (1.0 - stagnant) * inverse_size[i];
+}
+
+/* Replaces inverse sizes by that of the largest coordinate where `stagnant` is 1, not 0. */
+static inline void measure_by_largest(number stagnant, number *inverse_size)
+{
+  number sizes[M], found[M]; /* copies, so that those of the iteration may stay in registers */
+  memcpy(sizes, inverse_size, sizeof sizes);
+  find_least(stagnant, sizes, found);
+  memcpy(inverse_size, found, sizeof found);
 }
 #endif
 

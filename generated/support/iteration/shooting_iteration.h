@@ -103,6 +103,8 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
     }
     total += lanes_total(change);
     take_change(&now, total, options, k, report);
+    if (is_stagnant(&now, options, k))
+      measure_by_largest(stagnant(&now), inverse_size);
     if (must_amplify(&now, options, k))
       for (int i = 0; i < M; i++)
         curve.z[0][i] += AMPLIFICATION * corrected[i];

@@ -79,7 +79,7 @@ static inline void drift(const step_data *step, const solver_data *data, real pa
 
 /* Computes the increments of one step; memory contains the last force, which the next step reuses if it starts with a
  * kick. */
-static int solve(const step_data *step, const solver_data *data, real *memory, long long *guess, real *dq, real *dp,
+SPLITTING int solve(const step_data *step, const solver_data *data, real *memory, long long *guess, real *dq, real *dp,
     const solver_options *options, solver_report *report, real *workspace)
 {
   real F[M], u[M];

@@ -15,7 +15,7 @@ from scvi_codegen.fields.derivation import derivation_of
 
 
 @click.command()
-@model_arguments
+@model_arguments()
 @click.option("--latex", is_flag=True, help="LaTeX instead of text.")
 @click.option("--radicals", is_flag=True, help="Print table entries as short rationals and radicals.")
 @click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Write to FILE instead of stdout.")

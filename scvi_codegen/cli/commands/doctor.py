@@ -103,7 +103,6 @@ def _described(package: str) -> list[dict[str, str]]:
 
 
 def _packages(extra: str, name: str) -> CheckResult:
-    """Check the libraries of an extra, or the required libraries ("")."""
     present, absent = [], []
     for wanted in _requirements(PACKAGE, extra):
         try:

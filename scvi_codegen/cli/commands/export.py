@@ -7,12 +7,13 @@ import click
 from scvi_codegen.cli.command_group import check_writable, reporting, tell
 from scvi_codegen.cli.json_documents import recorded_numbers
 from scvi_codegen.cli.recording import check_format, describe_progress
+from scvi_codegen.files.export import FORMATS
 from scvi_codegen.results.recording import load_run
 
 
 @click.command()
 @click.argument("folder", type=click.Path())
-@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Trajectory: .npz, .csv, .h5 (HDF5) or .zarr.")
+@click.option("-o", "--output", type=click.Path(), metavar="FILE", help=f"Trajectory: {FORMATS}.")
 @reporting
 def export(folder: str, output: str | None) -> None:
     """Write the states of the run in FOLDER to one file, or print its progress.

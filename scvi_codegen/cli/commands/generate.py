@@ -5,7 +5,7 @@ from typing import Any
 import click
 
 from scvi_codegen.cli.command_group import reporting, tell
-from scvi_codegen.cli.model_options import SOLVER_OPTION, model_arguments, read_model, with_known_sizes
+from scvi_codegen.cli.model_options import model_arguments, read_model, with_known_sizes
 from scvi_codegen.models.packages.fmu import generate_fmu
 from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.native.building import TARGETS
@@ -13,7 +13,7 @@ from scvi_codegen.rendering.program_source import Embedded
 
 
 @click.command()
-@model_arguments
+@model_arguments("solver")
 @click.option(
     "-o",
     "--output",
@@ -22,7 +22,6 @@ from scvi_codegen.rendering.program_source import Embedded
     metavar="DIR",
     help="Folder, or NAME.fmu; the name is the C prefix.",
 )
-@SOLVER_OPTION
 @click.option("--force", is_flag=True, help="Overwrite existing files that were edited or not generated.")
 @click.option(
     "--embedded",

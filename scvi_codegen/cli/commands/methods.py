@@ -115,7 +115,6 @@ def _entries(A: Sequence[Expressions], b: Expressions, c: Expressions) -> Iterat
 
 
 def _options(arguments: Mapping[str, Any]) -> list[str]:
-    """Return further options of a method."""
     abscissae = ["--abscissae", ",".join(map(str, arguments["abscissae"]))] if "abscissae" in arguments else []
     return abscissae if arguments.get("variational", True) else [*abscissae, "--printed"]
 
@@ -125,7 +124,6 @@ def _yes_or_not(holds: bool) -> str:
 
 
 def _decimals(row: Any) -> Any:
-    """Return a number, or a row of numbers, in 17 digits."""
     return [float(_decimal(x)) for x in row] if hasattr(row, "__len__") else float(_decimal(row))
 
 

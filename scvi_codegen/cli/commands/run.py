@@ -1,26 +1,34 @@
 """Command ``scvi-codegen run``: integrate a model or an ensemble, in memory or into a folder, and print a summary."""
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 
 from scvi_codegen.advice.tolerance_check import missed_tolerance
-from scvi_codegen.cli.command_group import FAILURE, INTERRUPTED, CommandFailure, check_writable, reporting, tell
+from scvi_codegen.cli.command_group import (
+    FAILURE,
+    INTERRUPTED,
+    CommandFailure,
+    check_writable,
+    is_quiet,
+    reporting,
+    tell,
+)
 from scvi_codegen.cli.ensembles import ensemble_summary, integrate_states
 from scvi_codegen.cli.json_documents import ensemble_numbers, failure_text, recorded_numbers, run_numbers
-from scvi_codegen.cli.model_options import SOLVER_OPTION, model_arguments, read_model, with_known_sizes
+from scvi_codegen.cli.model_options import model_arguments, read_model, with_known_sizes
 from scvi_codegen.cli.recording import RecordedOutcome, Recording, check_format, check_resumed, is_run_folder
-from scvi_codegen.cli.reports import energy_balance
+from scvi_codegen.cli.reports import known_account
 from scvi_codegen.cli.running import RunOutcome, integrate_model, known_at_end, summary
 from scvi_codegen.cli.step_selection import model_with_adaptive_steps, model_with_advised_step, model_with_global_error
+from scvi_codegen.files.export import FORMATS
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.ensemble_file import load_ensemble
+from scvi_codegen.models.options import OPTIONS, STEP_SIZE
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.pictures.arrays import plot_arrays
-from scvi_codegen.pictures.canvas import check_plot_path
-from scvi_codegen.pictures.overview import plot_trajectory
+from scvi_codegen.pictures.animation import FILMS
+from scvi_codegen.pictures.canvas import PICTURES, check_plot_path
 from scvi_codegen.runtime.run.global_error import GlobalError
 
 ABOUT = """\
@@ -74,15 +82,18 @@ Examples:
   scvi-codegen run ring.toml --size N=10000 --plot ring.png
 """
 
+ERRORS = tuple(option.name for option in OPTIONS if option.determines == STEP_SIZE and not option.common)
+"""Options of an error that determines the step size."""
+
 
 @click.command(help=ABOUT)
-@partial(model_arguments, required=False)
+@model_arguments(*ERRORS, "solver", required=False)
 @click.option(
     "-o",
     "--output",
     type=click.Path(),
     metavar="PATH",
-    help="Trajectory: .npz, .csv, .h5 or .zarr; or a folder, NAME.run or NAME/, for a run of any length.",
+    help=f"Trajectory: {FORMATS}; or a folder, NAME.run or NAME/, for a run of any length.",
 )
 @click.option("--resume", type=click.Path(), metavar="FOLDER", help="Continue the run in a folder (without MODEL).")
 @click.option(
@@ -90,30 +101,10 @@ Examples:
 )
 @click.option("--checkpoint-steps", type=int, metavar="N", help="Most steps between checkpoints.")
 @click.option("--certificate", type=click.Path(), metavar="FILE", help="JSON file to store in the folder.")
-@click.option("--plot", type=click.Path(), metavar="FILE", help="Plot, .png or .svg (needs matplotlib).")
+@click.option("--plot", type=click.Path(), metavar="FILE", help="Plot (.png, .svg, .pdf) or film (.gif, .html, .mp4).")
 @click.option(
     "--ensemble", type=click.Path(), metavar="FILE", help="Many initial states: a grid (.toml) or a table (.csv)."
 )
-@click.option(
-    "--tolerance",
-    type=float,
-    metavar="X",
-    help="Adaptive step size with this relative local error (1e-16: round-off). With --time-transformation: a fixed "
-    "step of tau is chosen for it.",
-)
-@click.option(
-    "--error",
-    type=float,
-    metavar="X",
-    help="Adaptive step size with this bound on the relative global error, confirmed by runs with other step sizes.",
-)
-@click.option(
-    "--advise",
-    type=float,
-    metavar="X",
-    help="Choose a fixed step size for this relative error of the positions at the end.",
-)
-@SOLVER_OPTION
 @click.option(
     "--solver-tolerance",
     type=float,
@@ -132,9 +123,6 @@ def run(
     certificate: str | None,
     plot: str | None,
     ensemble: str | None,
-    tolerance: float | None,
-    error: float | None,
-    advise: float | None,
     solver_tolerance: float | None,
     max_iterations: int | None,
     threads: int | None,
@@ -151,7 +139,7 @@ def run(
     recorded = output is not None and is_run_folder(output)
     recording.check(recorded)
     _check_outputs(output, plot, ensemble)
-    wanted = {"tolerance": tolerance, "error": error, "advise": advise}
+    wanted = {name: choices.pop(name) for name in ERRORS}
     _check_combination(choices, plot=plot, ensemble=ensemble, wanted=wanted, folder=output if recorded else None)
     model = read_model(model_name, choices)
     arguments = {"tolerance": solver_tolerance, "max_iterations": max_iterations}
@@ -159,22 +147,22 @@ def run(
     options = SolverOptions(**chosen) if chosen else None
     for option, needed in (
         ("--ensemble", ensemble is not None),
-        ("--advise", advise is not None),
+        ("--advise", wanted["advise"] is not None),
         (f"-o {output}", recorded),
     ):
         model = with_known_sizes(model, option) if needed else model
     if threads is not None and model.array_system is None:
         raise click.UsageError("--threads requires an array model (array coordinates)")
     if model.system.inputs:
-        _check_driven(advise, recorded=recorded)
+        _check_driven(wanted["advise"], recorded=recorded)
     if ensemble is not None:
-        _run_ensemble(model, ensemble, output, options)
+        _run_ensemble(model, ensemble, (output, plot), options)
         return
     model, confirmation = _with_steps(model, wanted, options, threads)
     if output is not None and recorded:
         _finish_recording(recording.record(model, output, options=options))
     else:
-        _run_one(model, output, plot, options, threads, advised=advise)
+        _run_one(model, output, plot, options, threads, advised=wanted["advise"])
     _check_confirmed(confirmation)
 
 
@@ -208,7 +196,7 @@ def _check_outputs(output: str | None, plot: str | None, ensemble: str | None) -
         check_writable(Path(output), "'-o'")
     if plot is not None:
         check_writable(Path(plot), "'--plot'")
-        check_plot_path(plot)
+        check_plot_path(plot, PICTURES + FILMS)
 
 
 def _check_combination(
@@ -229,7 +217,7 @@ def _check_combination(
     for name in ("step", "steps") if arguments else ():
         if choices[name] is not None:
             raise click.UsageError(f"--{arguments[0]} determines the step size: omit --{name} (--span is the duration)")
-    for name, value in (("plot", plot), *wanted.items()):
+    for name, value in wanted.items():
         if ensemble is not None and value is not None:
             raise click.UsageError(f"--{name} is not available with --ensemble")
 
@@ -252,9 +240,11 @@ def _run_one(
 ) -> None:
     outcome = integrate_model(model, options=options, threads=threads)
     known = known_at_end(model, outcome)
-    balance = None if model.array_system else energy_balance(model.system, outcome.trajectory, outcome.run.steps)
-    tell(summary(model, outcome, known, balance), **run_numbers(model, outcome, known, balance))
-    written = _write_outputs(model, outcome, output, plot)
+    account = known_account(outcome.trajectory)
+    tell(summary(model, outcome, known, account), **run_numbers(model, outcome, known, account))
+    result = outcome.trajectory
+    draw = result.plot if model.array_system is None else result.plot.field
+    written = _write_outputs(result, output, plot, draw=draw)
     tell(written=written)
     if outcome.failure is not None:
         raise CommandFailure(f"{outcome.failure}\n{_kept(outcome, written)}", FAILURE)
@@ -281,7 +271,9 @@ def _finish_recording(outcome: RecordedOutcome) -> None:
     tell(f"wrote {outcome.recorded.folder}", written=[outcome.recorded.folder])
 
 
-def _run_ensemble(model: Model, path: str, output: str | None, options: SolverOptions | None) -> None:
+def _run_ensemble(
+    model: Model, path: str, outputs: tuple[str | None, str | None], options: SolverOptions | None
+) -> None:
     if model.error is not None:
         raise click.UsageError(f"[run] error = {model.error:g} is not available with --ensemble: set tolerance instead")
     if model.has_time_transformation:
@@ -290,26 +282,27 @@ def _run_ensemble(model: Model, path: str, output: str | None, options: SolverOp
         )
     outcome = integrate_states(load_ensemble(path, model), options=options)
     tell(ensemble_summary(model, outcome), **ensemble_numbers(model, outcome))
-    continuation = "the computed states were not written to a file (-o)"
-    if output is not None:
-        outcome.result.save(output)
-        continuation = f"the computed states were written: {output}"
+    written = _write_outputs(outcome.result, *outputs, draw=outcome.result.plot)
+    continuation = (
+        f"the computed states were {'written: ' + ' and '.join(written) if written else 'not written to a file (-o)'}"
+    )
     if outcome.interrupted:
         raise CommandFailure(
             f"interrupted after {outcome.result.steps.mean():.0f} steps on average\n{continuation}", INTERRUPTED
         )
     if not outcome.result.ok.any():
         raise CommandFailure(f"every trajectory failed\n{continuation}", FAILURE)
-    if output is not None:
-        tell(f"wrote {output}", written=[output])
+    for path in written:
+        tell(f"wrote {path}", written=written)
 
 
-def _write_outputs(model: Model, outcome: RunOutcome, output: str | None, plot: str | None) -> list[str]:
+def _write_outputs(result: Any, output: str | None, plot: str | None, *, draw: Any) -> list[str]:
     if output is not None:
-        outcome.trajectory.save(output)
-    if plot is not None:
-        draw: Any = plot_trajectory if model.array_system is None else plot_arrays
-        draw(outcome.trajectory, plot)
+        result.save(output)
+    if plot is not None and Path(plot).suffix.lower() in FILMS:
+        result.animate(plot, progress=(lambda *_: None) if is_quiet() else None)
+    elif plot is not None:
+        draw(plot)
     return [path for path in (output, plot) if path is not None]
 
 

@@ -8,27 +8,19 @@ import click
 
 from scvi_codegen import verification
 from scvi_codegen.cli.command_group import FAILURE, CommandFailure, check_writable, note, reporting, tell
-from scvi_codegen.cli.model_options import (
-    METHOD_CHOICES,
-    SOLVER_OPTION,
-    Choices,
-    model_arguments,
-    read_model,
-    sections_of,
-    with_known_sizes,
-)
+from scvi_codegen.cli.model_options import Choices, model_arguments, read_model, sections_of, with_known_sizes
 from scvi_codegen.errors import PackageError
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.model_file import load_model
+from scvi_codegen.models.options import METHOD_KEYS
 from scvi_codegen.models.packages.package import CERTIFICATE_FILE, MODEL_FILE, load_package
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.verification import Certificate
 
 
 @click.command()
-@model_arguments
+@model_arguments("solver")
 @click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Write the certificate as JSON.")
-@SOLVER_OPTION
 @reporting
 def verify(model_name: str, output: str | None, **choices: Any) -> None:
     """Measure the guaranteed properties of the integrator of MODEL; exit status 1 if one is violated.
@@ -67,7 +59,7 @@ def _verified(name: str, choices: Choices) -> Certificate:
         if model.array_system is not None and (model.h is None or model.array_system.constraints):
             model = with_known_sizes(model, "verify (adaptive steps, constraints)")
         return _certificate(model, model.stepper())
-    if choices["solver"] != "auto" or any(choices[choice] is not None for choice in METHOD_CHOICES):
+    if choices["solver"] != "auto" or any(choices[choice] is not None for choice in METHOD_KEYS):
         raise click.UsageError(f"'{name}' is a generated folder: its method and solver are those it was generated with")
     if not (folder / MODEL_FILE).is_file():
         raise PackageError(

@@ -51,7 +51,6 @@ def jacobian_pattern(stages: StageSystem, dimension: int) -> Pattern:
 def _coupled_pairs(
     rows: Iterable[tuple[object, ...]], blocks: Iterable[tuple[object, ...]], count: int
 ) -> set[tuple[int, int]]:
-    """Return the pairs of rows and blocks that have a point in common."""
     return {
         (r, b - 1)
         for row, block in zip(rows, blocks, strict=True)

@@ -278,7 +278,6 @@ class _Part:
         return factor * self.column.entry(index) * result_symbol(self.system, self.group, self.scatter, point)
 
     def weight(self, index: object) -> sympy.Expr:
-        """Return the weight of a point, 1 if weights have no names."""
         name = self.group.weight_names[0]
         return Symbol(f"{name.rpartition('_')[0]}_{index}") if name else sympy.S.One
 

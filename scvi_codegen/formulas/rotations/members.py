@@ -119,7 +119,6 @@ class _Vector:
 
     @property
     def entries(self) -> tuple[Symbol, ...]:
-        """Symbols of the components in formulas."""
         return tuple(symbol(f"{self.name}_{axis}") for axis in AXES)
 
 

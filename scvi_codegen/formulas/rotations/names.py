@@ -211,7 +211,6 @@ class RotationNames:
         return {function: self.lagrangian(formula, parameters), "reduced": reduced, **fields}
 
     def _rates(self, coordinates: Sequence[str]) -> dict[str, tuple[Symbol, ...]]:
-        """Return the symbols of velocities by name of a coordinate, rotation or direction."""
         ordinary = {name: (symbol(name + DOT),) for name in coordinates}
         return ordinary | {member.name: member.rates for member in self.members}
 

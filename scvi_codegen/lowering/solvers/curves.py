@@ -62,7 +62,7 @@ def position_iteration(problem: StepProblem) -> FixedPointIteration | None:
     system, shape = problem.lagrangian, problem.shape
     if system is None or not isinstance(shape, Accelerations):
         return None
-    lanes = lane_count(len(shape.tableau.b))
+    lanes = lane_count(len(shape.tableau.b), in_groups=False)
     if lanes > MOST_LANES:
         return None
     macros = (("HAMILTONIAN", int(bool(problem.system.auxiliaries))),)
@@ -74,7 +74,7 @@ def printed_iteration(problem: StepProblem) -> FixedPointIteration | None:
     system, shape = problem.lagrangian, problem.shape
     if system is None or not isinstance(shape, PrintedCurve):
         return None
-    lanes = lane_count(max(len(shape.tableau.b), len(shape.rule)))
+    lanes = lane_count(max(len(shape.tableau.b), len(shape.rule)), in_groups=False)
     if lanes > MOST_LANES:
         return None
     ends = _printed_ends(shape.tableau, shape.rule, lanes)
@@ -87,7 +87,7 @@ def shooting_iteration(problem: StepProblem) -> FixedPointIteration | None:
     if system is None or not isinstance(shape, ShotCurve):
         return None
     tableau, rule = shape.tableau, shape.rule
-    lanes = lane_count(max(len(tableau.b), len(rule)))
+    lanes = lane_count(max(len(tableau.b), len(rule)), in_groups=False)
     if lanes > MOST_LANES or system.dimension > LARGEST_DIMENSION:
         return None
     position = cardinal_integrals(tableau.c, rule.abscissae, 0)

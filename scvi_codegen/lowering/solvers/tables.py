@@ -60,6 +60,8 @@ Solver: TypeAlias = Callable[[StepProblem], FixedPointIteration | None]
 
 
 MOST_LANES = 32
+VECTOR = 8
+"""Lanes of the longest vector of a processor (AVX-512); shorter vectors divide it."""
 DEGREE_OF_ONE, DEGREE_OF_TWO = 8, 12
 """Degrees of the polynomials through the last step, or through the last two, that are extrapolated into the next.
 
@@ -71,9 +73,10 @@ INTERPOLATED = 5
 """Degree up to which the polynomial of two steps interpolates all points; above, least squares predict better."""
 
 
-def lane_count(points: int) -> int:
-    """Return the power of two, at least 2, that is not less than the number of points."""
-    return max(2, 1 << (points - 1).bit_length())
+def lane_count(points: int, *, in_groups: bool = True) -> int:
+    """Return the number of points with padding: a power of two, at least 2; in groups of more than 16 whole vectors."""
+    power = max(2, 1 << (points - 1).bit_length())
+    return -(-points // VECTOR) * VECTOR if in_groups and power > 2 * VECTOR else power
 
 
 def pad_matrix(entries: Matrix, lanes: int) -> NumberTable:

@@ -50,6 +50,7 @@ def unrolled_fields(
         "damping": system.damping,
         "arrays": tuple(known_array(array, sizes) for array in (*system.positions, *system.fields)),
         "indices": {**sizes, **{name: table.tolist() for name, table in written.tables.items()}},
+        "lengths": tuple(length for near in system.neighbours for length in near.lengths),
         "definition": {} if system.sizes else system.definition,
         **_formulas(system, written, constants),
     }

@@ -153,7 +153,6 @@ def _potential_of(forces: Sequence[Expr], variables: Variables) -> Expr | None:
 
 
 def _sum(rows: Iterable[Sequence[Expr]], size: int) -> tuple[Expr, ...]:
-    """Return the sum of force vectors."""
     rows = list(rows)
     return tuple(sympy.Add(*(row[i] for row in rows)) for i in range(size))
 

@@ -13,14 +13,16 @@ import sympy
 from numpy.typing import NDArray
 from sympy import Dummy, Expr, Matrix, Symbol
 from sympy.core.function import AppliedUndef
-from sympy.matrices.exceptions import NonInvertibleMatrixError
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.expressions import Tape, evaluated, gradient, jacobian, unsupported_part
 from scvi_codegen.formulas.rotations.members import Rotation
-from scvi_codegen.mechanics.derived_expressions import row_rank
+from scvi_codegen.mechanics.derived_expressions import coupled_blocks, inverse_by_minors, row_rank
 from scvi_codegen.mechanics.rotations.points import torque_of
 from scvi_codegen.tables.precision import mp
+
+MOST_COUPLED = 6
+"""Largest number of generalised speeds that equations with variable coefficients couple."""
 
 
 class Variables:
@@ -120,21 +122,25 @@ def solved_for_speeds(equations: Sequence[Expr], variables: Variables) -> dict[S
     """Return the generalised speeds in terms of coordinates and velocities, solved from linear equations.
 
     Raises:
-        SystemDefinitionError: if the equations are singular or nonlinear in the speeds.
+        SystemDefinitionError: if the equations are singular or nonlinear in the speeds, or couple too many of them.
     """
     if not variables.u:
         return {}
-    rows, resting = Matrix(equations), dict.fromkeys(variables.u, sympy.S.Zero)
-    try:
-        solution = rows.jacobian(variables.u).LUsolve(-rows.xreplace(resting))
-        if not solution.has(*variables.u, sympy.nan, sympy.zoo):
-            return dict(zip(variables.u, solution, strict=True))
-    except NonInvertibleMatrixError:
-        pass
+    rows, u = Matrix(equations), variables.u
+    matrix, right = rows.jacobian(u), -rows.xreplace(dict.fromkeys(u, sympy.S.Zero))
+    solution: dict[Symbol, Expr] = {}
+    for block in coupled_blocks({(i, len(u) + j): entry for (i, j), entry in matrix.todok().items()}, 2 * len(u)):
+        of, by = [i for i in block if i < len(u)], [j - len(u) for j in block if j >= len(u)]
+        if matrix.has(*u) or len(of) != len(by) or (len(of) > MOST_COUPLED and matrix.free_symbols):
+            break
+        part = inverse_by_minors(matrix.extract(of, by)) * right.extract(of, [0])
+        solution |= {u[j]: value for j, value in zip(by, part, strict=True) if not value.has(sympy.nan, sympy.zoo)}
+    if len(solution) == len(u):
+        return {each: solution[each] for each in u}
     names = ", ".join(str(variables.write(u)) for u in variables.u)
     raise SystemDefinitionError(
         f"the kinematic equations cannot be solved for the generalised speeds {names}: they must be an invertible "
-        "combination of the rates of the coordinates"
+        f"combination of the rates of the coordinates, at most {MOST_COUPLED} of which are coupled"
     )
 
 

@@ -18,7 +18,7 @@ from sympy import Add, Expr, Matrix, S, Symbol
 from scvi_codegen.formulas.expressions import gradient_tuple, hessian
 from scvi_codegen.formulas.rotations.names import RotationNames
 from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.mechanics.derived_expressions import coupled_blocks
+from scvi_codegen.mechanics.derived_expressions import coupled_blocks, inverse_by_minors
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 
@@ -69,7 +69,9 @@ def _inverse_of_constant(entries: dict[tuple[int, int], Expr], size: int, parame
     for block in coupled_blocks(entries, size):
         if len(block) > LARGEST_BLOCK:
             return None
-        part = Matrix(len(block), len(block), lambda i, j, block=block: entries.get((block[i], block[j]), S.Zero)).inv()
+        part = inverse_by_minors(
+            Matrix(len(block), len(block), lambda i, j, block=block: entries.get((block[i], block[j]), S.Zero))
+        )
         for i, row in enumerate(block):
             for j, column in enumerate(block):
                 inverse[row, column] = part[i, j]

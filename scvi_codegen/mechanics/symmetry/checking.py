@@ -135,7 +135,6 @@ def check_symmetry(
 
 
 def _generated(system: MechanicalSystem, G: Expr, name: str) -> Symmetry:
-    """Return the symmetry of phase space that G generates."""
     motion = rates_of(system)
     q, p, t = system.coordinates, system.momentum_symbols, system.time
     if not conserved(system, motion, [G]):

@@ -282,7 +282,6 @@ def rates_of(system: MechanicalSystem, term_groups: tuple[TermGroup, ...] = ()) 
 
 
 def _long_numbers(expressions: Sequence[Expr]) -> dict[Symbol, sympy.Rational]:
-    """Return a symbol for each absolute value of a long number."""
     rationals = (part for part in parts(*expressions) if part.is_Rational)
     sizes = {abs(x) for x in rationals if max(abs(x.p), x.q) > LONGEST_NUMBER and abs(x) < LARGEST}
     return {sympy.Dummy(real=True): number for number in sorted(sizes)}

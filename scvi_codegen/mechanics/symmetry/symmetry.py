@@ -310,7 +310,6 @@ def _sign(coefficient: Expr) -> int:
 
 
 def _term_text(coefficient: Expr, factors: list[Expr]) -> str:
-    """Return one term as text, beginning with its sign."""
     sign = _sign(coefficient)
     numerator, denominator = (sign * coefficient).as_numer_denom()
     if numerator != 1 or not factors:

@@ -13,7 +13,7 @@ from scvi_codegen.indices import Array
 from scvi_codegen.mechanics.first_order import FirstOrderSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_files.values import STATE
+from scvi_codegen.models.options import STATE, options_of
 
 if TYPE_CHECKING:
     from scvi_codegen.models.model_files.input_tables import InputTable
@@ -88,11 +88,15 @@ def _of_rotations(system: MechanicalSystem) -> dict[str, Any]:
 
 
 def _formulas(system: MechanicalSystem, names: Sequence[str]) -> dict[str, Any]:
-    """Return the sections of a system of named coordinates."""
     kind = "hamiltonian" if system.auxiliaries else "lagrangian"
     momenta = {"momenta": [p.name for p in system.auxiliaries]} if system.auxiliaries else {}
     document: dict[str, Any] = {
-        "system": {"name": system.name, "coordinates": list(names), **momenta, kind: _wrapped(system.to_text())}
+        "system": {
+            "name": system.name,
+            "coordinates": list(names),
+            **momenta,
+            kind: _wrapped(system.text_of(system.formula)),
+        }
     }
     forces = zip(names, system.forces, strict=False)
     if applied := {name: _wrapped(system.text_of(force)) for name, force in forces if force != 0}:
@@ -132,7 +136,6 @@ def _state_by_array(model: Model, names: Sequence[str]) -> dict[str, Any]:
 
 
 def _entries(array: Array, values: Mapping[str, float]) -> Any:
-    """Return the entries of an array of known sizes."""
     return _list(np.reshape([values[name] for name in array.elements], array.shape({})))
 
 
@@ -156,11 +159,9 @@ def motion_of(model: Model, names: Sequence[str]) -> dict[str, Any]:
     """Return the sections other than the system."""
     vectors = {key: getattr(model, name) for key, name in STATE.items()}
     initial = {key: _named(names, vector) for key, vector in vectors.items() if vector is not None}
-    length = {"steps": model.steps} if model.span is None else {"span": model.span}
-    fields = {"step": model.h, "tolerance": model.tolerance, "error": model.error}
-    step = {key: value for key, value in fields.items() if value is not None}
-    controller = {"controller": "reversible"} if model.time_transformation else {}
-    run = {**step, **controller, **length, "save_every": model.save_every}
+    values = {option.key: getattr(model, option.field, None) for option in options_of("run")}
+    values["controller"] = "reversible" if model.time_transformation else None
+    run = {key: value for key, value in values.items() if value is not None}
     specification = model.method.specification().items()
     method = {key: list(value) if isinstance(value, tuple) else value for key, value in specification}
     solver = {} if model.solver == "auto" else {"solver": model.solver}
@@ -174,7 +175,6 @@ def _wrapped(formula: str) -> str:
 
 
 def _named(names: Sequence[str], vector: Sequence[float]) -> list[float] | dict[str, float]:
-    """Return a short vector as a list, a long one by name."""
     return list(vector) if len(vector) <= SHORT_VECTOR else dict(zip(names, vector, strict=True))
 
 

@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scvi_codegen.errors import ModelFileError, closest
+from scvi_codegen.files.atomic import read_text
 from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.input_tables import parse_table
-from scvi_codegen.models.time_span import real
+from scvi_codegen.models.options import real
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.validation import checked_count
 
@@ -107,7 +108,7 @@ def load_ensemble(path: str | os.PathLike[str], model: Model) -> EnsembleStates:
     try:
         if suffix not in readers:
             raise ModelFileError("an ensemble must be a grid in a .toml file or a table in a .csv file")
-        columns = readers[suffix](Path(path).read_text(encoding="utf-8-sig"), partial(_check_names, model))
+        columns = readers[suffix](read_text(path, "utf-8-sig"), partial(_check_names, model))
     except OSError as error:
         raise ModelFileError(f"{path} cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:

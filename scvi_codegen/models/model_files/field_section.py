@@ -16,7 +16,7 @@ from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.numpy_values import array_value
 from scvi_codegen.formulas.symbols import TIME, symbol
 from scvi_codegen.models.model_files.sections import Document, Section, check_keys, in_section
-from scvi_codegen.models.time_span import real
+from scvi_codegen.models.options import real
 
 OTHERS = ("forces", "torques", "torques_space", "inputs", "sizes", "tables")
 """Sections that a density replaces."""

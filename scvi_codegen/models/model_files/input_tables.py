@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import ModelFileError, StateError
+from scvi_codegen.files.atomic import read_text
 from scvi_codegen.files.export import loaded
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.models.time_span import real
+from scvi_codegen.models.options import real
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.rendering.source import ExampleInput
 from scvi_codegen.runtime.inputs.segments import POWERS, first_inner_time, input_of, parameters_at
@@ -217,7 +218,7 @@ def _column(table: CsvTable, name: str) -> NDArray[np.float64]:
 
 def _read_csv(path: Path) -> CsvTable:
     try:
-        return parse_table(path.read_text(encoding="utf-8-sig"))
+        return parse_table(read_text(path, "utf-8-sig"))
     except UnicodeDecodeError as error:
         raise ModelFileError(f"it is not a text file in UTF-8: {error.reason} at byte {error.start}") from error
 

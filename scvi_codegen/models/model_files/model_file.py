@@ -6,16 +6,14 @@ Further sections, such as command-line options, can be merged over those of a fi
 from __future__ import annotations
 
 import os
-import re
 import warnings
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from scvi_codegen.errors import ModelFileError, SystemDefinitionWarning
-from scvi_codegen.files.atomic import write_text
+from scvi_codegen.files.atomic import read_text, write_text
 from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.lowering.arrays import one_coordinate
@@ -43,8 +41,10 @@ from scvi_codegen.models.model_files.sections import (
     read_method,
     read_run,
     read_system,
+    words_of,
 )
 from scvi_codegen.models.model_files.values import read_values
+from scvi_codegen.models.options import options_of
 from scvi_codegen.models.problems import Problem
 from scvi_codegen.validation import checks_arguments, of
 
@@ -52,12 +52,13 @@ SYSTEM_KEYS = (
     *("name", "coordinates", *TURNING, "momenta", *FORMULAS, "inputs", "neighbours", "catalogue"),
     *("time_transformation", "point_forces"),
 )
-RUN_KEYS = ("step", "tolerance", "error", "controller", "span", "steps", "save_every")
 FIELD_KEYS = (
     *("name", "fields", "momenta", "space", "boundary", "density", "hamiltonian", "dissipation"),
     *("scalars", "point_lagrangians", "discretisation"),
 )
-KEYS = {"system": SYSTEM_KEYS, "field": FIELD_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
+KEYS = {"system": SYSTEM_KEYS, "field": FIELD_KEYS} | {
+    section: tuple(option.key for option in options_of(section)) for section in ("initial", "run")
+}
 SECTIONS = (
     *("system", "field", "forces", *TORQUES, "inputs", "sizes", "parameters", "tables", "initial"),
     *("events", "method", "run"),
@@ -74,7 +75,7 @@ def load_model(path: str | os.PathLike[str], changes: Document | None = None) ->
         ModelFileError: beginning with the path and naming the key at fault.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = read_text(path, "utf-8")
     except OSError as error:
         raise ModelFileError(f"{path} cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
@@ -83,6 +84,8 @@ def load_model(path: str | os.PathLike[str], changes: Document | None = None) ->
         return parse_model(text, changes, folder=Path(path).parent)
     except ModelFileError as error:
         raise ModelFileError(f"{path}: {error}") from error
+    except MemoryError as error:
+        raise ModelFileError(f"{path}: its arrays do not fit in memory: reduce the sizes") from error
 
 
 @checks_arguments(model=of("a Model", Model))
@@ -160,9 +163,9 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
     for name in ARRAY_SECTIONS:
         if (name in document or name in changes) and not has_arrays(document):
             raise ModelFileError(f'[{name}] belongs to coordinates that are arrays, coordinates = ["q[N]"]')
-    if "time_transformation" in changes.get("system", {}) and "error" in document.get("run", {}):
-        _check_error_bound(document["run"]["error"], changes.get("run", {}))
-    document, changes = _without_inherited_step(document), _without_inherited_step(changes)
+    if "error" not in document.get("run", {}):
+        changes = _without_inherited_step(changes)
+    document = _without_inherited_step(document)
     document, specification, solver = _merged(document, changes, entry)
     with warnings.catch_warnings():  # other formulas than that of the system may use its parameters
         warnings.simplefilter("ignore", SystemDefinitionWarning)
@@ -211,7 +214,7 @@ def _with_time_transformation(model: Model, document: Document, specification: S
         system, g = in_section(where, lambda: with_time_transformation(model.system, g, controller))
         method = read_method(fitted(specification, system))
         model = replace(model, system=system, method=method, time_transformation=g)
-    others = [symbol(word) for word in re.findall(r"[A-Za-z_]\w*", str(document.get("events", "")))]
+    others = map(symbol, words_of(document))
     if model.array_system is not None:
         model.array_system.warn_of_mistakes(others)
         return model
@@ -226,15 +229,6 @@ def _without_inherited_step(layer: Document) -> Document:
     if "time_transformation" not in layer.get("system", {}) or {"step", "tolerance", "error"} & run.keys():
         return layer
     return {**layer, "run": {**run, "tolerance": None}}
-
-
-def _check_error_bound(error: Any, run: Section) -> None:
-    """Raise an error for a time transformation added to a model with ``error``, unless that is replaced."""
-    if not {"step", "tolerance"} & run.keys():
-        raise ModelFileError(
-            f"[run] error = {error} requires adaptive steps, but a time transformation has fixed steps in tau: "
-            "give --tolerance or --step with --time-transformation"
-        )
 
 
 def _read_inputs(section: Section, folder: str | os.PathLike[str]) -> Mapping[str, InputTable | float]:

@@ -1,7 +1,7 @@
 """Sections of model files: merging, validation of keys, methods, systems with their forces, hints for unknown keys."""
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import chain
 from typing import Any, Final, TypeVar
 
@@ -13,21 +13,19 @@ from scvi_codegen.mechanics.legendre import lagrangian_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification, sized, specification_of
 from scvi_codegen.models.model import DEFAULT_METHOD
+from scvi_codegen.models.options import ALTERNATIVE_KEYS, FIELDS, KEYED, alternatives, options_of, real
 from scvi_codegen.models.problems import Problem, problem
-from scvi_codegen.models.time_span import real
 from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.validation import FORMULA, checked_count, likely_names, synonym_hint
 
 KEYS: Final = {
-    "run": "step span steps tolerance save_every controller",
-    "initial": "q q_dot p t",
-    "method": "method degree quadrature",
     "system": "lagrangian hamiltonian damping dissipation constraints time_transformation inputs",
     "field": "density space boundary discretisation",
 }
 EVENT_KEYS: Final = ("function", "direction", "terminal", "then", "where", "restitution")
 NAMED_SECTIONS: Final = ("parameters", "forces", "torques", "torques_space", "initial", "run")
 LOCATIONS: Final = {
+    **{option.key: f"'{option.key}' belongs in [{option.section}]" for option in KEYED},
     **{key: f"'{key}' belongs in [{section}]" for section, keys in KEYS.items() for key in keys.split()},
     **{key: f"there is a section [{key}]" for key in NAMED_SECTIONS},
 }
@@ -54,10 +52,7 @@ Built = TypeVar("Built")
 Section = Mapping[str, Any]
 Document = Mapping[str, Section]
 
-ALTERNATIVES = (
-    *({"lagrangian", "hamiltonian"}, {"density", "hamiltonian"}, {"p", "q_dot"}),
-    *({"step", "tolerance", "error"}, {"span", "steps"}),
-)
+ALTERNATIVES = ({"lagrangian", "hamiltonian"}, {"density", "hamiltonian"}, *ALTERNATIVE_KEYS)
 """Groups of alternative keys, of which one is given."""
 INHERITED = ("degree", "quadrature", "nodes", "stages")
 """Arguments of a method that are inherited when another method is merged over it, if that accepts them."""
@@ -181,17 +176,12 @@ def in_section(where: str, build: Callable[[], Built]) -> Built:
 def read_run(section: Section) -> dict[str, Any]:
     """Return the fields of a model in ``[run]``; adaptive steps without a step size."""
     section = {key: value for key, value in section.items() if value is not None}
-    for one, other in (("step", "tolerance"), ("step", "error"), ("tolerance", "error")):
-        check_one(section, "run", one, other)
-    check_one(section, "run", "span", "steps")
-    fields = {"step": "h", "tolerance": "tolerance", "error": "error", "span": "span"}
-    run: dict[str, Any] = {field: real(section[key], f"[run] {key}") for key, field in fields.items() if key in section}
+    for one, other in alternatives("run"):
+        check_one(section, "run", one.key, other.key)
     if not {"step", "tolerance", "error"} & section.keys() and "steps" in section:
         raise ModelFileError("[run] has steps but no step: give the step size")
-    if "steps" in section:
-        run["steps"] = checked_count(section["steps"], "[run] steps", least=0, error=ModelFileError)
-    run["save_every"] = checked_count(section.get("save_every", 1), "[run] save_every", least=1, error=ModelFileError)
-    return run
+    fields = [option for option in options_of("run") if option in FIELDS and option.key in section]
+    return {option.field: option.read(section[option.key], f"[run] {option.key}") for option in fields}
 
 
 FORMULAS = ("lagrangian", "hamiltonian", "dissipation", "damping", "constraints")
@@ -246,14 +236,26 @@ def _is_optional(document: Document, key: str) -> bool:
 
 def check_used(document: Document, parameters: Section) -> None:
     """Raise an error for an added parameter that no formula contains."""
-    section = document.get("field") or document["system"]
-    formulas = [section.get(key, "") for key in (*FORMULAS, "time_transformation", "point_forces")]
-    formulas = [*section.values()] if "field" in document else formulas
-    acting = [formula for name in ("forces", *TORQUES) for formula in document.get(name, {}).values()]
-    formula = " ".join(map(str, (*formulas, *acting, *document.get("events", ()))))
+    used = words_of(document)
     for name in parameters:
-        if name not in re.findall(r"\w+", formula):
+        if name not in used:
             raise ModelFileError(f"the system has no parameter '{name}'")
+
+
+def words_of(document: Document) -> set[str]:
+    """Return the names in all formulas of a model file, also of events, the initial state, inputs and parameters."""
+
+    def texts(value: Any) -> Iterator[str]:
+        if isinstance(value, str):
+            yield value
+        elif isinstance(value, dict | list | tuple):
+            for each in value.values() if isinstance(value, dict) else value:
+                yield from texts(each)
+
+    sections = {name: section for name, section in document.items() if name not in ("method", "run")}
+    for name in {"system", "field"} & sections.keys():
+        sections[name] = {key: value for key, value in sections[name].items() if key != "name"}
+    return {word for text in texts(sections) for word in re.findall(r"[A-Za-z_]\w*", text)}
 
 
 def read_events(entries: Any) -> tuple[Event, ...]:

@@ -4,6 +4,7 @@ Formulas are those of :mod:`scvi_codegen.formulas.grammar`: parsed by it and eva
 code.
 """
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from sympy import Expr
 
 from scvi_codegen.errors import ExpressionError, ModelFileError
+from scvi_codegen.files.atomic import read_text
 from scvi_codegen.files.export import loaded
 from scvi_codegen.formulas.arrays import parse_array
 from scvi_codegen.formulas.grammar import parse_expression
@@ -34,18 +36,19 @@ from scvi_codegen.models.model_files.sections import (
     is_number,
     required,
 )
-from scvi_codegen.models.time_span import check_length, real
+from scvi_codegen.models.options import STATE, real
+from scvi_codegen.models.time_span import check_length
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.validation import checked_count
 
 Numbers: TypeAlias = NDArray[np.float64]
 Key: TypeAlias = tuple[str, str]
 
+MOST = 10**8
+"""Largest number of entries of an array whose size a file names."""
 INDICES = ("i", "j", "k")
 """Names of the indices in formulas, by axis."""
 FILE_KEYS = ("file", "array")
-STATE = {"q": "q", "p": "p", "q_dot": "velocity"}
-"""Field of a model by key of ``[initial]``."""
 
 
 class Entry(NamedTuple):
@@ -260,6 +263,8 @@ def read_array(
                 f"{where}: the size {name} is undefined: write [sizes] {name} = .., or --size {name}=.."
             )
     shape = array.shape(sizes)
+    if (count := math.prod(shape)) > MOST:
+        raise ModelFileError(f"{where} has {count} entries, more than the {MOST} that are supported in files")
     if not isinstance(value, list):
         return _filled(value, shape, where, {**parameters, **sizes})
     if array.axes[-1].name or len(value) != shape[-1]:
@@ -325,7 +330,7 @@ def _read_numpy(path: Path, name: str, array: Array) -> Numbers:
 
 def _read_csv(path: Path, name: str, array: Array) -> Numbers:
     """Read the column of that name, or the only one; an array with components has one column each."""
-    columns = parse_table(path.read_text(encoding="utf-8-sig")).columns
+    columns = parse_table(read_text(path, "utf-8-sig")).columns
     if len(array.axes) > 1:
         return np.stack(list(columns.values()), axis=-1)
     if name not in columns and len(columns) != 1:

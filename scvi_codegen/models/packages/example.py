@@ -1,11 +1,12 @@
 """Example runs of generated folders and FMUs, with the model's initial state and output interval; README of folders."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from scvi_codegen.errors import MethodError, ModelFileError, StateError
+from scvi_codegen.errors import ModelFileError, StateError
 from scvi_codegen.files.cache import template_folder
 from scvi_codegen.formulas.expressions import evaluate
 from scvi_codegen.mechanics.derived_expressions import forms_of
@@ -17,6 +18,7 @@ from scvi_codegen.rendering.environment import template_environment
 from scvi_codegen.rendering.program_source import Embedded, ExampleArrays, ExampleRun
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.interface import read_arrays, read_state, table_limits
+from scvi_codegen.runtime.core.features import refusal
 from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.tables.precision import mp
 
@@ -48,17 +50,14 @@ COMPARED = 1e-9
 
 
 def example_of(model: Model, *, controlled: bool) -> ExampleRun:
-    """Return the example run: the whole run of the model with about twenty lines of output at most."""
+    """Return the example run: the whole run of the model with twenty states after the first at most."""
     clock = model.system.clock
     if model.h is None and (clock or model.time_transformation is not None):
         raise ModelFileError(
             "a step size in tau cannot be found for a tolerance without compiling: give one (--step, [run] step)"
         )
     if model.h is None and not controlled:
-        raise MethodError(
-            f"adaptive steps are unavailable for {model.method.name} and this system: give a step h "
-            "(--step, [run] step)"
-        )
+        raise refusal("adaptive", "without an error estimate", f"{model.method.name}, --step, [run] step")
     inputs_by_name = model.all_inputs() if model.inputs else {}
     inputs, parameters = tables_of_example(
         model.system, inputs_by_name, (model.t, model.end if inputs_by_name else model.t)
@@ -69,7 +68,8 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
     else:
         count = OUTPUTS if model.h is None or model.time_transformation is not None else None
         steps = count or max(1, model.step_count if model.system.inputs else model.whole_step_count())
-    save_every = max(1, steps // OUTPUTS)
+    save_every = math.ceil(steps / OUTPUTS)
+    outputs = math.ceil(steps / save_every)
     return ExampleRun(
         q=model.q,
         p=momenta,
@@ -80,7 +80,8 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
         tolerance=_chosen_by(model),
         controlled=controlled,
         save_every=save_every,
-        outputs=steps // save_every,
+        outputs=outputs,
+        last=steps - (outputs - 1) * save_every,
         to_end=bool(clock) and model.ends_at_time,
         inputs=inputs,
         end=model.end if inputs else 0.0,

@@ -276,7 +276,6 @@ def _this_platform() -> str:
 
 
 def _library_path(platform: str, prefix: str) -> str:
-    """Return the path of a library in the archive."""
     return f"binaries/{platform}/{prefix}{SUFFIXES.get(platform.rpartition('-')[2], '.so')}"
 
 

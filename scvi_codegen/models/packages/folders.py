@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from scvi_codegen.errors import PackageError
-from scvi_codegen.files.atomic import write_text
+from scvi_codegen.files.atomic import read_text, write_text
 from scvi_codegen.rendering.source import PREFIX, Source
 from scvi_codegen.rendering.text import included
 
@@ -96,7 +96,7 @@ def read_record(folder: str | os.PathLike[str]) -> dict[str, Any]:
     """Return ``interface.json`` of a generated folder; raises as :func:`source_in`."""
     target = Path(folder)
     try:
-        record = json.loads((target / INTERFACE_FILE).read_text(encoding="utf-8"))
+        record = json.loads(read_text(target / INTERFACE_FILE, "utf-8"))
     except OSError as error:
         raise PackageError(f"{target} is not a generated package: {error.filename}: {error.strerror}") from error
     except ValueError as error:
@@ -127,8 +127,8 @@ def source_in(folder: Path, prefix: str) -> Source:
 
 
 def _source(folder: Path, prefix: str, declarations: Sequence[str]) -> Source:
-    header, code = ((folder / f"{prefix}.{kind}").read_text(encoding="utf-8") for kind in "hc")
-    support = included(code, lambda name: (folder / name).read_text(encoding="utf-8"))
+    header, code = (read_text(folder / f"{prefix}.{kind}", "utf-8") for kind in "hc")
+    support = included(code, lambda name: read_text(folder / name, "utf-8"))
     return Source(prefix=prefix, header=header, code=code, declarations="\n".join(declarations), support=support)
 
 

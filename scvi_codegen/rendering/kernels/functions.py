@@ -85,7 +85,6 @@ class _Statements:
         self.derivative = list(accumulate(counts, initial=0))
 
     def written(self, entries: dict[tuple[int, int, int, int], list[list[Term]]]) -> UnrolledEquations:
-        """Return all statements, with the given entries of the Jacobian."""
         program, blocks = self.program, self.program.equations.blocks
         sites = range(program.equations.sites)
 
@@ -309,7 +308,6 @@ class _Rows(Nest):
         self.parameter, self.columns = parameter, dict(looped.columns)
 
     def lines(self) -> list[str]:
-        """Return the statements."""
         call = f"{self.looped.kernel.name}(slot, t, parameters, term);"
         added = (f"value[{self.place(target)}] += term[{k}];" for k, target in enumerate(self.looped.writes))
         return self.text(innermost=[call, *added])
@@ -321,7 +319,6 @@ class _Rows(Nest):
         yield from super().known(depth_of)
 
     def read(self, k: int, slot: Access) -> str:
-        """Return the assignment of an argument."""
         return f"slot[{k}] = {self.source}[{self.place(slot)}];"
 
     def constant(self, k: int, access: Access) -> str:
@@ -333,7 +330,6 @@ class _Rows(Nest):
         return f"slot[{len(self.looped.reads) + k}] = {f'lanes_of({text})' if alike else text};"
 
     def table_entry(self, place: Place) -> str:
-        """Return an index in a constant table."""
         return f"{_named(self.looped, place.table)}[index_{place.index}][{place.column}]"
 
 

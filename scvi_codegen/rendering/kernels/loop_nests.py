@@ -354,7 +354,6 @@ class Nest:
             yield from (f"parameters[{k}] = given->parameters[{k}];" for k in range(self.scalars))
 
     def _arrays(self, text: str) -> Iterator[str]:
-        """Yield the arrays that occur."""
         yield from starts_text(self.layout, text)
         for kind, arrays, number in (("field", self.layout.fields, "double"), ("table", self.layout.tables, "int")):
             for k, array in enumerate(arrays):
@@ -386,7 +385,6 @@ def _shift(index: str, offset: int) -> str:
 
 
 def _loop(loop: Loop, first: str, end: str, lines: Sequence[str]) -> list[str]:
-    """Return a loop over first <= index < end."""
     name = counter(loop)
     head = f"for (long long {name} = {first}; {name} < {end}; {name}++)"
     if loop.near:

@@ -1,8 +1,8 @@
 """Systems of arrays as C: functions of nested loops around kernels, lattices, and the template's context."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import accumulate, groupby
+from itertools import accumulate, combinations, groupby
 from math import prod
 from typing import Any
 
@@ -81,6 +81,7 @@ def loop_context(program: Program) -> dict[str, Any]:
         "work": _step_work(program) + _transform_work(program),
         "hot": "static",
         "waves": _lattice_context(program) if _on_lattices(program) else None,
+        "arrays": [(product_text(each), int(_is_field(each, loops.applied))) for each in program.layout.coordinates],
         **_constraint_context(program, constrained),
     }
 
@@ -279,14 +280,12 @@ def _energy_text(
 
 
 def _mass_text(program: Program, looped: LoopedKernel) -> str:
-    """Return a function that adds to the masses."""
     name, place = looped.kernel.name, Nest(program.layout, looped, "", "").place_of(looped.writes[0])
     lines = [f"{name}(NULL, 0.0, parameters, value);", f"mass[{place}] += value[0];"]
     return _function(program, looped, f"add_{name}", ["double *mass"], lines, source="")
 
 
 def _constraint_context(program: Program, held: ConstrainedSteps | None) -> dict[str, Any]:
-    """Return the template's context for constraints."""
     if held is None:
         return {"held": None}
     counts = [count_text(each.loops) for each in held.conditions]
@@ -327,6 +326,17 @@ def _constraint_texts(program: Program, condition: LoopedKernel, curvature: Loop
     yield _function(program, bare, f"place_{name}", [now], lines, values=0, source="")
 
 
+def _is_field(array: Array, term_groups: Iterable[LoopedKernel]) -> bool:
+    """Return whether forces couple elements of an array with their neighbours: at offsets, or by rows of a table."""
+    reads = ([each for each in one.reads if each.array == array] for one in term_groups)
+    return any(
+        all(a.index == b.index and not (a.minus or b.minus) for a, b in zip(one.places, other.places, strict=True))
+        and any(a != b and a.index for a, b in zip(one.places, other.places, strict=True))
+        for group in reads
+        for one, other in combinations(group, 2)
+    )
+
+
 def _on_lattices(program: Program) -> bool:
     """Return whether Newton's method has the Fourier preconditioner: places in stencils, or circulant matrices."""
     alike = all(array.is_lattice for array in program.layout.coordinates) and not program.layout.tables
@@ -334,7 +344,6 @@ def _on_lattices(program: Program) -> bool:
 
 
 def _lattice_context(program: Program) -> dict[str, Any]:
-    """Return the template's context for lattices."""
     before: list[str] = []
     lines: list[str] = []
     for array in program.layout.coordinates:

@@ -168,7 +168,6 @@ def constants(kernel: Kernel) -> Iterator[Number]:
 
 
 def _every_part(kernel: Kernel) -> Iterator[Part]:
-    """Return the parts of the kernel and of the terms of its loops."""
     return (part for each in kernel.functions for part in parts(each))
 
 
@@ -234,7 +233,6 @@ class _Vectors:
                 self.temporaries.add(k)
 
     def has(self, expression: Expression) -> bool:
-        """Return whether the expression is a vector."""
         if isinstance(expression, Load):
             return expression.source in self.sources or (
                 expression.source == "w" and expression.index in self.temporaries

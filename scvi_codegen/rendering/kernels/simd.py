@@ -153,7 +153,6 @@ def _kept(fixed_point: FixedPointIteration) -> dict[str, str]:
 
 
 def _vector_function(name: str) -> str:
-    """Return the line that defines a function of vectors."""
     if name.startswith(INVERSE_ROOT):
         k = int(name.removeprefix(INVERSE_ROOT))
         powers = " * ".join(["square"] * (k // 2) + ["y"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import re
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import RecordingError
-from scvi_codegen.files.atomic import sync_folder, write_atomically, write_text
+from scvi_codegen.files.atomic import read_text, regular, sync_folder, write_atomically, write_text
 from scvi_codegen.files.export import COLUMNS, Piece, loaded
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.compilers import check_flags, compiler_title, fingerprint
@@ -102,7 +103,7 @@ def read_chunk(path: Path, dimension: int | None = None, rows: int | None = None
         RecordingError: if the file cannot be read or is damaged.
     """
     try:
-        with path.open("rb") as file, loaded(file) as arrays:
+        with regular(path).open("rb") as file, loaded(file) as arrays:
             t, q, p, iterations = (arrays[name] for name in COLUMNS)
             crossings = arrays["crossings"] if "crossings" in arrays else np.empty((0, 2 + 2 * q.shape[-1]))
             chunk = Chunk((t, q, p, iterations), int(arrays["step"]), arrays["memory"].tobytes(), crossings)
@@ -276,7 +277,8 @@ class Manifest:
             **({"events": [event.table for event in self.events]} if self.events else {}),
             **({"mesh": self.mesh} if self.mesh else {}),
         }
-        return json.dumps(document, indent=1) + "\n"
+        text = json.dumps(document, indent=1) + "\n"
+        return SEAL % hashlib.sha256(text.encode()).hexdigest() + text[1:]
 
     @classmethod
     def from_json(cls, text: str) -> Manifest:
@@ -284,6 +286,11 @@ class Manifest:
         document = json.loads(text)
         if not isinstance(document, dict) or document.get("format") not in (FORMAT, FORMAT_TO_A_TIME):
             raise ValueError(f"its format is neither {FORMAT} nor {FORMAT_TO_A_TIME}")
+        if "sha256" in document:  # absent in earlier versions
+            start = SEAL % document["sha256"]
+            body = "{" + text.removeprefix(start)
+            if not text.startswith(start) or hashlib.sha256(body.encode()).hexdigest() != document["sha256"]:
+                raise ValueError("its checksum differs: restore the file from a copy")
         if "every" in document:  # as version 0.1 named it, in the model, too
             document["save_every"] = document["every"]
             document["model"] = document["model"] and re.sub(r"(?m)^every\b", "save_every", document["model"])
@@ -304,6 +311,8 @@ class Manifest:
         return manifest
 
 
+SEAL = '{\n "sha256": "%s",'
+"""First lines of a manifest: the checksum of the text without it."""
 PLAN = ("t_end", "tolerance", "tau")
 PLAIN = ("flags", "parameters", "h", "t", "save_every", "steps", "rows", "model", "certificate")
 
@@ -316,7 +325,7 @@ def read_manifest(folder: Path) -> Manifest:
     """
     path = folder / MANIFEST
     try:
-        return Manifest.from_json(path.read_text(encoding="utf-8"))
+        return Manifest.from_json(read_text(path, "utf-8"))
     except (FileNotFoundError, NotADirectoryError) as error:
         raise RecordingError(f"'{folder}' contains no recorded run: there is no file '{path}'") from error
     except OSError as error:

@@ -23,6 +23,7 @@ from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.rotations.quantities import named_quantities
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.run_loop import first_step_size, trajectory_of
+from scvi_codegen.runtime.run.saving import MAGIC, sealed
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.quantities import quantities
 from scvi_codegen.runtime.trajectory.saved_states import checked_row
@@ -55,7 +56,6 @@ class RecordedRun(AttitudeHistory):
     Attributes:
         folder: the folder.
         manifest: description of the run.
-        mesh: of the fields of a density (:class:`~scvi_codegen.fields.mesh.MeshSystem`), or ``None``.
         t, q, p, iterations: lazy arrays of shapes (n,), (n, m), (n, m), (n,); ``numpy.asarray`` reads them in full.
     """
 
@@ -84,11 +84,15 @@ class RecordedRun(AttitudeHistory):
     def __getitem__(self, rows: slice) -> Trajectory: ...
     @overload
     def __getitem__(self, rows: int) -> tuple[float, Array, Array]: ...
-    def __getitem__(self, rows: slice | int) -> Trajectory | tuple[float, Array, Array]:
-        """Return a trajectory in memory for a slice, or (t, q, p) of one state for an index.
+    @overload
+    def __getitem__(self, rows: str) -> Array: ...
+    def __getitem__(self, rows: slice | int | str) -> Trajectory | tuple[float, Array, Array] | Array:
+        """Return a trajectory in memory for a slice, (t, q, p) of one state for an index, or all values of a name.
 
         ``iterations`` counts as in the whole run.
         """
+        if isinstance(rows, str):
+            return self._quantity(rows)
         if not isinstance(rows, slice):
             k = checked_row(rows, len(self))
             return float(self.t[k]), self.q[k], self.p[k]
@@ -97,7 +101,7 @@ class RecordedRun(AttitudeHistory):
 
     @cached_property
     def mesh(self) -> Any:
-        """Mesh of the fields of a density, or ``None``."""
+        """Mesh of the fields of a density (:class:`~scvi_codegen.fields.mesh.MeshSystem`), or ``None``."""
         return self.manifest.mesh_of_fields(self.folder)
 
     @property
@@ -148,8 +152,9 @@ class RecordedRun(AttitudeHistory):
             BuildError: if there is no C compiler.
         """
         manifest, plan = self.manifest, self.manifest.plan
+        memory = self._last.memory  # without a checksum of its own in recordings of earlier versions
         return self.stepper.from_checkpoint(
-            self._last.memory,
+            memory if memory.startswith(MAGIC) else sealed(memory),
             t_end=plan.t_end if plan else None,
             tolerance=(plan.tolerance or None) if plan else None,
             h=(plan.tau or None) if plan else None,
@@ -258,7 +263,7 @@ class RecordedRun(AttitudeHistory):
 
     @checks_arguments()
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
-        """Write ``.npz``, ``.csv``, ``.h5`` or ``.zarr`` in parts; otherwise as :meth:`Trajectory.save`.
+        """Write a file in parts; otherwise as :meth:`Trajectory.save`.
 
         A CSV file has no velocities and no energy, which would require compiling the C source of the recording.
         ``run[:].save(path)`` and HDF5 files have them.

@@ -216,7 +216,6 @@ class _Recorder:
         self.pending = [], self.crossings, run.steps, run.t, run.checkpoint()
 
     def load_last_file(self, folder: Path) -> None:
-        """Load the last file in order to complete it."""
         paths = chunk_paths(folder)
         chunk = read_chunk(paths[-1])
         full = len(chunk) == self.manifest.rows
@@ -325,8 +324,9 @@ class _Recorder:
             raise
         except OSError as error:
             problem = f"'{self.folder}' cannot be written: {error.strerror or error}"
-            if self.written < 0:
-                raise RecordingError(f"{problem}. Nothing was recorded") from error
+            if self.written < 0 or not (self.folder / MANIFEST).exists():
+                remedy = "Nothing was recorded: when it can be written, start the run again"
+                raise RecordingError(f"{problem}. {remedy}") from error
             raise RecordingError(
                 f"{problem}. It contains the run up to step {self.written} (t = {self.written_t:g}); "
                 f"{self.run.steps - self.written} later steps are not saved. When it can be written, continue with "
@@ -355,7 +355,6 @@ def _checked_steps(run: Run, steps: int | None) -> int | None:
 
 
 def _extended(manifest: Manifest, run: Run, steps: int | None, t_end: float | None) -> tuple[Manifest, StepPlan]:
-    """Return the manifest and the step plan of a run with a new end."""
     if run.plan.fixed:
         if t_end is not None:
             raise StateError(f"the run has fixed steps h = {run.h:g}: give steps instead of t_end")
@@ -383,7 +382,6 @@ def _checked_checkpoints(seconds: float, steps: int | None) -> tuple[float, int 
 
 
 def _certificate(argument: Any) -> Any:
-    """Return a certificate as JSON data."""
     if isinstance(argument, str | os.PathLike):
         try:
             return json.loads(Path(argument).read_text(encoding="utf-8"))

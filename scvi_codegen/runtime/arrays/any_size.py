@@ -14,6 +14,7 @@ from scvi_codegen.indices import MOST_THREADS, SIZES_REQUIRED, Loop
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.rendering.source import ArrayLayout, Interface
 from scvi_codegen.runtime.arrays.interface import RunSizes, first_state, read_arrays
+from scvi_codegen.runtime.core.features import refusal
 from scvi_codegen.runtime.core.validation import EntryNames
 from scvi_codegen.runtime.rotations.attitudes import quaternions
 from scvi_codegen.runtime.rotations.states import homogeneous_state
@@ -101,7 +102,7 @@ def sizes_of_run(
             check_kind(MAPPING, value, name, StateError)
     count = checked_count(1 if threads is None else threads, "threads", least=1, most=MOST_THREADS)
     if count > 1 and interface.layout.constraints:
-        raise MethodError("systems with constraints use one thread: omit threads")
+        raise refusal("threads", "with constraints of arrays")
     arrays = read_arrays(interface, first_state(interface, _homogeneous(interface, q)), parameters, tables)
     return RunSizes(sizes=arrays.sizes, places=arrays.places, threads=count)
 

@@ -88,11 +88,10 @@ class ArrayBinding(Binding):
         sizes: sizes, tables and number of threads per step.
     """
 
-    reusable = False
-
     def __init__(self, library: Library, interface: Interface, sizes: RunSizes) -> None:
         super().__init__(library, interface.prefix)
         self.interface, self.sizes, self._unused = interface, sizes, list[Any]()
+        self.reusable = not interface.layout.neighbours  # their lists, and rounding errors, depend on earlier states
         self.shapes, self.fields = (
             [(array.name, array.shape(sizes.sizes)) for array in each]
             for each in (interface.layout.coordinates, interface.layout.fields)
@@ -107,9 +106,12 @@ class ArrayBinding(Binding):
         """Messages of failed steps."""
         failures, hint = FAILURES_BY_SOLVER.get(self.interface.solver, FAILURES), ""
         if mesh := self.interface.layout.mesh:
-            hint = f". The highest frequency is at most {mesh.highest_frequency():.3g}: see largest_step() of the mesh"
+            hint = (
+                f". The highest frequency is at most {mesh.highest_frequency():.3g}: choose h below "
+                "mesh.largest_step(method), with the method of compile_stepper"
+            )
         if names := self.interface.layout.neighbours:
-            hint = f". Lengths of {', '.join(map(repr, names))} must be positive, and periods at least two cutoffs"
+            hint = f". No particle may move by a cutoff of {', '.join(map(repr, names))} in one step"
         return {word: (what, remedy + hint) for word, (what, remedy) in failures.items()}
 
     def new(self, what: str) -> Any:
@@ -233,7 +235,11 @@ class ArrayBinding(Binding):
             run.factors[0] = 0.0
 
     def _start(self, run: Any, t: float, h: float, q: Any, p: Any) -> None:
-        """Start at a state; nothing of an earlier run remains."""
+        """Start at a state; nothing of an earlier run remains, and the parameters are those set next."""
+        self._arrays[run].parameters.fill(np.nan)
+        self._set_state(run, t, h, q, p)
+
+    def _set_state(self, run: Any, t: float, h: float, q: Any, p: Any) -> None:
         head = self._ffi.offsetof(f"{self._prefix}_run", "t")
         self._ffi.buffer(run)[head:] = bytes(self._ffi.sizeof(f"{self._prefix}_run") - head)
         run.t, run.h, self.vector(run.q)[:], self.vector(run.p)[:] = t, h, self.vector(q), self.vector(p)
@@ -275,13 +281,16 @@ class ArrayBinding(Binding):
 
     def _energy_parts(self, count: int, t: Any, q: Any, p: Any, parameters: Any, parts: Any) -> None:
         """Compute (n, 3) kinetic, potential and total energies in double-double arithmetic; 0, H, H if given by H."""
-        n = self.count
+        n, layout = self.count, self.interface.layout
         with self._at(0.0, q, p, parameters) as run:
-            problem, energies = self._arrays[run].problem, super().function("energies")
+            problem, energies, inverse_mass = self._arrays[run].problem, super().function("energies"), run.inverse_mass
             for k in range(count):
-                for state, given in ((run.q, q), (run.p, p)):
-                    self._ffi.memmove(state, given + k * n, 8 * n)
-                energies(problem, t[k], run.q, run.p, run.inverse_mass, parts + 3 * k)
+                at, moving = q + k * n, p + k * n
+                if layout.momenta or not layout.symmetric:  # sums read p directly after q
+                    self._ffi.memmove(run.q, at, 8 * n)
+                    self._ffi.memmove(run.p, moving, 8 * n)
+                    at, moving = run.q, run.p
+                energies(problem, t[k], at, moving, inverse_mass, parts + 3 * k)
         if self.interface.layout.velocity_formulas:  # the terms of H are no parts of the energy
             self.vector(parts, 3 * count).reshape(-1, 3)[:, :2] = np.nan
 
@@ -324,14 +333,13 @@ class ArrayBinding(Binding):
         return 0
 
     def _momentum_maps(self, count: int, t: Any, q: Any, p: Any, parameters: Any, values: Any, sizes: Any) -> int:
-        maps, n = self.interface.layout.maps, self.count
-        for k in range(count):
-            states = [by_name(self.vector(each + k * n), self.shapes) for each in (q, p)]
-            absolute = [{name: np.abs(each) for name, each in state.items()} for state in states]
-            for j, each in enumerate(maps):
-                values[k * len(maps) + j] = momentum_of(states[0][each.array], states[1][each.array], each)
-                size = momentum_of(absolute[0][each.array], absolute[1][each.array], each, absolute=True)
-                sizes[k * len(maps) + j] = size
+        maps = self.interface.layout.maps
+        states = [by_name(self.vector(each, count * self.count).reshape(count, -1), self.shapes) for each in (q, p)]
+        results = [self.vector(each, count * len(maps)).reshape(count, -1) for each in (values, sizes)]
+        for j, each in enumerate(maps):
+            at, moving = states[0][each.array], states[1][each.array]
+            results[0][:, j] = momenta_of(at, moving, each)
+            results[1][:, j] = momenta_of(np.abs(at), np.abs(moving), each, absolute=True)
         return 0
 
     def _constraint_values(self, count: int, t: Any, q: Any, p: Any, parameters: Any, g: Any, rate: Any, _: Any) -> int:
@@ -376,7 +384,7 @@ class ArrayBinding(Binding):
             run = self._unused.pop()
         except IndexError:
             run = self._new_run()
-        self._start(run, t, h, q, p)
+        self._set_state(run, t, h, q, p)
         self._set_parameters(run, self.vector(parameters, self.parameter_count))
         try:
             yield run
@@ -384,13 +392,15 @@ class ArrayBinding(Binding):
             self._unused.append(run)
 
 
-def momentum_of(q: Numbers, p: Numbers, of: ArrayMap, *, absolute: bool = False) -> float:
-    """Return the value of a momentum map from the positions and momenta of its array; ``absolute``: sum of terms."""
+def momenta_of(q: Numbers, p: Numbers, of: ArrayMap, *, absolute: bool = False) -> Numbers:
+    """Return (n,) values of a momentum map from (n, ..) states of its array; ``absolute``: sums of absolute terms."""
     if of.phase:
-        return float(np.sum(q**2 + p**2) / 2)
-    if of.component is None:
-        return float(np.sum(p))
-    if of.other is None:
-        return float(np.sum(p[..., of.component]))
-    sign = 1.0 if absolute else -1.0
-    return float(np.sum(q[..., of.component] * p[..., of.other] + sign * q[..., of.other] * p[..., of.component]))
+        terms = (q**2 + p**2) / 2
+    elif of.component is None:
+        terms = p
+    elif of.other is None:
+        terms = p[..., of.component]
+    else:
+        sign = 1.0 if absolute else -1.0
+        terms = q[..., of.component] * p[..., of.other] + sign * q[..., of.other] * p[..., of.component]
+    return np.asarray(terms.reshape(len(terms), -1).sum(axis=1))

@@ -16,6 +16,11 @@ from scvi_codegen.validation import checked_count, checks_arguments
 RELATIVE_STRAIN = 1e-5
 """Relative change of lengths for the derivative of the energy: errors of 1e-9 by truncation and 1e-11 by rounding."""
 
+SPARSE = 0.04
+"""Fraction of all pairs below which a tree finds the near ones faster than all are compared."""
+PAIRS_TOGETHER = 30_000
+"""Number of pairs compared at once, which fit into the cache of the processor."""
+
 
 def temperature(states: Any) -> Any:
     """Return the temperature in units of energy, twice the kinetic energy per degree of freedom.
@@ -74,8 +79,6 @@ def radial_distribution(
         StateError: if there are several arrays of coordinates.
         ArgumentError: if there is no such parameter, or a distance is too large.
     """
-    from scipy.spatial import cKDTree
-
     _, lengths = _periods(states, box)
     dimension, half = len(lengths), lengths.min() / 2
     if not 0 < (end := half if largest is None else largest) <= half:
@@ -85,13 +88,44 @@ def radial_distribution(
     positions = positions.reshape(-1, positions.size // len(np.atleast_2d(states.q)) // dimension, dimension)
     inside = positions % lengths
     inside[inside >= lengths] = 0.0  # by rounding
-    pairs = np.zeros(len(edges))
-    for tree in (cKDTree(points, boxsize=lengths) for points in inside):
-        pairs += tree.count_neighbors(tree, edges)
-    ball = math.pi ** (dimension / 2) / math.gamma(dimension / 2 + 1)
-    count = positions.shape[1]
-    uniform = len(positions) * count * (count - 1) / lengths.prod() * ball * np.diff(edges**dimension)
-    return (edges[1:] + edges[:-1]) / 2, np.diff(pairs) / uniform
+    ball, count = math.pi ** (dimension / 2) / math.gamma(dimension / 2 + 1), positions.shape[1]
+    sparse = ball * end**dimension < SPARSE * lengths.prod()
+    pairs = (_histogram_of_near_pairs if sparse else _histogram_of_pairs)(inside, lengths, end, len(edges) - 1)
+    uniform = len(positions) * count * (count - 1) / 2 / lengths.prod() * ball * np.diff(edges**dimension)
+    return (edges[1:] + edges[:-1]) / 2, pairs / uniform
+
+
+def _histogram_of_pairs(inside: Array, lengths: Array, end: float, bins: int) -> Any:
+    """Return the numbers of pairs by distance, from all pairs: those of particles i and i + s, for each shift s."""
+    count, histogram = inside.shape[1], np.zeros(bins + 1, np.int64)
+    for first in range(0, len(inside), max(1, PAIRS_TOGETHER // count)):
+        some = np.moveaxis(inside[first : first + max(1, PAIRS_TOGETHER // count)] / lengths, -1, 0)
+        twice = np.concatenate([some, some], axis=2)
+        apart, nearest, squares = np.empty((3, *some.shape[1:]))
+        for shift in range(1, count // 2 + 1):
+            squares[:] = 0.0
+            for x, shifted, length in zip(some, twice[:, :, shift : shift + count], lengths, strict=True):
+                np.subtract(x, shifted, out=apart)
+                np.subtract(apart, np.rint(apart, out=nearest), out=apart)  # nearest image
+                np.multiply(apart, length * bins / end, out=apart)
+                np.add(squares, np.multiply(apart, apart, out=apart), out=squares)
+            rows = np.minimum(np.sqrt(squares, out=squares), bins, out=squares).astype(np.intp)
+            once = count // 2 if 2 * shift == count else count
+            histogram += np.bincount(rows[:, :once].ravel(), minlength=bins + 1)
+    return histogram[:-1]
+
+
+def _histogram_of_near_pairs(inside: Array, lengths: Array, end: float, bins: int) -> Any:
+    """Return the numbers of pairs by distance, from a tree of the particles."""
+    from scipy.spatial import cKDTree
+
+    histogram = np.zeros(bins, np.int64)
+    for points in inside:
+        i, j = cKDTree(points, boxsize=lengths).query_pairs(end, output_type="ndarray").T
+        apart = points[i] - points[j]
+        apart -= lengths * np.rint(apart / lengths)
+        histogram += np.histogram(np.sqrt((apart**2).sum(axis=1)), bins, (0.0, end))[0]
+    return histogram
 
 
 def _kinetic(states: Any) -> Any:

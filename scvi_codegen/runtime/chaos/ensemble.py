@@ -27,6 +27,7 @@ from scvi_codegen.runtime.chaos.growth import SERIES, Growth, ill_conditioned, r
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
 from scvi_codegen.runtime.chaos.tangent_propagation import MOST as LARGEST_CHUNK
 from scvi_codegen.runtime.chaos.tangent_propagation import InitialTangents, StepSegment, TangentPropagation
+from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, States
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, start_of_ensemble
@@ -66,8 +67,7 @@ class ChaosIndicatorsEnsemble:
         parameters: EnsembleParameters,
         options: SolverOptions | None,
     ) -> None:
-        stepper._check_fixed_steps("chaos_indicators_ensemble")
-        stepper._check_no_changes("chaos_indicators_ensemble")
+        require(stepper, "chaos_ensemble")
         self.stepper, self.options = stepper, checked_options(options)
         self.h, steps = checked_step(h), checked_count(steps, "steps", least=1)
         self.save_every = steps if save_every is None else checked_count(save_every, "save_every", least=1)

@@ -15,11 +15,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.chaos.growth import Growth, ill_conditioned, r_factors
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
+from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.rotations.reduction import Reduction
@@ -63,11 +64,7 @@ class InitialTangents:
     def checked(cls, stepper: Integrator, count: int | None, directions: ArrayLike | None) -> InitialTangents:
         """Construct from user arguments; raise :class:`StateError` for invalid numbers or directions."""
         size = 2 * stepper.dimension
-        if len(stepper.interface.constraints) == stepper.dimension:
-            raise MethodError(
-                f"'{stepper.interface.system}' has no tangent vectors: its constraints prescribe the motion. Leave out "
-                "a constraint, or use jacobian for derivatives by parameters"
-            )
+        require(stepper, "chaos")
         reduction = Reduction(stepper.interface) if stepper.interface.rotations else None
         if directions is None:
             most = reduction.size if reduction else size
@@ -133,7 +130,6 @@ def _frame(dimension: int) -> Array:
 
 def along(states: SavedStates, tangents: InitialTangents) -> ChaosIndicators:
     """Return the deviations of a run at its saved states; steps between these are recomputed."""
-    states.stepper._check_physical_time("the growth of tangent vectors")
     first = states.q[0], states.p[0], float(states.step_sizes[0]), float(states.t[0])
     propagation = TangentPropagation(tangents, tangents.at(*first, states.parameters, states.options), states.t)
     segments = (starts_of(states, first, last) for first, last in pieces(states))

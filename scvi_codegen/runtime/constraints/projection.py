@@ -13,10 +13,11 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, warn
+from scvi_codegen.errors import AccuracyWarning, StateError, warn
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import REASONS, STATUS
 from scvi_codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
+from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, Parameters, States, inputs_not_given, missing_input
 from scvi_codegen.runtime.rotations.states import checked_pair, checked_states
@@ -133,7 +134,7 @@ def check_reachable(stepper: Integrator, q: Array, p: Array, t: float, parameter
 
 def _of_constrained(stepper: Integrator, q: States, p: States, t: ArrayLike) -> tuple[Array, Array, Array]:
     if not stepper.constraints:
-        raise MethodError(f"'{stepper.interface.system}' has no constraints")
+        require(stepper, "project")
     return checked_states(stepper.interface, q, p, t)
 
 

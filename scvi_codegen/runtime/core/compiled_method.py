@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.display.cards import card, listed, plain
-from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.errors import MethodError, ScviCodegenError
 from scvi_codegen.indices import SIZES_REQUIRED
 from scvi_codegen.native import building
 from scvi_codegen.native.binding import Binding
@@ -25,6 +25,7 @@ from scvi_codegen.runtime.arrays.any_size import (
 )
 from scvi_codegen.runtime.arrays.binding import ArrayBinding
 from scvi_codegen.runtime.arrays.interface import RunSizes
+from scvi_codegen.runtime.core.features import Support, check_features, require
 from scvi_codegen.runtime.core.validation import Array, flat_state, named, shapes_of
 from scvi_codegen.runtime.events.array_events import EventBinding
 from scvi_codegen.runtime.events.event import Event, EventLike, as_events
@@ -46,18 +47,26 @@ class Variants:
     Args:
         made: sources by name; ``None`` for a variant that the method lacks. Those with events by the tuple of these.
         make: derives a source that is not among them.
+        lacking: returns whether the name is that of a variant that the method lacks, without deriving it.
     """
 
     def __init__(
-        self, made: Mapping[Any, Source | None] | None = None, make: Callable[[str], Source | None] = lambda _: None
+        self,
+        made: Mapping[Any, Source | None] | None = None,
+        make: Callable[[str], Source | None] = lambda _: None,
+        lacking: Callable[[str], bool] = lambda _: True,
     ) -> None:
         self._made: dict[Any, Source | None] = dict(made or {})
-        self._make = make
+        self._make, self._lacking = make, lacking
 
     def __getitem__(self, name: str) -> Source | None:
         if name not in self._made:
             self._made[name] = self._make(name)
         return self._made[name]
+
+    def lacks(self, name: str, *, of_sizes: bool = False) -> bool:
+        """Return whether the method lacks a variant, without deriving it; ``of_sizes``: that of other sizes."""
+        return self._made[name] is None if name in self._made and not of_sizes else self._lacking(name)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # second derivatives and tangent-vector variants are slow to derive: included only if already made
@@ -133,7 +142,6 @@ class CompiledMethod:
             self.binding = Binding(library, interface.prefix, interface.workspace, fallback=self._load_fallback)
 
     def _copy(self, events: tuple[Event, ...]) -> Self:
-        """Return the integrator with other events."""
         return type(self)(
             self._plain,
             self.interface,
@@ -175,14 +183,10 @@ class CompiledMethod:
         )
 
     def _check_not_of_run(self, tables: object, threads: object) -> None:
-        """Raise :class:`StateError` for arguments of arrays of run-time sizes."""
-        if tables is not None:
-            raise StateError("tables are for arrays whose sizes are known at run time only: omit them here")
-        if threads is not None:
-            raise StateError(
-                "threads share the steps of arrays whose sizes are known at run time only: omit threads, compile "
-                "without sizes, or compile roll_sums(system).system, whose runs take its tables and parameters"
-            )
+        """Raise :class:`MethodError` for arguments of arrays of run-time sizes."""
+        for name, value in (("tables", tables), ("threads", threads)):
+            if value is not None:
+                require(self, name)
 
     def _bound_to(self, problem: RunSizes) -> Self:
         """Return the stepper bound to these sizes and tables; the last one is kept for later calls."""
@@ -238,12 +242,13 @@ class CompiledMethod:
         """
         values = {**(sizes or {}), **named}
         if not self.any_size:
-            raise MethodError(f"{self!r} has known sizes: with_sizes is for a stepper of arrays of any size")
+            require(self, "with_sizes")
         check_few_coordinates(self.interface, values, self._reason)
         if self._of_sizes is None:
             raise MethodError(f"{self!r} lacks its system: call compile_stepper(system, method, sizes={values})")
         key = (tuple(sorted(values.items())), *((name, np.asarray(x).tobytes()) for name, x in (tables or {}).items()))
         if key not in self._known:
+            require(self, "with_sizes")
             self._known[key] = self._of_sizes(sizes=values, tables=dict(tables) if tables else None)
         return self._known[key]
 
@@ -313,7 +318,6 @@ class CompiledMethod:
                 building.load(source, flags=self.flags)
 
     def _compile(self) -> None:
-        """Compile the library and its fallback."""
         if not self.any_size:
             self.binding.set_fallback()
         elif not self._reason:
@@ -322,29 +326,18 @@ class CompiledMethod:
     @cached_property
     def tangent(self) -> Binding:
         """Library with derivatives of steps, compiled on first use."""
-        return self._linearised(self.derivatives, "derivatives")
+        return self._linearised("derivatives", "jacobian")
 
     @cached_property
     def _second_derivatives(self) -> Binding:
         """Library with second derivatives of steps, compiled on first use; raises ``MethodError`` if unavailable."""
-        return self._linearised(self.second_derivatives, "second derivatives")
+        return self._linearised("second_derivatives", "hessian")
 
-    def _linearised(self, source: Source | None, what: str) -> Binding:
-        if source is None:
-            raise MethodError(f"{what} of the steps are unavailable for '{self.title}'{self._why_not()}")
+    def _linearised(self, variant: str, operation: str) -> Binding:
+        require(self, operation)
+        source = cast(Source, self._variants[variant])
         binding = Binding(building.load(source, flags=self.flags), source.prefix)
         return binding.with_workspace(binding.constant("LINEARISED_WORKSPACE"))
-
-    def _why_not(self) -> str:
-        if not self.interface.energy_parameter:
-            return (
-                ": systems with damping have first derivatives only, and a pickled stepper has second derivatives only "
-                "if stepper.second_derivatives was used before pickling"
-            )
-        return (
-            ": in transformed time only first derivatives are available. Compile the original system with "
-            "time_transformation=..., or integrate it with t_end=..."
-        )
 
     def _load_fallback(self) -> building.Library:
         source = self.fallback
@@ -396,10 +389,26 @@ class CompiledMethod:
             raise unavailable("dimension", self)
         return self.interface.dimension
 
-    def _check_no_changes(self, what: str, *, wanted: bool = True) -> None:
-        """Raise :class:`MethodError` if something is wanted that events that change the states of runs exclude."""
-        if wanted and self.changes_states:
-            raise MethodError(f"{what} does not support events that change the state: make them terminal and restart")
+    def supports(self, feature: str, *together: str) -> Support:
+        """Return whether an operation is available for this system and method, without an attempt.
+
+        The result is true or false; its ``reason`` is the message of the error that the operation raises, with the
+        remedy, empty if the operation is available. :ref:`features` lists the names. For arrays of run-time sizes,
+        ``with_sizes(..)`` also answers what follows from the sizes, such as ``"work"``.
+
+        Args:
+            feature: name of the operation: ``"adaptive"``, ``"hessian"``, ``"fit"``.
+            together: names of further arguments of the same run: ``supports("t_eval", "inputs")``.
+
+        Raises:
+            StateError: if a name is unknown.
+        """
+        check_features(feature, *together)
+        try:
+            require(self, feature, *together)
+        except ScviCodegenError as error:
+            return Support(str(error))
+        return Support()
 
     def with_events(self, events: EventLike | Sequence[EventLike]) -> Self:
         """Return the integrator with these events in place of its own."""
@@ -412,11 +421,16 @@ class CompiledMethod:
             self._event_variants[wanted] = self._copy(wanted)
         return self._event_variants[wanted]
 
-    def _check_adaptive(self) -> None:
-        """Raise :class:`MethodError` if the method has no adaptive steps for this system."""
-        if not self.binding.has("advance_to"):
-            raise MethodError(
-                f"adaptive steps are unavailable for {self.interface.method} and this system: the error estimate "
-                "requires forces at two or more stages, or velocities that vary along a step; give h and steps (fixed "
-                "step size)"
-            )
+    def _lacks(self, variant: str) -> bool:
+        """Return whether the method lacks a variant; arrays of run-time sizes take it from their system."""
+        source = self.origin or self
+        if source.any_size:
+            return source._of_sizes is None or source._variants.lacks(variant, of_sizes=True)
+        return self._variants.lacks(variant)
+
+    @property
+    def _has_error_estimate(self) -> bool:
+        """Whether the method has adaptive steps for this system; true if that follows from sizes at run time."""
+        if self.any_size:
+            return bool(self._reason) or "_advance_to(" in self.source.header
+        return self.binding.has("advance_to")

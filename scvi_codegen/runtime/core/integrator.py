@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.errors import MethodError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, step_failure
+from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.validation import Array, Parameters, States, check_inputs_given
 from scvi_codegen.runtime.rotations.states import checked_pair
 from scvi_codegen.runtime.sensitivity.step_derivatives import LinearisedMethod
@@ -142,10 +142,7 @@ class Integrator(LinearisedMethod):
         if self.known is not self:
             return self.known.work_and_impulses(q, p, h, t, self._parameters(parameters), options=options)
         if not self.interface.exchange_names:
-            raise MethodError(
-                f"work and impulses are unavailable for {self.interface.method} and '{self.interface.system}': they "
-                "require forces, and SVI, SCVI, a Gauss method, or StoermerVerlet with solver='newton'"
-            )
+            require(self, "work")
         check_inputs_given(self.interface, parameters)
         state = *checked_pair(self.interface, q, p), self._parameters(parameters)
         q1, p1, values = *np.empty((2, self.dimension)), np.empty(len(self.interface.exchange_names))
@@ -176,10 +173,7 @@ class Integrator(LinearisedMethod):
         if self.known is not self:
             return self.known._discrete_legendre(q0, q1, h, t, self._parameters(parameters), options)
         if not self.interface.has_action:
-            raise MethodError(
-                f"{self.interface.method} has no discrete Lagrangian for '{self.interface.system}': this requires SVI, "
-                "SCVI or a Gauss method, no forces, and a system of second order"
-            )
+            require(self, "discrete_lagrangian")
         check_inputs_given(self.interface, parameters)
         ends = self._vector(q0, "q0"), self._vector(q1, "q1"), self._parameters(parameters)
         p0, p1, action = *np.empty((2, self.dimension)), np.empty(1)

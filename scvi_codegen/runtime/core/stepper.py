@@ -16,12 +16,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.arrays.interface import RunSizes
 from scvi_codegen.runtime.chaos.ensemble import ChaosIndicatorsEnsemble
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
 from scvi_codegen.runtime.constraints.projection import consistent, constraint_values, multipliers, projected
 from scvi_codegen.runtime.core.compiled_method import Variants
+from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, Parameters, States
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
@@ -38,17 +40,17 @@ from scvi_codegen.runtime.inputs.segments import (
 )
 from scvi_codegen.runtime.rotations.states import homogeneous_state, is_one_state
 from scvi_codegen.runtime.run.accuracy import (
-    check_growth_requested,
-    warn_of_energy_error,
+    measure_growth,
     warn_of_energy_errors,
     warn_of_error_growth,
-    warn_of_large_steps,
+    warn_of_inaccuracy,
     warn_of_unresolved_fields,
     warn_of_unresolved_members,
 )
 from scvi_codegen.runtime.run.global_error import checked_error, confirmed_run, warn_of_unconfirmed
+from scvi_codegen.runtime.run.largest_step import largest_step
 from scvi_codegen.runtime.run.run import Run
-from scvi_codegen.runtime.run.saving import read_checkpoint
+from scvi_codegen.runtime.run.saving import read_checkpoint, unsealed
 from scvi_codegen.runtime.run.step_plan import StepPlan, checked_plan, planned_steps
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
@@ -58,6 +60,8 @@ from scvi_codegen.validation import checked_count, checks_arguments, of
 
 class Stepper(Integrator):
     """Compiled integrator of one system: :class:`Integrator` with integrations, runs, ensembles and projections."""
+
+    _trajectory_type = Trajectory
 
     def __reduce__(self) -> tuple[Any, ...]:
         if self.origin is not None:
@@ -124,9 +128,10 @@ class Stepper(Integrator):
                 the bound: ``global_error``, ``confirmed_digits`` and ``confirmed_until`` of the trajectory. If double
                 precision does not suffice (chaotic motion), an :class:`~scvi_codegen.AccuracyWarning` reports the
                 time until which the bound is confirmed.
-            check_growth: after an adaptive run, repeat up to 2048 of its steps from an initial state perturbed in its
-                last place, unless a coarse run shows that errors grow slowly, and warn if the states differ by more
-                than 1e-7 (relative). ``True``: all steps, without a coarse run; ``False``: no check.
+            check_growth: by default adaptive runs warn of exponential growth of errors: of separable conservative
+                systems by a tangent vector along the run, of others by repeating up to 2048 steps from an initial state
+                perturbed in its last place, unless a coarse run shows that errors grow slowly. ``True``: repeat all
+                steps, and warn if the states differ by more than 1e-7 (relative); ``False``: no check.
             tables, threads: of arrays of run-time sizes: (rows, columns) whole numbers by name, (rows,) for a single
                 column; and the number of threads per step, by default one, with bitwise equal results. Threads pay off
                 if a step takes longer than some tens of microseconds; they are started by each call of C. The shapes
@@ -151,20 +156,21 @@ class Stepper(Integrator):
         if interface.rotations or interface.variables:
             q, p, velocity = homogeneous_state(interface, q, p, velocity)
         if error is not None:
-            stepper._check_no_changes("error=")
-            alternatives = {"h": h, "steps": steps, "tolerance": tolerance, "observe": observe}
-            return confirmed_run(
-                checked_error(error, alternatives, has_tau=self._has_tau),
-                partial(stepper.integrate, inputs=inputs),
-                partial(stepper.with_events(()).integrate, inputs=inputs),
-                (q, p, velocity),
-                {"t": t, "options": options, "parameters": parameters},
-                {"t_end": t_end, "save_every": save_every, "progress": progress, "t_eval": t_eval},
-            )
+            require(stepper, "error", *["observe"] * (observe is not None))
+            wanted = checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance})
+            along: dict[str, Any] = {"t": t, "options": options, "parameters": parameters}
+            whole = partial(stepper.integrate, q, p, velocity=velocity, inputs=inputs, progress=progress, **along)
+            once = partial(whole, t_end=t_end, save_every=save_every, t_eval=t_eval)
+            all_saved = not stepper.events and save_every == 1 and t_eval is None
+            again = None if all_saved else partial(stepper.with_events(()).integrate, *whole.args, **whole.keywords)
+            of_tau: Callable[[float], float] | None = None
+            if self._has_tau:
+                of_tau = partial(stepper._largest_step, (q, p, velocity), t_end, along)
+            return confirmed_run(wanted, once, again, checked_number(t, "the time t"), of_tau)
         if data is None:
             begin = 0.0 if h is None or t_end is None else t
-            transformed = interface.time_transformation, bool(interface.energy_parameter)
-            plan, count = planned_steps(h, steps, t_end, tolerance, save_every, begin, *transformed)
+            controller, in_tau = interface.time_transformation, bool(interface.energy_parameter)
+            plan, count = planned_steps(h, steps, t_end, tolerance, save_every, begin, controller, in_tau)
             run, repeat = stepper._started(q, p, velocity, plan, t, parameters, options, reuse=True), None
         else:
             fixed = h is not None and not interface.time_transformation
@@ -172,20 +178,29 @@ class Stepper(Integrator):
             plan, first = self._plan(h, None if fixed else end, tolerance), values(first_inner_time(t, end))
             run = stepper._started(q, p, velocity, plan, t, first, options, reuse=True)
             repeat = partial(advance_to, run, data, values=values)
-        if check_growth:
-            check_growth_requested(plan, stepper)
+        if check_growth or not plan.h:
+            measure_growth(run, check_growth)
         if data is None:
             times = None if t_eval is None else stepper._output_times(t_eval, run, count)
             trajectory = run._recorded(count, save_every=save_every, times=times, progress=progress, observe=observe)
-            warn_of_large_steps(trajectory)
-            warn_of_energy_error(trajectory, run)
+            warn_of_inaccuracy(trajectory, run)
         else:
             save_every = checked_count(save_every, "save_every", least=1)
             trajectory = record_pieces(run, data, end, save_every=save_every, values=values, progress=progress)
-        warn_of_unresolved_fields(trajectory)
-        warn_of_error_growth(run, trajectory, check_growth, repeat)
+            warn_of_unresolved_fields(trajectory)
+        if not plan.h:
+            warn_of_error_growth(run, trajectory, check_growth, repeat)
         run._release()
         return trajectory
+
+    def _largest_step(
+        self, state: tuple[Any, Any, Any], t_end: Any, along: Mapping[str, Any], tolerance: float
+    ) -> float:
+        """Return the largest step of tau of a tolerance for a run to t_end; ``along``: t, parameters and options."""
+        q, p, velocity = state
+        if p is None or velocity is not None:
+            p = self._initial_momenta(q, p, velocity, along["t"], along["parameters"])
+        return largest_step(self, q, p, checked_number(t_end, "the time t_end") - along["t"], tolerance, **along)
 
     @property
     def _has_tau(self) -> bool:
@@ -247,7 +262,6 @@ class Stepper(Integrator):
         return checked_plan(h, t_end, tolerance, interface.time_transformation, bool(interface.energy_parameter))
 
     def _output_times(self, t_eval: ArrayLike, run: Run, steps: int | None) -> Array:
-        """Return the checked output times of a run that begins."""
         if steps is None:
             return times_of_run(t_eval, run.t, run.plan.t_end)
         if self.interface.energy_parameter:
@@ -272,11 +286,12 @@ class Stepper(Integrator):
         contains its tables and parameters; ``threads`` is the number of threads per step.
 
         Raises:
-            StateError: if the bytes are no saved run or belong to another integrator.
+            StateError: if the bytes are damaged (their checksum differs) or belong to another integrator.
         """
         stepper: Any = self
         if self._reason:
             raise StateError(f"restore this run by with_sizes(...).from_checkpoint(saved): {self._reason}")
+        saved = unsealed(saved)
         if self.interface.layout.coordinates:
             stepper, saved, known = read_checkpoint(
                 saved, self.origin or self, threads=threads, adaptive=t_end is not None
@@ -339,10 +354,9 @@ class Stepper(Integrator):
             StateError: if a shape, name or number is invalid.
         """
         q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
-        self._check_no_changes("error=", wanted=error is not None)
         if error is not None:
-            others = {"h": h, "steps": steps, "tolerance": tolerance}
-            error = checked_error(error, others, has_tau=self._has_tau)
+            require(self, "error")
+            error = checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance})
         work = Ensemble(
             self,
             q,

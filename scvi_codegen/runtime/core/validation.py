@@ -3,7 +3,8 @@
 import difflib
 import math
 import re
-from collections.abc import Collection, Hashable, Iterable, Iterator, KeysView, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, KeysView, Mapping, Sequence
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -173,8 +174,12 @@ def coordinate_shapes(interface: Interface) -> list[tuple[str, tuple[int, ...]]]
 
 def declared(declarations: Sequence[str]) -> Iterator[tuple[str, tuple[int, ...]]]:
     """Yield the name and shape of each declaration; a single name has the shape ()."""
-    for each in declarations:
-        yield each.partition("[")[0], tuple(map(int, re.findall(r"\d+", each.partition("[")[2])))
+    yield from map(_declared, declarations)
+
+
+@lru_cache(maxsize=256)
+def _declared(declaration: str) -> tuple[str, tuple[int, ...]]:
+    return declaration.partition("[")[0], tuple(map(int, re.findall(r"\d+", declaration.partition("[")[2])))
 
 
 BINARY64, FEW = np.dtype(np.float64), 64
@@ -209,14 +214,12 @@ def checked_vector(interface: Interface, value: States, name: str) -> Array:
 def checked_parameters(interface: Interface, parameters: Parameters, base: Array | None = None) -> Array:
     """Return the (k,) parameter values in order; by default those of ``base``, or the defaults."""
     names, values = interface.parameters, np.array(interface.defaults if base is None else base, dtype=float)
-    if parameters is None:
-        return values
     if isinstance(parameters, Mapping):
         for name, where, value in parameter_columns(interface, parameters):
             if isinstance(where, slice) and value.ndim > 1:
                 raise StateError(f"the parameter {name} must have the shape of one state, not {value.shape}")
             values[where] = value if isinstance(where, slice) else checked_number(value, f"the parameter {name}")
-    else:
+    elif parameters is not None:
         array = real_array(parameters, "parameters")
         if array.shape != values.shape:
             known = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
@@ -225,7 +228,63 @@ def checked_parameters(interface: Interface, parameters: Parameters, base: Array
     if not np.isfinite(values).all():
         worst = int(np.flatnonzero(~np.isfinite(values))[0])
         raise StateError(f"the parameter {names[worst]} is {values[worst]}: it must be finite")
+    check_lengths(interface, values)
     return values
+
+
+def check_lengths(interface: Interface, values: Array, where: str = "") -> None:
+    """Raise :class:`StateError` unless lengths of lists of neighbours are positive and periods two cutoffs or more.
+
+    Args:
+        values: parameters in order.
+        where: words that follow the value in a message, as of which trajectory.
+    """
+    cutoffs: dict[str, tuple[str, float]] = {}
+    for near, kind, formula in (each.split(" ", 2) for each in interface.lengths):
+        length = _length(formula, interface.parameters, values)
+        what = f"the {kind} of the neighbours '{near}'{where} is {formula}"
+        what += "" if _is_number(formula) else f" = {length:.15g}"
+        if not 0 < length < math.inf:
+            raise StateError(f"{what}: it must be a positive number")
+        if kind == "cutoff":
+            cutoffs[near] = formula, length
+        elif kind == "box" and length < 2 * (cutoff := cutoffs[near])[1]:
+            raise StateError(
+                f"{what}: it must be at least two cutoffs, 2*({cutoff[0]}) = {2 * cutoff[1]:.15g}, since only the "
+                "nearest image of a point counts. Enlarge the box or reduce the cutoff"
+            )
+
+
+def _is_number(formula: str) -> bool:
+    return not re.search(r"[^\d.]", formula)
+
+
+def _length(formula: str, names: Sequence[str], values: Array) -> float:
+    """Return the value of a formula of parameters; NaN where it is undefined."""
+    if _is_number(formula):
+        return float(formula)
+    if formula.isidentifier() and formula in names:
+        return float(values[names.index(formula)])
+    evaluate, used = _evaluation(formula)
+    try:
+        return evaluate([float(values[names.index(name)]) for name in used])
+    except ArithmeticError:
+        return math.nan
+
+
+@lru_cache(maxsize=64)
+def _evaluation(formula: str) -> tuple[Callable[[Sequence[float]], float], tuple[str, ...]]:
+    """Return the function of a formula and the names of its arguments."""
+    # imported here because SymPy is slow to import, and most lengths are parameters
+    from scvi_codegen.formulas.expressions import Tape
+    from scvi_codegen.formulas.grammar import parse_expression
+    from scvi_codegen.formulas.symbols import symbol
+    from scvi_codegen.tables.precision import mp
+
+    used = tuple(sorted({*re.findall(r"(?<![\w.])[A-Za-z_]\w*(?!\w*\()", formula)} - {"pi"}))
+    symbols = {name: symbol(name) for name in used}
+    tape = Tape([parse_expression(formula, symbols)], list(symbols.values()))
+    return lambda numbers: float(tape([mp.mpf(x) for x in numbers])[0]), used
 
 
 def parameter_columns(interface: Interface, parameters: Mapping[str, Any]) -> Iterator[tuple[str, int | slice, Any]]:

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import EventError, StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import SolverOptions, checked_options
+from scvi_codegen.runtime.core.features import refusal, require
 from scvi_codegen.runtime.core.validation import Array, States, check_left_to_inputs, columns_of_inputs, parameter_index
 from scvi_codegen.runtime.ensemble.initial_states import (
     EnsembleParameters,
@@ -101,12 +102,9 @@ class Ensemble:
     ) -> None:
         interface = stepper.interface
         steps, t_end = _steps_or_end(t, h, steps, t_end, inputs, tolerance=tolerance, t_eval=t_eval)
-        if interface.time_transformation:
-            raise StateError("ensembles do not support time_transformation: compile the stepper without it")
-        if h is None and interface.energy_parameter:
-            raise StateError("adaptive steps are unavailable in transformed time: give h and steps (fixed step in tau)")
+        require(stepper, "ensembles")
         if h is None:
-            stepper._check_adaptive()
+            require(stepper, "adaptive")
         self.stepper = stepper
         self.options, self.inputs = checked_options(options), dict[str, Input]()
         if inputs is not None:
@@ -369,7 +367,7 @@ def _steps_or_end(
         StateError: for missing or contradictory arguments.
     """
     if inputs is not None and adaptive["t_eval"] is not None:
-        raise StateError("t_eval is not supported with inputs: omit t_eval")
+        raise refusal("t_eval", "with inputs")
     if (h is None and (t_end is None or steps is not None)) or (inputs is None and steps is t_end is None):
         raise StateError(EITHER)
     if h is None:

@@ -10,7 +10,14 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.runtime.constraints.projection import consistent
 from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.core.validation import Array, States, check_inputs_given, flat_state, parameter_columns
+from scvi_codegen.runtime.core.validation import (
+    Array,
+    States,
+    check_inputs_given,
+    check_lengths,
+    flat_state,
+    parameter_columns,
+)
 
 EnsembleParameters = Mapping[str, ArrayLike] | Sequence[Any] | Array | None
 
@@ -89,4 +96,6 @@ def parameters_of_each(stepper: Integrator, argument: EnsembleParameters, count:
     if not np.isfinite(values).all():
         j, i = (int(index[0]) for index in np.nonzero(~np.isfinite(values)))
         raise StateError(f"the parameter {names[i]} of trajectory {j} is {values[j, i]}: it must be finite")
+    for j, each in enumerate(values if stepper.interface.lengths else ()):
+        check_lengths(stepper.interface, each, f" of trajectory {j}")
     return values

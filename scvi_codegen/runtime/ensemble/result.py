@@ -7,14 +7,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, TypeAlias
+from typing import IO, TYPE_CHECKING, Any, TypeAlias, cast, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.files.atomic import write_atomically
-from scvi_codegen.files.export import LABELLED, check_format, write_whole
+from scvi_codegen.files.export import FORMATS, LABELLED, check_format, write_whole
 from scvi_codegen.files.labelled_arrays import AXES, Labelled, checked_units, to_dataset
 from scvi_codegen.representation import one_line
 from scvi_codegen.runtime.core.integrator import Integrator
@@ -24,14 +24,22 @@ from scvi_codegen.runtime.rotations.quantities import named_quantities
 from scvi_codegen.runtime.run.descriptions import short_title
 from scvi_codegen.runtime.run.global_error import ConfirmedEnsemble, GlobalError
 from scvi_codegen.runtime.run.step_plan import StepPlan
-from scvi_codegen.runtime.trajectory.joining import relative_changes
+from scvi_codegen.runtime.trajectory.joining import joined, relative_changes
 from scvi_codegen.runtime.trajectory.quantities import quantities
+from scvi_codegen.runtime.trajectory.saved_states import checked_row
 from scvi_codegen.validation import checks_arguments
 
 if TYPE_CHECKING:
     import xarray
 
+    from scvi_codegen.pictures.animation import Film
+    from scvi_codegen.pictures.overview import Plots
+    from scvi_codegen.runtime.trajectory.trajectory import Trajectory
+
 OK, INTERRUPTED, EVENT_FAILED = "ok", "interrupted", "event failed"
+
+MOST_DRAWN = 64
+"""Largest number of trajectories in a picture."""
 
 Span: TypeAlias = tuple[slice, slice, Callable[[slice], Array]]
 """Rows of states, a slice of trajectories, and a function returning the parameters of trajectories in these rows."""
@@ -73,6 +81,66 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
     def __len__(self) -> int:
         return len(self.status)
 
+    @overload
+    def __getitem__(self, j: int) -> Trajectory: ...
+    @overload
+    def __getitem__(self, j: str) -> Array: ...
+    def __getitem__(self, j: int | str) -> Trajectory | Array:
+        """Return trajectory j, or the values (n, k) of a name, as of :class:`Trajectory`: ``runs["x"]``."""
+        if isinstance(j, str):
+            return self._quantity(j)
+        trajectory: type[Trajectory] = cast(Any, self.stepper)._trajectory_type
+        j = checked_row(j, len(self))
+        parts = [(good, parameters) for k, good, parameters in self._with_parameters() if k == j]
+        times, in_tau = self._times()[:, j], bool(self.stepper.interface.energy_parameter)
+        plan = self.plans[j] if self.plans else StepPlan(h=self.h)
+        pieces = []
+        for number, (good, parameters) in enumerate(parts):
+            rows = np.insert(good, 0, good[0] - 1) if number else good  # the state at a breakpoint belongs to both
+            q, p = (self.stepper.named(np.ascontiguousarray(each[rows, j])) for each in (self.q, self.p))
+            pieces.append(
+                trajectory(
+                    t=times[rows],
+                    q=q,
+                    p=p,
+                    iterations=np.zeros(len(rows), np.int32),
+                    step_sizes=np.full(len(rows), self.h or np.nan),
+                    h=self.h,
+                    tau=self.t[rows] if in_tau else None,
+                    parameters=parameters,
+                    stepper=self.stepper,
+                    plan=plan,
+                    steps=int(self.steps[j]),
+                )
+            )
+        return joined(pieces) if len(pieces) > 1 else pieces[0]
+
+    @property
+    def plot(self) -> Plots:
+        """Plots of the first trajectories (at most 64), as of :attr:`Trajectory.plot`."""
+        from scvi_codegen.pictures.overview import Plots
+
+        return Plots([self[j] for j in range(min(len(self), MOST_DRAWN))])
+
+    def animate(
+        self,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        seconds: float = 8.0,
+        positions: Callable[[Array], Array] | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Film:
+        """Return an animation of the first trajectories (at most 64) together, as :meth:`Trajectory.animate`."""
+        from scvi_codegen.pictures.animation import animate
+
+        return animate(
+            [self[j] for j in range(min(len(self), MOST_DRAWN))],
+            path,
+            seconds=seconds,
+            positions=positions,
+            progress=progress,
+        )
+
     def __repr__(self) -> str:
         states = f"{len(self.t)} states of each of {len(self)} trajectories, {np.count_nonzero(self.ok)} of them ok"
         return one_line(self, short_title(self.stepper.interface), states)
@@ -97,7 +165,6 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
             yield times[good, j], self.q[good, j], self.p[good, j], status, steps
 
     def _times(self) -> Array:
-        """Return the (n, k) times."""
         return np.broadcast_to(self.t[:, np.newaxis], self.q.shape[:2]) if self.times is None else self.times
 
     def energy(self) -> Array:
@@ -137,10 +204,11 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
 
     @checks_arguments()
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
-        """Write ``.npz``, ``.csv`` (one state a line: trajectory, t, q, p), ``.h5``, ``.nc`` or ``.zarr``, atomically.
+        """Write a file in the format of its suffix, one of those of :meth:`Trajectory.save`, atomically.
 
-        CSV files number trajectories from 0, have columns for parameters that differ between trajectories, and omit
-        states after a failure. HDF5 and Zarr files contain the variables of :meth:`to_xarray`.
+        CSV files have one state a line (trajectory, t, q, p), number trajectories from 0, have columns for parameters
+        that differ between trajectories, and omit states after a failure. HDF5 and Zarr files contain the variables of
+        :meth:`to_xarray`.
 
         Raises:
             StateError: if the suffix is unknown, or the format has no units.
@@ -154,7 +222,7 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
             return
         write = {".npz": self._write_npz, ".csv": self._write_csv}.get(suffix)
         if write is None:
-            raise StateError(f"cannot save an ensemble as {str(path)!r}: use .npz, .csv, {', '.join(LABELLED)}")
+            raise StateError(f"cannot save an ensemble as {str(path)!r}: use {FORMATS}")
         if known:
             raise StateError(f"{suffix} files cannot store units: use {', '.join(LABELLED)}, or omit units")
         write_atomically(path, write)

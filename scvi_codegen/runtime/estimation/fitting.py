@@ -245,7 +245,6 @@ class _Model:
 
     @property
     def guess(self) -> Array:
-        """(k,) initial guesses."""
         return self.known[self.unknown_indices]
 
     def bounded(self, argument: Mapping[str, tuple[float, float]]) -> Limits:

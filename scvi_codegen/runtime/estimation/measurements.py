@@ -13,8 +13,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.errors import MethodError, StateError, closest
+from scvi_codegen.errors import StateError, closest
 from scvi_codegen.native.arguments import checked_number, checked_step, real_array
+from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.inputs.segments import Input, parameters_of
@@ -59,9 +60,7 @@ class Measurements:
         inputs: Mapping[str, Input],
     ) -> Measurements:
         """Construct from validated arguments of :func:`~scvi_codegen.fit`."""
-        stepper._check_fixed_steps("fit")
-        if stepper.constraints:
-            raise MethodError("fit does not support constraints: use independent coordinates")
+        require(stepper, "fit")
         times, values = checked_times(t, "t"), real_array(measured, "measured")
         if times.ndim != 1 or not len(times) or (np.diff(times) <= 0.0).any():
             raise StateError("t must be a one-dimensional array of ascending times")

@@ -36,6 +36,7 @@ class EventBinding(ArrayBinding):
         from scvi_codegen.rendering.array_events import array_events  # here: imports SymPy
 
         super().__init__(library, interface, sizes)
+        self.reusable = False
         self.events, self.acts = events, any(event.changes_state for event in events)
         for event, code in zip(events, array_events(interface, events).events, strict=True):
             try:

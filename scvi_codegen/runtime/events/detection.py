@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import EventError, EventWarning, StateError, warn
 from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.events.event import ACCUMULATED, BEHIND, JAMMED, THROUGH, UNDEFINED, Crossings
+from scvi_codegen.runtime.events.event import (
+    ACCUMULATED,
+    BEHIND,
+    JAMMED,
+    THROUGH,
+    UNDEFINED,
+    UNDEFINED_CHANGE,
+    Crossings,
+)
 from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
 
 if TYPE_CHECKING:
@@ -139,11 +147,12 @@ class CrossingSearch:
     def _failure(self, status: int, report: Any, step: int, h: float) -> Exception:
         behind = getattr(self.watch, "behind", 0.0)
         through = BEHIND if behind < 0.0 else THROUGH
-        messages = {"undefined": UNDEFINED, "accumulated": ACCUMULATED, "through": through, "jammed": JAMMED}
+        undefined = UNDEFINED_CHANGE if getattr(self.watch, "undefined", 0) < 0 else UNDEFINED
+        messages = {"undefined": undefined, "accumulated": ACCUMULATED, "through": through, "jammed": JAMMED}
         for name, message in messages.items():
             number = getattr(self.watch, name, 0)
             if number and not (name == "accumulated" and self.ended):
-                function = self.stepper.events[number - 1].function
+                function = self.stepper.events[abs(number) - 1].function
                 return EventError(message.format(function=function, t=report.t, g=behind))
         return step_failure(status, report, step=step, h=h)
 

@@ -23,6 +23,10 @@ DIRECTIONS = (-1, 0, 1)
 COMPARISON = re.compile(r"(>=|<=|>|<)")
 LOOPS = re.compile(r"\s+for\b.*", re.DOTALL)
 UNDEFINED = "the event function '{function}' is not finite in the step from t = {t:.17g}"
+UNDEFINED_CHANGE = (
+    "the state after the event '{function}' is not finite in the step from t = {t:.17g}: a formula of then= or "
+    "restitution is undefined at the state of the event; change it, or limit the event by where="
+)
 ACCUMULATED = (
     "the crossings of the terminal event '{function}' accumulate at t = {t:.17g}: the run starts at its zero and "
     "returns within a rounding error (Zeno behaviour, as of infinitely many bounces). End the run here, or continue "

@@ -5,7 +5,7 @@ Steps end at breakpoints; compensated sums continue across them. See :mod:`scvi_
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -15,6 +15,7 @@ import numpy as np
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, checked_step, real_array
 from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.core.features import refusal
 from scvi_codegen.runtime.core.validation import Array, check_left_to_inputs, no_input
 from scvi_codegen.runtime.run.accuracy import warn_of_large_steps
 from scvi_codegen.runtime.run.memory import Memory
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
 POWERS = 4
 ALL = slice(None)
+KINDS_OF_INPUTS = "a number, (t, values) or (t, values, 'cubic')"
 NEGLIGIBLE_STEP = 1e-9
 """Fraction of a step below which the remainder before a breakpoint is skipped."""
 
@@ -65,7 +67,7 @@ def checked_inputs(
         StateError: if a name is no input, an input is missing, or data define no function of time.
     """
     if interface.energy_parameter and argument is not None:
-        raise StateError("inputs are not supported in transformed time: compile the original system")
+        raise refusal("inputs", "in transformed time")
     names, argument = interface.inputs, dict(argument or {})
     for name in argument:
         if name not in names:
@@ -83,10 +85,11 @@ def checked_data(
     """Return validated inputs; raise :class:`StateError` for output arguments that exclude each other or inputs."""
     if t_eval is not None and save_every != 1:
         raise StateError(f"give either t_eval or save_every={save_every}, not both")
-    if inputs is not None and t_eval is not None:
-        raise StateError("t_eval is not supported with inputs: omit t_eval")
-    if observed and (inputs is not None or t_eval is not None):
-        raise StateError("observe is not supported with inputs or t_eval: omit observe")
+    for name, used in (("t_eval", t_eval is not None), ("observe", observed)):
+        if used and inputs is not None:
+            raise refusal(name, "with inputs")
+    if observed and t_eval is not None:
+        raise refusal("observe", "with t_eval")
     return None if inputs is None else checked_inputs(interface, inputs)
 
 
@@ -101,13 +104,15 @@ def input_of(name: str, argument: Any, trajectories: int | None = None) -> Input
         )
     if hasattr(argument, "c") and hasattr(argument, "x"):
         return _from_pieces(name, *_powers(name, argument), trajectories)
+    if isinstance(argument, str):
+        read = f"t, values = numpy.loadtxt({argument!r}, delimiter=',', skiprows=1, unpack=True)"
+        raise StateError(f"the input '{name}' must be {KINDS_OF_INPUTS}, not text; read a file first: {read}")
     if not isinstance(argument, tuple):
         constant = real_array(argument, f"the input '{name}'")
         if constant.shape in ((), (trajectories,)):
             return _from_pieces(name, np.array([-np.inf, np.inf]), constant[np.newaxis, ..., np.newaxis], trajectories)
     if not isinstance(argument, tuple) or len(argument) not in (2, 3):
-        kinds = "a number, (t, values) or (t, values, 'cubic')"
-        raise StateError(f"the input '{name}' must be {kinds}, not {argument!r:.60}")
+        raise StateError(f"the input '{name}' must be {KINDS_OF_INPUTS}, not {argument!r:.60}")
     t, values = (
         checked_times(part, f"{what} of the input {name}")
         for part, what in zip(argument, ("t", "values"), strict=False)
@@ -202,21 +207,40 @@ def record_pieces(
         values: function that returns the parameters of the piece containing a time.
         progress: called with the number of completed steps.
     """
-    pieces: list[Trajectory] = []
     first, run._watch = run.steps, None
     report = None if progress is None else lambda _: progress(run.steps - first)
-    for steps in prepared_segments(run, inputs, t_end, values):
+    recorded = partial(run.record, save_every=save_every, progress=report)
+    trajectory = record_segments(run, prepared_segments(run, inputs, t_end, values), recorded)
+    if run._leaving:
+        warn_of_large_steps(trajectory)
+    return trajectory
+
+
+def record_segments(
+    run: Run,
+    segments: Iterable[int | None],
+    recorded: Callable[[int | None], Trajectory],
+    stopped: Callable[[], bool] = lambda: False,
+) -> Trajectory:
+    """Record a run segment by segment; the states at their ends, and the last one before a failure, are also saved.
+
+    Args:
+        run: the run.
+        segments: prepares the run for each segment and yields its number of steps, as :func:`prepared_segments`.
+        recorded: records a number of steps.
+        stopped: returns whether the run was stopped in the last segment; a terminal event ends it as well.
+    """
+    pieces: list[Trajectory] = []
+    for steps in segments:
         try:
-            piece = run.record(steps, save_every=save_every, progress=report)
+            piece = recorded(steps)
         except StepFailedError as failure:
-            failure.trajectory = joined([*pieces, Trajectory.before(failure)])
+            failure.trajectory = joined([*pieces, with_final_state(Trajectory.before(failure), run)])
             raise
         pieces.append(piece if run.ended else with_final_state(piece, run))
-        if run.ended:
+        if run.ended or stopped():
             break
-    if run._leaving and pieces:
-        warn_of_large_steps(pieces[-1])
-    return joined(pieces or [run.record(0)])
+    return joined(pieces or [recorded(0)])
 
 
 def prepared_segments(

@@ -120,7 +120,6 @@ class PeriodicOrbit:
 
 
 def _inverse(matrix: Array) -> Array:
-    """Return the inverse of a symplectic matrix."""
     m = len(matrix) // 2
     a, b, c, d = matrix[:m, :m], matrix[:m, m:], matrix[m:, :m], matrix[m:, m:]
     return np.block([[d.T, -b.T], [-c.T, a.T]])

@@ -17,9 +17,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.errors import EventError, MethodError, OrbitError, StateError, StepFailedError, closest
+from scvi_codegen.errors import (
+    AccuracyWarning,
+    EventError,
+    MethodError,
+    OrbitError,
+    StateError,
+    StepFailedError,
+    closest,
+    warn,
+)
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.stepper import STEPPER, Stepper
 from scvi_codegen.runtime.core.validation import Array, Parameters, check_inputs_given, checked_vector
 from scvi_codegen.runtime.estimation.measurements import state_names
@@ -46,6 +56,10 @@ SETTLED = 1e-13
 """Newton step, relative to state and period, below which the iteration ends."""
 MOST_INCREASE = 10.0
 """Largest factor by which a Newton step may increase the residual."""
+FREEDOM = 3.0
+"""Largest factor by which the period of an orbit may differ from its guess."""
+FAR = 1.5
+"""Factor between the periods, and part of the size of the state, beyond which an orbit is not the guessed one."""
 EQUILIBRIUM_MOTION = 1e-6
 """Motion over a period, relative to the size of the state, below which an orbit counts as an equilibrium."""
 
@@ -70,7 +84,10 @@ def periodic_orbit(
 ) -> PeriodicOrbit:
     """Find a periodic orbit near an initial guess, by Newton's iteration with exact derivatives of the steps.
 
-    Where the orbit is unstable, multiple shooting improves the guess first.
+    Where the orbit is unstable, multiple shooting improves the guess first. Give a state on the orbit, the period, and
+    ``steps`` or ``h``; without ``fixed`` or ``energy`` the orbit is one of a family near the guess. If the iteration
+    fails or converges to an equilibrium, it is repeated from a closed curve near the guess, and with fixed positions.
+    An :class:`~scvi_codegen.AccuracyWarning` reports an orbit far from the guess.
 
     Args:
         stepper: the compiled stepper.
@@ -100,16 +117,18 @@ def periodic_orbit(
     stepper = stepper.bind(q, parameters)[0]._known_with_events
     q, p, velocity = homogeneous_state(stepper.interface, q, p, velocity)
     interface, names = stepper.interface, state_names(stepper)
-    stepper._check_fixed_steps("periodic_orbit")
+    require(stepper, "periodic_orbit")
     check_inputs_given(interface, parameters)
-    if interface.constraints:
-        raise MethodError("periodic_orbit does not support constraints: use independent coordinates")
-    if energy is not None and interface.exchange_names:
-        raise MethodError(f"energy cannot be prescribed, because forces act on '{interface.system}': omit energy")
+    if energy is not None:
+        require(stepper, "energy")
     if (period := checked_number(period, "the period")) <= 0.0:
         raise StateError(f"the period must be positive, not {period:g}")
     if (steps is None) == (h is None):
-        raise StateError(f"give either steps (of a period) or h (largest); got {'neither' if h is None else 'both'}")
+        got = "neither" if h is None else f"both, steps={steps} and h={h}"
+        raise StateError(
+            "periodic_orbit requires one step size, either the number of steps per period (steps=200) or the largest "
+            f"step size (h=0.05); it got {got}"
+        )
     for name in fixed:
         if name not in names:
             raise StateError(f"fixed names '{name}', which is no coordinate or momentum{closest(name, names)}")
@@ -151,19 +170,54 @@ class _OrbitSearch:
     options: SolverOptions | None
 
     def orbit(self, guess: Array) -> PeriodicOrbit:
-        """Return the orbit near a guess."""
-        z, equations, iterations = self._iterated(*self._by_segments(guess))
+        """Return the orbit near a guess, found in one of a few attempts.
+
+        The first one starts at the trajectory of the guess; the second one at a closed curve near it. If nothing is
+        fixed two more keep the positions, so that the amplitude cannot vanish: then the iteration does not converge to
+        an equilibrium.
+        """
+        failures: list[Exception] = []
+        far: list[PeriodicOrbit] = []
+        attempts = [(self, False), (self, True)]
+        if self.energy is None and not set(self.fixed_indices) - {-1}:
+            held = replace(self, fixed_indices=(*self.fixed_indices, *range(self.stepper.dimension)))
+            attempts += [(held, False), (held, True)]
+        for search, smoothed in attempts:
+            try:
+                orbit = search._orbit(guess, smoothed=smoothed)
+                if _is_near(orbit, guess):
+                    return orbit
+                far.append(orbit)
+            except (OrbitError, StepFailedError, np.linalg.LinAlgError) as failure:
+                failures.append(failure)
+        if far:
+            away = float(np.abs(np.concatenate([far[0].q, far[0].p]) - guess[:-1]).max())
+            warn(
+                f"the periodic orbit that was found is far from the guess: its period is {far[0].period:.6g}, "
+                f"not {guess[-1]:.6g}, and its state differs by {away:.2g}. Compare both, or fix an amplitude",
+                AccuracyWarning,
+            )
+            return far[0]
+        raise next((each for each in failures if isinstance(each, OrbitError)), failures[0])
+
+    def _orbit(self, guess: Array, *, smoothed: bool) -> PeriodicOrbit:
+        z, equations, iterations = self._iterated(*self._by_segments(guess, smoothed=smoothed))
         m, motion = self.stepper.dimension, equations.motion
         size = float(np.abs([z[:-1], guess[:-1]]).max())
         allowed = CLOSED * max(1.0, float(np.linalg.norm(equations.monodromy, 2)))
         if not equations.error <= allowed * size:
             raise OrbitError(
                 f"no periodic orbit was found near the guess: after {iterations} iterations the closing error is "
-                f"{equations.error:.1e}. Give a better initial guess, or more steps"
+                f"{equations.error:.1e}, for q = {_listed(z[:m])}, p = {_listed(z[m:-1])}, period {z[-1]:.6g}. "
+                "Give a better initial guess (unstable orbits need one within a few percent), fix an "
+                "amplitude, fixed=['x', ..], or the period, fixed_period=True, or take more steps"
             )
         self._check_energy(equations, allowed * size)
         if np.linalg.norm(self._leaving(motion) @ motion.by_period) * z[-1] <= EQUILIBRIUM_MOTION * size:
-            raise OrbitError("the iteration converged to an equilibrium: give a better initial guess")
+            raise OrbitError(
+                f"the iteration converged to an equilibrium, q = {_listed(z[:m])}, p = {_listed(z[m:-1])}: fix an "
+                "amplitude, fixed=['x', ..], or give a better initial guess"
+            )
         if motion.by_time.any():
             period = float(z[-1])
             if -1 not in self.fixed_indices:
@@ -192,7 +246,7 @@ class _OrbitSearch:
             options=self.options,
         )
 
-    def _by_segments(self, guess: Array) -> tuple[Array, _ClosingEquations, int]:
+    def _by_segments(self, guess: Array, *, smoothed: bool) -> tuple[Array, _ClosingEquations, int]:
         """Improve a guess by multiple shooting where tangent vectors grow along it; one segment needs no improvement.
 
         States at the ends of segments are further unknowns, and continuity there further equations (Stoer & Bulirsch,
@@ -213,9 +267,14 @@ class _OrbitSearch:
         growth = float(np.abs(np.linalg.eigvals(monodromy)).max())
         if growth <= EASY:
             return guess, self._closing(guess), 0
-        count = min(2 * int(np.ceil(np.log(growth) / np.log(GROWTH) / 2.0)), self.steps)
+        count = min(2 * int(np.ceil(np.log(growth) / np.log(GROWTH) / 2.0)) * (1 + smoothed), self.steps)
         later = later + np.append(self.gain, np.zeros(len(self.gain)))
         path = np.vstack([start, forward.states[: self.steps - len(later)], later[-2::-1]])
+        if smoothed and len(later) > 1:  # distributes the jump in the middle, quadratically in time
+            middle = self.steps - len(later)
+            jump = later[-1] - forward.states[middle - 1]
+            share = np.minimum(np.arange(len(path)) / middle, (self.steps - np.arange(len(path))) / len(later))
+            path += np.outer(np.where(np.arange(len(path)) <= middle, 0.5, -0.5) * share**2, jump)
         nodes = np.append(path[self._bounds(count)[:-1]], guess[-1])
         z, _, iterations = self._iterated(nodes, self._closing(nodes), 0)
         nearer = np.append(z[: len(start)], z[-1])
@@ -267,7 +326,7 @@ class _OrbitSearch:
             return None
         for shortened in 0.5 ** np.arange(MOST_HALVINGS):
             trial = z - shortened * change
-            if trial[-1] <= 0.0:
+            if not self.period / FREEDOM <= trial[-1] <= self.period * FREEDOM:
                 continue
             states = trial[:-1].reshape(-1, 2, self.stepper.dimension)
             trial[:-1] = np.ravel([self.reduction.normalised(*state) for state in states])
@@ -373,6 +432,15 @@ class _OrbitSearch:
         q, p = map(np.ascontiguousarray, np.split(states, 2, axis=1))
         maps = self.stepper.momentum_maps(q, p, t, self.parameters).reshape(len(t), -1)
         return np.column_stack([self.stepper.energy(q, p, t, self.parameters), maps])
+
+
+def _listed(values: Array) -> str:
+    return f"[{', '.join(f'{x:.6g}' for x in values[:6])}{', ..' if len(values) > 6 else ''}]"
+
+
+def _is_near(orbit: PeriodicOrbit, guess: Array) -> bool:
+    away = float(np.abs(np.concatenate([orbit.q, orbit.p]) - guess[:-1]).max())
+    return bool(1 / FAR < orbit.period / guess[-1] < FAR and away < FAR * np.abs(guess[:-1]).max())
 
 
 @dataclass(frozen=True, eq=False)

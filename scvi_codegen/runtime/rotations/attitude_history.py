@@ -1,5 +1,6 @@
 """Rotations, directions and spins of the states of a trajectory."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -8,8 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError, closest
+from scvi_codegen.formulas.symbols import DOT
 from scvi_codegen.rendering.source import Interface
-from scvi_codegen.runtime.core.validation import Array, shapes_of
+from scvi_codegen.runtime.core.validation import Array, coordinate_shapes, shapes_of
 from scvi_codegen.runtime.rotations.attitudes import (
     angular_velocity,
     body_momentum,
@@ -18,7 +20,7 @@ from scvi_codegen.runtime.rotations.attitudes import (
     matrices,
     unit_vectors,
 )
-from scvi_codegen.runtime.rotations.quantities import spins
+from scvi_codegen.runtime.rotations.quantities import spins, values_by_name
 from scvi_codegen.runtime.rotations.states import Member, members_of
 
 
@@ -39,6 +41,8 @@ class AttitudeHistory:
         each: Any
         at: Any
         pieces: Any
+        t: Any
+        energy: Any
         velocity: Any
 
     @property
@@ -98,6 +102,46 @@ class AttitudeHistory:
         columns, (q, p) = self._member("spin", name).columns, self._states(t)
         return spins(q[..., columns], p[..., columns])
 
+    def _quantity(self, name: str) -> Array:
+        """Return the values of one name at the states, (n, ..), or (n, k, ..) of an ensemble.
+
+        Names are those of coordinates, momenta ``p_x``, velocities ``x_dot``, arrays, fields on a mesh, rotations and
+        their angular velocities, directions and spins; ``t``, ``energy``; and ``q``, ``p``, ``velocity``, all columns,
+        unless a coordinate has this name.
+
+        Raises:
+            StateError: for another name.
+        """
+        interface, (q, p) = self.stepper.interface, self._states(None)
+        if name in ("t", "energy"):
+            return np.asarray(self.t if name == "t" else self.energy())
+        if (values := _fields(interface.layout.mesh, q, p).get(name)) is not None:
+            return values
+        if (columns := _columns(interface, name)) is not None:
+            return np.asarray(q[..., columns])
+        if (columns := _momentum_columns(interface, name)) is not None:
+            return np.asarray(p[..., columns])
+        if name.endswith(DOT) and (columns := _columns(interface, name.removesuffix(DOT))) is not None:
+            return np.asarray(self._velocities(q, p, None)[..., columns])
+        derived = values_by_name(interface, q, p, self._velocities(q, p, None)) if interface.rotations else {}
+        if name in derived:
+            return derived[name]
+        if name in ("q", "p", "velocity"):  # no coordinate has this name: whole state vectors
+            return {"q": q, "p": p}[name] if name != "velocity" else self._velocities(q, p, None)
+        shown = [name for name, _ in coordinate_shapes(interface)]
+        shown += [name for _, name, *_ in map(str.split, interface.rotations)]
+        known = [
+            *shown,
+            *(f"p_{each}" for each in shown),
+            *(f"{each}{DOT}" for each in shown),
+            "t",
+            "energy",
+            "q",
+            "p",
+            "velocity",
+        ]
+        raise StateError(f"there is no quantity '{name}' of the states{closest(name, known)} Known: {', '.join(known)}")
+
     def _states(self, t: ArrayLike | None) -> tuple[Array, Array]:
         """Return the saved states, or those at times t."""
         if t is None:
@@ -138,6 +182,32 @@ class AttitudeHistory:
             hint = closest(str(name), names) if name is not None else "."
             raise StateError(f"{reason}{hint} The system has: {', '.join(names) or f'no {kind}'}")
         return members[names.index(name)]
+
+
+def _columns(interface: Interface, name: str) -> NDArray[np.intp] | int | None:
+    """Return the indices of an array in its shape, or the index of a coordinate; ``None`` for another name."""
+    first = 0
+    for array, shape in shapes_of(interface) or ():
+        if array == name:
+            return np.arange(first, first + math.prod(shape)).reshape(shape)
+        first += math.prod(shape)
+    return interface.coordinates.index(name) if name in interface.coordinates else None
+
+
+def _momentum_columns(interface: Interface, name: str) -> NDArray[np.intp] | int | None:
+    if name in interface.momenta:
+        return interface.momenta.index(name)
+    arrays = dict(zip((each.name for each in interface.layout.momenta), shapes_of(interface) or (), strict=False))
+    conjugate = arrays[name][0] if name in arrays else name.removeprefix("p_")
+    return None if conjugate == name else _columns(interface, conjugate)
+
+
+def _fields(mesh: Any, q: Array, p: Array) -> dict[str, Array]:
+    """Return fields at the points of a mesh, (.., shape of the fields), of (.., m) states; none without a mesh."""
+    if mesh is None:
+        return {}
+    fields = mesh.fields_of(*(each.reshape(-1, each.shape[-1]) for each in (q, p)))
+    return {name: values.reshape(*q.shape[:-1], *values.shape[1:]) for name, values in fields.items()}
 
 
 def _columns_of_arrays(interface: Interface, names: Sequence[str]) -> dict[str, NDArray[np.intp]]:

@@ -72,10 +72,10 @@ def _of_angles(value: Mapping[str, Any], name: str) -> Array:
         except (ValueError, TypeError) as error:
             raise StateError(f"the Euler angles of '{name}' are invalid: {error}") from error
     elif set(value) == {"axis", "angle"}:
-        axis, angle = real_array(value["axis"], name), real_array(value["angle"], name)
-        length = np.linalg.norm(axis)
-        if axis.shape != (3,) or angle.ndim or not 0 < length < np.inf or not np.isfinite(angle):
-            raise StateError(f"the axis of '{name}' must be three numbers, not all zero, and the angle a finite number")
+        axis, length, _ = scaled_vectors(value["axis"], f"the axis of '{name}'")
+        angle = real_array(value["angle"], name)
+        if axis.ndim != 1 or angle.ndim or not np.isfinite(angle):
+            raise StateError(f"the axis of '{name}' must be one vector, and the angle a finite number")
         rotation = Rotation.from_rotvec(axis / length * angle)
     elif set(value) == {"rotation_vector"}:
         vector = real_array(value["rotation_vector"], name)
@@ -87,6 +87,27 @@ def _of_angles(value: Mapping[str, Any], name: str) -> Array:
     else:
         raise StateError(f"the rotation '{name}' must be {ACCEPTED}; the mapping has the keys {', '.join(value)}")
     return np.roll(np.asarray(rotation.as_quat(), dtype=float), 1, axis=-1)
+
+
+def scaled_vectors(value: Any, what: str) -> tuple[Array, Array, Array]:
+    """Return (.., 3) vectors divided by powers of two near their largest components, their lengths, and the exponents.
+
+    Squares then neither overflow nor underflow.
+
+    Raises:
+        StateError: unless there are three components, finite and not all zero.
+    """
+    vector = real_array(value, what)
+    if not vector.ndim or vector.shape[-1] != 3:
+        raise StateError(f"{what} must have three components, not {value!r}")
+    if not np.isfinite(vector).all():
+        raise StateError(f"{what} must be finite, not {value!r}")
+    largest = np.abs(vector).max(axis=-1, keepdims=True)
+    if not (largest > 0).all():
+        raise StateError(f"{what} must not be zero, but is {value!r}: give three components, not all zero")
+    exponent = np.frexp(largest)[1]
+    scaled = np.ldexp(vector, -exponent)
+    return scaled, np.linalg.norm(scaled, axis=-1, keepdims=True), exponent
 
 
 def _of_matrices(matrix: Array, name: str) -> Array:
@@ -169,10 +190,8 @@ def rates_matrices(q: Array) -> Array:
 
 
 def _transposed(q: Array, p: Array) -> Array:
-    """Return E(q)^T p."""
     return np.asarray(np.einsum("...ij,...i->...j", rates_matrices(q), p))
 
 
 def _rotated(q: Array, r: Array) -> Array:
-    """Return E(q) r."""
     return np.asarray(np.einsum("...ij,...j->...i", rates_matrices(q), r))

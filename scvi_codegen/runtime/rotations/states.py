@@ -15,10 +15,20 @@ from scvi_codegen.errors import StateError, closest
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.rendering.source import COMPONENTS, Interface
 from scvi_codegen.runtime.core.validation import Array, Shapes, States, checked_vector, flat_state, shapes_of
-from scvi_codegen.runtime.rotations.attitudes import matrices, momenta_of_body, quaternions, velocities_of_body
+from scvi_codegen.runtime.rotations.attitudes import (
+    matrices,
+    momenta_of_body,
+    quaternions,
+    scaled_vectors,
+    velocities_of_body,
+)
 
 if TYPE_CHECKING:
     from scvi_codegen.mechanics.system import MechanicalSystem
+
+
+TANGENT = 1e-6
+"""Largest component along a direction of its velocity or momentum, relative to these, which typed digits explain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,13 +251,10 @@ def _coordinates(member: Member, q: Mapping[str, Any]) -> tuple[Array, Array]:
     value = q[member.name]
     if member.kind == "rotation":
         return quaternions(value, member.name), np.zeros(0)
-    vector = real_array(value, member.name)
-    length = np.linalg.norm(vector, axis=-1, keepdims=True) if vector.ndim else np.zeros(1)
-    if not vector.ndim or vector.shape[-1] != 3 or not (length > 0).all():
-        raise StateError(f"'{member.name}' must have three components, not all zero, not {value!r}")
+    vector, length, exponent = scaled_vectors(value, f"the {member.kind} '{member.name}'")
     if member.kind == "direction":
         return np.asarray(vector / length), np.zeros(0)
-    return _hopf(vector, length)
+    return _hopf(np.ldexp(vector, exponent), np.ldexp(length, exponent))
 
 
 def _hopf(s: Array, length: Array) -> tuple[Array, Array]:
@@ -286,7 +293,13 @@ def _moving(
         if not vector.ndim or vector.shape[-1] != 3 or not np.isfinite(vector).all():
             raise StateError(f"{what}: '{name}' must have three finite components, not {vector.tolist()}")
         if member.kind == "direction":
-            parts.append(np.asarray(vector - q * (q * vector).sum(axis=-1, keepdims=True)))
+            radial = (q * vector).sum(axis=-1, keepdims=True)
+            if not (np.abs(radial) <= TANGENT * np.abs(vector).max(axis=-1, keepdims=True)).all():
+                raise StateError(
+                    f"{what}: '{name}' = {vector.tolist()} is not tangent to the unit sphere: its component along the "
+                    f"direction is {np.abs(radial).max():.3g}. The length is constant: give an orthogonal vector"
+                )
+            parts.append(np.asarray(vector - q * radial))
             continue
         body = np.einsum("...ji,...j->...i", matrices(q), vector) if in_space else vector
         q, body = np.broadcast_arrays(q, np.concatenate([body, body[..., :1]], axis=-1))

@@ -1,18 +1,19 @@
-"""Global error of an adaptive run, estimated by a second run and controlled by the local tolerance.
+"""Global error of an adaptive run, estimated by runs of smaller local tolerances.
 
-A run with a small local tolerance is compared with runs of other steps: their tolerances are 30 and 300 times larger,
-and they begin in states changed in the last place. The differences are dominated by the errors of the others; the
-largest, times a safety factor, is the estimate for the first run, which is returned. While the estimate exceeds the
-wanted error, the tolerances are tightened; the last runs are as accurate as binary64 allows, and what they do not
-confirm stays unconfirmed. Where rounding dominates, all runs have errors of the same size, and there are three others:
-one run with nearly the same error is not rare, three are. (R. D. Skeel, Thirteen ways to estimate global error, Numer.
-Math. 48 (1986) 1-20; E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, II.4.)
+A run is compared with one whose local tolerance is a thousand times smaller, so that the difference is its error; three
+times the largest difference is the estimate. While that exceeds the wanted error, a run of smaller tolerance is judged
+in the same way. Where rounding dominates, all runs have errors of the same size: the run is compared with three others,
+since one run with nearly the same error is not rare, and the factor is four. The last runs, at round-off level, are
+compared with each other; what they do not confirm stays unconfirmed. (R. D. Skeel, Thirteen ways to estimate global
+error, Numer. Math. 48 (1986) 1-20; E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I,
+II.4.)
 """
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from itertools import pairwise
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -25,46 +26,61 @@ from scvi_codegen.runtime.run.accuracy import warnings_wanted, without_accuracy_
 Array = NDArray[np.float64]
 Result = TypeVar("Result")
 
-FIRST = 1e-4
-"""First local tolerance relative to the wanted error."""
-TRUNCATED, ROUNDED = (300.0, 30.0), (300.0, 30.0, 100.0)
-"""Tolerances of the other runs relative to that of the returned one, where steps or where rounding dominates errors."""
-DOMINATED, LEAST = 1e-12, 1e-17
-"""Tolerances of the returned run below which rounding may dominate, and below which the last runs are made."""
-FINEST, LAST, RELAXED = 1e-20, (0.0, 1e-18, 1e-19), (1e-14, 1e-15, 1e-16)
-"""Tolerances of the last runs (0: round-off): of the returned one and the others; of the others if that one fails."""
-LARGEST_CUT, MARGIN = 1e-4, 0.1
-"""Tolerances are reduced by no more than this factor at once; part of the wanted error that is aimed at."""
-SAFETY = 5.0
-"""Factor between the largest difference and the estimate."""
-NUDGE = 2.0**-52
-"""Relative change of the initial states of the other runs: the last place."""
-MOST_SAMPLES, MOST_NUMBERS = 512, 2**22
-"""Times at which two runs are compared: their number, and that times the number of coordinates."""
+FIRST, RATIO = 1e-3, 1e-3
+"""First local tolerance relative to the wanted error; next tolerance, and that of a comparison, relative to a run's."""
+GAIN = 100.0
+"""Factor by which ``RATIO`` reduces the error of nearly every run."""
+ROUNDED, ROUNDED_OF_TAU, LEAST = 0.99e-14, 1e-10, 1e-17
+"""Tolerances below which rounding may dominate errors, also with steps of tau, and from which the last runs are made.
+
+Steps of tau are equal, so that many have smaller errors than the tolerance.
+"""
+OTHERS = (0.1, 0.01, 0.001)
+"""Tolerances of the comparisons of a run whose error rounding may dominate, relative to that of the run."""
+LAST = (0.0, 1e-18, 1e-19, 1e-20)
+"""Tolerances of the last runs (0: the default, round-off level), which are compared with each other."""
+COARSER = 1e4
+"""Factor of the tolerance of a comparison that fails, for a second attempt."""
+SAFETY, SAFETY_OF_ROUNDING = 3.0, 4.0
+"""Factors between the largest difference and the estimate."""
+SMALLEST = 5.0 * float(np.finfo(float).eps)
+"""Smallest estimate."""
+LEAST_SAMPLES, STEPS_PER_SAMPLE, MOST_SAMPLES, MOST_NUMBERS = 16, 8, 512, 2**22
+"""Numbers of states that are compared: least, per steps, most, and most times the number of coordinates."""
 EARLY = 1.0 / 16.0
 """Part of the run whose largest state sets the least size that errors are relative to."""
+ORDER = 10.0
+"""Power of a step of tau that a local tolerance stands for: ``RATIO`` halves the steps of a time transformation."""
+UNEVEN = 30.0
+"""Ratio of the longest to the shortest step from which on a time transformation is recommended."""
+LOST = 0.1
+"""Estimate from which on runs are uncorrelated."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GlobalError:
-    """Differences between a run and others with different steps, and the estimate of its global error.
+    """Differences between a run and others with smaller steps, and the estimate of its global error.
 
     Attributes:
         requested: requested bound of the relative global error.
         tolerance: local tolerance of the returned run, 0 for round-off.
-        t: (n,) times at which the runs were compared: at most 512 of the saved states.
+        h: step of tau of a run in transformed time, else 0.
+        t: (n,) times at which the runs were compared: at most 512 of the saved states, where the motion is fast.
         differences: (n,) the larger of ``|dq| / |q|`` and ``|dp| / |p|``. The norms are the largest up to that time, at
             least those of the first sixteenth of the run.
-        estimate: five times the largest difference, at least the unit round-off; meaningless above about 0.1, where the
-            runs are uncorrelated.
-        confirmed_until: last time up to which five times each difference is at most the requested error.
+        safety: factor of the estimate: 3, or 4 where rounding may dominate the error.
+        estimate: this factor times the largest difference, at least 1.1e-15 and the tolerance; meaningless above about
+            0.1, where runs are uncorrelated.
+        confirmed_until: last of the times up to which the factor times each difference is at most the requested error.
         runs: number of runs.
     """
 
     requested: float
     tolerance: float
+    h: float
     t: Array
     differences: Array
+    safety: float
     estimate: float
     confirmed_until: float
     runs: int
@@ -72,12 +88,12 @@ class GlobalError:
     @property
     def confirmed(self) -> bool:
         """Return whether the requested error is confirmed for the whole run."""
-        return self.estimate <= max(self.requested, float(np.finfo(float).eps))
+        return self.estimate <= self.requested
 
     @property
-    def local_tolerance(self) -> float | None:
-        """``tolerance`` as :meth:`Stepper.integrate` takes it: ``None`` for round-off."""
-        return self.tolerance or None
+    def steps(self) -> dict[str, float | None]:
+        """``h``, or ``tolerance`` (``None`` for round-off), as :meth:`Stepper.integrate` takes it for this run."""
+        return {"h": self.h} if self.h else {"tolerance": self.tolerance or None}
 
     @property
     def digits(self) -> int:
@@ -142,7 +158,7 @@ def warn_of_unconfirmed(confirmations: Sequence[GlobalError | None]) -> None:
         )
 
 
-def checked_error(error: Any, others: Mapping[str, Any], *, has_tau: bool = False) -> float:
+def checked_error(error: Any, others: Mapping[str, Any]) -> float:
     """Return the requested global error as a number; raise StateError if combined with another step-size option."""
     wanted = checked_number(error, "the global error")
     if not 0.0 < wanted < 1.0:
@@ -153,120 +169,191 @@ def checked_error(error: Any, others: Mapping[str, Any], *, has_tau: bool = Fals
                 f"error={wanted:g} and {name}={value!r} both determine the step size: error= requires adaptive steps; "
                 f"omit {name} and give t_end"
             )
-    if has_tau:
-        raise StateError(
-            f"error={wanted:g} requires adaptive steps, but a time transformation has fixed steps in tau: omit error "
-            "and compare with a run of half the step size"
-        )
     return wanted
-
-
-def _nudged(values: Any, number: int) -> Any:
-    """Return an initial vector, or several by name, perturbed by one to three last places, differently for each run."""
-    if values is None:
-        return None
-    if isinstance(values, Mapping):
-        return {name: _nudged(each, number) for name, each in values.items()}
-    numbers = np.array(values, dtype=float)
-    signs = np.sign(np.cos(np.arange(numbers.size) + 2.0 * number)).reshape(numbers.shape)
-    return numbers * (1.0 + (number + 1) * NUDGE * signs)
 
 
 def confirmed_run(
     wanted: float,
     integrate: Callable[..., Result],
-    again: Callable[..., Result],
-    state: tuple[Any, Any, Any],
-    common: Mapping[str, Any],
-    output_arguments: Mapping[str, Any],
+    again: Callable[..., Result] | None,
+    start: float,
+    step_of_tau: Callable[[float], float] | None,
 ) -> Result:
     """Return the run whose global error is at most ``wanted``, or the most accurate one with a warning.
 
     Args:
         wanted: bound of the relative global error.
-        integrate: function that makes the returned run.
-        again: function that makes the runs for comparison, without events.
-        state: q, and p or the velocity.
-        common: arguments of both, including the initial time ``t``.
-        output_arguments: arguments of the returned run only: its end and its output options.
+        integrate: function of ``tolerance`` or ``h`` that makes the returned run.
+        again: that of the runs for comparison, which ends at ``t_end``; ``None`` if ``integrate`` saves all steps.
+        start: initial time.
+        step_of_tau: function that returns the largest step of tau for a tolerance, or ``None`` without it.
 
     Raises:
         StepFailedError: if the most accurate run fails.
     """
-    q, p, velocity = state
-    start = checked_number(common["t"], "the time t")
-
-    def tight(tolerance: float) -> Result:
-        return integrate(q, p, velocity=velocity, tolerance=tolerance or None, **common, **output_arguments)
-
-    def other(tolerance: float, number: int, end: float) -> Result:
-        nearby, moving = _nudged(p, number), _nudged(velocity, number)
-        return again(_nudged(q, number), nearby, velocity=moving, tolerance=tolerance or None, t_end=end, **common)
-
-    tolerance, runs = wanted * FIRST, 0
     with without_accuracy_warnings():
-        while True:
-            last, runs = tolerance < LEAST, runs + 1
-            trajectory, tolerance, others = _accurate(tight, tolerance, last=last)
-            result = None
-            for number, each in enumerate(others if trajectory is not None else ()):
-                compared = _compared(partial(other, each, number), trajectory, start)
-                result, runs = _estimated(wanted, tolerance, compared, result, start, runs + 1), runs + 1
-                if not (result.confirmed or last):
-                    break
-            if result is not None and (result.confirmed or last):
-                break
-            excess = math.inf if result is None else result.estimate / wanted
-            tolerance *= max(min(MARGIN, MARGIN / excess), LARGEST_CUT)
+        trajectory, result = _Runs(wanted, integrate, again, start, step_of_tau).judged()
     if not result.confirmed and warnings_wanted():
-        until = f"confirmed until t = {result.confirmed_until:.6g} only"
         warn(
-            f"the global error {wanted:g} is {until}: beyond it, runs with other steps and initial states perturbed in "
-            f"the last place differ by up to about {result.estimate:.1e}. End the run there, or give a larger error",
+            f"the global error {wanted:g} is confirmed until t = {result.confirmed_until:.6g} only: beyond it, runs "
+            f"with other steps differ by up to about {result.estimate:.1e}. End the run there, or give a larger error"
+            f"{_alternative(trajectory, result)}",
             AccuracyWarning,
         )
-    return cast(Result, replace(cast(Any, trajectory), confirmation=result))
+    return cast(Result, replace(trajectory, confirmation=result))
 
 
-def _accurate(
-    run: Callable[[float], Result], tolerance: float, *, last: bool
-) -> tuple[Result | None, float, tuple[float, ...]]:
-    """Return a run, its tolerance (which may differ from the requested one) and the tolerances of the other runs.
+def _alternative(trajectory: Any, result: GlobalError) -> str:
+    """Return the recommendation of a time transformation for uneven steps of a conservative motion."""
+    lengths = abs(trajectory.step_sizes[:-1])
+    lengths = lengths[np.isfinite(lengths)][:-1]  # t_end shortens the last step
+    suitable = trajectory.plan.adaptive and trajectory.stepper.interface.conserves_energy and result.estimate < LOST
+    if not suitable or not lengths.size or lengths.max() < UNEVEN * lengths.min():
+        return ""
+    return (
+        f"; or try a time transformation (reparametrise), whose errors are often smaller in close encounters: the "
+        f"longest step is {lengths.max() / lengths.min():.0f} times the shortest"
+    )
 
-    ``None`` if the run fails while smaller tolerances remain.
+
+class _Runs:
+    """Runs of one motion by tolerance; arguments as of :func:`confirmed_run`."""
+
+    def __init__(
+        self,
+        wanted: float,
+        integrate: Callable[..., Any],
+        again: Callable[..., Any] | None,
+        start: float,
+        step_of_tau: Callable[[float], float] | None,
+    ) -> None:
+        self.wanted, self.integrate, self.again, self.start = wanted, integrate, again, start
+        self.first, self.h, self.count = min(wanted * FIRST, 0.1), 0.0, 0
+        if step_of_tau is not None:
+            self.first = max(self.first, LEAST)
+            self.h = step_of_tau(self.first)
+        self.made: dict[float, Any] = {}
+
+    def steps(self, tolerance: float) -> dict[str, float | None]:
+        if self.h:
+            return {"h": self.h * ((tolerance or LEAST) / self.first) ** (1.0 / ORDER)}
+        return {"tolerance": tolerance or None}
+
+    def run(self, tolerance: float) -> Any:
+        if tolerance not in self.made:
+            self.count += 1
+            self.made[tolerance] = self.integrate(**self.steps(tolerance))
+        return self.made[tolerance]
+
+    def other(self, tolerance: float, end: float) -> Any:
+        """Return a run for comparison, to its last state if it fails."""
+        try:
+            if self.again is None:
+                return self.run(tolerance)
+            self.count += 1
+            return self.again(**self.steps(tolerance), t_end=end)
+        except StepFailedError as failure:
+            if failure.trajectory is None:
+                raise
+            return failure.trajectory
+
+    def judged(self) -> tuple[Any, GlobalError]:
+        """Return the first run that is confirmed, and its estimate; otherwise the better of the last."""
+        tolerance, rounded = self.first, ROUNDED_OF_TAU if self.h else ROUNDED
+        while tolerance > 2.0 * LEAST:
+            try:
+                trajectory = self.run(tolerance)
+            except StepFailedError:
+                tolerance *= RATIO
+                continue
+            others = tuple(tolerance * each for each in (OTHERS if tolerance < rounded else (RATIO,)))
+            result = self.estimated(trajectory, tolerance, others)
+            if result.confirmed:
+                return trajectory, result
+            excess = result.estimate / self.wanted
+            tolerance *= RATIO ** max(1, math.ceil(math.log(excess, GAIN))) if result.estimate < 1.0 else 0.0
+        found: list[tuple[Any, GlobalError]] = []
+        for tolerance in LAST:
+            try:
+                trajectory = self.run(tolerance)
+            except StepFailedError:
+                if not found:
+                    raise
+                continue
+            others = tuple(each for each in LAST if each != tolerance)
+            found.append((trajectory, self.estimated(trajectory, tolerance, others, last=True)))
+            if found[-1][1].confirmed or found[-1][1].estimate > GAIN * self.wanted:
+                break
+        return min(found, key=lambda each: each[1].estimate)
+
+    def estimated(
+        self, trajectory: Any, tolerance: float, others: tuple[float, ...], *, last: bool = False
+    ) -> GlobalError:
+        """Return the estimate of the error of a run by others; the last runs are compared with all of them."""
+        compared = _Samples(trajectory, self.start)
+        safety = SAFETY if len(others) == 1 else SAFETY_OF_ROUNDING
+        differences = np.zeros(len(compared.t))
+        for each in others if compared.end != self.start else ():
+            further = compared.differences(self.other(each, compared.end))
+            if last and not np.isfinite(further).all():
+                further = compared.differences(self.other((each or LEAST) * COARSER, compared.end))
+            differences = np.maximum(differences, further)
+            if not last and safety * differences.max() > self.wanted:
+                break
+        within = safety * differences <= self.wanted
+        reached = len(within) if within.all() else int(np.argmin(within))
+        largest = float(differences.max(initial=0.0))
+        return GlobalError(
+            requested=self.wanted,
+            tolerance=tolerance,
+            h=float(self.steps(tolerance).get("h") or 0.0),
+            t=compared.t,
+            differences=differences,
+            safety=safety,
+            estimate=math.inf if math.isnan(largest) else max(safety * largest, SMALLEST, tolerance),
+            confirmed_until=float(compared.t[reached - 1]) if reached else self.start,
+            runs=self.count,
+        )
+
+
+class _Samples:
+    """States of a run for comparison with others.
+
+    Attributes:
+        t, q, p: times, positions and momenta: the last state, and from each of equal numbers of states the one where
+            positions or momenta change fastest relative to their sizes, as an error in time has the largest effect
+            there.
+        end: last time.
     """
-    others = LAST if last else tuple(tolerance * each for each in (ROUNDED if tolerance < DOMINATED else TRUNCATED))
-    tolerance = FINEST if last else tolerance
-    try:
-        return run(tolerance), tolerance, others
-    except StepFailedError:
-        return (run(0.0), 0.0, RELAXED) if last else (None, tolerance, ())
 
+    def __init__(self, trajectory: Any, start: float) -> None:
+        t, vectors = trajectory.t, [np.asarray(trajectory.q), np.asarray(trajectory.p)]
+        early = abs(t - start) <= EARLY * abs(t[-1] - start)
+        sizes = [_sizes(each, early) for each in vectors]
+        count = max(LEAST_SAMPLES, min(len(t) // STEPS_PER_SAMPLE, MOST_SAMPLES, MOST_NUMBERS // vectors[0].shape[1]))
+        chosen = np.arange(len(t))
+        if count < len(t) - 1:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                spans = np.maximum(abs(np.diff(t)), np.finfo(float).tiny)
+                speeds = [_norms(np.diff(x, axis=0)) / n[1:] for x, n in zip(vectors, sizes, strict=True)]
+                speeds = np.nan_to_num(np.maximum(*speeds)) / spans
+            parts = np.linspace(0, len(t) - 1, count).astype(int)
+            fastest = [a + int(np.argmax(speeds[a:b])) + 1 for a, b in pairwise(parts)]
+            chosen = np.unique([0, *fastest, len(t) - 1])
+        self.t, self.end, self.start = t[chosen], float(t[-1]), start
+        self.states = [(x[chosen], n[chosen]) for x, n in zip(vectors, sizes, strict=True)]
 
-def _compared(run: Callable[[float], Any], trajectory: Any, start: float) -> tuple[Array, Array]:
-    """Return times, and the relative differences of the returned run and another one that ends at the last time."""
-    q, p = np.asarray(trajectory.q), np.asarray(trajectory.p)
-    most = max(2, min(MOST_SAMPLES, MOST_NUMBERS // q.shape[1]))
-    chosen = np.unique(np.linspace(0, len(trajectory.t) - 1, most).astype(int))
-    t, q, p = trajectory.t[chosen], q[chosen], p[chosen]
-    end = float(t[-1])
-    if end == start:
-        return t, np.zeros(len(t))
-    try:
-        first = run(end)
-    except StepFailedError as failure:
-        if failure.trajectory is None:
-            raise
-        first = failure.trajectory
-    forward = math.copysign(1.0, end - start)
-    reached = (forward * (t - first.t[-1]) <= 0.0) & (forward * (t - first.t[0]) >= 0.0)
-    differences = np.full(len(t), np.inf)
-    if reached.any():
-        moved = first.at(t[reached])
-        early = abs(t - start) <= EARLY * abs(end - start)
-        parts = [_relative(a, b[reached], _sizes(b, early)[reached]) for a, b in zip(moved, (q, p), strict=True)]
-        differences[reached] = np.maximum(*parts)
-    return t, differences
+    def differences(self, other: Any) -> Array:
+        """Return the relative differences to another run, infinite after its end."""
+        t = self.t
+        forward = math.copysign(1.0, self.end - self.start)
+        reached = (forward * (t - other.t[-1]) <= 0.0) & (forward * (t - other.t[0]) >= 0.0)
+        differences = np.full(len(t), np.inf)
+        with suppress(StepFailedError):  # a partial step
+            if reached.any():
+                parts = zip(other.at(t[reached]), self.states, strict=True)
+                differences[reached] = np.maximum(*(_relative(x - y[reached], n[reached]) for x, (y, n) in parts))
+        return differences
 
 
 def _sizes(states: Array, early: NDArray[np.bool_]) -> Array:
@@ -282,28 +369,7 @@ def _norms(rows: Array) -> Array:
         return np.asarray(units * np.linalg.norm(rows / np.where(units == 0.0, 1.0, units)[:, None], axis=1))
 
 
-def _relative(one: Array, other: Array, sizes: Array) -> Array:
-    apart = _norms(one - other)
+def _relative(apart: Array, sizes: Array) -> Array:
+    norms = _norms(apart)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(apart == 0.0, 0.0, apart / sizes)
-
-
-def _estimated(
-    wanted: float, tolerance: float, compared: tuple[Array, Array], before: GlobalError | None, start: float, runs: int
-) -> GlobalError:
-    """Return the error estimate from these differences and those of earlier comparisons."""
-    t, differences = compared
-    if before is not None:
-        differences = np.maximum(differences, before.differences)
-    largest = float(differences.max(initial=0.0))
-    within = SAFETY * differences <= wanted
-    reached = len(within) if within.all() else int(np.argmin(within))
-    return GlobalError(
-        requested=wanted,
-        tolerance=tolerance,
-        t=t,
-        differences=differences,
-        estimate=math.inf if math.isnan(largest) else max(SAFETY * largest, float(np.finfo(float).eps)),
-        confirmed_until=float(t[reached - 1]) if reached else start,
-        runs=runs,
-    )
+        return np.where(norms == 0.0, 0.0, norms / sizes)

@@ -7,11 +7,11 @@ violations appear in ``step_error`` of the run, the largest error of all its ste
 import math
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import Parameters, States, check_inputs_given
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.run.run import Run
@@ -27,7 +27,7 @@ ALLOWED = 10.0
 
 
 def largest_step(
-    stepper: Stepper,
+    stepper: Any,
     q: States,
     p: States,
     span: float,
@@ -40,7 +40,7 @@ def largest_step(
     """Return the largest step of tau, to a fifth, whose estimated errors in a pilot run do not exceed the tolerance.
 
     Args:
-        stepper: stepper of a system in transformed time, or compiled with ``time_transformation``.
+        stepper: :class:`Stepper` of a system in transformed time, or compiled with ``time_transformation``.
         q, p: (m,) initial state.
         span: duration of the run, negative for a run backward; pilot runs do not exceed it.
         tolerance: relative error of a step, 0 for round-off.

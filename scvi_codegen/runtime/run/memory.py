@@ -10,6 +10,7 @@ from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions, checked_options, step_failure
 from scvi_codegen.runtime.constraints.projection import check_reachable, singular_position
+from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import (
     Array,
@@ -40,8 +41,10 @@ RANGES = {
     "avoiding": (-MOST_GRID_LEVEL, LARGEST_STEP),
 }
 """Smallest and largest values of whole numbers in the memory of a run, which C uses as counts and indices."""
+STEPS_FROM_REST, STEPS_NEAR_REST = 2**20, 16
+"""First value of the count of steps from rest in C; number of steps in which a force moves a state away from rest."""
 EVENT_NUMBERS = ("undefined", "accumulated", "through", "jammed")
-"""Numbers of events, from 1 on, in the state of the search for events; 0 for none."""
+"""Numbers of events, from 1 on, in the state of the search for events; 0 for none, < 0 for an undefined change."""
 FUNCTIONS = ("start", "set_parameters", "advance", "advance_to", "step_error")
 """Functions of C that take a run; sources of version 0.1 have no error estimate."""
 NO_OUTPUT, NO_PLAN = LARGEST_COUNT, StepPlan()
@@ -73,9 +76,11 @@ class Memory(OneThread):
         self._rows: Any = None  # memory for states that every recording uses
         self._discarded = *(binding.numbers(f"double[{stepper.dimension}]"),) * 3, binding.numbers("int *")
         self._report, self._workspace = binding.new("report *"), binding.workspace()
+        self._unsaved = *self._arguments, *self._discarded, self._report, self._workspace  # arguments of C
+        self._untimed = len(self._q) <= MOST_UNTIMED  # whether ``advance`` takes steps without looking at the clock
         self._functions = {name: binding.function(name, memory) for name in FUNCTIONS if binding.has(name)}
         self._step_error = self._functions.get("step_error")
-        self._plan, self.longest = NO_PLAN, 0.0
+        self._plan, self.longest, self._can_measure_growth = NO_PLAN, 0.0, hasattr(memory, "measures_growth")
         firsts = {name: parameter_index(stepper.interface, f"{name}_0") for name in stepper.interface.inputs}
         self._inputs = {name: slice(first, first + 5) for name, first in firsts.items()}
 
@@ -108,7 +113,7 @@ class Memory(OneThread):
             self._parameters[:] = stepper._parameters_at(self._q, self._p, parameters)
             self._pass_parameters()
             self._unset_inputs = inputs_not_given(interface, parameters)
-            self._has_defaults = parameters is None and not interface.energy_parameter
+            self._has_defaults = parameters is None and not interface.energy_parameter and stepper.problem is None
         if plan is not self._plan:
             self.plan = plan
         if options is not self._options:
@@ -117,6 +122,7 @@ class Memory(OneThread):
 
     def _set_options(self, options: SolverOptions | None) -> None:
         self._arguments = self._arguments[0], self.stepper.binding.options(checked_options(options))
+        self._unsaved = *self._arguments, *self._unsaved[2:]
         self._options = options
 
     @classmethod
@@ -129,19 +135,15 @@ class Memory(OneThread):
         options: SolverOptions | None = None,
         plan: StepPlan | None = None,
     ) -> Self:
-        """Construct from the bytes of :meth:`save`; raise ``StateError`` for invalid bytes or another kind of steps."""
+        """Construct from :attr:`snapshot`; raise ``StateError`` for invalid bytes or another kind of steps."""
         run = cls(stepper)
-        memory, size = run._memory, len(stepper.binding.buffer(run._memory))
-        if not isinstance(saved, bytes):
-            raise StateError(f"a saved run must be bytes, not {type(saved).__name__}")
-        watched = len(stepper.binding.buffer(stepper.binding.new("watch *"))) if stepper.events else 0
-        if len(saved) not in (size, size + watched):
-            raise StateError(f"invalid saved run: it has {len(saved)} bytes, those of this stepper have {size}")
+        memory = run._memory
         run.rollback(saved)
         vectors = map(stepper.binding.vector, (memory.q, memory.p, memory.carry_q, memory.carry_p))
         if not np.isfinite(np.concatenate([[_time(memory), memory.h], *vectors])).all():
             raise StateError(f"invalid saved run: its state is not finite, h = {memory.h:g}")
         searched = dict.fromkeys(EVENT_NUMBERS, (0, len(stepper.events)))
+        searched["undefined"] = (-len(stepper.events), len(stepper.events))
         numbers = [*((memory, *each) for each in RANGES.items()), *((run._watch, *each) for each in searched.items())]
         for owner, name, (least, most) in numbers:
             if not least <= (value := getattr(owner, name, least)) <= most:
@@ -167,8 +169,8 @@ class Memory(OneThread):
 
     @plan.setter
     def plan(self, plan: StepPlan) -> None:
-        if not plan.fixed:
-            self.stepper._check_adaptive()
+        if not (plan.fixed or self.stepper._has_error_estimate):
+            require(self.stepper, "adaptive")
         self._plan, self._plan_arguments = plan, () if plan.fixed else (plan.t_end, plan.tau or plan.tolerance)
         self._advance_function = self._functions["advance" if plan.fixed else "advance_to"]
 
@@ -292,12 +294,16 @@ class Memory(OneThread):
 
     @alone
     def rollback(self, saved: bytes) -> None:
-        """Restore the state saved by :meth:`save`."""
-        buffer = self.stepper.binding.buffer(self._memory)
-        buffer[:], watch = saved[: len(buffer)], saved[len(buffer) :]
-        self._watch = self.stepper.binding.new("watch *") if watch else None
-        if watch:
-            self.stepper.binding.buffer(self._watch)[:] = watch
+        """Restore the state of :attr:`snapshot`; raise ``StateError`` for bytes of another length."""
+        binding = self.stepper.binding
+        buffer = binding.buffer(self._memory)
+        watch = binding.new("watch *") if self.stepper.events and len(saved) > len(buffer) else None
+        size = len(buffer) + (0 if watch is None else len(binding.buffer(watch)))
+        if len(saved) != size:
+            raise StateError(f"invalid saved run: it has {len(saved)} bytes, those of this stepper have {size}")
+        buffer[:], self._watch = saved[: len(buffer)], watch
+        if watch is not None:
+            binding.buffer(watch)[:] = saved[len(buffer) :]
 
     def advance(
         self, steps: int, *, progress: Callable[[int], None] | None = None, stop: Callable[[], bool] | None = None
@@ -312,25 +318,29 @@ class Memory(OneThread):
         Raises:
             StepFailedError: if a step fails; the run is left at the state before it.
         """
-        left = checked_count(steps, "steps", least=0)
+        left = steps if type(steps) is int and 0 <= steps <= STEPS_PER_CALL else checked_count(steps, "steps", least=0)
         if not self._lock.acquire(False):  # as ``alone``, at half the cost
             raise in_use()
         try:
-            if progress is None and stop is None and len(self._q) <= MOST_UNTIMED:
-                while left > 0 and not self.arrived:
-                    left -= self._taken(min(left, STEPS_PER_CALL))
-                return
-            drive(
-                self._taken,
-                left,
-                ended=lambda: self.arrived or bool(stop and stop()),
-                progress=progress and (lambda _: progress(self.steps)),
-            )
+            if progress is None and stop is None and self._untimed:
+                fixed = self._plan.h
+                while left > 0 and (fixed or not self.arrived):
+                    size = left if left < STEPS_PER_CALL else STEPS_PER_CALL
+                    if self._unset_inputs:
+                        self.check_inputs()
+                    if status := self._advance_function(*self._plan_arguments, size, NO_OUTPUT, *self._unsaved):
+                        raise self._failure(status)
+                    left -= size if fixed else self._report.steps
+            else:
+                self._advance_timed(left, progress and (lambda _: progress(self.steps)), stop or (lambda: False))
         finally:
             self._lock.release()
 
+    def _advance_timed(self, steps: int, progress: Callable[[int], None] | None, stop: Callable[[], bool]) -> None:
+        """Advance as :meth:`advance` in C calls of bounded duration."""
+        drive(self._taken, steps, ended=lambda: self.arrived or stop(), progress=progress)
+
     def _failure(self, status: int) -> StepFailedError:
-        """Return the exception for a failed step of the run."""
         remark = singular_position(self.stepper, self._q, self.t, self._parameters)
         return step_failure(status, self._report, step=self.steps, h=self.h, remark=remark)
 
@@ -401,20 +411,27 @@ class Memory(OneThread):
 
     def _end_energies(self, t: Array, q: Array, p: Array) -> tuple[float, float] | None:
         """Return the energies of the first and the last state of a run so far; ``None`` outside the domain of L."""
-        binding, m = self.stepper.binding, len(self._q)
+        binding = self.stepper.binding
         if self._energies is None:
             self._energies = binding.function("energies"), binding.numbers("double[2]")
         (function, energies), (at, positions, momenta) = self._energies, binding.pointers(t, q, p)
-        last, row, values = len(t) - 1, (len(q) - 1) * m, self._arguments[0]
-        status = function(1, at, positions, momenta, values, energies, self._workspace) or function(
-            1, at + last, positions + row, momenta + row, values, energies + 1, self._workspace
-        )
+        last, values, workspace = len(t) - 1, self._arguments[0], self._workspace
+        status = function(1 + (last == 1), at, positions, momenta, values, energies, workspace)
+        if last != 1 and not status:
+            row = last * len(self._q)
+            status = function(1, at + last, positions + row, momenta + row, values, energies + 1, workspace)
         return None if status else (energies[0], energies[1])
+
+    @property
+    def _growth(self) -> tuple[float, float] | None:
+        """Logarithm g of the growth of the tangent vector at the end, and the largest g - mean g."""
+        samples = self._can_measure_growth and self._memory.growth_samples
+        return (self._memory.growth, self._memory.growth_excess) if samples else None
 
     @property
     def _leaving(self) -> bool:
         """Return whether the run started at the origin and is still near it, where relative errors are undefined."""
-        return bool(getattr(self._memory, "steps_from_rest", 0))
+        return int(getattr(self._memory, "steps_from_rest", 0)) > STEPS_FROM_REST - STEPS_NEAR_REST
 
 
 def _time(memory: Any) -> float:

@@ -14,7 +14,7 @@ from scvi_codegen.runtime.constraints.projection import constraint_values, multi
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, Parameters
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
-from scvi_codegen.runtime.run.accuracy import warn_of_energy_error, warn_of_large_steps, warn_of_unresolved_fields
+from scvi_codegen.runtime.run.accuracy import warn_of_inaccuracy
 from scvi_codegen.runtime.run.descriptions import describe_run
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.observation import Observation
@@ -31,6 +31,10 @@ MOST_KEPT = 2**16
 class Run(Memory, AttitudeHistory):
     """Run in progress: :class:`Memory` with recording of states."""
 
+    def __init__(self, stepper: Integrator) -> None:
+        super().__init__(stepper)
+        self._untimed &= not stepper.changes_states
+
     def __repr__(self) -> str:
         return describe_run(self)
 
@@ -41,7 +45,7 @@ class Run(Memory, AttitudeHistory):
             run: Self = stepper._released_runs.pop()
         except IndexError:
             run = cls(stepper)
-            if stepper.binding.reusable and len(run._workspace) + FIRST_STEPS * len(run._q) <= MOST_KEPT:
+            if stepper.binding.reusable and stepper.binding._workspace + FIRST_STEPS * len(run._q) <= MOST_KEPT:
                 run._rows = StateRows(run, FIRST_STEPS + 3)
         return run
 
@@ -75,22 +79,15 @@ class Run(Memory, AttitudeHistory):
         """
         before = 0.0 if self._leaving else self.step_error
         trajectory = self._recorded(steps, save_every=save_every, progress=progress)
-        if not self._leaving:
-            warn_of_large_steps(trajectory, before=before)
-        warn_of_energy_error(trajectory, self)
-        warn_of_unresolved_fields(trajectory)
+        warn_of_inaccuracy(trajectory, self, before=math.inf if self._leaving else before)
         return trajectory
 
-    def advance(
-        self, steps: int, *, progress: Callable[[int], None] | None = None, stop: Callable[[], bool] | None = None
-    ) -> None:
-        """Take steps as :meth:`Memory.advance`, with the changes of the state by events."""
+    def _advance_timed(self, steps: int, progress: Callable[[int], None] | None, stop: Callable[[], bool]) -> None:
+        """Advance with the changes of the state by events."""
         if not self.stepper.changes_states:
-            super().advance(steps, progress=progress, stop=stop)
+            super()._advance_timed(steps, progress, stop)
         else:
-            with self.alone():
-                report = progress and (lambda _: progress(self.steps))
-                Observation(self, save_every=LARGEST_COUNT).advance(steps, report, stop or (lambda: False))
+            Observation(self, save_every=LARGEST_COUNT).advance(steps, progress, stop)
 
     def _recorded(
         self,
@@ -100,12 +97,14 @@ class Run(Memory, AttitudeHistory):
         times: Array | None = None,
         progress: Callable[[int], None] | None = None,
         observe: Callable[[Run], ArrayLike] | None = None,
+        stop: Callable[[], bool] | None = None,
     ) -> Trajectory:
         """Return the states as :meth:`record` does, or those at ``times``, without its warnings and its lock."""
         plan, further = self._plan, times is not None or observe is not None
         if self.stepper.events or further or (plan.h and plan.t_end != math.inf):
-            return Observation(self, save_every=save_every, times=times, observe=observe).advance(steps, progress)
-        return record(self, steps, save_every=save_every, progress=progress)
+            recorder = Observation(self, save_every=save_every, times=times, observe=observe)
+            return recorder.advance(steps, progress, stop or (lambda: False))
+        return record(self, steps, save_every=save_every, progress=progress, stop=stop)
 
     @property
     def velocity(self) -> Array:

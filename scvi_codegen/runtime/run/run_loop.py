@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable
-from functools import lru_cache
-from struct import Struct
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,9 @@ from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import checked_count
 
 States = tuple[Array, Array, Array, NDArray[np.int32]]
-NATIVE_DOUBLE, INT32 = Struct("d"), np.dtype(np.int32)
+NATIVE_DOUBLE, INT32 = struct.Struct("d"), np.dtype(np.int32)
+SEQUENCES, NUMBERS = (list, tuple), frozenset((float, int, np.float64))
+"""Types of states, and of their entries, that are converted without NumPy."""
 FIRST_STEPS = 256
 """Number of saved states of the first C call, before the speed of the steps is known."""
 
@@ -81,16 +83,20 @@ def _in_one_call(
     """
     run, plan, most = memory._memory, memory._plan, FIRST_STEPS * save_every
     first, size = run.step, most if steps is None else steps
-    if size > most or memory.t == plan.t_end or plan.tau or memory.stepper.interface.energy_parameter:
+    h = plan.h
+    if size > most or plan.tau or not (h or memory.t != plan.t_end) or memory.stepper.interface.energy_parameter:
         return None, 0, 0
     if first:
         rows.begin_checked(memory.t, memory._q, memory._p)
-    status, report = memory._advance(size, save_every, rows.next), memory._report
-    h, filled = plan.h, 1 + (run.step // save_every - first // save_every if plan.h else report.stored)
-    if status or (steps is None and report.steps == size):
+    status = memory._advance(size, save_every, rows.next)
+    filled = 1 + (run.step // save_every - first // save_every if h else memory._report.stored)
+    if status or (steps is None and memory._report.steps == size):
         return None, filled, status
     states = rows.copies(filled)
-    step_sizes = _repeated(h, filled) if h else _differences(states[0], whole=save_every == 1)
+    if h:
+        step_sizes = _repeated(h, filled)
+    else:
+        step_sizes = rows.step_sizes() if save_every == 1 else _differences(states[0], whole=False)
     return trajectory_of(memory, states, step_sizes), filled, status
 
 
@@ -102,30 +108,52 @@ class StateRows:
         starts, next: pointers to their first and to their second rows.
     """
 
-    __slots__ = ("_count", "_p", "_pointers", "_q", "_views", "next", "shape", "starts", "states")
+    __slots__ = (
+        *("_count", "_difference", "_p", "_pack", "_pointers", "_q", "_steps", "_t", "_views"),
+        *("next", "shape", "starts", "states"),
+    )
 
     def __init__(self, memory: Memory, rows: int) -> None:
         m, binding = len(memory._q), memory.stepper.binding
         t, q, p = empty_array((rows,)), empty_array((rows, m)), empty_array((rows, m))
         self.states: States = t, q, p, np.zeros(rows, INT32)
         self.starts = *binding.pointers(t, q, p), binding.integers(self.states[3])
-        self._q, self._p, self._pointers = q[0], p[0], self.starts[1:3]
+        first: Any = map(memoryview, (t, q[0], p[0]))  # faster to assign to than arrays
+        self._t, self._q, self._p = first
+        self._pointers = self.starts[1:3]
         self.shape = (m,) if m <= FEW else None  # of vectors that are checked as lists, faster than as arrays
+        self._pack = struct.Struct(f"{m}d").pack_into
         self.next, self._count, self._views = self.after(1), 0, self.states
 
     def begin(self, t: float, q: Any, p: Any) -> tuple[Any, Any] | None:
         """Set the first state; return pointers to it, ``None`` unless q and p are short vectors of finite numbers."""
-        if not (
-            type(q) is type(p) is np.ndarray and q.shape == p.shape == self.shape and q.dtype is p.dtype is BINARY64
-        ):
+        kind = type(q)
+        if kind is not type(p) or self.shape is None:
             return None
-        return self.begin_checked(t, q, p) if math.isfinite(sum(q.tolist()) + sum(p.tolist())) else None
+        if kind is np.ndarray:
+            if not (q.shape == p.shape == self.shape and q.dtype is p.dtype is BINARY64):
+                return None
+            return self.begin_checked(t, q, p) if math.isfinite(sum(q.tolist()) + sum(p.tolist())) else None
+        if kind not in SEQUENCES or not NUMBERS.issuperset(map(type, q + p)):
+            return None
+        try:
+            if math.isfinite(sum(q) + sum(p)):
+                self._pack(self._q, 0, *q)
+                self._pack(self._p, 0, *p)
+                self._t[0] = t
+                return self._pointers
+        except (OverflowError, struct.error):  # of an integer above all floats; of another number of entries
+            pass
+        return None
 
     def begin_checked(self, t: float, q: Array, p: Array) -> tuple[Any, Any]:
         """Set the first state and return pointers to it."""
-        self.states[0][0] = t
-        self._q[:] = q
-        self._p[:] = p
+        self._t[0] = t
+        try:
+            self._q[:] = q
+            self._p[:] = p
+        except ValueError:  # unaligned arrays, which memory views do not copy
+            self.states[1][0], self.states[2][0] = q, p
         return self._pointers
 
     def after(self, row: int) -> tuple[Any, ...]:
@@ -136,9 +164,16 @@ class StateRows:
     def copies(self, count: int) -> States:
         """Return copies of the first rows."""
         if count != self._count:
-            self._count, self._views = count, self.first(count)
+            self._count, self._views, self._steps = count, self.first(count), np.full(count, math.nan)
+            t = self._views[0]
+            self._difference = partial(np.subtract, t[1:], t[:-1], self._steps[:-1])
         t, q, p, iterations = self._views
         return t.copy(), q.copy(), p.copy(), iterations.copy()
+
+    def step_sizes(self) -> Array:
+        """Return the steps that follow the states of :meth:`copies`, NaN for the last one."""
+        self._difference()
+        return self._steps.copy()
 
     def first(self, count: int) -> States:
         """Return the first rows, in the same memory."""

@@ -1,4 +1,4 @@
-"""Checkpoints: the bytes of a run, of arrays of run-time sizes preceded by sizes, tables and parameters."""
+"""Checkpoints: checksum and bytes of a run, of arrays of run-time sizes preceded by sizes, tables and parameters."""
 
 import hashlib
 import json
@@ -15,8 +15,26 @@ from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.validation import checked_count
 
 MAGIC = b"scvi run 3\n"
-"""First bytes of runs of run-time sizes."""
+"""First bytes of checkpoints, before the checksum."""
 DIGEST = 32
+
+
+def sealed(body: bytes) -> bytes:
+    """Return bytes behind their checksum, for :func:`unsealed`."""
+    return MAGIC + hashlib.sha256(body).digest() + body
+
+
+def unsealed(saved: bytes) -> bytes:
+    """Return the bytes behind a checksum; raise ``StateError`` if they are damaged."""
+    if not isinstance(saved, bytes):
+        raise StateError(f"a saved run must be bytes, not {type(saved).__name__}")
+    body = saved[len(MAGIC) + DIGEST :]
+    if saved != sealed(body):
+        raise StateError(
+            f"invalid saved run: the checksum of its {len(saved)} bytes differs, so they are damaged or not of "
+            "Run.checkpoint(). Use another copy, or save the run again"
+        )
+    return body
 
 
 def checkpoint(run: Any) -> bytes:
@@ -24,7 +42,7 @@ def checkpoint(run: Any) -> bytes:
     stepper: Integrator = run.stepper
     state: bytes = run.snapshot
     if stepper.problem is None or stepper.origin is None:
-        return state
+        return sealed(state)
     arrays = [*stepper.problem.places.values(), run.parameters]
     header = {
         "integrator": _integrator(stepper.origin.interface),
@@ -32,23 +50,17 @@ def checkpoint(run: Any) -> bytes:
         "unset inputs": run._unset_inputs,
         "adaptive": not run.plan.fixed,
     }
-    body = b"".join([json.dumps(header).encode(), b"\n", *(array.tobytes() for array in arrays), state])
-    return MAGIC + hashlib.sha256(body).digest() + body
+    return sealed(b"".join([json.dumps(header).encode(), b"\n", *(array.tobytes() for array in arrays), state]))
 
 
 def read_checkpoint(
-    saved: bytes, origin: Integrator, *, threads: int | None, adaptive: bool
+    body: bytes, origin: Integrator, *, threads: int | None, adaptive: bool
 ) -> tuple[Integrator, bytes, dict[str, Any]]:
-    """Return the bound stepper, the state and the parameters by name of a run of run-time sizes.
+    """Return the bound stepper, the state and the parameters by name of an unsealed run of run-time sizes.
 
     Raises:
-        StateError: if the bytes are invalid or damaged or belong to another integrator or another kind of steps.
+        StateError: if the bytes are invalid or belong to another integrator or another kind of steps.
     """
-    if not isinstance(saved, bytes):
-        raise StateError(f"a saved run must be bytes, not {type(saved).__name__}")
-    body = saved[len(MAGIC) + DIGEST :]
-    if not saved.startswith(MAGIC) or hashlib.sha256(body).digest() != saved[len(MAGIC) : -len(body)]:
-        raise StateError("invalid saved run: the checksum differs. Save the run again")
     try:
         return _read(body, origin, threads, adaptive=adaptive)
     except StateError:

@@ -10,6 +10,7 @@ from typing import Any, TypeVar, cast
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.runtime.core.features import FEATURES, refusal
 from scvi_codegen.runtime.run.times import steps_to
 from scvi_codegen.validation import check_tolerance, checked_count
 
@@ -73,16 +74,14 @@ def checked_plan(
     """
     if controller:
         if h is None or t_end is None or tolerance is not None:
-            raise StateError(
-                f"a stepper with the time transformation {controller} requires h (constant step in tau) and t_end, and "
-                "no tolerance"
-            )
+            remedy = FEATURES["adaptive", "with a time transformation"]
+            raise StateError(f"the time transformation {controller} determines the step size: {remedy}")
         tau = checked_step(h)
         if tau < 0.0:
             raise StateError(f"h = {h:g} must be positive with a time transformation: t_end determines the direction")
         return StepPlan(t_end=checked_number(t_end, "t_end"), tau=tau)
     if h is None and in_tau:
-        raise StateError("adaptive steps are unavailable in transformed time: give h (fixed step in tau)")
+        raise refusal("adaptive", "in transformed time")
     if (t_end is None) == (h is None):
         raise StateError(
             f"give either h (fixed step size) or t_end (adaptive step size); got {'neither' if h is None else 'both'}"

@@ -209,7 +209,6 @@ def starts_of(states: SavedStates, first: int, last: int) -> tuple[Starts, NDArr
 
 
 def _has_fixed_step_size(states: SavedStates) -> bool:
-    """Return whether all steps have size h."""
     if not states.plan.fixed:
         return False
     spans = np.diff(states.stepped)

@@ -58,7 +58,6 @@ def second_order_adjoints(
 
 
 def _tangents_at_starts(states: SavedStates, between: list[tuple[int, int]], tangents: Array) -> list[Array]:
-    """Return the tangent vectors at the start of each segment."""
     tangents_at = [tangents]
     for first, last in between[:-1]:
         starts, numbers = starts_of(states, first, last)

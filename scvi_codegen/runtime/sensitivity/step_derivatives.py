@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step, real_array
 from scvi_codegen.native.options import REASONS, SolverOptions, step_failure
 from scvi_codegen.representation import summary
@@ -108,20 +108,6 @@ class LinearisedMethod(StateFunctions):
     def _energy_index(self) -> int:
         """Index of the energy parameter of transformed time among the variables."""
         return 2 * self.dimension + self.parameters.index(self.interface.energy_parameter)
-
-    def _check_fixed_steps(self, what: str) -> None:
-        """Raise :class:`MethodError` for steppers whose step size is not the fixed h."""
-        if self.interface.time_transformation:
-            raise MethodError(f"{what} requires fixed steps h: compile the stepper without time_transformation")
-        self._check_physical_time(what)
-
-    def _check_physical_time(self, what: str) -> None:
-        """Raise :class:`MethodError` in transformed time."""
-        if self.interface.energy_parameter:
-            raise MethodError(
-                f"{what} is unavailable in transformed time: compile the original system, with fixed steps h, or with "
-                "time_transformation=... or t_end=..."
-            )
 
     def _energy_gradient(self, q: Array, p: Array, parameters: Array) -> Array:
         """Return the (variables,) gradient of the energy of a state by all variables; 0 if time is not transformed.

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import StateError
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
 from scvi_codegen.runtime.chaos.tangent_propagation import InitialTangents, along
+from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.validation import columns_of_inputs
 from scvi_codegen.runtime.sensitivity.gradients import (
     Gradient,
@@ -45,9 +46,9 @@ class TrajectoryDerivatives(SavedStates):
         """Trajectories between the breakpoints of inputs, this one without inputs; each begins where the last ends."""
         return getattr(self, "pieces", ()) or (self,)
 
-    def _check_without_inputs(self, what: str) -> None:
-        if self._runs != (self,):
-            raise StateError(f"{what} is not available for runs with inputs: use tangent or pullback, or run.pieces")
+    def _require(self, operation: str) -> None:
+        """Raise the error of an operation that the stepper or the inputs of the run exclude."""
+        require(self.stepper, operation, *["inputs"] * (self._runs != (self,)))
 
     def tangent(self, directions: ArrayLike | None = None) -> Array:
         """Return (n, 2m, k) tangent vectors at the states, from (2m, k) initial directions of (q, p), by default all.
@@ -75,7 +76,7 @@ class TrajectoryDerivatives(SavedStates):
         :meth:`pullback` is cheaper. In transformed time ``times`` contains the derivatives of the times. Raises as
         :meth:`tangent`.
         """
-        self._check_without_inputs("sensitivity")
+        self._require("sensitivity")
         return sensitivity(self)
 
     def pullback(self, cotangents: ArrayLike) -> Gradient:
@@ -119,10 +120,9 @@ class TrajectoryDerivatives(SavedStates):
             MethodError: if time is transformed, or the system is damped.
             StateError: if a shape is another, or the states are not at whole steps.
         """
-        self.stepper._check_no_changes("hessian_product")
+        require(self.stepper, "hessian")
         derivatives, hessian_blocks = checked_function(self.stepper, len(self), cotangents, curvatures)
         columns = finite(directions, "directions")
-        self.stepper._second_derivatives  # noqa: B018  (raises MethodError if unavailable)
         at_starts = [self._initial_tangents(columns)]
         for run in self._runs[:-1]:
             at_starts.append(forward(run, at_starts[-1])[1])
@@ -195,7 +195,7 @@ class TrajectoryDerivatives(SavedStates):
             MethodError: if time is transformed.
             StateError: if the run has no steps, a shape is another, or the states are not at whole steps.
         """
-        self._check_without_inputs("chaos_indicators")
+        self._require("chaos")
         if len(self) < 2:
             raise StateError("deviations require a run of at least one step")
         return along(self, InitialTangents.checked(self.stepper, count, directions))

@@ -88,18 +88,20 @@ def whole_steps(spans: Array, h: Array, slack: float = 0.0) -> NDArray[np.int64]
     return np.where(fits, nearest, np.floor(ratio)).astype(np.int64)
 
 
-def _take_partial_steps(states: SavedStates, t: Array, h: Array, q: Array, p: Array) -> None:
-    """Take one step of size h[k] from each state k, in place."""
+def _take_partial_steps(states: SavedStates, t: Array, h: Array, q: Array, p: Array) -> int:
+    """Take one step of size h[k] from each state k, in place; return the number of iterations of their equations."""
     binding, m = states.stepper.binding, states.stepper.dimension
     step, report, workspace = binding.function("step"), binding.new("report *"), binding.workspace()
     parameters, options = binding.pointer(states.parameters), binding.options(states.options)
     q_start, p_start = binding.pointer(q), binding.pointer(p)
-    numbers = np.flatnonzero(h)
+    numbers, iterations = np.flatnonzero(h), 0
     for k, begin, length in zip(numbers.tolist(), t[numbers].tolist(), h[numbers].tolist(), strict=True):
         q_k, p_k = q_start + k * m, p_start + k * m
         status = step(begin, length, q_k, p_k, parameters, options, q_k, p_k, report, workspace)
         if status:
             raise step_failure(status, report, step=0, h=length)
+        iterations += report.iterations
+    return iterations
 
 
 def checked_times(t: ArrayLike, name: str) -> Array:

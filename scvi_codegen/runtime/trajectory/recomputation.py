@@ -6,11 +6,12 @@ equations; recomputed steps that do not end in the next saved state raise an err
 
 from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import StateError
+from scvi_codegen.errors import ScviCodegenError, StateError
 from scvi_codegen.runtime.events.event import Crossings
 from scvi_codegen.runtime.trajectory.dense_output import whole_steps
 from scvi_codegen.runtime.trajectory.saved_states import ROUNDINGS, STEP_END_TOLERANCE, Array, SavedStates
@@ -111,3 +112,23 @@ def check_recomputed(t: Array, recomputed: Array, known: Array, before: Array) -
             "equations have several solutions (use a smaller step size), or the motion is too sensitive between saved "
             "states (use save_every=1)"
         )
+
+
+def exchanged_energy(states: Any, energy: Array) -> Array | None:
+    """Return (n,) work of forces and energy exchanged at events; ``None`` if the states do not determine it."""
+    stepper = states.stepper
+    if stepper.interface.changes_energy and not stepper.interface.balances_energy:
+        return None
+    before = np.full(len(energy), np.inf)  # energies before the first of the events at one time
+    try:
+        for crossings, rows in changes_by_events(states):
+            for row, value in zip(
+                rows, stepper.energy(crossings.q, crossings.p, crossings.t, states.parameters), strict=True
+            ):
+                if abs(value - energy[row - 1]) < abs(before[row] - energy[row - 1]):
+                    before[row] = value
+        exchanged = np.where(np.isfinite(before), energy - before, 0.0)
+        total: Array = np.cumsum(exchanged)
+        return total + states.work() if stepper.interface.changes_energy else total
+    except ScviCodegenError:
+        return None  # the method or the states do not determine the work, or there is no compiler

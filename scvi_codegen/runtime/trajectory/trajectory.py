@@ -9,16 +9,18 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Self, overload
+from typing import TYPE_CHECKING, Any, Self, cast, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.display.cards import Html, card, grid, listed, plain, sparkline
-from scvi_codegen.errors import EventError, MethodError, StateError, StepFailedError
+from scvi_codegen.errors import EventError, StateError, StepFailedError
+from scvi_codegen.files.energy import energy_account
 from scvi_codegen.files.export import States, to_dataframe, write_states
 from scvi_codegen.files.labelled_arrays import checked_units, to_dataset
 from scvi_codegen.runtime.constraints.projection import constraint_values, multipliers
+from scvi_codegen.runtime.core.features import refusal, require
 from scvi_codegen.runtime.core.validation import columns_of_inputs
 from scvi_codegen.runtime.events.detection import crossings_of
 from scvi_codegen.runtime.events.event import Crossings, Event, EventLike, as_events
@@ -31,7 +33,7 @@ from scvi_codegen.runtime.sensitivity.trajectory_derivatives import TrajectoryDe
 from scvi_codegen.runtime.trajectory.dense_output import checked_times, states_at, within
 from scvi_codegen.runtime.trajectory.joining import Number, concatenated, joined, joined_crossings, relative_changes
 from scvi_codegen.runtime.trajectory.quantities import quantities
-from scvi_codegen.runtime.trajectory.recomputation import work_and_impulses_until
+from scvi_codegen.runtime.trajectory.recomputation import exchanged_energy, work_and_impulses_until
 from scvi_codegen.runtime.trajectory.saved_states import Array, checked_row
 from scvi_codegen.validation import checks_arguments
 
@@ -95,16 +97,25 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
     def __getitem__(self, rows: slice) -> Self: ...
     @overload
     def __getitem__(self, rows: int) -> tuple[float, Array, Array]: ...
-    def __getitem__(self, rows: slice | int) -> Self | tuple[float, Array, Array]:
-        """Return a trajectory for a slice, or (t, q, p) of one state for an index.
+    @overload
+    def __getitem__(self, rows: str) -> Array: ...
+    def __getitem__(self, rows: slice | int | str) -> Self | tuple[float, Array, Array] | Array:
+        """Return a trajectory for a slice, (t, q, p) of one state for an index, or values for a name.
+
+        ``run["x"]`` are the values (n,) of a coordinate x, ``run["p_x"]`` and ``run["x_dot"]`` those of its momentum
+        and velocity; names of arrays, fields, rotations and their angular velocities, ``"t"`` and ``"energy"`` are
+        accepted as well.
 
         Events outside the times of a slice are omitted; ``steps`` and ``step_error`` remain those of the whole run.
         Slices of a run with inputs must have stride 1, since pieces share the states at breakpoints.
 
         Raises:
             IndexError: if an index is out of range, or a slice is empty or descending.
+            StateError: for an unknown name.
         """
         self._check_saved()
+        if isinstance(rows, str):
+            return self._quantity(rows)
         if not isinstance(rows, slice):
             k = checked_row(rows, len(self))
             return float(self.t[k]), self.q[k].copy(), self.p[k].copy()
@@ -154,7 +165,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
     def _check_saved(self) -> None:
         """Raise :class:`StateError` if states were not saved."""
         if self.observed is not None:
-            raise StateError("a run with observe saves no states: omit observe")
+            raise refusal("dense_output", "with observe")
 
     @classmethod
     def before(cls, failure: StepFailedError) -> Self:
@@ -176,16 +187,31 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
             return self.conserved[:, :3]
         return self._joined(lambda piece: piece.stepper._energy_parts(piece.q, piece.p, piece.t, piece.parameters))
 
-    def energy_error(self) -> float:
-        """Return the largest change of the energy, relative to the largest sum of its absolute parts if known.
+    def _exchanged_energy(self, energy: Array) -> Array | None:
+        """Return (n,) work of forces and energy exchanged at events; ``None`` if the states do not determine it."""
+        return exchanged_energy(self, energy)
 
-        Otherwise it is relative to the largest energy or, if that is less than 1e-8 of p.v, to the largest p.v.
+    def energy_error(self) -> float:
+        """Return the largest error of the energy, relative to the largest sum of its absolute parts if known.
+
+        Otherwise it is relative to the largest energy or, if that is less than 1e-8 of p.v, to the largest p.v. Where
+        forces, damping or impacts change the energy, the error is that of the balance E - E0 - W.
+
+        Raises:
+            StateError: if the energy changes for another reason, or its work W is unknown: the change is no error.
         """
+        account = energy_account(self)
+        if not account.is_error:
+            raise StateError(
+                f"the energy of '{self.stepper.interface.system}' changes ({account.reason}), and the work is "
+                "unknown, so that the change is no error: use energy(). Work requires a method with a curve, L or H "
+                "without time, and at impacts all states (save_every=1)"
+            )
         energies, parts = np.abs(self.energies), np.isfinite(self.energies[0, 0])
         size = float(np.max(energies[:, :2].sum(axis=1) if parts else energies[:, 2]))
         if not parts and size < 1e-8 * (action := float(np.abs(np.sum(self.p * self.velocity, axis=-1)).max())):
             size = action
-        return float(np.max(np.abs(self.energy() - self.energy()[0]))) / (size or 1.0)
+        return float(np.max(np.abs(account.values))) / (size or 1.0)
 
     def momentum_maps(self) -> Array:
         """Return (n, k) conserved quantities, in the order of ``stepper.momentum_map_names``."""
@@ -271,9 +297,8 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
         Raises:
             MethodError: if the system is not that of a mesh.
         """
-        if (parts := unresolved_parts(self.stepper, self.q)) is None:
-            raise MethodError("the system is not discretised from a density: unresolved() requires a mesh")
-        return parts
+        require(self.stepper, "unresolved")
+        return cast(Array, unresolved_parts(self.stepper, self.q))
 
     @property
     def ended_by(self) -> Event | None:
@@ -379,19 +404,21 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
         *,
         seconds: float = 8.0,
         positions: Callable[[Array], Array] | None = None,
+        progress: Callable[[int, int], None] | None = None,
     ) -> Film:
         """Return an animation for a notebook, or write .gif, .html or .mp4; see :func:`scvi_codegen.animate`."""
         from scvi_codegen.pictures.animation import animate
 
-        return animate(self, path, seconds=seconds, positions=positions)
+        return animate(self, path, seconds=seconds, positions=positions, progress=progress)
 
     @checks_arguments()
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
-        """Write ``.npz``, ``.csv``, ``.h5`` (or ``.nc``) or ``.zarr``, atomically.
+        """Write a file in the format of its suffix, atomically; the error of an unknown suffix lists the formats.
 
         An ``.npz`` file has arrays t, q, p, iterations, h, parameters, coordinates, parameter_names, and strings
         title, system, method, version. A CSV file has columns t, coordinates x, momenta p_x, iterations, velocities
-        x_dot and energy, NaN where undefined. HDF5 and Zarr files contain the variables of :meth:`to_xarray`.
+        x_dot and energy, NaN where undefined. HDF5 and Zarr files (``.h5``, ``.nc``, ``.zarr``)
+        contain the variables of :meth:`to_xarray`.
 
         Raises:
             StateError: if the suffix is unknown, or the format has no units.

@@ -20,10 +20,10 @@ from scvi_codegen.indices import Array
 from scvi_codegen.lowering.arrays import one_coordinate
 from scvi_codegen.mechanics.arrays.rolling import unroll_sums
 from scvi_codegen.mechanics.arrays.system import ArraySystem
-from scvi_codegen.methods import as_method
+from scvi_codegen.methods import SVI, StoermerVerlet, as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.rendering.source import Interface
-from scvi_codegen.runtime.arrays.interface import check_accesses, read_arrays
+from scvi_codegen.runtime.arrays.interface import RunArrays, check_accesses, read_arrays
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.verification.arrays.whole import WholeStart, whole_checks
 from scvi_codegen.verification.certificate import Certificate, Check, Finding, checked, information, issued
@@ -77,15 +77,17 @@ def verify_arrays(
         of: dict[str, Any] = {"h": run.h, "t": run.t, "tolerance": tolerance, "flags": flags}
         if watched.events:
             of["stepper"] = compile_stepper(known, chosen, flags=watched.flags, events=watched.events)
-        return of_known_sizes(known, chosen, run.q, run.p, **of)
+        if system.constraints and isinstance(chosen, StoermerVerlet):
+            chosen = SVI(1, "gauss-lobatto:2")  # RATTLE under its name for known sizes
+        certificate = of_known_sizes(known, chosen, run.q, run.p, **of)
+        if stepper.source is None:
+            return certificate
+        loops = SystemUnderTest(known, chosen, _bound(stepper, arrays), None, State(run.q, run.p, run.t, run.h))
+        return replace(certificate, checks=(*_unrolled_checks(loops), *certificate.checks))
     start = WholeStart(system, chosen, stepper, arrays, run.stepper.arrays(run.p), run.h, run.t)
     tested = _subject(start)
     checks = (
-        *checked(
-            "unrolled system",
-            f"{SMALL_STEPS} steps equal those of the unrolled system",
-            partial(_compared_with_unrolled, start, tested),
-        ),
+        *_unrolled_checks(tested),
         *step_checks(tested),
         *structure_checks(tested),
         *convergence_checks(tested),
@@ -132,15 +134,25 @@ def _subject(start: WholeStart) -> SystemUnderTest:
     arrays = small.arrays
     written = unroll_sums(start.system, arrays.sizes, tables=arrays.places, parameters=small.parameters)
     q, p = (np.concatenate([values.reshape(-1) for values in state.values()]) for state in (arrays.state, small.p))
-    stepper = start.stepper._bound_to(arrays)._copy(())
-    stepper.interface = replace(stepper.interface, map_names=())  # whole_checks examines momentum maps
-    return SystemUnderTest(written, start.method, stepper, None, State(q, p, start.t, start.h))
+    return SystemUnderTest(written, start.method, _bound(start.stepper, arrays), None, State(q, p, start.t, start.h))
 
 
-def _compared_with_unrolled(start: WholeStart, tested: SystemUnderTest) -> Finding:
+def _bound(stepper: Stepper, arrays: RunArrays) -> Stepper:
+    """Return a stepper of arrays at these sizes, as one of named coordinates."""
+    result = stepper._bound_to(arrays)._copy(())
+    result.interface = replace(result.interface, map_names=())  # whole_checks examines momentum maps
+    return result
+
+
+def _unrolled_checks(tested: SystemUnderTest) -> Iterator[Check]:
+    statement = f"{SMALL_STEPS} steps equal those of the unrolled system"
+    return checked("unrolled system", statement, partial(_compared_with_unrolled, tested))
+
+
+def _compared_with_unrolled(tested: SystemUnderTest) -> Finding:
     """Return the largest difference from the compiled unrolled system, in units of rounding of the first step."""
     first = tested.states[0]
-    other = compile_stepper(tested.system, start.method, flags=start.stepper.flags)
+    other = compile_stepper(tested.system, tested.method, flags=tested.stepper.flags)
     run: dict[str, Any] = {"h": first.h, "t": first.t, "steps": SMALL_STEPS, "parameters": tested.parameters}
     rolled, expected = (each.integrate(first.q, first.p, **run) for each in (tested.stepper, other))
     difference = np.abs(np.concatenate([rolled.q - expected.q, rolled.p - expected.p], axis=1)) / tested.rounding(first)

@@ -165,7 +165,6 @@ def _energies(start: WholeStart) -> Finding:
 
 
 def _values(start: WholeStart, at: Elements, formula: Expr, slots: Sequence[tuple[Any, Access]]) -> Any:
-    """Return the values of a formula at every element."""
     arrays = {access.array.name: start.array(access.array.name) for _, access in slots} | {**start.arrays.fields}
     numbers: dict[Expr, float] = dict(zip(start.system.parameters, start.arrays.numbers, strict=True))
     return at.values(formula, slots, arrays, {**numbers, start.system.time: start.t})

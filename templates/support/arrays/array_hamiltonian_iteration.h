@@ -15,12 +15,13 @@
 #define SUDDEN_GROWTH 1e20 /* of the largest coordinate in one iteration: a larger one changes the whole state */
 #define KEPT_FIRST(apart) ((apart) / 2) /* velocities follow forces */
 
-/* Positions or momenta: the state and the points; their rates, a table and weights; the largest size so far. */
+/* Positions or momenta: the state and the points; their rates, a table and weights; the largest size so
+ * far, also of each array. */
 typedef struct {
   const double *start, *carry;
   lanes *y;
   const lanes *rates, *table, *end, *weights;
-  double largest;
+  double largest, of_array[COORDINATE_ARRAYS];
 } half_state;
 
 /* Rates of coordinate i at the points times the weights. */
@@ -44,9 +45,9 @@ static step_points points_in(const step_data *step, const iteration_data *data, 
   const long long n = step->n;
   lanes *X = step->work->X;
   const half_state q = {step->q0, step->carry_q, X, past.now + n, POSITION, POINT_END_POSITION,
-      data->position_weight, 0.0};
+      data->position_weight, 0.0, {0.0}};
   const half_state p = {step->p0, step->carry_p, X + n, past.now, MOMENTUM, POINT_END_MOMENTUM,
-      data->momentum_weight, 0.0};
+      data->momentum_weight, 0.0, {0.0}};
   const step_points points = {step, data, X, past.now, n, {q, p}};
   return points;
 }
@@ -70,33 +71,44 @@ static void first_rates(const step_points *w, history past, long long steps)
 /* Updates y from its rates; returns the mean of the squared changes relative to the size of each coordinate. */
 static double improve(const step_data *step, half_state *of, const solver_options *options)
 {
-  const double before = of->largest, least = LEAST_SIZE * before + DBL_MIN;
+  const double before = of->largest;
+  coordinate_array array[COORDINATE_ARRAYS];
   double change;
   sums all;
+  describe_coordinate_arrays(step->given, array);
   begin_blocks(&all, step);
   EACH_BLOCK (all) {
     lanes total = lanes_of(0.0), increment[GROUPS], scaled[GROUPS];
-    double largest = 0.0;
-    for (long long i = all.here.first; i < all.here.end; i++) {
-      double size, inverse;
-      weighted_rates(of, 2 * step->n, i, scaled);
-      for (int g = 0; g < GROUPS; g++)
-        increment[g] = contribution_of_points(of->table, g, scaled, 1);
-      size = fabs(of->start[i]) + fabs(at_point(increment, 1, POINTS - 1));
-      inverse = options->absolute ? 1.0 : 1.0 / (size + least);
-      largest = larger(largest, size);
-      for (int g = 0; g < GROUPS; g++) {
-        lanes *y = &of->y[g * 2 * step->n + i];
-        const lanes x = of->start[i] + (of->carry[i] + increment[g]), moved = inverse * (x - *y);
-        total += moved * moved;
-        *y = x;
+    double values[1 + COORDINATE_ARRAYS] = {0.0};
+    for (int k = 0; k < COORDINATE_ARRAYS; k++) {
+      const section part = part_in(all.here, &array[k]);
+      const double least = least_size(&array[k], of->of_array[k], before);
+      for (long long i = part.first; i < part.end; i++) {
+        double size, inverse;
+        weighted_rates(of, 2 * step->n, i, scaled);
+        for (int g = 0; g < GROUPS; g++)
+          increment[g] = contribution_of_points(of->table, g, scaled, 1);
+        size = fabs(of->start[i]) + fabs(at_point(increment, 1, POINTS - 1));
+        inverse = options->absolute ? 1.0 : 1.0 / (size + least);
+        values[1 + k] = larger(values[1 + k], size);
+        for (int g = 0; g < GROUPS; g++) {
+          lanes *y = &of->y[g * 2 * step->n + i];
+          const lanes x = of->start[i] + (of->carry[i] + increment[g]), moved = inverse * (x - *y);
+          total += moved * moved;
+          *y = x;
+        }
       }
     }
-    add_block(&all, lanes_total(total), largest);
+    values[0] = lanes_total(total);
+    add_values(&all, values, 1 + COORDINATE_ARRAYS);
   }
   meet(step);
   change = sum_of(&all, 0) / (options->absolute ? 1.0 : (double)step->n);
-  of->largest = largest_over(&all, 1);
+  of->largest = 0.0;
+  for (int k = 0; k < COORDINATE_ARRAYS; k++) {
+    of->of_array[k] = largest_over(&all, 1 + k);
+    of->largest = larger(of->largest, of->of_array[k]);
+  }
   return of->largest > SUDDEN_GROWTH * before ? 1.0 : change;
 }
 

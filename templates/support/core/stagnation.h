@@ -6,10 +6,11 @@
 /* Stagnation of the iteration of one trajectory, by rounding or by slow convergence. Requires: convergence.h. */
 
 /* Progress of the iteration of a step of one trajectory: the first change, the last three; the change that was
- * amplified by AMPLIFICATION, if any, and the number of iterations since. */
+ * amplified by AMPLIFICATION, if any, and the number of iterations since; by_largest: 1 if changes are relative to the
+ * largest coordinate. */
 typedef struct {
   double first, last, before, earlier, amplified;
-  int status, since;
+  int status, since, by_largest;
 } trajectory_progress;
 
 /* factor by which the last change is amplified; it has to decrease to about its former size */
@@ -32,6 +33,33 @@ static SELDOM int check_stagnation(trajectory_progress *now, const solver_option
   now->last = INFINITY;
   now->status = 0;
   return 1;
+}
+
+/* Begins to measure changes relative to the largest coordinate; returns 0 if they already are or the step fails. */
+static SELDOM int begin_by_largest(trajectory_progress *now, const solver_options *options, int k)
+{
+  if (options->absolute || !(now->last < INFINITY) || k >= options->max_iterations || now->amplified > 0.0 ||
+      now->by_largest)
+    return 0;
+  now->by_largest = 1;
+  now->status = 0;
+  now->last = now->before = now->earlier = INFINITY;
+  return 1;
+}
+
+/* Returns 1 if changes relative to the size of each coordinate stagnate; the following ones are then relative to the
+ * largest. At a coordinate that vanishes, such as a node of a standing wave, forces are rounding errors of terms that
+ * cancel, and its relative changes do not decrease. */
+static inline int is_one_stagnant(trajectory_progress *now, const solver_options *options, int k)
+{
+  if (k > 1 && now->status <= 0 &&
+      (now->status < 0 || (now->last > STAGNANT * now->before && now->last > STAGNATION * now->earlier))) {
+    trajectory_progress seen = *now; /* so that `now` may stay in registers */
+    const int stagnant = begin_by_largest(&seen, options, k);
+    *now = seen;
+    return stagnant;
+  }
+  return 0;
 }
 
 /* Returns 1 if the last change has to be amplified to test whether it decreases. If mass matrices are nearly singular,

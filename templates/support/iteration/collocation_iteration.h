@@ -127,6 +127,8 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
     total = lanes_total(change);
     total += correct_start(step, data, mass, inverse_size, &curve);
     take_change(&now, total, options, k, report);
+    if (is_stagnant(&now, options, k))
+      measure_by_largest(stagnant(&now), inverse_size);
   }
   status = outcome(&now, report);
   if (status != OK)

@@ -121,6 +121,8 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
         change += moved * moved;
       }
     take_change(&now, total_change(change), options, k, report);
+    if (is_stagnant(&now, options, k))
+      measure_by_largest(stagnant(&now), inverse_size);
 #ifdef SUPPORT_SECANTS_H
     if (k >= FIRST_ITERATIONS && (before.known || any_positive(undecided(&now, ACCELERATED_LEVEL))))
       accelerate(&before, k % MASS_AGE == 0, inverse_size, undecided(&now, 0.0), r, z);

@@ -172,6 +172,10 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
         value[n][i] = correction;
       }
     take_change(&now, total_change(change), options, k, report);
+    if (is_stagnant(&now, options, k)) {
+      measure_by_largest(1.0, velocity_size);
+      measure_by_largest(1.0, momentum_size);
+    }
     if (must_amplify(&now, options, k))
       for (int n = 0; n < GROUPS; n++)
         for (int i = 0; i < M; i++)

@@ -48,7 +48,7 @@ static inline int start_velocities(const step_data *step, lanes (*z)[M])
 /* Progress of the iteration of a step in every lane, as trajectory_progress. status: 1 converged, 0 undecided, -1
  * failed in this iteration, -2 before; amplification: factor of the last change to be added, AMPLIFICATION or 0. */
 typedef struct {
-  lanes first, last, before, earlier, amplified, since, status, amplification;
+  lanes first, last, before, earlier, amplified, since, status, amplification, by_largest, stagnant;
   int pending;
 } progress;
 
@@ -86,6 +86,54 @@ static inline void take_change(progress *now, lanes change, const solver_options
   now->before = now->last;
   now->last = change;
   report->iterations++;
+}
+
+/* is_one_stagnant in each lane. */
+static SELDOM int find_stagnant(progress *now, const solver_options *options, int k)
+{
+  lane_view last = {now->last}, before = {now->before}, earlier = {now->earlier}, status = {now->status};
+  lane_view by_largest = {now->by_largest}, stagnant = {lanes_of(0.0)};
+  const lane_view amplified = {now->amplified};
+  int any = 0;
+  for (int j = 0; j < LANES; j++)
+    if (status.lane[j] == 0.0 || status.lane[j] == -1.0) {
+      trajectory_progress seen = {0.0, last.lane[j], before.lane[j], earlier.lane[j], amplified.lane[j]};
+      seen.status = (int)status.lane[j];
+      seen.by_largest = by_largest.lane[j] > 0.0;
+      if (is_one_stagnant(&seen, options, k)) {
+        last.lane[j] = before.lane[j] = earlier.lane[j] = INFINITY;
+        status.lane[j] = 0.0;
+        by_largest.lane[j] = stagnant.lane[j] = 1.0;
+        now->pending = any = 1;
+      }
+    }
+  now->last = last.all, now->before = before.all, now->earlier = earlier.all;
+  now->status = status.all;
+  now->by_largest = by_largest.all, now->stagnant = stagnant.all;
+  return any;
+}
+
+static inline int is_stagnant(progress *now, const solver_options *options, int k)
+{
+  const lane_view last = {now->last}, before = {now->before}, earlier = {now->earlier}, status = {now->status};
+  int stagnates = 0;
+  for (int j = 0; j < LANES; j++)
+    stagnates |= (status.lane[j] == -1.0) |
+        ((status.lane[j] == 0.0) & (last.lane[j] > STAGNANT * before.lane[j]) &
+            (last.lane[j] > STAGNATION * earlier.lane[j]));
+  if (k > 1 && stagnates) {
+    progress seen = *now; /* so that `now` may stay in registers */
+    const int any = find_stagnant(&seen, options, k);
+    *now = seen;
+    return any;
+  }
+  return 0;
+}
+
+/* Where is_stagnant returned 1. */
+static inline lanes stagnant(const progress *now)
+{
+  return now->stagnant;
 }
 
 /* Decides about stagnation in the lanes that have not converged; returns 1 if changes have to be amplified. */

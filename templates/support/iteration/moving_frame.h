@@ -216,9 +216,10 @@ static inline void rotate_freely(const step_data *step, frame_state *at, int end
   lanes q[M], p[M], value[M + TURNS];
   double u[2 * M], g[4 * TURNS], turn[4 * TURNS];
   for (int i = 0; i < M; i++) {
-    q[i] = lanes_of(u[i] = at->q[i]);
-    p[i] = lanes_of(at->p[i]);
-    u[M + i] = step->h * at->p[i];
+    const double momentum = at->p[i] + at->low_p[i];
+    q[i] = lanes_of(u[i] = at->q[i] + at->low_q[i]);
+    p[i] = lanes_of(momentum);
+    u[M + i] = step->h * momentum;
   }
   potential_rates(step, 0, q, q, value);
   for (int k = 0; k < TURNS; k++) {

@@ -264,18 +264,29 @@ static void first_points(const step_points *w, history past, long long steps)
 /* Sizes of the coordinates. */
 static inline void measure_points(const step_points *w, const solver_options *options)
 {
+  coordinate_array array[COORDINATE_ARRAYS];
+  double largest = 0.0;
   sums all;
+  describe_coordinate_arrays(w->step->given, array);
   begin_blocks(&all, w->step);
   EACH_BLOCK (all) {
-    double largest = 0.0;
-    for (long long i = all.here.first; i < all.here.end; i++) {
-      w->inverse_size[i] = size_of(w, find_drift(w, i), i);
-      largest = larger(largest, w->inverse_size[i]);
+    double values[COORDINATE_ARRAYS] = {0.0};
+    for (int k = 0; k < COORDINATE_ARRAYS; k++) {
+      const section part = part_in(all.here, &array[k]);
+      for (long long i = part.first; i < part.end; i++) {
+        w->inverse_size[i] = size_of(w, find_drift(w, i), i);
+        values[k] = larger(values[k], w->inverse_size[i]);
+      }
     }
-    add_block(&all, largest, 0.0);
+    add_values(&all, values, COORDINATE_ARRAYS);
   }
   meet(w->step);
-  invert_sizes(options, largest_over(&all, 0), w->n, own_part(w->step), w->inverse_size);
+  for (int k = 0; k < COORDINATE_ARRAYS; k++)
+    largest = larger(largest, largest_over(&all, k));
+  for (int k = 0; k < COORDINATE_ARRAYS; k++) {
+    const double least = least_size(&array[k], largest_over(&all, k), largest);
+    invert_sizes(options, largest, least, w->n, part_in(own_part(w->step), &array[k]), w->inverse_size);
+  }
 }
 
 static inline double improve(const step_points *w)
@@ -365,6 +376,10 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
     const number change = improve(&w);
     forces(&w);
     take_change(&now, change, options, k, report);
+#ifndef ARRAYS
+    if (is_stagnant(&now, options, k))
+      measure_by_largest(stagnant(&now), inverse_size);
+#endif
   }
   status = outcome(&now, report);
   if (status != OK)
@@ -379,6 +394,10 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
     return NOT_FINITE;
 #ifndef ARRAYS
   remember_curve(F, past);
+#endif
+#ifdef ERROR_GROWTH
+  if (step->points)
+    memcpy(step->points, X, sizeof X);
 #endif
   *steps = next_guess(*steps, &now, report);
   return OK;

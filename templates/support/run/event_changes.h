@@ -320,7 +320,7 @@ static int change_state(const event_step *step, int e, event_sample *at)
       status = satisfy_constraints(step, at->t, at->q, at->p, 1);
   }
   if (status == OK && !(all_finite(at->q, M) && all_finite(at->p, M))) {
-    step->watch->undefined = EVENT_OF(e) + 1;
+    step->watch->undefined = -(EVENT_OF(e) + 1);
     status = NOT_FINITE;
   }
   return status;

@@ -93,6 +93,9 @@ typedef struct {
   long long change; /* of the level, from the previous step to this */
   real length; /* step size; 0 before the first trial */
   int last; /* 1 if the step ends at t_end */
+#ifdef ERROR_GROWTH
+  coordinates points[GROUPS]; /* of the last trial */
+#endif
 } trial;
 
 /* Performs one trial of the next step: its increments and the error estimate of the curve if it exceeds `least`,
@@ -301,6 +304,10 @@ static inline void accept_trial(run_memory *run, trial *now)
 #ifdef ARRAYS
   continue_steps(run, &now->step, now->dq, now->dp);
 #else
+#ifdef ERROR_GROWTH
+  if (run->measures_growth)
+    measure_growth(run, &now->step, &now->data, now->points, now->dq, now->dp);
+#endif
   add_increments(now->at.q, now->at.carry_q, now->dq);
   add_increments(now->at.p, now->at.carry_p, now->dp);
 #endif

@@ -35,7 +35,7 @@ from scvi_codegen.mechanics.multibody.trees.energies import (
     position_of,
     rotation_of,
 )
-from scvi_codegen.mechanics.multibody.trees.tree import Joint, Link, Vector
+from scvi_codegen.mechanics.multibody.trees.tree import DrawnLink, Joint, Link, Vector
 from scvi_codegen.mechanics.reading import default_momenta, system_from_sympy
 
 SMALLEST = 12
@@ -54,7 +54,7 @@ def system_of_tree(
     tree = Tree(links, gravity)
 
     def made(**fields: Any) -> Any:
-        members = fields.get("rotations", ())
+        members, fields = fields.get("rotations", ()), fields | {"links": tuple(map(DrawnLink.of, tree.links))}
         if constraints or len(fields["coordinates"]) - len(members) < SMALLEST:
             return kind(**fields)
         return kind(**fields, dual_energy=_in_quaternions(dual_energy(tree), **fields))
@@ -119,7 +119,6 @@ def _degrees_of_freedom(tree: Tree, joint: Joint) -> Iterator[tuple[int, Expr]]:
 
 
 def _in_parent(tree: Tree, joint: Joint, inertia: Matrix, bias: Matrix) -> tuple[Matrix, Matrix]:
-    """Return an inertia and a bias in the frame of the parent."""
     arm = tree.origin(joint).hat()
     angular, mixed, linear = (
         _turned_twice(tree, joint, block) for block in (inertia[:3, :3], inertia[:3, 3:], inertia[3:, 3:])

@@ -88,7 +88,6 @@ def _conditions(links: Sequence[Link], closure: Closure | Coupling) -> Iterator[
 
 
 def _coordinate(links: Sequence[Link], name: str) -> Expr:
-    """Return the coordinate of a hinge or slide."""
     joints = {each.joint.name: each.joint for each in links if each.joint.kind in SINGLE}
     if name not in joints:
         raise SystemDefinitionError(f"an equality names '{name}', which is no hinge or slide{closest(name, joints)}")

@@ -56,20 +56,36 @@ class Tree:
         links = self.links = aligned(named(without_fixed(links)))
         self.gravity = exact_vector(gravity)
         self.joints = {link.joint.name: link.joint for link in links}
+        self.leaders = {each.name: self.leader(each) for each in self.joints.values() if each.kind in SINGLE}
         self.masses = self.of_subtrees([exact_number(each.inertia.mass) for each in links])
         self.weights = self.of_subtrees([exact_number(each.inertia.mass - each.inertia.lift[0]) for each in links])
         self.moments = self.first_moments()
 
     def coordinate(self, joint: Joint) -> tuple[Expr, Expr]:
         """Return q and q_dot of a hinge or slide."""
-        if joint.follows is not None:
-            other, factor, offset = joint.follows
-            if other not in self.joints:
-                known = closest(other, [*self.joints])
-                raise SystemDefinitionError(f"joint '{joint.name}' follows '{other}', which is no moving joint{known}")
-            q, v = self.coordinate(self.joints[other])
-            return exact_number(factor) * q + exact_number(offset), exact_number(factor) * v
-        return symbol(joint.name), symbol(joint.name + DOT)
+        name, factor, offset = self.leaders[joint.name]
+        return factor * symbol(name) + offset, factor * symbol(name + DOT)
+
+    def leader(self, joint: Joint) -> tuple[str, Expr, Expr]:
+        """Return the name of the joint that one follows, itself or through others, the factor, and the offset.
+
+        Raises:
+            SystemDefinitionError: if that is no hinge or slide, or the joint itself.
+        """
+        factor, offset, seen = S.One, S.Zero, [joint.name]
+        while joint.follows is not None:
+            other, *numbers = joint.follows
+            factor, offset = factor * exact_number(numbers[0]), offset + factor * exact_number(numbers[1])
+            if other in seen:
+                raise SystemDefinitionError(f"joint '{seen[0]}' follows itself: {', '.join((*seen, other))}")
+            if other not in self.joints or self.joints[other].kind not in SINGLE:
+                known = [each.name for each in self.joints.values() if each.kind in SINGLE]
+                raise SystemDefinitionError(
+                    f"joint '{joint.name}' follows '{other}', which is no moving joint{closest(other, known)}"
+                )
+            seen.append(other)
+            joint = self.joints[other]
+        return joint.name, factor, offset
 
     def displacement(self, joint: Joint) -> Expr:
         """Return the coordinate of a hinge or slide from the zero of the model."""

@@ -1,166 +1,214 @@
 """Reader of MJCF, the model format of MuJoCo: bodies, joints, inertias of bodies and geoms, gravity, equalities.
 
-Contacts, meshes, limits of joints, actuators and sensors are not read. Attributes and defaults are those of
-https://mujoco.readthedocs.io/en/stable/XMLreference.html.
+Attributes and defaults are those of https://mujoco.readthedocs.io/en/stable/XMLreference.html;
+:mod:`scvi_codegen.mechanics.multibody.trees.schema` lists which are read.
 """
 
 import re
-import warnings
-from collections.abc import Iterator, Mapping
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import combinations
 from os import PathLike
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 
 from scvi_codegen.errors import closest
 from scvi_codegen.formulas.rotations.members import matrix_of
 from scvi_codegen.mechanics.multibody.trees.closures import Closure, Coupling, at_reference
-from scvi_codegen.mechanics.multibody.trees.document import Element, root_of, warn_of_dry_friction
+from scvi_codegen.mechanics.multibody.trees.document import Element, Unread, root_of
+from scvi_codegen.mechanics.multibody.trees.schema import MJCF, TURN
 from scvi_codegen.mechanics.multibody.trees.shapes import SHAPES
 from scvi_codegen.mechanics.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about
 
-REFUSED = ("attach", "replicate", "composite", "flexcomp", "plugin")
-"""Elements inside bodies that are not read, and without which the model would be another one."""
 WEIGHTLESS = ("plane", "hfield")
-CHANGES = {"boundmass": "0", "boundinertia": "0", "balanceinertia": "false"}
-"""Settings that change inertias and are not read, with their defaults."""
-ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
-MOST_INCLUDED = 20
+ORIENTATIONS = TURN.split()
 AXES = dict(zip("xyz", np.eye(3), strict=True))
+Defaults = dict[str, dict[str, str]]
+"""Attributes by kind of element."""
 
 
 def links_of_mjcf(path: str | PathLike[str]) -> tuple[str, list[Link], Vector, list[Closure | Coupling]]:
     """Return the name of the model, its links with parents first, the acceleration of gravity, and its equalities.
 
     Raises:
-        SystemDefinitionError: naming file and element, if something is malformed or changes the mechanics and is not
-            read.
+        SystemDefinitionError: naming file and element, if something is malformed or unknown, or changes the motion and
+            is not read.
     """
-    model = _MujocoModel(root_of(path, "mujoco"))
-    for body in model.inside("worldbody"):
-        model.read(body, -1, Pose(), "main")
-    warn_of_dry_friction(path, model.rough)
-    name, closures = model.root.node.get("model", Path(path).stem), [*model.closures()]
-    return name, model.scaled(), model.gravity, closures
+    root = root_of(Path(path), "mujoco")
+    _include(root)
+    _apply_defaults(root)
+    model = _MujocoModel(root)
+    closures = [*model.closures()]
+    model.unread.warn(root.file)
+    return root.text("model", Path(path).stem), model.scaled(), model.gravity, closures
 
 
 class _MujocoModel:
-    """Settings, default classes and links of a document."""
+    """Links of a document whose attributes are explicit."""
 
     def __init__(self, root: Element) -> None:
-        self.root = root
-        self.sections = [*_sections(root, 0)]
-        self.settings: dict[str, str] = {}
-        options: dict[str, str] = {}
-        flags = (flag.node for section in self.inside("option") for flag in section.children("flag"))
-        self.disabled = {name for flag in flags for name, value in flag.items() if value == "disable"}
-        self.rough: list[str] = []
-        self.still: set[int] = set()
-        self.classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
-        for section in self.sections:
-            if section.node.tag == "compiler":
-                self.settings |= section.node.attrib
-            elif section.node.tag == "option":
-                options |= section.node.attrib
-            elif section.node.tag == "default":
-                self.read_defaults(section, {})
-            elif section.node.tag == "deformable" and len(section.node):
-                section.refuse(f"contains <{section.node[0].tag}>, which is not read: remove it or write a constraint")
-            elif section.node.tag == "tendon":
-                for tendon in section.children("spatial", "fixed"):
-                    if tendon.has("stiffness"):
-                        tendon.refuse("has a stiffness, which is not read")
-        option = Element(root.file, root.node, options)
+        self.root, self.unread = root, Unread()
+        self.settings, option, flags = (
+            _merged(root, tag, parts)
+            for tag, parts in (
+                ("compiler", self.inside("compiler")),
+                ("option", self.inside("option")),
+                ("flag", [flag for each in self.inside("option") for flag in each.children("flag")]),
+            )
+        )
+        self.disabled = {key for key in flags.node.attrib if flags.choice(key, "enable", "disable") == "disable"}
         self.gravity = option.vector("gravity", (0, 0, -9.81)) * ("gravity" not in self.disabled)
-        if any(option.number(each, 0) != 0 for each in ("density", "viscosity")):
-            warnings.warn(f"{root.file}: forces of the medium (density, viscosity) are not read", stacklevel=5)
-        self.turn = 1.0 if self.settings.get("angle", "degree") == "radian" else np.pi / 180
+        self.turn = np.pi / 180 if self.settings.choice("angle", "degree", "radian") == "degree" else 1.0
         self.links: list[Link] = []
+        self.compensating: list[Element] = []
+        self.carriers, self.parents = {-1: -1}, dict[int, int]()
+        """Of each body, by its link: the moving body that it is fixed to, and the one that this is connected with."""
+        self.shapes: dict[tuple[int, int, int], None] = {}
+        """Of geoms: the link, contype and conaffinity."""
         self.places: dict[tuple[str, str], tuple[int, Pose]] = {("body", "world"): (-1, Pose())}
         """Link and pose in it of bodies and sites, by tag and name."""
+        for world in self.inside("worldbody"):
+            self.read(world)
+        self.read_actuators()
+        self.read_tendons()
+        if self.contacts():
+            self.unread.add("contacts")
+        if self.compensating and any(link.inertia.lift[0] for link in self.links):
+            self.compensating[0].refuse("has actuatorgravcomp, which is not read where bodies have gravcomp")
 
-    def read_defaults(self, element: Element, inherited: Mapping[str, Mapping[str, str]]) -> None:
-        """Store the attributes of a default class, which inherits those of the class around it."""
-        attributes = {tag: dict(values) for tag, values in inherited.items()}
-        for node in element.node:
-            if node.tag != "default":
-                attributes[node.tag] = attributes.get(node.tag, {}) | node.attrib
-        self.classes[element.node.get("class", "main")] = attributes
-        for child in element.children("default"):
-            self.read_defaults(child, attributes)
+    def inside(self, tag: str) -> list[Element]:
+        return self.root.children(tag)
 
-    def inside(self, tag: str) -> Iterator[Element]:
-        """Yield the sections with a tag."""
-        yield from (section for section in self.sections if section.node.tag == tag)
+    def read_tendons(self) -> None:
+        """Store the limits and dry friction of tendons."""
+        for tendon in (each for section in self.inside("tendon") for each in section.children()):
+            self.read_limits(tendon, "tendons", tendon.name)
 
-    def with_defaults(self, element: Element, inherited: str) -> Element:
-        """Return an element with the defaults of its class, or of the class of the bodies around it."""
-        name = element.node.get("class", inherited)
-        if name not in self.classes:
-            element.refuse(f"is of the class '{name}', which does not exist")
-        return Element(element.file, element.node, self.classes[name].get(element.node.tag, {}))
+    def read(self, world: Element) -> None:
+        """Read the bodies, frames and sites of the world."""
+        pending = [(world, -1, Pose())]
+        while pending:
+            element, link, at = pending.pop()
+            if element.tag == "body":
+                link, at = self.add(element, link, at @ self.pose(element)), Pose()
+                self.put(element, link, at)
+            elif element.tag == "frame":
+                at = at @ self.pose(element)
+            if element.tag != "frame":
+                for geom, _ in self.contents(element, "geom"):
+                    self.shapes[link, int(geom.number("contype", 1)), int(geom.number("conaffinity", 1))] = None
+            for site in element.children("site"):
+                self.put(site, link, at @ self.pose(site))
+            inner = (*element.children("frame"), *element.children("body"))
+            pending += [(each, link, at) for each in reversed(inner)]
 
-    def read(self, body: Element, link: int, at: Pose, inherited: str) -> None:
-        """Read what a body, a frame or the world contains, fixed to a link at a pose."""
-        for child in body.children(*REFUSED):
-            child.refuse("is not read: write its bodies out")
-        inherited = body.node.get("childclass", inherited)
-        for site in body.children("site"):
-            self.places["site", site.name] = link, at @ self.pose(self.with_defaults(site, inherited))
-        for frame in body.children("frame"):
-            self.read(frame, link, at @ self.pose(frame), inherited)
-        for inner in body.children("body"):
-            pose = at @ self.pose(inner)
-            self.places["body", inner.name] = (
-                self.add(inner, link, pose, inner.node.get("childclass", inherited)),
-                Pose(),
-            )
-            self.read(inner, self.places["body", inner.name][0], Pose(), inherited)
+    def put(self, element: Element, link: int, at: Pose) -> None:
+        """Store the place of a body or site, if it has a name."""
+        key = element.tag, element.node.get("name", "")
+        if key in self.places:
+            element.refuse("is defined twice: rename one")
+        if key[1]:
+            self.places[key] = link, at
 
-    def add(self, body: Element, parent: int, pose: Pose, inherited: str) -> int:
+    def add(self, body: Element, parent: int, pose: Pose) -> int:
         """Add a link for each joint of a body and one that carries its inertia; return the position of the last."""
-        name = body.node.get("name", f"body{len(self.links)}")
-        anchor = np.zeros(3)
-        for count, (element, frame) in enumerate(self.contents(body, "joint", "freejoint")):
-            joint = self.with_defaults(element, inherited)
-            at = frame.position + frame.rotation @ joint.vector("pos", (0, 0, 0))
-            place = pose @ Pose(at - anchor)
-            label = element.node.get("name", name if count == 0 else f"{name}_{count + 1}")
-            self.links.append(Link(label, parent, self.joint(joint, label, place, frame, parent), Inertia()))
+        name = body.text("name", f"body{len(self.links)}")
+        joints = [*self.contents(body, "joint", "freejoint")]
+        above, anchor = self.carriers[parent], np.zeros(3)
+        for count, (joint, frame) in enumerate(joints):
+            free = joint.tag == "freejoint" or joint.text("type", "hinge") == "free"  # has no place in the body
+            at = np.zeros(3) if free else frame.position + frame.rotation @ joint.vector("pos", (0, 0, 0))
+            moved = pose @ Pose(at - anchor)
+            label = joint.text("name", name if count == 0 else f"{name}_{count + 1}")
+            self.links.append(Link(label, parent, self.joint(joint, label, moved, frame, parent), Inertia()))
             parent, pose, anchor = len(self.links) - 1, Pose(), at
+        place = len(self.links)
+        self.carriers[place] = place if joints else above
+        if joints:
+            self.parents[place] = above
+        if body.choice("mocap", "false", "true") == "true":
+            self.unread.add("motion of mocap bodies", name)
         carried = Joint(name=name, kind="fixed", pose=pose @ Pose(-anchor))
-        fixed = (parent < 0 or parent in self.still) and "settotalmass" not in self.settings  # to the world
-        inertia = Inertia() if fixed else self.inertia(body, inherited).compensated(body.number("gravcomp", 0))
-        self.still |= {len(self.links)} if fixed else set()
-        self.links.append(Link(name, parent, carried, inertia))
-        return len(self.links) - 1
+        fixed = self.carriers[place] < 0 and not self.settings.has("settotalmass")  # to the world
+        lift = body.number("gravcomp", 0) * (not {"spring", "damper"} <= self.disabled)
+        self.links.append(Link(name, parent, carried, Inertia() if fixed else self.inertia(body).compensated(lift)))
+        return place
 
     def contents(self, body: Element, *tags: str) -> Iterator[tuple[Element, Pose]]:
         """Yield the children of a body with one of the tags, also in frames, with the pose of their frame."""
-        for child in body.children("frame", *tags):
-            if child.node.tag == "frame":
-                for element, inner in self.contents(child, *tags):
-                    yield element, self.pose(child) @ inner
-            else:
-                yield child, Pose()
+        pending = [(body, Pose())]
+        while pending:
+            element, at = pending.pop()
+            if element.tag in tags:
+                yield element, at
+            elif element.tag == "frame" or element is body:
+                inner = at @ self.pose(element) if element.tag == "frame" else at
+                pending += [(child, inner) for child in reversed(element.children("frame", *tags))]
+
+    def contacts(self) -> bool:
+        """Return whether geoms of different bodies may touch, in MuJoCo's rules.
+
+        https://mujoco.readthedocs.io/en/stable/computation/index.html#selection
+        """
+        if self.disabled & {"contact", "constraint"}:
+            return False
+        sections = self.inside("contact")
+        excluded = {
+            frozenset(self.place(each, key)[0] for key in ("body1", "body2"))
+            for section in sections
+            for each in section.children("exclude")
+        }
+        near = set() if "filterparent" in self.disabled else {*self.parents.items()}
+        for (one, *types), (two, *others) in combinations(self.shapes, 2):
+            a, b = self.carriers[one], self.carriers[two]
+            filtered = a == b or (min(a, b) >= 0 and not near.isdisjoint({(a, b), (b, a)}))
+            if not filtered and (types[0] & others[1] or others[0] & types[1]) and {one, two} not in excluded:
+                return True
+        return any(section.children("pair") for section in sections)
+
+    def read_actuators(self) -> None:
+        """Add the inertias of rotors and the damping of actuators, which are those of lengths gear q, to joints."""
+        places = {link.joint.name: i for i, link in enumerate(self.links) if link.joint.kind in SINGLE}
+        for each in (actuator for section in self.inside("actuator") for actuator in section.children()):
+            self.unread.add("actuators", each.name)
+            armature, damping = (each.number(key, 0, 0) for key in ("armature", "damping"))
+            if armature or damping:
+                place = places.get(each.text("joint", each.text("jointinparent", "")))
+                if place is None:
+                    each.refuse("has armature or damping, which is read of actuators of hinges and slides only")
+                joint, factor = self.links[place].joint, each.vector("gear", (1,), range(1, 7))[0] ** 2
+                damping = joint.damping + factor * damping * ("damper" not in self.disabled)
+                joint = replace(joint, damping=damping, armature=joint.armature + factor * armature)
+                self.links[place] = replace(self.links[place], joint=joint)
+
+    def read_limits(self, element: Element, part: str, name: str) -> None:
+        """Store that a joint or tendon has limits or dry friction."""
+        limited = element.choice("limited", "auto", "true", "false")
+        low, high = element.vector("range", (0, 0), (2,))
+        if limited == "auto" and low < high and self.settings.choice("autolimits", "true", "false") == "true":
+            limited = "true"
+        if limited == "true" and not self.disabled & {"limit", "constraint"}:
+            self.unread.add(f"limits of {part}", name)
+        if element.number("frictionloss", 0, 0) and not self.disabled & {"frictionloss", "constraint"}:
+            self.unread.add(f"dry friction of {part}", name)
 
     def closures(self) -> Iterator[Closure | Coupling]:
         """Yield the equalities that are active; their softness is not read.
 
         https://mujoco.readthedocs.io/en/stable/XMLreference.html#equality
         """
-        for section in self.inside("equality"):
-            for node in section.node:
-                each = self.with_defaults(Element(section.file, node), "main")
-                if each.text("active", "true") == "false" or "equality" in self.disabled:
-                    continue
-                if node.tag == "joint":
-                    yield self.coupling(each)
-                elif node.tag not in ("connect", "weld"):
-                    each.refuse("is not read: remove it or write a constraint")
-                else:
-                    yield self.closure(each)
+        for each in (equality for section in self.inside("equality") for equality in section.children()):
+            if each.choice("active", "true", "false") == "false" or self.disabled & {"equality", "constraint"}:
+                continue
+            if each.tag == "joint":
+                yield self.coupling(each)
+            elif each.tag in ("connect", "weld"):
+                yield self.closure(each)
+            else:
+                each.refuse("is not read: remove it or write a constraint")
 
     def place(self, element: Element, key: str) -> tuple[int, Pose]:
         """Return the link and the pose in it of the body or site that an attribute names."""
@@ -173,8 +221,15 @@ class _MujocoModel:
     def closure(self, equality: Element) -> Closure:
         """Return a connection or weld of two sites, or of bodies, by default as in the reference configuration."""
         kind = "site" if equality.has("site1") else "body"
-        (one, at), (two, other) = (self.place(equality, f"{kind}{k}") for k in (1, 2))
-        turning = equality.node.tag == "weld"
+        mixed = [key for key in ("body1", "body2", "anchor", "relpose") if equality.has(key)]
+        if mixed and kind == "site":
+            equality.refuse(f"has site1 and {mixed[0]}: sites or bodies are needed")
+        (one, at), (two, end) = (self.place(equality, f"{kind}{k}") for k in (1, 2))
+        if one == two:
+            equality.refuse("is between a body and itself")
+        turning = equality.tag == "weld"
+        if turning and equality.number("torquescale", 1) <= 0:
+            equality.refuse("has a torquescale that is not > 0: use a <connect>")
         if kind == "body" and turning:
             pose = equality.vector("relpose", (0, 1, 0, 0, 0, 0, 0), (7,))
             if pose[3:].any():
@@ -183,94 +238,103 @@ class _MujocoModel:
                 at = at_reference(self.links, one).inverse @ at_reference(self.links, two)
         elif kind == "body":
             at = Pose(equality.vector("anchor"))
-            other = at_reference(self.links, two).inverse @ at_reference(self.links, one) @ at
-        return Closure((one, two), (at, other), turning)
+            end = at_reference(self.links, two).inverse @ at_reference(self.links, one) @ at
+        return Closure((one, two), (at, end), turning)
 
     def coupling(self, equality: Element) -> Coupling:
         """Return a relation between two joints, or the fixed value of one."""
         zeros = {each.joint.name: each.joint.zero for each in self.links}
         joint, other = equality.text("joint1"), equality.text("joint2", "") or None
+        if joint == other:
+            equality.refuse(f"is between joint '{joint}' and itself")
         given = equality.vector("polycoef", (0, 1, 0, 0, 0), range(1, 6))
         coefficients = tuple(map(float, given if other else given[:1]))
         return Coupling(joint, other, coefficients, zeros.get(joint, 0.0), zeros.get(other or "", 0.0))
 
     def joint(self, joint: Element, name: str, pose: Pose, frame: Pose, parent: int) -> Joint:
-        """Return a joint whose link has a pose in its parent."""
-        kind = "free" if joint.node.tag == "freejoint" else joint.text("type", "hinge")
-        if kind not in ("hinge", "slide", "ball", "free"):
-            joint.refuse(f"is of type '{kind}', which does not exist")
+        bare = joint.tag == "freejoint"
+        kind = "free" if bare else joint.choice("type", "hinge", "slide", "ball", "free")
         if kind == "free" and parent >= 0:
             joint.refuse("is free, but its body is inside another body")
         turn = self.turn if kind == "hinge" else 1.0
         stiffness, rest, zero = (joint.number(each, 0) for each in ("stiffness", "springref", "ref"))
-        if joint.vector("springdamper", (0, 0), (2,)).any():
-            joint.refuse("has springdamper, which is not read: give its stiffness and damping")
+        if "spring" in self.disabled:
+            stiffness = 0.0
         if kind in ("ball", "free") and stiffness != 0:
             joint.refuse("has a stiffness, which is read for hinges and slides only")
-        if kind != "free" and joint.number("frictionloss", 0) != 0:
-            self.rough.append(name)
-        bare = joint.node.tag == "freejoint"
+        if joint.choice("actuatorgravcomp", "false", "true") == "true":
+            self.compensating.append(joint)
+        self.read_limits(joint, "joints", name)
+        damping = joint.number("damping", 0, 0)
         return Joint(
             name=name,
             kind=kind,
             pose=pose,
             axis=frame.rotation @ joint.unit("axis", (0, 0, 1)) if kind in SINGLE else np.zeros(3),
-            damping=0.0 if bare or "damper" in self.disabled else joint.number("damping", 0),
-            stiffness=0.0 if "spring" in self.disabled else stiffness,
+            damping=0.0 if "damper" in self.disabled else damping,
+            stiffness=stiffness,
             rest=rest * turn,
-            armature=0.0 if bare else joint.number("armature", 0),
+            armature=joint.number("armature", 0, 0),
             zero=zero * turn if kind in SINGLE else 0.0,
         )
 
-    def inertia(self, body: Element, inherited: str) -> Inertia:
+    def inertia(self, body: Element) -> Inertia:
         """Return the inertia of a body, by its inertial or, as ``inertiafromgeom`` says, by its geoms."""
-        rule = self.settings.get("inertiafromgeom", "auto")
-        inertial = body.child("inertial")
-        if rule == "false" or (rule == "auto" and inertial is not None):
-            return Inertia() if inertial is None else self.inertial(inertial)
+        rule = self.settings.choice("inertiafromgeom", "auto", "true", "false")
+        inertials = [*self.contents(body, "inertial")]
+        if len(inertials) > 1:
+            inertials[1][0].refuse("is the second of its body: one is allowed")
+        if rule == "false" or (rule == "auto" and inertials):
+            return self.inertial(inertials[0][0]).seen_from(inertials[0][1]) if inertials else Inertia()
         total = Inertia()
-        low, high = Element(self.root.file, self.root.node, self.settings).vector("inertiagrouprange", (0, 5), (2,))
-        for element, frame in self.contents(body, "geom"):
-            geom = self.with_defaults(element, inherited)
+        low, high = self.settings.vector("inertiagrouprange", (0, 5), (2,))
+        for geom, frame in self.contents(body, "geom"):
             if low <= geom.number("group", 0) <= high:
                 total += self.geom(geom).seen_from(frame)
         return total
 
     def inertial(self, inertial: Element) -> Inertia:
+        inertial.vector("pos")
         if inertial.has("fullinertia"):
+            if others := [key for key in ("diaginertia", *ORIENTATIONS) if inertial.has(key)]:
+                inertial.refuse(f"has fullinertia and {others[0]}: one is needed")
             xx, yy, zz, xy, xz, yz = inertial.vector("fullinertia", sizes=(6,))
             matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         else:
             matrix = np.diag(inertial.vector("diaginertia", (0, 0, 0)))
-        return Inertia(inertial.number("mass"), matrix=matrix).seen_from(self.pose(inertial))
+        return Inertia(inertial.number("mass", least=0), matrix=matrix).seen_from(self.pose(inertial))
 
     def geom(self, geom: Element) -> Inertia:
-        """Return the inertia of a geom."""
-        shape = geom.text("type", "mesh" if geom.has("mesh") and not geom.has("type") else "sphere")
-        if shape in WEIGHTLESS or (geom.has("mass") and geom.number("mass") == 0):
+        shape = geom.text("type", "mesh" if geom.has("mesh") else "sphere")
+        density, mass = geom.number("density", 1000, 0), geom.number("mass", np.nan, 0)
+        if shape in WEIGHTLESS or mass == 0:
             return Inertia()
-        if shape not in SHAPES or geom.has("shellinertia"):
+        if shape not in SHAPES or geom.has("mesh") or geom.choice("shellinertia", "false", "true") == "true":
             geom.refuse(f"is a {shape} whose inertia is not computed: give its body an <inertial>")
         count, volume_and_inertia = SHAPES[shape]
-        pose = self.pose(geom)
+        size = geom.vector("size", sizes=(1, 2, 3))
         if geom.has("fromto"):
             ends = geom.vector("fromto", sizes=(6,))
-            line = (ends[3:] - ends[:3]) / 2
-            half = float(np.linalg.norm(line))
-            if half == 0 or shape == "sphere":
-                geom.refuse("has fromto, which needs two different points and a shape with an axis")
-            pose = Pose((ends[:3] + ends[3:]) / 2, _shortest_turn(line / half))
-            radius = geom.vector("size", sizes=(1, 2, 3))[0]
-            size = np.array([radius] * (count - 1) + [half])
-        else:
-            size = geom.vector("size", sizes=range(count, 4))[:count]
-        volume, moments = volume_and_inertia(size)
-        mass = geom.number("mass") if geom.has("mass") else geom.number("density", 1000) * volume
-        return Inertia(mass, matrix=mass * np.diag(moments)).seen_from(pose)
+            if shape == "sphere":
+                geom.refuse("has fromto, which needs a shape with an axis")
+            size = np.array([size[0]] * (count - 1) + [float(np.linalg.norm(ends[3:] - ends[:3])) / 2])
+        if len(size) < count or (size[:count] <= 0).any():
+            geom.refuse(f"is a {shape} and has size='{geom.text('size')}': {count} numbers > 0 are needed")
+        volume, moments = volume_and_inertia(size[:count])
+        mass = density * volume if np.isnan(mass) else mass
+        return Inertia(mass, matrix=mass * np.diag(moments)).seen_from(self.pose(geom))
 
     def pose(self, element: Element) -> Pose:
-        """Return position and orientation of an element."""
-        return Pose(element.vector("pos", (0, 0, 0)), self.orientation(element))
+        if not element.has("fromto"):
+            return Pose(element.vector("pos", (0, 0, 0)), self.orientation(element))
+        if element.has("pos"):
+            element.refuse("has pos and fromto: one is needed")
+        ends = element.vector("fromto", sizes=(6,))
+        line = ends[:3] - ends[3:]
+        length = float(np.linalg.norm(line))
+        if length == 0:
+            element.refuse("has fromto, which needs two different points")
+        return Pose((ends[:3] + ends[3:]) / 2, _shortest_turn(line / length))
 
     def orientation(self, element: Element) -> Vector:
         """Return the rotation matrix of the one attribute of orientation that an element has."""
@@ -288,7 +352,7 @@ class _MujocoModel:
             return about(np.array(axis) / length, angle * self.turn)
         if kind == "euler":
             rotation = np.eye(3)
-            sequence = self.settings.get("eulerseq", "xyz")
+            sequence = self.settings.text("eulerseq", "xyz")
             if not re.fullmatch("[xyzXYZ]{3}", sequence):
                 element.refuse(f"has euler, and eulerseq='{sequence}' is not three of the letters xyzXYZ")
             for letter, angle in zip(sequence, element.vector("euler"), strict=True):
@@ -297,37 +361,108 @@ class _MujocoModel:
             return rotation
         if kind == "xyaxes":
             axes = element.vector("xyaxes", sizes=(6,))
-            x = axes[:3] / np.linalg.norm(axes[:3])
-            y = axes[3:] - (axes[3:] @ x) * x
-            y /= np.linalg.norm(y)
-            return np.column_stack([x, y, np.cross(x, y)])
+            z = np.cross(axes[:3], axes[3:])
+            if not z.any():
+                element.refuse(f"has xyaxes='{element.text('xyaxes')}', which must be two different directions")
+            x, z = axes[:3] / np.linalg.norm(axes[:3]), z / np.linalg.norm(z)
+            return np.column_stack([x, np.cross(z, x), z])
         return _shortest_turn(element.unit("zaxis")) if kind else np.eye(3)
 
     def scaled(self) -> list[Link]:
         """Return the links, with inertias scaled to ``settotalmass``."""
-        settings = Element(self.root.file, self.root.node, self.settings)
-        if changed := [each for each, usual in CHANGES.items() if settings.text(each, usual) != usual]:
-            settings.refuse(f"has {changed[0]}, which is not read: remove it and adapt the inertias")
-        total = settings.number("settotalmass", -1)
+        total = self.settings.number("settotalmass", -1)
         masses = sum(link.inertia.mass for link in self.links)
         if total <= 0 or masses == 0:
             return self.links
         return [replace(each, inertia=each.inertia.scaled(total / masses)) for each in self.links]
 
 
-def _sections(root: Element, depth: int) -> Iterator[Element]:
-    """Yield the sections of a document and of those that it includes, in place of nested elements, too."""
-    for node in root.node:
-        section = Element(root.file, node)
-        if node.tag != "include":
-            if next(node.iter("include"), None) is not None:
-                node[:] = [each.node for each in _sections(section, depth)]
-            yield section
-        elif depth == MOST_INCLUDED:
-            section.refuse(f"is nested deeper than {MOST_INCLUDED} files")
-        else:
-            file = Path(root.file).parent / section.text("file")
-            yield from _sections(root_of(file, "mujocoinclude", "mujoco"), depth + 1)
+def _merged(root: Element, tag: str, parts: list[Element]) -> Element:
+    """Return one element with the attributes of several, of which the later ones win."""
+    attributes = {key: value for part in parts for key, value in part.node.attrib.items()}
+    return Element(root.file, ElementTree.Element(tag, attributes))
+
+
+def _include(root: Element) -> None:
+    """Replace ``<include>`` by the contents of the file.
+
+    Its path is relative to the folder of the main document or, where it does not exist there, of the including one.
+    """
+    read, pending = {Path(root.file).resolve()}, [root]
+    while pending:
+        outer = pending.pop()
+        nodes, children = [], deque(outer.children())
+        while children:
+            child = children.popleft()
+            if child.tag != "include":
+                nodes.append(child)
+                continue
+            name = Path(child.text("file"))
+            if name.is_absolute() or set(child.node.attrib) != {"file"} or len(child.node):
+                child.refuse(f"must have only file, a path relative to the folder of the document: '{name}'")
+            folders = [Path(each).parent for each in (root.file, child.file)]
+            path = next((each / name for each in folders if (each / name).exists()), folders[0] / name)
+            if path.resolve() in read:
+                child.refuse(f"names '{name}', which is included already")
+            read.add(path.resolve())
+            included = root_of(path, "mujocoinclude", "mujoco")
+            root.files.update(dict.fromkeys(included.node, included.file))
+            children.extendleft(Element(included.file, node, root.files) for node in reversed(included.node))
+        if len(nodes) != len(outer.node) or any(a.node is not b for a, b in zip(nodes, outer.node, strict=True)):
+            outer.node[:] = [each.node for each in nodes]
+        pending += nodes
+
+
+def _apply_defaults(root: Element) -> None:
+    """Give elements the attributes of their class, or of the class of the bodies around them, and check them all."""
+    elements, classes = [*root.walk(MJCF)], _classes(root)
+    of_classes = {node for section in root.children("default") for node in section.node.iter()}
+    for element, kind in elements:
+        if element.node in of_classes:
+            continue
+        inherited = element.node.get("childclass", "")
+        for child in element.node if inherited else ():
+            if child.tag in ("body", "frame") or (child.tag in MJCF and MJCF[child.tag].defaults):
+                child.attrib.setdefault("class" if MJCF[child.tag].defaults else "childclass", inherited)
+        name = inherited or element.text("class", "main")
+        if name not in classes:
+            element.refuse(f"is of the class '{name}', which does not exist{closest(name, classes)}")
+        if kind.defaults:
+            element.node.attrib.update(_over(classes[name].get(kind.defaults, {}), element.node.attrib))
+        element.check_neutral(kind)
+
+
+def _classes(root: Element) -> dict[str, Defaults]:
+    """Return the default attributes of each class, which inherits those of the class around it."""
+    classes: dict[str, Defaults] = {"main": {}}
+    for section in root.children("default"):
+        if section.text("class", "main") != "main":
+            section.refuse("is an outermost one, whose class is 'main'")
+        pending = [(section, "main")]
+        while pending:
+            element, name = pending.pop()
+            for child in element.children():
+                kind = MJCF.get(MJCF["default"].children[child.tag])
+                if kind is not None and kind.defaults:
+                    if wrong := {"class", "name"} & {*child.node.attrib}:
+                        child.refuse(f"has {min(wrong)}, which defaults do not have")
+                    classes[name] |= {kind.defaults: _over(classes[name].get(kind.defaults, {}), child.node.attrib)}
+            for child in element.children("default"):
+                if child.text("class") in classes:
+                    child.refuse(f"is the second of the class '{child.text('class')}': one is allowed")
+                classes[child.text("class")] = dict(classes[name])
+                pending.append((child, child.text("class")))
+    return classes
+
+
+def _over(defaults: dict[str, str], own: dict[str, str]) -> dict[str, str]:
+    """Return attributes over their defaults: one orientation replaces another, and numbers of a size the first ones."""
+    turned = any(key in own for key in ORIENTATIONS)
+    merged = {key: value for key, value in defaults.items() if not (turned and key in ORIENTATIONS)} | own
+    if "size" in defaults and "size" in own:
+        sizes = own["size"].split()
+        merged["size"] = " ".join(sizes + defaults["size"].split()[len(sizes) :])
+    return merged
 
 
 def _of_quaternion(element: Element, q: Vector) -> Vector:

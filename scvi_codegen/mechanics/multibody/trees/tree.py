@@ -20,6 +20,9 @@ ROUNDED = 1e-9
 """Entries of rotation matrices that differ less from 0, 1 or -1 are these numbers."""
 LOST = 1e-15
 """Entries of turned vectors and matrices that are smaller, relative to the largest one, are rounding errors."""
+ROUGH, POINT = 0.05, 1e-6
+"""Tolerance of moments of inertia that were identified or printed with few digits, relative to the largest one and, for
+bodies that are nearly points, to the mass."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +126,27 @@ class Link:
     inertia: Inertia
 
 
+@dataclass(frozen=True, slots=True)
+class DrawnLink:
+    """Geometry of a link in plain numbers, for pictures: see :class:`Link` and :class:`Joint`."""
+
+    parent: int
+    name: str
+    kind: str
+    position: tuple[float, ...]
+    rotation: tuple[tuple[float, ...], ...]
+    center: tuple[float, ...]
+    zero: float
+    follows: tuple[str, float, float] | None
+
+    @classmethod
+    def of(cls, link: Link) -> DrawnLink:
+        """Return the geometry of a link whose frame is that of its formulas, :func:`aligned`."""
+        joint, rotation = link.joint, tuple(tuple(row) for row in link.joint.pose.rotation.tolist())
+        position, center = (tuple(each.tolist()) for each in (joint.pose.position, link.inertia.center))
+        return cls(link.parent, joint.name, joint.kind, position, rotation, center, joint.zero, joint.follows)
+
+
 def without_fixed(links: Sequence[Link]) -> list[Link]:
     """Return the links with those of fixed joints merged into their parents."""
     moving: list[Link] = []
@@ -136,16 +160,23 @@ def without_fixed(links: Sequence[Link]) -> list[Link]:
                 base = moving[carrier]
                 moving[carrier] = replace(base, inertia=base.inertia + link.inertia.seen_from(pose))
         else:
+            if link.joint.kind == "free" and carrier >= 0:
+                raise SystemDefinitionError(
+                    f"joint '{link.joint.name}' is free, but its parent moves: remove the joint"
+                )
             places.append((len(moving), Pose()))
             moving.append(replace(link, parent=carrier, joint=replace(link.joint, pose=pose)))
     if not moving:
-        raise SystemDefinitionError("all joints are fixed, so that nothing moves: floating=True frees the base")
+        raise SystemDefinitionError(
+            "no body has a joint that moves: add one, or free the base (from_urdf: floating=True, MJCF: <freejoint>)"
+        )
     for link in moving:
         mass, moments = link.inertia.mass, np.linalg.eigvalsh(link.inertia.matrix)
-        if moments[0] < -1e-9 * abs(moments).max() - 1e-12 * mass:  # rounded in files
+        excess, allowed = moments[2] - moments[1] - moments[0], ROUGH * moments[2] + POINT * mass
+        if moments[0] < -1e-9 * abs(moments).max() - 1e-12 * mass or excess > allowed:
             raise SystemDefinitionError(
                 f"link '{link.name}', with the links fixed to it, has the mass {mass:g} and the moments of inertia "
-                f"{moments}, which must not be < 0: correct its <inertial>"
+                f"{moments}, which no body has: none is < 0 or exceeds the sum of the others; correct its <inertial>"
             )
     return moving
 

@@ -1,17 +1,20 @@
 """Reader of URDF, the robot description format of ROS: links, inertials, joints.
 
-Meshes, collisions, transmissions, joint limits and dry friction are not read. Axes and angles are those of
-https://docs.ros.org/en/rolling/p/urdfdom: ``rpy`` are rotations about the fixed axes x, y, z, in this order.
+Axes and angles are those of https://docs.ros.org/en/rolling/p/urdfdom: ``rpy`` are rotations about the fixed axes x, y,
+z, in this order. :mod:`scvi_codegen.mechanics.multibody.trees.schema` lists the attributes that are read.
 """
 
 from os import PathLike
+from pathlib import Path
 
 import numpy as np
 
-from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.mechanics.multibody.trees.document import Element, root_of, warn_of_dry_friction
+from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.mechanics.multibody.trees.document import Element, Unread, root_of
+from scvi_codegen.mechanics.multibody.trees.schema import URDF
 from scvi_codegen.mechanics.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about
 
+LIMITED = ("revolute", "prismatic")
 KINDS = {"fixed": "fixed", "revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free"}
 """Kind of joint by URDF's name."""
 RIGHT_ANGLE = np.pi / 2
@@ -30,33 +33,52 @@ def links_of_urdf(path: str | PathLike[str], *, floating: bool) -> tuple[str, li
         SystemDefinitionError: naming file and element, if a link or joint is missing, named twice or malformed, the
             links are no tree, or a joint is of a kind that is not read.
     """
-    robot = root_of(path, "robot")
+    robot = root_of(Path(path), "robot")
+    for element, kind in robot.walk(URDF):
+        element.check_neutral(kind)
     links = _by_name(robot, "link")
     joints: dict[str, Element] = {}  # by the name of the child
+    outgoing: dict[str, list[str]] = {name: [] for name in links}
     for joint in _by_name(robot, "joint").values():
         ends = {end: _linked(joint, end) for end in ("parent", "child")}
         for name in ends.values():
             if name not in links:
-                joint.refuse(f"names the link '{name}', which does not exist")
+                joint.refuse(f"names the link '{name}', which does not exist{closest(name, links)}")
         if ends["child"] in joints:
             joint.refuse(f"moves the link '{ends['child']}', which joint '{joints[ends['child']].name}' moves as well")
         joints[ends["child"]] = joint
+        outgoing[ends["parent"]].append(ends["child"])
     roots = [name for name in links if name not in joints]
     if len(roots) != 1:
         raise SystemDefinitionError(f"{path}: the links must form one tree, but without parents are {roots or 'none'}")
     base = Joint(name=roots[0], kind="free" if floating else "fixed", pose=Pose())
     tree = [Link(roots[0], -1, base, _inertia(links[roots[0]]))]
-    order = [roots[0]]
-    for parent in order:
-        for child, joint in joints.items():
-            if _linked(joint, "parent") == parent:
-                tree.append(Link(child, order.index(parent), _joint(joint), _inertia(links[child])))
-                order.append(child)
+    places = {roots[0]: 0}
+    for parent in (order := [roots[0]]):
+        for child in outgoing[parent]:
+            tree.append(Link(child, places[parent], _joint(joints[child]), _inertia(links[child])))
+            places[child] = len(order)
+            order.append(child)
     if len(order) < len(links):
         raise SystemDefinitionError(f"{path}: the links {sorted(set(links) - set(order))} form a circle")
-    dynamics = {each.name: each.child("dynamics") for each in joints.values()}
-    warn_of_dry_friction(path, [name for name, each in dynamics.items() if each and each.number("friction", 0) != 0])
+    _unread(robot).warn(str(path))
     return robot.name, tree
+
+
+def _unread(robot: Element) -> Unread:
+    """Return the parts of a document that matter and are not read."""
+    unread = Unread()
+    for joint in robot.children("joint"):
+        limit, dynamics = joint.child("limit"), joint.child("dynamics")
+        if limit and (limit.number("lower", 0) or limit.number("upper", 0)) and joint.text("type") in LIMITED:
+            unread.add("limits of joints", joint.name)
+        if dynamics and dynamics.number("friction", 0, 0):
+            unread.add("dry friction of joints", joint.name)
+    if any(link.child("collision") for link in robot.children("link")):
+        unread.add("contacts")
+    for actuator in robot.children("transmission", "ros2_control"):
+        unread.add("actuators", actuator.name)
+    return unread
 
 
 def _by_name(robot: Element, tag: str) -> dict[str, Element]:
@@ -81,15 +103,18 @@ def _joint(joint: Element) -> Joint:
     if kind not in KINDS:
         joint.refuse(f"is of type '{kind}', which is not read; possible: {', '.join(KINDS)}")
     axis, dynamics, mimic = (joint.child(each) for each in ("axis", "dynamics", "mimic"))
+    single = KINDS[kind] in SINGLE
     follows = None
-    if mimic is not None:
+    if mimic is not None and kind != "fixed":
+        if not single:
+            joint.refuse(f"is of type '{kind}', which cannot mimic another joint")
         follows = (mimic.text("joint"), mimic.number("multiplier", 1), mimic.number("offset", 0))
     return Joint(
         name=joint.name,
         kind=KINDS[kind],
         pose=_pose(joint),
-        axis=axis.unit("xyz", (1, 0, 0)) if axis is not None and KINDS[kind] in SINGLE else np.array([1.0, 0.0, 0.0]),
-        damping=0.0 if dynamics is None else dynamics.number("damping", 0),
+        axis=axis.unit("xyz", (1, 0, 0)) if axis is not None and single else np.array([1.0, 0.0, 0.0]),
+        damping=0.0 if dynamics is None else dynamics.number("damping", 0, 0),
         follows=follows,
     )
 
@@ -99,14 +124,11 @@ def _inertia(link: Element) -> Inertia:
     if inertial is None:
         return Inertia()
     mass, inertia = inertial.child("mass"), inertial.child("inertia")
-    xx, xy, xz, yy, yz, zz = (
-        0.0 if inertia is None else inertia.number(f"i{each}", 0) for each in ("xx", "xy", "xz", "yy", "yz", "zz")
-    )
+    if mass is None or inertia is None:
+        link.refuse("has an <inertial>, which needs <mass> and <inertia>")
+    xx, xy, xz, yy, yz, zz = (inertia.number(f"i{each}") for each in ("xx", "xy", "xz", "yy", "yz", "zz"))
     matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    value = 0.0 if mass is None else mass.number("value")
-    if value < 0:
-        link.refuse(f"has the mass {value:g}, which must not be < 0")
-    return Inertia(value, matrix=matrix).seen_from(_pose(inertial))
+    return Inertia(mass.number("value", least=0), matrix=matrix).seen_from(_pose(inertial))
 
 
 def _pose(element: Element) -> Pose:

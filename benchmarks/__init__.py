@@ -1,0 +1,148 @@
+"""Benchmark: this package and other integrators, compared at equal error.
+
+    cases/       systems with their initial states and spans: unforced, forced, adaptive, rotations, robots, fields,
+                 large array systems; accelerations derived by hand, and final states in extended precision,
+                 independent of the package's steppers (references)
+    contenders/  functions from a case and a step size or tolerance to its final state: steppers of this package; peers:
+                 heyoka (taylor), REBOUND, CyRK, SciPy (peers), MuJoCo, Pinocchio, Exudyn (engines), OpenMM (arrays),
+                 PyDy (mechanisms), py-pde and spectral methods by hand (pdes)
+    comparison   timing of all contenders of a case in turn, in one process
+    sections     which contenders and which reference belong to a case
+    report       time at equal error, by interpolation; tables and JSON of results; plots: their pictures
+    tables       energy drift, time from text to the first step
+    machine      description of the machine
+    settings     settings of a benchmark; processor times of functions
+
+The rules: medians of alternating rounds; stepping time only, compile time apart; every peer with the best options and
+the best formulation known to us, which are named; whole work-precision curves, no step or tolerance tuned afterwards.
+"""
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+from benchmarks.cases.unforced import CASES
+from benchmarks.comparison import run_race
+from benchmarks.contenders.peers import PEERS
+from benchmarks.machine import machine
+from benchmarks.report import LEGEND, CaseResult, ResultTable, header_lines
+from benchmarks.sections import BUILDERS
+from benchmarks.settings import Plan, ReportActivity
+from benchmarks.tables import run_drift, run_first_steps
+from scvi_codegen.errors import ScviCodegenError, StateError, closest
+from scvi_codegen.files.atomic import write_text
+
+__all__ = ["CASES", "PEERS", "SCHEMA", "SECTIONS", "Plan", "Report", "benchmark"]
+
+SCHEMA = 2
+"""Version of the JSON document."""
+
+SECTIONS: Mapping[str, Callable[[Plan, ReportActivity], CaseResult | ResultTable]] = {
+    **{name: partial(run_race, build) for name, build in BUILDERS.items()},
+    "drift": run_drift,
+    "first-step": run_first_steps,
+}
+"""Sections of the benchmark: name on the command line -> function that measures it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Report:
+    """Results of a benchmark.
+
+    Attributes:
+        machine: description of the machine.
+        results: results in the order of measurement.
+        interrupted: name of the section that Ctrl-C ended, or ``""``.
+    """
+
+    machine: Mapping[str, Any]
+    results: tuple[CaseResult | ResultTable, ...]
+    interrupted: str = ""
+
+    @property
+    def cases(self) -> list[CaseResult]:
+        """Results that are work-precision curves."""
+        return [result for result in self.results if isinstance(result, CaseResult)]
+
+    def text(self) -> str:
+        """Return all tables as text."""
+        legend = [LEGEND] if self.cases else []
+        return "\n\n".join([header_lines(self.machine), *(result.text() for result in self.results), *legend])
+
+    def data(self) -> dict[str, Any]:
+        """Return all tables and measurements as data for ``json.dump``."""
+        return {
+            "schema": SCHEMA,
+            "machine": dict(self.machine),
+            "cases": [result.data() for result in self.cases],
+            "tables": [result.data() for result in self.results if isinstance(result, ResultTable)],
+            "interrupted": self.interrupted,
+        }
+
+
+def benchmark(
+    names: Sequence[str] = (),
+    plan: Plan | None = None,
+    *,
+    json_path: str | None = None,
+    plot_path: str | None = None,
+    report_activity: ReportActivity = lambda text: None,
+    show: ReportActivity = lambda text: None,
+) -> Report:
+    """Measure sections in turn; a section that fails is reported, Ctrl-C ends the benchmark with its results so far.
+
+    Args:
+        names: names of sections, by default all; ``kepler`` means ``kepler:0.2`` and ``kepler:0.5``.
+        plan: settings of the measurement.
+        json_path: file to write, after each section.
+        plot_path: file of the plot.
+        report_activity: called with a description of each activity.
+        show: called with the text of the report, section by section.
+
+    Raises:
+        StateError: for an unknown section.
+    """
+    sections = tuple(section for name in names for section in _sections(name))
+    if plot_path is not None:
+        from scvi_codegen.pictures.canvas import check_plot_path
+
+        check_plot_path(plot_path)
+    for report in _reports(tuple(dict.fromkeys(sections or SECTIONS)), plan or Plan(), report_activity, show):
+        if json_path is not None:
+            write_text(json_path, json.dumps(report.data(), indent=1, allow_nan=False) + "\n")
+    if plot_path is not None and report.cases:
+        from benchmarks.plots import plot_curves
+
+        plot_curves(report.cases, plot_path)
+    return report
+
+
+def _sections(name: str) -> tuple[str, ...]:
+    """Return the section of that name, or all whose names begin with it and a colon."""
+    names = (name,) if name in SECTIONS else tuple(each for each in SECTIONS if each.startswith(f"{name}:"))
+    if not names:
+        raise StateError(f"there is no section '{name}'{closest(name, SECTIONS)} Known: {', '.join(SECTIONS)}")
+    return names
+
+
+def _reports(
+    names: Sequence[str], plan: Plan, report_activity: ReportActivity, show: ReportActivity
+) -> Iterator[Report]:
+    """Yield the report after each section; its text is shown as it grows."""
+    report = Report(machine=machine(), results=())
+    show(header_lines(report.machine))
+    for name in names:
+        try:
+            result = SECTIONS[name](plan, report_activity)
+        except KeyboardInterrupt:
+            yield replace(report, interrupted=name)
+            break
+        except ScviCodegenError as error:
+            result = ResultTable(name=name, title=f"failed: {error}", columns={}, rows=())
+        report = replace(report, results=(*report.results, result))
+        show(f"\n{result.text()}")
+        yield report
+    if report.cases:
+        show(f"\n{LEGEND}")

@@ -1,0 +1,193 @@
+"""Contender: one integrator at one setting, ready to be timed.
+
+Steppers of this package at the step sizes that :func:`scvi_codegen.advise` recommends for a list of tolerances.
+"""
+
+import itertools
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any, cast
+
+import numpy as np
+
+from benchmarks.cases.unforced import Array, Case
+from benchmarks.report import OURS, Contender
+from benchmarks.settings import set_variable
+from scvi_codegen.advice.advice import advise
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import StateError
+from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.methods.method import Method
+from scvi_codegen.native import building
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.rotations.states import homogeneous_state, members_of
+
+TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-8, 1e-9, 1e-10, 3e-11, 1e-11, 3e-12, 1e-12, 5e-13, 3e-13, 2e-13, 1e-13)
+"""Tolerances for which a step size is recommended; the errors reached are measured."""
+
+QUICK_TOLERANCES = (1e-8, 1e-10, 1e-12)
+ADAPTIVE_TOLERANCES = (None, 1e-15, 1e-14, 1e-13, 1e-12, 1e-10, 1e-8)
+FIXED = tuple(2.0 ** (k / 2) for k in range(-2, 9))
+"""Fixed steps, as multiples of the number of adaptive steps."""
+LARGEST_NEWTON = 18
+"""Largest number of degrees of freedom for which Newton's method is used; beyond, its larger steps take seconds
+each."""
+
+_builds = itertools.count()
+
+
+def our_contenders(case: Case, *, methods: Iterable[Method] = (), quick: bool = False) -> list[Contender]:
+    """Return contenders for every method at every recommended step size.
+
+    Args:
+        case: case to integrate.
+        methods: by default SVI(8).
+        quick: use few tolerances.
+    """
+    result = []
+    for method in methods or (SVI(8),):
+        stepper, seconds = compiled(case.system, method)
+        momenta = momenta_of(stepper, case)
+        options = f"{stepper.title}, solver auto, {' '.join(stepper.flags)}"
+        for count, setting in _settings(case, method, momenta, quick).items():
+            prepare = partial(_fixed, stepper, case, momenta, count)
+            result.append(Contender(f"{OURS} {method.name}", setting, options, seconds, prepare, momenta))
+    return result
+
+
+def fixed_contenders(case: Case, counts: Mapping[str | Method, Iterable[int]]) -> list[Contender]:
+    """Return contenders by several methods with numbers of steps."""
+    result = []
+    for method, numbers in counts.items():
+        stepper, seconds = compiled(case.system, method)
+        momenta = momenta_of(stepper, case) if case.arrays is None and not case.system.constraints else None
+        for steps in numbers:
+            prepare, name = partial(_fixed, stepper, case, momenta, steps), getattr(method, "name", method)
+            setting, starts = f"h={case.span / steps:.4g}", len(case.q)
+            result.append(Contender(f"{OURS} {name}", setting, "", seconds, prepare, momenta, starts=starts))
+    return result
+
+
+def _fixed(stepper: Any, case: Case, momenta: Array | None, steps: int, index: int) -> Callable[[], Array]:
+    shape = (-1,) if case.arrays is None else case.arrays.shape
+    q, velocity = (part[index].reshape(shape) for part in case.states)
+    how = {"velocity": velocity} if momenta is None else {"p": momenta[index]}
+    run = stepper.start(q, **how, h=case.span / steps)
+
+    def integrate() -> Array:
+        run.advance(steps)
+        return np.array(run.q, dtype=float).ravel()
+
+    return integrate
+
+
+def run_contenders(case: Case, counts: Mapping[str | Method, Iterable[int]]) -> list[Contender]:
+    """Return contenders that advance one run for each state of a case in turn, started beforehand."""
+
+    def prepare(contender: Contender, _: int) -> Callable[[], Array]:
+        integrations = [contender.prepare(k) for k in range(len(case.q))]
+        return lambda: np.array([integrate() for integrate in integrations])
+
+    made = fixed_contenders(case, counts)
+    return [
+        replace(each, method=f"{OURS} runs", prepare=partial(prepare, each), starts=1, trajectories=len(case.q))
+        for each in made
+    ]
+
+
+def our_ensembles(case: Case, *, quick: bool = False) -> list[Contender]:
+    """Return contenders by SVI(8) with all states of the case as one ensemble, in one thread."""
+    stepper, seconds = compiled(case.system, SVI(8))
+    momenta = momenta_of(stepper, case)
+    began = time.perf_counter()
+    stepper.integrate_ensemble(case.q, momenta, h=case.step, steps=1, threads=1)  # compiled on first use
+    seconds += time.perf_counter() - began
+    options, size = f"{stepper.title}, one thread", len(case.q)
+    result = []
+    for count, setting in _settings(case, SVI(8), momenta, quick).items():
+        prepare = partial(_prepared_ensemble, stepper, case, momenta, count)
+        result.append(Contender(f"{OURS} ensemble", setting, options, seconds, prepare, momenta, size))
+    return result
+
+
+def _settings(case: Case, method: Method, momenta: Array, quick: bool) -> dict[int, str]:
+    """Return the recommended step sizes by number of steps, as text."""
+    counts = advised_counts(case, method, momenta[0], quick=quick)
+    return {count: f"h={case.span / count:.4g} for {tolerance:.0e}" for count, tolerance in counts.items()}
+
+
+def advised_counts(case: Case, method: Method, momentum: Array, *, quick: bool) -> dict[int, float]:
+    """Return numbers of steps that fill the span -> the tolerance for which each is recommended, at the first state."""
+    counts: dict[int, float] = {}
+    solver = "auto" if case.dimension <= LARGEST_NEWTON or case.system.constraints else "fixed-point"
+    for tolerance in QUICK_TOLERANCES if quick else TOLERANCES:
+        try:
+            advice = advise(case.system, method, case.q[0], momentum, case.span, tolerance, solver=solver)
+        except StateError:  # no step size is known to be small enough
+            continue
+        counts.setdefault(advice.steps, tolerance)
+    return counts
+
+
+def compiled(system: Any, method: str | Method, solver: str = "auto") -> tuple[Any, float]:
+    """Return the stepper, and the seconds to compile it with an empty cache and a new name."""
+    with (
+        tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder,
+        set_variable(building.CACHE_VARIABLE, folder),
+    ):
+        began = time.perf_counter()
+        stepper = compile_stepper(system, method, solver=solver, prefix=f"bench_{next(_builds)}")
+        return stepper, time.perf_counter() - began
+
+
+def momenta_of(stepper: Stepper, case: Case) -> Array:
+    """Return (k, m) initial momenta, of rotations those of their quaternions."""
+    members = members_of(stepper.dimension, stepper.interface.rotations)
+    ordinary = stepper.dimension - 4 * len(members)
+    q, velocity = ({name: part[:, k] for k, name in enumerate(stepper.coordinates[:ordinary])} for part in case.states)
+    for k, member in enumerate(members):
+        q[member.name] = case.q[:, member.columns]
+        velocity[member.rate] = case.velocity[:, ordinary + 3 * k : ordinary + 3 * k + 3]
+    positions, _, velocities = homogeneous_state(stepper.interface, q, None, velocity)
+    return stepper.momentum(positions, velocities) if members else stepper.momentum(*case.states)
+
+
+def _prepared_ensemble(stepper: Stepper, case: Case, momenta: Array, count: int, _: int) -> Callable[[], Array]:
+    arguments: dict[str, Any] = {"h": case.span / count, "steps": count, "save_every": count, "threads": 1}
+    return lambda: cast("Array", stepper.integrate_ensemble(case.q, momenta, **arguments).q[-1])
+
+
+def adaptive_contenders(case: Case, *, quick: bool) -> list[Contender]:
+    """Return contenders by SVI(8) with adaptive step size at several tolerances, and with fixed steps beside them."""
+    stepper, seconds = compiled(case.system, SVI(8))
+    momenta = momenta_of(stepper, case)
+    adaptive = stepper.integrate(case.q[0], momenta[0], t_end=case.span, check_growth=False).steps
+    counts = [max(1, round(adaptive * factor)) for factor in FIXED[: 1 if quick else None]]
+
+    def prepare(tolerance: float | None, index: int) -> Callable[[], Array]:
+        run = stepper.start(case.q[index], momenta[index], t_end=case.span, tolerance=tolerance)
+
+        def integrate() -> Array:
+            """Integrate and return the final state alone, as heyoka's propagate_until."""
+            run._run_to_target()
+            end: Array = run.q
+            return end
+
+        return integrate
+
+    controlled = [
+        Contender(
+            method=f"{OURS} adaptive",
+            setting=f"tol={tolerance:.0e}" if tolerance else "tol=default",
+            options=f"{stepper.title}, {' '.join(stepper.flags)}",
+            compile_seconds=seconds,
+            prepare=partial(prepare, tolerance),
+            momenta=momenta,
+        )
+        for tolerance in ADAPTIVE_TOLERANCES[: 2 if quick else None]
+    ]
+    fixed = (replace(each, method=f"{OURS} fixed") for each in fixed_contenders(case, {SVI(8): counts}))
+    return [*controlled, *fixed]

@@ -1,0 +1,170 @@
+"""Elements and attributes of MJCF and URDF: which are read, which are ignored, and which are refused.
+
+https://mujoco.readthedocs.io/en/stable/XMLreference.html and https://docs.ros.org/en/rolling/p/urdfdom. Attributes that
+are read are those of the motion, and those of parts that are reported as missing in it (limits, friction, contacts,
+actuators). Attributes that are ignored do not change the motion.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+
+class Kind:
+    """Attributes and children of an element.
+
+    Args:
+        read: names of the attributes that are read.
+        ignored: names of those without effect on the motion.
+        refused: neutral values (several words are alternatives) of attributes that are not read and change the motion.
+        children: tags of the children. ``tag*`` may be repeated, ``tag=kind`` is of another kind than its tag;
+            ``tag~`` is not checked, nor what it contains, ``tag!`` is refused; both may be repeated.
+        defaults: name of the defaults of its attributes.
+    """
+
+    def __init__(
+        self,
+        read: str = "",
+        ignored: str = "",
+        refused: Mapping[str, str] | None = None,
+        children: str = "",
+        defaults: str = "",
+    ) -> None:
+        self.refused, self.defaults = refused or {}, defaults
+        self.attributes = {*read.split(), *ignored.split(), *self.refused}
+        parsed = [re.fullmatch(r"(\w+)(?:=(\w+))?([*~!]?)", each).groups() for each in children.split()]  # type: ignore[union-attr]
+        self.children = {tag: {"~": "unchecked", "!": "refused"}.get(mark, kind or tag) for tag, kind, mark in parsed}
+        self.repeated = {tag for tag, _, mark in parsed if mark}
+
+
+TURN = "quat axisangle euler xyaxes zaxis"
+"""Attributes of orientation."""
+SOFTNESS = "solref solimp"
+SENSELESS = "group user margin solreflimit solimplimit solreffriction solimpfriction"
+"""Attributes of joints and tendons without effect on the motion without limits and friction."""
+BODIES = "body* frame* geom* site* camera~ light~ attach! replicate! composite! flexcomp! plugin!"
+JOINTS = "inertial joint* freejoint"
+TENDON = Kind(
+    "name class limited range frictionloss",
+    f"{SENSELESS} springlength springyield width material rgba actuatorfrcrange actuatorfrclimited",
+    {"stiffness": "0", "damping": "0", "armature": "0"},
+    "joint~ site~ geom~ pulley~",
+    "tendon",
+)
+EQUALITY = Kind("name class active", f"{SOFTNESS} tendon1 tendon2 polycoef flex cell", defaults="equality")
+ACTUATORS = "general motor position velocity intvelocity orientation pid damper cylinder muscle adhesion dcmotor plugin"
+
+MJCF = {
+    "mujoco": Kind(
+        "model",
+        children="compiler* option* default* worldbody* deformable* equality* tendon* actuator* contact* asset~ "
+        "custom~ extension~ keyframe~ sensor~ size~ statistic~ visual~",
+    ),
+    "compiler": Kind(
+        "angle eulerseq autolimits inertiafromgeom inertiagrouprange settotalmass",
+        "assetdir conflict convexhull discardvisual exactmeshinertia fitaabb fusestatic meshdir passthrough "
+        "savecanonical savecompiled saveinertial strippath texturedir usethread",
+        {"alignfree": "false", "balanceinertia": "false", "boundinertia": "0", "boundmass": "0", "coordinate": "local"},
+        "lengthrange~",
+    ),
+    "option": Kind(
+        "gravity",
+        "actuatorgroupdisable apirate ccd_iterations ccd_tolerance collision cone impratio integrator iterations "
+        "jacobian ls_iterations ls_tolerance magnetic mpr_iterations mpr_tolerance noslip_iterations noslip_tolerance "
+        "o_friction o_margin o_solimp o_solref sdf_initpoints sdf_iterations sleep_tolerance solver timestep tolerance "
+        "wind",
+        {"density": "0", "viscosity": "0"},
+        "flag",
+    ),
+    "flag": Kind(
+        "constraint contact damper equality filterparent frictionloss gravity limit spring",
+        "actuation autoreset clampctrl diagexact energy eulerdamp fwdinv invdiscrete ipc island midphase multiccd "
+        "nativeccd override refsafe sensor sensornoise sleep speculative warmstart",
+        {"passive": "enable"},
+    ),
+    "default": Kind(
+        "class",
+        children="default* joint geom site equality=any_equality tendon=spatial mesh~ texture~ material~ "
+        f"camera~ light~ pair~ {' '.join(f'{each}=actuated' for each in ACTUATORS.split())}",
+    ),
+    "worldbody": Kind(children=BODIES),
+    "body": Kind(f"name childclass pos {TURN} gravcomp mocap", "fuse simple sleep user", None, f"{BODIES} {JOINTS}"),
+    "frame": Kind(f"name childclass pos {TURN}", "", None, f"{BODIES} {JOINTS}"),
+    "inertial": Kind(f"pos {TURN} mass diaginertia fullinertia"),
+    "joint": Kind(
+        "name class type pos axis ref stiffness springref damping armature frictionloss limited range actuatorgravcomp",
+        f"{SENSELESS} actuatorfrcrange actuatorfrclimited",
+        {"springdamper": "0", "springyield": "0"},
+        defaults="joint",
+    ),
+    "freejoint": Kind("name", "group", {"align": "false auto"}),
+    "geom": Kind(
+        f"name class type pos {TURN} fromto size mass density shellinertia mesh group contype conaffinity",
+        "adhesion castshadow condim fitscale fluidcoef fluidshape friction gap hfield margin material priority rgba "
+        "solimp solmix solref surfacevel user",
+        None,
+        "plugin!",
+        "geom",
+    ),
+    "site": Kind(f"name class type pos {TURN} fromto size", "group material mesh rgba user", defaults="site"),
+    "deformable": Kind(children="flex! skin~"),
+    "equality": Kind(
+        children="connect* weld* joint=coupling* tendon=any_equality* flex=any_equality* flexstrain=any_equality* "
+        "flexvert=any_equality*"
+    ),
+    "any_equality": EQUALITY,
+    "connect": Kind("name class active body1 body2 anchor site1 site2", SOFTNESS, defaults="equality"),
+    "weld": Kind(
+        "name class active body1 body2 relpose site1 site2 torquescale", f"{SOFTNESS} anchor", defaults="equality"
+    ),
+    "coupling": Kind("name class active joint1 joint2 polycoef", SOFTNESS, defaults="equality"),
+    "tendon": Kind(children="spatial* fixed*"),
+    "spatial": TENDON,
+    "fixed": TENDON,
+    "actuator": Kind(children=" ".join(f"{each}=actuated*" for each in ACTUATORS.split())),
+    "actuated": Kind(
+        "name class joint jointinparent gear armature damping",
+        "actdim actearly actlimited actrange area bias biasprm biastype body cogging controller cranklength cranksite "
+        "ctrllimited ctrlrange dampratio delay diameter dynprm dyntype ffrange force forcelimited forcerange fpmax "
+        "fvmax gain gainprm gaintype group imax inductance inheritrange input instance interp ki kp kv lengthrange "
+        "lmax lmin lugre motorconst nominal nsample plugin posrange range refsite resistance saturation scale site "
+        "slewmax slidersite tausmooth tendon thermal timeconst user velrange vmax",
+        None,
+        "config~",
+        "actuator",
+    ),
+    "contact": Kind(children="pair~ exclude~"),
+}
+"""Kinds of elements of MJCF, by tag or by the name that their parent calls them."""
+
+URDF = {
+    "robot": Kind(
+        "name", "version", None, "link* joint* transmission~ ros2_control~ material~ gazebo~ sensor~ mujoco~ group~"
+    ),
+    "link": Kind(
+        "name",
+        "type",
+        None,
+        "inertial collision~ visual~ contact~ collision_checking~ gravity~ kinematic~ self_collision_checking~ "
+        "self_filter~ surface~",
+    ),
+    "inertial": Kind(children="origin mass inertia"),
+    "mass": Kind("value"),
+    "inertia": Kind("ixx ixy ixz iyy iyz izz"),
+    "origin": Kind("xyz rpy", "", {"quat_xyzw": "none"}),
+    "joint": Kind(
+        "name type",
+        "dont_collapse",
+        None,
+        "parent child origin axis dynamics limit mimic joint_properties calibration~ safety_controller~",
+    ),
+    "parent": Kind("link"),
+    "child": Kind("link"),
+    "axis": Kind("xyz", "", {"rpy": "0"}),
+    "dynamics": Kind("damping friction", "D K mu_coulomb mu_viscous"),
+    "joint_properties": Kind(refused={"damping": "0", "friction": "0"}),
+    "limit": Kind("lower upper", "effort velocity acceleration deceleration jerk command_effort current gear_velocity"),
+    "mimic": Kind("joint multiplier offset"),
+}
+"""Kinds of elements of URDF, by tag."""

@@ -1,0 +1,94 @@
+"""The adaptive cases of the benchmark: their equations, their references, all modes of this project, the pictures."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import benchmarks as bench
+from benchmarks.cases import references
+from benchmarks.cases.adaptive import ADAPTIVE_CASES, adaptive_case
+from benchmarks.cases.references import equal_steps, field_of, reference, states_after
+from benchmarks.contenders.ours import adaptive_contenders
+from scvi_codegen.errors import StateError
+from scvi_codegen.native import building
+
+needs_extended = pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="long double is no wider than double")
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "adaptive-cache"))
+
+
+def test_every_case_has_eight_states_of_one_energy_scale():
+    for name in ADAPTIVE_CASES:
+        chosen = adaptive_case(name)
+        assert chosen.name == f"adaptive:{name}"
+        assert chosen.q.shape == chosen.velocity.shape == (8, chosen.dimension)
+
+
+@pytest.mark.sampled(1)
+@needs_extended
+@pytest.mark.parametrize("e", [0.0, 0.9, 0.999])
+def test_keplers_reference_returns_after_a_period(e):
+    chosen = replace(adaptive_case(f"kepler:{e}"), span=2.0 * np.pi)
+    found = reference(chosen)
+    assert np.abs(found.positions - chosen.q).max() < 1e-14 / (1.0 - e)  # the period of rounded states
+    assert found.accuracy < 1e-15
+
+
+@pytest.mark.full
+@needs_extended
+def test_references_on_selected_steps_equal_those_on_uniform_steps():
+    chosen = replace(adaptive_case("double-pendulum"), span=3.0)
+    found = reference(chosen)
+    assert found.accuracy < 1e-17
+    start = np.concatenate([chosen.q, chosen.velocity], axis=1).astype(np.longdouble)
+    equal = states_after(field_of(chosen), start, equal_steps(chosen.span, 1.0 / 64.0))
+    assert np.abs(equal[:, :2] - found.positions).max() < 1e-17
+    split = states_after(field_of(chosen), start, np.longdouble([0.0625, 0.03125, 0.03125] + 46 * [0.0625]))
+    assert np.abs(split - equal).max() < 1e-12
+
+
+def test_steps_of_a_reference_are_the_shortest_of_its_runs():
+    runs = np.array([0.0, 1.0, 1.5, 2.0, 4.0]), np.array([0.0, 0.75, 2.75, 4.0])
+    steps = references._shortest(runs)
+    assert np.array_equal(steps, [0.75, 1.0, 0.5, 1.75])
+    third = references._shortest([np.linspace(0.0, 4.0, 4), np.linspace(0.0, 4.0, 3)])
+    assert third.sum() == 4.0
+
+
+def test_reference_uses_smaller_steps_where_large_ones_fail(monkeypatch):
+    asked = []
+
+    def states_after(field, start, steps):
+        asked.append(float(steps[0]))
+        if steps[0] > 0.3:
+            raise StateError("no")
+        return start
+
+    monkeypatch.setattr(references, "states_after", states_after)
+    references._with_two_steps(lambda x: x, np.zeros((1, 2)), np.ones(3, dtype=np.longdouble))
+    assert asked == [1.0, 0.5, 0.25, 0.125]
+    with pytest.raises(StateError):
+        references._with_two_steps(lambda x: x, np.zeros((1, 2)), np.full(3, 9.0))
+
+
+@needs_extended
+def test_all_modes_run_and_agree():
+    chosen = replace(adaptive_case("kepler:0.5"), span=20.0)
+    made = adaptive_contenders(chosen, quick=False)
+    assert {each.method.split()[1] for each in made} == {"adaptive", "fixed"}
+    exact = reference(chosen)
+    tight = [each for each in made if each.setting == "tol=default"]
+    for each in tight:
+        assert np.abs(each.prepare(3)() - exact.positions[3]).max() < 1e-12
+    assert all(f"adaptive:{name}" in bench.SECTIONS for name in ADAPTIVE_CASES)
+
+
+@pytest.mark.full
+def test_the_reference_of_the_pythagorean_problem_passes_its_encounters():
+    chosen = adaptive_case("pythagorean")
+    one = replace(chosen, q=chosen.q[:1], velocity=chosen.velocity[:1])
+    assert reference(one).accuracy < 1e-4

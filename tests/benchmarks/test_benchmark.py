@@ -1,0 +1,490 @@
+"""The benchmark's own arithmetic: references against closed forms, equal error, ratios. No peer is needed."""
+
+import json
+import math
+import re
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import sympy
+from click.testing import CliRunner
+from mpmath import mp
+
+import benchmarks as bench
+from benchmarks import __main__ as command
+from benchmarks import comparison, report, tables
+from benchmarks.cases import unforced
+from benchmarks.cases.adaptive import adaptive_case
+from benchmarks.cases.forced import driven_pendulum
+from benchmarks.cases.references import Reference, equal_steps, gauss_tables, reference, rms_error, states_after
+from benchmarks.contenders import ours, peers
+from benchmarks.contenders.ours import our_ensembles
+from benchmarks.contenders.tracing import rates_text
+from benchmarks.report import FLOOR, Contender, Point, ResultTable, common_error, frontier, time_at
+from benchmarks.tables import drift_row, fitted_rate
+from scvi_codegen.errors import StateError, SystemDefinitionError
+from scvi_codegen.methods import SVI
+from scvi_codegen.native import building
+
+ROOT = Path(bench.__file__).parents[1]
+EXTENDED = np.finfo(np.longdouble).eps < 1e-18
+needs_extended = pytest.mark.skipif(not EXTENDED, reason="long double is no wider than double here")
+
+
+def points(*pairs):
+    return [Point(seconds=seconds, error=error) for seconds, error in pairs]
+
+
+def short(name, span):
+    return replace(unforced.case(name), span=span)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(autouse=True)
+def own_cache(folder, monkeypatch):
+    monkeypatch.setenv(building.CACHE_VARIABLE, str(folder))
+
+
+MOVED = (
+    {name: partial(unforced.case, name) for name in sorted(unforced.CASES.keys() - {"fput-chain:64", "fput-chain:256"})}
+    | {"forced:double-pendulum": driven_pendulum}
+    | {name: partial(adaptive_case, name) for name in ("comet", "pythagorean")}
+)
+"""Systems with accelerations solved by hand."""
+
+
+class TestCases:
+    @pytest.mark.sampled(4)
+    @pytest.mark.parametrize("name", MOVED)
+    def test_hand_solved_accelerations_are_those_of_the_equations_of_motion(self, name):
+        """d/dt L_v = L_q + f at a random state and time."""
+        chosen = MOVED[name]()
+        system, t = chosen.system, mp.mpf(0.7)
+        x = [mp.mpf(int(value)) / 1000 for value in np.random.default_rng(3).integers(100, 600, 2 * chosen.dimension)]
+        functions = SimpleNamespace(sin=mp.sin, cos=mp.cos, sqrt=mp.sqrt, time=t)
+        accelerations = chosen.formulations[0].rates(x, chosen.parameters, functions)[chosen.dimension :]
+        arguments = [*system.coordinates, *system.velocities, system.time, *system.parameters]
+        momenta = sympy.Matrix([system.lagrangian]).jacobian(system.velocities)
+        forces = sympy.Matrix([system.lagrangian]).jacobian(system.coordinates)
+        forces += sympy.Matrix([system.forces or [0] * chosen.dimension])
+        rest = momenta.jacobian(system.coordinates) * sympy.Matrix(system.velocities) + momenta.diff(system.time).T
+        terms = sympy.lambdify(arguments, [momenta.jacobian(system.velocities), rest, forces.T], "mpmath", cse=True)
+        masses, others, forces = terms(*x, t, *system.defaults)
+        assert mp.norm(masses * mp.matrix(accelerations) + others - forces) < 1e-12 * (1 + mp.norm(forces))
+        assert any(force != 0 for force in system.forces) == name.startswith("forced")
+
+    def test_the_formulation_in_momenta_agrees_with_the_one_in_velocities(self):
+        chosen = unforced.case("relativistic-particle")
+        plain, momenta = chosen.formulations
+        q, v = 0.3, 0.6
+        p = v / math.sqrt(1 - v * v)
+        q_rate, p_rate = momenta.rates([q, p], chosen.parameters, math)
+        acceleration = plain.rates([q, v], chosen.parameters, math)[1]
+        assert q_rate == pytest.approx(v, rel=1e-15)
+        assert p_rate == pytest.approx(acceleration * (1 - v * v) ** -1.5, rel=1e-14)
+        assert not chosen.velocity.any()
+
+    def test_every_case_has_eight_different_states(self):
+        for name in unforced.CASES:
+            chosen = unforced.case(name)
+            assert chosen.q.shape == chosen.velocity.shape == (unforced.STATES, chosen.dimension)
+            assert len(np.unique(chosen.q, axis=0)) == unforced.STATES
+
+    def test_unknown_names_are_rejected(self):
+        with pytest.raises(SystemDefinitionError, match=r"did you mean 'duffing'"):
+            unforced.case("dufing")
+        with pytest.raises(StateError, match=r"there is no section 'drif'; did you mean 'drift'\?"):
+            bench.benchmark(["drif"])
+        with pytest.raises(StateError, match="no peer 'heyoca'"):
+            bench.Plan(peers=("heyoca",))
+
+    def test_traced_text_computes_the_same(self):
+        chosen = unforced.case("outer-solar-system")
+        text = rates_text(chosen.formulations[0].rates, chosen.parameters, 36)
+        names = {"sqrt": math.sqrt}
+        exec(text, names)
+        x = [*chosen.q[0], *chosen.velocity[0]]
+        out = np.empty(36)
+        names["rates"](out, 0.0, x, 0)
+        np.testing.assert_allclose(out, chosen.formulations[0].rates(x, chosen.parameters, math), rtol=1e-13)
+
+    def test_the_loops_of_a_chain_compute_the_same(self):
+        chosen = unforced.case("fput-chain:8")
+        names = {}
+        exec(chosen.loops, names)
+        x, out = np.random.default_rng(5).standard_normal(16), np.empty(16)
+        names["rates"](out, 0.0, x, 0)
+        np.testing.assert_allclose(out, chosen.formulations[0].rates(list(x), chosen.parameters, math), rtol=1e-13)
+
+
+def kepler_position(q, v, t):
+    """The orbit through double q and v about a unit mass, by Kepler's equation with 40 digits."""
+    with mp.workdps(40):
+        q, v = ([mp.mpf(float(x)) for x in part] for part in (q, v))
+        r, speed = mp.hypot(*q), mp.hypot(*v)
+        a = 1 / (2 / r - speed**2)
+        rate = a ** mp.mpf("-1.5")
+        sine, cosine = (q[0] * v[0] + q[1] * v[1]) / mp.sqrt(a), 1 - r / a
+        ahead = mp.findroot(lambda x: x - cosine * mp.sin(x) + sine * (1 - mp.cos(x)) - rate * t, rate * t)
+        f = 1 - a / r * (1 - mp.cos(ahead))
+        g = t - (ahead - mp.sin(ahead)) / rate
+        return [f * x + g * y for x, y in zip(q, v, strict=True)]
+
+
+@needs_extended
+class TestReference:
+    def test_tables_integrate_polynomials(self):
+        a, b, guess = gauss_tables(16)
+        c = a.sum(axis=1)
+        assert abs(b.sum() - 1) < 1e-18
+        assert np.abs(a @ c**5 - c**6 / 6).max() < 1e-18
+        assert np.abs(guess @ c**3 - (1 + c) ** 3).max() < 1e-8
+
+    def test_kepler_against_its_closed_form(self):
+        chosen = short("kepler:0.5", 40.0)
+        found = reference(chosen)
+        exact = [kepler_position(q, v, 40) for q, v in zip(chosen.q, chosen.velocity, strict=True)]
+        exact = np.array([[np.longdouble(mp.nstr(x, 25)) for x in row] for row in exact])
+        assert np.abs(found.positions - exact).max() < 2e-16
+        assert found.accuracy < 2e-16
+
+    def test_driven_oscillator_with_a_span_that_is_no_multiple_of_the_step(self):
+        start = np.array([[1.0, 0.0]], dtype=np.longdouble)
+        steps = equal_steps(10.1, 0.75)
+        end = states_after(lambda x, t: np.stack([x[..., 1], 3 * np.cos(2 * t) - x[..., 0]], axis=-1), start, steps)
+        t = np.longdouble(10.1)
+        exact = [2 * np.cos(t) - np.cos(2 * t), 2 * np.sin(2 * t) - 2 * np.sin(t)]
+        assert np.abs(end[0] - exact).max() < 4e-18
+
+    def test_reference_is_stored_and_reloaded(self, monkeypatch):
+        chosen = short("planar-pendulum", 5.0)
+        first = reference(chosen)
+
+        def again(*arguments: object) -> None:
+            pytest.fail("again")
+
+        monkeypatch.setattr("benchmarks.cases.references._compute", again)
+        assert np.array_equal(reference(chosen).positions, first.positions)
+        with pytest.raises(BaseException, match="again"):
+            reference(short("planar-pendulum", 6.0))
+
+    @pytest.mark.full
+    def test_rounded_momenta_have_a_separate_reference(self):
+        chosen = short("outer-solar-system", 1024.0)
+        momenta = chosen.velocity * np.repeat(chosen.bodies.masses, 3)
+        moved = reference(chosen, momenta)
+        assert 0 < np.abs(moved.positions - reference(chosen).positions).max() < 1e-14
+
+    @pytest.mark.full
+    def test_ensemble_converges_to_the_reference(self, monkeypatch):
+        monkeypatch.setattr(ours, "advised_counts", lambda *_, quick: {100: 1e-12})
+        chosen = short("kepler:0.2", 50.0)
+        (ensemble,) = our_ensembles(chosen)
+        assert ensemble.trajectories == len(chosen.q)
+        assert rms_error(ensemble.prepare(0)(), reference(chosen)) < 1e-12
+
+
+class TestCurves:
+    def test_interpolates_log_time_against_log_error(self):
+        curve = points((1e-3, 1e-4), (4e-3, 1e-8), (16e-3, 1e-12))
+        assert time_at(curve, 1e-6) == pytest.approx(2e-3)
+        assert time_at(curve, 1e-10) == pytest.approx(8e-3)
+        assert time_at(curve, 1e-8) == pytest.approx(4e-3)
+
+    def test_curves_are_not_extrapolated(self):
+        curve = points((1.0, 1e-4), (2.0, 1e-6))
+        assert time_at(curve, 1e-2) == 1.0
+        assert time_at(curve, 1e-7) is None
+        assert time_at([], 1e-7) is None
+
+    def test_errors_below_the_floor_are_equal(self):
+        curve = points((1.0, 1e-11), (4.0, 1e-15), (5.0, 1e-16))
+        assert [point.seconds for point in frontier(curve)] == [1.0, 4.0]
+        assert time_at(curve, 1e-15) == time_at(curve, FLOOR) == pytest.approx(2.0)
+        assert time_at(points((1.0, 1e-11), (4.0, 0.0)), FLOOR) < 4.0
+
+    def test_slower_and_less_accurate_settings_are_ignored(self):
+        curve = points((1.0, 1e-6), (2.0, 1e-10))
+        assert time_at([*curve, *points((3.0, 1e-7), (1.5, 1e-5), (1.0, math.nan))], 1e-8) == time_at(curve, 1e-8)
+
+    def test_common_error_is_reached_by_both_programs(self):
+        one, other = points((1.0, 1e-11)), points((1.0, 1e-9), (2.0, 1e-16))
+        assert common_error(one, other) == pytest.approx(2e-11)
+        assert common_error(other, other) == FLOOR
+        assert common_error(one, []) is None
+
+
+def measurement(method, seconds, error, **changes):
+    entries = {"setting": "h=1", "options": "", "compile_seconds": 0.1, "fastest": seconds, "repeats": 3} | changes
+    return report.Measurement(method=method, seconds=seconds, error=error, **entries)
+
+
+def result_of(*found, **skipped):
+    return report.CaseResult(
+        name="x", span=1.0, dimension=1, reference_accuracy=1e-18, measurements=found, skipped=skipped
+    )
+
+
+class TestReport:
+    result = result_of(
+        measurement("scvi-codegen svi", 1e-3, 1e-12),
+        measurement("heyoka", 5e-3, 1e-13, setting="tol=default"),
+        measurement("heyoka", 4e-3, 1e-12),
+        measurement("heyoka fast_math", 3e-3, 1e-12),
+        measurement("broken", math.nan, math.nan, failure="ArithmeticError: no"),
+        cyrk="not installed",
+    )
+
+    def test_ratios_are_against_heyoka_by_default_and_at_best_and_against_the_best_peer(self):
+        other = measurement("CyRK DOP853", 2e-3, 1e-12)
+        ours, _, fast, _ = report.rows(replace(self.result, measurements=(*self.result.measurements, other)))
+        assert [ours[key] for key in ("default", "best", "peer")] == [pytest.approx(x) for x in (5.0, 3.0, 2.0)]
+        assert fast["best"] == 1.0
+
+    def test_ratios_at_an_error_are_over_the_fastest_of_this_package(self):
+        slow, small = measurement("scvi-codegen other", 2e-3, 1e-12), measurement("CyRK DOP853", 5e-4, 1e-8)
+        result = replace(self.result, measurements=(*self.result.measurements, slow, small))
+        fastest, times = report.ratios_at(result, 1e-9)
+        assert fastest == "scvi-codegen svi"
+        expected = {"scvi-codegen svi": 1e-3, "scvi-codegen other": 2e-3, "heyoka": 4e-3, "heyoka fast_math": 3e-3}
+        assert times == pytest.approx(expected, rel=1e-14)
+        line = next(line for line in result.text().splitlines() if line.startswith("  at 1e-09"))
+        assert "1 ms by scvi-codegen svi; others over it: heyoka 4, heyoka fast_math 3, scvi-codegen other 2" in line
+        assert line.endswith("not reached: broken, CyRK DOP853")
+
+    def test_ratios_require_heyoka(self):
+        result = result_of(measurement("scvi-codegen svi", 1e-3, 1e-12))
+        (row,) = report.rows(result)
+        assert row["default"] is row["best"] is row["peer"] is None
+        assert "-" in result.text()
+
+    def test_table_names_failures_and_skipped_peers(self):
+        text = self.result.text()
+        assert "skipped cyrk: not installed" in text
+        assert "broken h=1: ArithmeticError: no" in text
+        (line,) = (line.split() for line in text.splitlines() if line.startswith("  broken  "))
+        assert line[:3] == ["broken", "failed", "-"]
+
+    def test_json_schema(self):
+        table = ResultTable(
+            name="t", title="", columns={"a": ".1f", "b": ""}, rows=({"a": math.nan}, {"a": 1.0, "b": "x"})
+        )
+        whole = bench.Report(machine=bench.machine(), results=(self.result, table))
+        data = json.loads(json.dumps(whole.data(), allow_nan=False))
+        assert set(data) == {"schema", "machine", "cases", "tables", "interrupted"}
+        assert {"processor", "compiler", "flags", "versions"} <= set(data["machine"])
+        (found,) = data["cases"]
+        assert set(found) == {"name", "span", "dimension", "reference_accuracy", "skipped", "measurements", "rows"}
+        fields = {
+            "method",
+            "setting",
+            "options",
+            "compile_seconds",
+            "seconds",
+            "fastest",
+            "error",
+            "repeats",
+            "failure",
+        }
+        assert all(set(entry) == fields for entry in found["measurements"])
+        assert found["measurements"][4]["seconds"] is None
+        assert data["tables"][0]["rows"] == [{"a": None}, {"a": 1.0, "b": "x"}]
+        assert "  a    b\n  -    -\n  1.0  x" in table.text()
+
+
+class TestMeasuring:
+    def test_rounds_alternate_and_failures_are_recorded(self):
+        order = []
+
+        def contender(name):
+            def prepare(index):
+                def integrate():
+                    order.append(name)
+                    if name == "bad":
+                        raise ArithmeticError("no")
+                    return np.array([float(index)])
+
+                return integrate
+
+            return Contender(method=name, setting="", options="", compile_seconds=0.0, prepare=prepare)
+
+        high = np.arange(8.0)[:, None]
+        exact = Reference(positions=high, accuracy=0.0)
+        good, bad, last = comparison.measure(
+            [contender("one"), contender("bad"), contender("two")], lambda _: exact, repeats=2
+        )
+        assert order == [*["one"] * 8, "bad", *["two"] * 8, *(["one"] * 8 + ["two"] * 8) * 2]
+        assert (good.error, good.repeats, last.repeats) == (0.0, 2, 2)
+        assert bad.failure == "ArithmeticError: no"
+
+    def test_ensemble_is_one_run_with_divided_time(self):
+        high = np.arange(8.0)[:, None]
+        final = np.tile(high, (2, 1))
+        ensemble = Contender(
+            method="all", setting="", options="", compile_seconds=0.0, prepare=lambda n: lambda: final, trajectories=16
+        )
+        exact = Reference(positions=high, accuracy=0.0)
+        (found,) = comparison.measure([ensemble], lambda _: exact, repeats=2)
+        assert found.error == 0.0
+        assert found.seconds < 1e-3
+
+
+@needs_extended
+class TestCommand:
+    def test_runs_without_peers(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(peers.importlib.util, "find_spec", lambda name: None)
+        path = tmp_path / "out.json"
+        messages = []
+        plan = bench.Plan(peers=("heyoka", "cyrk", "rebound"), quick=True, methods=(SVI(4),))
+        names = ["planar-pendulum", "drift"]
+        text = bench.benchmark(names, plan, json_path=str(path), report_activity=messages.append).text()
+        assert "skipped heyoka: heyoka is not installed (pip install 'scvi-codegen[bench]')" in text
+        assert "skipped cyrk: CyRK is not installed" in text
+        data = json.loads(path.read_text())
+        assert [found["name"] for found in data["cases"]] == names[:1]
+        assert data["cases"][0]["rows"][0]["best"] is None
+        assert max(found["error"] for found in data["cases"][0]["measurements"]) < 1e-6
+        assert len(data["tables"][0]["rows"]) == 6
+        assert "planar-pendulum: reference" in messages
+
+    def test_interrupt_saves_completed_measurements(self, tmp_path, monkeypatch):
+        def interrupt(plan, report_activity):
+            raise KeyboardInterrupt
+
+        def fail(plan, report_activity):
+            raise StateError("no")
+
+        done = ResultTable(name="done", title="kept", columns={"a": ""}, rows=({"a": "b"},))
+        sections = {"one": lambda plan, report_activity: done, "bad": fail, "two": interrupt, "three": interrupt}
+        monkeypatch.setattr(bench, "SECTIONS", sections)
+        path = tmp_path / "out.json"
+        shown = []
+        found = bench.benchmark(json_path=str(path), show=shown.append)
+        assert [text.strip().splitlines()[0] for text in shown[1:]] == ["done: kept", "bad: failed: no"]
+        assert (found.results[0], found.interrupted) == (done, "two")
+        assert "bad: failed: no" in found.text()
+        assert json.loads(path.read_text())["interrupted"] == "two"
+        assert "done: kept" in found.text()
+
+    def test_each_section_is_saved_when_measured(self, tmp_path, monkeypatch):
+        path, measured = tmp_path / "out.json", []
+
+        def section(name, plan, report_activity):
+            on_disk = json.loads(path.read_text())["tables"] if path.exists() else []
+            measured.append((name, [each["name"] for each in on_disk]))
+            if name == "two" and len(measured) == 2:
+                raise StateError("not yet")
+            return ResultTable(name=name, title="x", columns={"a": ""}, rows=({"a": name},))
+
+        monkeypatch.setattr(bench, "SECTIONS", {name: partial(section, name) for name in ("one", "two", "three")})
+        bench.benchmark(json_path=str(path))
+        assert measured == [("one", []), ("two", ["one"]), ("three", ["one", "two"])]
+
+    def test_benchmark_command_draws_a_picture(self, tmp_path):
+        pytest.importorskip("matplotlib")
+        from benchmarks.plots import plot_curves
+
+        plot_curves([TestReport.result, TestReport.result], tmp_path / "curves.svg")
+        text = (tmp_path / "curves.svg").read_text()
+        assert "time of a trajectory, ms" in text
+        assert text.count("heyoka fast_math") == 1
+
+    @pytest.mark.parametrize("panels", [1, 2, 4])
+    def test_all_names_are_in_the_picture(self, panels):
+        names = "scvi-codegen controlled, scvi-codegen fixed, scvi-codegen transformed, heyoka, heyoka fast_math, "
+        names += "heyoka.lagrangian, rebound IAS15"
+        pytest.importorskip("matplotlib")
+        from benchmarks.plots import draw_curves
+
+        found = TestReport.result
+        many = [replace(each, method=name) for name in names.split(", ") for each in found.measurements]
+        figure = draw_curves([replace(found, measurements=many)] * panels)
+        figure.draw_without_rendering()
+        legend, whole = figure.legends[0].get_window_extent(), figure.bbox
+        assert whole.x0 <= legend.x0 < legend.x1 <= whole.x1
+        assert whole.y0 <= legend.y0 < legend.y1 <= whole.y1
+
+
+class TestDrift:
+    def test_slope_of_a_line_is_exact(self):
+        derivative, error = fitted_rate(np.linspace(0.0, 3e-12, 2001))
+        assert derivative == pytest.approx(3e-12)
+        assert error < 1e-20
+
+    def test_slope_of_a_random_walk_is_within_its_error(self):
+        random = np.random.default_rng(5)
+        walks = [fitted_rate(np.cumsum(random.standard_normal(2001))) for _ in range(300)]
+        scores = np.array([derivative / error for derivative, error in walks])
+        assert 0.85 < scores.std() < 1.2
+
+    def test_short_run_conserves_energy(self):
+        assert drift_row(unforced.case("kepler:0.2"), "svi:8", 0.2, 20_000)["largest"] < 1e-12
+
+
+class TestTables:
+    @pytest.mark.full
+    @needs_extended
+    def test_forced_problems_are_measured_at_their_errors(self, monkeypatch):
+        monkeypatch.setattr(ours, "QUICK_TOLERANCES", (1e-6,))
+        for name, count in (("forced:double-pendulum", 1),):
+            plan = bench.Plan(peers=("scipy",), repeats=1, quick=True)
+            found = [each for each in bench.SECTIONS[name](plan, lambda text: None).measurements if not each.failure]
+            own = [each for each in found if each.method.startswith("scvi-codegen")]
+            assert len(own) == count
+            assert all(each.error < 1e-4 and each.seconds > 0.0 for each in own)
+            assert max(each.error for each in found if each not in own) < 1e-10
+
+    @pytest.mark.full
+    def test_mechanisms_are_measured_at_equal_error(self):
+        plan = bench.Plan(quick=True, repeats=1, peers=("lambdify",))
+        result = bench.SECTIONS["mechanisms:2"](plan, lambda text: None)
+        assert result.methods() == ["scvi-codegen svi:4", "lambdify DOP853"]
+        assert max(each.error for each in result.measurements) < 1e-6
+        assert min(each.seconds for each in result.measurements) > 0.0
+
+    def test_start_up_time_is_measured(self):
+        cold, cached = tables.run_first_steps(bench.Plan(repeats=1, quick=True), lambda text: None).rows
+        assert (cold["cache"], cached["cache"]) == ("empty", "filled")
+        assert cached["first_step_s"] < cold["first_step_s"]
+        assert cold["coordinates"] == 2
+        assert cold["lines_of_C"] > 100
+        assert cold["compiler_cpu_s"] > 0.0
+
+
+class TestCommandLine:
+    def test_the_help_names_every_section(self):
+        text = CliRunner().invoke(command.main, ["--help"]).stdout
+        assert {name.split(":")[0] for name in bench.SECTIONS} <= set(re.findall(r"[\w-]+", text))
+
+    def test_documented_commands_are_accepted(self):
+        words = r"python -m benchmarks(\s[^`]*|)`"
+        pages = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs").rglob("*.md"))
+        lines = [line for line in re.findall(words, pages) if "SECTION" not in line]
+        assert len(lines) >= 10
+        for line in lines:
+            context = command.main.make_context("benchmarks", line.split())
+            assert all(bench._sections(name) for name in context.params["sections"])
+
+    def test_results_as_text_as_a_document_and_as_nothing(self, monkeypatch):
+        table = ResultTable(name="nothing", title="no times", columns={"a": ""}, rows=({"a": "b"},))
+        monkeypatch.setattr(bench, "SECTIONS", {"nothing": lambda plan, report: table})
+        text, document, quiet = (
+            CliRunner().invoke(command.main, ["nothing", *more]) for more in ([], ["--json"], ["--quiet"])
+        )
+        assert "no times" in text.stdout
+        assert json.loads(document.stdout)["tables"][0]["name"] == "nothing"
+        assert (quiet.exit_code, quiet.stdout, quiet.stderr) == (0, "", "")
+
+    @pytest.mark.parametrize("words", [["drif"], ["drift", "--peers", "heyoca"], ["drift", "--plot", "a/b.png"]])
+    def test_errors_are_messages(self, words):
+        failed = CliRunner().invoke(command.main, words)
+        assert (failed.exit_code, failed.stdout) == (2, "")
+        assert "Error: " in failed.stderr

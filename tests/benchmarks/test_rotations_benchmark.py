@@ -1,0 +1,46 @@
+"""Rigid bodies of the benchmark: Euler's equations by hand, this project and MuJoCo compute the same motion."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import benchmarks as bench
+from benchmarks.cases.references import reference, rms_error
+from benchmarks.cases.rotations import ROTATIONS, tumbling
+from benchmarks.contenders.engines import mujoco_contenders
+from benchmarks.contenders.ours import momenta_of
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.native import building
+
+pytestmark = pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="long double is no wider than double")
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "rotations-cache"))
+
+
+@pytest.mark.parametrize("name", ROTATIONS)
+def test_the_compiled_lagrangian_obeys_the_equations_derived_by_hand(name):
+    chosen = replace(ROTATIONS[name](), span=5.0)
+    stepper = compile_stepper(chosen.system, "svi:8")
+    momenta, exact = momenta_of(stepper, chosen), reference(chosen)
+    ends = [stepper.integrate(q, p, h=0.05, steps=100).q[-1] for q, p in zip(chosen.q, momenta, strict=True)]
+    assert exact.accuracy < 1e-17
+    assert rms_error(np.array(ends), exact) < 2e-14
+    assert rms_error(chosen.q, exact) > 0.1
+
+
+def test_bodies_tumble_in_mujoco_as_in_the_equations():
+    pytest.importorskip("mujoco", reason="extra bench")
+    chosen = replace(tumbling(3), span=1.0)
+    contender = next(each for each in mujoco_contenders(chosen, quick=True) if each.setting == "h=0.01")
+    assert contender.trajectories == 3
+    assert rms_error(contender.prepare(0)()(), reference(chosen)) < 1e-4
+
+
+def test_bodies_are_measured_without_peers():
+    result = bench.SECTIONS["rotations:bodies"](bench.Plan(quick=True, peers=(), repeats=1), lambda text: None)
+    assert result.methods() == ["scvi-codegen runs", "scvi-codegen ensemble"]
+    assert min(each.error for each in result.measurements) < 1e-8

@@ -1,0 +1,152 @@
+"""Array systems, multibody systems and fields of the benchmark: all contenders compute the same motion."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import benchmarks as bench
+from benchmarks import sections
+from benchmarks.cases.fields import FIELDS, our_fields
+from benchmarks.cases.large import atoms, bodies, field, ring
+from benchmarks.cases.robots import chain, four_bar, quadruped
+from benchmarks.contenders import arrays, engines, pdes, peers
+from benchmarks.contenders.ours import fixed_contenders
+from scvi_codegen.methods import Composition
+
+
+def quiet(text):
+    """Says nothing."""
+
+
+def end(contender):
+    """Return the final positions of a contender."""
+    found = contender.prepare(0)()
+    return found() if callable(found) else found
+
+
+def ours(case, method, steps):
+    """Return the final positions of this package."""
+    (contender,) = fixed_contenders(case, {method: [steps]})
+    return end(contender)
+
+
+@pytest.mark.parametrize("case", [ring(8, 1.0), field(6, 0.2)], ids=lambda case: case.name)
+def test_lattices_by_hand_move_as_generated_ones(case):
+    by_hand, generated = end(arrays.by_hand(case, "", 8, 10)), ours(case, Composition(8), 10)
+    assert np.abs(by_hand - generated).max() < 1e-14
+    assert np.abs(generated - case.q[0]).max() > 0.01
+
+
+@pytest.mark.parametrize("name", sorted(arrays.PLATFORMS))
+def test_openmm_makes_the_steps_of_leapfrog(name):
+    pytest.importorskip("openmm", reason="needs the extra 'bench'")
+    crystal, steps = atoms(1, 0.5), 50
+    found = ours(crystal, "stoermer-verlet", steps)
+    rounding = {"OpenMM CPU": 1e-5, "OpenMM Reference": 1e-13}[name]
+    assert np.abs(end(arrays.openmm_contender(crystal, name, steps)) - found).max() < rounding
+    assert np.abs(found - crystal.q[0]).max() > 0.1
+
+
+@pytest.mark.full
+def test_rebound_converges_to_the_same_state():
+    pytest.importorskip("rebound", reason="needs the extra 'bench'")
+    each = bodies(10, 0.5)
+    theirs = end(next(peers.PEERS["rebound"].contenders(each, True)))
+    assert np.abs(ours(each, "svi:8", 32) - theirs).max() < 1e-14
+
+
+@pytest.mark.full
+def test_array_systems_are_measured_at_equal_error():
+    plan = bench.Plan(quick=True, repeats=1, peers=("hand",))
+    result = bench.run_race(
+        lambda plan: sections._halved(lambda: ring(32, 40.0), sections.EXPLICIT, sections.EXACT, plan), plan, quiet
+    )
+    assert result.reference_accuracy < 1e-13
+    assert {"leapfrog by hand", "scvi-codegen svi:8"} <= set(result.methods())
+    assert min(each.error for each in result.measurements) < 1e-12
+
+
+@pytest.mark.parametrize("make", [lambda: chain(2), four_bar], ids=["chain", "four-bar"])
+def test_multibody_systems_are_measured_without_peers(make):
+    plan = bench.Plan(quick=True, peers=(), repeats=1)
+    result = bench.run_race(
+        lambda plan: sections._halved(make, {"svi:2": range(2)}, {"svi:3": 2, "svi:2": 3}, plan), plan, quiet
+    )
+    assert result.methods() == ["scvi-codegen svi:2"]
+    assert 0.0 < min(each.error for each in result.measurements) < 1e-6
+
+
+@pytest.mark.parametrize(("name", "setting"), [("mujoco", "h=0.01"), ("pinocchio", "h=0.01"), ("exudyn", "rtol=1e-06")])
+def test_chains_move_in_engines_as_here(name, setting):
+    pytest.importorskip(name, reason="extra bench")
+    robot = chain(3)
+    contenders = getattr(engines, f"{name}_contenders")(robot, quick=True)
+    found = end(next(each for each in contenders if each.setting == setting))
+    assert np.abs(found - ours(robot, "svi:4", 200)).max() < 2e-6
+
+
+def test_closed_loops_in_mujoco_are_soft_unless_stiff():
+    pytest.importorskip("mujoco", reason="extra bench")
+    linkage = four_bar()
+    exact = ours(linkage, "svi:4", 400)
+    soft, stiff = (
+        np.abs(end(each) - exact).max()
+        for each in engines.mujoco_contenders(linkage, quick=True)
+        if each.setting == "h=0.01" and "RK4" in each.method
+    )
+    assert stiff < 0.1 * soft < 0.1
+
+
+def test_instability_of_mujoco_is_reported_and_leaves_no_file(monkeypatch, tmp_path):
+    """MuJoCo would write its warnings into the working folder."""
+    pytest.importorskip("mujoco", reason="extra bench")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(engines, "LARGEST_STEP", 2.0)
+    robot = replace(chain(5), span=400.0)
+    with pytest.raises(ArithmeticError, match="unstable"):
+        end(next(engines.mujoco_contenders(robot, quick=True)))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.full
+def test_coordinates_of_a_free_base_are_those_of_mujoco():
+    mujoco = pytest.importorskip("mujoco", reason="extra bench")
+    animal = quadruped()
+    places = engines.coordinate_places(mujoco.MjModel.from_xml_string(animal.mjcf), animal)
+    assert sorted(places[0]) == list(range(animal.dimension))
+    assert sorted(places[1]) == list(range(animal.dimension - 1))
+    assert animal.q[0][places[0]][3] == 1.0
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_exact_solutions_of_fields_solve_their_equations(name):
+    """Differences of order 8 in space, of order 2 in time."""
+    case, t, dt = FIELDS[name](), 0.7, 1e-4
+    axes = pdes._axes(case, 128 if name == "wave-2d" else 512)
+    points, dx = pdes._points(axes), axes[0][1] - axes[0][0]
+    before, now, after = (case.exact(points, t + k * dt) for k in (-1, 0, 1))
+
+    def laplacian(u):
+        total = len(axes) * pdes.STENCIL[0] * u
+        for k, weight in enumerate(pdes.STENCIL[1:], 1):
+            total = total + weight * sum(np.roll(u, sign * k, axis) for axis in range(len(axes)) for sign in (1, -1))
+        return total / dx**2
+
+    if case.complex:
+        psi, rate = now[0] + 1j * now[1], (after[0] - before[0] + 1j * (after[1] - before[1])) / (2 * dt)
+        rest = 1j * rate + laplacian(psi) / 2 + abs(psi) ** 2 * psi
+    else:
+        nonlinear = np.sin(now[0]) if name == "breather" else 0.0
+        rest = (after[0] - 2 * now[0] + before[0]) / dt**2 - laplacian(now[0]) + nonlinear
+        assert np.abs((after[0] - before[0]) / (2 * dt) - now[1]).max() < 1e-6 * np.abs(now[1]).max()
+    assert np.abs(rest).max() < 1e-4 * max(1.0, np.abs(now[0]).max())
+
+
+def test_fields_are_measured_without_peers_and_by_split_steps():
+    case = FIELDS["breather"]()
+    here = [each.error(end(each)) for each in our_fields(case, quick=True)]
+    assert min(here) < 0.03
+    contenders = [each for each in pdes.fft_contenders(case.plain(), quick=False) if each.method.endswith("8")]
+    split = next(each for each in contenders if each.setting == "256 points, 200 steps")
+    assert split.error(end(split)) < 1e-8

@@ -1,0 +1,192 @@
+"""Growth of errors along adaptive runs, by a tangent vector: chaotic motions are reported, regular ones are not."""
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
+
+TOLERANCES = [None, 1e-12, 1e-9, 1e-6, 1e-3]
+PLANE, BODIES = ("x", "y"), ("x1", "y1", "x2", "y2", "x3", "y3")
+KEPLER = PLANE, "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)"
+HENON_HEILES = PLANE, "(x_dot**2 + y_dot**2)/2 - (x**2 + y**2)/2 - x**2*y + y**3/3"
+MASSES = {1: 3, 2: 4, 3: 5}
+BURRAU = (
+    BODIES,
+    " + ".join(
+        [
+            *(f"{m}*(x{i}_dot**2 + y{i}_dot**2)/2" for i, m in MASSES.items()),
+            *(f"{MASSES[i] * MASSES[j]}/sqrt((x{i}-x{j})**2 + (y{i}-y{j})**2)" for i, j in ((1, 2), (1, 3), (2, 3))),
+        ]
+    ),
+)
+ELASTIC = PLANE, "(x_dot**2 + y_dot**2)/2 - y - 15*(sqrt(x**2 + y**2) - 1)**2"
+OSCILLATORS = PLANE, "(x_dot**2 + y_dot**2)/2 - x**2/2 - 9*y**2"
+HILL = PLANE, "(x_dot**2 + y_dot**2)/2 + x*y_dot - y*x_dot + 3*x**2/2 + 1/sqrt(x**2 + y**2)"
+PENDULUM = ("a", "b"), "a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)"
+STEPPERS = {}
+
+
+def stepper_of(system, method="svi:8"):
+    if (system, method) not in STEPPERS:
+        names, text = system
+        STEPPERS[system, method] = sc.compile_stepper(
+            sc.LagrangianSystem.from_text(name="motion", coordinates=names, lagrangian=text), method
+        )
+    return STEPPERS[system, method]
+
+
+def ellipse(e):
+    return [1.0 - e, 0.0], [0.0, math.sqrt((1.0 + e) / (1.0 - e))]
+
+
+def burrau_states(random):
+    return np.array([1.0, 3.0, -2.0, -1.0, 1.0, -1.0]) * (1.0 + 1e-3 * random.standard_normal(6)), np.zeros(6)
+
+
+def ejecting_states(random):
+    """One body leaves the others early, and later motion is regular."""
+    return np.array([1.0, 3.0, -2.0, -1.0, 1.0, -1.0]) + random.uniform(-0.05, 0.05, 6), np.zeros(6)
+
+
+def pendulum_states(random):
+    return random.uniform(1.5, 3.0, 2) * random.choice([-1.0, 1.0], 2), np.zeros(2)
+
+
+def hill_states(random):
+    """Orbits about the smaller mass."""
+    x = random.uniform(0.1, 0.3)
+    return [x, 0.0], [0.0, math.sqrt(1.0 / x)]
+
+
+def henon_heiles_states(random, energy):
+    """A state with x = 0 and this energy, above 0 in p_x."""
+    while True:
+        y, p_y = random.uniform([-0.4, -0.5], [0.8, 0.5])
+        rest = 2.0 * energy - y**2 + 2.0 * y**3 / 3.0 - p_y**2
+        if rest > 0.0:
+            return [0.0, y], [math.sqrt(rest), p_y]
+
+
+def reports(stepper, q, p, t_end, **arguments):
+    """Whether a run reports that errors grow."""
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        stepper.integrate(q, p, t_end=t_end, **arguments)
+    return any(str(each.message).startswith("the motion amplifies errors") for each in heard)
+
+
+REGULAR = {
+    **{f"Kepler {e}": (KEPLER, *ellipse(e), 300.0) for e in (0.0, 0.2, 0.5, 0.9, 0.99)},
+    "elastic pendulum": (ELASTIC, [0.2, -1.0], [0.0, 0.0], 100.0),
+    "Hill": (HILL, [0.1, 0.0], [0.0, math.sqrt(10.0)], 40.0),
+    "oscillators": (OSCILLATORS, [1.0, 0.5], [0.0, 0.7], 300.0),
+    "Henon-Heiles, E = 1/12": (HENON_HEILES, [0.0, 0.1], [math.sqrt(1 / 6 - 0.01 + 0.002 / 3 - 0.01), 0.1], 300.0),
+}
+CHAOTIC = {
+    "Burrau": (BURRAU, [1.0, 3.0, -2.0, -1.0, 1.0, -1.0], [0.0] * 6, 65.0),
+    "early ejection": (BURRAU, [1.0, 3.05, -2.02, -1.01, 0.95, -1.01], [0.0] * 6, 65.0),
+    "Henon-Heiles, E = 1/6.2": (HENON_HEILES, *henon_heiles_states(np.random.default_rng(7), 1 / 6.2), 300.0),
+}
+
+
+@pytest.mark.parametrize("tolerance", TOLERANCES)
+@pytest.mark.parametrize("name", [*REGULAR, *CHAOTIC])
+def test_chaotic_motions_are_reported_and_regular_ones_are_not(name, tolerance):
+    system, q, p, t_end = (REGULAR | CHAOTIC)[name]
+    assert reports(stepper_of(system), q, p, t_end, tolerance=tolerance) == (name in CHAOTIC)
+
+
+@pytest.mark.parametrize("method", ["svi:3", "svi:16"])
+@pytest.mark.parametrize("name", ["Kepler 0.9", "Henon-Heiles, E = 1/6.2"])
+def test_other_methods_report_the_same(name, method):
+    system, q, p, t_end = (REGULAR | CHAOTIC)[name]
+    assert reports(stepper_of(system, method), q, p, t_end / 2, tolerance=1e-9) == (name in CHAOTIC)
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1e-9])
+def test_growth_is_that_of_nearby_runs(tolerance):
+    """The tangent vector starts as cos(i) q_i, cos(i + 1) v_i; its part off the energy surface does not grow."""
+    system, q, p, _ = CHAOTIC["Henon-Heiles, E = 1/6.2"]
+    stepper, t_end, size = stepper_of(system), 120.0, 1e-9
+    run = stepper.start(q, p, t_end=t_end, tolerance=tolerance or None)
+    run._memory.measures_growth = 1
+    run._run_to_target()
+    states = np.array([[*q, *p]]) * (1.0 + size * np.array([[0.0] * 4, np.cos([0, 1, 1, 2])]))
+    one, other = (stepper.integrate(x[:2], x[2:], t_end=t_end, check_growth=False) for x in states)
+    pairs = (one.q, other.q), (one.p, other.p)
+    apart = max(np.linalg.norm(b[-1] - a[-1]) / np.linalg.norm(a, axis=1).max() for a, b in pairs)
+    assert run._growth[0] > 5.0
+    assert run._growth[0] == pytest.approx(math.log(apart / size), abs=1.5)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [{"save_every": 7}, {"t_eval": np.linspace(0.0, 300.0, 20)}, {"observe": lambda run: run.q[0]}, {"events": "x"}],
+    ids=lambda each: next(iter(each)),
+)
+def test_reports_do_not_depend_on_what_is_saved(more):
+    system, q, p, t_end = CHAOTIC["Henon-Heiles, E = 1/6.2"]
+    assert reports(stepper_of(system), q, p, t_end, **more)
+
+
+def test_backward_runs_are_checked():
+    system, q, p, t_end = CHAOTIC["Henon-Heiles, E = 1/6.2"]
+    assert reports(stepper_of(system), q, p, -t_end)
+
+
+def test_growth_is_measured_only_where_the_check_needs_it():
+    system, q, p, t_end = CHAOTIC["Henon-Heiles, E = 1/6.2"]
+    stepper = stepper_of(system)
+    run = stepper.start(q, p, t_end=t_end)
+    run._run_to_target()
+    assert run._growth is None
+    assert not reports(stepper, q, p, t_end, check_growth=False)
+    with without_accuracy_warnings():
+        assert not reports(stepper, q, p, t_end)
+    assert reports(stepper, q, p, t_end)
+
+
+@pytest.mark.parametrize("scale", [2.0**-600, 2.0**600])
+def test_states_of_extreme_size_are_checked_by_repetition(scale):
+    """Squares of such numbers are not representable."""
+    saddle = (("x",), "x_dot**2/2 + x**2/2")
+    assert not reports(stepper_of(saddle, "svi:4"), [scale], [scale], 43.0)
+    run = stepper_of(saddle, "svi:4").start([scale], [scale], t_end=5.0)
+    run._memory.measures_growth = 1
+    run._run_to_target()
+    assert run._growth is None
+
+
+@pytest.mark.parametrize("tolerance", TOLERANCES)
+@pytest.mark.parametrize(
+    ("system", "states", "t_end", "least", "most"),
+    [
+        (BURRAU, burrau_states, 65.0, 26, 30),
+        (BURRAU, ejecting_states, 65.0, 26, 30),
+        (PENDULUM, pendulum_states, 60.0, 24, 30),  # some are regular
+        (HILL, hill_states, 40.0, 0, 0),
+        (HENON_HEILES, lambda random: henon_heiles_states(random, 1 / 6.2), 300.0, 24, 26),  # the others are regular
+        (HENON_HEILES, lambda random: henon_heiles_states(random, 1 / 12), 300.0, 0, 0),
+        (HENON_HEILES, lambda random: henon_heiles_states(random, 1 / 30), 300.0, 0, 0),
+        (KEPLER, lambda random: ellipse(random.uniform(0.0, 0.99)), 300.0, 0, 0),
+    ],
+    ids=[
+        "Burrau",
+        "early ejection",
+        "double pendulum",
+        "Hill",
+        "Henon-Heiles 1/6.2",
+        "Henon-Heiles 1/12",
+        "Henon-Heiles 1/30",
+        "Kepler",
+    ],
+)
+@pytest.mark.full
+def test_most_chaotic_runs_and_no_regular_ones_are_reported(system, states, t_end, least, most, tolerance):
+    random, stepper = np.random.default_rng(1), stepper_of(system)
+    found = [reports(stepper, *states(random), t_end, tolerance=tolerance) for _ in range(30)]
+    assert least <= sum(found) <= most

@@ -1,0 +1,301 @@
+"""Derivatives of runs: motions x situations, and a chain of identities.
+
+``sensitivity`` of a run is the product of those of its steps (compared with 60 digits in test_sensitivity), ``tangent``
+its columns, ``pullback`` its transpose, and ``hessian_product`` the difference quotient of ``pullback``.
+"""
+
+import pickle
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from samples import QUICK_FLAGS, damped_pendulum
+from scipy.interpolate import PPoly
+
+from scvi_codegen import SVI, LagrangianSystem, MethodError, StateError, compile_stepper, problem, reparametrise
+
+BREAKS, COEFFICIENTS = np.array([0.0, 1.0, 2.3, 3.1, 4.0]), np.random.default_rng(5).normal(size=(4, 4))
+"""An input; coefficients of descending powers."""
+
+
+def pendulum(force, parameters, **options):
+    return LagrangianSystem.from_text(
+        name="damped pendulum with a force",
+        coordinates=["q"],
+        lagrangian="l*q_dot**2/2 + cos(q)",
+        parameters=parameters,
+        forces={"q": force},
+        dissipation="c*q_dot**2/2",
+        **options,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A stepper and an initial state (q, p); ``plan``: arguments of its runs."""
+
+    system: object
+    method: object
+    x: tuple[float, ...]
+    plan: dict
+    options: dict = field(default_factory=dict)
+    has_data: bool = False
+
+    @cached_property
+    def stepper(self):
+        return compile_stepper(self.system, self.method, flags=QUICK_FLAGS, **self.options)
+
+    def run(self, x=None, coefficients=COEFFICIENTS, **changes):
+        """The run from x = (q, p) or (q, p, parameters, t, h)."""
+        m, x = self.stepper.dimension, np.array(self.x if x is None else x)
+        arguments = {"t": 0.3, **self.plan, **changes}
+        if len(x) > 2 * m:
+            arguments |= {"parameters": x[2 * m : -2], "t": x[-2]} | ({"h": x[-1]} if arguments.get("h") else {})
+        if self.has_data:
+            arguments |= {"inputs": {"u": PPoly(coefficients, BREAKS)}, "t": 0.0}
+        arguments = {name: value for name, value in arguments.items() if value is not None}
+        return self.stepper.integrate(x[:m], x[m : 2 * m], **arguments)
+
+
+MOTIONS = {
+    "pendula": Motion(problem("double-pendulum").system, SVI(4), (0.9, -0.6, 1.0, 0.5), {"h": 0.05, "steps": 36}),
+    "driven": Motion(
+        pendulum("f*cos(t)", {"c": 0.1, "f": 0.3, "l": 1.2}), SVI(3), (0.4, -0.8), {"h": 0.07, "steps": 60}
+    ),
+    "data": Motion(
+        pendulum("u", {"c": 0.1, "l": 1.2}, inputs=["u"]), SVI(3), (0.4, -0.8), {"h": 0.07, "t_end": 4.0}, has_data=True
+    ),
+    "reversible": Motion(
+        problem("kepler").system,
+        SVI(4),
+        (0.5, 0.0, 0.0, 3**0.5),
+        {"h": 0.05, "t_end": 3.3},
+        {"time_transformation": "frequency"},
+    ),
+    "damped": Motion(damped_pendulum(), SVI(2), (1.0, 1.0, 0.0, 0.0), {"h": 0.1, "steps": 12}),
+}
+SITUATIONS = {
+    "all": {},
+    "sparse": {"save_every": 12},
+    "backward": {"h": -0.07},
+    "adaptive": {"h": None, "steps": None, "t_end": 4.0},
+}
+VARYING_STEPS = ("data", "reversible")
+"""Their last steps are shorter, and they have one direction."""
+CASES = [
+    *((name, each) for each in SITUATIONS for name in MOTIONS if each == "all" or name not in VARYING_STEPS),
+    ("data", "sparse"),
+]
+
+
+def states_of(run):
+    return np.concatenate([run.q, run.p], axis=1)
+
+
+def assert_close(found, expected, error):
+    assert_allclose(found, expected, rtol=0, atol=error * np.abs(expected).max(initial=1e-3))
+
+
+def stacked(gradient):
+    """(inputs, ..) derivatives in the order of the inputs of a step."""
+    last = [np.asarray(x)[np.newaxis] for x in (gradient.t, gradient.h) if x is not None]
+    return np.concatenate([gradient.q, gradient.p, gradient.parameters, *last])
+
+
+def derivatives_of(run):
+    """(n, 2m, inputs) derivatives of all states."""
+    if run.pieces:
+        return run.tangent()
+    found = run.sensitivity()
+    times = [found.t] if found.h is None else [found.t, found.h]
+    return np.concatenate([found.state, found.parameters, np.stack(times, axis=-1)], axis=-1)
+
+
+def differences(function, x, width=1e-4):
+    """(.., x) derivatives, of fourth order."""
+    columns = []
+    for unit in width * np.eye(x.size).reshape(-1, *x.shape):
+        a, b, c, d = (function(x + s * unit) for s in (1, -1, 2, -2))
+        columns.append((8 * (a - b) - (c - d)) / (12 * width))
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize(("name", "situation"), CASES)
+def test_derivatives_of_runs_are_products_of_those_of_steps(name, situation):
+    motion, changes = MOTIONS[name], SITUATIONS[situation]
+    run, whole = motion.run(**changes), motion.run(**changes | {"save_every": 1})
+    size, found = 2 * motion.stepper.dimension, derivatives_of(run)
+    product = np.eye(size, found.shape[2])
+    products = [product]
+    for piece in whole.pieces or (whole,):
+        for k, (t, h) in enumerate(zip(piece.t[:-1], np.diff(piece.t), strict=True)):
+            step = piece.stepper.sensitivity(piece.q[k], piece.p[k], h, t, piece.parameters)
+            product = step.state @ product
+            if found.shape[2] > size:
+                by_h = [(step.h + k * step.t)[:, np.newaxis]] * (found.shape[2] - size - step.parameters.shape[1] - 1)
+                product[:, size:] += np.concatenate([step.parameters, step.t[:, np.newaxis], *by_h], axis=1)
+            products.append(product)
+    expected = np.array(products)[np.searchsorted(whole.t * whole.forward, run.t * run.forward)]
+    assert_close(found, expected, 1e-9)
+    assert_close(run.tangent(), found[:, :, :size], 1e-12)
+    direction = np.arange(1.0, size + 1)
+    assert_close(run.tangent(direction)[-1], found[-1, :, :size] @ direction, 1e-11)
+
+
+@pytest.mark.parametrize(("name", "situation"), CASES)
+def test_gradients_are_the_transpose_of_sensitivities(name, situation):
+    run = MOTIONS[name].run(**SITUATIONS[situation])
+    whole, seeds = derivatives_of(run), np.random.default_rng(1).normal(size=(len(run), 2 * run.q.shape[1], 3))
+    gradient = run.pullback(seeds)
+    found = stacked(gradient)[: whole.shape[2]]
+    assert_close(found, np.einsum("nic,nij->jc", seeds, whole), 1e-10)
+    assert_close(stacked(run.pullback(seeds[:, :, 0]))[: whole.shape[2]], found[:, 0], 1e-12)
+    assert (gradient.h is None) == (situation == "adaptive" or name in VARYING_STEPS)
+
+
+@pytest.mark.parametrize("situation", ["all", "sparse", "backward"])
+def test_hessians_are_derivatives_of_gradients(situation):
+    """F = sum w . x + x . C x/2 of all states; more directions than pass through a step at once."""
+    motion, changes = MOTIONS["driven"], SITUATIONS[situation]
+    x = np.array([0.4, -0.8, *motion.stepper.defaults, 0.3, changes.get("h", 0.07)])
+    rng, run = np.random.default_rng(2), motion.run(x, **changes)
+    w, C = rng.normal(size=(len(run), 2)), rng.normal(size=(len(run), 2, 2))
+    C = C + C.transpose(0, 2, 1)
+
+    def partials(run):
+        return w + np.einsum("nij,nj->ni", C, states_of(run))
+
+    expected = differences(lambda y: stacked(motion.run(y, **changes).pullback(partials(motion.run(y, **changes)))), x)
+    product = run.hessian_product(partials(run), np.eye(len(x)), C)
+    found = np.vstack([product.q, product.p, product.parameters, product.t, product.h])
+    assert_close(found, expected, 1e-7)
+    assert_close(found, found.T, 1e-12)
+    many = run.hessian_product(partials(run), np.tile(np.eye(len(x)), 3)[:, :19], C)
+    assert_close(many.q, np.tile(product.q, 3)[:, :19], 1e-11)
+    unpickled = replace(run, stepper=pickle.loads(pickle.dumps(motion.stepper)))
+    assert_close(stacked(unpickled.hessian_product(partials(run), x, C)), found @ x, 1e-10)
+
+
+def test_hessians_of_adaptive_runs_are_symmetric():
+    run = MOTIONS["driven"].run(**SITUATIONS["adaptive"])
+    directions = np.eye(7)[:, :6]  # the step sizes are constant
+    product = run.hessian_product(np.ones((len(run), 2)), directions, np.tile(np.eye(2), (len(run), 1, 1)))
+    found = np.vstack([product.q, product.p, product.parameters, product.t])
+    assert_close(found, found.T, 1e-11)
+
+
+def test_derivatives_by_data_and_named_parameters():
+    motion = MOTIONS["data"]
+    run, start = motion.run(), np.array([*motion.x, 0.1, 1.2])
+    rows = [0, 1, *(2 + motion.stepper.parameters.index(name) for name in ("c", "l"))]
+    w = np.random.default_rng(1).normal(size=(len(run), 2))
+
+    def run_from(x, coefficients=COEFFICIENTS):
+        return motion.run(x[:2], coefficients, parameters={"c": x[2], "l": x[3]})
+
+    def gradient(x):
+        return stacked(run_from(x).pullback(w))[rows]
+
+    found = run.pullback(w)
+    by_data = differences(lambda c: (w * states_of(motion.run(None, c))).sum(), COEFFICIENTS)
+    assert_close(found.inputs["u"], by_data.reshape(4, 4)[::-1].T, 1e-7)
+    assert_close(gradient(start), differences(lambda x: (w * states_of(run_from(x))).sum(), start), 1e-8)
+    assert np.isnan(found.parameters).sum() == 5
+    directions = np.eye(motion.stepper._input_size)[:, rows]
+    by_all = differences(lambda x: states_of(run_from(x)), start)
+    assert_close(run.tangent(directions), by_all.transpose(1, 0, 2), 1e-8)
+    product = run.hessian_product(w, directions)
+    assert_close(stacked(product)[rows], differences(gradient, start), 1e-7)
+    assert product.inputs["u"].shape == (4, 4, 4)
+
+
+def test_long_runs_are_taken_in_segments():
+    whole, sparse = (MOTIONS["driven"].run(steps=2500, save_every=n) for n in (1, 500))
+    w, C = np.zeros((2501, 2)), np.zeros((2501, 2, 2))
+    w[::500], C[::500] = np.random.default_rng(2).normal(size=(6, 2)), np.eye(2)
+    assert_close(stacked(sparse.pullback(w[::500])), stacked(whole.pullback(w)), 1e-9)
+    assert_close(derivatives_of(sparse), derivatives_of(whole)[::500], 1e-9)
+    found, expected = (r.hessian_product(w[::n], [1.0, 0.5], C[::n]) for r, n in ((sparse, 500), (whole, 1)))
+    assert_close(stacked(found), stacked(expected), 1e-8)
+
+
+def test_derivatives_of_conserved_energies():
+    """Energy at the end is that at the start; after a Kepler period only the phase depends on the energy."""
+    stepper = compile_stepper(problem("planar-pendulum").system, SVI(8), flags=QUICK_FLAGS)
+    run = stepper.integrate([2.0], [0.3], h=0.05, steps=200)
+    m, length, g = stepper.defaults
+
+    def partials(q, p):
+        return [m * g * length * np.sin(q), p / (m * length**2)]
+
+    def hessian(q):
+        return np.diag([m * g * length * np.cos(q), 1 / (m * length**2)])
+
+    w, C = np.zeros((len(run), 2)), np.zeros((len(run), 2, 2))
+    w[-1], C[-1] = partials(run.q[-1, 0], run.p[-1, 0]), hessian(run.q[-1, 0])
+    first, second = run.pullback(w), run.hessian_product(w, np.eye(2), C)
+    assert_allclose([*first.q, *first.p], partials(2.0, 0.3), rtol=1e-9)
+    assert abs(first.h) + abs(first.t) < 1e-9
+    assert_allclose(np.vstack([second.q, second.p]), hessian(2.0), atol=1e-7)
+    kepler = compile_stepper(problem("kepler").system, SVI(8), flags=QUICK_FLAGS)
+    monodromy = kepler.integrate([0.5, 0.0], [0.0, 3**0.5], h=2 * np.pi / 64, steps=64).tangent()[-1]
+    assert np.linalg.matrix_rank(monodromy - np.eye(4), tol=1e-4) == 1
+    gradient = np.array([4.0, 0.0, 0.0, 3**0.5])  # of the energy
+    assert_allclose(gradient @ monodromy, gradient, rtol=0, atol=1e-6)
+    still = MOTIONS["driven"].run(steps=0).hessian_product(np.ones((1, 2)), np.eye(2), 3 * np.eye(2)[np.newaxis])
+    assert np.array_equal(np.vstack([still.q, still.p]), 3 * np.eye(2))
+
+
+W = np.zeros((61, 2))
+REJECTED = [
+    ("pendula", lambda run: run.tangent([1.0, 2.0]), StateError, r"shape \(4,\) or \(4, k\)"),
+    ("driven", lambda run: run.pullback(W[1:]), StateError, r"of each state, must have shape \(61, 2\)"),
+    ("driven", lambda run: run.pullback(W + np.nan), StateError, "cotangents must be finite"),
+    (
+        "driven",
+        lambda run: run.hessian_product(np.zeros((61, 2, 3)), [1.0, 0.0]),
+        StateError,
+        r"cotangents of one function must have shape \(61, 2\)",
+    ),
+    ("driven", lambda run: run.hessian_product(W, [1.0] * 3), StateError, r"or \(7,\) or \(7, k\), of .*, not \(3,\)"),
+    ("driven", lambda run: run.hessian_product(W, [1.0, 0.0], W), StateError, r"curvatures, Hessians .* not \(61, 2\)"),
+    ("driven", lambda run: moved(run).sensitivity(), StateError, r"from t = 2\.33, computed again, end in another"),
+    (
+        "damped",
+        lambda run: run.hessian_product(np.ones((13, 4)), np.ones(4)),
+        MethodError,
+        "damping have first derivatives only",
+    ),
+    (
+        "data",
+        lambda run: run.tangent(np.ones(run.stepper._input_size)),
+        StateError,
+        "directions must be 0 for the parameters of inputs",
+    ),
+    ("data", lambda run: run.pullback(np.zeros((3, 2))), StateError, "cotangents, derivatives by"),
+]
+
+
+def moved(run):
+    """The run with another state 30."""
+    return replace(run, q=run.q + (np.arange(61) == 30)[:, np.newaxis] * 1e-3)
+
+
+@pytest.mark.parametrize(("name", "call", "error", "message"), REJECTED)
+def test_arguments_of_derivatives_are_checked(name, call, error, message):
+    with pytest.raises(error, match=message):
+        call(MOTIONS[name].run())
+
+
+def test_runs_without_derivatives_are_rejected():
+    with pytest.raises(StateError, match="whole steps"):
+        MOTIONS["driven"].run(steps=9, t=0.0, t_eval=[0.03, 0.1]).sensitivity()
+    kepler = problem("kepler")
+    clocked = compile_stepper(reparametrise(kepler.system, "frequency"), SVI(4), flags=QUICK_FLAGS)
+    with pytest.raises(MethodError, match="hessian_product is not available"):
+        clocked.integrate(kepler.q, [0.0, 1.0], h=0.1, steps=3).hessian_product(np.ones((4, 4)), np.ones(4))
+    hill = LagrangianSystem.from_text(name="hill", coordinates=["q"], lagrangian="q_dot**2/2 + q**2/2")
+    with pytest.raises(StateError, match="derivatives exceed the largest double"):
+        compile_stepper(hill, SVI(2)).integrate([0.0], [0.0], h=0.5, steps=1600).tangent()

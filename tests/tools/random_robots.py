@@ -1,0 +1,307 @@
+"""Random robots in MJCF and URDF over the attributes that are read, and their energies by MuJoCo and Pinocchio.
+
+``python tests/tools/random_robots.py`` records the energies for tests on machines without these programs.
+"""
+
+import json
+import random
+from pathlib import Path
+from typing import Any
+
+RECORDED = Path(__file__).parents[1] / "mechanics" / "robots" / "random.json"
+SEEDS = 8
+"""Number of robots of each format whose energies are recorded."""
+TURNS = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
+SHAPES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
+State = dict[str, list[float]]
+"""Position (or quaternion) and velocity of each joint, one after the other, by its name."""
+
+
+class Draw:
+    """Random numbers that are equal in all versions of Python."""
+
+    def __init__(self, seed: int) -> None:
+        self.random = random.Random(seed).random
+
+    def maybe(self, chance: float = 0.5) -> bool:
+        return self.random() < chance
+
+    def one(self, *options: Any) -> Any:
+        return options[int(self.random() * len(options))]
+
+    def numbers(self, count: int, low: float = -1.0, high: float = 1.0) -> str:
+        return " ".join(f"{low + (high - low) * self.random():.3f}" for _ in range(count))
+
+    def some(self, chance: float, **attributes: str) -> dict[str, str]:
+        """Return each attribute with a chance."""
+        return {key: value for key, value in attributes.items() if self.maybe(chance)}
+
+    def turn(self, chance: float = 0.6) -> dict[str, str]:
+        kind = self.one(*TURNS)
+        return {kind: self.numbers(TURNS[kind])} if self.maybe(chance) else {}
+
+
+def element(tag: str, attributes: dict[str, str], *inner: str) -> str:
+    written = "".join(f' {key}="{value}"' for key, value in attributes.items())
+    return f"<{tag}{written}>{''.join(inner)}</{tag}>"
+
+
+class Mjcf:
+    """Random model; ``document`` is its text, ``included`` that of a file that it includes."""
+
+    def __init__(self, seed: int) -> None:
+        self.draw, self.seed = Draw(seed), seed
+        draw = self.draw
+        self.joints: dict[str, str] = {}
+        self.bodies = 0
+        self.fromto = draw.maybe(0.3)  # geoms then have no pos
+        self.classes = ["main", "a", "b", "c"]
+        compiler = draw.some(0.4, angle=draw.one("radian", "degree"), settotalmass="7")
+        compiler |= draw.some(0.5, eulerseq="".join(draw.one(*"xyzXYZ") for _ in range(3)), inertiafromgeom="true")
+        compiler |= draw.some(0.3, inertiagrouprange="0 2")
+        flags = ("gravity", "spring", "damper", "constraint", "equality", "contact", "filterparent")
+        flag = element("flag", draw.some(0.12, **dict.fromkeys(flags, "disable")))
+        option = element("option", draw.some(0.8, gravity=draw.numbers(3, -9, 9)), flag)
+        inner = element("default", {"class": "a"}, self.default(), element("default", {"class": "b"}, self.default()))
+        defaults = element("default", {}, inner, self.default())
+        defaults += element("default", {}, self.default(), element("default", {"class": "c"}, self.default()))
+        world = "".join(self.body(2) for _ in range(2))
+        self.included = f"<mujocoinclude>{world}</mujocoinclude>"
+        sections = [
+            element("compiler", compiler),
+            option,
+            defaults,
+            element("worldbody", {}, '<include file="included.xml"/>', element("site", {"name": "s"} | self.site())),
+            element("equality", {}, *self.equalities()),
+            element("actuator", {}, *self.actuators()),
+        ]
+        self.document = element("mujoco", {}, *sorted(sections, key=lambda _: draw.random()))
+
+    def default(self) -> str:
+        draw = self.draw
+        parts = {
+            "joint": self.joint() | draw.some(0.2, type="slide"),
+            "geom": self.geom(),
+            "site": self.site(),
+            "equality": draw.some(0.4, active=draw.one("true", "false")),
+            draw.one("motor", "general", "position"): self.actuator(),
+            "tendon": draw.some(0.5, group="1"),
+        }
+        return "".join(element(tag, attributes) for tag, attributes in parts.items() if draw.maybe(0.4))
+
+    def joint(self) -> dict[str, str]:
+        draw = self.draw
+        attributes = draw.some(0.4, pos=draw.numbers(3), axis=draw.numbers(3, 0.1), damping=draw.numbers(1, 0))
+        attributes |= draw.some(0.3, armature=draw.numbers(1, 0), ref=draw.numbers(1), springref=draw.numbers(1))
+        return attributes | draw.some(0.2, frictionloss="0.1", group="3", margin="0.1")
+
+    def geom(self) -> dict[str, str]:
+        draw = self.draw
+        attributes = draw.turn(0.5) | draw.some(0.5, density=draw.numbers(1, 100, 900))
+        attributes |= draw.some(0.4, type=draw.one(*SHAPES)) | draw.some(0.5, size=draw.numbers(3, 0.1, 0.5))
+        attributes |= draw.some(
+            0.2, mass=draw.numbers(1, 0.5, 3), group=draw.one("0", "3"), contype="2", rgba="1 0 0 1"
+        )
+        return attributes | ({} if self.fromto else draw.some(0.5, pos=draw.numbers(3)))
+
+    def site(self) -> dict[str, str]:
+        return self.draw.turn(0.4) | self.draw.some(0.5, pos=self.draw.numbers(3))
+
+    def actuator(self) -> dict[str, str]:
+        draw = self.draw
+        return draw.some(0.5, armature=draw.numbers(1, 0), damping=draw.numbers(1, 0), gear=draw.numbers(1, 1, 3))
+
+    def klass(self, key: str, chance: float = 0.4) -> dict[str, str]:
+        return self.draw.some(chance, **{key: self.draw.one(*self.classes)})
+
+    def body(self, depth: int) -> str:
+        draw, name = self.draw, f"b{self.bodies}"
+        self.bodies += 1
+        free, parts = depth == 2 and draw.maybe(0.25), []
+        kinds = [draw.one("hinge", "slide", "ball")] + ["hinge" for _ in range(draw.maybe(0.3))]
+        for k, kind in enumerate([] if free or not (depth == 2 or draw.maybe(0.8)) else kinds):
+            if kind == "hinge" and "ball" in kinds[:k]:
+                continue
+            self.joints[f"j{name}{k}"] = kind
+            spring = {"stiffness": "0" if kind == "ball" else draw.numbers(1, -1, 3)}
+            own = {"name": f"j{name}{k}", "type": kind, **self.joint(), **self.klass("class"), **spring}
+            parts.append(element("joint", own))
+        if free:
+            self.joints[f"j{name}"] = "free"
+            bare = f'<freejoint name="j{name}"/>'
+            parts = [draw.one(bare, element("joint", {"name": f"j{name}", "type": "free", "stiffness": "0"}))]
+        shape = draw.one(*SHAPES)
+        size = {"size": draw.numbers(draw.one(SHAPES[shape], 3), 0.1, 0.5)}
+        geom = self.geom() | {"group": "0"} | {"type": shape} | size | self.klass("class")
+        if self.fromto and shape != "sphere":
+            geom |= {"fromto": draw.numbers(6)}
+        parts.append(element("geom", geom))
+        if draw.maybe(0.4):
+            moments = {"diaginertia": "0.3 0.4 0.5", **draw.turn()}
+            full = {"fullinertia": "0.3 0.4 0.5 0.01 -0.02 0.03"}
+            mass = {"pos": draw.numbers(3), "mass": draw.numbers(1, 1, 3)}
+            parts.append(element("inertial", mass | (moments if draw.maybe() else full)))
+        if draw.maybe(0.4):
+            parts = [element("frame", {"pos": draw.numbers(3), **draw.turn(), **self.klass("childclass")}, *parts)]
+        parts += [self.body(depth - 1) for _ in range(depth > 0 and 1 + draw.maybe(0.3))]
+        parts.append(element("site", {"name": f"s{name}"} | self.site()))
+        own = {"name": name, "pos": draw.numbers(3), **draw.turn(), **self.klass("childclass")}
+        return element("body", own | draw.some(0.2, gravcomp=draw.numbers(1)), *parts)
+
+    def equalities(self) -> list[str]:
+        draw = self.draw
+        last = f"b{self.bodies - 1}"
+        pairs = [{"site1": "s", "site2": f"s{last}"}, {"body1": last, "anchor": draw.numbers(3)}]
+        made = [element("connect", draw.one(*pairs) | draw.some(0.3, active="false"))] if draw.maybe() else []
+        singles = [name for name, kind in self.joints.items() if kind in ("hinge", "slide")]
+        if len(singles) > 1 and draw.maybe():
+            own = {"joint1": singles[0], "joint2": singles[1], "polycoef": draw.numbers(draw.one(2, 3, 5))}
+            made.append(element("joint", own | self.klass("class")))
+        return made
+
+    def actuators(self) -> list[str]:
+        names = [name for name, kind in self.joints.items() if kind in ("hinge", "slide") and self.draw.maybe(0.4)]
+        return [element("motor", {"joint": name} | self.actuator() | self.klass("class")) for name in names]
+
+    def write(self, folder: Path) -> Path:
+        (folder / "included.xml").write_text(self.included)
+        (folder / "model.xml").write_text(self.document)
+        return folder / "model.xml"
+
+
+class Urdf:
+    """Random robot; ``floating`` is whether its base is free."""
+
+    def __init__(self, seed: int) -> None:
+        self.draw, self.seed = Draw(1000 + seed), seed
+        draw = self.draw
+        self.floating = draw.maybe()
+        self.joints = {"l0": "free"} if self.floating else {}
+        self.mimics: dict[str, tuple[str, float, float]] = {}
+        links = [self.link(0)]
+        joints = []
+        for k in range(1, 7):
+            links.append(self.link(k))
+            kind = draw.one("revolute", "continuous", "prismatic", "fixed") if k > 1 else "revolute"
+            inner = [f'<parent link="l{int(draw.random() * k)}"/><child link="l{k}"/>', self.origin()]
+            inner += [element("axis", {"xyz": draw.numbers(3, 0.1)})] if draw.maybe(0.8) else []
+            if kind != "fixed":
+                inner.append(element("dynamics", {"damping": draw.numbers(1, 0)} | draw.some(0.5, friction="0.2")))
+                if kind in ("revolute", "prismatic"):
+                    inner.append('<limit lower="-1" upper="2" effort="10" velocity="3"/>')
+                single = [name for name, each in self.joints.items() if each == kind != "continuous"]
+                if single and draw.maybe(0.3):
+                    factor, offset = draw.numbers(2).split()
+                    self.mimics[f"j{k}"] = single[0], float(factor), float(offset)
+                    inner.append(element("mimic", {"joint": single[0], "multiplier": factor, "offset": offset}))
+                else:
+                    self.joints[f"j{k}"] = kind
+            joints.append(element("joint", {"name": f"j{k}", "type": kind}, *inner))
+        self.document = element("robot", {"name": "random"}, *links, *joints)
+
+    def link(self, k: int) -> str:
+        moments = {"ixx": "0.3", "ixy": "0.01", "ixz": "-0.02", "iyy": "0.4", "iyz": "0.03", "izz": "0.5"}
+        inertial = (
+            self.origin(),
+            element("mass", {"value": self.draw.numbers(1, 0.5, 3)}),
+            element("inertia", moments),
+        )
+        return element("link", {"name": f"l{k}"}, element("inertial", {}, *inertial))
+
+    def origin(self) -> str:
+        return element("origin", self.draw.some(0.8, xyz=self.draw.numbers(3), rpy=self.draw.numbers(3)))
+
+    def write(self, folder: Path) -> Path:
+        (folder / "robot.urdf").write_text(self.document)
+        return folder / "robot.urdf"
+
+
+def state_of(robot: Mjcf | Urdf) -> State:
+    """Return a random state: free joints have position, unit quaternion, velocity, and angular velocity of the body."""
+    draw = Draw(robot.seed + 5000)
+    state: State = {}
+    for name, kind in robot.joints.items():
+        place = [*map(float, draw.numbers(3 if kind == "free" else 1).split())]
+        if kind == "ball":
+            place = []
+        if kind in ("ball", "free"):
+            turn = [*map(float, draw.numbers(4, 0.2).split())]
+            place += [each / sum(a * a for a in turn) ** 0.5 for each in turn]
+        rates = {"free": 6, "ball": 3}.get(kind, 1)
+        state[name] = [*place, *map(float, draw.numbers(rates).split())]
+    return state
+
+
+def by_mujoco(robot: Mjcf, state: State, path: Path) -> list[float]:
+    """Return T - V - (-V at q = 0), the power of damping, and the sorted absolute values of the constraints."""
+    import mujoco
+    import numpy as np
+
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
+    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+    disabled = model.opt.disableflags
+    lifts = model.body_gravcomp * model.body_mass
+    if disabled & mujoco.mjtDisableBit.mjDSBL_SPRING and disabled & mujoco.mjtDisableBit.mjDSBL_DAMPER:
+        lifts *= 0
+    if disabled & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
+        lifts *= 0
+    potentials = []
+    for scale in (0.0, 1.0):
+        for name, kind in robot.joints.items():
+            joint, values = model.joint(name), state[name]
+            count = {"free": 7, "ball": 4}.get(kind, 1)
+            at, rate = joint.qposadr[0], joint.dofadr[0]
+            identity = [0.0] * (count - 4) + [1.0, 0.0, 0.0, 0.0] if count > 1 else [0.0]
+            data.qpos[at : at + count] = values[:count] if scale else identity
+            data.qvel[rate : rate + len(values) - count] = scale * np.array(values[count:])
+        mujoco.mj_forward(model, data)
+        potentials.append(data.energy[0] + lifts @ data.xipos @ model.opt.gravity)
+    rows = np.array(data.efc_pos)[: data.ne]
+    power = data.qfrc_damper @ data.qvel
+    return [data.energy[1] - potentials[1] + potentials[0], power, *sorted(abs(rows))]
+
+
+def by_pinocchio(robot: Urdf, state: State, path: Path) -> list[float]:
+    """Return T - V - (-V at q = 0) and the power of damping."""
+    import numpy as np
+    import pinocchio
+
+    base = [pinocchio.JointModelFreeFlyer()] if robot.floating else []
+    model = pinocchio.buildModelFromUrdf(str(path), *base)
+    data = model.createData()
+    damped = np.array(model.damping)
+    potentials = []
+    for scale in (0.0, 1.0):
+        q, v = pinocchio.neutral(model), np.zeros(model.nv)
+        for name in model.names[1:]:
+            joint = model.joints[model.getJointId(name)]
+            if name == "root_joint":
+                x, turn, rates, spin = (state["l0"][i:j] for i, j in ((0, 3), (3, 7), (7, 10), (10, 13)))
+                if scale:
+                    rotation = pinocchio.Quaternion(*turn).toRotationMatrix()
+                    q[joint.idx_q : joint.idx_q + 7] = [*x, *turn[1:], turn[0]]
+                    v[joint.idx_v : joint.idx_v + 6] = [*(rotation.T @ rates), *spin]
+                continue
+            leader, factor, offset = robot.mimics.get(name, (name, 1.0, 0.0))
+            angle, rate = scale * factor * state[leader][0] + offset, scale * factor * state[leader][1]
+            q[joint.idx_q : joint.idx_q + joint.nq] = [np.cos(angle), np.sin(angle)] if joint.nq == 2 else [angle]
+            v[joint.idx_v] = rate
+        energy = pinocchio.computeKineticEnergy(model, data, q, v)
+        potentials.append(pinocchio.computePotentialEnergy(model, data, q))
+    return [energy - potentials[1] + potentials[0], -damped @ v**2]
+
+
+if __name__ == "__main__":
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        recorded: dict[str, list[list[float]]] = {"mjcf": [], "urdf": []}
+        for seed in range(SEEDS):
+            for kind, make, reference in (("mjcf", Mjcf, by_mujoco), ("urdf", Urdf, by_pinocchio)):
+                robot = make(seed)
+                recorded[kind].append(reference(robot, state_of(robot), robot.write(folder)))  # type: ignore[operator]
+    RECORDED.write_text(json.dumps(recorded, indent=1) + "\n")
