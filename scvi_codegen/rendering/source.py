@@ -130,6 +130,7 @@ class Source:
 
 COMPONENTS = {"rotation": 4, "direction": 3, "spin": 2}
 """Number of homogeneous coordinates by kind."""
+LENGTH_OF_NEIGHBOURS = re.compile(r"[A-Za-z]\w* (cutoff|skin|box) \S.*", re.ASCII)
 DECLARED = re.compile(r"rotation [A-Za-z]\w* [A-Za-z]\w*( momentum)?|(direction|spin) [A-Za-z]\w*", re.ASCII)
 
 
@@ -159,6 +160,10 @@ def check_interface(source: Source, interface: Interface) -> None:
     for name, (found, wanted) in lengths.items():
         if found != wanted:
             raise ValueError(f"{name}: the interface has {found}; {wanted} is required")
+    with_cutoff = {each.split(" ")[0] for each in interface.lengths if LENGTH_OF_NEIGHBOURS.fullmatch(each)}
+    for each in interface.lengths:
+        if not LENGTH_OF_NEIGHBOURS.fullmatch(each) or each.split(" ")[0] not in with_cutoff:
+            raise ValueError(f"lengths: {each!r} must be the name of neighbours, cutoff, skin or box, and a formula")
     if not set(interface.inputs) <= {name[:-2] for name in interface.parameters if name.endswith("_0")}:
         raise ValueError(
             f"the inputs {interface.inputs} must be among the parameters, each with its first parameter NAME_0"

@@ -238,8 +238,6 @@ def test_model_files_and_generated_programs_have_constraints(tmp_path):
     end = np.loadtxt(folder / "end.txt")
     assert np.abs(end[:12] - run.q["r"][-1].ravel()).max() < 1e-12
     assert "lambda*(2*r[i+1, 0] - 2*r[i, 0])" in derive(model.system, model.method).to_text()
-    with pytest.raises(MethodError, match="gauss-lobatto:2'\\) is RATTLE"):
-        sc.verify(model.system, model.method, model.q, h=0.01)
 
 
 @pytest.mark.parametrize(

@@ -85,7 +85,7 @@ def test_orbits_of_billiards_have_the_multipliers_of_mirrors():
 
 def test_fit_of_restitution_and_wall_from_bounces():
     """Exact parameters from exact heights, and parameters within their errors from noisy ones."""
-    with pytest.warns(sc.SystemDefinitionWarning, match="'e' is not used"):
+    with pytest.warns(sc.SystemDefinitionWarning, match="'e' does not occur"):
         ball = LagrangianSystem.from_text(
             name="ball", coordinates=["y"], lagrangian="y_dot**2/2 - g*y", parameters={"g": 1.0, "e": 0.8, "w": 0.1}
         )

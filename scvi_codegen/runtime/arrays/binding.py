@@ -286,7 +286,7 @@ class ArrayBinding(Binding):
             problem, energies, inverse_mass = self._arrays[run].problem, super().function("energies"), run.inverse_mass
             for k in range(count):
                 at, moving = q + k * n, p + k * n
-                if layout.momenta or not layout.symmetric:  # sums read p directly after q
+                if layout.momenta or layout.velocity_formulas or not layout.symmetric:  # sums read p directly after q
                     self._ffi.memmove(run.q, at, 8 * n)
                     self._ffi.memmove(run.p, moving, 8 * n)
                     at, moving = run.q, run.p

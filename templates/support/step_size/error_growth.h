@@ -5,12 +5,12 @@
 #include "../run/run.h"
 
 /* Growth of errors along an adaptive run: the relative size of one tangent vector (dq, dv), dq'' = F_q dq / m, which an
- * explicit Runge-Kutta-Nystroem scheme advances by each accepted step. Its nodes are points of the step, at which F_q is
- * evaluated in SIMD lanes; a_0 is extrapolated from the step before. Where h^2 F_q / m is large, the scheme is corrected
- * by fixed-point iterations x = x0 + h^2 P (F_q x) / m of the equations of the step itself. Every second step the vector
- * is projected on the energy surface (in the metric of the sizes of q and v): its part along the gradient of the energy,
- * which is conserved, grows by the error of the scheme only. Requires: the tables of the scheme, point_derivatives and
- * derivative_product. */
+ * explicit Runge-Kutta-Nystroem scheme advances by each accepted step. Its nodes are points of the step, at which
+ * F_q is evaluated in SIMD lanes; a_0 is extrapolated from the step before. Where h^2 F_q / m is large, the scheme is
+ * corrected by fixed-point iterations x = x0 + h^2 P (F_q x) / m of the equations of the step itself. Every second step
+ * the vector is projected on the energy surface (in the metric of the sizes of q and v): its part along the gradient of
+ * the energy, which is conserved, grows by the error of the scheme only. Requires: the tables of the scheme,
+ * point_derivatives and derivative_product. */
 
 #define LOOSE_TOLERANCE 2 /* value of measures_growth for tolerances above 1e-6 */
 #define SAMPLED_STEPS 2 /* one of so many steps is projected and measured */
@@ -85,8 +85,8 @@ static __attribute__((noinline)) void correct_tangent(run_memory *run, const ste
   }
 }
 
-/* Advances the tangent vector by a step. The stages are the same in all lanes, of which each uses the derivatives at one
- * point: reading single lanes of all derivatives would take longer. */
+/* Advances the tangent vector by a step. The stages are the same in all lanes, of which each uses the derivatives at
+ * one point: reading single lanes of all derivatives would take longer. */
 static inline void advance_tangent(run_memory *run, const step_data *step, const iteration_data *data,
     coordinates *X)
 {
