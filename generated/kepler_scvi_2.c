@@ -71,8 +71,8 @@ static const double QUADRATURE_SCATTER_0[2][6] = {
 static const double QUADRATURE_SCATTER_1[2][6] = {
     {-1.0, -0.6056624327025936, 0.39433756729740643, 0.0, 0.0, 0.0},
     {-1.0, -0.8943375672974064, 0.10566243270259355, 0.0, 0.0, 0.0}};
-static const int QUADRATURE_SLOPE_0[4][2] = {{0, 0}, {0, 1}, {1, 0}, {1, 1}};
-static const int QUADRATURE_SLOPE_1[2][2] = {{0, 0}, {1, 1}};
+static const int QUADRATURE_DERIVATIVES_0[4][2] = {{0, 0}, {0, 1}, {1, 0}, {1, 1}};
+static const int QUADRATURE_DERIVATIVES_1[2][2] = {{0, 0}, {1, 1}};
 
 /* Node: 2 points. Gather tables have one row
  * per block and one column per point, scatter tables one row per point and one column per row of equations, the last
@@ -86,11 +86,11 @@ static const double NODE_SCATTER_0[2][6] = {{0.5, 0.4375, -0.0625, 0.0, 0.0, 1.0
 static const double NODE_SCATTER_1[2][6] = {{-1.0, -0.75, 0.25, 0.0, 0.0, 0.0}, {-1.0, -1.0, 0.0, 0.0, 0.0, 0.0}};
 static const double NODE_SCATTER_2[2][6] = {{0.0, -1.0, 0.0, 0.0, 0.0, 0.0}, {0.0, 0.0, -1.0, 0.0, 0.0, 0.0}};
 static const double NODE_SCATTER_3[2][6] = {{0.0, 0.0, 0.0, -1.0, 0.0, 0.0}, {0.0, 0.0, 0.0, 0.0, -1.0, 0.0}};
-static const int NODE_SLOPE_0[4][2] = {{0, 0}, {0, 1}, {1, 0}, {1, 1}};
-static const int NODE_SLOPE_1[4][2] = {{0, 0}, {0, 1}, {1, 0}, {1, 1}};
-static const int NODE_SLOPE_2[2][2] = {{0, 0}, {1, 1}};
-static const int NODE_SLOPE_3[4][2] = {{0, 0}, {0, 1}, {1, 0}, {1, 1}};
-static const int NODE_SLOPE_4[2][2] = {{0, 0}, {1, 1}};
+static const int NODE_DERIVATIVES_0[4][2] = {{0, 0}, {0, 1}, {1, 0}, {1, 1}};
+static const int NODE_DERIVATIVES_1[4][2] = {{0, 0}, {0, 1}, {1, 0}, {1, 1}};
+static const int NODE_DERIVATIVES_2[2][2] = {{0, 0}, {1, 1}};
+static const int NODE_DERIVATIVES_3[4][2] = {{0, 0}, {0, 1}, {1, 0}, {1, 1}};
+static const int NODE_DERIVATIVES_4[2][2] = {{0, 0}, {1, 1}};
 
 /* Position of each coordinate in a bandwidth-reducing ordering; {i, j}: d y_i / d x_j. */
 static const int POSITION_IN_MATRIX[SITES] = {0, 1};
@@ -115,7 +115,8 @@ static void quadrature_value(const double *u, double t, const double *parameters
 
 /* The same, and the nonzero derivatives with respect to u = (q, v). Operations: 13 *, 1 +, 2 -, 1 inverse_root_3, 1
  * inverse_root_5, 4 neg. */
-static void quadrature_slope(const double *u, double t, const double *parameters, double *value, double *derivative)
+static void quadrature_derivatives(const double *u, double t, const double *parameters, double *value,
+    double *derivative)
 {
   (void)t;
   value[2] = u[2];
@@ -161,7 +162,7 @@ static void node_value(const double *u, double t, const double *parameters, doub
 
 /* The same, and the nonzero derivatives with respect to u = (q, v, a, lambda). Operations: 55 *, 6 +, 12 -, 1
  * inverse_root_3, 1 inverse_root_5, 1 inverse_root_7, 1 neg. */
-static void node_slope(const double *u, double t, const double *parameters, double *value, double *derivative)
+static void node_derivatives(const double *u, double t, const double *parameters, double *value, double *derivative)
 {
   (void)t;
   value[2] = 0.0;
@@ -252,7 +253,7 @@ static void add_quadrature(const step_data *step, const double *z, double *rows,
   gather(QUADRATURE_GATHER_1[0], 2, 1, z, 2, u + 2, 4, 1);
   for (int n = 0; n < 2; n++) {
     if (jacobian)
-      quadrature_slope(u + n * 4, step->t, step->parameters, value + n * 4, derivative + n * 6);
+      quadrature_derivatives(u + n * 4, step->t, step->parameters, value + n * 4, derivative + n * 6);
     else
       quadrature_value(u + n * 4, step->t, step->parameters, value + n * 4);
   }
@@ -260,10 +261,10 @@ static void add_quadrature(const step_data *step, const double *z, double *rows,
   scatter(QUADRATURE_SCATTER_1[0], 2, QUADRATURE_WEIGHT, 1, value + 2, 4, 2, rows, size);
   if (!jacobian)
     return;
-  scatter_derivatives(QUADRATURE_SCATTER_0[0], QUADRATURE_GATHER_0[0], 2, QUADRATURE_WEIGHT, h * h, QUADRATURE_SLOPE_0,
-      4, &derivative[0], 6, jacobian, shape);
-  scatter_derivatives(QUADRATURE_SCATTER_1[0], QUADRATURE_GATHER_1[0], 2, QUADRATURE_WEIGHT, 1, QUADRATURE_SLOPE_1, 2,
-      &derivative[4], 6, jacobian, shape);
+  scatter_derivatives(QUADRATURE_SCATTER_0[0], QUADRATURE_GATHER_0[0], 2, QUADRATURE_WEIGHT, h * h,
+      QUADRATURE_DERIVATIVES_0, 4, &derivative[0], 6, jacobian, shape);
+  scatter_derivatives(QUADRATURE_SCATTER_1[0], QUADRATURE_GATHER_1[0], 2, QUADRATURE_WEIGHT, 1,
+      QUADRATURE_DERIVATIVES_1, 2, &derivative[4], 6, jacobian, shape);
 }
 
 /* Node points: adds their part of the rows, and of the Jacobian unless it is NULL. */
@@ -279,7 +280,7 @@ static void add_node(const step_data *step, const double *z, double *rows, doubl
   gather(NODE_GATHER_3[0], 2, 1, z, 2, u + 6, 8, 1);
   for (int n = 0; n < 2; n++) {
     if (jacobian)
-      node_slope(u + n * 8, step->t, step->parameters, value + n * 8, derivative + n * 16);
+      node_derivatives(u + n * 8, step->t, step->parameters, value + n * 8, derivative + n * 16);
     else
       node_value(u + n * 8, step->t, step->parameters, value + n * 8);
   }
@@ -289,16 +290,16 @@ static void add_node(const step_data *step, const double *z, double *rows, doubl
   scatter(NODE_SCATTER_3[0], 2, NODE_WEIGHT, h, value + 6, 8, 2, rows, size);
   if (!jacobian)
     return;
-  scatter_derivatives(NODE_SCATTER_0[0], NODE_GATHER_0[0], 2, NODE_WEIGHT, h * h * h, NODE_SLOPE_0, 4, &derivative[0],
+  scatter_derivatives(NODE_SCATTER_0[0], NODE_GATHER_0[0], 2, NODE_WEIGHT, h * h * h, NODE_DERIVATIVES_0, 4,
+      &derivative[0], 16, jacobian, shape);
+  scatter_derivatives(NODE_SCATTER_0[0], NODE_GATHER_3[0], 2, NODE_WEIGHT, h * h, NODE_DERIVATIVES_1, 4, &derivative[4],
       16, jacobian, shape);
-  scatter_derivatives(NODE_SCATTER_0[0], NODE_GATHER_3[0], 2, NODE_WEIGHT, h * h, NODE_SLOPE_1, 4, &derivative[4], 16,
+  scatter_derivatives(NODE_SCATTER_2[0], NODE_GATHER_3[0], 2, NODE_WEIGHT, 1, NODE_DERIVATIVES_2, 2, &derivative[8], 16,
       jacobian, shape);
-  scatter_derivatives(NODE_SCATTER_2[0], NODE_GATHER_3[0], 2, NODE_WEIGHT, 1, NODE_SLOPE_2, 2, &derivative[8], 16,
-      jacobian, shape);
-  scatter_derivatives(NODE_SCATTER_3[0], NODE_GATHER_0[0], 2, NODE_WEIGHT, h * h, NODE_SLOPE_3, 4, &derivative[10], 16,
-      jacobian, shape);
-  scatter_derivatives(NODE_SCATTER_3[0], NODE_GATHER_2[0], 2, NODE_WEIGHT, 1, NODE_SLOPE_4, 2, &derivative[14], 16,
-      jacobian, shape);
+  scatter_derivatives(NODE_SCATTER_3[0], NODE_GATHER_0[0], 2, NODE_WEIGHT, h * h, NODE_DERIVATIVES_3, 4,
+      &derivative[10], 16, jacobian, shape);
+  scatter_derivatives(NODE_SCATTER_3[0], NODE_GATHER_2[0], 2, NODE_WEIGHT, 1, NODE_DERIVATIVES_4, 2, &derivative[14],
+      16, jacobian, shape);
 }
 
 /* Evaluates the stage equations: for every coordinate B residuals and p1 - p0 in rows; the sizes of p1 and q1 before

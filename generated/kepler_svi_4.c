@@ -75,8 +75,8 @@ static const double QUADRATURE_SCATTER_1[4][5] = {
     {0.0, -1.0, 0.0, 0.0, 0.0},
     {0.0, 0.0, -1.0, 0.0, 0.0},
     {0.0, 0.0, 0.0, -1.0, 0.0}};
-static const int QUADRATURE_SLOPE_0[4][2] = {{0, 0}, {0, 1}, {1, 0}, {1, 1}};
-static const int QUADRATURE_SLOPE_1[2][2] = {{0, 0}, {1, 1}};
+static const int QUADRATURE_DERIVATIVES_0[4][2] = {{0, 0}, {0, 1}, {1, 0}, {1, 1}};
+static const int QUADRATURE_DERIVATIVES_1[2][2] = {{0, 0}, {1, 1}};
 
 /* Position of each coordinate in a bandwidth-reducing ordering; {i, j}: d y_i / d x_j. */
 static const int POSITION_IN_MATRIX[SITES] = {0, 1};
@@ -100,7 +100,8 @@ static void quadrature_value(const double *u, double t, const double *parameters
 
 /* The same, and the nonzero derivatives with respect to u = (q, v). Operations: 13 *, 1 +, 2 -, 1 inverse_root_3, 1
  * inverse_root_5, 4 neg. */
-static void quadrature_slope(const double *u, double t, const double *parameters, double *value, double *derivative)
+static void quadrature_derivatives(const double *u, double t, const double *parameters, double *value,
+    double *derivative)
 {
   (void)t;
   value[2] = u[2];
@@ -163,7 +164,7 @@ static void add_quadrature(const step_data *step, const double *z, double *rows,
   gather(QUADRATURE_GATHER_1[0], 4, 1, z, 2, u + 2, 4, 1);
   for (int n = 0; n < 4; n++) {
     if (jacobian)
-      quadrature_slope(u + n * 4, step->t, step->parameters, value + n * 4, derivative + n * 6);
+      quadrature_derivatives(u + n * 4, step->t, step->parameters, value + n * 4, derivative + n * 6);
     else
       quadrature_value(u + n * 4, step->t, step->parameters, value + n * 4);
   }
@@ -171,10 +172,10 @@ static void add_quadrature(const step_data *step, const double *z, double *rows,
   scatter(QUADRATURE_SCATTER_1[0], 4, QUADRATURE_WEIGHT, 1, value + 2, 4, 2, rows, size);
   if (!jacobian)
     return;
-  scatter_derivatives(QUADRATURE_SCATTER_0[0], QUADRATURE_GATHER_0[0], 4, QUADRATURE_WEIGHT, h * h, QUADRATURE_SLOPE_0,
-      4, &derivative[0], 6, jacobian, shape);
-  scatter_derivatives(QUADRATURE_SCATTER_1[0], QUADRATURE_GATHER_1[0], 4, QUADRATURE_WEIGHT, 1, QUADRATURE_SLOPE_1, 2,
-      &derivative[4], 6, jacobian, shape);
+  scatter_derivatives(QUADRATURE_SCATTER_0[0], QUADRATURE_GATHER_0[0], 4, QUADRATURE_WEIGHT, h * h,
+      QUADRATURE_DERIVATIVES_0, 4, &derivative[0], 6, jacobian, shape);
+  scatter_derivatives(QUADRATURE_SCATTER_1[0], QUADRATURE_GATHER_1[0], 4, QUADRATURE_WEIGHT, 1,
+      QUADRATURE_DERIVATIVES_1, 2, &derivative[4], 6, jacobian, shape);
 }
 
 /* Evaluates the stage equations: for every coordinate B residuals and p1 - p0 in rows; the sizes of p1 and q1 before

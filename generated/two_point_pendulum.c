@@ -63,7 +63,8 @@ static void quadrature_value(const double *u, double t, const double *parameters
 }
 
 /* The same, and the nonzero derivatives with respect to u = (q, v). Operations: 7 *, 1 cos, 2 neg, 1 sin. */
-static void quadrature_slope(const double *u, double t, const double *parameters, double *value, double *derivative)
+static void quadrature_derivatives(const double *u, double t, const double *parameters, double *value,
+    double *derivative)
 {
   (void)t;
   const double w0 = parameters[2] * parameters[1] * parameters[0];
@@ -119,7 +120,7 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
   for (int n = 0; n < 2; n++) {
     const double t = step->t;
     if (jacobian)
-      quadrature_slope(u + n * 2, t, step->parameters, value + n * 2, derivative + n * 2);
+      quadrature_derivatives(u + n * 2, t, step->parameters, value + n * 2, derivative + n * 2);
     else
       quadrature_value(u + n * 2, t, step->parameters, value + n * 2);
   }

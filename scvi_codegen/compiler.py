@@ -112,7 +112,7 @@ def compile_stepper(
     sources = CachedSources(system, method, solver, prefix, symmetries, time_transformation)
     variants = Variants(make=sources.variant, lacking=lambda name: name == "second_derivatives" and system.damping != 0)
     if not known_sizes:
-        source, interface, reason = sources.of_any_size()
+        source, interface, reason = sources.of_run_time_sizes()
         rattle = system.constraints and isinstance(method, StoermerVerlet)
         of_sizes = partial(
             compile_stepper,
@@ -177,8 +177,8 @@ class CachedSources:
         source, interface = json.loads(cached_source((*self.key, "integrator"), derive))
         return Source.from_record(source), Interface.from_record(interface)
 
-    def of_any_size(self) -> tuple[Source | None, Interface, str]:
-        """Return the C source for arrays of any size, or ``None``; the interface; the reason why there is none."""
+    def of_run_time_sizes(self) -> tuple[Source | None, Interface, str]:
+        """Return the C source for run-time sizes, or ``None``; the interface; the reason why there is none."""
 
         def derive() -> str:
             try:

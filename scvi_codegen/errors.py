@@ -68,7 +68,7 @@ class MethodError(ScviCodegenError, ValueError):
 
 
 class SizesRequiredError(SystemDefinitionError, MethodError):
-    """A system or a method that has no integrator for arrays of any size: the sizes must be known."""
+    """A system or a method that has no integrator for arrays of run-time sizes: the sizes must be known."""
 
 
 class OrbitError(ScviCodegenError, ArithmeticError):

@@ -43,7 +43,7 @@ from scvi_codegen.mechanics.derived_systems import with_tangent_vectors
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
-from scvi_codegen.mechanics.term_groups import rolled
+from scvi_codegen.mechanics.term_groups import roll_terms
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretise, discretised_form
 from scvi_codegen.methods.method import Method
@@ -91,9 +91,9 @@ def program_of(
     program_part = partial(
         lower, method=method, prefix=name, solver=solver, symmetries=tracked, lanes=lanes, fallback=fallback
     )
-    parts = rolled(system)
-    looped = with_sums(program_part(parts.rest), parts) if parts else None
-    return looped or program_part(system)
+    parts = roll_terms(system)
+    rolled = with_sums(program_part(parts.rest), parts) if parts else None
+    return rolled or program_part(system)
 
 
 def c_identifier(name: str) -> str:
@@ -241,12 +241,12 @@ class Sources:
             self._derived = partial(program_of, form, method, prefix=self.prefix, symmetries=symmetries)
 
     def _program_of_arrays(self, **_: bool) -> Program:
-        """Return the program of arrays; raise :class:`SizesRequiredError` if there is none for any size."""
+        """Return the program of arrays; raise :class:`SizesRequiredError` if there is none for run-time sizes."""
         system = self.sites.system if self.sites else self.system
         system.check_run_time_sizes()
         try:
             if self.g is not None:
-                raise SizesRequiredError("time_transformation is not available for arrays of any size")
+                raise SizesRequiredError("time_transformation is not available for arrays of run-time sizes")
             return lower(system, self.method, prefix=self.prefix, solver=self.solver)
         except SizesRequiredError as error:
             raise SizesRequiredError(f"{error}. This concerns '{self.system.name}': {SIZES_REQUIRED}") from error

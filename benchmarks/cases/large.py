@@ -1,4 +1,4 @@
-"""Array systems of any size for timing: a ring of springs, a field, a crystal and a cluster of bodies."""
+"""Array systems of run-time sizes for timing: a ring of springs, a field, a crystal and a cluster of bodies."""
 
 from collections.abc import Mapping
 

@@ -171,7 +171,7 @@ def derive(system: MechanicalSystem, method: Method | str, *, radicals: bool = F
 def derive(
     system: MechanicalSystem | ArraySystem, method: Method | str, *, radicals: bool = False
 ) -> StepEquations | ArrayStepEquations:
-    """Return the closed form of one step in the notation of the paper; of arrays of any size its kernels and loops.
+    """Return the closed form of one step in the notation of the paper; of run-time sizes its kernels and loops.
 
     Args:
         system: the Lagrangian.

@@ -45,7 +45,7 @@ class Flow:
         """Return a flow for arguments of users.
 
         Raises:
-            MethodError: for a stepper without derivatives, without fixed steps or of arrays of any size.
+            MethodError: for a stepper without derivatives, without fixed steps or of arrays of run-time sizes.
             StateError: for invalid numbers of steps.
         """
         require(stepper, "flow")

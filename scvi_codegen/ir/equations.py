@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from enum import Enum, auto
 from typing import Literal, TypeAlias
 
-from scvi_codegen.ir.kernel import Kernel, LoopedKernel, Number, NumberTable
+from scvi_codegen.ir.kernel import Kernel, Number, NumberTable, RolledKernel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -156,8 +156,8 @@ class ConstrainedSteps:
         parts: fractions of a step, each of which is a RATTLE step.
     """
 
-    conditions: tuple[LoopedKernel, ...]
-    curvatures: tuple[LoopedKernel, ...]
+    conditions: tuple[RolledKernel, ...]
+    curvatures: tuple[RolledKernel, ...]
     parts: tuple[Number, ...]
 
 
@@ -281,7 +281,7 @@ class FixedPointIteration:
         table = next(each for each in self.own_tables if each.name == name)
         return table.numbers if table.is_matrix else (table.numbers,)
 
-    def with_forces(self, forces: tuple[LoopedKernel, ...]) -> FixedPointIteration | None:
+    def with_forces(self, forces: tuple[RolledKernel, ...]) -> FixedPointIteration | None:
         """Return the iteration with further forces L_q of positions; ``None`` if these also enter otherwise."""
         added = (each.with_sums(forces) if each.name in self.forces else each for each in self.kernels)
         return replace(self, kernels=tuple(added)) if self.forces else None

@@ -3,7 +3,7 @@
 ``u[i]`` are its arguments, ``t`` the time and ``parameters[i]`` the parameters: temporaries, each used more than once,
 then results. Operations are ``+ - * / neg sqrt``, ``inverse_root_k`` (x^(-k/2)) and calls of elementary functions on
 numbers of the target's scalar type; there are no branches. Terms that differ only in the entries that they read are a
-loop around a kernel (:class:`LoopedKernel`): of a system of arrays over its indices, of a system of named coordinates
+loop around a kernel (:class:`RolledKernel`): of a system of arrays over its indices, of a system of named coordinates
 over a constant table of indices, within the kernel of the other terms.
 
 Large kernels are divided into parts, since compile times grow faster than the length of a function: gcc 12 spends 6 of
@@ -122,9 +122,9 @@ class Kernel:
     symbols: tuple[sympy.Symbol, ...] = field(default=(), repr=False, compare=False)
     formulas: tuple[sympy.Expr, ...] = field(default=(), repr=False, compare=False)
     purpose: str = field(default="", repr=False, compare=False)
-    sums: tuple[LoopedKernel, ...] = ()
+    sums: tuple[RolledKernel, ...] = ()
 
-    def with_sums(self, sums: tuple[LoopedKernel, ...]) -> Kernel:
+    def with_sums(self, sums: tuple[RolledKernel, ...]) -> Kernel:
         """Return the kernel with further loops, whose kernels are called after it."""
         named = (replace(each, kernel=replace(each.kernel, name=f"{self.name}_{each.kernel.name}")) for each in sums)
         return replace(self, sums=(*self.sums, *named))
@@ -172,7 +172,7 @@ class Kernel:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LoopedKernel:
+class RolledKernel:
     """A kernel in loops over indices, whose values are added to entries of arrays.
 
     Elements, and the writes of an element, are processed in order, so that loops and their unrolled form round alike.
@@ -212,7 +212,7 @@ class LoopedKernel:
         table: tuple[tuple[int, ...], ...],
         given: tuple[tuple[Constant | Load, ...], ...] = (),
         targets: tuple[tuple[int, ...], ...] = (),
-    ) -> LoopedKernel:
+    ) -> RolledKernel:
         """Return the loop over constant rows e: value[targets[e][a]] += kernel_a(u[table[e][..]], given[..][e]).
 
         Args:

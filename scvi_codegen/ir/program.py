@@ -18,7 +18,7 @@ from scvi_codegen.ir.equations import (
     Rattle,
     Splitting,
 )
-from scvi_codegen.ir.kernel import Kernel, LoopedKernel, Number, NumberTable
+from scvi_codegen.ir.kernel import Kernel, Number, NumberTable, RolledKernel
 
 LEAST_REUSED_UNKNOWNS = 32
 """Number of unknowns from which on factors of the Newton matrix are reused in later steps.
@@ -187,7 +187,7 @@ class ShiftTables:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LoopedTerms:
+class RolledTerms:
     """Terms of a system of arrays, each in its loops.
 
     Attributes:
@@ -202,18 +202,18 @@ class LoopedTerms:
             skin, which writes to the first position.
     """
 
-    forces: tuple[LoopedKernel, ...] = ()
-    masses: tuple[LoopedKernel, ...] = ()
-    constants: tuple[LoopedKernel, ...] = ()
+    forces: tuple[RolledKernel, ...] = ()
+    masses: tuple[RolledKernel, ...] = ()
+    constants: tuple[RolledKernel, ...] = ()
     constrained: ConstrainedSteps | None = None
-    products: tuple[LoopedKernel, ...] = ()
-    diagonals: tuple[LoopedKernel, ...] = ()
+    products: tuple[RolledKernel, ...] = ()
+    diagonals: tuple[RolledKernel, ...] = ()
     reach: int = 0
     shifts: ShiftTables | None = None
-    neighbours: tuple[tuple[str, int, LoopedKernel], ...] = ()
+    neighbours: tuple[tuple[str, int, RolledKernel], ...] = ()
 
     @property
-    def applied(self) -> tuple[LoopedKernel, ...]:
+    def applied(self) -> tuple[RolledKernel, ...]:
         """Terms that are evaluated at the points of a step."""
         return (*self.forces, *self.products, *self.diagonals)
 
@@ -254,7 +254,7 @@ class Program:
     constraints: Constraints | None = None
     rattle: Rattle | None = None
     damping: Kernel | None = None
-    loops: LoopedTerms = LoopedTerms()
+    loops: RolledTerms = RolledTerms()
 
     @property
     def dimension(self) -> int:
@@ -262,7 +262,7 @@ class Program:
         return len(self.layout.coordinates)
 
     @property
-    def in_loops(self) -> bool:
+    def of_arrays(self) -> bool:
         """True for a system of arrays."""
         return bool(self.loops.forces or self.loops.masses)
 

@@ -2,7 +2,7 @@
 
 from scvi_codegen.errors import MethodError, ScviCodegenError, SizesRequiredError
 from scvi_codegen.ir.equations import ConstrainedSteps, FixedPointIteration, Splitting
-from scvi_codegen.ir.program import LoopedTerms
+from scvi_codegen.ir.program import RolledTerms
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -32,7 +32,7 @@ def check_solver_of_arrays(
     method: Method,
     solver: str,
     chosen: Splitting | ConstrainedSteps | FixedPointIteration | None,
-    loops: LoopedTerms,
+    loops: RolledTerms,
 ) -> None:
     """Raise :class:`MethodError` for a method and a solver that are not available for an array system.
 

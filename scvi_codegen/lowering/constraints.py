@@ -33,9 +33,9 @@ from sympy import Symbol
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.equations import ConstrainedSteps, Constraints, Rattle
-from scvi_codegen.ir.kernel import LoopedKernel, lower_matrix, lower_vector
+from scvi_codegen.ir.kernel import RolledKernel, lower_matrix, lower_vector
 from scvi_codegen.lowering.solvers.tables import velocity_tables
-from scvi_codegen.lowering.stage_groups import looped_kernel, system_kernel
+from scvi_codegen.lowering.stage_groups import rolled_kernel, system_kernel
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.arrays.terms import constraint_gradient, constraint_second_rate, constraint_text, entries_of
 from scvi_codegen.mechanics.derived_expressions import forms_of
@@ -105,7 +105,7 @@ def _parts(stages: StageSystem, method: Method) -> Vector:
     )
 
 
-def _kernels(system: ArraySystem) -> Iterator[tuple[LoopedKernel, LoopedKernel]]:
+def _kernels(system: ArraySystem) -> Iterator[tuple[RolledKernel, RolledKernel]]:
     """Yield the condition of each constraint, and its second derivative in time at constant velocity."""
     for number, term in enumerate(system.constraints):
         u = entries_of(term, system.coordinates)
@@ -113,10 +113,10 @@ def _kernels(system: ArraySystem) -> Iterator[tuple[LoopedKernel, LoopedKernel]]
         *partials, rate = constraint_gradient(term, system.coordinates, system.time)
         second = constraint_second_rate(term, system.coordinates, system.time, v)
         values, purpose = [term.formula, rate, *partials], "g, g_t, and the derivatives of g."
-        looped = partial(looped_kernel, system, of=term, u=u, text=constraint_text(term))
+        rolled = partial(rolled_kernel, system, of=term, u=u, text=constraint_text(term))
         yield (
-            looped(f"condition_{number}", values, purpose=purpose),
-            looped(f"curvature_{number}", [second], along=v, purpose="d^2 g / dt^2 along v."),
+            rolled(f"condition_{number}", values, purpose=purpose),
+            rolled(f"curvature_{number}", [second], along=v, purpose="d^2 g / dt^2 along v."),
         )
 
 

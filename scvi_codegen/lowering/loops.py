@@ -14,9 +14,9 @@ from scvi_codegen.formulas.neighbours import MAX_COMPONENTS, Neighbours
 from scvi_codegen.indices import Access, Array, Place
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.equations import ConstrainedSteps
-from scvi_codegen.ir.kernel import Constant, Load, LoopedKernel, exact_number
-from scvi_codegen.ir.program import LoopedTerms, Program
-from scvi_codegen.lowering.stage_groups import looped_kernel
+from scvi_codegen.ir.kernel import Constant, Load, RolledKernel, exact_number
+from scvi_codegen.ir.program import Program, RolledTerms
+from scvi_codegen.lowering.stage_groups import rolled_kernel
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.arrays.terms import entries_of, force_of
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -26,7 +26,7 @@ LONG_FORMULA = 1000
 """Nodes of the expressions from which on a comment does not contain a formula."""
 
 
-def looped_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, newton: bool) -> LoopedTerms:
+def rolled_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, newton: bool) -> RolledTerms:
     """Return the kernels of the terms of a system of arrays; ``newton``: with the Jacobian of the forces."""
     potentials = [part for term in system.potentials for part in _parts(system, term)]
     arguments = (*system.state, *system.velocities)
@@ -34,7 +34,7 @@ def looped_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, n
     masses = [
         (f"mass of {access}", mass, number) for number, mass in enumerate(system.masses) for access, _ in mass.targets
     ]
-    return LoopedTerms(
+    return RolledTerms(
         forces=(
             *(_potential(system, *part, number) for number, part in enumerate(potentials)),
             *(
@@ -44,7 +44,7 @@ def looped_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, n
         ),
         masses=tuple(_added(system, f"mass_{number}", mass, (), text, "A mass.") for text, mass, number in masses),
         constants=tuple(
-            looped_kernel(system, f"constant_{number}", [term.formula], term, text=_shown(term), purpose="The term.")
+            rolled_kernel(system, f"constant_{number}", [term.formula], term, text=_shown(term), purpose="The term.")
             for number, term in enumerate(system.energy_offsets)
         ),
         constrained=constrained,
@@ -55,33 +55,33 @@ def looped_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, n
     )
 
 
-def _list(system: ArraySystem, near: Neighbours) -> tuple[str, int, LoopedKernel]:
+def _list(system: ArraySystem, near: Neighbours) -> tuple[str, int, RolledKernel]:
     """Return name, components and lengths of a list of neighbours."""
     lengths = [*near.box, *[S.Zero] * (MAX_COMPONENTS - len(near.box)), near.cutoff, near.skin]
     none = ArrayTerm(loops=(), formula=S.One, slots=())
     first = Access(array=near.array, places=(Place(),) * len(near.array.axes))
     name, purpose = f"list_{near.name}", "Periods, cutoff and skin of a list of neighbours."
-    looped = looped_kernel(system, name, lengths, none, targets=[first], text=near.name, purpose=purpose)
-    return near.name, near.components, looped
+    rolled = rolled_kernel(system, name, lengths, none, targets=[first], text=near.name, purpose=purpose)
+    return near.name, near.components, rolled
 
 
 def _added(
     system: ArraySystem, name: str, of: ArrayForce, arguments: Sequence[Array], text: str, purpose: str
-) -> LoopedKernel:
+) -> RolledKernel:
     """Return the kernel of formulas that are added to entries, as functions of entries of certain arrays."""
     targets, formulas = zip(*of.targets, strict=True)
     u = entries_of(of, arguments)
-    return looped_kernel(system, name, formulas, of, u, targets=targets, text=text, purpose=purpose)
+    return rolled_kernel(system, name, formulas, of, u, targets=targets, text=text, purpose=purpose)
 
 
-def _potential(system: ArraySystem, term: ArrayTerm, axis: int | None, number: int) -> LoopedKernel:
+def _potential(system: ArraySystem, term: ArrayTerm, axis: int | None, number: int) -> RolledKernel:
     """Return the derivatives of a term by coordinates and momenta, and the term; ``axis``: of a circulant matrix."""
     force = _signed(system, force_of(term, system.state))
     purpose = "Derivatives with respect to its coordinates."
-    looped = _added(system, f"force_{number}", force, system.state, _shown(term), purpose)
+    rolled = _added(system, f"force_{number}", force, system.state, _shown(term), purpose)
     u = entries_of(term, system.state)
-    scalar = looped_kernel(system, f"term_{number}", [term.formula], term, u, text="", purpose="The term.")
-    return replace(looped, scalar=scalar.kernel, circulant=axis)
+    scalar = rolled_kernel(system, f"term_{number}", [term.formula], term, u, text="", purpose="The term.")
+    return replace(rolled, scalar=scalar.kernel, circulant=axis)
 
 
 def _parts(system: ArraySystem, term: ArrayTerm) -> Iterator[tuple[ArrayTerm, int | None]]:
@@ -122,7 +122,7 @@ def _shown(of: ArrayTerm | ArrayForce) -> str:
 
 def _jacobian(
     system: ArraySystem, potentials: Sequence[tuple[ArrayTerm, int | None]]
-) -> tuple[tuple[LoopedKernel, ...], tuple[LoopedKernel, ...]]:
+) -> tuple[tuple[RolledKernel, ...], tuple[RolledKernel, ...]]:
     """Return the Jacobian of the forces times a direction, by term groups; by term groups also its diagonal."""
     forces = [(force_of(term, system.state), axis) for term, axis in potentials]
     forces += [(force, None) for force in system.applied_forces]
@@ -136,7 +136,7 @@ def _jacobian(
 
 def _derived(
     system: ArraySystem, force: ArrayForce, axis: int | None, number: int
-) -> tuple[LoopedKernel, LoopedKernel] | None:
+) -> tuple[RolledKernel, RolledKernel] | None:
     """Return the kernels of a force for :func:`_jacobian`; ``None`` if it does not depend on the state."""
     signed = _signed(system, force)
     force = replace(force, targets=tuple(pair for pair in signed.targets if pair[1] != 0))
@@ -150,16 +150,16 @@ def _derived(
         Add(*(derivative for k, derivative in row.items() if moving[k][1] == access))
         for row, (access, _) in zip(rows, force.targets, strict=True)
     ]
-    looped = partial(
-        looped_kernel,
+    rolled = partial(
+        rolled_kernel,
         system,
         of=force,
         u=moving,
         targets=[access for access, _ in force.targets],
         text=f"derivatives of {_shown(force)}",
     )
-    jacobian = looped(f"product_{number}", along, along=w, purpose="Jacobian of the forces times a direction.")
-    diagonal = looped(f"diagonal_{number}", own, purpose="Diagonal of the Jacobian of the forces.")
+    jacobian = rolled(f"product_{number}", along, along=w, purpose="Jacobian of the forces times a direction.")
+    diagonal = rolled(f"diagonal_{number}", own, purpose="Diagonal of the Jacobian of the forces.")
     return replace(jacobian, circulant=axis), replace(diagonal, circulant=axis)
 
 
@@ -188,7 +188,7 @@ def with_sums(program: Program, of: SplitSystem) -> Program | None:
 
 def _over_terms(
     system: MechanicalSystem, name: str, group: TermGroup, values: Sequence[Expr], targets: tuple[tuple[int, ...], ...]
-) -> LoopedKernel:
+) -> RolledKernel:
     kernel = lower_kernel(
         name,
         arguments=(*group.slots, *group.constants),
@@ -202,10 +202,10 @@ def _over_terms(
         tuple(Load("parameters", index[x]) if x in index else Constant(exact_number(x)) for x in column)
         for column in group.values
     )
-    return LoopedKernel.over_rows(kernel, group.places, given, targets)
+    return RolledKernel.over_rows(kernel, group.places, given, targets)
 
 
-def reach_of(arrays: Iterable[Array], term_groups: Iterable[LoopedKernel]) -> int:
+def reach_of(arrays: Iterable[Array], term_groups: Iterable[RolledKernel]) -> int:
     """Return the largest distance on an axis of places that forces couple.
 
     Args:
@@ -220,10 +220,10 @@ def reach_of(arrays: Iterable[Array], term_groups: Iterable[LoopedKernel]) -> in
         return 0
     pairs = [
         (target, slot)
-        for looped in term_groups
-        if looped.loops
-        for target in looped.writes
-        for slot in looped.reads
+        for rolled in term_groups
+        if rolled.loops
+        for target in rolled.writes
+        for slot in rolled.reads
         if target != slot
     ]
     if not all(_same_loops(*pair) for pair in pairs):

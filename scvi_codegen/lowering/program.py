@@ -29,7 +29,7 @@ from scvi_codegen.ir.program import (
 )
 from scvi_codegen.lowering.arrays import check_solver_of_arrays, one_coordinate
 from scvi_codegen.lowering.constraints import constrained_steps, lowered_constraints, rattle_of
-from scvi_codegen.lowering.loops import looped_terms
+from scvi_codegen.lowering.loops import rolled_terms
 from scvi_codegen.lowering.solvers.curves import position_iteration, printed_iteration, shooting_iteration
 from scvi_codegen.lowering.solvers.points import coupled_iteration, hamiltonian_iteration, separable_iteration
 from scvi_codegen.lowering.solvers.tables import Solver, StepProblem, resolved_degree, shift_tables, velocity_tables
@@ -171,7 +171,7 @@ def lower(
         splitting=splitting,
     )
     if isinstance(system, ArraySystem):
-        loops = looped_terms(system, constrained_steps(system, stages, method), newton=solver == "newton")
+        loops = rolled_terms(system, constrained_steps(system, stages, method), newton=solver == "newton")
         if loops.products and fixed_point and fixed_point.matrix:
             loops = replace(loops, shifts=shift_tables(fixed_point.matrix, fixed_point.lanes))
         check_solver_of_arrays(system, method, solver, splitting or loops.constrained or fixed_point, loops)

@@ -20,7 +20,7 @@ from scvi_codegen.formulas.expressions import Tape, jacobian
 from scvi_codegen.indices import Access
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.equations import DerivativeBlock, GatherLoop, LoweredStageGroup, ScatterLoop
-from scvi_codegen.ir.kernel import Kernel, LoopedKernel, lower_matrix, lower_vector
+from scvi_codegen.ir.kernel import Kernel, RolledKernel, lower_matrix, lower_vector
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, curve_rates, multipliers
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
@@ -78,7 +78,7 @@ def system_kernel(
     return replace(kernel, purpose=purpose)
 
 
-def looped_kernel(
+def rolled_kernel(
     system: ArraySystem,
     name: str,
     values: Iterable[Expr],
@@ -89,7 +89,7 @@ def looped_kernel(
     targets: Sequence[Access] | None = None,
     text: str,
     purpose: str,
-) -> LoopedKernel:
+) -> RolledKernel:
     """Return the kernel ``name`` in the loops of a term.
 
     Args:
@@ -109,7 +109,7 @@ def looped_kernel(
         parameters=(*system.parameters, *(slot for slot, _ in given)),
         values=tuple(values),
     )
-    return LoopedKernel(
+    return RolledKernel(
         kernel=replace(kernel, purpose=purpose),
         loops=of.loops,
         reads=accesses * (2 if along else 1),
@@ -255,7 +255,7 @@ def lowered_stage_group(system: MechanicalSystem, group: StageGroup, sites: Unkn
         ),
         derivative=system_kernel(
             system,
-            f"{group.name}_slope",
+            f"{group.name}_derivatives",
             group.results,
             of=group.arguments,
             partials=partials,

@@ -118,7 +118,7 @@ class SimilarTerms:
 
 
 @lru_cache(maxsize=16)
-def rolled(system: MechanicalSystem) -> SplitSystem | None:
+def roll_terms(system: MechanicalSystem) -> SplitSystem | None:
     """Split a system; ``None`` without large term groups, or with constraints, a clock, or intermediate quantities."""
     terms = Add.make_args(system.formula)
     if len(terms) < MIN_GROUP_SIZE or system.constraints or system.clock or inner_of(system.formula):

@@ -20,7 +20,7 @@ from scvi_codegen.formulas.arrays import ArrayTerm, parse_sums
 from scvi_codegen.formulas.symbols import DOT, TIME, symbol
 from scvi_codegen.indices import Access, Array, Loop
 from scvi_codegen.ir.arithmetic import lower_kernel
-from scvi_codegen.ir.kernel import Kernel, LoopedKernel
+from scvi_codegen.ir.kernel import Kernel, RolledKernel
 from scvi_codegen.ir.program import Layout
 from scvi_codegen.rendering.kernels.loop_nests import Nest, count_text, size_text
 
@@ -36,8 +36,8 @@ NEXT = "to->value[to->count]"
 class _Entries(Nest):
     """Loops that read entries of q, p and v, in all their elements or in the ranges ``in`` of the caller."""
 
-    def __init__(self, code: ArrayEvents, looped: LoopedKernel, *, within: bool) -> None:
-        super().__init__(code.layout, looped, "double", "at" if looped.kernel.values else "")
+    def __init__(self, code: ArrayEvents, rolled: RolledKernel, *, within: bool) -> None:
+        super().__init__(code.layout, rolled, "double", "at" if rolled.kernel.values else "")
         self.code, self.within = code, within
 
     def read(self, k: int, slot: Access) -> str:
@@ -59,7 +59,7 @@ class ArrayEvents:
     """C of events in index notation.
 
     Args:
-        interface: of the stepper of any size.
+        interface: of the stepper of run-time sizes.
         events: the events.
 
     Attributes:
@@ -136,7 +136,7 @@ class ArrayEvents:
             parameters=(*map(symbol, self.layout.parameters), *(slot for slot, _ in given)),
             values=tuple(values),
         )
-        looped = LoopedKernel(
+        rolled = RolledKernel(
             kernel=replace(kernel, purpose="Formulas of an event."),
             loops=of.loops,
             reads=tuple(access for _, access in moving),
@@ -144,12 +144,12 @@ class ArrayEvents:
             given=tuple(access for _, access in given),
             text=f"Adds {name.replace('_', ' ')}.",
         )
-        nest = _Entries(self, looped, within=within)
+        nest = _Entries(self, rolled, within=within)
         places = [nest.place_of(access) for _, access in to]
         inner = [f"{name}(u, at->t, parameters, value);"] * bool(values) + [line.format(*places) for line in lines]
         body = ["(void)given, (void)at, (void)in, (void)to;", *nest.text(innermost=inner)]
         declared = f"double value[{len(values)}]" if values else ""
-        self.kernels += [looped.kernel] * bool(values)
+        self.kernels += [rolled.kernel] * bool(values)
         self.functions.append(nest.function(f"static void add_{name}", ARGUMENTS, body, values=declared))
         return f"add_{name}(given, at, in, to);"
 

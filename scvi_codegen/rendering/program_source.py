@@ -149,7 +149,7 @@ def render(program: Program, control: Control | None = None, *, fallback: Fallba
 
     If the fixed-point iteration fails, Newton's method is the fallback if the program has it, unless another is named.
     """
-    if program.in_loops:
+    if program.of_arrays:
         return _render(program.prefix, loop_context(program) | _control_context(program, control), "arrays")
     return _render(program.prefix, _context(program, DOUBLE, control, fallback))
 

@@ -107,7 +107,7 @@ def verify(
             raise StateError(
                 f"{name} is for arrays of run-time sizes: give p, and parameters as defaults of the system"
             )
-    if stepper is not None and stepper.any_size:
+    if stepper is not None and stepper.run_time_sizes:
         raise StateError(f"{stepper!r} is for arrays of run-time sizes, but the sizes of '{system.name}' are known")
     t, h = checked_number(t, "the time t"), None if h is None else checked_step(h)
     began, method = time.perf_counter(), as_method(method, system)

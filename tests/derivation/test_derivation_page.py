@@ -272,7 +272,7 @@ class TestPage:
         assert "144 rows and columns" in page
         assert "they are omitted here" in page
         functions = functions_of(sc.generate_source(system, sc.SVI(8))[0].amalgamated().code)
-        count = sum(len(functions[f"quadrature_slope{end}"].text.splitlines()) for end in ("_1", "_2", ""))
+        count = sum(len(functions[f"quadrature_derivatives{end}"].text.splitlines()) for end in ("_1", "_2", ""))
         assert count > 1000
         assert f"/* .. {count - MOST_LINES} more lines */" in page
 

@@ -7,7 +7,7 @@ import sympy
 from samples import QUICK_FLAGS
 
 from scvi_codegen.ir.arithmetic import lower_kernel
-from scvi_codegen.ir.kernel import Kernel, LoopedKernel
+from scvi_codegen.ir.kernel import Kernel, RolledKernel
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SVI
 from scvi_codegen.models.systems import fput_chain
@@ -19,7 +19,7 @@ from scvi_codegen.runtime.core.stepper import Stepper
 FLAGS = (*(flag for flag in QUICK_FLAGS if "contract" not in flag), "-ffp-contract=off")
 
 
-def looped_force(system: LagrangianSystem, name: str, bonds: list[tuple[int, int]]) -> Kernel:
+def rolled_force(system: LagrangianSystem, name: str, bonds: list[tuple[int, int]]) -> Kernel:
     """The force of a chain: the bonds to the walls in a straight line, those between masses in a loop."""
     q, (alpha, beta) = system.coordinates, system.parameters
     common = {"time": system.time, "parameters": system.parameters}
@@ -34,7 +34,7 @@ def looped_force(system: LagrangianSystem, name: str, bonds: list[tuple[int, int
     walls[0] -= tension(q[0])
     walls[-1] += tension(-q[-1])
     kernel = lower_kernel(name, arguments=q, values=walls, **common)
-    return replace(kernel, sums=(LoopedKernel.over_rows(bond, tuple(bonds)),))
+    return replace(kernel, sums=(RolledKernel.over_rows(bond, tuple(bonds)),))
 
 
 def chain(masses: int) -> tuple[LagrangianSystem, list[tuple[int, int]]]:
@@ -62,8 +62,8 @@ def states(system: LagrangianSystem, force: Kernel | None) -> tuple[np.ndarray, 
 
 def test_loop_over_bonds_equals_its_unrolled_terms() -> None:
     system, bonds = chain(6)
-    looped = looped_force(system, "force_lanes", bonds)
-    found, own = (states(system, force) for force in (looped, None))
+    rolled = rolled_force(system, "force_lanes", bonds)
+    found, own = (states(system, force) for force in (rolled, None))
     assert all(np.allclose(*pair, rtol=0, atol=1e-13) for pair in zip(found, own, strict=True))
 
 
@@ -73,7 +73,7 @@ def test_the_code_of_a_loop_does_not_grow_with_its_table() -> None:
         system, bonds = chain(masses)
         program = program_of(system, SVI(2), solver="fixed-point", prefix="chain")
         assert program.fixed_point is not None
-        force = looped_force(system, "force_lanes", bonds)
+        force = rolled_force(system, "force_lanes", bonds)
         code = render(replace(program, fixed_point=replace(program.fixed_point, kernels=(force,)))).code
         start = code.index("void bond(")
         sizes.append(code[start : code.index("void mass(", start)].count(";"))

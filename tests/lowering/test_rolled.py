@@ -57,9 +57,9 @@ def hamiltonian(name: str, count: int) -> sc.HamiltonianSystem:
 def few(monkeypatch):
     """Families of three terms are rolled."""
     monkeypatch.setattr(module, "MIN_GROUP_SIZE", 3)
-    module.rolled.cache_clear()
+    module.roll_terms.cache_clear()
     yield
-    module.rolled.cache_clear()
+    module.roll_terms.cache_clear()
 
 
 CASES = [
@@ -76,37 +76,37 @@ CASES = [
 @pytest.mark.parametrize(("make", "method"), CASES)
 @pytest.mark.usefixtures("few")
 def test_steps_energies_and_ensembles_equal_those_of_unrolled_terms(make, method, monkeypatch):
-    system = make("in_loops", 5)
-    assert module.rolled(system) is not None
-    looped = sc.compile_stepper(system, method, **FLAGS)
-    assert "static const int" in looped.source.code
+    system = make("rolled", 5)
+    assert module.roll_terms(system) is not None
+    rolled = sc.compile_stepper(system, method, **FLAGS)
+    assert "static const int" in rolled.source.code
     monkeypatch.setattr(module, "MIN_GROUP_SIZE", 10**6)
-    module.rolled.cache_clear()
+    module.roll_terms.cache_clear()
     written = sc.compile_stepper(make("written_out", 5), method, **FLAGS)
     q, v = np.random.default_rng(2).normal(size=(2, len(system.coordinates)))
     start = {"q": q, "p": v}
-    one, other = (each.integrate(**start, h=0.01, steps=10) for each in (looped, written))
+    one, other = (each.integrate(**start, h=0.01, steps=10) for each in (rolled, written))
     assert np.abs(one.q - other.q).max() < 1e-13 * np.abs(q).max()
     assert np.abs(one.p - other.p).max() < 1e-12 * np.abs(one.p).max()
     assert np.abs(one.energy() - other.energy()).max() < 1e-12 * np.abs(one.energy()).max()
-    many, others = (each.integrate_ensemble([q, -q], [v, v], h=0.01, steps=10) for each in (looped, written))
+    many, others = (each.integrate_ensemble([q, -q], [v, v], h=0.01, steps=10) for each in (rolled, written))
     assert np.abs(many.q - others.q).max() < 1e-13 * np.abs(q).max()
 
 
 @pytest.mark.usefixtures("few")
 def test_symmetries_equal_those_of_unrolled_terms(monkeypatch):
-    looped = symmetries(bodies("in_loops", 14))
+    rolled = symmetries(bodies("rolled", 14))
     monkeypatch.setattr(module, "MIN_GROUP_SIZE", 10**6)
-    module.rolled.cache_clear()
-    assert [str(each) for each in looped] == [str(each) for each in symmetries(bodies("written_out", 14))]
-    assert len(looped) == 9
+    module.roll_terms.cache_clear()
+    assert [str(each) for each in rolled] == [str(each) for each in symmetries(bodies("written_out", 14))]
+    assert len(rolled) == 9
 
 
 @pytest.mark.usefixtures("few")
 def test_the_number_of_operations_in_the_text_does_not_grow_with_the_number_of_terms():
     sizes = []
     for count in (5, 15):
-        program = program_of(bodies(f"in_loops_{count}", count), as_method("svi:2"), fallback=False)
+        program = program_of(bodies(f"rolled_{count}", count), as_method("svi:2"), fallback=False)
         (force,) = program.fixed_point.kernels
         sizes.append([len(each.kernel.temporaries) for each in force.sums])
         assert all(not str(result).startswith("Operation") for result in force.results)
@@ -115,9 +115,9 @@ def test_the_number_of_operations_in_the_text_does_not_grow_with_the_number_of_t
 
 
 def test_few_terms_and_constraints_remain_unrolled():
-    assert module.rolled(bodies("few", 5)) is None
+    assert module.roll_terms(bodies("few", 5)) is None
     rods = [f"(x{i} - x{i + 1})**2 + (y{i} - y{i + 1})**2 + (z{i} - z{i + 1})**2 = 1" for i in range(46)]
-    assert module.rolled(bodies("held", 47, constraints=rods)) is None
+    assert module.roll_terms(bodies("held", 47, constraints=rods)) is None
 
 
 @pytest.mark.usefixtures("few")
@@ -130,5 +130,5 @@ def test_parameters_may_have_the_names_of_reads():
         lagrangian=" + ".join(f"{q}_dot**2" for q in names) + springs,
         parameters={"slot_0": 2, "given_0": 3},
     )
-    (group,) = module.rolled(system).term_groups
+    (group,) = module.roll_terms(system).term_groups
     assert {each.name for each in group.formula.free_symbols} >= {"slot_0", "given_0", "slot__0"}

@@ -93,7 +93,7 @@ def test_solver_is_read_from_the_file(net: Path) -> None:
 
 
 def test_newton_that_requires_known_sizes_runs_with_those_of_the_model(net: Path) -> None:
-    """Its states are those of the other solver; C for arrays of any size is refused."""
+    """Its states are those of the other solver; C for arrays of run-time sizes is refused."""
     net.write_text(net.read_text().replace('"svi:2"', '"stoermer-verlet"', 1))
     model = sc.load_model(net, {"method": {"solver": "newton"}})
     other = sc.load_model(net)

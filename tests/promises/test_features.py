@@ -183,7 +183,7 @@ def test_refusals_of_the_table_are_those_of_the_operations(situation, situations
 @pytest.mark.parametrize("situation", [name for name in SITUATIONS if name != "without derivatives"])
 def test_operations_that_a_stepper_supports_work(situation, situations):
     stepper, left_out = situations(situation), {"fit", "flow", "periodic_orbit", "energy"}
-    of_sizes = {"work", "discrete_lagrangian", "chaos"} if stepper.any_size else set()
+    of_sizes = {"work", "discrete_lagrangian", "chaos"} if stepper.run_time_sizes else set()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for operation, call in OPERATIONS.items():

@@ -137,9 +137,9 @@ def test_invalid_states_are_rejected(known, q, message):
 def test_steps_that_require_known_sizes_are_compiled_with_those_of_the_call(extra, method, message):
     given = {"lagrangian": "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)", **extra}
     system = sc.LagrangianSystem.from_text(name="chain", coordinates=["q[N]"], **given)
-    any_size, start = sc.compile_stepper(system, method, flags=QUICK_FLAGS), {"q": np.array([0.1, 0.2])}
-    run = any_size.integrate(start, velocity={"q": [0.02, 0.2]}, h=0.1, steps=3)
+    run_time_sizes, start = sc.compile_stepper(system, method, flags=QUICK_FLAGS), {"q": np.array([0.1, 0.2])}
+    run = run_time_sizes.integrate(start, velocity={"q": [0.02, 0.2]}, h=0.1, steps=3)
     known = sc.compile_stepper(system, method, sizes={"N": 2}, flags=QUICK_FLAGS)
     assert (run.q["q"] == known.integrate(start, velocity=[0.02, 0.2], h=0.1, steps=3).q).all()
     with pytest.raises(sc.MethodError, match=rf"(?s)2001 coordinates are too many.*{message}.*sizes=\{{'N': 8\}}"):
-        any_size.integrate(np.zeros(2001), h=0.1, steps=1)
+        run_time_sizes.integrate(np.zeros(2001), h=0.1, steps=1)

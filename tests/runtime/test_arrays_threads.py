@@ -140,7 +140,7 @@ def bits(run: Any) -> tuple[Any, ...]:
 def test_terms_are_distributed_over_threads(name: str) -> None:
     system = system_of(CASES[name])
     program = lower(system, as_method("svi:2"), prefix="shared")
-    assert {sharing_of(looped) for looped in program.loops.forces} == {CASES[name].shared}
+    assert {sharing_of(rolled) for rolled in program.loops.forces} == {CASES[name].shared}
 
 
 @pytest.mark.sampled(5)

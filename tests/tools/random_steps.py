@@ -191,7 +191,7 @@ def trials(name: str, count: int, seed: int = 1) -> list[Trial]:
 
 def taken(stepper: Any, trial: Trial) -> tuple[Array, float]:
     """The end of a step and its estimate."""
-    if stepper.any_size:
+    if stepper.run_time_sizes:
         shape = [axis.number or 1 for axis in stepper.interface.layout.coordinates[0].axes]
         at = [np.reshape(x, [-1, *shape[1:]]) for x in (trial.q, trial.p)]
         run = stepper.integrate(*at, t=trial.t, h=trial.h, steps=1)

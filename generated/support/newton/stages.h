@@ -61,8 +61,8 @@ static inline void scatter(const real *table, int points, const real *weight, re
   }
 }
 
-/* Adds sum_n weight[n] scale row[n][r] slope_n column[b][n] to the entries of the Jacobian in rows (i, r), columns (j,
- * b), for every derivative and its pair of sites i, j. */
+/* Adds sum_n weight[n] scale row[n][r] derivative_n column[b][n] to the entries of the Jacobian in rows (i, r), columns
+ * (j, b), for every derivative and its pair of sites i, j. */
 static inline void scatter_derivatives(const real *row, const real *column, int points, const real *weight, real scale,
     const int (*pair)[2], int count, const real *derivative, int across, real *jacobian, const band *shape)
 {

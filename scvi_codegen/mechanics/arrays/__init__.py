@@ -1,1 +1,1 @@
-"""Array systems: Lagrangians and Hamiltonians of arrays in index notation, of any size."""
+"""Array systems: Lagrangians and Hamiltonians of arrays in index notation, of run-time sizes."""

@@ -1,4 +1,4 @@
-"""Legendre transform of arrays of any size whose kinetic energy couples the velocities of one element only.
+"""Legendre transform of arrays of run-time sizes whose kinetic energy couples the velocities of one element only.
 
     L = sum_e l(q, v_e, t),    l = l_0 + b . v_e + v_e . C v_e/2    has    H = sum_e (p_e - b) . C^-1 (p_e - b)/2 - l_0
 

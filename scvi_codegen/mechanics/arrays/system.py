@@ -124,15 +124,15 @@ class ArraySystem:
         """Raise :class:`SizesRequiredError` for a system that cannot be compiled for sizes known at run time."""
         try:
             if self.rotations:
-                raise SizesRequiredError("rotations, directions and spins are not available for arrays of any size")
+                raise SizesRequiredError("rotations, directions and spins are not available for run-time sizes")
             if self.is_first_order:
                 raise SizesRequiredError(
-                    "Lagrangians linear in the velocities are not available for arrays of any size"
+                    "Lagrangians linear in the velocities are not available for arrays of run-time sizes"
                 )
             for term in self.coupled_terms:
                 raise SizesRequiredError(
-                    f"'{term}' contains velocities in another form: arrays of any size have velocities as m*v**2/2 "
-                    "only, with a constant mass m"
+                    f"'{term}' contains velocities in another form: arrays of run-time sizes have velocities as "
+                    "m*v**2/2 only, with a constant mass m"
                 )
             inputs = "|".join(f"{name}_[0123t]" for name in self.inputs)
             for term in self.constraints:

@@ -67,7 +67,7 @@ from scvi_codegen.mechanics.symmetry.ansatz import (
 from scvi_codegen.mechanics.symmetry.invariants import Monomial, Polynomial, confirmed, conserved
 from scvi_codegen.mechanics.symmetry.sampling import Rates, rates_of, terms_among_few_bodies
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.mechanics.term_groups import rolled
+from scvi_codegen.mechanics.term_groups import roll_terms
 from scvi_codegen.representation import summary
 from scvi_codegen.validation import checks_arguments, several
 
@@ -162,8 +162,8 @@ def symmetries(system: MechanicalSystem) -> tuple[Symmetry, ...]: ...
 def symmetries(system: MechanicalSystem | ArraySystem) -> tuple[Symmetry, ...] | tuple[ArrayMap, ...]:
     """Return the affine symmetries of a system, a basis with short momentum maps: translations, rotations, boosts, ..
 
-    They are affine in q and t for a Lagrangian, in (q, p) and t for a Hamiltonian. Those of arrays of any size are the
-    translations and rotations of whole arrays.
+    They are affine in q and t for a Lagrangian, in (q, p) and t for a Hamiltonian. Those of arrays of run-time sizes
+    are the translations and rotations of whole arrays.
 
     >>> from scvi_codegen.models.problems import problem
     >>> print(*symmetries(problem("kepler").system))
@@ -244,7 +244,7 @@ def _of_rotations(system: MechanicalSystem) -> list[Terms]:
 
 def _rigid(system: MechanicalSystem) -> list[Terms]:
     """Return momentum maps of rigid motions; those of few bodies are found first and then verified for all terms."""
-    parts, columns = rolled(system), list[Polynomial](rigid_columns(system))
+    parts, columns = roll_terms(system), list[Polynomial](rigid_columns(system))
     if parts is None:
         return _combined(*_conserved_by(system, rates_of(system), columns))
     motion = rates_of(parts.rest, parts.term_groups)

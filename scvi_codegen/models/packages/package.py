@@ -6,7 +6,7 @@
                    __init__.py  interface.json      ``import pendulum_svi`` provides ``pendulum_svi.stepper``
                    model.toml  README.md            the model file, and instructions
 
-With arrays whose sizes are known at run time the C code is for any sizes; ``q.txt``, ``velocity.txt``, ``field_m.txt``,
+With arrays whose sizes are known at run time the C code is for all sizes; ``q.txt``, ``velocity.txt``, ``field_m.txt``,
 .. contain the arrays that ``main.c`` reads, one number per line.
 
 The name of the folder is the prefix of all C names. Importing it compiles the C code once, without SymPy.
@@ -65,7 +65,7 @@ def generate_package(
 
     Args:
         model: system, method, and the initial state and step size of the example. The code for arrays of run-time
-            sizes is for any sizes, unless steps are adaptive.
+            sizes is for run-time sizes, unless steps are adaptive.
         folder: target; its name becomes the prefix of the C names and the name of the Python package.
         solver: of the stage equations, as for ``compile_stepper``; by default that of the model.
         force: overwrite files of the same names that were edited or not generated.
@@ -84,8 +84,8 @@ def generate_package(
     target = Path(folder)
     prefix = prefix_of(target)
     model = model if solver == "auto" else replace(model, solver=solver)
-    of_any_sizes = model.array_system is not None and model.h is not None and not embedded and not model.events
-    write = _texts_of_arrays if of_any_sizes else _texts
+    of_run_time_sizes = model.array_system is not None and model.h is not None and not embedded and not model.events
+    write = _texts_of_arrays if of_run_time_sizes else _texts
     write_folder(target, write(model, prefix, embedded, single_file=single_file), force=force)
     return target
 

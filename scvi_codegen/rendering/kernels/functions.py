@@ -15,7 +15,7 @@ from typing import TypeAlias
 
 from scvi_codegen.indices import Access, Place
 from scvi_codegen.ir.equations import FixedPointIteration, LoweredStageGroup
-from scvi_codegen.ir.kernel import Constant, Kernel, Load, LoopedKernel, Number, Part, parts
+from scvi_codegen.ir.kernel import Constant, Kernel, Load, Number, Part, RolledKernel, parts
 from scvi_codegen.ir.program import FEW_UNKNOWNS, Layout, Program
 from scvi_codegen.rendering.kernels.loop_nests import Nest
 from scvi_codegen.rendering.kernels.printer import (
@@ -284,7 +284,7 @@ def lane_mass_text(kernel: Kernel, fixed_point: FixedPointIteration, lanes: Lane
     return kernel_text(kernel, target) if lanes.are_points else lane_kernel_text(kernel, fixed_point, lanes)
 
 
-def _tables(each: LoopedKernel, target: Target) -> Iterator[str]:
+def _tables(each: RolledKernel, target: Target) -> Iterator[str]:
     """Yield the constant tables of a loop, and the constants of its rows."""
     for name, rows in each.tables:
         lines = [list(map(str, row)) for row in rows]
@@ -296,26 +296,26 @@ def _tables(each: LoopedKernel, target: Target) -> Iterator[str]:
         yield table(f"static const {kind} {_named(each, name)}[{len(column)}]", numbers or places)
 
 
-def _named(each: LoopedKernel, name: str) -> str:
+def _named(each: RolledKernel, name: str) -> str:
     return f"{each.kernel.name}_{name}".upper()
 
 
 class _Rows(Nest):
     """Loop of a kernel over the rows of constant tables: entries of ``u`` are read, and values added."""
 
-    def __init__(self, looped: LoopedKernel, real: str, parameter: str) -> None:
-        super().__init__(Layout(), looped, real, "u")
-        self.parameter, self.columns = parameter, dict(looped.columns)
+    def __init__(self, rolled: RolledKernel, real: str, parameter: str) -> None:
+        super().__init__(Layout(), rolled, real, "u")
+        self.parameter, self.columns = parameter, dict(rolled.columns)
 
     def lines(self) -> list[str]:
-        call = f"{self.looped.kernel.name}(slot, t, parameters, term);"
-        added = (f"value[{self.place(target)}] += term[{k}];" for k, target in enumerate(self.looped.writes))
+        call = f"{self.rolled.kernel.name}(slot, t, parameters, term);"
+        added = (f"value[{self.place(target)}] += term[{k}];" for k, target in enumerate(self.rolled.writes))
         return self.text(innermost=[call, *added])
 
     def known(self, depth_of: int) -> Iterator[str]:
         """Yield the declarations of arguments and values, then the arguments."""
         if depth_of:
-            yield f"{self.scalar} slot[{self.looped.kernel.arguments}], term[{self.looped.kernel.values}];"
+            yield f"{self.scalar} slot[{self.rolled.kernel.arguments}], term[{self.rolled.kernel.values}];"
         yield from super().known(depth_of)
 
     def read(self, k: int, slot: Access) -> str:
@@ -324,13 +324,13 @@ class _Rows(Nest):
     def constant(self, k: int, access: Access) -> str:
         """Return the assignment of a constant of a row, one of the last arguments."""
         name, is_number = access.array.name, isinstance(self.columns[access.array.name][0], Constant)
-        table = f"{_named(self.looped, name)}[index_e]"
+        table = f"{_named(self.rolled, name)}[index_e]"
         text = table if is_number else f"parameters[{table}]"
         alike = self.scalar == "lanes" and (is_number or self.parameter == "double")
-        return f"slot[{len(self.looped.reads) + k}] = {f'lanes_of({text})' if alike else text};"
+        return f"slot[{len(self.rolled.reads) + k}] = {f'lanes_of({text})' if alike else text};"
 
     def table_entry(self, place: Place) -> str:
-        return f"{_named(self.looped, place.table)}[index_{place.index}][{place.column}]"
+        return f"{_named(self.rolled, place.table)}[index_{place.index}][{place.column}]"
 
 
 def _parts(kernel: Kernel) -> tuple[Part, ...]:

@@ -18,7 +18,7 @@ from enum import Enum, auto
 from typing import TypeAlias
 
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
-from scvi_codegen.ir.kernel import LoopedKernel
+from scvi_codegen.ir.kernel import RolledKernel
 from scvi_codegen.ir.program import Layout
 from scvi_codegen.rendering.text import wrapped, wrapped_comment
 
@@ -58,9 +58,9 @@ class Sharing(Enum):
     BY_PLACES = auto()
 
 
-def sharing_of(looped: LoopedKernel) -> Sharing:
+def sharing_of(rolled: RolledKernel) -> Sharing:
     """Return the kind of tasks for a term group."""
-    loops, targets = looped.loops, looped.writes
+    loops, targets = rolled.loops, rolled.writes
     if not loops:
         return Sharing.ALONE
     if _common_axes(targets, {loops[0].index}):
@@ -72,12 +72,12 @@ def sharing_of(looped: LoopedKernel) -> Sharing:
     return Sharing.BY_PLACES
 
 
-def sharing_text(looped: LoopedKernel) -> str:
+def sharing_text(rolled: RolledKernel) -> str:
     """Return the C expression of the rounds."""
-    found, loops = sharing_of(looped), looped.loops
+    found, loops = sharing_of(rolled), rolled.loops
     if found is Sharing.IN_TURN:
         span = f"{size_text(loops[0].first)}, {size_text(loops[0].end)}"
-        return f"alternating_blocks({span}, {_width(looped.writes, {loops[0].index})}, {count_text(loops[1:])})"
+        return f"alternating_blocks({span}, {_width(rolled.writes, {loops[0].index})}, {count_text(loops[1:])})"
     if found is Sharing.IN_TILES:
         return f"pairs_of_blocks({size_text(loops[0].end)})"
     return "by_elements(run, n)" if found is Sharing.BY_PLACES else "alternating_blocks(0, 1, 0, 1)"
@@ -128,7 +128,7 @@ class Nest:
 
     Args:
         layout: the arrays.
-        looped: the kernel.
+        rolled: the kernel.
         scalar: type of the arguments.
         source: array that they are read from; empty if there are none.
         chunked: whether all values of a part are computed before any is added, in loops without conflicts, which a
@@ -139,22 +139,22 @@ class Nest:
     def __init__(
         self,
         layout: Layout,
-        looped: LoopedKernel,
+        rolled: RolledKernel,
         scalar: str,
         source: str,
         *,
         chunked: bool = False,
         sharing: Sharing = Sharing.ALONE,
     ) -> None:
-        self.layout, self.looped, self.scalar, self.source = layout, looped, scalar, source
+        self.layout, self.rolled, self.scalar, self.source = layout, rolled, scalar, source
         self.chunked, self.sharing = chunked, sharing
-        self.levels = {loop.index: depth for depth, loop in enumerate(looped.loops, 1)}
-        self.loops = {loop.index: loop for loop in looped.loops}
+        self.levels = {loop.index: depth for depth, loop in enumerate(rolled.loops, 1)}
+        self.loops = {loop.index: loop for loop in rolled.loops}
         self.scalars = len(layout.parameters)
 
     def read(self, k: int, slot: Access) -> str:
         """Return the assignment of an argument: an entry of the state, or of a direction."""
-        along = k >= len(self.looped.reads) - self.looped.along
+        along = k >= len(self.rolled.reads) - self.rolled.along
         source = ("image_along" if along else "image") if slot.sums else DIRECTION if along else self.source
         return f"u[{k}] = {source}[{self.place_in(slot, self.place_of(slot))}];"
 
@@ -173,7 +173,7 @@ class Nest:
 
     def is_innermost(self, access: Access) -> bool:
         """Return whether an entry depends on the index of the innermost loop."""
-        return self.depth_of(access) == len(self.looped.loops)
+        return self.depth_of(access) == len(self.rolled.loops)
 
     def text(
         self,
@@ -193,23 +193,23 @@ class Nest:
             depth: number of loops around these lines.
         """
         lines = list(self.known(depth))
-        if depth == len(self.looped.loops):
+        if depth == len(self.rolled.loops):
             return [*lines, *innermost]
-        outer = [k for k, target in enumerate(self.looped.writes) if self.depth_of(target) == depth]
+        outer = [k for k, target in enumerate(self.rolled.writes) if self.depth_of(target) == depth]
         lines += [line for k in outer for line in prepare(k)]
         inner = self.text(prepare=prepare, innermost=innermost, finish=finish, behind=behind, depth=depth + 1)
-        loop = self.looped.loops[depth]
+        loop = self.rolled.loops[depth]
         if loop.near:
             lines.append(f"const section row = row_of(near_{loop.near}, index_{loop.behind}, {self._window()});")
         lines += (
-            self._parts(loop, inner, behind) if loop is self.looped.loops[-1] else _loop(loop, *self._span(loop), inner)
+            self._parts(loop, inner, behind) if loop is self.rolled.loops[-1] else _loop(loop, *self._span(loop), inner)
         )
         return lines + [line for k in outer for line in finish(k)]
 
     def _parts(self, loop: Loop, inner: Sequence[str], behind: Sequence[Sequence[str]]) -> list[str]:
         """Return the innermost loop, divided into parts if necessary."""
         first, end = self._span(loop)
-        accesses = (*self.looped.reads, *self.looped.writes, *self.looped.given)
+        accesses = (*self.rolled.reads, *self.rolled.writes, *self.rolled.given)
         places = [place for access in accesses for place in access.places]
         moved = {place.base.number for place in places if place.index == loop.index and not place.table}
         offsets = sorted(moved - {0}) if loop.periodic else []
@@ -221,7 +221,7 @@ class Nest:
             for offset in offsets
         ]
         if self.chunked:
-            lines += [*self._part_passed_over(loop), f"lanes values[{len(self.looped.writes)}][CHUNK];"]
+            lines += [*self._part_passed_over(loop), f"lanes values[{len(self.rolled.writes)}][CHUNK];"]
         lines += _loop(loop, "begin", "end", inner)
         for each in [[line for lines in behind for line in lines]] if loop.near else behind:
             lines += _loop(loop, "begin", "end", each)
@@ -233,9 +233,9 @@ class Nest:
 
     def _span(self, loop: Loop) -> tuple[str, str]:
         """Return the first index and the end of a loop in a task."""
-        if self.sharing in (Sharing.IN_TURN, Sharing.IN_TILES) and loop is self.looped.loops[0]:
+        if self.sharing in (Sharing.IN_TURN, Sharing.IN_TILES) and loop is self.rolled.loops[0]:
             return "here->of.first", "here->of.end"
-        if self.sharing is Sharing.IN_TILES and loop is self.looped.loops[1]:
+        if self.sharing is Sharing.IN_TILES and loop is self.rolled.loops[1]:
             return f"between({_first(loop)}, here->behind.first, here->behind.end)", "here->behind.end"
         if loop.near:
             return "row.first", "row.end"
@@ -243,7 +243,7 @@ class Nest:
 
     def _window(self) -> str:
         """Return the elements that the rows of a list of neighbours add to in a task: here, their offset and width."""
-        arrays = {target.array for target in self.looped.writes}
+        arrays = {target.array for target in self.rolled.writes}
         if self.sharing is not Sharing.BY_PLACES or len(arrays) != 1:
             return "NULL, 0, 0"
         (array,) = arrays
@@ -251,7 +251,7 @@ class Nest:
 
     def adding(self, k: int, value: str) -> list[str]:
         """Return the lines that add to the element of a target, if the task adds to it."""
-        target = self.looped.writes[k]
+        target = self.rolled.writes[k]
         into = "transposed" if target.sums else "F"
         if self.sharing is not Sharing.BY_PLACES:
             return [f"{into}[{self.place_in(target, self.place_of(target))}] += {value};"]
@@ -260,15 +260,15 @@ class Nest:
         return [*named, f"if (whole || within(here, place_{k}))", f"  {into}[{place}] += {value};"]
 
     def _named(self, k: int) -> str:
-        return f"const long long place_{k} = {self.place_of(self.looped.writes[k])};"
+        return f"const long long place_{k} = {self.place_of(self.rolled.writes[k])};"
 
     def _in_a_part(self, k: int) -> bool:
         """Return whether an element is only known in the loops over a part."""
-        return self.chunked and self.is_innermost(self.looped.writes[k])
+        return self.chunked and self.is_innermost(self.rolled.writes[k])
 
     def _passed_over(self) -> list[str]:
         """Return the lines that skip an element that adds to nothing in a task."""
-        wanted = [f"within(here,\0place_{k})" for k in range(len(self.looped.writes))]
+        wanted = [f"within(here,\0place_{k})" for k in range(len(self.rolled.writes))]
         past = [f"if (!(whole || {' || '.join(wanted)}))", "  continue;"]
         return past if self.sharing is Sharing.BY_PLACES and not self.chunked else []
 
@@ -276,7 +276,7 @@ class Nest:
         """Return the lines that skip a part of the innermost loop that adds to nothing in a task."""
         if self.sharing is not Sharing.BY_PLACES:
             return []
-        places = range(len(self.looped.writes))
+        places = range(len(self.rolled.writes))
         named = [self._named(k) for k in places if self._in_a_part(k)]
         tests = [f"wanted |= within(here, place_{k});" for k in places]
         look = _loop(loop, "begin", "end && !wanted", [*named, *tests])
@@ -284,15 +284,15 @@ class Nest:
 
     def known(self, depth_of: int) -> Iterator[str]:
         """Yield the lines known at a level: arguments, parameters, elements that not every task adds to."""
-        for k, target in enumerate(self.looped.writes if self.sharing is Sharing.BY_PLACES else ()):
+        for k, target in enumerate(self.rolled.writes if self.sharing is Sharing.BY_PLACES else ()):
             if self.depth_of(target) == depth_of and not self._in_a_part(k):
                 yield self._named(k)
-        if depth_of == len(self.looped.loops):
+        if depth_of == len(self.rolled.loops):
             yield from self._passed_over()
-        for k, slot in enumerate(self.looped.reads):
+        for k, slot in enumerate(self.rolled.reads):
             if self.depth_of(slot) == depth_of and self.source:
                 yield self.read(k, slot)
-        for k, access in enumerate(self.looped.given):
+        for k, access in enumerate(self.rolled.given):
             if self.depth_of(access) == depth_of:
                 yield self.constant(k, access)
 
@@ -325,7 +325,7 @@ class Nest:
         loop = self.loops[place.index]
         if not offset or not loop.periodic:
             return name + (f" {'+' if offset > 0 else '-'} {abs(offset)}" if offset else "")
-        if loop is self.looped.loops[-1]:
+        if loop is self.rolled.loops[-1]:
             return f"{name} + {_shift(place.index, offset)}"
         return f"wrapped_index({name} + {offset}, {size_text(loop.end)})".replace("+ -", "- ")
 
@@ -336,12 +336,12 @@ class Nest:
         text = "\n".join(wrapped(line.strip(), indent=2 + len(line) - len(line.lstrip())) for line in body)
         whole = (argument.replace(" ", "\0") for argument in arguments)
         signature = wrapped(f"{head}({', '.join(whole)})", indent=0)
-        return f"{wrapped_comment(self.looped.text)}\n{signature}\n{{\n{text}\n}}"
+        return f"{wrapped_comment(self.rolled.text)}\n{signature}\n{{\n{text}\n}}"
 
     def _unknowns(self) -> Iterator[str]:
         """Yield the declaration of the arguments of the kernel, if it has any."""
-        if self.source and self.looped.reads:
-            yield f"{self.scalar} u[{len(self.looped.reads)}];"
+        if self.source and self.rolled.reads:
+            yield f"{self.scalar} u[{len(self.rolled.reads)}];"
         elif self.source:
             yield f"const {self.scalar} u[1] = {{0}};"
             yield f"(void){self.source};"
@@ -350,7 +350,7 @@ class Nest:
         """Yield the declarations of the parameters and values of the kernel."""
         if values:
             yield f"{values};"
-            yield f"double parameters[{max(1, self.scalars + len(self.looped.given))}] = {{0}};"
+            yield f"double parameters[{max(1, self.scalars + len(self.rolled.given))}] = {{0}};"
             yield from (f"parameters[{k}] = given->parameters[{k}];" for k in range(self.scalars))
 
     def _arrays(self, text: str) -> Iterator[str]:
@@ -366,7 +366,7 @@ class Nest:
             yield "const lanes *image_along = sums->along;"
         if "transposed[" in text:
             yield "lanes *transposed = sums->transposed;"
-        for loop in self.looped.loops:
+        for loop in self.rolled.loops:
             if loop.near:
                 yield f"const neighbours *near_{loop.near} = given->near_{loop.near};"
 

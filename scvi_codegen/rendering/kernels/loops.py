@@ -8,7 +8,7 @@ from typing import Any
 
 from scvi_codegen.indices import MOST_THREADS, Array, Convolution
 from scvi_codegen.ir.equations import ConstrainedSteps
-from scvi_codegen.ir.kernel import Kernel, LoopedKernel, is_divided
+from scvi_codegen.ir.kernel import Kernel, RolledKernel, is_divided
 from scvi_codegen.ir.program import Program
 from scvi_codegen.rendering.kernels.functions import kernel_text
 from scvi_codegen.rendering.kernels.loop_nests import (
@@ -86,13 +86,13 @@ def loop_context(program: Program) -> dict[str, Any]:
     }
 
 
-def _circulants(program: Program) -> list[LoopedKernel]:
+def _circulants(program: Program) -> list[RolledKernel]:
     """Return the terms whose forces, or products with a direction, are products with circulant matrices."""
     return [each for each in program.loops.applied if each.circulant is not None]
 
 
-def _has_sums(looped: LoopedKernel) -> bool:
-    return any(each.sums for each in looped.reads)
+def _has_sums(rolled: RolledKernel) -> bool:
+    return any(each.sums for each in rolled.reads)
 
 
 def _stages(sums: Sequence[Convolution]) -> list[tuple[int, str, int]]:
@@ -150,20 +150,20 @@ def _vector_functions(program: Program) -> list[str]:
     return sorted(set(LIBRARY) & set().union(*map(scalar_functions, kernels)))
 
 
-def _force_text(program: Program, looped: LoopedKernel) -> str:
+def _force_text(program: Program, rolled: RolledKernel) -> str:
     """Return a function that adds to the forces; for an explicit method, with a factor."""
     explicit = program.fixed_point is None
-    chunked, sharing = explicit and bool(looped.loops), sharing_of(looped)
-    nest = Nest(program.layout, looped, "lanes", "X", chunked=chunked, sharing=sharing)
-    slots = range(len(looped.writes))
-    inner = [nest.is_innermost(target) for target in looped.writes]
+    chunked, sharing = explicit and bool(rolled.loops), sharing_of(rolled)
+    nest = Nest(program.layout, rolled, "lanes", "X", chunked=chunked, sharing=sharing)
+    slots = range(len(rolled.writes))
+    inner = [nest.is_innermost(target) for target in rolled.writes]
 
     def added(k: int, value: str) -> list[str]:
         return nest.adding(k, value) if inner[k] else [f"sum_{k} += {value};"]
 
-    call = f"{looped.kernel.name}(u, t, parameters, value);"
+    call = f"{rolled.kernel.name}(u, t, parameters, value);"
     if nest.chunked:
-        here = f"[{counter(looped.loops[-1])} - begin]"
+        here = f"[{counter(rolled.loops[-1])} - begin]"
         innermost = [call, *(f"values[{k}]{here} = by * value[{k}];" for k in slots)]
         behind = [added(k, f"values[{k}]{here}") for k in slots]
     else:
@@ -177,40 +177,40 @@ def _force_text(program: Program, looped: LoopedKernel) -> str:
     )
     zero = [] if all(inner) else ["const lanes zero = {0};"]
     factor = ["double by"] if explicit else []
-    direction = [f"const lanes *{DIRECTION}"] if looped.along else []
+    direction = [f"const lanes *{DIRECTION}"] if rolled.along else []
     arguments = ["const problem *given", "const lanes *restrict X", "times t", *direction, *factor, "lanes *restrict F"]
-    arguments += ["const window *here", *(["const images *sums"] if _has_sums(looped) else [])]
+    arguments += ["const window *here", *(["const images *sums"] if _has_sums(rolled) else [])]
     if sharing is Sharing.BY_PLACES:
         zero.append("const int whole = here->whole;")
     unused = ["(void)here;"] if sharing is Sharing.ALONE else []
-    values, name = f"lanes value[{len(looped.writes)}]", f"static void add_{looped.kernel.name}"
+    values, name = f"lanes value[{len(rolled.writes)}]", f"static void add_{rolled.kernel.name}"
     text = nest.function(name, arguments, [*unused, *zero, *lines], values=values)
     if text.count("given") == 1:  # among the arguments
         text = nest.function(name, arguments, ["(void)given;", *unused, *zero, *lines], values=values)
-    return f"{text}\n\n{_sharing_text(program, looped)}"
+    return f"{text}\n\n{_sharing_text(program, rolled)}"
 
 
-def _circulant_text(program: Program, looped: LoopedKernel) -> str:
+def _circulant_text(program: Program, rolled: RolledKernel) -> str:
     """Return functions that describe the circulant matrix of a term and return its factor, and that add its energy."""
-    nest, name, scalar = Nest(program.layout, looped, "lanes", "X"), looped.kernel.name, looped.scalar
-    matrix = _matrix_of_pairs(program, looped)
+    nest, name, scalar = Nest(program.layout, rolled, "lanes", "X"), rolled.kernel.name, rolled.scalar
+    matrix = _matrix_of_pairs(program, rolled)
     unit = f"parameters[{len(program.layout.parameters)}] = 1.0;"
     lines = [
         f"*matrix = {matrix};",
-        *(f"u[{k}] = lanes_of({1 - k % 2}.0);" for k in range(len(looped.reads))),
+        *(f"u[{k}] = lanes_of({1 - k % 2}.0);" for k in range(len(rolled.reads))),
         unit,
         f"{name}(u, t, parameters, value);",
         "return value[0];",
     ]
     arguments = ["const problem *given", "times t", "circulant *matrix"]
     force = nest.function(f"static lanes describe_{name}", arguments, lines, values="lanes value[2]")
-    return f"{force}\n\n{_energy_text(program, looped, scalar, before=[unit])}" if scalar else force
+    return f"{force}\n\n{_energy_text(program, rolled, scalar, before=[unit])}" if scalar else force
 
 
-def _matrix_of_pairs(program: Program, looped: LoopedKernel) -> str:
+def _matrix_of_pairs(program: Program, rolled: RolledKernel) -> str:
     """Return the description of the circulant matrix of a sum over pairs in C."""
-    array, name = looped.reads[0].array, looped.given[0].array.name
-    return f"(circulant){_circulant_matrix(program, array, looped.circulant or 0, name, 0)}"
+    array, name = rolled.reads[0].array, rolled.given[0].array.name
+    return f"(circulant){_circulant_matrix(program, array, rolled.circulant or 0, name, 0)}"
 
 
 def _circulant_matrix(program: Program, array: Array, axis: int, coefficients: str, power: int) -> str:
@@ -221,7 +221,7 @@ def _circulant_matrix(program: Program, array: Array, axis: int, coefficients: s
     return f"{{start_{array.name}, {outer}, {size}, {inner}, given->field[{field}], {power}, {plan}}}"
 
 
-def _list_text(program: Program, components: int, lengths: LoopedKernel) -> str:
+def _list_text(program: Program, components: int, lengths: RolledKernel) -> str:
     """Return a function that describes the points of a list of neighbours."""
     nest = Nest(program.layout, lengths, "double", "")
     start, name = nest.place_of(lengths.writes[0]), lengths.kernel.name
@@ -235,18 +235,18 @@ def _list_text(program: Program, components: int, lengths: LoopedKernel) -> str:
     return f"{kernel_text(lengths.kernel, DOUBLE)}\n\n{text}"
 
 
-def _sharing_text(program: Program, looped: LoopedKernel) -> str:
+def _sharing_text(program: Program, rolled: RolledKernel) -> str:
     """Return a function that describes how threads share a term group."""
-    how = sharing_text(looped)
+    how = sharing_text(rolled)
     known = [*sizes_text(program.layout, how), *(f"(void){name};" for name in ("run", "given", "n"))]
-    head = f"static sharing share_{looped.kernel.name}(const run_memory *run, const problem *given, long long n)"
+    head = f"static sharing share_{rolled.kernel.name}(const run_memory *run, const problem *given, long long n)"
     lines = "\n".join(f"  {line}" for line in [*known, f"return {how};"])
     return f"/* Its rounds of tasks. */\n{head}\n{{\n{lines}\n}}"
 
 
 def _function(
     program: Program,
-    looped: LoopedKernel,
+    rolled: RolledKernel,
     name: str,
     arguments: Sequence[str],
     lines: Sequence[str],
@@ -256,33 +256,33 @@ def _function(
     before: Sequence[str] = (),
 ) -> str:
     """Return a function of numbers with the same statements for every element, and others before."""
-    nest = Nest(program.layout, looped, "double", source)
+    nest = Nest(program.layout, rolled, "double", source)
     text = ["(void)given;", *before, *nest.text(innermost=lines)]
     declared = f"double value[{values}]" if values else ""
     return nest.function(f"static void {name}", ["const problem *given", *arguments], text, values=declared)
 
 
 def _energy_text(
-    program: Program, looped: LoopedKernel, kernel: Kernel, *, declared: bool = False, before: Sequence[str] = ()
+    program: Program, rolled: RolledKernel, kernel: Kernel, *, declared: bool = False, before: Sequence[str] = ()
 ) -> str:
     """Return a function that sums the terms; ``before``: for the factor of a circulant matrix, at u = (1, 0)."""
     arguments = ["const double *q", "double t", "compensated *total"]
-    arguments += ["const double *image", "long long length"] if _has_sums(looped) else []
+    arguments += ["const double *image", "long long length"] if _has_sums(rolled) else []
     call = f"{kernel.name}(u, t, parameters, value);"
     if declared:
         return f"static void sum_{kernel.name}(const problem *given, {', '.join(arguments)});"
     if before:
-        matrix = _matrix_of_pairs(program, looped)
+        matrix = _matrix_of_pairs(program, rolled)
         added = "if (add_energy(&matrix, q, value[0], total))"
         before = [f"const circulant matrix = {matrix};", "u[0] = 1.0, u[1] = 0.0;", *before, call, added, "  return;"]
     lines = [call, "add_to_sum(total, value[0]);"]
-    return _function(program, looped, f"sum_{kernel.name}", arguments, lines, source="q", before=before)
+    return _function(program, rolled, f"sum_{kernel.name}", arguments, lines, source="q", before=before)
 
 
-def _mass_text(program: Program, looped: LoopedKernel) -> str:
-    name, place = looped.kernel.name, Nest(program.layout, looped, "", "").place_of(looped.writes[0])
+def _mass_text(program: Program, rolled: RolledKernel) -> str:
+    name, place = rolled.kernel.name, Nest(program.layout, rolled, "", "").place_of(rolled.writes[0])
     lines = [f"{name}(NULL, 0.0, parameters, value);", f"mass[{place}] += value[0];"]
-    return _function(program, looped, f"add_{name}", ["double *mass"], lines, source="")
+    return _function(program, rolled, f"add_{name}", ["double *mass"], lines, source="")
 
 
 def _constraint_context(program: Program, held: ConstrainedSteps | None) -> dict[str, Any]:
@@ -302,7 +302,7 @@ def _constraint_context(program: Program, held: ConstrainedSteps | None) -> dict
     return {"held": found, "part_ends": list(accumulate(held.parts))}
 
 
-def _constraint_texts(program: Program, condition: LoopedKernel, curvature: LoopedKernel) -> Iterator[str]:
+def _constraint_texts(program: Program, condition: RolledKernel, curvature: RolledKernel) -> Iterator[str]:
     """Yield functions of a constraint: g, g_t and derivatives; second derivatives; indices of its coordinates."""
     name, count = condition.kernel.name, len(condition.reads)
     X, now = "const double *restrict X", "condition *now"
@@ -326,7 +326,7 @@ def _constraint_texts(program: Program, condition: LoopedKernel, curvature: Loop
     yield _function(program, bare, f"place_{name}", [now], lines, values=0, source="")
 
 
-def _is_field(array: Array, term_groups: Iterable[LoopedKernel]) -> bool:
+def _is_field(array: Array, term_groups: Iterable[RolledKernel]) -> bool:
     """Return whether forces couple elements of an array with their neighbours: at offsets, or by rows of a table."""
     reads = ([each for each in one.reads if each.array == array] for one in term_groups)
     return any(

@@ -1,4 +1,4 @@
-"""Steppers of arrays of any size: each call binds one to the sizes and tables of its arrays."""
+"""Steppers of arrays of run-time sizes: each call binds one to the sizes and tables of its arrays."""
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
@@ -32,12 +32,12 @@ class UnavailableError(MethodError, AttributeError):
 
 
 def unavailable(name: str, stepper: object) -> UnavailableError:
-    """Return the error for an attribute that a stepper of any size lacks."""
+    """Return the error for an attribute that a stepper of run-time sizes lacks."""
     return UnavailableError(f"{name} is not available for {stepper!r}: {SIZES_REQUIRED}")
 
 
 def forwarding_methods(stepper: Any) -> dict[str, Callable[..., Any]]:
-    """Return the methods of a stepper of any size that take a state: each calls that of a stepper bound to its sizes.
+    """Return the methods that take a state, for a stepper of run-time sizes: each binds it to its sizes first.
 
     Each has the further argument ``tables``.
     """

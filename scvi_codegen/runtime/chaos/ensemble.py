@@ -237,11 +237,11 @@ class _TangentLanes:
         for k in range(blocks):
             binding.function("start")(self.memory + k, float(work.t[0]), work.h)
         self.lanes = binding.records(self.memory)
-        save_every = np.arange(blocks * self.width)
-        self.lane_indices = np.minimum(save_every, self.size - 1)
+        lane_numbers = np.arange(blocks * self.width)
+        self.lane_indices = np.minimum(lane_numbers, self.size - 1)
         self.lanes["q"][:, : self.dimension], self.lanes["p"][:, : self.dimension] = map(self._across, (q, p))
         self.lanes["parameters"][:, : parameters.shape[1]] = self._across(parameters)
-        self.lanes["active"] = (save_every < self.size).reshape(blocks, self.width)
+        self.lanes["active"] = (lane_numbers < self.size).reshape(blocks, self.width)
 
     def _across(self, rows: Array) -> Array:
         """Transpose (K, n) rows to (blocks, n, lanes)."""

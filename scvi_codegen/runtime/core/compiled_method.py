@@ -88,9 +88,9 @@ class CompiledMethod:
         fallback: source with Newton's iteration, if the main source contains only the fixed-point iteration.
         events: events that every run records.
         changes_states: whether one of them changes the states of runs.
-        any_size: whether the sizes of its arrays are those of each call; the stepper is bound to them, or
-            compiled with them if an integrator of any size is impossible.
-        origin, problem: of a bound stepper, the stepper of any size, and the sizes and tables; else ``None``.
+        run_time_sizes: whether the sizes of its arrays are those of each call; the stepper is bound to them, or
+            compiled with them if an integrator of run-time sizes is impossible.
+        origin, problem: of a bound stepper, the stepper of run-time sizes, and the sizes and tables; else ``None``.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class CompiledMethod:
         self.interface, self.flags, self.events = interface, flags, events
         self.changes_states = any(event.changes_state for event in events)
         self.origin, self.problem, self._of_sizes, self._reason = origin, problem, of_sizes, reason
-        self.any_size = problem is None and bool(interface.layout.coordinates)
+        self.run_time_sizes = problem is None and bool(interface.layout.coordinates)
         self._variants = Variants() if variants is None else variants
         self._event_variants: dict[tuple[Event, ...], Self] = {}
         self._released_runs: list[Any] = []
@@ -119,14 +119,14 @@ class CompiledMethod:
         self._plain = cast(Source, source)
         self.shapes = shapes_of(interface)
         self._load()
-        if self.any_size:
+        if self.run_time_sizes:
             self.__dict__.update(forwarding_methods(self))
 
     def _load(self) -> None:
         """Load the library with the events; of arrays of run-time sizes once these are known."""
         interface, events = self.interface if self.origin is None else self.origin.interface, self.events
         self.source = self._plain
-        if self.any_size:
+        if self.run_time_sizes:
             return
         if events and (known := self._variants._made.get(events)) is not None:
             self.source = known
@@ -155,7 +155,7 @@ class CompiledMethod:
         )
 
     def __getattr__(self, name: str) -> Any:
-        if self.__dict__.get("any_size") and name in ("binding", "dimension"):
+        if self.__dict__.get("run_time_sizes") and name in ("binding", "dimension"):
             raise unavailable(name, self)
         raise AttributeError(f"'{type(self).__name__}' has no attribute '{name}'")
 
@@ -169,7 +169,7 @@ class CompiledMethod:
         Raises:
             StateError: if a name, shape or number is invalid, or an index would leave its array.
         """
-        if not self.any_size:
+        if not self.run_time_sizes:
             self._check_not_of_run(tables, threads)
             return self, q
         problem = sizes_of_run(self.interface, q, parameters, tables, threads)
@@ -209,8 +209,8 @@ class CompiledMethod:
 
     @property
     def known(self) -> Self:
-        """Stepper compiled with known sizes; raises as :meth:`with_sizes`, and for a stepper of any size."""
-        if self.any_size:
+        """Stepper compiled with known sizes; raises as :meth:`with_sizes`, and for a stepper of run-time sizes."""
+        if self.run_time_sizes:
             raise MethodError(f"{self!r} requires sizes here: pass stepper.with_sizes(..). {SIZES_REQUIRED}")
         if self.problem is None or self.origin is None:
             return self
@@ -241,7 +241,7 @@ class CompiledMethod:
                 loaded from a folder and hence lacks its system.
         """
         values = {**(sizes or {}), **named}
-        if not self.any_size:
+        if not self.run_time_sizes:
             require(self, "with_sizes")
         check_few_coordinates(self.interface, values, self._reason)
         if self._of_sizes is None:
@@ -318,7 +318,7 @@ class CompiledMethod:
                 building.load(source, flags=self.flags)
 
     def _compile(self) -> None:
-        if not self.any_size:
+        if not self.run_time_sizes:
             self.binding.set_fallback()
         elif not self._reason:
             building.load(self.source, flags=self.flags)
@@ -385,7 +385,7 @@ class CompiledMethod:
     @property
     def dimension(self) -> int:
         """Degrees of freedom m."""
-        if self.any_size:
+        if self.run_time_sizes:
             raise unavailable("dimension", self)
         return self.interface.dimension
 
@@ -424,13 +424,13 @@ class CompiledMethod:
     def _lacks(self, variant: str) -> bool:
         """Return whether the method lacks a variant; arrays of run-time sizes take it from their system."""
         source = self.origin or self
-        if source.any_size:
+        if source.run_time_sizes:
             return source._of_sizes is None or source._variants.lacks(variant, of_sizes=True)
         return self._variants.lacks(variant)
 
     @property
     def _has_error_estimate(self) -> bool:
         """Whether the method has adaptive steps for this system; true if that follows from sizes at run time."""
-        if self.any_size:
+        if self.run_time_sizes:
             return bool(self._reason) or "_advance_to(" in self.source.header
         return self.binding.has("advance_to")

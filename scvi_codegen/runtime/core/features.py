@@ -57,8 +57,8 @@ PROPERTIES: dict[str, Callable[[Any], bool]] = {
     ),
     "without constraints": lambda stepper: not (stepper.interface.constraints or stepper.interface.layout.constraints),
     "without a mesh": lambda stepper: stepper.interface.layout.mesh is None,
-    "with sizes known when compiled": lambda stepper: not stepper.any_size,
-    "with sizes known at run time": lambda stepper: stepper.any_size,
+    "with sizes known when compiled": lambda stepper: not stepper.run_time_sizes,
+    "with sizes known at run time": lambda stepper: stepper.run_time_sizes,
     "without derivatives": lambda stepper: stepper._lacks("derivatives"),
     "without second derivatives": lambda stepper: stepper._lacks("second_derivatives"),
     "without an error estimate": lambda stepper: not (stepper._has_error_estimate or stepper._has_tau),
@@ -182,7 +182,7 @@ def require(stepper: Any, operation: str, *together: str) -> None:
         if each != operation:
             continue
         if property_ in PROPERTIES_OF_SIZES:
-            found = not stepper.any_size and PROPERTIES_OF_SIZES[property_](stepper.known)
+            found = not stepper.run_time_sizes and PROPERTIES_OF_SIZES[property_](stepper.known)
         else:
             found = PROPERTIES[property_](stepper) if property_ in PROPERTIES else property_[5:] in together
         if found:

@@ -57,14 +57,14 @@ def verify_arrays(
     """Return the certificate of arrays of run-time sizes; arguments as of ``of_known_sizes``, which is ``verify``.
 
     Properties are measured on a few indices of the arrays first, then at full size; adaptive steps, constraints, and
-    systems without an integrator for arrays of any size with known sizes only.
+    systems without an integrator for arrays of run-time sizes with known sizes only.
     """
     if q is None and p is None and system.mesh is not None:
         q, p, h = _state_of_fields(system.mesh, method, h)
     if q is None or h is None:
         raise StateError(f"verify requires q and h for arrays of '{system.name}': their shapes determine the sizes")
-    if stepper is not None and not stepper.any_size:
-        raise StateError(f"stepper must be one of any size, not {stepper!r}: compile it without sizes")
+    if stepper is not None and not stepper.run_time_sizes:
+        raise StateError(f"stepper must be one of run-time sizes, not {stepper!r}: compile it without sizes")
     began = time.perf_counter()
     chosen = as_method(method, one_coordinate(system))
     watched = stepper or compile_stepper(system, chosen, flags=tuple(flags))
