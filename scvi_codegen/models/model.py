@@ -379,6 +379,8 @@ class Model(TimeSpan):
         if self.system.inputs:
             arguments["inputs"] = self.all_inputs()
         if self.ends_at_time or self.has_shorter_last_step or (self.system.inputs and self.span is not None):
+            if self.h is not None and self.time_transformation is not None:
+                arguments["h"] = abs(self.h)  # the end determines the direction
             return arguments | {"t_end": self.t + self.covered, "steps": None}
         return arguments | {"steps": self.step_count}
 

@@ -384,18 +384,6 @@ class TestRun:
     def test_energy_change_of_systems_with_inputs_is_not_called_an_error(self):
         assert "L depends on time" in output_of("run", "duffing", "--parameter", "gamma=0.3")
 
-    @pytest.mark.parametrize("save_every", [1, 7])
-    def test_saved_trajectory_equals_integrate(self, save_every):
-        for name in ("orbit.npz", "orbit.csv"):
-            output_of("run", "kepler", "--steps", "500", "--save-every", str(save_every), "-o", name)
-        model = chosen(steps=500)
-        expected = model.start(compile_stepper(model.system, model.method)).record(500, save_every=save_every)
-        written, table = arrays("orbit.npz"), np.loadtxt("orbit.csv", delimiter=",", skiprows=1)
-        for key in ("t", "q", "p", "iterations"):
-            assert np.array_equal(written[key], getattr(expected, key))
-        columns = [expected.t, expected.q, expected.p, expected.iterations, expected.velocity, expected.energy()]
-        assert np.array_equal(table, np.column_stack(columns))
-
     def test_fewer_steps_than_save_every_and_no_steps(self):
         assert "3 steps of 0.25 from t = 0 to t = 0.75; 1 state saved" in output_of(
             "run", "kepler", "--steps", "3", "--save-every", "5", "-o", "a.npz"

@@ -1,7 +1,6 @@
 """``scvi-codegen run`` of a system with inputs: its tables, its files, what it refuses, and where it stops."""
 
 import os
-import re
 import signal
 from pathlib import Path
 
@@ -52,22 +51,6 @@ def output_of(*words):
     result = invoke(*words)
     assert result.exit_code == 0, result.output
     return result.stdout
-
-
-def test_run_with_inputs_and_its_file_equal_integrate(model):
-    text = output_of("-o", "run.npz", "--plot", "run.png", "--save-every", "2")
-    expected = compile_stepper(model.system, model.method).integrate(
-        model.q, model.p, inputs=dict(model.inputs), h=0.1, t_end=2.3, save_every=2
-    )
-    with np.load("run.npz") as file:
-        assert (file["t"] == expected.t).all()
-        assert (file["q"] == expected.q).all()
-        assert (file["p"] == expected.p).all()
-    assert Path("run.png").stat().st_size > 1000
-    assert "24 steps of 0.1 from t = 0 to t = 2.3" in text  # one more than without a breakpoint within a step
-    assert "in the digits confirmed by a second run" in text
-    reported = [re.search(r"[\d.]+ iterations a step", each)[0] for each in (text, output_of())]
-    assert reported[0] == reported[1]
 
 
 def test_inputs_of_the_command_line_replace_those_of_the_file(model):

@@ -89,29 +89,6 @@ def test_adaptive_steps_of_an_array_system_are_verified(ring: str) -> None:
     assert invoke("verify", "own.toml", "--size", "N=3").exit_code == 0
 
 
-def test_run_of_an_array_system(ring: str) -> None:
-    """Conserved quantities and final states in text, numbers and files agree with normal modes."""
-    result = invoke("run", ring, "-o", "ring.npz")
-    assert result.exit_code == 0, result.output
-    for words in (
-        "ring: 8 coordinates, N = 8",
-        "relative energy error",
-        "relative error of momentum of q:",
-        "largest local error",
-    ):
-        assert words in result.stdout
-    document = json.loads(invoke("run", ring, "--json").stdout)
-    assert document["energy_change"] < 1e-13
-    assert document["momentum_errors"]["momentum of q"] < 1e-14
-    with np.load("ring.npz") as saved:
-        assert saved["q"].shape == (5, 8)
-        phase, w = 2 * np.pi * np.arange(8) / 8, 2 * np.sin(np.pi / 8)
-        exact = np.sin(phase) * np.cos(2 * w) + np.cos(phase) * np.sin(2 * w) / w + 0.2
-        assert saved["q"][-1] == pytest.approx(exact, abs=1e-9)
-    assert document["final"]["q"]["q"] == pytest.approx(exact, abs=1e-9)
-    assert invoke("run", ring, "--quiet").stdout == ""
-
-
 def test_options_of_array_systems(ring: str) -> None:
     """Size, parameter, step, method."""
     words = ("--size", "N=12", "--parameter", "k=0", "--step", "0.25", "--span", "2", "--method", "stoermer-verlet")

@@ -8,8 +8,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from scvi_codegen import LagrangianSystem, Model, ModelFileError, compile_stepper, load_model, save_model
-from scvi_codegen.models.model_files.input_tables import InputTable, tables_of_example
-from scvi_codegen.models.model_files.model_file import dump_model, parse_model
+from scvi_codegen.models.model_files.input_tables import InputTable
+from scvi_codegen.models.model_files.model_file import parse_model
 
 MODEL = """
 [system]
@@ -52,34 +52,6 @@ def _write(path, header):
     path.write_text("\n".join([header, "", *(f"{t!r}, {u!r}" for t, u in zip(T, U, strict=True))]) + "\n")
 
 
-def test_model_with_inputs_equals_integrate(file, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path.parent)  # paths are relative to the model file
-    model = load_model(file)
-    assert model.inputs == {"u": InputTable(T, U, "cubic"), "w": InputTable((0.0, 3.0), (0.0, 0.3), "linear")}
-    stepper = compile_stepper(model.system, model.method)
-    expected = stepper.integrate([0.3], velocity=[0.1], inputs=dict(model.inputs), h=0.1, t_end=2.3)
-    run = model.start(stepper)
-    for steps in model.segments(run):
-        run.advance(steps)
-    assert (run.t, run.q[0], run.p[0]) == (expected.t[-1], expected.q[-1, 0], expected.p[-1, 0])
-
-
-def test_constants(file):
-    file.write_text(MODEL.replace('{ file = "tables/u.csv", kind = "cubic" }', "0.5"))
-    model = load_model(file)
-    assert model.inputs["u"] == 0.5
-    assert parse_model(dump_model(model)) == model
-    stepper = compile_stepper(model.system, model.method)
-    expected = stepper.integrate([0.3], velocity=[0.1], inputs=dict(model.inputs), h=0.1, t_end=2.3)
-    table = stepper.integrate(
-        [0.3], velocity=[0.1], inputs=dict(model.inputs) | {"u": ((0, 9), (0.5, 0.5))}, h=0.1, t_end=2.3
-    )
-    assert_allclose(expected.q, table.q, rtol=0, atol=1e-14)
-    inputs, parameters = tables_of_example(model.system, model.inputs, (0.0, 2.3))
-    assert inputs[0].coefficients == ((0.5, 0.0, 0.0, 0.0),)
-    assert dict(zip(stepper.parameters, parameters, strict=True))["u_0"] == 0.5
-
-
 def test_momenta_use_the_inputs_at_the_start():
     system = LagrangianSystem.from_text(
         name="growing", coordinates=["q"], lagrangian="(1 + u)*q_dot**2/2", inputs=["u"]
@@ -109,15 +81,6 @@ def test_formulas_use_the_names_of_inputs(lagrangian, tmp_path):
     model = Model(system=system, method="svi:4", q=(0.1,), p=(0.0,), h=0.1, span=1.0, inputs={"u": (T, U, "constant")})
     save_model(model, tmp_path / "model.toml")
     assert load_model(tmp_path / "model.toml") == model
-
-
-def test_saved_files_are_self_contained(file, tmp_path):
-    model = load_model(file)
-    (tmp_path / "tables" / "u.csv").unlink()
-    text = dump_model(model)
-    assert parse_model(text) == model
-    assert model.parameters == {"c": 0.2}
-    assert "u_0" not in text
 
 
 @pytest.mark.parametrize("header", ["t,value", "t,acceleration", "t,u"])
@@ -212,13 +175,3 @@ def test_names_that_are_not_inputs_are_rejected():
     model = Model(**given)
     with pytest.raises(ModelFileError, match=r"the input u is not set: .*--input u=FILE"):
         next(model.segments(model.start(compile_stepper(system, "svi:2"))))
-
-
-def test_hamiltonian_has_inputs():
-    """The file survives a round trip."""
-    text = MODEL.replace('lagrangian = "q_dot**2/2 + (1 + w)*cos(q)"', 'hamiltonian = "p_q**2/2 - (1 + w)*cos(q)"')
-    text = text.replace("c*q_dot", "c*p_q").replace("q_dot = [0.1]", "p = [0.1]")
-    text = text.replace('{ file = "tables/u.csv", kind = "cubic" }', "{ t = [0, 3.0], values = [0.0, 1.0] }")
-    model = parse_model(text)
-    assert model.system.inputs == ("u", "w")
-    assert parse_model(dump_model(model)) == model

@@ -1,6 +1,5 @@
 """Models in transformed time: files, the command line, and generated folders."""
 
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +10,7 @@ import scvi_codegen as sc
 from scvi_codegen.cli import main
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.models.model_files.model_file import catalogue_model, dump_model, parse_model
-from scvi_codegen.models.packages.package import generate_package, load_package
 
-STRICT = "-O2 -std=c99 -Wall -Wextra -Werror -Wno-psabi -ffp-contract=off"
 BY_CLOCK = {"system": {"time_transformation": "frequency"}, "run": {"step": 0.2, "span": 20.0}}
 
 
@@ -63,22 +60,6 @@ def test_step_size_of_another_time_is_not_reused(model: sc.Model) -> None:
         dump_model(sc.Model(system=changed, method=sc.SVI(4), q=(1.0, 0.0), p=(0.0, 1.0), h=0.1, steps=3))
 
 
-def test_the_command_line_runs_to_a_time(model: sc.Model, tmp_path: Path) -> None:
-    orbit = tmp_path / "orbit.npz"
-    printed = invoke(
-        "run", "kepler", "--time-transformation", "frequency", "--step", "0.2", "--span", "20", "-o", str(orbit)
-    )
-    assert "of 0.2 in tau from t = 0 to t = 20;" in printed
-    stepper = sc.compile_stepper(model.system, model.method)
-    run = stepper.integrate(model.q, velocity=model.velocity, h=0.2, t_end=20.0)
-    with np.load(orbit) as file:
-        assert np.array_equal(file["t"], run.t)
-        assert np.array_equal(file["q"], run.q)
-    assert f"{run.q[-1, 0]:.17g}" in printed
-    back = invoke("run", "kepler", "--time-transformation", "frequency", "--step", "-0.2", "--span", "5")
-    assert "to t = -5;" in back
-
-
 def test_command_line_finds_a_step_and_reports_unsuitable_steps() -> None:
     printed = invoke("run", "kepler", "--time-transformation", "frequency", "--span", "50", "--tolerance", "1e-8")
     error = float(printed.partition("largest local error: ")[2].partition(" ")[0])
@@ -119,23 +100,3 @@ def test_folders_contain_a_number_of_steps(tmp_path: Path) -> None:
     assert "50 steps in tau (all)" in invoke(*by_clock, "--step", "0.2", "--steps", "50", "-o", folder)
     assert "not --span" in invoke("run", "--resume", folder, "--span", "9", status=2)
     assert "60 steps in tau (all)" in invoke("run", "--resume", folder, "--steps", "60")
-
-
-def test_generated_folders_carry_time_and_energy(model: sc.Model, tmp_path: Path) -> None:
-    folder = generate_package(model, tmp_path / "by_clock")
-    done = subprocess.run(
-        ["make", "-s", "-C", str(folder), "run", f"CFLAGS={STRICT}"], capture_output=True, text=True, check=True
-    )
-    rows = np.array([[float(x) for x in line.split()] for line in done.stdout.splitlines() if not line.startswith("#")])
-    run = load_package(folder).integrate(model.q, velocity=model.velocity, h=0.2, t_end=20.0)
-    saved = rows[rows[:, 0] <= run.t[-2]]
-    assert len(saved) > 5
-    for t, row in zip(saved[:, 0], saved, strict=True):
-        k = int(np.abs(run.t - t).argmin())
-        assert np.abs(np.concatenate([[run.t[k]], run.q[k], run.p[k]]) - row[:5]).max() < 1e-12
-    assert np.abs(rows[:, -1]).max() < 1e-13
-    assert rows[-1, 0] >= 20.0
-    assert "`E` is the energy of the initial state" in (folder / "README.md").read_text()
-    assert parse_model((folder / "model.toml").read_text()) == model
-    with pytest.raises(ModelFileError, match="give one"):
-        generate_package(catalogue_model("kepler", {"system": {"time_transformation": "frequency"}}), tmp_path / "none")

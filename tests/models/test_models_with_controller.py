@@ -79,24 +79,6 @@ def test_controller_of_a_time_transformation_can_be_replaced() -> None:
     assert parse_model(dump_model(symplectic), {"run": {"controller": "reversible"}}) == reversible
 
 
-def test_command_line_uses_the_steps_of_the_library(shaken: Path, tmp_path: Path) -> None:
-    model, orbit = sc.load_model(shaken), tmp_path / "orbit.npz"
-    printed = invoke("run", str(shaken), "-o", str(orbit))
-    assert "of 0.1 in tau by the reversible controller from t = 0 to t = 12;" in printed
-    stepper = sc.compile_stepper(model.system, model.method, time_transformation=model.time_transformation)
-    run = stepper.integrate(model.q, model.p, h=0.1, t_end=12.0)
-    with np.load(orbit) as file:
-        assert np.array_equal(file["t"], run.t)
-        assert np.array_equal(file["q"], run.q)
-    exact = plain(model).integrate(model.q, model.p, t_end=12.0)
-    assert np.abs(run.q[-1] - exact.q[-1]).max() < 1e-10
-    back = tmp_path / "back.npz"
-    invoke("run", str(shaken), "--step", "-0.1", "--span", "2", "-o", str(back))
-    with np.load(back) as file:
-        expected = stepper.integrate(model.q, model.p, h=0.1, t_end=-2.0)
-        assert np.array_equal(file["q"], expected.q)
-
-
 def test_command_line_finds_the_step_in_tau(shaken: Path) -> None:
     printed = invoke("run", str(shaken), "--tolerance", "1e-8")
     error = float(printed.partition("largest local error: ")[2].partition(" ")[0])

@@ -15,7 +15,7 @@ from scvi_codegen.cli import main
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import BuildError, PackageError, StateError, StepFailedError
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.methods import SVI, Gauss, SpectralCollocation
+from scvi_codegen.methods import SVI, Gauss
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.model_file import load_model
 from scvi_codegen.models.packages.package import generate_package, load_package
@@ -24,7 +24,6 @@ from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.tables.quadrature import Quadrature
 
 STRICT = "-O1 -std=c99 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror"
-COMPILERS = ("gcc", "clang")
 
 WITHOUT_SYMPY = """
 import sys
@@ -95,49 +94,11 @@ def test_package_steps_as_the_compiled_system_without_sympy(name, tmp_path):
     assert [float.fromhex(word) for word in result.stdout.split()] == expected.tolist()
 
 
-def test_load_package_gives_an_equal_stepper(pendulum, tmp_path):
-    loaded = load_package(generate_package(pendulum, tmp_path / "pendulum_svi"))
-    stepper = compile_stepper(pendulum.system, pendulum.method)
-    assert (loaded.coordinates, loaded.parameters) == (stepper.coordinates, stepper.parameters)
-    assert loaded.interface.prefix == "pendulum_svi"
-    ours, theirs = (one.integrate([2.0], [0.1], h=0.3, steps=50, parameters={"g": 2.0}) for one in (loaded, stepper))
-    assert np.array_equal(ours.q, theirs.q)
-    assert np.array_equal(ours.energy(), theirs.energy())
-
-
 def test_generated_c_is_compiled_unchanged(pendulum, tmp_path):
     folder = generate_package(pendulum, tmp_path / "pendulum_svi")
     (folder / "pendulum_svi.c").write_text("#error edited\n")
     with pytest.raises(BuildError, match="edited"):
         load_package(folder)
-
-
-@pytest.mark.sampled(2)
-@pytest.mark.covering
-@pytest.mark.parametrize("compiler", COMPILERS)
-@pytest.mark.parametrize(
-    ("name", "method"),
-    [("planar-pendulum", SVI(3)), ("duffing", SpectralCollocation(2)), ("outer-solar-system", SVI(2))],
-)
-def test_make_run_requires_only_a_c_compiler_and_equals_python(compiler, name, method, tmp_path):
-    needs("make", compiler)
-    model = model_of(name, method=method)
-    folder = generate_package(model, tmp_path / "generated_stepper")
-    command = ["make", "-s", "-C", str(folder), "run", f"CC={compiler}", f"CFLAGS={STRICT}"]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (result.returncode, "warning" in result.stderr) == (0, False)
-    header, *lines = result.stdout.splitlines()
-    lines = [line for line in lines if not line.startswith("#")]
-    names = [coordinate.name for coordinate in model.system.coordinates]
-    energy = "energy_change" if model.system.changes_energy else "energy_error"
-    assert header.split() == ["#", "t", *names, *(f"p_{name}" for name in names), energy]
-    table = np.array([line.split() for line in lines], dtype=float)
-    stepper = compile_stepper(model.system, method)
-    trajectory = model.start(stepper).record(model.step_count, save_every=model.step_count // 20)
-    assert np.array_equal(table[:, 0], trajectory.t)
-    states = np.hstack([trajectory.q, trajectory.p])
-    assert np.abs(table[:, 1:-1] - states).max() < 1e-8 * np.abs(states).max()
-    assert np.abs(table[:, -1]).max() <= 2 * np.abs(trajectory.energy() - trajectory.energy()[0]).max() + 1e-13
 
 
 @pytest.mark.parametrize(

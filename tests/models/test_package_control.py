@@ -9,7 +9,7 @@ import pytest
 
 import scvi_codegen as sc
 from scvi_codegen.errors import MethodError
-from scvi_codegen.models.packages.package import generate_package, load_package
+from scvi_codegen.models.packages.package import generate_package
 
 STRICT = "-O2 -std=c99 -Wall -Wextra -Werror -Wno-psabi -ffp-contract=off"
 SPAN = 10.0
@@ -33,28 +33,10 @@ def exact_end(model: sc.Model) -> np.ndarray:
     return stepper.integrate(model.q, velocity=model.velocity, t_end=SPAN).q[-1]
 
 
-@pytest.mark.parametrize("solver", ["auto", "newton"])
-def test_adaptive_example_reaches_the_end_time(model, tmp_path, solver):
-    lines = output(generate_package(model, tmp_path / "controlled", solver=solver))
-    states = np.array([[float(word) for word in line.split()] for line in lines if not line.startswith("#")])
-    assert np.allclose(states[:, 0], np.linspace(0.0, SPAN, 21), rtol=1e-15)
-    assert np.abs(states[-1, 1:3] - exact_end(model)).max() < 1e-6
-    assert np.abs(states[:, -1]).max() < 1e-7
-    assert lines[-1].startswith("# ")
-    assert int(lines[-1].split()[1]) > 20
-
-
 def test_step_example_compares_adaptive_steps_with_the_step(model, tmp_path):
     lines = output(generate_package(replace(model, h=0.01, tolerance=None), tmp_path / "fixed"))
     assert "adaptive steps" in lines[-1]
     assert max(abs(float(word)) for word in lines[-1].split()[-2:]) < 1e-5
-
-
-def test_python_module_of_the_folder_has_adaptive_steps(model, tmp_path):
-    stepper = load_package(generate_package(model, tmp_path / "controlled"))
-    run = stepper.integrate([1.0, 0.0], [0.0, 1.0], t_end=2.0 * np.pi)
-    assert np.abs(run.q[-1] - [1.0, 0.0]).max() < 1e-13
-    assert "_advance_to" in (tmp_path / "controlled" / "README.md").read_text()
 
 
 @pytest.mark.parametrize(("precision", "error"), [("double", 1e-6), ("single", 1e-2)])

@@ -9,9 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 from style import check_style
 
-from scvi_codegen import SVI, Gauss, LagrangianSystem, Model, StoermerVerlet, compile_stepper, load_model, load_package
+from scvi_codegen import SVI, LagrangianSystem, Model, StoermerVerlet, compile_stepper, load_package
 from scvi_codegen.models.packages.package import generate_package
-from scvi_codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.runtime.events.event import Event, impact
 from scvi_codegen.runtime.inputs.segments import checked_inputs, parameters_of, prepared_segments
 
@@ -40,34 +39,6 @@ def states_printed(folder, flags=STRICT):
     command = [str(folder / f"{folder.name}_main")]
     printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     return np.loadtxt(printed.splitlines(), comments="#"), printed
-
-
-@pytest.mark.sampled(1)
-@pytest.mark.covering
-@pytest.mark.parametrize("method", [SVI(4), Gauss(2), StoermerVerlet()], ids=lambda method: method.name)
-@pytest.mark.parametrize(("h", "t"), [(0.03, 0.0), (-0.07, 2.55)])
-def test_example_equals_integrate_bitwise(model, method, h, t, tmp_path):
-    model = replace(model, method=method, h=h, t=t)
-    states, printed = states_printed(generate_package(model, tmp_path / "pushed"))
-    stepper = compile_stepper(model.system, method, flags=PORTABLE_FLAGS)
-    run = stepper.integrate(model.q, states[:1, 2], inputs=dict(model.inputs), h=h, t=t, t_end=t + np.copysign(2.3, h))
-    rows = np.isin(run.t, states[:, 0])
-    assert rows.sum() == len(states) > 10
-    assert (states[:, 1] == run.q[rows, 0]).all()
-    assert (states[:, 2] == run.p[rows, 0]).all()
-    assert states[-1, 0] == run.t[-1]
-    assert_allclose(states[:, 2][0], stepper.momentum(model.q, model.velocity, t, model.parameters_at_start(stepper)))
-    assert_allclose(states[:, 3], (run.energy() - run.energy()[0])[rows], rtol=0, atol=2e-3)
-    (apart,) = re.findall(r"difference of the end (\S+)", printed) or ["0"]
-    assert abs(float(apart)) < 1e-2
-
-
-def test_adaptive_steps_end_at_breakpoints(model, tmp_path):
-    model = replace(model, h=None, tolerance=None)
-    states, _ = states_printed(generate_package(model, tmp_path / "pushed"))
-    stepper = compile_stepper(model.system, model.method)
-    run = stepper.integrate(model.q, velocity=model.velocity, inputs=dict(model.inputs), t_end=2.3)
-    assert_allclose(states[-1, :3], [2.3, run.q[-1, 0], run.p[-1, 0]], rtol=0, atol=3e-13)
 
 
 @pytest.mark.parametrize("h", [0.03, None])
@@ -140,16 +111,6 @@ def _tables(stepper, inputs):
         entry.t, entry.coefficients = map(stepper.binding.pointer, saved[-2:])
         entry.pieces, entry.piece = len(data.pieces), 0
     return table, saved
-
-
-def test_folder_with_inputs_runs_from_python(model, tmp_path):
-    folder = generate_package(model, tmp_path / "pushed")
-    assert load_model(folder / "model.toml") == model
-    given = {"inputs": dict(model.inputs), "h": 0.03, "t_end": 2.3}
-    run = load_package(folder).integrate(model.q, velocity=model.velocity, **given)
-    same = compile_stepper(model.system, model.method).integrate(model.q, velocity=model.velocity, **given)
-    assert_allclose(run.q, same.q, rtol=0, atol=1e-14)
-    assert "pushed_next_steps" in (folder / "README.md").read_text()
 
 
 def test_inputs_without_data_are_zero(model, tmp_path):
