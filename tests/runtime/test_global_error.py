@@ -64,6 +64,10 @@ def chain(t, y):
     return np.concatenate([y[n:], force[1:] - force[:-1]])
 
 
+def duffing(t, y):
+    return np.array([y[1], y[0] - y[0] ** 3 + np.cos(t) / 4 - y[1] / 8])
+
+
 def made(name, coordinates, lagrangian, **more):
     return sc.LagrangianSystem.from_text(name=name, coordinates=coordinates, lagrangian=lagrangian, **more)
 
@@ -169,17 +173,25 @@ class TestMotions:
         assert np.median(ratios) < 30.0
         assert np.median(costs) < 6.0
 
+    def test_runs_that_agree_by_chance_do_not_confirm_each_other(self):
+        """Rounding errors grow a thousandfold: runs with tolerances 1e-14, 1e-17 agree to 3e-15, both off by 3e-13."""
+        system = made("d", ["x"], "x_dot**2/2 + x**2/2 - x**4/4", forces={"x": "cos(t)/4 - x_dot/8"})
+        start = {"q": [0.8359375], "p": [0.54931640625], "t_end": 39.3681640625}
+        run = sc.compile_stepper(system, "svi:6").integrate(**start, error=1e-11)
+        exact = integrated(duffing, [*start["q"], *start["p"]], run.t[[0, -1]])[-1]
+        assert np.linalg.norm(exact[0] - run.q[-1]) / abs(run.q).max() <= run.global_error <= 1e-11
+
     @pytest.mark.full
     def test_errors_of_growing_motions_are_relative_to_their_size_by_then(self):
         """Of q = p = exp(t); at first relative to the largest size of the first sixteenth."""
         saddle = sc.compile_stepper(made("saddle", ["q"], "q_dot**2/2 + q**2/2"), "svi:4")
-        run = saddle.integrate([1.0], [1.0], t_end=24.0, error=1e-6)
+        run = saddle.integrate([1.0], [1.0], t_end=48.0, error=1e-6)
         found, exact = run.confirmation, np.exp(run.t)
-        early = exact[run.t <= 1.5].max()
+        early = exact[run.t <= 3.0].max()
         off = np.maximum(abs(run.q[:, 0] - exact), abs(run.p[:, 0] - exact)) / np.maximum(exact, early)
         off = off[np.searchsorted(run.t, found.t)]
         assert found.differences == pytest.approx(off, rel=0.05, abs=1e-14)
-        assert (off[found.t < 1.0] > 0).sum() > 1
+        assert (off[found.t <= 3.0] > 0).any()
 
     def test_time_transformations_can_be_combined(self):
         """Kepler's problem with e = 0.99: one is recommended, and confirms a hundredth of the error without it."""

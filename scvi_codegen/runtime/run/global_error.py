@@ -13,7 +13,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -30,7 +29,7 @@ FIRST, RATIO = 1e-3, 1e-3
 """First local tolerance relative to the wanted error; next tolerance, and that of a comparison, relative to a run's."""
 GAIN = 100.0
 """Factor by which ``RATIO`` reduces the error of nearly every run."""
-ROUNDED, ROUNDED_OF_TAU, LEAST = 0.99e-14, 1e-10, 1e-17
+ROUNDED, ROUNDED_OF_TAU, LEAST = 0.99e-12, 1e-10, 1e-17
 """Tolerances below which rounding may dominate errors, also with steps of tau, and from which the last runs are made.
 
 Steps of tau are equal, so that many have smaller errors than the tolerance.
@@ -53,6 +52,8 @@ ORDER = 10.0
 """Power of a step of tau that a local tolerance stands for: ``RATIO`` halves the steps of a time transformation."""
 UNEVEN = 30.0
 """Ratio of the longest to the shortest step from which on a time transformation is recommended."""
+SMALLEST_SQUARE = 1e-280
+"""Sums of squares below this, or above its inverse, are computed from scaled numbers."""
 LOST = 0.1
 """Estimate from which on runs are uncorrelated."""
 
@@ -330,29 +331,31 @@ class _Samples:
         t, vectors = trajectory.t, [np.asarray(trajectory.q), np.asarray(trajectory.p)]
         early = abs(t - start) <= EARLY * abs(t[-1] - start)
         sizes = [_sizes(each, early) for each in vectors]
+        steps = len(t) - 1
         count = max(LEAST_SAMPLES, min(len(t) // STEPS_PER_SAMPLE, MOST_SAMPLES, MOST_NUMBERS // vectors[0].shape[1]))
         chosen = np.arange(len(t))
-        if count < len(t) - 1:
+        if count < steps:
             with np.errstate(divide="ignore", invalid="ignore"):
-                spans = np.maximum(abs(np.diff(t)), np.finfo(float).tiny)
-                speeds = [_norms(np.diff(x, axis=0)) / n[1:] for x, n in zip(vectors, sizes, strict=True)]
-                speeds = np.nan_to_num(np.maximum(*speeds)) / spans
-            parts = np.linspace(0, len(t) - 1, count).astype(int)
-            fastest = [a + int(np.argmax(speeds[a:b])) + 1 for a, b in pairwise(parts)]
-            chosen = np.unique([0, *fastest, len(t) - 1])
+                speeds = [_norms(x[1:] - x[:-1]) / n[1:] for x, n in zip(vectors, sizes, strict=True)]
+                speed = np.nan_to_num(np.maximum(*speeds)) / np.maximum(abs(t[1:] - t[:-1]), np.finfo(float).tiny)
+            size = -(-steps // count)
+            parts = np.full((-(-steps // size), size), -1.0)
+            parts.ravel()[:steps] = speed
+            fastest = np.arange(0, steps, size) + parts.argmax(axis=1) + 1
+            chosen = np.unique([0, *fastest, steps])
         self.t, self.end, self.start = t[chosen], float(t[-1]), start
         self.states = [(x[chosen], n[chosen]) for x, n in zip(vectors, sizes, strict=True)]
 
     def differences(self, other: Any) -> Array:
         """Return the relative differences to another run, infinite after its end."""
-        t = self.t
-        forward = math.copysign(1.0, self.end - self.start)
+        t, forward = self.t, math.copysign(1.0, self.end - self.start)
         reached = (forward * (t - other.t[-1]) <= 0.0) & (forward * (t - other.t[0]) >= 0.0)
-        differences = np.full(len(t), np.inf)
-        with suppress(StepFailedError):  # a partial step
+        differences, some = np.full(len(t), np.inf), slice(None) if reached.all() else reached
+        with suppress(StepFailedError), np.errstate(divide="ignore", invalid="ignore"):  # a partial step
             if reached.any():
-                parts = zip(other.at(t[reached]), self.states, strict=True)
-                differences[reached] = np.maximum(*(_relative(x - y[reached], n[reached]) for x, (y, n) in parts))
+                pairs = zip(other.at(t[some]), self.states, strict=True)
+                norms = [(_norms(x - y[some]), n[some]) for x, (y, n) in pairs]
+                differences[some] = np.maximum(*(np.where(each == 0.0, 0.0, each / n) for each, n in norms))
         return differences
 
 
@@ -363,13 +366,13 @@ def _sizes(states: Array, early: NDArray[np.bool_]) -> Array:
 
 
 def _norms(rows: Array) -> Array:
-    """Return the norm of each row, scaled so that squares neither overflow nor underflow."""
-    units = abs(rows).max(axis=1, initial=0.0)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(units * np.linalg.norm(rows / np.where(units == 0.0, 1.0, units)[:, None], axis=1))
-
-
-def _relative(apart: Array, sizes: Array) -> Array:
-    norms = _norms(apart)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(norms == 0.0, 0.0, norms / sizes)
+    """Return the norm of each row; rows whose squares may overflow or underflow are scaled."""
+    squares = np.einsum("ij,ij->i", rows, rows)
+    norms = np.sqrt(squares)
+    extreme = (squares < SMALLEST_SQUARE) | (squares > 1.0 / SMALLEST_SQUARE)
+    if extreme.any() and (some := rows[extreme]).any():
+        units = abs(some).max(axis=1)
+        with np.errstate(invalid="ignore"):
+            scaled = some / np.where(units == 0.0, 1.0, units)[:, None]
+            norms[extreme] = units * np.linalg.norm(scaled, axis=1)
+    return np.asarray(norms)
