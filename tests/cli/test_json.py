@@ -8,7 +8,6 @@ from typing import Any
 import click
 import numpy as np
 import pytest
-import sympy
 from click.testing import CliRunner, Result
 
 import scvi_codegen as sc
@@ -68,21 +67,6 @@ def test_quiet_prints_nothing_and_json_prints_one_document(words):
     assert document(*words)
 
 
-def test_the_equations_of_a_step_are_formulas():
-    words = ("derive", "planar-pendulum", "--method", "svi:1", "--quadrature", "gauss-lobatto:2", "--radicals")
-    found = document(*words)
-    assert found["unknowns"] == ["Q_1"]
-    symbols = {name: sympy.Symbol(name) for name in ("Q_1", "q_k", "p_k", "h", "g", "l", "m")}
-    [equation] = found["equations"]
-    assert equation["number"] == "27a"
-    written = sympy.sympify("p_k - g*h*l*m*sin(q_k)/2 - l**2*m*(Q_1 - q_k)/h", symbols)
-    assert sympy.simplify(sympy.sympify(equation["residual"], symbols) - written) == 0
-    assert found["end"]["q"] == ["Q_1"]
-    assert found["text"] == invoke(*words).stdout[:-1]
-    assert document(*words, "-o", "step.txt")["written"] == ["step.txt"]
-    assert Path("step.txt").read_text().rstrip() == found["text"].rstrip()
-
-
 def test_failed_run_reports_how_far_it_got():
     found = document("run", "kepler", "--q", "1,0", "--velocity", "0,0", "--tolerance", "1e-9", "--span", "3", status=1)
     assert "step" in found["failure"]
@@ -101,22 +85,6 @@ def test_failed_run_reports_how_far_it_got():
         "use another time transformation" in document("run", "kepler", *far, "--tolerance", "1e-10", status=1)["missed"]
     )
     assert invoke("run", "keplr", "--json", status=2).stdout == ""
-
-
-def test_json_of_advice_folders_and_ensembles():
-    advised = document("run", "kepler", "--span", "10", "--advise", "1e-6")
-    assert advised["advice"]["h"] == advised["h"]
-    assert advised["advice"]["steps"] == advised["steps"]
-    recorded = document("run", *KEPLER, "-o", "orbit.run")
-    assert (recorded["steps"], recorded["finished"], recorded["folder"]) == (50, True, "orbit.run")
-    assert recorded["final"]["q"] == document("run", *KEPLER)["final"]["q"]
-    further = document("run", "--resume", "orbit.run", "--steps", "60")
-    assert further["steps"] == 60
-    assert document("export", "orbit.run", "-o", "orbit.csv")["written"] == ["orbit.csv"]
-    Path("grid.toml").write_text("[grid]\nq1 = [0.4, 0.5, 0.6]\n")
-    many = document("run", *KEPLER, "--ensemble", "grid.toml")
-    assert (many["trajectories"], many["statuses"], many["steps"]["most"]) == (3, {"ok": 3}, 50)
-    assert len(many["energy"]) == 3
 
 
 def test_json_of_several_momentum_maps():

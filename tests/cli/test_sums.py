@@ -89,17 +89,6 @@ def test_adaptive_steps_of_an_array_system_are_verified(ring: str) -> None:
     assert invoke("verify", "own.toml", "--size", "N=3").exit_code == 0
 
 
-def test_options_of_array_systems(ring: str) -> None:
-    """Size, parameter, step, method."""
-    words = ("--size", "N=12", "--parameter", "k=0", "--step", "0.25", "--span", "2", "--method", "stoermer-verlet")
-    document = json.loads(invoke("run", ring, "--json", *words).stdout)
-    assert (document["sizes"], document["steps"], document["method"]) == ({"N": 12}, 8, "stoermer-verlet")
-    i = np.arange(12)
-    assert document["final"]["q"]["q"] == pytest.approx(
-        np.sin(2 * np.pi * i / 12) + 2 * np.cos(2 * np.pi * i / 12) + 0.2, abs=1e-13
-    )
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [

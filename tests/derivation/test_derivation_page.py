@@ -193,10 +193,6 @@ class TestPage:
         page = derivation_html(singular, sc.Gauss(2))
         assert "in turn to convergence" in page
 
-    def test_jacobian_entries_show_their_indices(self):
-        page = derivation_html(sc.problem("planar-pendulum").system, sc.SVI(1, "gauss-legendre:1"))
-        assert "<title>equation 1 by Q_1</title>" in page
-
     def test_operations_are_counted(self):
         program = program_of(sc.problem("kepler").system, sc.SVI(2), prefix="kepler_problem")
         functions = functions_of(render(program).amalgamated().code)
@@ -227,26 +223,6 @@ class TestPage:
         numbers = set(re.findall(r'<span class="number">\(([^)]*)\)', page))
         assert {"2", "33", "34a, i = 1, 2", "34c", "34d", "34e", "dG/dQ", "dG/dv0"} <= numbers
 
-    def test_hamiltonian_shows_hamiltons_equations(self):
-        page = derivation_html(sc.hamiltonian_of(sc.problem("henon-heiles").system), sc.SVI(1))
-        assert "Hamilton&#39;s equations</h2>" in page
-        assert page.count("(19a)") == page.count("(19b)") == 2
-
-    @pytest.mark.parametrize(
-        ("more", "message"),
-        [
-            ({"forces": {"x": "-c*x_dot**3"}}, "Generalised forces f; below"),
-            ({"damping": "c"}, "Momenta are damped at one rate,"),
-            ({"constraints": ["x**2 + y**2 - 1"]}, "with Lagrange multipliers"),
-        ],
-        ids=["forces", "damping", "constraints"],
-    )
-    def test_forces_and_constraints_of_a_lagrangian_are_shown(self, more, message):
-        plain, acted_on = (derivation_html(swing(**each), sc.SVI(2, "gauss-lobatto:3")) for each in ({}, more))
-        assert message in acted_on
-        assert message not in plain
-        Page(acted_on)
-
     def test_composition_is_shown_as_its_leapfrog_steps(self):
         method = sc.Composition(8)
         assert f"{len(method.fractions)} leapfrog steps of sizes" in kepler_page(method)
@@ -275,9 +251,6 @@ class TestPage:
         count = sum(len(functions[f"quadrature_derivatives{end}"].text.splitlines()) for end in ("_1", "_2", ""))
         assert count > 1000
         assert f"/* .. {count - MOST_LINES} more lines */" in page
-
-    def test_omitted_terms_of_the_predictor_are_counted(self):
-        assert "The first 12 of 16 first values." in kepler_page(sc.SVI(8))
 
     def test_an_index_in_a_heading_is_a_variable(self):
         assert f"<var>j</var>{SPACE}={SPACE}0</th>" in kepler_page(sc.SVI(2))

@@ -7,7 +7,7 @@ import sympy
 from counting import at_most
 from sympy import Rational, Symbol, atan2, cos, exp, log, sin, sqrt
 
-from scvi_codegen.formulas.expressions import gradient, hessian, jacobian
+from scvi_codegen.formulas.expressions import gradient, hessian
 
 X, Y, Z = sympy.symbols("x y z", real=True)
 M = Symbol("m", real=True)
@@ -40,24 +40,11 @@ def test_first_and_second_derivatives_agree_with_sympy(expression: sympy.Expr) -
             assert curvatures.get((row, column)) is curvatures.get((column, row))
 
 
-def test_fourth_derivatives_by_repetition() -> None:
-    expression = exp(X * Y) * cos(Z)
-    level = {0: expression}
-    for variable in (X, Y, Z, X):
-        level = gradient(level[0], [variable])
-    assert same(level[0], expression.diff(X, Y, Z, X))
-
-
 def test_zeros_and_unknown_symbols_are_omitted() -> None:
     assert gradient(M**2 + 1, [X, Y]) == {}
     assert gradient(X - X + Y, [X, Y]) == {1: 1}
     assert hessian(X * Y + M * Z, [X, Y, Z]) == {(0, 1): 1, (1, 0): 1}
     assert gradient(Y, [X, Y]) == {1: 1}
-
-
-def test_jacobian_accepts_rows_as_sequence_or_by_index() -> None:
-    assert jacobian([X * M, Y**2], [X, Y]) == {(0, 0): M, (1, 1): 2 * Y}
-    assert jacobian({5: Y**2, 2: X}, [X, Y]) == {(2, 0): 1, (5, 1): 2 * Y}
 
 
 def test_unknown_node_is_rejected() -> None:

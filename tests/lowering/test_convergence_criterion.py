@@ -29,14 +29,6 @@ def scaling():
     return HamiltonianSystem.from_text(name="scaling", coordinates=["x"], hamiltonian="x*p_x")
 
 
-@pytest.mark.parametrize("h", [0.26, 0.3, 0.45, 0.6])
-def test_slow_fixed_point_iteration_agrees_with_newton(h):
-    method = SpectralCollocation(1, form="phase-space")
-    exact = Q[0] / (1 - h), P[0] / (1 + h)
-    found = compile_stepper(scaling(), method, flags=QUICK_FLAGS).step(Q, P, h)
-    assert np.concatenate(found) == pytest.approx(exact, rel=ROUNDING)
-
-
 @pytest.mark.parametrize("method", [SVI(1), SCVI(2), SVI(3, "clenshaw-curtis:4")], ids=lambda method: method.name)
 def test_long_steps_of_an_oscillator_equal_those_in_an_ensemble(method):
     system = problem("harmonic-oscillator").system

@@ -14,7 +14,6 @@ from scvi_codegen.mechanics.symmetry.symmetry import symmetries
 from scvi_codegen.mechanics.time_transformation import reparametrise
 from scvi_codegen.methods import SCVI, SVI
 from scvi_codegen.methods.discretise import discretise
-from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 
 PARAMETERS = {"m": 1.2, "c": 0.1, "F": 0.5, "w": 2.0}
 
@@ -129,28 +128,3 @@ def test_functions_that_need_an_action_reject_forces():
         discretise(system, SVI(2, "hermite:2"))
     with pytest.raises(MethodError, match="lagrangian_of"):
         discretise(hamiltonian_of(system), SCVI(2))
-
-
-def test_model_files_contain_forces():
-    text = """
-        [system]
-        name = "driven pendulum"
-        coordinates = ["q"]
-        lagrangian = "q_dot**2/2 + cos(q)"
-        dissipation = "c*q_dot**2/2"
-        [forces]
-        q = "F*cos(w*t)"
-        [parameters]
-        c = 0.1
-        F = 0.5
-        w = 2.0
-        [initial]
-        q = [1.0]
-        q_dot = [0.0]
-        [run]
-        step = 0.1
-        span = 1.0
-    """
-    model = parse_model(text)
-    assert str(model.system.forces[0]) == "F*cos(t*w) - c*q_dot"
-    assert parse_model(dump_model(model)) == model

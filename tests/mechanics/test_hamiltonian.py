@@ -17,7 +17,6 @@ from scvi_codegen.mechanics.legendre import equivalent_lagrangian, hamiltonian_o
 from scvi_codegen.methods import (
     SCVI,
     SVI,
-    Composition,
     ExplicitEuler,
     Gauss,
     LobattoIIIA,
@@ -114,13 +113,6 @@ def test_invalid_systems_are_rejected(changes: dict[str, object], message: str) 
         HamiltonianSystem.from_text(**given)  # type: ignore[arg-type]  # wrong on purpose
 
 
-def test_model_files_contain_a_hamiltonian() -> None:
-    model = Model(system=hyperbolic(), method=SVI(4), q=(1.0,), p=(2.0,), h=0.1, steps=5)
-    text = dump_model(model)
-    assert 'hamiltonian = "p*q"' in text
-    assert parse_model(text) == model
-
-
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -204,15 +196,6 @@ def test_transforms_and_energy_are_those_of_the_lagrangian(sample) -> None:
     q1 = one.step(q, p, 0.1)[0]
     assert abs(two.discrete_lagrangian(q, q1, 0.1) - one.discrete_lagrangian(q, q1, 0.1)) < ROUND_OFF
     assert np.abs(two.discrete_legendre_minus(q, q1, 0.1)[1] - p).max() < 1e-12
-
-
-def test_compositions_accept_a_separable_hamiltonian(sample) -> None:
-    system = sample("kepler").system
-    q, p = sample("kepler").state
-    one, two = (
-        compile_stepper(s, Composition(8), flags=QUICK).step(q, p, 0.1) for s in (system, hamiltonian_of(system))
-    )
-    assert np.array_equal(one, two)
 
 
 # Singular Hamiltonians.
@@ -303,27 +286,6 @@ def test_both_solvers_give_the_same_step_without_a_lagrangian(method, h) -> None
     assert np.abs(steps[0] - steps[1]).max() < ROUND_OFF
     ends = [stepper.integrate(entry.q, entry.p, h=h, steps=50).q[-1] for stepper in (one, two)]
     assert np.abs(ends[0] - ends[1]).max() < 1e-12
-
-
-def test_point_vortices_conserve_their_invariants() -> None:
-    """Energy nearly; the centre of vorticity and the angular impulse to round-off (linear and quadratic invariants)."""
-    entry = problem("point-vortices")
-    strength = np.array(entry.system.defaults)
-    run = compile_stepper(entry.system, SVI(6), flags=QUICK).integrate(entry.q, entry.p, h=0.2, steps=500)
-    y = run.p / strength
-    invariants = [run.q @ strength, y @ strength, (run.q**2 + y**2) @ strength]
-    for values in invariants:
-        assert np.abs(values - values[0]).max() < 1e-12
-    assert np.abs(run.energy() / run.energy()[0] - 1).max() < 1e-7
-
-
-def test_the_derivation_shows_the_momenta_at_the_points() -> None:
-    derived = derive(hamiltonian_of(problem("planar-pendulum").system), SCVI(2, "gauss-legendre:2"))
-    numbers = [equation.number for equation in derived.equations]
-    assert numbers.count("35f") == 6
-    assert {"35a", "35d"} <= set(numbers)
-    assert "H = " in derived.to_text()
-    assert {"P_1", "P_2", "N_1", "nu_2"} <= {symbol.name for symbol in derived.unknowns}
 
 
 def test_parameters_are_assumed_positive_if_their_values_are():

@@ -19,10 +19,6 @@ def scalar(formula, **given):
     return sc.LagrangianSystem.from_text("system", ["x"], formula, **given)
 
 
-def plane(formula, **given):
-    return sc.LagrangianSystem.from_text("system", ["x", "y"], formula, **given)
-
-
 def hamiltonian(formula, **given):
     return sc.HamiltonianSystem.from_text("system", ["x"], formula, **given)
 
@@ -57,22 +53,6 @@ def test_unused_parameter_or_input_is_reported(define, formula, function):
 def test_unused_array_parameter_is_reported():
     heard = messages(arrays, "sum(i in N, m[i]*q_dot[i]**2/2)", parameters={"m[N]": 1.0, "k[N]": 2.0})
     assert heard == ["parameter 'k' " + UNUSED.format("Lagrangian")]
-
-
-@pytest.mark.parametrize(
-    ("define", "formula", "given"),
-    [
-        (scalar, "x_dot**2/2", {"forces": {"x": "-k*x"}}),
-        (scalar, "x_dot**2/2", {"dissipation": "k*x_dot**2/2"}),
-        (scalar, "x_dot**2/2", {"damping": "k"}),
-        (plane, "x_dot**2/2 + y_dot**2/2", {"constraints": ["x**2 + y**2 - k"]}),
-        (hamiltonian, "p_x**2/2", {"forces": {"x": "-k*x"}}),
-        (arrays, "sum(i in N, q_dot[i]**2/2)", {"forces": {"q[i]": "-k*q[i]"}}),
-        (arrays, "sum(i in N, q_dot[i]**2/2)", {"constraints": ["q[i] = k*t for i in N"]}),
-    ],
-)
-def test_parameter_of_another_formula_counts_as_used(define, formula, given):
-    assert messages(define, formula, parameters={"k": 1.0}, **given) == []
 
 
 @pytest.mark.parametrize(

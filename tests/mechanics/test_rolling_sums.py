@@ -72,13 +72,6 @@ def test_rolled_system_has_equal_trajectories(system):
     assert np.abs(run.energy() - other.energy()).max() < 1e-12 * np.abs(run.energies).max()
 
 
-def test_source_size_does_not_grow():
-    few, many = (sc.roll_sums(bodies(count)) for count in (6, 20))
-    assert str(few.system) == str(many.system)
-    assert len(few.system.terms) == 2
-    assert len(sc.roll_sums(lattice(40)).system.terms) < 10  # some constants are 0, 1 or reduced
-
-
 def powers(count):
     """Products and quotients of neighbours with exponents of their own, in names whose order is not that of places."""
     q = [f"q{i}" for i in range(count)]

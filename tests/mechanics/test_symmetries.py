@@ -12,7 +12,6 @@ from counting import at_most
 from sympy import Symbol
 
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.derivation.equations import derive
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
@@ -119,14 +118,6 @@ def test_symmetries_of_a_central_force_in_space():
     }
 
 
-def test_oscillator_has_only_rotations():
-    """Its other symmetries depend on cos(t) and are not searched."""
-    assert list(formulas(particle("k*(x**2 + y**2 + z**2)/2", "xyz", k=2.0))) == [
-        f"angular momentum {a}" for a in "xyz"
-    ]
-    assert list(formulas(particle("k*(x**2 + y**2)/2 + k*z**2", "xyz", k=2.0))) == ["angular momentum z"]
-
-
 def test_symmetries_of_a_free_particle():
     assert formulas(particle()) == {
         "momentum of x": "p_x",
@@ -228,14 +219,6 @@ def test_more_than_twelve_coordinates_are_searched_together():
     )
     assert "momentum of q3" in formulas(loose)
     assert "momentum of q1" not in formulas(loose)
-
-
-@pytest.mark.parametrize("axis", "xyz")
-def test_each_rotation_is_about_the_axis_in_its_name(axis):
-    others = [name for name in "xyz" if name != axis]
-    (symmetry,) = symmetries(particle(f"({others[0]}**2 + {others[1]}**2)**2 + {axis}**2/3", "xyz"))
-    assert symmetry.name == f"angular momentum {axis}"
-    assert symmetry.direction["xyz".index(axis)] == 0
 
 
 @pytest.mark.parametrize(
@@ -574,32 +557,6 @@ def test_supplied_generator_is_tracked(quickly_compiled):
     run = stepper.integrate(entry.q, stepper.momentum(entry.q, entry.velocity), h=0.02, steps=200)
     assert run.momentum_maps()[0, 1] == pytest.approx(0.5, abs=1e-15)  # the eccentricity
     assert 0 < np.abs(run.momentum_errors()[:, 1]).max() < 1e-11
-
-
-def test_phase_space_rotations_are_conserved(quickly_compiled):
-    run = quickly_compiled(ROTATOR, SVI(3)).integrate([1.0], [0.5], h=0.1, steps=400)
-    assert np.abs(run.momentum_errors()).max() < ROUNDOFF
-    outside = quickly_compiled(CYLINDER, SVI(3)).integrate([2.0, -1.5], [0.0, 0.5], h=0.1, steps=400)
-    assert np.ptp(outside.q[:, 0]) > 1
-    assert np.abs(outside.momentum_errors()).max() < ROUNDOFF
-
-
-def test_ensembles_track_momentum_maps_with_individual_parameters(quickly_compiled):
-    stepper = quickly_compiled(particle("k*(x**2 + y**2)**2", k=1.0), SVI(2))
-    q, p = np.array([[1.0, 0.2], [0.3, 0.4]]), np.array([[0.1, 0.9], [0.5, -0.2]])
-    runs = stepper.integrate_ensemble(q, p, h=0.05, steps=20, parameters={"k": [0.5, 2.0]})
-    assert runs.momentum_maps().shape == (21, 2, 1)
-    assert np.abs(runs.momentum_errors()).max() < ROUNDOFF
-    alone = stepper.integrate(q[1], p[1], h=0.05, steps=20, parameters={"k": 2.0})
-    assert np.allclose(alone.momentum_maps(), runs.momentum_maps()[:, 1], rtol=1e-13)
-
-
-def test_derivations_show_momentum_maps():
-    derived = derive(magnetic(), RadauIIA(2))
-    assert "  momentum of x = p_x - B*e*y - E*e*t\n" in derived.to_text()
-    assert "  boost of z = m*z - p_z*t  (not guaranteed by this method)\n" in derived.to_text()
-    assert r"J &= m z - p_{z} t \tag{boost of z}" in derived.to_latex()
-    assert "conserved" not in derive(problem("henon-heiles").system, SVI(1)).to_text()
 
 
 def test_headers_list_conserved_quantities():

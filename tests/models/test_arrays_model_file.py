@@ -165,29 +165,6 @@ def test_invalid_files_are_rejected(net: Path, old: str, new: str, message: str)
     assert str(caught.value).startswith(str(net))
 
 
-def test_one_loader_reads_both_kinds_of_files(net: Path, tmp_path: Path) -> None:
-    """Array sizes known at run time, named coordinates; saved models are read again."""
-    model = sc.load_model(net)
-    assert isinstance(model, sc.Model)
-    assert (model.sizes, model.dimension) == ({"N": 3, "B": 2}, 6)
-    sc.save_model(model, tmp_path / "again.toml")
-    assert "sum(b in B" in (tmp_path / "again.toml").read_text()
-    again = sc.load_model(tmp_path / "again.toml")
-    assert again == model
-    assert sc.load_model(net, {"parameters": {"m": 1.0}}) != model
-    sc.save_model(sc.Model.from_problem(sc.problem("kepler")), tmp_path / "kepler.toml")
-    assert isinstance(sc.load_model(tmp_path / "kepler.toml"), sc.Model)
-
-
-def test_model_with_known_sizes_has_the_same_motion(net: Path) -> None:
-    """Entries become named coordinates; trajectories agree to round-off."""
-    model = sc.load_model(net)
-    known = model.with_known_sizes()
-    assert [each.name for each in known.system.coordinates] == ["r_0_0", "r_0_1", "r_1_0", "r_1_1", "r_2_0", "r_2_1"]
-    assert known.velocity == (0.0,) * 6
-    assert known.integrate().q[-1] == pytest.approx(model.integrate().q["r"][-1].ravel(), abs=1e-14)
-
-
 DRIVEN = """
 [system]
 name = "driven ring"

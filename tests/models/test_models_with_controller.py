@@ -58,16 +58,6 @@ def plain(model: sc.Model) -> sc.Stepper:
     return sc.compile_stepper(model.system, model.method)
 
 
-def test_files_contain_the_controller_and_its_time_transformation(shaken: Path, tmp_path: Path) -> None:
-    model = sc.load_model(shaken)
-    assert model.system.clock is None
-    assert (model.time_transformation, model.h, model.covered) == ("(x**2 + y**2)**(3/4)", 0.1, 12.0)
-    sc.save_model(model, tmp_path / "again.toml")
-    assert sc.load_model(tmp_path / "again.toml") == model
-    assert 'controller = "reversible"' in (tmp_path / "again.toml").read_text()
-    assert sc.load_model(shaken, {"run": {"tolerance": 1e-9}}).h is None
-
-
 def test_controller_of_a_time_transformation_can_be_replaced() -> None:
     both = {
         "system": {"time_transformation": "frequency"},

@@ -200,14 +200,6 @@ def test_user_names_do_not_occur_in_the_program(tmp_path):
     subprocess.run([sys.executable, "-c", "import pendulum_svi"], cwd=tmp_path, check=True)
 
 
-def test_other_files_remain_and_generated_files_are_replaced(pendulum, tmp_path):
-    folder = generate_package(pendulum, tmp_path / "pendulum_svi")
-    (folder / "notes.txt").write_text("mine")
-    generate_package(replace(pendulum, method=SVI(2)), folder)
-    assert (folder / "notes.txt").read_text() == "mine"
-    assert load_model(folder / "model.toml").method == SVI(2)
-
-
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ["main.c", "pendulum_svi.c", "__init__.py", "README.md", "interface.json"])
 def test_foreign_and_edited_files_require_force(pendulum, tmp_path, name):

@@ -66,22 +66,6 @@ def test_sanitizers_report_no_error(tmp_path):
     run_stepper_tests(tmp_path, SANITIZERS, *files, CC="gcc", LD_PRELOAD=libraries, ASAN_OPTIONS=options)
 
 
-def test_different_flags_give_a_different_build(tmp_path, monkeypatch):
-    """Flags of the environment are part of the name in the cache, and reach the compiler."""
-    from scvi_codegen.compiler import compile_stepper
-    from scvi_codegen.methods import StoermerVerlet
-    from scvi_codegen.models.problems import problem
-
-    monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path))
-    for flags in ("", "-O0"):
-        monkeypatch.setenv(building.FLAGS_VARIABLE, flags)
-        compile_stepper(problem("harmonic-oscillator").system, StoermerVerlet())
-    assert len(list(tmp_path.glob("_scvi_*"))) == 2
-    monkeypatch.setenv(building.FLAGS_VARIABLE, "-no-such-flag")
-    with pytest.raises(building.BuildError, match="no-such-flag"):
-        compile_stepper(problem("harmonic-oscillator").system, StoermerVerlet())
-
-
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["kepler", "double-pendulum", "charged-particle"])
 def test_portable_flags_are_bitwise_reproducible(tmp_path, monkeypatch, name):

@@ -155,45 +155,6 @@ def test_special_values_are_rejected_or_handled(name: str, tmp_path: Path, monke
     assert failed == []
 
 
-LINES = MODEL.splitlines()
-WRONG_LINES = [
-    "x = ",
-    "= 3",
-    "q = [1.0,, 2]",
-    "q = nan",
-    "q = 1979-05-27",
-    "q = { a = 1 }",
-    "q = [[1.0]]",
-    '"" = 1',
-    "\0",
-]
-
-
-@pytest.mark.parametrize("number", [number for number, line in enumerate(LINES) if line])
-def test_damaged_model_files_are_rejected(number: int, tmp_path: Path) -> None:
-    """Each line left out, cut, doubled, or with another in its place."""
-    path = tmp_path / "model.toml"
-    line = LINES[number]
-    name = line.partition(" = ")[0]
-    values = (
-        "-1",
-        "[]",
-        '"x"',
-        "true",
-        "nan",
-        "1e400",
-        "[1, [2]]",
-        "{}",
-        "1979-05-27",
-        "99999999999999999999",
-        '["", 1]',
-    )
-    replaced = [f"{name} = {value}" for value in values] if " = " in line else ["[x]", "[[system]]", "[system.a]"]
-    for text in ("", line[: len(line) // 2], f"{line}\n{line}", f"{line} #\udcff", *WRONG_LINES, *replaced):
-        path.write_text("\n".join([*LINES[:number], text, *LINES[number + 1 :]]), errors="surrogateescape")
-        refused(lambda: sc.load_model(path))
-
-
 CSV = [
     "",
     "u",
@@ -232,27 +193,6 @@ def test_damaged_csv_tables_are_rejected(number: int, tmp_path: Path, monkeypatc
     refused(lambda: sc.load_model("model.toml").all_inputs())
     result = CliRunner().invoke(main, ["run", "kepler", "--step", "0.1", "--steps", "2", "--ensemble", "u.csv"])
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-
-
-@pytest.mark.parametrize("kind", ["npz", "npy"])
-def test_damaged_numpy_files_are_rejected(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    path = Path(f"u.{kind}")
-    if kind == "npz":
-        np.savez(path, t=[0.0, 10.0], u=[0.0, 1.0])
-    else:
-        np.save(path, [0.0, 1.0])
-    whole, random = path.read_bytes(), np.random.default_rng(5)
-    Path("model.toml").write_text(MODEL.replace("{ t = [0.0, 10.0], values = [0.0, 1.0] }", f'{{ file = "u.{kind}" }}'))
-    damaged = [whole[:size] for size in range(0, len(whole), 41)]
-    for _ in range(60):
-        spoiled = bytearray(whole)
-        for place in random.integers(0, len(whole), 2):
-            spoiled[place] ^= int(random.integers(1, 256))
-        damaged.append(bytes(spoiled))
-    for data in damaged:
-        path.write_bytes(data)
-        refused(lambda: sc.load_model("model.toml").all_inputs())
 
 
 def paths_of(document: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:

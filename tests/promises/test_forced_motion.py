@@ -142,17 +142,6 @@ def test_hamiltonian_with_forces_has_the_same_step(quickly_compiled, method):
         np.testing.assert_allclose(one, two, rtol=3e-15)
 
 
-@pytest.mark.parametrize("method", [SVI(2), SCVI(2)], ids=lambda method: method.name)
-def test_forces_without_torque_conserve_angular_momentum(quickly_compiled, method):
-    stepper = quickly_compiled(radial(), method)
-    q, v = STATES[radial]
-    run = stepper.integrate(q, velocity=v, h=0.05, steps=400)
-    energy = run.energy()
-    assert energy[-1] < energy[0] - 0.05
-    assert stepper.interface.map_exact == (True,)
-    assert np.abs(run.momentum_errors()).max() < 1e-14
-
-
 def test_compositions_accept_forces_of_position_and_time(quickly_compiled):
     """x'' = -x + sin(2 t): the solution from rest is (2 sin t - sin 2t) / 3."""
     system = LagrangianSystem.from_text(

@@ -15,10 +15,8 @@ from scvi_codegen import (
     LagrangianSystem,
     Model,
     compile_stepper,
-    derive,
     generate_package,
     generate_source,
-    load_package,
 )
 from scvi_codegen.exact.step import compiled_equations, derived_step
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
@@ -62,15 +60,6 @@ def test_steps_are_those_of_the_equations_in_60_digits(s):
         assert_allclose(found[1], np.array(exact.p, dtype=float), rtol=0, atol=4e-15)
 
 
-def test_derivation_shows_multipliers():
-    derived = derive(LINKAGE, lobatto(1))
-    names = [symbol.name for symbol in derived.unknowns]
-    assert names[-6:] == [f"lambda_{n}_{k}" for n in (0, 1) for k in (1, 2, 3)]
-    text = derived.to_text()
-    assert "0 = -a**2 + x1**2 + y1**2" in text
-    assert sum(line.startswith("  (hidden)") for line in text.splitlines()) == 3
-
-
 def test_model_files_select_compatible_points():
     stepper = compile_stepper(LINKAGE, "svi:3")
     q, _ = stepper.project(NEAR)
@@ -79,17 +68,6 @@ def test_model_files_select_compatible_points():
     assert parse_model(dump_model(model)) == model
     text = dump_model(model).partition("[method]")[0]
     assert parse_model(f"{text}\n[run]\nspan = 1.0\n").method == lobatto(6)
-
-
-def test_packages_are_self_contained(tmp_path):
-    stepper = compile_stepper(LINKAGE, "svi:3")
-    q, _ = stepper.project(NEAR)
-    model = Model(system=LINKAGE, method="svi:3", q=tuple(q), velocity=(0.0,) * 4, h=0.01, span=1.0)
-    generate_package(model, tmp_path / "linkage")
-    loaded = load_package(tmp_path / "linkage")
-    one, other = (each.integrate(q, np.zeros(4), h=0.01, steps=20) for each in (stepper, loaded))
-    assert np.abs(one.q - other.q).max() < 1e-14
-    assert np.abs(other.multipliers() - one.multipliers()).max() < 1e-10
 
 
 def made_and_run(folder, q, *, precision=None, system=LINKAGE, exit_status=0):

@@ -21,7 +21,7 @@ from scvi_codegen.files.cache import key_of
 from scvi_codegen.mechanics.system import _text_of
 from scvi_codegen.methods import as_method
 from scvi_codegen.models.problems import problem
-from scvi_codegen.native import building, compilers
+from scvi_codegen.native import building
 
 
 @pytest.fixture
@@ -62,22 +62,6 @@ def test_ensemble_source_is_generated_on_demand_and_cached(made, tmp_path, monke
     assert saved.ensemble == stepper.ensemble == sc.compile_stepper(spring(), sc.SVI(2)).ensemble
     assert (len(written), len(list((tmp_path / "texts").iterdir()))) == (1, 5)
     assert len(made) == 2  # with the fallback and without
-
-
-@pytest.mark.parametrize(
-    "other",
-    [
-        lambda: sc.compile_stepper(spring(2.0), sc.SVI(2)),
-        lambda: sc.compile_stepper(spring(), sc.SVI(2, "gauss-legendre:3")),
-        lambda: sc.compile_stepper(spring(), sc.SVI(2), solver="newton"),
-        lambda: sc.compile_stepper(spring(), sc.SVI(2), prefix="other"),
-    ],
-    ids=["parameter", "method", "solver", "prefix"],
-)
-def test_different_arguments_are_derived_again(made, other):
-    sc.compile_stepper(spring(), sc.SVI(2))
-    other()
-    assert len(made) == 2
 
 
 def keys(change: dict, **options) -> tuple[str, ...]:
@@ -387,19 +371,3 @@ def test_keys_distinguish_values_that_are_equal_or_print_equally():
         key_of(object())
     assert keys({}, prefix="None") != keys({})
     assert keys({}, g="None") != keys({})
-
-
-def test_library_name_depends_on_compiler_flags_and_commands(monkeypatch):
-    source = sc.compile_stepper(spring(), sc.SVI(1)).source
-    found = [building.fingerprint(source, flags=flags) for flags in (("-O1", "-g"), ("-O1 -g",), ("-g", "-O1"))]
-    for field in fields(source):
-        other = copy.copy(source)
-        value = getattr(source, field.name)
-        changed = source if value is None else f"{value}2" if isinstance(value, str) else (*value, ("support/a.h", ""))
-        object.__setattr__(other, field.name, changed)
-        found.append(building.fingerprint(other, flags=("-O1", "-g")))
-    monkeypatch.setattr(compilers, "compiler_version", lambda command: "another")
-    found.append(building.fingerprint(source, flags=("-O1", "-g")))
-    monkeypatch.setattr(compilers, "_commands", lambda: "another")
-    found.append(building.fingerprint(source, flags=("-O1", "-g")))
-    assert len(set(found)) == len(found) == 11

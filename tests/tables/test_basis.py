@@ -2,7 +2,6 @@
 
 from fractions import Fraction
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -16,8 +15,6 @@ from scvi_codegen.tables.basis import (
     differentiation_matrix,
     extrapolation,
     legendre_functional,
-    matrix_product,
-    transpose,
 )
 from scvi_codegen.tables.nodes import chebyshev_lobatto, equispaced, legendre_lobatto
 from scvi_codegen.tables.precision import Matrix, Vector, mp
@@ -86,26 +83,6 @@ def test_least_squares_extrapolation_is_the_normal_equations(
     )
 
 
-def chebyshev_matrix_of_the_paper(N: int) -> np.ndarray:
-    x = np.cos(np.arange(N + 1) * np.pi / N)
-    c = np.r_[2, np.ones(N - 1), 2]
-    D = np.zeros((N + 1, N + 1))
-    for i in range(N + 1):
-        for j in range(N + 1):
-            if i != j:
-                D[i, j] = c[i] / c[j] * (-1) ** (i + j) / (x[i] - x[j])
-            elif 0 < i < N:
-                D[i, i] = -x[i] / (2 * (1 - x[i] ** 2))
-    D[0, 0], D[N, N] = (2 * N**2 + 1) / 6, -(2 * N**2 + 1) / 6
-    return D
-
-
-@pytest.mark.parametrize("N", [1, 2, 5, 12])
-def test_the_differentiation_matrix_is_equation_11_on_descending_points(N: int) -> None:
-    ours = np.array(differentiation_matrix(chebyshev_lobatto(N).points), float)
-    np.testing.assert_allclose(ours[::-1, ::-1], chebyshev_matrix_of_the_paper(N), rtol=1e-12, atol=1e-12)
-
-
 @pytest.mark.parametrize("nodes", [chebyshev_lobatto(30), legendre_lobatto(30), equispaced(30)], ids=lambda n: n.name)
 def test_degree_thirty_has_fifty_digits(nodes: object) -> None:
     points = nodes.points
@@ -119,35 +96,6 @@ def test_degree_thirty_has_fifty_digits(nodes: object) -> None:
             assert abs(derivative - (power * x ** (power - 1) if power else 0)) < FIFTY_DIGITS * scale
         total = apply(cardinal_integrals(points, (1,), -1), f)[0]
         assert abs(total - (mp.mpf(2) / (power + 1) if power % 2 == 0 else 0)) < FIFTY_DIGITS
-
-
-@pytest.mark.parametrize("degree", [4, 30])
-def test_extrapolation_of_full_degree_is_interpolation(degree: int) -> None:
-    points = equispaced(degree).points
-    interpolation, least_squares = extrapolation(points, 2), extrapolation(points, 2, degree)
-    scale = max(abs(entry) for row in interpolation for entry in row)
-    for left, right in zip(interpolation, least_squares, strict=True):
-        assert all(abs(a - b) < FIFTY_DIGITS * scale for a, b in zip(left, right, strict=True))
-
-
-def test_values_at_the_points_are_the_unit_matrix_and_rows_sum_to_one() -> None:
-    points = chebyshev_lobatto(6).points
-    assert cardinal_values(points, points) == tuple(tuple(mp.mpf(i == j) for j in range(7)) for i in range(7))
-    assert all(abs(mp.fsum(row) - 1) < FIFTY_DIGITS for row in cardinal_values(points, (-2, mp.mpf("0.3"), 5)))
-
-
-def test_derivatives_agree_with_numerical_differentiation() -> None:
-    points = (0, Fraction(1, 3), Fraction(4, 5), 2)
-    at = mp.mpf("0.37")
-    numerical = [mp.diff(lambda t, j=j: cardinal_values(points, (t,))[0][j], at, h=mp.mpf("1e-20")) for j in range(4)]
-    assert all(
-        abs(a - b) < mp.mpf("1e-30") for a, b in zip(cardinal_derivatives(points, (at,))[0], numerical, strict=True)
-    )
-
-
-def test_products_and_transposes() -> None:
-    left: Matrix = ((mp.mpf(1), mp.mpf(2)), (mp.mpf(3), mp.mpf(4)), (mp.mpf(5), mp.mpf(6)))
-    np.testing.assert_array_equal(np.array(matrix_product(transpose(left), left), float), [[35, 44], [44, 56]])
 
 
 @pytest.mark.parametrize(
