@@ -33,9 +33,9 @@ from scvi_codegen.errors import SystemDefinitionWarning as SystemDefinitionWarni
 from scvi_codegen.exact.discrete_lagrangian import ExactStep as ExactStep
 from scvi_codegen.exact.discrete_lagrangian import exact_discrete_lagrangian as exact_discrete_lagrangian
 from scvi_codegen.exact.discrete_lagrangian import exact_map as exact_map
-from scvi_codegen.fields.derivation import FieldDerivation as FieldDerivation
 from scvi_codegen.fields.laws import ConservationLaw as ConservationLaw
-from scvi_codegen.fields.local import LocalLaw as LocalLaw
+from scvi_codegen.fields.laws import FieldDerivation as FieldDerivation
+from scvi_codegen.fields.laws import LocalLaw as LocalLaw
 from scvi_codegen.fields.mesh import MeshSystem as MeshSystem
 from scvi_codegen.fields.system import FieldSystem as FieldSystem
 from scvi_codegen.files.cache import CacheInfo as CacheInfo
@@ -43,9 +43,9 @@ from scvi_codegen.files.cache import cache_info as cache_info
 from scvi_codegen.files.cache import clear_cache as clear_cache
 from scvi_codegen.frameworks.casadi import casadi_flow as casadi_flow
 from scvi_codegen.frameworks.casadi import casadi_step as casadi_step
-from scvi_codegen.frameworks.control_task import ControlledMotion as ControlledMotion
 from scvi_codegen.frameworks.flow import JaxFlow as JaxFlow
 from scvi_codegen.frameworks.flow import jax_flow as jax_flow
+from scvi_codegen.frameworks.optimal_control import ControlledMotion as ControlledMotion
 from scvi_codegen.frameworks.optimal_control import optimal_control as optimal_control
 from scvi_codegen.frameworks.rebound import GravitatingBodies as GravitatingBodies
 from scvi_codegen.frameworks.rebound import from_rebound as from_rebound

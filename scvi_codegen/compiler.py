@@ -135,7 +135,7 @@ def _at_sizes(
     system: Any, g: str | Expr | None, sizes: Mapping[str, int], tables: Mapping[str, ArrayLike] | None
 ) -> tuple[Any, str | Expr | None]:
     """Return a system of arrays and its time-rescaling function at known sizes."""
-    from scvi_codegen.formulas.array_entries import is_indexed
+    from scvi_codegen.formulas.array_statements import is_indexed
     from scvi_codegen.mechanics.arrays.elements import formula_at_sizes
     from scvi_codegen.mechanics.arrays.rolling import unroll_sums
 

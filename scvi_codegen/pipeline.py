@@ -30,9 +30,8 @@ from scvi_codegen.errors import MethodError, SizesRequiredError
 from scvi_codegen.indices import SIZES_REQUIRED
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.arrays import check_solver as check_solver_of_arrays
-from scvi_codegen.lowering.control import control_of, density_of
+from scvi_codegen.lowering.control import control_of, density_of, error_growth_of
 from scvi_codegen.lowering.derivatives import derivatives_of
-from scvi_codegen.lowering.error_growth import error_growth_of
 from scvi_codegen.lowering.loops import with_sums
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.mechanics.arrays.legendre import SiteHamiltonian, site_hamiltonian

@@ -1,7 +1,7 @@
 """Validation of the arguments of public functions, with errors that name the argument and suggest keywords.
 
 Types of arguments are checked when the function is called; numbers and arrays, which may be anything convertible, when
-they are converted (:func:`checked_count`, :mod:`scvi_codegen.native.arguments`).
+they are converted (:func:`checked_count`, :mod:`scvi_codegen.native.options`).
 """
 
 from __future__ import annotations

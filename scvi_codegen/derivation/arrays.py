@@ -5,14 +5,13 @@ from dataclasses import dataclass
 
 from sympy import latex
 
-from scvi_codegen.formulas.array_notation import latex_entry, latex_sums
+from scvi_codegen.formulas.array_statements import latex_entry, latex_sums
 from scvi_codegen.ir.equations import FixedPointIteration, Splitting
 from scvi_codegen.ir.kernel import Number
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
-from scvi_codegen.mechanics.arrays.system import ArraySystem
-from scvi_codegen.mechanics.arrays.terms import constraint_text, force_of
+from scvi_codegen.mechanics.arrays.system import ArraySystem, constraint_text, force_of
 from scvi_codegen.methods.method import Method
 from scvi_codegen.representation import LONGEST, clipped
 

@@ -3,9 +3,12 @@
 Named numbers of a method's tables, with their short exact forms.
 
 Numbers of 60 digits are recognised as short combinations of radicals by PSLQ.
+
+Changes of the state by events: maps, impulses of impacts, and their derivatives.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
@@ -15,9 +18,14 @@ import sympy
 from scvi_codegen.display.cards import Html, plain
 from scvi_codegen.display.mathml import mathml_terms
 from scvi_codegen.display.mathml.names import latex_name
+from scvi_codegen.errors import ExpressionError
+from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.symbols import TIME, symbol
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageSystem, Table
+from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.tables.closed_forms import exact_points, exact_rule, exact_tableau
 from scvi_codegen.tables.precision import DIGITS, Number, Vector, mp
 from scvi_codegen.tables.quadrature import Quadrature
@@ -134,8 +142,8 @@ def latex(
         return written(entry.exact) + " = " if entry.exact is not None else ""
 
     lines = [rf"0 &= {written(e.residual)} \tag{{{_tag(e.number)}}}" for e in equations]
-    for symbol, equation in end.items():
-        new = latex_name(f"{symbol.name}+1")
+    for start, equation in end.items():
+        new = latex_name(f"{start.name}+1")
         lines.append(rf"{new} &= {written(equation.residual)} \tag{{{_tag(equation.number)}}}")
     tables = [rf"{names[entry.symbol]} &= {exact(entry)}{mp.nstr(entry.value, 17)}" for entry in entries]
     maps = [
@@ -212,3 +220,29 @@ def _closed_forms(method: Method) -> Iterator[Sequence[sympy.Expr] | None]:
             yield None if rule is None else [x for group in rule for x in group]
         else:
             yield exact_points(part)
+
+
+IMPULSE = "p := p + (1 + e)/2 lambda n, H(q, p + lambda n) - H(q, p) + lambda g_t = 0"
+SALTATION = """Derivatives by saltation matrices (scvi_codegen.runtime.events.saltation): of z = (q, p) := R(z, t)
+    dz := R_z (dz + X- dt) + R_t dt - X+ dt, dt = -g_z dz/(g_z X- + g_t)
+    X-, X+: derivatives of the steps before and after the event with respect to their sizes"""
+
+
+def events_text(events: Iterable[Event], system: MechanicalSystem) -> str:
+    """Return the formulas of events in lines; of an impact its impulse, normal n = g_q, g_t and restitution e."""
+    return "\n".join(["Events:", *(line for event in events for line in _lines(event, system)), SALTATION])
+
+
+def _lines(event: Event, system: MechanicalSystem) -> Iterator[str]:
+    conditions = event.where if isinstance(event.where, tuple) else (event.where,)
+    yield f"  g = {event.function} = 0" + "".join(f", {each}" for each in conditions if each is not None)
+    yield from (f"    {name} := {value}" for name, value in event.changes)
+    if event.restitution is None:
+        return
+    yield f"    {IMPULSE}"
+    names = [*map(str, system.coordinates)]
+    known = {name: symbol(name) for name in (*names, *map(str, system.parameters), TIME)}
+    with suppress(ExpressionError):  # entries of arrays, components of rotations
+        g = parse_expression(str(event.function), known)
+        yield f"    n = ({', '.join(str(g.diff(known[name])) for name in names)}), g_t = {g.diff(known[TIME])}"
+    yield f"    e = {event.restitution}"

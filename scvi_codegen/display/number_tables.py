@@ -8,7 +8,7 @@ import sympy
 
 from scvi_codegen.display.cards import Html, grid, plain
 from scvi_codegen.display.mathml import mathml
-from scvi_codegen.display.page.blocks import Cell, TableBlock
+from scvi_codegen.display.page import Cell, TableBlock
 from scvi_codegen.tables.closed_forms import exact_points, exact_rule, exact_tableau
 from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import Number, Vector, mp

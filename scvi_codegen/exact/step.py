@@ -25,8 +25,7 @@ from scvi_codegen.formulas.expressions import Tape
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import MIDDLE, discretise, reference_equations
 from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.stage_structure import Velocities
-from scvi_codegen.methods.stage_system import StageGroup, StageSystem, straight
+from scvi_codegen.methods.stage_system import StageGroup, StageSystem, Velocities, straight
 from scvi_codegen.tables.precision import Number, mp
 
 DIGITS = 45

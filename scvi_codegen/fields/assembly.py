@@ -22,7 +22,7 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.fields.axes import Axis, Cells, digits, same
 from scvi_codegen.fields.density import Density, place_text
 from scvi_codegen.fields.mesh import Mesh, MeshSystem
-from scvi_codegen.formulas.array_notation import array_text
+from scvi_codegen.formulas.array_statements import array_text
 from scvi_codegen.formulas.arrays import MAX_UNROLLED_TERMS
 from scvi_codegen.formulas.symbols import TIME, symbol
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem

@@ -8,20 +8,34 @@ conservation law ``D_t J^t + sum_i D_i J^i = 0`` of every solution, with
 
 (P. J. Olver, Applications of Lie Groups to Differential Equations, Springer 1993, section 4.4). A Hamiltonian density H
 has L = sum p u_t - H. Candidates for Q and K are tested: ``dL - D_t K^t - sum D_i K^i`` must be zero identically.
+
+Conserved densities, their fluxes and the residuals of local conservation laws along a run.
+
+Derivatives in space are those of the interpolant, on elements element by element with the prescribed values at ends.
+Values at end points that elements share are means weighted by length.
+
+Derivation of a density: equations, semi-discrete system and conservation laws, as text.
 """
 
+from __future__ import annotations
+
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
+from typing import Any
 
+import numpy as np
 import sympy
-from sympy import Add, Derivative, Expr, Function, S, Symbol
+from numpy.typing import NDArray
+from sympy import Add, Derivative, Eq, Expr, Function, S, Symbol
 from sympy.core.function import AppliedUndef
 
-from scvi_codegen.errors import StateError, closest
-from scvi_codegen.fields.density import Density
+from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, closest, warn
+from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis
+from scvi_codegen.fields.density import Density, place_text
 from scvi_codegen.formulas.symbols import TIME, symbol
+from scvi_codegen.formulas.translation import format_expression
 from scvi_codegen.mechanics.arrays.symmetry import sums_to_zero
 from scvi_codegen.representation import summary
 
@@ -213,3 +227,250 @@ def names_of(formula: Expr) -> dict[Expr, Symbol]:
         else:
             found[each] = symbol(str(each.func))
     return found
+
+
+Array = NDArray[np.float64]
+
+RESOLVED, DOUBTFUL = 1e-9, 1e-3
+"""Relative errors of derivatives in time up to which states suffice, and from which there is a warning."""
+WINDOW = 9
+"""States of the differences in time, of order 8 between equidistant states."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LocalLaw:
+    """Values of a conservation law d/dt density + d/dx flux = 0 along a run of n states.
+
+    Attributes:
+        law: symbolic density and fluxes.
+        t: (n,) times.
+        density: (n, shape of the fields) conserved density at the points.
+        flux: of the same shape, by axis.
+        residual: d/dt density + sum over axes of d/dx flux, of the same shape; the derivative in time is that of the
+            polynomial through 9 neighbouring states, or states of dense output where these are too far apart; the
+            derivatives in space are spectral.
+        total: (n,) integral of the density over space.
+    """
+
+    law: ConservationLaw
+    t: Array
+    density: Array
+    flux: Mapping[str, Array]
+    residual: Array
+    total: Array
+
+    __repr__ = summary("law")
+
+
+def local_law(history: FieldHistory, law: ConservationLaw) -> LocalLaw:
+    """Return the values of a conservation law along a run."""
+    density = history.values(law.density)
+    divergence = history.values(Add(*(part.diff(symbol(axis)) for axis, part in law.flux.items())).doit())
+    return LocalLaw(
+        law=law,
+        t=history.t,
+        density=history.at_points(density),
+        flux={axis: history.at_points(history.values(part)) for axis, part in law.flux.items()},
+        residual=history.at_points(_rate(history, law, density) + divergence),
+        total=history.integral(density),
+    )
+
+
+def _rate(history: FieldHistory, law: ConservationLaw, density: Array) -> Array:
+    """Return the derivative of a density in time: by the states if they are close enough, else by dense output."""
+    rate = time_derivative(history.t, density)
+    error = np.abs(rate - time_derivative(history.t, density, WINDOW - 2)).max()
+    largest = np.abs(rate).max()
+    if error <= RESOLVED * largest:
+        return rate
+    try:
+        times, between = history.between
+    except (StateError, StepFailedError) as failure:
+        if error > DOUBTFUL * largest:
+            warn(
+                f"the residual of the law '{law.name}' is uncertain by {error:.1e}: the states are too far apart in "
+                f"time, and there is no dense output ({failure})",
+                AccuracyWarning,
+            )
+        return rate
+    values = between.values(law.density).reshape(*times.shape, *density.shape[1:])
+    return np.array([_derivative(*each) for each in zip(times, values, history.t, strict=True)])
+
+
+def time_derivative(t: Array, values: Array, most: int = WINDOW) -> Array:
+    """Return the derivative in time of values (n, ..), by polynomials through ``most`` neighbouring states."""
+    if (count := len(t)) < 2:
+        raise StateError("the residual of a conservation law needs at least two states")
+    width = min(most, count)
+    firsts = [min(max(k - width // 2, 0), count - width) for k in range(count)]
+    windows = [slice(first, first + width) for first in firsts]
+    return np.array([_derivative(t[each], values[each], at) for each, at in zip(windows, t, strict=True)])
+
+
+def _derivative(t: Array, values: Array, at: float) -> Array:
+    """Return the derivative at a time of the polynomial through values (k, ..) at times (k,)."""
+    distance = t - at
+    scaled = distance / np.abs(distance).max()
+    moments = np.zeros(len(t))
+    moments[1] = 1 / np.abs(distance).max()
+    weights = np.linalg.solve(np.vander(scaled, increasing=True).T, moments)
+    return np.asarray(np.tensordot(weights, values, 1))
+
+
+class FieldHistory:
+    """Fields and their derivatives along a run, (n, points of the axes); points of elements one after the other."""
+
+    def __init__(self, mesh: Any, run: Any) -> None:
+        if run.observed is not None:
+            raise StateError("a run with observe saves only its first and last state: run it without observe")
+        self.mesh, self.system, self.run = mesh, mesh.field_system, run
+        self.t = np.asarray(run.t, float)
+        velocity = None if self.system.momenta else np.asarray(run.velocity)
+        self.fields: dict[str, Array] = mesh.fields_of(np.asarray(run.q), np.asarray(run.p), velocity)
+        by_name = run.stepper.parameters_by_name(run.parameters)
+        self.known: dict[Expr, Any] = {each: by_name[str(each)] for each in self.system.parameters}
+        self.axes: dict[str, tuple[int, Axis]] = {axis.name: (k + 1, axis) for k, axis in enumerate(mesh.axes)}
+        coordinates = {TIME: self.t} | {axis.name: (axis.closed or axis).points for axis in mesh.axes}
+        self.known |= zip(map(symbol, coordinates), np.ix_(*coordinates.values()), strict=True)
+        self.shape = tuple(len(values) for values in coordinates.values())
+
+    @cached_property
+    def between(self) -> tuple[Array, FieldHistory]:
+        """Times (n, 9) near each state, a twentieth of the distance of states apart, and the history at these times.
+
+        Raises:
+            StateError: if the run has no dense output.
+            StepFailedError: if a partial step fails.
+        """
+        if not hasattr(self.run, "at") or self.run.pieces:
+            raise StateError("recordings and runs with inputs have none here")
+        count = len(self.t)
+        steps = np.arange(WINDOW) - np.where(np.arange(count) == 0, 0, WINDOW // 2)[:, np.newaxis]
+        steps[-1] -= WINDOW // 2
+        gaps = np.diff(self.t)
+        before, after = np.append(gaps[:1], gaps), np.append(gaps, gaps[-1:])
+        spacing = np.where(np.abs(before) < np.abs(after), before, after) / 20
+        times = self.t[:, np.newaxis] + steps * spacing[:, np.newaxis]
+        q, p = self.run.at(times.ravel())
+        changed = {"t": times.ravel(), "q": q, "p": p, "tau": None, "step_sizes": np.full(times.size, np.nan)}
+        return times, FieldHistory(self.mesh, replace(self.run, **changed, iterations=np.zeros(times.size, np.int32)))
+
+    def values(self, formula: Expr) -> Array:
+        """Return a formula in functions and their derivatives."""
+        names = names_of(formula)
+        known = {name: self._function(each) for each, name in names.items()} | self.known
+        return np.broadcast_to(sympy.lambdify([*known], formula.xreplace(names), "numpy")(*known.values()), self.shape)
+
+    def _function(self, each: Any) -> Array:
+        """Return a field, or a derivative of it of order one in time and any order in space."""
+        orders = {str(axis): int(order) for axis, order in getattr(each, "variable_count", ())}
+        name, rate = str(getattr(each, "expr", each).func), orders.pop(TIME, 0)
+        values = self.fields[f"{name}_{TIME}" if rate else name]
+        for along, axis in self.axes.values():
+            values = axis.in_elements(values, along, self._at_ends(axis.name, name, rate, values.ndim))
+        for letter, order in orders.items():
+            along, axis = self.axes[letter]
+            for _ in range(order):
+                values = axis.derivative(values, along)
+        return values
+
+    def _at_ends(self, axis: str, name: str, rate: int, dimension: int) -> list[Array | None]:
+        """Return the prescribed values at both ends of an axis, (n, 1, ..) with one dimension less than fields."""
+        result: list[Array | None] = []
+        for end in () if self.system.boundary[axis] == PERIODIC else self.system.boundary[axis]:
+            result.append(None)
+            if end != NATURAL:
+                formula = end[name].diff(symbol(TIME), rate)
+                values = sympy.lambdify([*self.known], formula, "numpy")(*self.known.values())
+                result[-1] = np.broadcast_to(values, (len(self.t), *(1,) * (dimension - 1)))[..., 0]
+        return result
+
+    def integral(self, values: Array) -> Array:
+        """Return the integral over space, (n,)."""
+        for _, axis in reversed(self.axes.values()):
+            values = values @ (axis.closed or axis).weights
+        return values
+
+    def at_points(self, values: Array) -> Array:
+        """Return values at the points of the mesh, (n, shape of the fields)."""
+        for along, axis in self.axes.values():
+            values = axis.from_elements(values, along)
+        return values
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldDerivation:
+    """Equations of motion and local conservation laws of a density; of a mesh also its semi-discrete system.
+
+    Attributes:
+        field_system: the density.
+        equations: Euler-Lagrange equation of each field; of a Hamiltonian density its equations of first order.
+        laws: conservation laws of the symmetries of the density.
+        semidiscrete: the semi-discrete L or H and its energy in index notation by name; empty without a mesh.
+    """
+
+    field_system: Density
+    equations: Mapping[str, Eq]
+    laws: tuple[ConservationLaw, ...]
+    semidiscrete: Mapping[str, str]
+
+    __repr__ = summary("field_system", "laws")
+
+    def to_text(self) -> str:
+        """Return plain text: density, equations, semi-discrete system, and conservation laws."""
+        return "".join(f"{line}\n" for line in self._lines())
+
+    def _lines(self) -> Iterator[str]:
+        letter, title = ("H", "Hamilton") if self.field_system.momenta else ("L", "Euler-Lagrange")
+        yield f"{self.field_system.name}: {letter} = {format_expression(self.field_system.density)}"
+        for place, formula in self.field_system.point_lagrangians:
+            yield f"  at {place_text(place)}: {format_expression(formula)}"
+        yield ""
+        yield f"{title} equations"
+        for each in self.equations.values():
+            yield f"  {_written(each.lhs)} = {_written(each.rhs)}"
+        for name, text in self.semidiscrete.items():
+            yield f"\n{name}"
+            yield from (f"  {line}" for line in text.split("\n"))
+        divergence = " + ".join(f"d/d{axis} J{axis}" for axis in self.field_system.space)
+        found = f", d/d{TIME} J{TIME} + {divergence} = 0" if self.laws else ": none found"
+        yield f"\nconservation laws{found}{', the density is damped' * (self.field_system.dissipation != 0)}"
+        for law in self.laws:
+            yield f"  {law.name}: {law.symmetry}"
+            yield f"    J{TIME} = {_written(law.density)}"
+            yield from (f"    J{axis} = {_written(part)}" for axis, part in law.flux.items())
+
+
+def derivation_of(system: Density, assembled: Any = None) -> FieldDerivation:
+    """Return the derivation of a density, with its semi-discrete system."""
+    variations = Variations(system)
+    order = 1 if system.momenta else 2
+    equations = {
+        each: Eq(variations.functions[each].diff(symbol(TIME), order), formula)
+        for each, formula in variations.equations.items()
+    }
+    for each, rate in zip(system.fields, system.rates, strict=True) if system.dissipation != 0 else ():
+        force = variations.along(system.dissipation.diff(rate) / system.density.diff(rate, 2))
+        equations[each] = Eq(equations[each].lhs, sympy.expand(equations[each].rhs - force))
+    return FieldDerivation(
+        field_system=system,
+        equations=equations,
+        laws=variations.laws() if system.dissipation == 0 else (),
+        semidiscrete={} if assembled is None else _semidiscrete(assembled),
+    )
+
+
+def _semidiscrete(assembled: Any) -> dict[str, str]:
+    """Return the texts of the semi-discrete Lagrangian and of its energy, or of the semi-discrete Hamiltonian."""
+    if assembled.momenta:
+        return {"semi-discrete Hamiltonian": assembled.definition["hamiltonian"]}
+    text = assembled.definition["lagrangian"]
+    terms = text.split("\n+ ")
+    kinetic = [each for each in terms if "_dot" in each]
+    others = [each for each in terms if each not in kinetic]
+    energy = "\n+ ".join(kinetic) + "".join(f"\n- {each}" for each in others)
+    return {"semi-discrete Lagrangian": text, "semi-discrete energy": energy}
+
+
+def _written(formula: Expr) -> str:
+    return format_expression(formula.xreplace(names_of(formula)))

@@ -13,10 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis
 from scvi_codegen.fields.density import Density
-from scvi_codegen.fields.derivation import FieldDerivation, derivation_of
-from scvi_codegen.fields.laws import chosen_laws
-from scvi_codegen.fields.local import FieldHistory, LocalLaw, local_law
-from scvi_codegen.formulas.array_notation import array_text
+from scvi_codegen.fields.laws import FieldDerivation, FieldHistory, LocalLaw, chosen_laws, derivation_of, local_law
+from scvi_codegen.formulas.array_statements import array_text
 from scvi_codegen.formulas.symbols import TIME, symbol
 from scvi_codegen.lowering.arrays import one_coordinate
 from scvi_codegen.methods import as_method

@@ -14,12 +14,20 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.fields.assembly import Assembly
-from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis, clamped_ends, fourier, held_ends, spectral_elements
+from scvi_codegen.fields.axes import (
+    NATURAL,
+    PERIODIC,
+    Axis,
+    clamped_ends,
+    differences,
+    fourier,
+    held_ends,
+    spectral_elements,
+)
 from scvi_codegen.fields.density import Density, derivatives_of
-from scvi_codegen.fields.derivation import FieldDerivation, derivation_of
-from scvi_codegen.fields.differences import differences
+from scvi_codegen.fields.laws import FieldDerivation, derivation_of
 from scvi_codegen.fields.mesh import MeshSystem
-from scvi_codegen.formulas.array_notation import array_text
+from scvi_codegen.formulas.array_statements import array_text
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import TIME, check_names, number, symbol
 from scvi_codegen.validation import checked_count, checks_arguments

@@ -15,9 +15,8 @@ from typing import TypeAlias
 from sympy import Add, Expr, S, Symbol
 
 from scvi_codegen.errors import ExpressionError, SystemDefinitionError, closest
-from scvi_codegen.formulas.convolutions import NESTED, convolution_of
 from scvi_codegen.formulas.grammar import Parser, Token, parsed
-from scvi_codegen.formulas.neighbours import Neighbours
+from scvi_codegen.formulas.neighbours import NESTED, Neighbours, convolution_of
 from scvi_codegen.formulas.symbols import check_name, symbol
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
 

@@ -33,7 +33,7 @@ from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageGroup, StageSystem, Table, straight
 from scvi_codegen.native import building
-from scvi_codegen.rendering.flow import casadi_name, with_casadi_flow
+from scvi_codegen.rendering.program_source import casadi_name, with_casadi_flow
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.validation import TEXTS, checked_count, checks_arguments, of
 

@@ -1,7 +1,7 @@
 """Flow map: a number of steps as a differentiable function of (q, p, parameters, t, h), and its form for JAX.
 
-JAX calls the compiled C by XLA, PyTorch (:mod:`scvi_codegen.frameworks.torch`) for many rows of numbers at once; both
-have JVP, VJP, second derivatives and batches.
+JAX calls the compiled C by XLA, PyTorch (:mod:`scvi_codegen.frameworks.torch_functions`) for many rows of numbers at
+once; both have JVP, VJP, second derivatives and batches.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from scvi_codegen.errors import StateError, imported
 from scvi_codegen.native import building
 from scvi_codegen.native.binding import Binding
-from scvi_codegen.rendering.flow import XLA_PARTS, XLA_SECOND_ORDER, with_flow_of_rows, with_xla_flow
+from scvi_codegen.rendering.program_source import XLA_PARTS, XLA_SECOND_ORDER, with_flow_of_rows, with_xla_flow
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.runtime.core.features import require

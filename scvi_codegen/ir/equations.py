@@ -369,7 +369,7 @@ class Control:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorGrowth:
-    """Explicit Runge-Kutta-Nystroem scheme for a tangent vector (:mod:`scvi_codegen.lowering.error_growth`).
+    """Explicit Runge-Kutta-Nystroem scheme for a tangent vector (:mod:`scvi_codegen.lowering.control`).
 
     Attributes:
         partials: distinct derivatives F_q at the points, on lanes.

@@ -36,8 +36,13 @@ from scvi_codegen.ir.equations import ConstrainedSteps, Constraints, Rattle
 from scvi_codegen.ir.kernel import RolledKernel, lower_matrix, lower_vector
 from scvi_codegen.lowering.solvers.tables import velocity_tables
 from scvi_codegen.lowering.stage_groups import rolled_kernel, system_kernel
-from scvi_codegen.mechanics.arrays.system import ArraySystem
-from scvi_codegen.mechanics.arrays.terms import constraint_gradient, constraint_second_rate, constraint_text, entries_of
+from scvi_codegen.mechanics.arrays.system import (
+    ArraySystem,
+    constraint_gradient,
+    constraint_second_rate,
+    constraint_text,
+    entries_of,
+)
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.forces import (
     constraint_jacobian,
@@ -48,8 +53,7 @@ from scvi_codegen.mechanics.forces import (
 )
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.stage_structure import Velocities
-from scvi_codegen.methods.stage_system import StageSystem
+from scvi_codegen.methods.stage_system import StageSystem, Velocities
 from scvi_codegen.tables.basis import matrix_product, transpose
 from scvi_codegen.tables.precision import Vector, mp
 

@@ -17,8 +17,7 @@ from scvi_codegen.ir.equations import ConstrainedSteps
 from scvi_codegen.ir.kernel import Constant, Load, RolledKernel, exact_number
 from scvi_codegen.ir.program import Program, RolledTerms
 from scvi_codegen.lowering.stage_groups import rolled_kernel
-from scvi_codegen.mechanics.arrays.system import ArraySystem
-from scvi_codegen.mechanics.arrays.terms import entries_of, force_of
+from scvi_codegen.mechanics.arrays.system import ArraySystem, entries_of, force_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.term_groups import SplitSystem, TermGroup
 

@@ -54,8 +54,7 @@ from scvi_codegen.methods.constraints import END_VELOCITY
 from scvi_codegen.methods.discretise import discretise, is_conformally_symplectic, is_symplectic
 from scvi_codegen.methods.leapfrog_stages import kicks_and_drifts
 from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.stage_structure import Accelerations, PrintedCurve, ShotCurve, Velocities
-from scvi_codegen.methods.stage_system import StageSystem
+from scvi_codegen.methods.stage_system import Accelerations, PrintedCurve, ShotCurve, StageSystem, Velocities
 from scvi_codegen.tables.basis import cardinal_values, legendre_functional
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 

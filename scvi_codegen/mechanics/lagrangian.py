@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from sympy import Expr, Symbol
     from sympy.physics.mechanics import KanesMethod, LagrangesMethod, System
 
-    from scvi_codegen.formulas.rotations.names import Reduced
+    from scvi_codegen.formulas.rotations import Reduced
 
 LAGRANGES_METHOD = ArgumentType("a LagrangesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "lam_vec"))
 KANES_METHOD = ArgumentType("a KanesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "kindiffdict"))
@@ -106,7 +106,7 @@ class LagrangianSystem(MechanicalSystem):
             rotations: name of the angular velocity in the body frame by name of the rotation: ``{"R": "omega"}``
                 declares the entries ``R_11`` to ``R_33`` of the matrix from body to space, ``omega_1`` to ``omega_3``,
                 ``rotate_k(R, a, b, c)``, component k of R (a, b, c), and ``unrotate_k`` of its inverse
-                (:mod:`scvi_codegen.formulas.rotations.members`). Arrays, ``{"R[8]": "omega"}``, have indices as other
+                (:mod:`scvi_codegen.formulas.rotations`). Arrays, ``{"R[8]": "omega"}``, have indices as other
                 arrays: ``sum(i in 8, omega_1[i]**2 - R_33[i])``.
             directions: names of unit vectors: ``n`` has components ``n_1`` to ``n_3`` and velocities ``n_1_dot`` ...
             parameters: default value by name, or of all entries by declaration of an array, ``{"k": 1, "m[N]": 1}``.

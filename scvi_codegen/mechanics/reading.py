@@ -7,7 +7,7 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.rotations.names import RotationNames
+from scvi_codegen.formulas.rotations import RotationNames
 from scvi_codegen.formulas.symbols import (
     DOT,
     TIME,

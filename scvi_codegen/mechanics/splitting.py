@@ -23,7 +23,7 @@ from sympy import Add, Expr, Float, Matrix, Quaternion, S, atan2, cos, expand, e
 
 from scvi_codegen.formulas.expressions import jacobian
 from scvi_codegen.formulas.intermediates import intermediate
-from scvi_codegen.formulas.rotations.members import Rotation
+from scvi_codegen.formulas.rotations import Rotation
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian

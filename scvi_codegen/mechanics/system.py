@@ -39,7 +39,7 @@ from scvi_codegen.validation import of
 if TYPE_CHECKING:
     from sympy import Expr, Symbol
 
-    from scvi_codegen.formulas.rotations.members import Homogeneous
+    from scvi_codegen.formulas.rotations import Homogeneous
 
 
 class Deferred:
@@ -167,7 +167,7 @@ class MechanicalSystem(Deferred, ABC):
         lengths: cutoffs and periods of lists of neighbours (:class:`~scvi_codegen.formulas.neighbours.Neighbours`).
         definition: the text with arrays or rotations that the system was read from, for model files; else empty.
         rotations: rotations, directions and spins, whose coordinates follow the ordinary ones
-            (:mod:`scvi_codegen.formulas.rotations.members`).
+            (:mod:`scvi_codegen.formulas.rotations`).
     """
 
     name: str

@@ -34,10 +34,10 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError, closest
-from scvi_codegen.formulas.array_entries import formula_of_entries, is_indexed, momentum_arrays
+from scvi_codegen.formulas.array_statements import formula_of_entries, is_indexed, momentum_arrays
 from scvi_codegen.formulas.expressions import gradient, hessian
 from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.formulas.rotations.names import RotationNames
+from scvi_codegen.formulas.rotations import RotationNames
 from scvi_codegen.formulas.symbols import input_formulas, symbol
 from scvi_codegen.formulas.translation import format_expression
 from scvi_codegen.mechanics.derived_expressions import forms_of

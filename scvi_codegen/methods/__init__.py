@@ -6,7 +6,6 @@ from typing import Any, Final
 
 from scvi_codegen.errors import MethodError, closest
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.collocation import SpectralCollocation
 from scvi_codegen.methods.composition import Composition, StoermerVerlet
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method, Specification
@@ -21,6 +20,7 @@ from scvi_codegen.methods.runge_kutta import (
     RadauIA,
     RadauIIA,
     RungeKutta,
+    SpectralCollocation,
 )
 from scvi_codegen.methods.shooting import SCVI
 from scvi_codegen.validation import checked_count

@@ -1,15 +1,49 @@
-"""Stage equations in v0 and z_i = h (acceleration at c_i): Euler-Lagrange equations at stages of a tableau."""
+"""Stage equations in v0 and z_i = h (acceleration at c_i): Euler-Lagrange equations at stages of a tableau.
 
+Stage equations of shooting-based methods, (33)-(34): compiled and nodal, with total and partial derivatives.
+"""
+
+from dataclasses import replace
 from fractions import Fraction
 
-from scvi_codegen.mechanics.derived_expressions import accelerations, forms_of
+from scvi_codegen.errors import MethodError
+from scvi_codegen.mechanics.derived_expressions import accelerations, forms_of, multipliers
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.galerkin_stages import position_block
-from scvi_codegen.methods.stage_structure import Accelerations
-from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table
-from scvi_codegen.tables.basis import differentiation_matrix, matrix_product, next_step
+from scvi_codegen.methods.galerkin_stages import (
+    action_groups,
+    curve_gathers,
+    lagrangian_scatters,
+    nodal_quadrature_group,
+    position_block,
+)
+from scvi_codegen.methods.stage_system import (
+    Accelerations,
+    Block,
+    Gather,
+    PrintedCurve,
+    Row,
+    ScalarStageGroup,
+    Scatter,
+    ShotCurve,
+    StageGroup,
+    StageSystem,
+    Table,
+    dyadic,
+    stationary_increments,
+    stationary_nodal,
+    unit_sum,
+)
+from scvi_codegen.tables.basis import (
+    cardinal_derivatives,
+    cardinal_values,
+    differentiation_matrix,
+    matrix_product,
+    next_step,
+)
 from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
+from scvi_codegen.tables.quadrature import Quadrature
+from scvi_codegen.tables.spaces import Polynomials
 from scvi_codegen.tables.tableau import Tableau
 
 VELOCITY_BLOCK = Block(name="v_0", power=1, straight=(mp.zero, mp.one))
@@ -162,4 +196,178 @@ def nodal_gathers(system: MechanicalSystem, nodes: Nodes, *, other_blocks: int =
             arguments=system.velocities, table=Table.joined(derivative, zeros, padding), power=-1, scale=Fraction(2)
         ),
         Gather(arguments=accelerations(system), table=Table.joined(acceleration, padding), power=-2, scale=Fraction(4)),
+    )
+
+
+def shooting_increments(
+    system: MechanicalSystem, tableau: Tableau, rule: Quadrature, *, rounded: bool = True
+) -> StageSystem:
+    """Return the stationarity of G = h sum w_n L(q_n, v_n) + sum_i h^2 m_i . E_i, unknowns (v0, z_i = h a_i, m_i).
+
+    A quadrature with derivatives adds h^(k + 1) sum w_kn d^k L/dt^k, with the derivatives of the same curve. Unless
+    ``rounded``, tables have all digits.
+    """
+    if system.forces and system.auxiliaries:
+        raise MethodError(
+            "shooting-based methods support forces for Lagrangians only: use the Lagrangian of "
+            f"'{system.name}' (lagrangian_of)"
+        )
+    size = len(tableau.b)
+    position, velocities, beta = _curve(tableau, rule)
+    weights = rule.unit_weights
+    if rounded:
+        position, weights, beta = dyadic(position), unit_sum(weights), dyadic([beta])[0]
+    blocks = (
+        *acceleration_unknowns(size),
+        *(Block(name=f"m_{i}", power=1, straight=(mp.zero, mp.zero)) for i in range(1, size + 1)),
+    )
+    action = action_groups(
+        system,
+        rule.abscissae,
+        (weights, *rule.unit_derivative_weights),
+        curve_gathers(system, position, velocities, names=("r", "u"), first=0, other_blocks=size),
+    )
+    extrapolated = acceleration_extrapolation(tableau)
+    return stationary_increments(
+        stage_groups=(*action, _multiplier_group(system, tableau, rounded=rounded)),
+        blocks=blocks,
+        end_position=(*beta, *(mp.zero,) * size),
+        rows=(
+            *(Row(number=f"z_{i}", kind="IDEL", momentum=beta[i]) for i in range(size + 1)),
+            *(Row(number="34a", kind="stage", momentum=mp.zero) for _ in range(size)),
+        ),
+        extrapolation=(
+            *((*line, *(mp.zero,) * size) for line in extrapolated),
+            *((*(mp.zero,) * (size + 1), *(mp.mpf(int(i == j)) for j in range(size))) for i in range(size)),
+        ),
+        shape=None if rule.derivative_weights else ShotCurve(tableau, rule),
+    )
+
+
+def _multiplier_group(system: MechanicalSystem, tableau: Tableau, *, rounded: bool) -> ScalarStageGroup:
+    """Return the collocation nodes with scalar m_i . E_i, weight h^2 (unknowns v0, z, m)."""
+    size = len(tableau.b)
+    position, velocity, acceleration = acceleration_gathers(system, tableau.A, other_blocks=size)
+    if rounded:
+        table = Table(entries=dyadic(position.table.entries), names=position.table.names)
+        position = replace(position, table=table)
+    multiplier_gather = Gather(
+        arguments=multipliers(system),
+        table=Table.joined(Table.constant(size, 2 + size), Table.identity(size)),
+        power=-1,
+    )
+    return ScalarStageGroup(
+        name="node",
+        abscissae=tableau.c,
+        gathers=(position, velocity, acceleration, multiplier_gather),
+        scalar=forms_of(system).multiplied_residual,
+        power=1,
+        in_action=False,
+        forces=forms_of(system).multiplied_forces,
+    )
+
+
+def _curve(tableau: Tableau, rule: Quadrature) -> tuple[Matrix, tuple[Matrix, ...], Vector]:
+    """Return rows of q/h, of v and h^k d^k v/dt^k of the rule, and of q1/h, for V_i = v0 + sum a_ij z_j."""
+    curves, at = Polynomials(), rule.abscissae
+    moved = tuple((mp.one, *line) for line in tableau.A)
+    velocities = tuple(
+        matrix_product(curves.velocities(tableau.c, at, k), moved) for k in range(len(rule.derivative_weights) + 1)
+    )
+    position = matrix_product(curves.positions(tableau.c, at), moved)
+    return position, velocities, matrix_product((tableau.b,), moved)[0]
+
+
+def printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrature, nodes: Nodes) -> StageSystem:
+    """Return (34a) and the partial derivatives (34d), (34e), unknowns (v0, z_i = h a_i)."""
+    size, points = len(tableau.b), len(rule)
+    position_rows, velocities, end_row = _curve(tableau, rule)
+    abscissae = nodes.abscissae
+    values = cardinal_values(abscissae, rule.abscissae)
+    derivative_values = cardinal_derivatives(abscissae, rule.abscissae)
+    none = Table.constant(points, size)
+
+    def first_and_sum(name: str, lines: Matrix) -> Table:
+        first, both = [(line[0],) for line in lines], [(line[0] + line[-1],) for line in lines]
+        return Table.joined(Table.named(name, first), none, Table.named(name, both, column=2))
+
+    quadrature = StageGroup(
+        name="quadrature",
+        abscissae=rule.abscissae,
+        weights=rule.unit_weights,
+        weight_names=tuple(f"w_{n}" for n in range(1, points + 1)),
+        gathers=curve_gathers(system, position_rows, velocities, names=("r", "u"), first=0),
+        scatters=lagrangian_scatters(system, first_and_sum("s1", values), first_and_sum("s2", derivative_values)),
+    )
+    inner = Table.joined(Table.constant(size, 1), Table.identity(size), Table.constant(size, 1))
+    node = residual_group(system, tableau.c, acceleration_gathers(system, tableau.A), inner, power=1)
+    return StageSystem(
+        blocks=acceleration_unknowns(size),
+        rows=(
+            Row(number="34d", kind="IDEL", momentum=mp.one),
+            *(Row(number="34a", kind="stage", momentum=mp.zero) for _ in range(size)),
+        ),
+        stage_groups=(quadrature, node),
+        end_position=Table.named("beta", [(1, *end_row)], column=0),
+        end_momentum=mp.one,
+        end_numbers=("34c", "34e"),
+        extrapolation=acceleration_extrapolation(tableau),
+        shape=PrintedCurve(tableau, rule),
+    )
+
+
+def shooting_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> StageSystem:
+    """Return the stationarity of G = L_d + sum lambda_i . E_i in the paper's Q^1 .. Q^s, v0, lambda_1 .. lambda_s."""
+    size = nodes.degree
+    multiplier_gather = Gather(
+        arguments=multipliers(system), table=Table.joined(Table.constant(size, 2 + size), Table.identity(size)), power=0
+    )
+    node = ScalarStageGroup(
+        name="node",
+        abscissae=nodes.abscissae[1:],
+        gathers=(*nodal_gathers(system, nodes, other_blocks=size), multiplier_gather),
+        scalar=forms_of(system).multiplied_residual,
+        power=-1,
+        in_action=False,
+        forces=forms_of(system).multiplied_forces,
+    )
+    return stationary_nodal(
+        stage_groups=(nodal_quadrature_group(system, nodes, rule, other_blocks=1 + size), node),
+        blocks=(
+            *nodal_blocks(nodes),
+            *(Block(name=f"lambda_{i}", power=0, straight=(mp.zero, mp.zero)) for i in range(1, size + 1)),
+        ),
+        end_block=size - 1,
+        rows=(
+            Row(number="34d", kind="IDEL", momentum=mp.one),
+            *(Row(number="dG/dQ", kind="multiplier", momentum=mp.zero) for _ in range(size - 1)),
+            Row(number="dG/dv0", kind="multiplier", momentum=mp.zero, power=1),
+            *(Row(number="34a", kind="stage", momentum=mp.zero) for _ in range(size)),
+        ),
+        end_numbers=("34c", "34e"),
+    )
+
+
+def printed_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> StageSystem:
+    """Return (34a), (34d) and (34e) as printed, unknowns Q^1 .. Q^s and v0; (36)-(37) for the two-point pendulum."""
+    size = nodes.degree
+    action = nodal_quadrature_group(system, nodes, rule, other_blocks=1)
+    none = Table.constant(len(rule), size)
+
+    def ends(table: Table) -> Table:
+        return Table.joined(none, table.columns([0]), table.columns([size]))
+
+    quadrature = action.to_stage_group([ends(gather.table) for gather in action.gathers])
+    inner = Table.joined(Table.identity(size), Table.constant(size, 2))
+    node = residual_group(system, nodes.abscissae[1:], nodal_gathers(system, nodes), inner)
+    return StageSystem(
+        blocks=nodal_blocks(nodes),
+        rows=(
+            *(Row(number="34a", kind="stage", momentum=mp.zero) for _ in range(size)),
+            Row(number="34d", kind="IDEL", momentum=mp.one),
+        ),
+        stage_groups=(quadrature, node),
+        end_position=Table.joined(Table.constant(1, size), Table.constant(1, 1, 1), Table.constant(1, 1)),
+        end_momentum=mp.zero,
+        end_numbers=("34c", "34e"),
     )

@@ -40,8 +40,7 @@ from scvi_codegen.mechanics.forces import (
     with_constraint_forces,
 )
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.stage_structure import Velocities
-from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table
+from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table, Velocities
 from scvi_codegen.tables.basis import cardinal_values
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 from scvi_codegen.tables.quadrature import gauss_legendre

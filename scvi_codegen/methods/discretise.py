@@ -30,8 +30,7 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.time_transformation import reparametrise
 from scvi_codegen.methods.constraints import with_constraints
 from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.stage_structure import Velocities
-from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table
+from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table, Velocities
 from scvi_codegen.tables.basis import identity_matrix, next_step
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
@@ -47,7 +46,7 @@ def discretised_form(system: MechanicalSystem, method: Method) -> MechanicalSyst
     """Return the form of a system that a method discretises: of one with rotations the Hamiltonian, if it serves.
 
     The Hamiltonian needs about half of the operations; it is singular in p
-    (:mod:`scvi_codegen.mechanics.rotations.hamiltonian`).
+    (:mod:`scvi_codegen.mechanics.rotations`).
     """
     if not isinstance(system, LagrangianSystem) or not system.rotations or not method.symplectic:
         return system

@@ -11,7 +11,6 @@ from fractions import Fraction
 from scvi_codegen.errors import MethodError
 from scvi_codegen.mechanics.derived_expressions import curve_rates, forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.stage_structure import Velocities
 from scvi_codegen.methods.stage_system import (
     Block,
     Gather,
@@ -21,6 +20,7 @@ from scvi_codegen.methods.stage_system import (
     StageGroup,
     StageSystem,
     Table,
+    Velocities,
     dyadic,
     stationary_increments,
     unit_sum,

@@ -188,7 +188,7 @@ class SCVI(NodalMethod):
         """Return equations with unknowns v0, h a_i and h^-2 lambda_i; degree 1 is the SVI with the same quadrature."""
         if self.degree == 1:
             return self._line.stage_system(system)
-        from scvi_codegen.methods.shooting_stages import printed_increments, shooting_increments
+        from scvi_codegen.methods.acceleration_stages import printed_increments, shooting_increments
 
         if self.variational:
             return shooting_increments(system, self.tableau, self.rule)
@@ -200,7 +200,7 @@ class SCVI(NodalMethod):
         With abscissae, and for quadratures with derivatives, which the paper does not write out: the compiled equations
         with unknowns v0, h a_i and h^-2 lambda_i, with all digits.
         """
-        from scvi_codegen.methods.shooting_stages import printed_nodal, shooting_increments, shooting_nodal
+        from scvi_codegen.methods.acceleration_stages import printed_nodal, shooting_increments, shooting_nodal
 
         if self.abscissae is not None or self.rule.derivative_weights:
             if self.degree == 1:

@@ -17,6 +17,12 @@ the degree and the number of points. Everything else is a table in 60 digits.
 There are two parametrisations of the same method. The *paper's* has the positions Q^v at the nodes as unknowns;
 ``derive`` shows it. The *compiled* one has velocities as unknowns: its tables are free of h, the known state enters as
 "q0" and "p0" alone, and p1 = p0 + increments, which avoids cancellation for small steps and far from the origin.
+
+Shapes of stage equations: the structure that a solver without a Newton matrix must know.
+
+A method states the shape of its stage system (:attr:`~scvi_codegen.methods.stage_system.StageSystem.shape`); a solver
+states which shapes it supports (:mod:`scvi_codegen.lowering.program`). A shape consists of numbers of the
+method, in 60 digits, independent of the system. Stage equations without a shape are solved by Newton's iteration.
 """
 
 from __future__ import annotations
@@ -31,6 +37,8 @@ import sympy
 
 from scvi_codegen.formulas.expressions import gradient
 from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
+from scvi_codegen.tables.quadrature import Quadrature
+from scvi_codegen.tables.tableau import Tableau
 
 DYADIC_BITS = 52
 ROUNDING = mp.mpf("1e-50")
@@ -204,7 +212,7 @@ class StageGroup(StagePoints):
 
 
 class Shape:
-    """Base class of the structure used by matrix-free solvers: :mod:`scvi_codegen.methods.stage_structure`."""
+    """Base class of the structure used by matrix-free solvers: :mod:`scvi_codegen.methods.stage_system`."""
 
     __slots__ = ()
 
@@ -377,3 +385,55 @@ def unit_sum(weights: Sequence[Number]) -> Vector:
         largest = max(range(len(rounded)), key=lambda n: abs(rounded[n]))
         rounded[largest] -= excess
     return tuple(rounded)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Velocities(Shape):
+    """Unknown velocities V_b of a curve; positions and velocities at the points are linear in them.
+
+        q_n = q0 + h sum_b position[n][b] V_b,    v_n = sum_b velocity[n][b] V_b,    q1 = q0 + h sum_b end[b] V_b,
+
+    If ``variational``, h sum_n weights[n] L(q_n, v_n) is stationary. Otherwise the momenta at the points, which are the
+    blocks, are p0 + h sum_j position[n][j] L_q, and p1 = p0 + h sum_n weights[n] L_q.
+
+    Attributes:
+        abscissae: (g,) of the points.
+        blocks: (s,) abscissae of the velocities.
+        position, velocity: (g, s) matrices.
+        end: (s,) vector.
+        weights: (g,) vector.
+        variational: whether the equations are those of a stationary action.
+        unrounded: the same shape in 60 digits, if these numbers are rounded to doubles.
+    """
+
+    abscissae: Vector
+    blocks: Vector
+    position: Matrix
+    velocity: Matrix
+    end: Vector
+    weights: Vector
+    variational: bool
+    unrounded: Velocities | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Accelerations(Shape):
+    """Unknown accelerations at the stages of a tableau in position form; p0 and p1 are L_v at the ends (18)."""
+
+    tableau: Tableau
+
+
+@dataclass(frozen=True, slots=True)
+class ShotCurve(Shape):
+    """Accelerations and multipliers at the nodes of a curve; momenta are total derivatives of its action (SCVI)."""
+
+    tableau: Tableau
+    rule: Quadrature
+
+
+@dataclass(frozen=True, slots=True)
+class PrintedCurve(Shape):
+    """Accelerations at the nodes of a curve; momenta as the paper prints them: (34a), (34d), (34e)."""
+
+    tableau: Tableau
+    rule: Quadrature

@@ -27,12 +27,17 @@ from sympy import Expr, Symbol
 from sympy.core.function import AppliedUndef
 
 from scvi_codegen.errors import EventError, ScviCodegenError, SystemDefinitionError, closest
-from scvi_codegen.formulas.array_entries import EntryRules, entry_names, formula_of_entries, is_indexed, momentum_arrays
-from scvi_codegen.formulas.array_statements import parse_constraint
+from scvi_codegen.formulas.array_statements import (
+    EntryRules,
+    entry_names,
+    formula_of_entries,
+    is_indexed,
+    momentum_arrays,
+    parse_constraint,
+)
 from scvi_codegen.formulas.arrays import parse_coordinate
 from scvi_codegen.formulas.expressions import evaluated, unsupported_part
-from scvi_codegen.formulas.rotations.arrays import entries_in_formulas
-from scvi_codegen.formulas.rotations.names import RotationNames
+from scvi_codegen.formulas.rotations import RotationNames, entries_in_formulas
 from scvi_codegen.formulas.symbols import DOT, TIME, identifier, input_formulas, symbol
 from scvi_codegen.indices import Array, Size
 from scvi_codegen.ir.arithmetic import lower_kernel

@@ -3,6 +3,11 @@
 Entry templates are named after the file they make; parts are in ``templates/parts``. Templates contain only structure:
 loops over the program's tables and the C that does not depend on it. Kernels are printed by
 :mod:`scvi_codegen.rendering.kernels.printer` through filters.
+
+Flow of many steps as one C function with its derivatives, added to a source that has those of a step.
+
+The support headers contain all of it: ``flow.h`` the function, ``xla_flow.h`` and ``casadi_flow.h`` the interfaces of
+frameworks.
 """
 
 from collections.abc import Mapping, Sequence
@@ -372,3 +377,77 @@ def with_fmu(
         support=included(code, support_text),
     )
     return replace(source, beside=replace(beside, beside=source.beside))
+
+
+XLA_PARTS = ("states", "jvp", "vjp")
+"""XLA handlers: states, tangent vectors of states (JVP), gradients with respect to inputs (VJP)."""
+XLA_SECOND_ORDER = "vjp_derivative"
+"""XLA handler of derivatives of gradients."""
+
+
+def with_xla_flow(derivatives: Source, version: str, *, second: bool = False) -> Source:
+    """Return a source with the XLA custom calls ``<prefix>_xla_states``, ``_jvp``, ``_vjp``.
+
+    Args:
+        derivatives: a source with derivatives of steps.
+        version: of the library whose ``xla/ffi/api/c_api.h`` it is compiled with; a source is specific to one version.
+        second: whether to add second derivatives, ``_curvature``, which the source must have.
+    """
+    parts = (*XLA_PARTS, *([XLA_SECOND_ORDER] if second else ()))
+    handlers = "".join(f"void *{derivatives.prefix}_xla_{part}(void *frame);\n" for part in parts)
+    headers = ("flow", "xla_flow")
+    return _behind(derivatives, f"\n/* For jaxlib {version}. */\n", headers, handlers, second=second)
+
+
+def with_flow_of_rows(derivatives: Source, *, second: bool = False) -> Source:
+    """Return a source with the flow of many rows, ``<prefix>_flow_rows``.
+
+    Args:
+        derivatives: a source with derivatives of steps.
+        second: whether to add second derivatives, ``<prefix>_hessian_rows``, which the source must have.
+    """
+    prefix = derivatives.prefix
+    shape = "long long steps, long long every, int count, long long rows"
+    rest = f"double *found, {prefix}_report *report"
+    declared = f"int {prefix}_flow_rows(int part, {shape}, const double *x, const double *given, {rest});\n"
+    if second:
+        declared += f"int {prefix}_hessian_rows({shape}, const double *x, "
+        declared += f"const double *partials, const double *changes, {rest});\n"
+    return _behind(derivatives, "\n#define FLOW_OF_ROWS\n", ("flow",), declared, second=second)
+
+
+def casadi_name(prefix: str) -> str:
+    """Return the name of the function that CasADi looks up in a library."""
+    return f"{prefix}_flow"
+
+
+def with_casadi_flow(derivatives: Source, steps: int, save_every: int, *, second: bool = False) -> Source:
+    """Return a source with the flow of ``steps`` steps and its derivatives, by CasADi's naming convention.
+
+    Args:
+        derivatives: a source with derivatives of steps.
+        steps: number of steps; save_every: steps between stored states.
+        second: whether to add the Jacobian of the adjoint, from second derivatives that the source must have.
+    """
+    name = casadi_name(derivatives.prefix)
+    fixed = f"\nenum {{\n  FLOW_STEPS = {steps},\n  FLOW_EVERY = {save_every}\n}};\n\n"
+    headers = ("flow", "casadi_flow")
+    return _behind(
+        derivatives, f"{fixed}#define EXTERNAL(before, after) before##{name}##after\n\n", headers, "", second=second
+    )
+
+
+def _behind(source: Source, text: str, headers: Sequence[str], declarations: str, *, second: bool) -> Source:
+    tail = (
+        text
+        + "#define SECOND_DERIVATIVES\n" * second
+        + "".join(f'#include "support/frameworks/{header}.h"\n' for header in headers)
+    )
+    own = dict(source.support)
+    code = source.code + tail
+    return replace(
+        source,
+        code=code,
+        declarations=source.declarations + declarations,
+        support=included(code, lambda name: own.get(name) or support_text(name)),
+    )

@@ -8,12 +8,11 @@ import numpy as np
 import sympy
 
 from scvi_codegen.derivation.equations import derive
-from scvi_codegen.display.page.blocks import TableBlock
+from scvi_codegen.display.page import TableBlock
 from scvi_codegen.methods import SCVI, SVI, SpectralCollocation
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.problems import problem
-from scvi_codegen.reproduce.drawing import Panel, Picture, Series
-from scvi_codegen.reproduce.experiment import Comparison, Experiment, Result, comparison
+from scvi_codegen.reproduce.experiment import Comparison, Experiment, Panel, Picture, Result, Series, comparison
 from scvi_codegen.reproduce.runs import KEPLER, ROUNDOFF, MeasuredRun, RunSetting, Scheme, exact_kepler, largest
 
 ROWS = ((2, 2), (3, 2), (4, 3), (5, 4), (6, 5), (7, 6), (9, 7))

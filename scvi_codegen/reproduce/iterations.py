@@ -14,10 +14,9 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from scvi_codegen.display.page.blocks import TableBlock
+from scvi_codegen.display.page import TableBlock
 from scvi_codegen.files.toml_text import package_table
-from scvi_codegen.reproduce.drawing import Array
-from scvi_codegen.reproduce.experiment import Comparison, Experiment, Result, comparison
+from scvi_codegen.reproduce.experiment import Array, Comparison, Experiment, Result, comparison
 from scvi_codegen.reproduce.runs import SECTION_3, perihelion
 from scvi_codegen.tables.basis import cardinal_derivatives, cardinal_values, differentiation_matrix
 from scvi_codegen.tables.nodes import chebyshev_lobatto

@@ -27,10 +27,9 @@ from scvi_codegen.cli import main
 from scvi_codegen.derivation import derivation_html
 from scvi_codegen.derivation.equations import derive
 from scvi_codegen.derivation.notation import table_entries
-from scvi_codegen.derivation.page.jacobian import jacobian_pattern
-from scvi_codegen.derivation.page.kernels import ITERATIONS, kernels_of
-from scvi_codegen.display.page.blocks import MOST_LINES, Formula, Paragraph, formulas, operations
-from scvi_codegen.display.page.environment import SPACE
+from scvi_codegen.derivation.page.document import ITERATIONS, kernels_of
+from scvi_codegen.derivation.page.drawings import jacobian_pattern
+from scvi_codegen.display.page import MOST_LINES, SPACE, Formula, Paragraph, formulas, operations
 from scvi_codegen.ir.equations import IterationName
 from scvi_codegen.methods.discretise import paper_equations, with_auxiliaries
 from scvi_codegen.pipeline import program_of

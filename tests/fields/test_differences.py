@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 import scvi_codegen as sc
 from scvi_codegen import FieldSystem, SystemDefinitionError
-from scvi_codegen.fields.differences import differences
+from scvi_codegen.fields.axes import differences
 
 WAVES = "u_t**2/2 - u_x**2/2"
 

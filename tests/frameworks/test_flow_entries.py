@@ -13,7 +13,7 @@ from pumped_leapfrog import EVERY, ROWS, STEP_INPUTS, STEPS, hessian, partials, 
 
 from scvi_codegen.frameworks.flow import FlowOfRows
 from scvi_codegen.native import building
-from scvi_codegen.rendering.flow import casadi_name, with_casadi_flow, with_xla_flow
+from scvi_codegen.rendering.program_source import casadi_name, with_casadi_flow, with_xla_flow
 
 EVERY_STEP, NOT_FINITE_STATUS = 1, 3
 SAVED, SIZE = STEPS // EVERY + 1, len(STEP_INPUTS)

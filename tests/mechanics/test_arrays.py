@@ -8,8 +8,7 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.mechanics.arrays.reading import arrays_from_text
 from scvi_codegen.mechanics.arrays.rolling import unroll_sums
 from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
-from scvi_codegen.mechanics.arrays.system import ArraySystem
-from scvi_codegen.mechanics.arrays.terms import force_of
+from scvi_codegen.mechanics.arrays.system import ArraySystem, force_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 

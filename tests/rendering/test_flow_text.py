@@ -8,7 +8,7 @@ from samples import linkage, pumped_cart_pole, two_rods
 from style import check_style
 
 from scvi_codegen import SCVI, SVI, Gauss, SpectralCollocation, StoermerVerlet, compile_stepper, problem
-from scvi_codegen.rendering.flow import with_casadi_flow, with_flow_of_rows, with_xla_flow
+from scvi_codegen.rendering.program_source import with_casadi_flow, with_flow_of_rows, with_xla_flow
 
 STRICT = ["-std=c99", "-O0", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
 CASES = {

@@ -15,7 +15,7 @@ from programs import needs
 
 from scvi_codegen import SVI, LagrangianSystem, SpectralCollocation, compile_stepper, impact, problem
 from scvi_codegen.files.cache import template_folder
-from scvi_codegen.rendering.flow import with_casadi_flow, with_flow_of_rows
+from scvi_codegen.rendering.program_source import with_casadi_flow, with_flow_of_rows
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.rendering.text import preprocessed
 

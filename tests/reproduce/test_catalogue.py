@@ -5,8 +5,7 @@ import re
 import pytest
 
 from scvi_codegen.reproduce.catalogue import EXPERIMENTS
-from scvi_codegen.reproduce.claims import CLAIMS, EVIDENCE
-from scvi_codegen.reproduce.experiment import Verdict
+from scvi_codegen.reproduce.experiment import CLAIMS, EVIDENCE, Verdict
 from scvi_codegen.reproduce.runner import Failure, run_experiments
 
 PAPER = {*(f"figure-{n}" for n in range(1, 31) if n != 2), *("table-8", "table-9", "claims", "correction")}

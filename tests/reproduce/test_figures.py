@@ -8,16 +8,15 @@ import pytest
 import scvi_codegen as sc
 from scvi_codegen.reproduce import correction
 from scvi_codegen.reproduce.catalogue import EXPERIMENTS
-from scvi_codegen.reproduce.drawing import draw
-from scvi_codegen.reproduce.experiment import Verdict, judged
-from scvi_codegen.reproduce.figures import SETTINGS, compared
-from scvi_codegen.reproduce.report import statement
+from scvi_codegen.reproduce.experiment import Verdict, draw, judged, statement
 from scvi_codegen.reproduce.runs import (
     KEPLER,
     SECTION_4,
+    SETTINGS,
     MeasuredRun,
     RunSetting,
     Scheme,
+    compared,
     drift,
     drift_share,
     exact_kepler,

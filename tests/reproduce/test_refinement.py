@@ -9,6 +9,8 @@ import scvi_codegen as sc
 from scvi_codegen.reproduce.catalogue import EXPERIMENTS
 from scvi_codegen.reproduce.experiment import Verdict
 from scvi_codegen.reproduce.refinement import (
+    CASES,
+    STUDIES,
     Law,
     factors,
     fitted_line,
@@ -18,7 +20,6 @@ from scvi_codegen.reproduce.refinement import (
     step_errors,
     within,
 )
-from scvi_codegen.reproduce.refinement_figures import CASES, STUDIES
 from scvi_codegen.tables.precision import mp
 
 pytestmark = pytest.mark.long

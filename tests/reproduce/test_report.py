@@ -22,11 +22,9 @@ from toy_experiments import EXPERIMENTS, GOOD
 
 from scvi_codegen.cli import main
 from scvi_codegen.cli.commands.reproduce import Reproduction, experiments_table, experiments_titles
-from scvi_codegen.display.page.environment import cell, prose
+from scvi_codegen.display.page import cell, prose
 from scvi_codegen.errors import StateError
-from scvi_codegen.reproduce.drawing import draw
-from scvi_codegen.reproduce.experiment import Result
-from scvi_codegen.reproduce.report import report_html, tally
+from scvi_codegen.reproduce.experiment import Result, draw, report_html, tally
 from scvi_codegen.reproduce.runner import Failure, run_experiments, with_needs
 
 if TYPE_CHECKING:

@@ -8,8 +8,7 @@ import toy_experiments
 from browsing import UNREADABLE, VIEWS, assert_it_asks_for_nothing, assert_nothing_sticks_out, opened
 from toy_experiments import GOOD
 
-from scvi_codegen.reproduce.experiment import Result
-from scvi_codegen.reproduce.report import report_html
+from scvi_codegen.reproduce.experiment import Result, report_html
 from scvi_codegen.reproduce.runner import run_experiments
 
 

@@ -8,8 +8,7 @@ import pytest
 from scvi_codegen.methods import SVI, SpectralCollocation
 from scvi_codegen.reproduce import claims, iterations
 from scvi_codegen.reproduce.catalogue import EXPERIMENTS
-from scvi_codegen.reproduce.experiment import Comparison, Result, Verdict
-from scvi_codegen.reproduce.report import statement
+from scvi_codegen.reproduce.experiment import Comparison, Result, Verdict, statement
 from scvi_codegen.reproduce.runs import KEPLER, perihelion, stepper_of
 
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
 from scvi_codegen.errors import ExpressionError, StateError, SystemDefinitionError
-from scvi_codegen.formulas.rotations.names import RotationNames
+from scvi_codegen.formulas.rotations import RotationNames
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.methods import SVI, as_method
 from scvi_codegen.methods.discretise import discretised_form

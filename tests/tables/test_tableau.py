@@ -16,7 +16,6 @@ from scvi_codegen.errors import MethodError
 from scvi_codegen.tables import nodes
 from scvi_codegen.tables.closed_forms import exact_tableau
 from scvi_codegen.tables.precision import Matrix, mp
-from scvi_codegen.tables.stability import is_nonnegative
 from scvi_codegen.tables.tableau import (
     TABLEAU_FAMILIES,
     Tableau,
@@ -25,6 +24,7 @@ from scvi_codegen.tables.tableau import (
     collocation_tableau,
     explicit_euler,
     gauss,
+    is_nonnegative,
     lobatto_iiia,
     lobatto_iiib,
     radau_ia,

@@ -8,9 +8,18 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from scvi_codegen.display.page.blocks import TableBlock
-from scvi_codegen.reproduce.drawing import Panel, Picture, Series, largest_in_bins
-from scvi_codegen.reproduce.experiment import Comparison, Experiment, Result, Verdict, judged
+from scvi_codegen.display.page import TableBlock
+from scvi_codegen.reproduce.experiment import (
+    Comparison,
+    Experiment,
+    Panel,
+    Picture,
+    Result,
+    Series,
+    Verdict,
+    judged,
+    largest_in_bins,
+)
 
 LONG_LINE = "double energy = 0.5*(v[0]*v[0] + v[1]*v[1]) - mu/sqrt(q[0]*q[0] + q[1]*q[1]);  /* kept on one line */"
 

@@ -10,8 +10,8 @@ from scvi_codegen.cli.model_options import model_arguments, read_model, with_kno
 from scvi_codegen.derivation import derivation_html
 from scvi_codegen.derivation.equations import StepEquations
 from scvi_codegen.derivation.equations import derive as derive_equations
-from scvi_codegen.derivation.events import events_text
-from scvi_codegen.fields.derivation import derivation_of
+from scvi_codegen.derivation.notation import events_text
+from scvi_codegen.fields.laws import derivation_of
 
 
 @click.command()

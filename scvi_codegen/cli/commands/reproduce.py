@@ -21,8 +21,7 @@ from scvi_codegen.cli.command_group import (
 from scvi_codegen.cli.reports import counted
 from scvi_codegen.files.atomic import write_text
 from scvi_codegen.pictures.canvas import check_plot_path
-from scvi_codegen.reproduce.experiment import Experiment, Result
-from scvi_codegen.reproduce.report import report_html, tally, write_result
+from scvi_codegen.reproduce.experiment import Experiment, Result, report_html, tally, write_result
 from scvi_codegen.reproduce.runner import CATALOGUE, Failure, Watch, catalogue, run_experiments, with_needs
 
 EVERYTHING = "all"

@@ -16,7 +16,7 @@ import sympy
 from sympy import Symbol
 
 from scvi_codegen.display.mathml.names import RAISED
-from scvi_codegen.display.page.blocks import Formula
+from scvi_codegen.display.page import Formula
 from scvi_codegen.lowering.stage_groups import argument_name
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.forces import constraint_rates, holonomic_expressions, nonholonomic_expressions

@@ -41,7 +41,7 @@ from scvi_codegen.lowering.stage_groups import system_kernel
 from scvi_codegen.mechanics.derived_expressions import accelerations, forms_of, multipliers
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.stage_structure import Accelerations, PrintedCurve, ShotCurve
+from scvi_codegen.methods.stage_system import Accelerations, PrintedCurve, ShotCurve
 from scvi_codegen.tables.basis import (
     cardinal_derivatives,
     cardinal_integrals,

@@ -22,7 +22,7 @@ computes forces, momenta, velocities and positions in turn, each from the latest
 convergence rate is h^2 if H = T(p) + V(q), and h at worst. H need not be regular. Rotations share most operations of
 forces and velocities and have the rate h either way: both are evaluated at once (Jacobi), in a fifth more iterations
 with half the latency; kernels then add terms in pairs. Turns of axially symmetric bodies follow the iteration, and turn
-its predictor (:mod:`scvi_codegen.mechanics.rotations.axial`).
+its predictor (:mod:`scvi_codegen.mechanics.rotations`).
 
 **Any regular Lagrangian.** Velocities are corrected by the mass matrix at each point: the equations are L_v(q_n, V_n) =
 P_n. If the points are not those of the velocities (an SVI with another quadrature), the s velocities z_b give V_n =
@@ -66,7 +66,7 @@ from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.rotations.axial import Turn, axial_turns, frame_potential
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.stage_structure import Accelerations, Velocities
+from scvi_codegen.methods.stage_system import Accelerations, Velocities
 from scvi_codegen.tables.basis import matrix_product, transpose
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 

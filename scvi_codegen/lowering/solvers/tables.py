@@ -30,8 +30,7 @@ from scvi_codegen.ir.program import ShiftTables
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.stage_structure import Velocities
-from scvi_codegen.methods.stage_system import Shape
+from scvi_codegen.methods.stage_system import Shape, Velocities
 from scvi_codegen.tables.basis import (
     continuation,
     extrapolation,

@@ -8,10 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 from sympy import Add, Expr, Matrix, S, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError, closest
-from scvi_codegen.formulas.array_entries import EntryRules, entry_names, formula_of_entries, known_array
-from scvi_codegen.formulas.rotations.arrays import torque_symbols
-from scvi_codegen.formulas.rotations.members import AXES, momenta_of
-from scvi_codegen.formulas.rotations.names import Forces, RotationNames
+from scvi_codegen.formulas.array_statements import EntryRules, entry_names, formula_of_entries, known_array
+from scvi_codegen.formulas.rotations import AXES, Forces, RotationNames, momenta_of, torque_symbols
 from scvi_codegen.formulas.symbols import number, symbol
 from scvi_codegen.indices import Array
 from scvi_codegen.mechanics.arrays.system import ArraySystem

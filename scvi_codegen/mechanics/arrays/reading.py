@@ -8,16 +8,22 @@ import numpy as np
 from sympy import Expr
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.array_notation import array_text
-from scvi_codegen.formulas.array_statements import parse_constraint, parse_force
+from scvi_codegen.formulas.array_statements import array_text, parse_constraint, parse_force
 from scvi_codegen.formulas.arrays import parse_array, parse_coordinate, parse_sums
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.neighbours import parse_neighbours
-from scvi_codegen.formulas.rotations.arrays import member_arrays, torque_components
+from scvi_codegen.formulas.rotations import member_arrays, torque_components
 from scvi_codegen.formulas.symbols import DOT, TIME, input_formulas, number, symbol, with_inputs
 from scvi_codegen.indices import Array
-from scvi_codegen.mechanics.arrays.system import ArrayHamiltonian, ArrayLagrangian, ArraySystem
-from scvi_codegen.mechanics.arrays.terms import friction, momenta_of, substituted, table_of
+from scvi_codegen.mechanics.arrays.system import (
+    ArrayHamiltonian,
+    ArrayLagrangian,
+    ArraySystem,
+    friction,
+    momenta_of,
+    substituted,
+    table_of,
+)
 from scvi_codegen.mechanics.forces import damping_rate
 
 LISTED = ("coordinates", "directions", "spins", "momenta", "constraints", "inputs", "tables", "point_forces")

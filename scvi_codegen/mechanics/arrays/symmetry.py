@@ -17,8 +17,7 @@ from scvi_codegen.formulas.array_statements import ArrayForce
 from scvi_codegen.formulas.expressions import Tape
 from scvi_codegen.formulas.symbols import DOT, symbol
 from scvi_codegen.indices import Access, Array, ArrayMap, Place, Size
-from scvi_codegen.mechanics.arrays.system import ArraySystem
-from scvi_codegen.mechanics.arrays.terms import force_of
+from scvi_codegen.mechanics.arrays.system import ArraySystem, force_of
 from scvi_codegen.tables.precision import mp
 
 SAMPLES = 4

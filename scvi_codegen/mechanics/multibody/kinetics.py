@@ -35,7 +35,7 @@ from sympy.integrals.manualintegrate import manualintegrate
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.expressions import jacobian, unsupported_part
-from scvi_codegen.formulas.rotations.names import RotationNames
+from scvi_codegen.formulas.rotations import RotationNames
 from scvi_codegen.mechanics.multibody.variables import Variables, samples
 from scvi_codegen.tables.precision import mp
 

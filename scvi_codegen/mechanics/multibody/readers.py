@@ -12,7 +12,7 @@ from sympy import Expr, Symbol
 from sympy.physics.mechanics import KanesMethod, LinearSpring, dynamicsymbols
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.rotations.members import Rotation
+from scvi_codegen.formulas.rotations import Rotation
 from scvi_codegen.mechanics.multibody.kinetics import (
     gyroscopic_forces,
     kinetic_energy,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from sympy import Expr, Matrix, sympify
 from sympy.physics.mechanics import RigidBody, SphericalJoint, Vector, dynamicsymbols
 
-from scvi_codegen.formulas.rotations.members import Rotation
+from scvi_codegen.formulas.rotations import Rotation
 from scvi_codegen.mechanics.multibody.kinetics import are_zero
 from scvi_codegen.mechanics.multibody.trees.tree import identifier
 from scvi_codegen.mechanics.multibody.variables import Variables

@@ -16,7 +16,7 @@ from sympy.core.function import AppliedUndef
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.expressions import Tape, evaluated, gradient, jacobian, unsupported_part
-from scvi_codegen.formulas.rotations.members import Rotation
+from scvi_codegen.formulas.rotations import Rotation
 from scvi_codegen.mechanics.derived_expressions import coupled_blocks, inverse_by_minors, row_rank
 from scvi_codegen.mechanics.rotations.points import torque_of
 from scvi_codegen.tables.precision import mp

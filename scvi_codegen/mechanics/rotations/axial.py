@@ -32,7 +32,7 @@ from sympy import Add, Expr, Quaternion, S, cos, expand, sin
 from sympy.core.function import AppliedUndef
 
 from scvi_codegen.formulas.intermediates import intermediate
-from scvi_codegen.formulas.rotations.members import Rotation
+from scvi_codegen.formulas.rotations import Rotation
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.arrays.symmetry import sums_to_zero
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem

@@ -1,6 +1,6 @@
 """Hamiltonian of a system with rotations whose mass matrix is constant.
 
-In the notation of :mod:`scvi_codegen.formulas.rotations.members`, with the velocities u = (x_dot, omega), their
+In the notation of :mod:`scvi_codegen.formulas.rotations`, with the velocities u = (x_dot, omega), their
 momenta mu = (p_x, E(q)^T p_q/2) and l = u^T M u/2 + b . u - V,
 
     H = (mu - b)^T M^-1 (mu - b)/2 + V(x, R2(q)/|q|^2, t).
@@ -16,7 +16,7 @@ import sympy
 from sympy import Add, Expr, Matrix, S, Symbol
 
 from scvi_codegen.formulas.expressions import gradient_tuple, hessian
-from scvi_codegen.formulas.rotations.names import RotationNames
+from scvi_codegen.formulas.rotations import RotationNames
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.derived_expressions import coupled_blocks, inverse_by_minors
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem

@@ -18,7 +18,7 @@ from sympy import Expr, Matrix, S, zeros
 from sympy.core.function import AppliedUndef
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.rotations.members import AXES, Direction, Homogeneous, Rotation, matrix_of, rates_matrix
+from scvi_codegen.formulas.rotations import AXES, Direction, Homogeneous, Rotation, matrix_of, rates_matrix
 from scvi_codegen.formulas.symbols import symbol
 
 KEYS = ("body", "point", "origin", "force", "frame")

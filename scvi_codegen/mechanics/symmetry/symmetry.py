@@ -51,11 +51,15 @@ from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.first_order import FirstOrderSystem, translations
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.symmetry.ansatz import (
+from scvi_codegen.mechanics.symmetry.invariants import (
+    Monomial,
+    Polynomial,
     Terms,
     bodies_of,
     boost_columns,
     combined,
+    confirmed,
+    conserved,
     independent,
     is_shift,
     monomial_columns,
@@ -64,7 +68,6 @@ from scvi_codegen.mechanics.symmetry.ansatz import (
     rigid_columns,
     rotation_columns,
 )
-from scvi_codegen.mechanics.symmetry.invariants import Monomial, Polynomial, confirmed, conserved
 from scvi_codegen.mechanics.symmetry.sampling import Rates, rates_of, terms_among_few_bodies
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.term_groups import roll_terms

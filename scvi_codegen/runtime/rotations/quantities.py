@@ -62,7 +62,7 @@ def values_by_name(interface: Interface, q: Array, p: Array, velocity: Array) ->
 
 
 def spins(q: Array, p: Array) -> Array:
-    """Return (.., 3) spins of (.., 2) canonical pairs (:class:`scvi_codegen.formulas.rotations.members.Spin`)."""
+    """Return (.., 3) spins of (.., 2) canonical pairs (:class:`scvi_codegen.formulas.rotations.Spin`)."""
     (a, b), (c, d) = np.moveaxis(q, -1, 0), np.moveaxis(p, -1, 0)
     return np.stack([(a * b + c * d) / 2, (a * d - b * c) / 2, (a * a + c * c - b * b - d * d) / 4], axis=-1)
 

@@ -24,7 +24,7 @@ from typing import Any
 from sympy import Add, Expr, Matrix, S, Symbol, eye, zeros
 
 from scvi_codegen.formulas.intermediates import intermediate
-from scvi_codegen.formulas.rotations.names import RotationNames
+from scvi_codegen.formulas.rotations import RotationNames
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.multibody.trees.energies import (
     Tree,

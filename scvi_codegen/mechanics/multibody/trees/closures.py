@@ -14,7 +14,7 @@ from sympy import Add, Dummy, Expr, Matrix, cos, eye, sin
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.expressions import gradient
 from scvi_codegen.formulas.intermediates import intermediate
-from scvi_codegen.formulas.rotations.names import RotationNames
+from scvi_codegen.formulas.rotations import RotationNames
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.multibody.trees.energies import (
     exact_matrix,

@@ -27,7 +27,7 @@ from sympy import Add, Expr, Matrix, Rational, S, cos, sin, zeros
 
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.intermediates import intermediate
-from scvi_codegen.formulas.rotations.members import Rotation
+from scvi_codegen.formulas.rotations import Rotation
 from scvi_codegen.formulas.symbols import DOT, symbol
 from scvi_codegen.mechanics.multibody.trees.tree import (
     SINGLE,

@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from scvi_codegen.errors import closest
-from scvi_codegen.formulas.rotations.members import matrix_of
+from scvi_codegen.formulas.rotations import matrix_of
 from scvi_codegen.mechanics.multibody.trees.closures import Closure, Coupling, at_reference
 from scvi_codegen.mechanics.multibody.trees.document import Element, Unread, root_of
 from scvi_codegen.mechanics.multibody.trees.schema import MJCF, TURN

@@ -1,1 +1,0 @@
-"""Rotations, directions and spins in formulas, as functions of homogeneous coordinates."""
