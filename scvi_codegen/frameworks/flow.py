@@ -1,6 +1,6 @@
 """Flow map: a number of steps as a differentiable function of (q, p, parameters, t, h), and its form for JAX.
 
-JAX calls the compiled C by XLA, PyTorch (:mod:`scvi_codegen.frameworks.torch_functions`) for many rows of numbers at
+JAX calls the compiled C by XLA, PyTorch (:mod:`scvi_codegen.frameworks.torch`) for many rows of numbers at
 once; both have JVP, VJP, second derivatives and batches.
 """
 

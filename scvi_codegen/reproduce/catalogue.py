@@ -1,6 +1,6 @@
 """Catalogue of all experiments by name, in the paper's order; ``claims``, which judges the others, is last."""
 
-from scvi_codegen.reproduce import claims, correction, figures, iterations, refinement_figures
+from scvi_codegen.reproduce import correction, experiment, iterations, refinement, runs
 
 ORDER = """
     figure-1 figure-3 figure-4 figure-5 figure-6 figure-7 figure-8
@@ -9,6 +9,6 @@ ORDER = """
     figure-21 figure-22 figure-23 figure-24 figure-25 figure-26 figure-27 figure-28 figure-29 figure-30
     correction claims
 """
-MODULES = (figures, refinement_figures, iterations, correction, claims)
-_BY_NAME = {experiment.name: experiment for module in MODULES for experiment in module.EXPERIMENTS}
+MODULES = (runs, refinement, iterations, correction, experiment)
+_BY_NAME = {each.name: each for module in MODULES for each in module.EXPERIMENTS}
 EXPERIMENTS = {name: _BY_NAME[name] for name in ORDER.split()}

@@ -8,7 +8,7 @@ import sympy
 from sabotage import Case, Make, Sabotage, changed_result
 
 from scvi_codegen.ir.kernel import Operation
-from scvi_codegen.methods import SVI, RungeKutta, shooting_stages
+from scvi_codegen.methods import SVI, RungeKutta, acceleration_stages
 from scvi_codegen.methods.stage_system import Table
 from scvi_codegen.tables.nodes import chebyshev_lobatto
 from scvi_codegen.tables.precision import mp
@@ -130,12 +130,12 @@ def of_another_system(original: Any) -> Any:
 
 def as_printed(sabotage: Sabotage) -> None:
     """The chain-rule term of the discrete Lagrangian lost everywhere, as in the paper."""
-    sabotage.replace(shooting_stages, "shooting_nodal", lambda _: shooting_stages.printed_nodal)
+    sabotage.replace(acceleration_stages, "shooting_nodal", lambda _: acceleration_stages.printed_nodal)
 
     def printed(system: Any, tableau: Any, rule: Any, **_: Any) -> Any:
-        return shooting_stages.printed_increments(system, tableau, rule, chebyshev_lobatto(len(tableau.b)))
+        return acceleration_stages.printed_increments(system, tableau, rule, chebyshev_lobatto(len(tableau.b)))
 
-    sabotage.replace(shooting_stages, "shooting_increments", lambda _: printed)
+    sabotage.replace(acceleration_stages, "shooting_increments", lambda _: printed)
 
 
 def power_rule_halved(original: Any) -> Any:

@@ -39,7 +39,7 @@ from scvi_codegen.lowering import stage_groups
 from scvi_codegen.lowering.solvers import curves, points
 from scvi_codegen.mechanics import derived_expressions as mechanics
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.methods import acceleration_stages, composition, leapfrog_stages, shooting_stages, stage_system
+from scvi_codegen.methods import acceleration_stages, composition, leapfrog_stages, stage_system
 from scvi_codegen.rendering.kernels import printer as c_printer
 from scvi_codegen.tables import quadrature, tableau
 from scvi_codegen.tables.precision import mp
@@ -296,7 +296,7 @@ MUTATIONS = (
     here(
         "the curve of the points 1e-8 off",
         case("double/scvi"),
-        shooting_stages,
+        acceleration_stages,
         "matrix_product",
         of_entries(lambda x: x * (1 + mp.mpf("1e-8"))),
     ),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scvi_codegen.methods import SVI, SpectralCollocation
-from scvi_codegen.reproduce import claims, iterations
+from scvi_codegen.reproduce import experiment, iterations
 from scvi_codegen.reproduce.catalogue import EXPERIMENTS
 from scvi_codegen.reproduce.experiment import Comparison, Result, Verdict, statement
 from scvi_codegen.reproduce.runs import KEPLER, perihelion, stepper_of
@@ -76,7 +76,7 @@ def test_claims_collect_checks():
         "table-8": result_with("table-8", ("stability", Verdict.FAILS), ("long-time", Verdict.HOLDS)),
         "figure-5": result_with("figure-5", ("long-time", Verdict.FAILS), ("order", Verdict.SHOWN)),
     }
-    verdicts = dict(zip(claims.CLAIMS, (c.verdict.value for c in claims.claims(results).checks), strict=True))
+    verdicts = dict(zip(experiment.CLAIMS, (c.verdict.value for c in experiment.claims(results).checks), strict=True))
     assert verdicts["accuracy"] == "holds"
     assert verdicts["stability"] == "does not hold"
     assert verdicts["long-time"] == "holds in part"
