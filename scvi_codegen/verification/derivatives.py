@@ -28,6 +28,8 @@ JACOBIAN_ROUNDOFF = 1e-12
 """Bound on the defect of J^T Omega J = Omega: round-off of an analytic derivative."""
 WIDTH = mp.mpf(10) ** -15
 """Relative perturbation of the arguments for differences in 60 digits."""
+LEAST = 1e-2
+"""Least derivative, in units of the scales, with which errors are compared; constraints may leave no motion at all."""
 MAX_HESSIAN_COORDINATES = 4
 """Largest number of coordinates for which second derivatives are compiled; it takes long for more."""
 
@@ -74,14 +76,14 @@ class _Map:
         result = self.propagated(direction, back=False)[self.outputs]
         ends = [self.moved_end(direction * (sign * WIDTH)) for sign in (1, -1)]
         exact = ((ends[0] - ends[1]) / (2 * WIDTH)).astype(float)
-        return float(np.abs((result - exact) / self.scales).max() / np.abs(exact / self.scales).max())
+        return float(np.abs((result - exact) / self.scales).max() / max(np.abs(exact / self.scales).max(), LEAST))
 
     def transpose_error(self) -> float:
         """Return the defect (J v, w) - (v, J^T w), where w weighs all components of the end alike."""
         v = self.direction()
         w = np.cos(2.0 + np.arange(len(v))) / np.abs(v)
         forward, back = (self.propagated(vector, back=which) for vector, which in ((v, False), (w, True)))
-        size = max(np.abs(forward * w).max(), np.abs(v * back).max())
+        size = max(np.abs(forward * w).max(), np.abs(v * back).max(), LEAST)
         return float(abs(forward @ w - v @ back) / size)
 
 
@@ -154,8 +156,8 @@ def _second(tested: SystemUnderTest) -> Finding | None:
     for sign, other in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
         total += sign * other * mp.fdot(weights, step.moved_end((sign * u + other * v) * WIDTH))
     exact = float(total / (4 * WIDTH**2))
-    size = np.abs(u) @ np.abs(hessian) @ np.abs(v)
-    return Finding(float(abs(u @ hessian @ v - exact) / size) if size else 0.0, BOUND, "relative, along two directions")
+    size = max(float(np.abs(u) @ np.abs(hessian) @ np.abs(v)), LEAST)
+    return Finding(float(abs(u @ hessian @ v - exact) / size), BOUND, "relative, along two directions")
 
 
 def _symmetry(tested: SystemUnderTest) -> Finding | None:
@@ -165,9 +167,8 @@ def _symmetry(tested: SystemUnderTest) -> Finding | None:
     step = _map_of(tested, tested.stepper)
     sizes = np.abs(step.direction())
     hessian = _hessian(step) * np.outer(sizes, sizes)
-    return Finding(
-        float(np.abs(hessian - hessian.T).max() / (np.abs(hessian).max() or 1.0)), BOUND, "relative, all entries"
-    )
+    largest = max(float(np.abs(hessian).max()), LEAST)
+    return Finding(float(np.abs(hessian - hessian.T).max()) / largest, BOUND, "relative, all entries")
 
 
 def _has_second_derivatives(tested: SystemUnderTest) -> bool:

@@ -80,6 +80,8 @@ WIDTH = 1e-5
 PERTURBATION, PERTURBATIONS = 0.05, 6
 """Perturbation of the initial state relative to its size; divided by 4 up to six times until a step succeeds."""
 PARAMETER_PERTURBATION = 0.05
+AT_REST = 1e-12
+"""Displacement in a step, relative to the coordinates, below which velocities are taken as rounding errors."""
 STEPS_BETWEEN = 5
 """Number of steps from the first state to the second."""
 MAX_COORDINATES = 12
@@ -252,23 +254,36 @@ class SystemUnderTest:
         """Return (2m,) the size of q and of p: of the state or, if larger, of its change in a step.
 
         All coordinates have the same size. The size of a momentum is its change for a common change of the velocities,
-        whatever its mass.
+        whatever its mass. Sizes are at least those of the initial state, in place of which 0 has size 1.
         """
+        return np.maximum(self._sizes(state), self._initial_sizes)
+
+    @cached_property
+    def _initial_sizes(self) -> Array:
+        return self._sizes(self.initial)
+
+    def _sizes(self, state: State) -> Array:
         m = len(state.q)
         try:
             end = np.concatenate(self.stepper.step(state.q, state.p, state.h, state.t, self.stepper.defaults))
         except StepFailedError:
             end = state.z
+        if not state.z.any() and len(self.system.constraints) >= m:  # prescribed: changes are rounding errors
+            end = state.z
         change = end - state.z
         sizes = [max(_rms(state.z[part]), _rms(change[part])) or 1.0 for part in (slice(m), slice(m, None))]
-        return np.concatenate([np.full(m, sizes[0]), self._momentum_sizes(state, sizes[1])])
+        return np.concatenate([np.full(m, sizes[0]), self._momentum_sizes(state, end, *sizes)])
 
-    def _momentum_sizes(self, state: State, size: float) -> Array:
-        """Return (m,) changes of the momenta for a change of velocity by its mean; ``size`` for those without."""
+    def _momentum_sizes(self, state: State, end: Array, length: float, size: float) -> Array:
+        """Return (m,) changes of the momenta for a change of velocity by its mean; ``size`` for those without.
+
+        In equilibrium, where velocities are rounding errors of forces that cancel, the mean is 1.
+        """
         m = len(state.q)
         try:
-            v = self.stepper.velocity(state.q, state.p, state.t)
-            moved = 0.1 * (_rms(v) or 1.0) * np.eye(m)
+            v, after = (self.stepper.velocity(q, p, state.t) for q, p in ((state.q, state.p), (end[:m], end[m:])))
+            speed = max(_rms(v), _rms(after - v))
+            moved = 0.1 * (speed if speed * abs(state.h) > AT_REST * length else 1.0) * np.eye(m)
             changes = [self.stepper.momentum(state.q, v + unit, state.t) - state.p for unit in moved]
         except StateError:
             return np.full(m, size)
@@ -285,7 +300,11 @@ class SystemUnderTest:
         return linearised(step, state.z, self.scales(state))
 
     def rounding(self, state: State) -> Array:
-        """Return (2m,) bounds on the change of the end by one rounding of each number that enters a step."""
+        """Return (2m,) bounds on the change of the end by one rounding of each number that enters a step.
+
+        The least is one rounding of the size of all coordinates, and of all momenta: where terms cancel, as impulses
+        and reactions at a pinned coordinate, the end is their rounding error whatever the derivatives of the step.
+        """
         end, around = self.ends(state), self.linearised(state)
         propagated = np.abs(state.z) if around is None else around.propagated(state.z)
         time_change = 1e-6 * state.h
@@ -293,8 +312,16 @@ class SystemUnderTest:
         drift = np.abs(later - end) / abs(time_change) * (abs(state.t) + abs(state.h))
         longer = self.ends(State(state.q, state.p, state.t, state.h + time_change))
         step_change = np.abs(longer - end) / abs(time_change) * abs(state.h)
-        total: Array = EPSILON * (propagated + np.abs(end) + np.abs(end - state.z) + drift + step_change)
-        return total + np.finfo(float).tiny
+        total = propagated + np.abs(end) + np.abs(end - state.z) + drift + step_change
+        result: Array = EPSILON * np.maximum(total, self._least_sizes(state, end)) + np.finfo(float).tiny
+        return result
+
+    def _least_sizes(self, state: State, end: Array) -> Array:
+        """Return (2m,) :meth:`scales`, increased to the largest change relative to them."""
+        sizes = self.scales(state)
+        relative = (np.abs(end - state.z) / sizes).reshape(2, -1).max(axis=1, initial=1.0)
+        least: Array = sizes * np.repeat(relative, len(state.q))
+        return least
 
     def derived(self, method: Method | None = None, system: MechanicalSystem | None = None) -> DerivedStep:
         """Return the equations of the step in 60 digits, optionally of another method or system.

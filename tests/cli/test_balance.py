@@ -77,12 +77,13 @@ def test_conservative_systems_have_no_balance(changed):
     assert found["energy_balance"] is None
 
 
-def test_many_coordinates_have_no_balance_unless_it_is_asked_for():
+@pytest.mark.parametrize("sizes", [{"N": MOST_BALANCED_COORDINATES + 1}, None])
+def test_many_coordinates_have_no_balance_unless_it_is_asked_for(sizes):
     system = LagrangianSystem.from_text(
         "chain", ["q[N]"], "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)", dissipation="sum(i in N, q_dot[i]**2/20)"
     )
-    stepper = compile_stepper(system, "svi:3", sizes={"N": MOST_BALANCED_COORDINATES + 1})
-    run = stepper.integrate({"q": [1.0] * stepper.dimension}, {"q": [0.0] * stepper.dimension}, h=0.1, steps=20)
+    stepper, n = compile_stepper(system, "svi:3", sizes=sizes), MOST_BALANCED_COORDINATES + 1
+    run = stepper.integrate({"q": [1.0] * n}, {"q": [0.0] * n}, h=0.1, steps=20)
     assert energy_account(run, limited=True).title == "energy change |E - E0|: forces act"
     assert energy_account(run).title == "energy balance |E - E0 - W| / |E0|"
     assert run.energy_error() < 1e-7 < 0.1 < abs(run.energy() - run.energy()[0]).max()

@@ -31,7 +31,7 @@ def work_and_impulses_until(states: SavedStates) -> Array:
         StepFailedError: if Newton's iteration does not converge.
     """
     stepper = states.stepper
-    total = np.zeros((len(states), max(1, len(stepper.interface.exchange_names))))
+    values = [np.zeros(1)]  # of the first state; the number of impulses of arrays is known after a step
     step = partial(stepper.work_and_impulses, parameters=states.parameters, options=states.options)
     ends = np.concatenate([states.q, states.p], axis=1)
     for crossings, rows in changes_by_events(states):
@@ -41,13 +41,15 @@ def work_and_impulses_until(states: SavedStates) -> Array:
         zip(states.t[:-1].tolist(), states.step_sizes[:-1].tolist(), spans, strict=True)
     ):
         count, q, p = steps_between(length, span), states.q[k], states.p[k]
-        total[k + 1] = total[k]
+        total = values[-1]
         for j in range(count):
             q, p, output = step(q, p, length if count > 1 else span, start + j * length)
-            total[k + 1] += output
+            total = total + output
+        values.append(total)
         recomputed = np.concatenate([q, p])[np.newaxis]
         check_recomputed(states.t[k : k + 1], recomputed, ends[k + 1 : k + 2], ends[k : k + 1])
-    return total
+    values[0] = np.zeros_like(values[-1])
+    return np.array(values)
 
 
 def changes_by_events(states: SavedStates) -> Iterator[tuple[Crossings, NDArray[np.intp]]]:

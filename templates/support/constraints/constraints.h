@@ -17,7 +17,7 @@
 #define SETTLED_UPDATE REAL(1e-9)
 /* relative to the state: accepted size of the last update where rounding prevents a smaller residual */
 #define ACCEPTED_UPDATE REAL(1e-6)
-#define ROUNDED_UPDATE (1024 * REAL_EPSILON) /* near q = 0, where a relative distance is undefined */
+#define ROUNDED_UPDATE (1024 * REAL_EPSILON) /* near q = 0 or at rest, where a relative distance is undefined */
 #define BEYOND REAL(1e6) /* times an update: where g is still linear, rounding limits |g| */
 #define SLOW REAL(0.01) /* reduction of |g|^2 by an update that indicates rounding */
 
@@ -235,11 +235,12 @@ int NAME(apart)(real t, const real *q0, const real *p0, const real *q1, const re
     real *apart, real *workspace)
 {
   const real still[M] = {0};
-  real u[2 * M], x[2][M], y[2][M], p[M], mass[MASS_ENTRIES];
+  real u[2 * M], velocity[M], x[2][M], y[2][M], p[M], mass[MASS_ENTRIES];
   int status = NAME(velocity)(t, q1, p0, parameters, y[0], workspace);
   if (status == OK)
     status = NAME(velocity)(t, q1, p1, parameters, y[1], workspace);
   memcpy(u, q1, sizeof(real) * M);
+  memcpy(velocity, y[0], sizeof velocity);
   memcpy(u + M, y[1], sizeof y[1]);
   if (status == OK)
     status = NAME(velocity)(t, q1, still, parameters, p, workspace);
@@ -258,10 +259,14 @@ int NAME(apart)(real t, const real *q0, const real *p0, const real *q1, const re
   times_mass(mass, x[0], y[0]);
   times_mass(mass, x[1], y[1]);
   apart[0] = part_of(x, y);
-  for (int i = 0; i < M; i++)
+  for (int i = 0; i < M; i++) {
     p[i] = q1[i] - q0[i];
+    velocity[i] -= u[M + i];
+  }
   if (largest_of(p) <= ROUNDED_UPDATE && apart[0] > ACCEPTED_UPDATE)
     apart[0] = ACCEPTED_UPDATE;
+  if (largest_of(velocity) <= ROUNDED_UPDATE && apart[1] > ACCEPTED_UPDATE)
+    apart[1] = ACCEPTED_UPDATE;
   return all_finite(apart, 2) ? OK : NOT_FINITE;
 }
 

@@ -146,14 +146,27 @@ static void positions_by(const step_data *step, const real *z, real *u)
   }
 }
 
+/* Sizes of the terms of the displacements: forces and reactions cancel at a pinned coordinate, which may be 0. */
+static void term_sizes(const step_data *step, const rattle_step *now, real *size)
+{
+  for (int i = 0; i < M; i++)
+    size[i] = MATH(fabs)(now->force[i * B]);
+  for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+    size[CONSTRAINT_ENTRY[e][1]] +=
+        MATH(fabs)(now->derivative[e * B] * now->lambda[CONSTRAINT_ENTRY[e][0] * DEGREE]);
+  for (int i = 0; i < M; i++)
+    size[i] = MATH(fabs)(step->q0[i]) +
+        MATH(fabs)(step->h * now->inverse_mass[i]) * (MATH(fabs)(step->p0[i]) + MATH(fabs)(step->h) * size[i]);
+}
+
 /* u += change; returns its size. */
 static movement move(const step_data *step, rattle_step *now, const real *change)
 {
   movement moved = no_movement();
   real most[M], size[M];
+  term_sizes(step, now, size);
   for (int i = 0; i < M; i++) {
     most[i] = 0;
-    size[i] = MATH(fabs)(step->q0[i]) + MATH(fabs)(step->h * step->p0[i] * now->inverse_mass[i]);
     for (int r = 0; r < DEGREE; r++) {
       now->u[i * DEGREE + r] += change[i * DEGREE + r];
       most[i] = larger(most[i], MATH(fabs)(change[i * DEGREE + r]));
