@@ -3,6 +3,8 @@
 The other side of each identity is the oracle, or a stepper compiled from another stage system.
 """
 
+from itertools import combinations
+
 import numpy as np
 import oracle
 import pytest
@@ -22,129 +24,132 @@ from scvi_codegen.methods import (
 
 H, T = 0.13, 0.4
 ROUND_OFF = 2e-14
-ANY = ("kepler", "double-pendulum", "charged-particle", "pumped-cart-pole", "relativistic-particle")
-SOME = ("kepler", "pumped-cart-pole", "relativistic-particle")
 CONSTANT_MASS = ("kepler", "driven-duffing")
+SOME = ("kepler", "pumped-cart-pole", "relativistic-particle")
+ANY = (*SOME, "double-pendulum", "charged-particle")
+FAMILIES = ("chebyshev-lobatto", "legendre-lobatto", "equispaced")
 
 
 def distance(left, right):
     return np.abs(np.array(left) - np.array(right)).max()
 
 
-def oracle_map(sample, name, function, h=H, **arguments):
-    case = sample(name)
-    q, p = map(oracle.numbers, case.state)
-    return np.array(function(case.mechanics, oracle.mp.mpf(T), q, p, oracle.mp.mpf(h), **arguments)).astype(float)
+def by_oracle(function, **arguments):
+    """A step of the oracle, as a function of a sample."""
+
+    def step(case):
+        q, p = map(oracle.numbers, case.state)
+        return np.array(function(case.mechanics, oracle.mp.mpf(T), q, p, oracle.mp.mpf(H), **arguments)).astype(float)
+
+    return step
 
 
-def compiled_map(sample, compiled, name, method, h=H):
-    return np.array(compiled(name, method).step(*sample(name).state, h, T))
-
-
-# 1. SVI depends on degree and quadrature only.
-
-
-@pytest.mark.sampled(3)
-@pytest.mark.parametrize("name", ANY)
-def test_svi_does_not_depend_on_its_nodes(sample, compiled, name):
+def galerkin(nodes):
     c, w = oracle.rule("gauss-legendre:4")
+    return by_oracle(oracle.svi, nodes=nodes, c=c, w=w)
+
+
+def shooting(function, quadrature):
+    c, w = oracle.rule(quadrature)
+    return by_oracle(function, nodes=oracle.points("chebyshev-lobatto", 2), c=c, w=w)
+
+
+def collocation(c, function=oracle.runge_kutta):
+    return by_oracle(function, **oracle.collocation_tableau(c))
+
+
+def lobatto_pair(s):
+    return by_oracle(oracle.partitioned, **oracle.lobatto_pair(s))
+
+
+def later_nodes(s, form, nodal, stages):
+    """Spectral collocation is collocation Runge-Kutta on all nodes but the first."""
+    nodes = oracle.points("chebyshev-lobatto", s + 1)
+    return SpectralCollocation(s, form=form), by_oracle(nodal, nodes=nodes), collocation(nodes[1:], stages)
+
+
+def same_maps():
+    """Systems and methods of one map, by name; each kind of SVI depends on degree and quadrature only."""
     node_sets = [oracle.points(family, 4) for family in ("chebyshev-lobatto", "lobatto", "equispaced")]
-    node_sets.append(oracle.numbers([0, 0.2, 0.3, 1]))
-    found = [
-        *(oracle_map(sample, name, oracle.svi, nodes=nodes, c=c, w=w) for nodes in node_sets),
-        *(
-            compiled_map(sample, compiled, name, SVI(3, "gauss-legendre:4", nodes))
-            for nodes in ("chebyshev-lobatto", "legendre-lobatto", "equispaced")
-        ),
-    ]
-    assert max(distance(one, found[0]) for one in found) < ROUND_OFF
+    galerkins = map(galerkin, [*node_sets, oracle.numbers([0, 0.2, 0.3, 1])])
+    yield "svi on any nodes", ANY, (*(SVI(3, "gauss-legendre:4", nodes) for nodes in FAMILIES), *galerkins)
+    for s in (1, 2, 4):  # floats of Gauss's abscissae change the map by less than round-off
+        c = oracle.points("gauss", s)
+        yield f"svi:{s} is gauss:{s}", SOME, (SVI(s), Gauss(s), CollocationRK(c.astype(float).tolist()), collocation(c))
+    for s in (2, 3, 4):
+        yield f"svi:{s} with {s} lobatto points", SOME, (SVI(s, f"gauss-lobatto:{s}"), lobatto_pair(s))
+        yield f"scvi:{s} on gauss points", CONSTANT_MASS, (SCVI(s, abscissae="gauss"), SVI(s))
+    for s in (1, 2, 3):
+        more = SVI(s, f"gauss-lobatto:{s + 1}"), lobatto_pair(s + 1)
+        yield f"svi:{s} with {s + 1} lobatto points", CONSTANT_MASS + ("relativistic-particle",) * (s == 1), more
+        yield (
+            f"sc:{s} by positions",
+            SOME[:2],
+            later_nodes(s, "position", oracle.sc_position, oracle.runge_kutta_position),
+        )
+        yield (
+            f"sc:{s} in phase space",
+            SOME[:2],
+            later_nodes(s, "phase-space", oracle.sc_phase_space, oracle.runge_kutta),
+        )
+    yield "leapfrog", CONSTANT_MASS, (SVI(1, "gauss-lobatto:2"), StoermerVerlet(), by_oracle(oracle.leapfrog))
+    for rule in ("gauss-legendre:1", "gauss-lobatto:2"):  # with two nodes
+        oracles = (shooting(function, rule) for function in (oracle.scvi, oracle.scvi_printed))
+        yield f"scvi:1 with {rule}", SOME, (SVI(1, rule), SCVI(1, rule), SCVI(1, rule, variational=False), *oracles)
+    abscissae = [(1 + x) / 2 for x in SCVI(3).node_set.points[1:]]
+    yield "scvi:3 on its abscissae", SOME, (SCVI(3), SCVI(3, abscissae=abscissae))
+    for one in FORMS:
+        yield f"{one[0].name} of a constant mass", ("kepler",), one
 
 
-def test_scvi_and_collocation_do_depend_on_their_nodes(sample, compiled):
+FORMS = (
+    (SpectralCollocation(2), SpectralCollocation(2, form="phase-space")),
+    (LobattoIIIA(3, form="position"), LobattoIIIA(3)),
+    (RadauIIA(2, form="position"), RadauIIA(2)),
+)
+"""Equations of positions and of phase space: of a vector potential p is no constant multiple of v."""
+
+
+def different_maps():
+    """Systems, methods, no two of which are the same map, and their least distance."""
     for family in (SCVI, SpectralCollocation):
-        maps = [
-            compiled_map(sample, compiled, "kepler", family(3, nodes=nodes))
-            for nodes in ("chebyshev-lobatto", "legendre-lobatto", "equispaced")
-        ]
-        assert min(distance(maps[0], maps[1]), distance(maps[0], maps[2])) > 1e-11
-
-
-# 2. SVI with s Gauss points is Gauss collocation.
-
-
-@pytest.mark.covering
-@pytest.mark.parametrize("name", SOME)
-@pytest.mark.parametrize("s", [1, 2, 4])
-def test_svi_with_as_many_gauss_points_as_its_degree_is_gauss_collocation(sample, compiled, name, s):
-    """Three ways: Galerkin, the oracle's tableau, and general collocation on abscissae that only a reader knows to be
-    Gauss's (rounded to floats, which changes the map by less than round-off)."""
-    svi = compiled_map(sample, compiled, name, SVI(s))
-    c = oracle.points("gauss", s)
-    expected = oracle_map(sample, name, oracle.runge_kutta, **oracle.collocation_tableau(c))
-    assert distance(svi, expected) < ROUND_OFF
-    assert distance(compiled_map(sample, compiled, name, Gauss(s)), expected) < ROUND_OFF
-    assert distance(compiled_map(sample, compiled, name, CollocationRK(c.astype(float).tolist())), expected) < ROUND_OFF
-
-
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize("name", ANY)
-def test_additional_gauss_point_changes_the_map(sample, compiled, name):
-    two, three = (compiled_map(sample, compiled, name, SVI(2, f"gauss-legendre:{g}")) for g in (2, 3))
-    assert distance(two, three) > 1e-9
-
-
-# 3. SVI with Lobatto points and the Lobatto IIIA-IIIB pairs.
-
-
-@pytest.mark.covering
-@pytest.mark.parametrize("name", SOME)
-@pytest.mark.parametrize("s", [2, 3, 4])
-def test_svi_with_as_many_lobatto_points_as_its_degree_is_the_lobatto_pair(sample, compiled, name, s):
-    expected = oracle_map(sample, name, oracle.partitioned, **oracle.lobatto_pair(s))
-    assert distance(compiled_map(sample, compiled, name, SVI(s, f"gauss-lobatto:{s}")), expected) < ROUND_OFF
-
-
-@pytest.mark.covering
-@pytest.mark.parametrize("name", CONSTANT_MASS)
-@pytest.mark.parametrize("s", [1, 2, 3])
-def test_constant_mass_additional_lobatto_point_is_the_next_pair(sample, compiled, name, s):
-    expected = oracle_map(sample, name, oracle.partitioned, **oracle.lobatto_pair(s + 1))
-    assert distance(compiled_map(sample, compiled, name, SVI(s, f"gauss-lobatto:{s + 1}")), expected) < ROUND_OFF
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("name", ["double-pendulum", "charged-particle", "pumped-cart-pole"])
-def test_other_lagrangians_additional_lobatto_point_is_not_the_next_pair(sample, compiled, name):
-    differences = [
-        distance(
-            compiled_map(sample, compiled, name, SVI(s, f"gauss-lobatto:{s + 1}")),
-            oracle_map(sample, name, oracle.partitioned, **oracle.lobatto_pair(s + 1)),
+        yield (
+            f"{family.__name__} on other nodes",
+            ("kepler",),
+            1e-11,
+            [family(3, nodes=nodes) for nodes in FAMILIES[:2]],
         )
-        for s in (1, 2, 3)
-    ]
-    assert differences[0] > 1e-5
-    assert differences[0] > differences[1] > differences[2] > 1e-12
+        yield f"{family.__name__} on equal ones", ("kepler",), 1e-11, [family(3, nodes=x) for x in FAMILIES[::2]]
+    yield "a further gauss point", ANY, 1e-9, [SVI(2, f"gauss-legendre:{g}") for g in (2, 3)]
+    for s, least in ((1, 1e-5), (2, 1e-9), (3, 1e-12)):
+        yield f"svi:{s} of variable masses", ANY[3:], least, (SVI(s, f"gauss-lobatto:{s + 1}"), lobatto_pair(s + 1))
+    more = SVI(2, "gauss-lobatto:3"), lobatto_pair(3)  # of L = T(v) - V(q), two velocities make a difference
+    yield "svi:2 of a kinetic energy that is not quadratic", ("relativistic-particle",), 1e-8, more
+    three = [method(2, "gauss-legendre:3") for method in (SVI, SCVI)]
+    yield "three nodes", ("kepler",), 1e-8, [*three, SCVI(2, "gauss-legendre:3", variational=False)]
+    yield "scvi collocates second-order equations", ("double-pendulum",), 1e-7, (SCVI(2, abscissae="gauss"), SVI(2))
+    for one in FORMS:
+        yield f"{one[0].name} of a vector potential", ("charged-particle",), 1e-9, one
 
 
-def test_nonquadratic_kinetic_energy_distinguishes_methods_from_degree_two(sample, compiled):
-    """For L = T(v) - V(q) the single velocity of degree 1 makes no difference; two velocities do."""
-    name = "relativistic-particle"
-    one, two = (
-        distance(
-            compiled_map(sample, compiled, name, SVI(s, f"gauss-lobatto:{s + 1}")),
-            oracle_map(sample, name, oracle.partitioned, **oracle.lobatto_pair(s + 1)),
-        )
-        for s in (1, 2)
-    )
-    assert one < ROUND_OFF
-    assert two > 1e-8
+CASES = [(name, system, ways, None) for name, systems, ways in same_maps() for system in systems]
+CASES += [(name, system, ways, least) for name, systems, least, ways in different_maps() for system in systems]
 
 
-@pytest.mark.parametrize("name", CONSTANT_MASS)
-def test_svi_of_degree_one_with_the_trapezoidal_rule_is_leapfrog(sample, compiled, name):
-    expected = oracle_map(sample, name, oracle.leapfrog)
-    assert distance(compiled_map(sample, compiled, name, SVI(1, "gauss-lobatto:2")), expected) < ROUND_OFF
-    assert distance(compiled_map(sample, compiled, name, StoermerVerlet()), expected) < ROUND_OFF
+@pytest.mark.parametrize(
+    ("name", "system", "ways", "least"),
+    [
+        pytest.param(*case, id=f"{case[0]}-{case[1]}", marks=[] if case[0] != before else pytest.mark.full)
+        for case, (before, *_) in zip(CASES, [("",), *CASES], strict=False)
+    ],
+)
+def test_methods_are_one_map_or_different_ones(sample, compiled, name, system, ways, least):
+    case = sample(system)
+    maps = [way(case) if callable(way) else compiled(system, way).step(*case.state, H, T) for way in ways]
+    if least is None:
+        assert max(distance(maps[0], each) for each in maps[1:]) < ROUND_OFF
+    else:
+        assert min(distance(*each) for each in combinations(maps, 2)) > least
 
 
 @pytest.mark.parametrize("name", ANY)
@@ -156,88 +161,6 @@ def test_svi_of_degree_one_with_one_gauss_point_is_the_midpoint_rule(sample, com
     middle = [oracle.numbers([T + H / 2]), oracle.numbers([(q + q1) / 2]), oracle.numbers([(q1 - q) / H])]
     assert distance(case.mechanics.momentum(*middle)[0].astype(float), (p + p1) / 2) < ROUND_OFF
     assert distance(case.mechanics.force(*middle)[0].astype(float), (p1 - p) / H) < 10 * ROUND_OFF  # divided by H
-
-
-# 4. With two nodes the shooting methods are the Galerkin one.
-
-
-@pytest.mark.covering
-@pytest.mark.parametrize("name", SOME)
-@pytest.mark.parametrize("quadrature", ["gauss-legendre:1", "gauss-lobatto:2"])
-def test_scvi_of_degree_one_is_svi_of_degree_one(sample, compiled, name, quadrature):
-    c, w = oracle.rule(quadrature)
-    two = oracle.points("chebyshev-lobatto", 2)
-    svi = compiled_map(sample, compiled, name, SVI(1, quadrature))
-    for function in (oracle.scvi, oracle.scvi_printed):
-        assert distance(oracle_map(sample, name, function, nodes=two, c=c, w=w), svi) < ROUND_OFF
-    for variational in (True, False):
-        scvi = compiled_map(sample, compiled, name, SCVI(1, quadrature, variational=variational))
-        assert distance(scvi, svi) < ROUND_OFF
-
-
-def test_three_nodes_give_three_maps(sample, compiled):
-    methods = SVI(2, "gauss-legendre:3"), SCVI(2, "gauss-legendre:3"), SCVI(2, "gauss-legendre:3", variational=False)
-    svi, scvi, printed = (compiled_map(sample, compiled, "kepler", method) for method in methods)
-    assert min(distance(svi, scvi), distance(svi, printed), distance(scvi, printed)) > 1e-8
-
-
-# 5. Spectral collocation is collocation Runge-Kutta.
-
-
-@pytest.mark.covering
-@pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole"])
-@pytest.mark.parametrize("s", [1, 2, 3])
-@pytest.mark.parametrize("form", ["position", "phase-space"])
-def test_spectral_collocation_is_collocation_runge_kutta_on_its_later_nodes(sample, compiled, name, s, form):
-    nodes = oracle.points("chebyshev-lobatto", s + 1)
-    nodal, stages = {
-        "position": (oracle.sc_position, oracle.runge_kutta_position),
-        "phase-space": (oracle.sc_phase_space, oracle.runge_kutta),
-    }[form]
-    by_nodes = oracle_map(sample, name, nodal, nodes=nodes)
-    by_stages = oracle_map(sample, name, stages, **oracle.collocation_tableau(nodes[1:]))
-    assert distance(by_nodes, by_stages) < 1e-15
-    assert distance(compiled_map(sample, compiled, name, SpectralCollocation(s, form=form)), by_nodes) < ROUND_OFF
-
-
-@pytest.mark.full
-@pytest.mark.parametrize(("name", "same"), [("kepler", True), ("charged-particle", False)])
-def test_position_and_phase_space_form_agree_only_for_constant_mass(sample, compiled, name, same):
-    """A vector potential is enough to part them: p is not a constant multiple of v."""
-    for one, other in (
-        (SpectralCollocation(2), SpectralCollocation(2, form="phase-space")),
-        (LobattoIIIA(3, form="position"), LobattoIIIA(3)),
-        (RadauIIA(2, form="position"), RadauIIA(2)),
-    ):
-        difference = distance(compiled_map(sample, compiled, name, one), compiled_map(sample, compiled, name, other))
-        assert difference < ROUND_OFF if same else difference > 1e-9
-
-
-# 6. SCVI on abscissae.
-
-
-@pytest.mark.parametrize("name", SOME)
-def test_the_abscissae_of_nodes_give_the_scvi_on_those_nodes(sample, compiled, name):
-    nodes = SCVI(3)
-    abscissae = SCVI(3, abscissae=[(1 + x) / 2 for x in nodes.node_set.points[1:]])
-    maps = [compiled_map(sample, compiled, name, method) for method in (nodes, abscissae)]
-    assert distance(*maps) < 1e-15
-
-
-@pytest.mark.covering
-@pytest.mark.parametrize("s", [2, 3, 4])
-@pytest.mark.parametrize("name", CONSTANT_MASS)
-def test_constant_mass_scvi_on_gauss_points_is_svi(sample, compiled, name, s):
-    maps = [compiled_map(sample, compiled, name, method) for method in (SCVI(s, abscissae="gauss"), SVI(s))]
-    assert distance(*maps) < ROUND_OFF
-
-
-def test_variable_mass_scvi_on_gauss_points_is_not_svi(sample, compiled):
-    """SCVI collocates the second-order equations, Gauss methods the first-order equations."""
-    maps = [
-        compiled_map(sample, compiled, "double-pendulum", method) for method in (SCVI(2, abscissae="gauss"), SVI(2))
-    ]
-    assert distance(*maps) > 1e-7
 
 
 @pytest.mark.parametrize(
@@ -253,9 +176,6 @@ def test_variable_mass_scvi_on_gauss_points_is_not_svi(sample, compiled):
 def test_invalid_abscissae_are_rejected(arguments, message):
     with pytest.raises(MethodError, match=message):
         SCVI(3, **arguments)
-
-
-# 7. Total time derivatives.
 
 
 def with_gauge(name, order):

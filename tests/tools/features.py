@@ -86,21 +86,9 @@ class Kind:
         return sc.load_model(path)
 
 
-def scvi(of: Kind, _: Path) -> Any:
-    return of.run(of.compiled(of.system(), "scvi:2"))
-
-
-def splittings(of: Kind, _: Path) -> Any:
-    return of.run(of.compiled(of.system(), "stoermer-verlet")), of.compiled(of.system(), "composition:8")
-
-
 def hamiltonians(of: Kind, _: Path) -> Any:
     text = f"p_x**2/2 + {of.sum('p_y**2/2 + p_z**2/2 + y**2 + z**2', 'p_q[i]**2/2 + q[i]**2')} + x**4"
     return of.run(of.compiled(sc.HamiltonianSystem.from_text("bodies", of.coordinates, text)))
-
-
-def full_masses(of: Kind, _: Path) -> Any:
-    return of.run(of.compiled(of.system(kinetic=f" + {of.sum('x_dot*y_dot/9', 'x_dot*q_dot[i]/9')}")))
 
 
 def forces(of: Kind, _: Path) -> Any:
@@ -120,10 +108,6 @@ def first_order(of: Kind, _: Path) -> Any:
     return run
 
 
-def damping(of: Kind, _: Path) -> Any:
-    return of.run(of.compiled(of.system(damping=0.1)))
-
-
 def holonomic(of: Kind, _: Path) -> Any:
     system = of.system(constraints=[f"{of.first} - x = -0.2"])
     return of.run(of.compiled(system, "stoermer-verlet" if of.run_time else sc.SVI(1, "gauss-lobatto:2")))
@@ -139,25 +123,9 @@ def inputs(of: Kind, _: Path) -> Any:
     return of.run(stepper, inputs={"u": ([0.0, 1.0], [0.0, 1.0])})
 
 
-def adaptive(of: Kind, _: Path) -> Any:
-    return of.stepper().integrate(of.q, of.p, t_end=1.0)
-
-
 def time_transformation(of: Kind, _: Path) -> Any:
     stepper = of.compiled(of.system(), time_transformation="1/(1 + x**2)")
     return stepper.integrate(of.q, of.p, h=0.1, t_end=1.0)
-
-
-def t_eval(of: Kind, _: Path) -> Any:
-    return of.run(t_eval=[0.05, 0.3])
-
-
-def dense_output(of: Kind, _: Path) -> Any:
-    return of.run().at([0.05, 0.3])
-
-
-def events(of: Kind, _: Path) -> Any:
-    return of.run(events="x - 0.25")
 
 
 def changing_events(of: Kind, _: Path) -> Any:
@@ -171,10 +139,6 @@ def ensembles(of: Kind, _: Path) -> Any:
     return of.stepper().integrate_ensemble(starts, np.zeros((2, 3)), h=0.1, steps=3)
 
 
-def threads(of: Kind, _: Path) -> Any:
-    return of.run(threads=2)
-
-
 def neighbours(of: Kind, _: Path) -> Any:
     near = {"near": {"of": of.first.removesuffix("[0]"), "cutoff": 0.5}}
     system = of.system(neighbours=near, kinetic=" - sum(i < j in near, (q[i] - q[j])**4)")
@@ -184,14 +148,6 @@ def neighbours(of: Kind, _: Path) -> Any:
 def other_sizes(of: Kind, _: Path) -> Any:
     q = {"x": 0.0, "q": [0.1, 0.2, 0.3]} if not of.named else [0.0, 0.1, 0.2, 0.3]
     return of.stepper().integrate(q, q, h=0.1, steps=1)
-
-
-def observe(of: Kind, _: Path) -> Any:
-    return of.run(observe=lambda run: run.energy)
-
-
-def tangent(of: Kind, _: Path) -> Any:
-    return of.stepper().jacobian(*of.flat(), 0.1)
 
 
 def adjoint(of: Kind, _: Path) -> Any:
@@ -204,10 +160,6 @@ def hessian_products(of: Kind, _: Path) -> Any:
     return run.hessian_product(np.ones((len(run.t), 6)), np.ones(6))
 
 
-def chaos(of: Kind, _: Path) -> Any:
-    return of.run(steps=20).megno()
-
-
 def periodic(of: Kind, _: Path) -> Any:
     q = [0.0, 0.1, -0.1] if not of.run_time else of.q
     return sc.periodic_orbit(of.stepper(), q, of.flat()[1], period=6.3, steps=60)
@@ -216,62 +168,6 @@ def periodic(of: Kind, _: Path) -> Any:
 def fits(of: Kind, _: Path) -> Any:
     run = of.run(steps=20)
     return sc.fit(of.stepper(), run.t, run.q, q=of.flat()[0], p=of.flat()[1], h=0.1, unknown=["k"])
-
-
-def jax(of: Kind, _: Path) -> Any:
-    return sc.jax_flow(of.sized(), steps=3)
-
-
-def torch(of: Kind, _: Path) -> Any:
-    return sc.torch_flow(of.sized(), steps=3)
-
-
-def casadi(of: Kind, _: Path) -> Any:
-    return sc.casadi_flow(of.sized(), steps=3)
-
-
-def momentum_maps(of: Kind, _: Path) -> Any:
-    return of.run().momentum_maps()
-
-
-def symmetries(of: Kind, _: Path) -> Any:
-    return sc.symmetries(of.system())
-
-
-def work(of: Kind, _: Path) -> Any:
-    return of.run(of.compiled(of.system(forces={"x": "cos(t)"}))).work()
-
-
-def discrete_lagrangian(of: Kind, _: Path) -> Any:
-    return of.stepper().discrete_lagrangian(of.flat()[0], of.flat()[0], 0.1)
-
-
-def exact_map(of: Kind, _: Path) -> Any:
-    return sc.exact_map(of.system(), *of.flat(), 0.01, digits=15)
-
-
-def derivation(of: Kind, _: Path) -> Any:
-    return sc.derive(of.system(), "svi:1").to_text()
-
-
-def certificate(of: Kind, _: Path) -> Any:
-    return sc.verify(of.system(), "svi:2", *of.flat(), h=0.05, flags=QUICK_FLAGS)
-
-
-def model_file(of: Kind, folder: Path) -> Any:
-    return of.model(folder)
-
-
-def c_folder(of: Kind, folder: Path) -> Any:
-    return sc.generate_package(of.model(folder), folder / "made")
-
-
-def fmu(of: Kind, folder: Path) -> Any:
-    return sc.generate_fmu(of.model(folder), folder / "made.fmu", flags=QUICK_FLAGS)
-
-
-def advice(of: Kind, _: Path) -> Any:
-    return sc.advise(of.system(), "svi:2", *of.flat(), 1.0, 1e-4)
 
 
 def solve_ivp(of: Kind, _: Path) -> Any:
@@ -287,18 +183,6 @@ def checkpoints(of: Kind, _: Path) -> Any:
     return of.stepper().from_checkpoint(run.checkpoint())
 
 
-def recording(of: Kind, folder: Path) -> Any:
-    return sc.record_run(of.stepper().start(of.q, of.p, h=0.1), folder / "run", steps=3)
-
-
-def export(of: Kind, _: Path) -> Any:
-    return of.run().to_xarray()
-
-
-def newton(of: Kind, _: Path) -> Any:
-    return of.run(of.compiled(of.system(), solver="newton"))
-
-
 def rotations(of: Kind, _: Path) -> Any:
     system = of.system(kinetic=" + omega_1**2 + omega_2**2 + omega_3**2 - x*R_33", rotations={"R": "omega"})
     rest = {**of.p, "omega": [0, 0, 1]}
@@ -307,53 +191,57 @@ def rotations(of: Kind, _: Path) -> Any:
 
 FEATURES: dict[str, Callable[[Kind, Path], Any]] = {
     "SVI, spectral collocation, Runge-Kutta": lambda of, _: of.run(),
-    "SCVI": scvi,
-    "Stoermer-Verlet and compositions": splittings,
+    "SCVI": lambda of, _: of.run(of.compiled(of.system(), "scvi:2")),
+    "Stoermer-Verlet and compositions": lambda of, _: [
+        of.run(of.compiled(of.system(), method)) for method in ("stoermer-verlet", "composition:8")
+    ],
     "Hamiltonians": hamiltonians,
-    "any kinetic energy": full_masses,
+    "any kinetic energy": lambda of, _: of.run(
+        of.compiled(of.system(kinetic=f" + {of.sum('x_dot*y_dot/9', 'x_dot*q_dot[i]/9')}"))
+    ),
     "forces, Rayleigh dissipation": forces,
     "rotations, directions, spins": rotations,
     "Lagrangians linear in velocities": first_order,
-    "uniform damping": damping,
+    "uniform damping": lambda of, _: of.run(of.compiled(of.system(damping=0.1))),
     "holonomic constraints": holonomic,
     "nonholonomic constraints": nonholonomic,
     "inputs": inputs,
-    "adaptive steps": adaptive,
-    "Newton's iteration": newton,
+    "adaptive steps": lambda of, _: of.stepper().integrate(of.q, of.p, t_end=1.0),
+    "Newton's iteration": lambda of, _: of.run(of.compiled(of.system(), solver="newton")),
     "time transformation": time_transformation,
-    "output times `t_eval`": t_eval,
-    "dense output `at`": dense_output,
-    "events": events,
+    "output times `t_eval`": lambda of, _: of.run(t_eval=[0.05, 0.3]),
+    "dense output `at`": lambda of, _: of.run().at([0.05, 0.3]),
+    "events": lambda of, _: of.run(events="x - 0.25"),
     "events that change the state": changing_events,
     "ensembles": ensembles,
     "lists of neighbours": neighbours,
-    "threads within a step": threads,
+    "threads within a step": lambda of, _: of.run(threads=2),
     "sizes chosen by each run": other_sizes,
-    "reduction of states `observe`": observe,
-    "Jacobians of steps": tangent,
+    "reduction of states `observe`": lambda of, _: of.run(observe=lambda run: run.energy),
+    "Jacobians of steps": lambda of, _: of.stepper().jacobian(*of.flat(), 0.1),
     "adjoint derivatives": adjoint,
     "Hessian products": hessian_products,
-    "chaos indicators": chaos,
+    "chaos indicators": lambda of, _: of.run(steps=20).megno(),
     "periodic orbits": periodic,
     "fits": fits,
-    "JAX": jax,
-    "PyTorch": torch,
-    "CasADi": casadi,
-    "momentum maps": momentum_maps,
-    "symmetries of the system": symmetries,
-    "work of forces": work,
-    "discrete Lagrangian": discrete_lagrangian,
-    "exact map": exact_map,
-    "derivation": derivation,
-    "verification report": certificate,
-    "model files": model_file,
-    "C folder": c_folder,
-    "FMU": fmu,
-    "advice": advice,
+    "JAX": lambda of, _: sc.jax_flow(of.sized(), steps=3),
+    "PyTorch": lambda of, _: sc.torch_flow(of.sized(), steps=3),
+    "CasADi": lambda of, _: sc.casadi_flow(of.sized(), steps=3),
+    "momentum maps": lambda of, _: of.run().momentum_maps(),
+    "symmetries of the system": lambda of, _: sc.symmetries(of.system()),
+    "work of forces": lambda of, _: of.run(of.compiled(of.system(forces={"x": "cos(t)"}))).work(),
+    "discrete Lagrangian": lambda of, _: of.stepper().discrete_lagrangian(of.flat()[0], of.flat()[0], 0.1),
+    "exact map": lambda of, _: sc.exact_map(of.system(), *of.flat(), 0.01, digits=15),
+    "derivation": lambda of, _: sc.derive(of.system(), "svi:1").to_text(),
+    "verification report": lambda of, _: sc.verify(of.system(), "svi:2", *of.flat(), h=0.05, flags=QUICK_FLAGS),
+    "model files": lambda of, folder: of.model(folder),
+    "C folder": lambda of, folder: sc.generate_package(of.model(folder), folder / "made"),
+    "FMU": lambda of, folder: sc.generate_fmu(of.model(folder), folder / "made.fmu", flags=QUICK_FLAGS),
+    "advice": lambda of, _: sc.advise(of.system(), "svi:2", *of.flat(), 1.0, 1e-4),
     "`solve_ivp`": solve_ivp,
     "checkpoints": checkpoints,
-    "recorded runs": recording,
-    "xarray, pandas, HDF5": export,
+    "recorded runs": lambda of, folder: sc.record_run(of.stepper().start(of.q, of.p, h=0.1), folder / "run", steps=3),
+    "xarray, pandas, HDF5": lambda of, _: of.run().to_xarray(),
 }
 """Function of a kind of system and a folder, by row of the table."""
 
