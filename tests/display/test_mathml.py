@@ -2,12 +2,12 @@
 
 import math
 import re
-from collections.abc import Iterator
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 import sympy
+from printed_formulas import mp, names, trees_of_mathml, value
 from sympy import Float, Function, Matrix, Mul, Pow, Rational, Symbol, cos, exp, pi, sin, sqrt, symbols
 
 from scvi_codegen.derivation.equations import derive
@@ -17,18 +17,6 @@ from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
 from scvi_codegen.models.problems import problem
 
 x, y, h = symbols("x y h")
-LEAVES = {
-    "sin": "math.sin",
-    "cos": "math.cos",
-    "log": "math.log",
-    "e": "math.e",
-    "π": "math.pi",
-    "\N{MINUS SIGN}": "-",
-    "\u2062": "*",
-    "·": "*",
-    "×": "*",
-}
-FUNCTIONS = ("math.sin", "math.cos", "math.log", "(lambda")
 
 
 def inner(expression: sympy.Basic) -> str:
@@ -36,58 +24,10 @@ def inner(expression: sympy.Basic) -> str:
     return mathml(expression).removeprefix("<math>").removesuffix("</math>")
 
 
-class Reader:
-    """Evaluates presentation MathML as a mathematician would read it, given the values of symbols."""
-
-    def __init__(self, values: dict[Symbol, float]) -> None:
-        self.values = {inner(symbol): value for symbol, value in values.items()}
-
-    def value(self, *elements: str) -> float:
-        tokens = [token for text in elements for child in ElementTree.fromstring(text) for token in self.tokens(child)]
-        return float(eval(self.joined(tokens)))
-
-    def joined(self, tokens: list[str]) -> str:
-        """Operands side by side are factors."""
-        text = ""
-        for before, token in zip(["(", *tokens], tokens, strict=False):
-            operands = before[-1].isalnum() or before[-1] in ").", token[0].isalnum() or token[0] == "("
-            text += "*" if all(operands) and not before.startswith(FUNCTIONS) else ""
-            text += token
-        return text
-
-    def tokens(self, element: ElementTree.Element) -> Iterator[str]:
-        known = self.values.get(ElementTree.tostring(element, encoding="unicode"))
-        if known is not None:
-            yield f"({known!r})"
-            return
-        children = list(element)
-        match element.tag:
-            case "mrow":
-                yield from (token for child in children for token in self.tokens(child))
-            case "mn":
-                yield (element.text or "").replace("\N{MINUS SIGN}", "-")
-            case "mi" | "mo":
-                yield LEAVES.get(element.text or "", element.text or "")
-            case "mfrac":
-                yield f"(({self.expression(children[0])})/({self.expression(children[1])}))"
-            case "msqrt":
-                yield f"(({self.joined([t for c in children for t in self.tokens(c)])})**0.5)"
-            case "mroot":
-                yield f"(({self.expression(children[0])})**(1/({self.expression(children[1])})))"
-            case "msup":
-                yield from self.power(children[0], children[1])
-            case _:
-                raise AssertionError(f"what is {element.tag}?")
-
-    def expression(self, element: ElementTree.Element) -> str:
-        return self.joined(list(self.tokens(element)))
-
-    def power(self, base: ElementTree.Element, exponent: ElementTree.Element) -> Iterator[str]:
-        """A power; that of a function's name is the power of its value."""
-        if base.tag == "mi" and base.text in ("sin", "cos"):
-            yield f"(lambda z: {LEAVES[base.text]}(z)**({self.expression(exponent)}))"
-        else:
-            yield f"(({self.expression(base)})**({self.expression(exponent)}))"
+def read(*elements: str, **values: float) -> float:
+    """The value of presentation MathML as it is printed, given the values of its names."""
+    known = {"e": mp.e, "π": mp.pi} | values
+    return float(value(trees_of_mathml(elements), known.__getitem__))
 
 
 EXPRESSIONS = [
@@ -141,10 +81,10 @@ def check_read_back(expression: sympy.Expr, seed: int = 1) -> None:
     values = dict(zip(sorted(expression.free_symbols, key=str), map(float, draws), strict=True))
     if Symbol("n") in values:
         values[Symbol("n")] = 3.0
-    reader = Reader(values)
+    printed = {next(names(trees_of_mathml([mathml(symbol)]))): number for symbol, number in values.items()}
     expected = float(expression.xreplace({symbol: Float(value) for symbol, value in values.items()}).evalf())
-    assert reader.value(mathml(expression)) == pytest.approx(expected, rel=1e-10, abs=1e-12)
-    assert reader.value(*mathml_terms(expression)) == pytest.approx(expected, rel=1e-10, abs=1e-12)
+    for elements in ([mathml(expression)], mathml_terms(expression)):
+        assert read(*elements, **printed) == pytest.approx(expected, rel=1e-10, abs=1e-12)
 
 
 @pytest.mark.parametrize("expression", EXPRESSIONS, ids=str)
@@ -258,10 +198,9 @@ class TestTerms:
 
 
 def test_round_trip_detects_a_wrong_sign():
-    reader = Reader({x: 2.0, y: 3.0})
-    assert reader.value(mathml(x - y)) == -1.0
-    assert reader.value(mathml(x - y).replace("\N{MINUS SIGN}", "+")) == 5.0
-    assert math.isclose(reader.value(mathml(sin(x) ** 2)), math.sin(2.0) ** 2)
+    assert read(mathml(x - y), x=2.0, y=3.0) == -1.0
+    assert read(mathml(x - y).replace("\N{MINUS SIGN}", "+"), x=2.0, y=3.0) == 5.0
+    assert math.isclose(read(mathml(sin(x) ** 2), x=2.0), math.sin(2.0) ** 2)
 
 
 @pytest.mark.parametrize(
