@@ -6,8 +6,6 @@ import sympy
 
 from scvi_codegen import methods
 from scvi_codegen.errors import MethodError, StateError
-from scvi_codegen.methods.galerkin import SVI
-from scvi_codegen.tables.quadrature import gauss_legendre
 from scvi_codegen.validation import LARGEST_COUNT, checked_count
 
 
@@ -33,12 +31,6 @@ def test_non_integers_are_rejected(value):
 def test_out_of_range_values_are_named_with_the_bound(value, message):
     with pytest.raises(MethodError, match=message):
         checked_count(value, "n", least=2, most=5, error=MethodError)
-
-
-def test_numpy_integer_degree_is_equal():
-    assert SVI(np.int64(3)) == SVI(3)
-    assert repr(SVI(np.int64(3))) == repr(SVI(3))
-    assert gauss_legendre(np.int32(4)) == gauss_legendre(4)
 
 
 COUNTED = (

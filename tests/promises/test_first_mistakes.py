@@ -1,18 +1,28 @@
-"""Common first mistakes in Python and on the command line: errors name the argument, its value and the remedy."""
+"""Common mistakes in Python and on the command line: errors name the argument, its value and the remedy."""
 
 import math
+import re
+from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.cli import main
-from scvi_codegen.errors import ScviCodegenError
+from scvi_codegen.errors import ScviCodegenError, StateError
+from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.inputs.segments import input_of
+from scvi_codegen.validation import hints, keyword_hint
 
 TEXT = {"name": "swing", "coordinates": ["q"], "lagrangian": "q_dot**2/2 + cos(q)"}
+PUSHED = {"forces": {"q": "u"}, "inputs": ["u"]}
+CHAIN = {"coordinates": ["q[N]"], "lagrangian": "sum(i in N, q_dot[i]**2/2)", "forces": {"q[0]": "u"}, "inputs": ["u"]}
+DATA = {"u": ([0.0, 1.0], [0.0, 1.0])}
+STATE = {"q": [0.2], "p": [0.0]}
+KEPLER = sc.problem("kepler").system
 MODEL = """\
 [system]
 name = "swing"
@@ -29,127 +39,132 @@ span = 1.0
 """
 
 
-@pytest.fixture(scope="module")
-def stepper():
-    return sc.compile_stepper(sc.LagrangianSystem.from_text(**TEXT), "svi:2", flags=QUICK_FLAGS)
+def system(**changes):
+    return sc.LagrangianSystem.from_text(**TEXT | changes)
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"q": [1.0]}, "give either p or velocity with q; got neither"),
-        ({"q": [1.0, 2.0], "p": [0.0]}, "q must have shape (1,) for (q), not (2,)"),
-        ({"q": [1.0], "velocity": [0.0, 0.0]}, "velocity must have shape (1,) for (q), not (2,)"),
-        ({"q": ["1.0"], "p": [0.0]}, "q must be real numbers, not text: ['1.0'], write it without quotes"),
-        ({"q": "q.csv", "p": [0.0]}, "read the file first, as by numpy.loadtxt('q.csv', delimiter=',', skiprows=1)"),
-        ({"q": ["one"], "p": [0.0]}, "q must be real numbers, not text: ['one'], give numbers"),
-        ({"q": {"x": 1.0}, "p": [0.0]}, "there is no 'x' in q"),
-        ({"q": [math.nan], "p": [0.0]}, "q[0] (q) is nan: it must be finite"),
-        ({"q": [1.0], "p": [0.0], "h": 0.0}, "the step size h is 0: it must be positive, or negative to integrate"),
-        ({"q": [1.0], "p": [0.0], "h": math.nan}, "the step size h is nan: it must be finite"),
-        ({"q": [1.0], "p": [0.0], "h": "0.1"}, "the step size h must be real numbers, not text: '0.1'"),
-        ({"q": [1.0], "p": [0.0], "steps": -3}, "steps must be at least 0, not -3"),
-        ({"q": [1.0], "p": [0.0], "parameters": {"g": 9.8}}, "no parameter 'g': 'swing' has none. Declare it"),
-    ],
-    ids=lambda part: part if isinstance(part, str) else None,
-)
-def test_first_mistakes_with_runs(given, message, stepper):
-    with pytest.raises(ScviCodegenError) as caught:
-        stepper.integrate(**{"h": 0.1, "steps": 3} | given)
-    assert message in str(caught.value)
+STEPPERS = {
+    "swing": {},
+    "pushed": PUSHED,
+    "chain": CHAIN,
+    "weighed": {"lagrangian": "m*q_dot**2/2 - q**2/2", "parameters": {"m": 1.0}},
+}
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        (
-            {"lagrangian": "q_dot**2/2 + k*cos(q)"},
-            "unknown name 'k'. Known here: q, q_dot, t, pi; declare a constant as a parameter",
-        ),
-        ({"forces": {"x": "1"}}, "there is a force on 'x', which is not a coordinate. Coordinates: q"),
-        ({"lagrangian": "q'**2/2"}, 'unexpected character "\'": write the velocity of q as q_dot'),
-        ({"lagrangian": "L = q_dot**2/2"}, "unexpected character '=': write the right-hand side only"),
-        ({"lagrangian": "|q_dot|"}, "unexpected character '|': write abs(x)"),
-        ({"lagrangian": "q_dot²/2"}, "unexpected character '²': powers are written x**2"),
-    ],
-    ids=["a constant", "a force", "a prime", "an equation", "bars", "a superscript"],
-)
-def test_first_mistakes_with_systems(given, message):
-    with pytest.raises(ScviCodegenError) as caught:
-        sc.LagrangianSystem.from_text(**TEXT | given)
-    assert message in str(caught.value)
+@cache
+def stepper(name="swing"):
+    return sc.compile_stepper(system(**STEPPERS[name]), "svi:2", flags=QUICK_FLAGS)
 
 
-def test_functions_report_what_they_require(stepper):
-    kepler = sc.problem("kepler").system
-    for call, message in (
-        (lambda: sc.advise(kepler, "svi:4", [1.0, 0.0], [0.0, 1.0], 10.0), "advise requires tolerance, the error at"),
-        (lambda: sc.advise(kepler, "svi:4", [1.0, 0.0], span=10.0, tolerance=1e-6), "give either p or velocity"),
-        (lambda: sc.periodic_orbit(stepper, [0.1], [0.0], period=6.0), r"\(steps=200\).*\(h=0.05\); it got neither"),
-        (lambda: input_of("u", "torque.csv"), "the input 'u' must be .*read a file first: t, values = numpy.loadtxt"),
-    ):
-        with pytest.raises(ScviCodegenError, match=message):
-            call()
+def run(name="swing", **given):
+    return stepper(name).integrate(**{"h": 0.1, "steps": 3} | given)
 
 
-def test_system_accepts_positional_arguments_and_scalar_states(stepper):
+def massless(**given):
+    return stepper("weighed").integrate([1.0], [0.0], parameters={"m": 0.0}, **given)
+
+
+RUNS = [
+    ({"q": [1.0]}, "give either p or velocity with q; got neither"),
+    ({"q": [1.0, 2.0], "p": [0.0]}, "q must have shape (1,) for (q), not (2,)"),
+    ({"q": [1.0], "velocity": [0.0, 0.0]}, "velocity must have shape (1,) for (q), not (2,)"),
+    ({"q": ["1.0"], "p": [0.0]}, "q must be real numbers, not text: ['1.0'], write it without quotes"),
+    ({"q": "q.csv", "p": [0.0]}, "read the file first, as by numpy.loadtxt('q.csv', delimiter=',', skiprows=1)"),
+    ({"q": ["one"], "p": [0.0]}, "q must be real numbers, not text: ['one'], give numbers"),
+    ({"q": {"x": 1.0}, "p": [0.0]}, "there is no 'x' in q"),
+    ({"q": [math.nan], "p": [0.0]}, "q[0] (q) is nan: it must be finite"),
+    (STATE | {"h": 0.0}, "the step size h is 0: it must be positive, or negative to integrate"),
+    (STATE | {"h": math.nan}, "the step size h is nan: it must be finite"),
+    (STATE | {"h": "0.1"}, "the step size h must be real numbers, not text: '0.1'"),
+    (STATE | {"steps": -3}, "steps must be at least 0, not -3"),
+    (STATE | {"parameters": {"g": 9.8}}, "no parameter 'g': 'swing' has none. Declare it"),
+    (STATE | {"inputs": DATA}, "'u' is not an input: the system has none."),
+    ({"dt": 0.1}, "Stepper.integrate() takes no 'dt'; did you mean 'h'?"),
+    ({"n_steps": 10}, "Stepper.integrate() takes no 'n_steps'; did you mean 'steps'?"),
+    ({"velocty": [0.0]}, "Stepper.integrate() takes no 'velocty'; did you mean 'velocity'?"),
+    ({"v0": [0.0]}, "Stepper.integrate() takes no 'v0'; did you mean 'velocity'?"),
+    ({"solver": "newton"}, "Stepper.integrate() takes no 'solver': pass it when compiling"),
+    ({"method": "svi:4"}, "Stepper.integrate() takes no 'method': pass it when compiling"),
+    ({"colour": "red"}, "Stepper.integrate() takes no 'colour': it takes q, p, inputs, velocity, h, steps, t_end"),
+]
+SYSTEMS = [
+    ({"lagrangian": "q_dot**2/2 + k*cos(q)"}, "Known here: q, q_dot, t, pi; declare a constant as a parameter"),
+    ({"forces": {"x": "1"}}, "there is a force on 'x', which is not a coordinate. Coordinates: q"),
+    ({"lagrangian": "q'**2/2"}, 'unexpected character "\'": write the velocity of q as q_dot'),
+    ({"lagrangian": "L = q_dot**2/2"}, "unexpected character '=': write the right-hand side only"),
+    ({"lagrangian": "|q_dot|"}, "unexpected character '|': write abs(x)"),
+    ({"lagrangian": "q_dot²/2"}, "unexpected character '²': powers are written x**2"),
+    ({"L": "x"}, "takes no 'L'; did you mean 'lagrangian'?"),
+]
+METHODS = {"verlet": "stoermer-verlet", "leapfrog": "stoermer-verlet", "midpoint": "gauss:1", "svl:4": "svi"}
+CALLS = [
+    *((lambda given=given: run(**given), message) for given, message in RUNS),
+    *((lambda given=given: system(**given), message) for given, message in SYSTEMS),
+    *((lambda name=name: sc.compile_stepper(system(), name), f"did you mean '{x}'") for name, x in METHODS.items()),
+    (lambda: sc.compile_stepper(h=0.1), "takes no 'h': pass it to a stepper"),
+    (lambda: sc.compile_stepper(degree=8), "takes no 'degree': include it in the method, 'svi:8'"),
+    (lambda: sc.advise(KEPLER, "svi:4", [1.0, 0.0], [0.0, 1.0], 10.0), "advise requires tolerance, the error at"),
+    (lambda: sc.advise(KEPLER, "svi:4", [1.0, 0.0], span=10.0, tolerance=1e-6), "give either p or velocity"),
+    (lambda: sc.periodic_orbit(stepper(), [0.1], [0.0], period=6.0), "(h=0.05); it got neither"),
+    (lambda: input_of("u", "torque.csv"), "read a file first: t, values = numpy.loadtxt"),
+    (lambda: sc.compile_stepper(KEPLER, "svi:2").energy(1.0, 0.5), "q must have shape (2,) for (q1, q2), not ()"),
+    (lambda: massless(h=0.1, steps=9), "no mass is 0"),
+    (lambda: massless(t_end=1.0), "below machine precision"),
+    (lambda: stepper("pushed").start([0.2], [0.0], h=0.1, inputs=DATA), "takes no 'inputs': pass them to .integrate("),
+    (lambda: stepper("chain").start(np.zeros(3), h=0.1, inputs=DATA), "takes no 'inputs': pass them to .integrate("),
+    (lambda: run("pushed", **STATE, inputs={"u1": DATA["u"]}), "'u1' is not an input; the system has u; did you mean"),
+    (lambda: stepper("chain").start(np.zeros(3), h=0.1).set_inputs(w=1.0), "'w' is not an input; the system has u"),
+]
+
+
+@pytest.mark.parametrize(("call", "message"), CALLS, ids=[message for _, message in CALLS])
+def test_first_mistakes_are_named_with_the_remedy(call, message):
+    with pytest.raises((ScviCodegenError, TypeError), match=re.escape(message)):
+        call()
+
+
+def test_states_of_runs_with_inputs_are_saved_at_steps():
+    for integrate, state in ((stepper("pushed").integrate, [0.2]), (stepper("pushed").integrate_ensemble, [[0.2]])):
+        with pytest.raises(StateError, match="t_eval is not available with inputs: omit t_eval"):
+            integrate(state, state, t_end=0.3, inputs=DATA, t_eval=[0.1])
+    assert run("pushed", **STATE, inputs=DATA).t[-1] == pytest.approx(0.3)
+
+
+def test_no_synonym_hides_a_keyword():
+    """A known keyword is never reported as a synonym, and every suggested location exists."""
+    assert keyword_hint("q", ["y0"]) == "; did you mean 'y0'?"
+    assert keyword_hint("n", ["mass"]).startswith(": pass the number to run.advance(n)")
+    assert not [here for here, elsewhere in hints()["synonyms"].items() if {*here.split()} & {*elsewhere.split()}]
+    for name in ("integrate", "integrate_ensemble", "momentum"):
+        assert hasattr(Stepper, name)
+        assert any(f".{name}" in place for place in hints()["explanations"].values())
+
+
+def test_system_accepts_positional_arguments_and_scalar_states():
     for kind, formula in ((sc.LagrangianSystem, TEXT["lagrangian"]), (sc.HamiltonianSystem, "p_q**2/2 - cos(q)")):
         by_name = {"lagrangian": formula} if kind is sc.LagrangianSystem else {"hamiltonian": formula}
         assert kind.from_text("swing", ["q"], formula) == kind.from_text(name="swing", coordinates=["q"], **by_name)
-    text = "sum(a in N, q_dot[a]**2/2)"
-    assert sc.LagrangianSystem.from_text("chain", ["q[N]"], text).name == "chain"
-    run = stepper.integrate(1.0, 0.5, h=0.1, steps=3)
-    assert run.q.tolist() == stepper.integrate([1.0], [0.5], h=0.1, steps=3).q.tolist()
-    assert stepper.energy(1.0, 0.5) == stepper.energy([1.0], [0.5])
-    with pytest.raises(ScviCodegenError, match=r"q must have shape \(2,\) for \(q1, q2\), not \(\)"):
-        sc.compile_stepper(sc.problem("kepler").system, "svi:2", flags=QUICK_FLAGS).energy(1.0, 0.5)
+    assert sc.LagrangianSystem.from_text("chain", ["q[N]"], "sum(a in N, q_dot[a]**2/2)").name == "chain"
+    assert run(q=1.0, p=0.5).q.tolist() == run(q=[1.0], p=[0.5]).q.tolist()
+    assert stepper().energy(1.0, 0.5) == stepper().energy([1.0], [0.5])
 
 
-def test_zero_mass_and_step_size_underflow_are_explained():
-    text = {"lagrangian": "m*q_dot**2/2 - q**2/2", "parameters": {"m": 1.0}}
-    stepper = sc.compile_stepper(sc.LagrangianSystem.from_text(**TEXT | text), "svi:2", flags=QUICK_FLAGS)
-    for given, message in (
-        ({"h": 0.1, "steps": 9}, "no mass is 0"),
-        ({"t_end": 1.0}, "below machine precision.*mass of 0"),
-    ):
-        with pytest.raises(sc.StepFailedError, match=message):
-            stepper.integrate([1.0], [0.0], parameters={"m": 0.0}, **given)
+NO_START = "there is no p or q_dot in [initial]; for a start from rest write q_dot = [0.0, ..], or --velocity"
+COMMANDS = [
+    ("q_dot = [0.0]", "", "", NO_START),
+    ("q = [1.0]", 'q = ["1.0"]', "", "[initial] q, q, must be a number, not '1.0'"),
+    ("lagrangian", "lagrangain", "", "unknown key 'lagrangain' in [system]; did you mean 'lagrangian'?"),
+    ("", "", "--step 0", "the step size is 0: it must be positive, or negative for a run backward in time"),
+    ("", "", "--method verlet", "did you mean 'stoermer-verlet'?"),
+    ("", "", "-o nowhere/run.npz", "there is no folder 'nowhere'"),
+    ("", "", "runn", "there is no command 'runn'; did you mean 'run'? Known: cache,"),
+]
 
 
-@pytest.mark.parametrize(
-    ("name", "meant"),
-    [("verlet", "stoermer-verlet"), ("leapfrog", "stoermer-verlet"), ("midpoint", "gauss:1"), ("svl:4", "svi")],
-)
-def test_first_mistakes_with_methods(name, meant, stepper):
-    with pytest.raises(ScviCodegenError, match=f"did you mean '{meant}'"):
-        sc.compile_stepper(sc.LagrangianSystem.from_text(**TEXT), name)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "words", "message"),
-    [
-        (
-            "q_dot = [0.0]",
-            "",
-            "",
-            "there is no p or q_dot in [initial]; for a start from rest write q_dot = [0.0, ..], or --velocity",
-        ),
-        ("q = [1.0]", 'q = ["1.0"]', "", "[initial] q, q, must be a number, not '1.0'"),
-        ("lagrangian", "lagrangain", "", "unknown key 'lagrangain' in [system]; did you mean 'lagrangian'?"),
-        ("", "", "--step 0", "the step size is 0: it must be positive, or negative for a run backward in time"),
-        ("", "", "--method verlet", "did you mean 'stoermer-verlet'?"),
-        ("", "", "-o nowhere/run.npz", "there is no folder 'nowhere'"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "words", "message"), COMMANDS)
 def test_first_mistakes_with_files_and_commands(old, new, words, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("swing.toml").write_text(MODEL.replace(old, new, 1))
-    result = CliRunner().invoke(main, ["run", "swing.toml", *words.split()])
+    result = CliRunner().invoke(main, [words] if words == "runn" else ["run", "swing.toml", *words.split()])
     assert result.exit_code == 2, result.output
     assert message in result.stderr
-
-
-def test_first_mistakes_with_command_names():
-    result = CliRunner().invoke(main, ["runn", "kepler"])
-    assert result.exit_code == 2
-    assert "there is no command 'runn'; did you mean 'run'? Known: cache," in result.stderr
