@@ -58,6 +58,7 @@ def compile_stepper(
     symmetries: Sequence[Symmetry] = (),
     events: EventLike | Sequence[EventLike] | None = None,
     time_transformation: str | Expr | None = None,
+    controller: str | None = None,
     sizes: Mapping[str, int] | None = None,
     tables: Mapping[str, ArrayLike] | None = None,
 ) -> Stepper:
@@ -80,6 +81,8 @@ def compile_stepper(
             :func:`~scvi_codegen.reparametrise`. Runs with h and t_end then take constant steps h in tau, dt = g dtau,
             by the reversible controller of Hairer and Soederlind; time-dependent and forced systems are supported.
             Momentum maps are preserved. Entries and sums of arrays are written in index notation.
+        controller: step-size controller of runs to t_end, by default ``"predictive"`` (adaptive steps), and
+            ``"reversible"`` with a time transformation; a name among ``scvi_codegen.controllers.CONTROLLERS``.
         sizes: whole numbers for the sizes of arrays, ``{"N": 8}``: the system of all entries q_0, q_1, .. is compiled,
             which has every feature. Without them arrays have the sizes that each run gives them: neither the length of
             the C source nor its compile time depends on the number of coordinates, and the solver is ``"fixed-point"``,
@@ -109,7 +112,7 @@ def compile_stepper(
         if symmetries:
             raise MethodError(f"symmetries= is unavailable for '{system.name}': {SIZES_REQUIRED}")
         method = as_method(method)
-    sources = CachedSources(system, method, solver, prefix, symmetries, time_transformation)
+    sources = CachedSources(system, method, solver, prefix, symmetries, time_transformation, controller)
     variants = Variants(make=sources.variant, lacking=lambda name: name == "second_derivatives" and system.damping != 0)
     if not known_sizes:
         source, interface, reason = sources.of_run_time_sizes()
@@ -122,6 +125,7 @@ def compile_stepper(
             flags=flags,
             prefix=prefix,
             time_transformation=time_transformation,
+            controller=controller,
         )
         further: dict[str, Any] = {"events": as_events(events), "of_sizes": of_sizes, "reason": reason}
         return Stepper(source, interface, variants=variants, flags=flags, **further)
@@ -155,17 +159,18 @@ class CachedSources:
         prefix: str | None,
         symmetries: Sequence[Symmetry],
         g: str | Expr | None,
+        controller: str | None = None,
     ) -> None:
         self.system, self.method, self.solver, self.prefix = system, method, solver, prefix
-        self.symmetries, self.g = symmetries, g
-        self.key = (*system.key(), *method.key(), key_of((solver, prefix, tuple(symmetries), g)))
+        self.symmetries, self.g, self.controller = symmetries, g, controller
+        self.key = (*system.key(), *method.key(), key_of((solver, prefix, tuple(symmetries), g, controller)))
 
     @cached_property
     def derived(self) -> Sources:
         """The sources that are not in the cache."""
         from scvi_codegen.pipeline import Sources
 
-        return Sources(self.system, self.method, self.solver, self.prefix, self.symmetries, self.g)
+        return Sources(self.system, self.method, self.solver, self.prefix, self.symmetries, self.g, self.controller)
 
     def integrator(self) -> tuple[Source, Interface]:
         """Return the C source and its interface."""

@@ -26,11 +26,12 @@ from typing import Any
 
 from sympy import Expr
 
+from scvi_codegen.controllers import controller_named
 from scvi_codegen.errors import MethodError, SizesRequiredError
 from scvi_codegen.indices import SIZES_REQUIRED
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.arrays import check_solver as check_solver_of_arrays
-from scvi_codegen.lowering.control import control_of, density_of, error_growth_of
+from scvi_codegen.lowering.control import control_of, error_growth_of
 from scvi_codegen.lowering.derivatives import derivatives_of
 from scvi_codegen.lowering.loops import with_sums
 from scvi_codegen.lowering.program import lower
@@ -221,8 +222,10 @@ class Sources:
         prefix: str | None = None,
         symmetries: Sequence[Symmetry] = (),
         g: str | Expr | None = None,
+        controller: str | None = None,
     ) -> None:
         self.method, self.solver, self.g = method, solver, g
+        self.controller = controller_named(controller, in_tau=g is not None)
         self.prefix = c_identifier(prefix or f"{system.name}_{method.name}")
         self._programs: dict[bool, Program] = {}
         self.system: Any
@@ -274,12 +277,11 @@ class Sources:
     def integrator(self, *, controlled: bool = True) -> tuple[Source, Interface]:
         """Return the C source and its interface.
 
-        It has fixed steps and, if ``controlled`` and the method has an error estimate, adaptive steps; with a time
-        transformation the step-density controller.
+        It has fixed steps and, if ``controlled`` and the method has an error estimate, those of the controller.
         """
         program = self.program()
-        control = control_of(program) if self.g is None else density_of(self.system, self.g)
-        if control and controlled and not (self.of_arrays or self.g):
+        control = control_of(program, self.controller, self.system, self.g)
+        if control and controlled and not (self.of_arrays or control.density):
             control = replace(control, growth=error_growth_of(self.system, program))
         fallback: Fallback | None = "external" if self.uses_fallback_library else None
         return render(program, control if controlled else None, fallback=fallback), self.interface
@@ -340,6 +342,7 @@ def generate_source(
     amalgamate: bool = False,
     controlled: bool = False,
     time_transformation: str | Expr | None = None,
+    controller: str | None = None,
 ) -> tuple[Source, Interface]:
     """Return the C source of an integrator and its interface; other arguments as of :func:`compile_stepper`.
 
@@ -349,6 +352,7 @@ def generate_source(
         amalgamate: include the support headers in the source; always done for a microcontroller.
         controlled: use adaptive steps, if the method has an error estimate.
         time_transformation: use constant steps in tau instead, dt = g dtau, by the reversible controller.
+        controller: step-size controller, as of :func:`compile_stepper`.
 
     Raises:
         MethodError: if the solver is not available for the method, if a constant exceeds single precision, and if
@@ -365,7 +369,8 @@ def generate_source(
         raise MethodError("events require double precision, in which they are located: use embedded='double'")
     program = program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None)
     g = time_transformation
-    control = density_of(system, g) if g is not None else control_of(program) if controlled else None
+    chosen = controller_named(controller, in_tau=g is not None)
+    control = control_of(program, chosen, system, g) if controlled or g is not None else None
     source = render_embedded(program, embedded, control) if embedded else render(program, control)
     interface = describe(program, system, method, g=g)
     complete = with_events(source, interface, searched) if searched else source

@@ -14,11 +14,11 @@ from sympy import Expr
 from scvi_codegen.advice.advice import advise
 from scvi_codegen.advice.tolerance_check import missed_tolerance
 from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.controllers import SYMPLECTIC, with_time_transformation
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.mechanics.arrays.rolling import unrolled_at
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.mechanics.time_transformation import with_time_transformation
 from scvi_codegen.methods import Method, as_method, default_method
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
@@ -199,7 +199,8 @@ def _stepper(
     if not isinstance(system, Stepper):
         system, g = with_time_transformation(system, *transformation)
         chosen = default_method(system) if method is None else as_method(method, system)
-        return compile_stepper(system, chosen, time_transformation=g), (system, chosen)
+        controller = None if transformation[1] == SYMPLECTIC else transformation[1]
+        return compile_stepper(system, chosen, time_transformation=g, controller=controller), (system, chosen)
     if method is not None or transformation != (None, None) or request.tolerance is not None:
         raise StateError(
             "method, time_transformation, controller and tolerance need a system, not a compiled stepper: omit them, "

@@ -175,7 +175,7 @@ def describe_step_size(model: Model, run: Run) -> str:
     if model.in_transformed_time:
         return f"of {run.h:g} in tau"
     if run.plan.tau:
-        return f"of {run.plan.tau:g} in tau by the reversible controller"
+        return f"of {run.plan.tau:g} in tau by the {model.controller or 'reversible'} controller"
     adaptive = run.plan.adaptive or model.h is None
     return f"of adaptive size ({run.rejected_steps} rejected)" if adaptive else f"of {model.h:g}"
 

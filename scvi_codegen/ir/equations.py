@@ -349,17 +349,20 @@ class Splitting:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Control:
-    """Adaptive steps with sizes h = 2^(k / levels), by fixed-point iteration or Newton's method; or a step density.
+    """Adaptive steps with sizes h = 2^(k / levels), by fixed-point iteration or Newton's method; or steps of tau.
 
     Attributes:
+        code: C of the step-size controller.
+        memory: names and comments of its fields in the struct of a run.
         mantissas: 2^(k / levels) for the levels of an octave.
         predictor: predictor of the fixed-point iteration, ``None`` without one.
         stage_growth: factor of the error estimate per level for Newton's method; 0 if there is no estimate.
-        density: 1/g and -d(log g)/dt at (q, v), or (q, p) of a Hamiltonian, of a time transformation g; instead of the
-            predictor.
+        density: values of a time transformation at (q, v), or (q, p) of a Hamiltonian; instead of the predictor.
         growth: of errors, measured along runs; ``None`` if it is not.
     """
 
+    code: str
+    memory: tuple[tuple[str, str], ...] = ()
     mantissas: tuple[float, ...] = ()
     predictor: AdaptivePredictor | None = None
     stage_growth: float = 0.0

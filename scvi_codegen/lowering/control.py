@@ -5,11 +5,6 @@ The stored values of the last step, or of the last two, are extrapolated into th
 predictors they need only double precision, by Stieltjes' procedure (Gautschi, *Orthogonal Polynomials*, 2004, section
 2.2), in sums that round the same on all platforms.
 
-With a time transformation dt = g dtau the density rho = 1/g has an equation of motion, drho/dtau = -d(log g)/dt along
-the motion. Explicit leapfrog steps of rho between the steps of a symmetric method give a method that is symmetric on
-(q, p, rho), for any system, also time-dependent or forced. Source: E. Hairer, G. Soederlind, SIAM J. Sci. Comput. 26
-(2005), section 2.
-
 Growth of errors along adaptive runs: a tangent vector by an explicit Runge-Kutta-Nystroem scheme.
 
 The variational equation dq'' = F_q dq / m of a separable system is integrated over each accepted step. Its nodes c_s
@@ -27,10 +22,10 @@ import operator
 from collections.abc import Sequence
 from dataclasses import replace
 
-import sympy
 from sympy import Expr
 
-from scvi_codegen.formulas.expressions import gradient
+from scvi_codegen.controllers import Controller
+from scvi_codegen.controllers.predictive import PREDICTIVE
 from scvi_codegen.ir.arithmetic import INVERSE_ROOTS
 from scvi_codegen.ir.equations import AdaptivePredictor, Control, ErrorGrowth, FixedPointIteration, StoredValues
 from scvi_codegen.ir.kernel import Expression, Kernel, Load, Number, NumberTable, Operation, lower_matrix, lower_vector
@@ -41,7 +36,6 @@ from scvi_codegen.lowering.stage_groups import system_kernel
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.mechanics.time_transformation import time_rescaling_function
 from scvi_codegen.tables.basis import cardinal_integrals, cardinal_values, least_squares, matrix_product, transpose
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 from scvi_codegen.tables.quadrature import gauss_legendre
@@ -56,12 +50,37 @@ leading digits, is the same in every orbit, and accumulates: 2e-17 to 7e-17 of t
 """
 
 
-def control_of(program: Program) -> Control | None:
-    """Return the adaptive step-size control of a program; ``None`` if its curves give no error estimate."""
+def control_of(
+    program: Program,
+    controller: Controller = PREDICTIVE,
+    system: MechanicalSystem | None = None,
+    g: str | Expr | None = None,
+) -> Control | None:
+    """Return the step-size control of a program; ``None`` for adaptive steps whose curves give no error estimate.
+
+    Args:
+        program: the lowered program.
+        controller: the step-size controller.
+        system, g: of a controller of steps in tau, the system in physical time and the time-rescaling function.
+    """
+    if controller.values is not None:
+        assert system is not None  # by the caller
+        assert g is not None
+        kernel = system_kernel(
+            system,
+            "step_density",
+            controller.values(system, g),
+            of=forms_of(system).legendre_arguments,
+            purpose="1/g and -d(log g)/dt of the time rescaling g at u = "
+            f"{'(q, p)' if system.auxiliaries else '(q, v)'}.",
+        )
+        return Control(code=controller.code, memory=controller.memory, density=kernel)
     if not program.error_power or program.quantities.integrals:
         return None
     stage_curve = program.equations.stage_curve
     return Control(
+        code=controller.code,
+        memory=controller.memory,
         mantissas=MANTISSAS,
         predictor=predictor_of(program.fixed_point) if program.fixed_point else None,
         stage_growth=2.0 ** (stage_curve.power / LEVELS_PER_BINADE) if stage_curve else 0.0,
@@ -130,34 +149,6 @@ def _padded(rows: list[list[float]], through: NumberTable, lanes: int) -> Number
         ]
     wide = [(*row, *(0.0,) * (lanes - count)) for row in rows]
     return (*wide, *(wide[-1],) * (lanes - count))
-
-
-def density_of(system: MechanicalSystem, g: str | Expr) -> Control:
-    """Return the step density of a time-rescaling function of the system.
-
-    Args:
-        system: in physical time.
-        g: as in :func:`~scvi_codegen.mechanics.time_transformation.time_rescaling_function`, or of time.
-
-    Raises:
-        SystemDefinitionError: for an invalid time-rescaling function.
-    """
-    rate = time_rescaling_function(system, g, in_time=True)
-    forms = forms_of(system)
-    rates = dict(zip(system.coordinates, forms.legendre if system.auxiliaries else system.velocities, strict=True))
-    if system.auxiliaries:
-        rates |= dict(zip(system.auxiliaries, forms.momentum_rate, strict=True))
-    rates[system.time] = sympy.S.One
-    variables = list(rates)
-    change = sympy.Add(*(derivative * rates[variables[i]] for i, derivative in gradient(rate, variables).items()))
-    kernel = system_kernel(
-        system,
-        "step_density",
-        (1 / rate, -change / rate),
-        of=forms.legendre_arguments,
-        purpose=f"1/g and -d(log g)/dt of the time rescaling g at u = {'(q, p)' if system.auxiliaries else '(q, v)'}.",
-    )
-    return Control(density=kernel)
 
 
 MOST_NODES = 4

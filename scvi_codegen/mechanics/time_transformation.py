@@ -8,7 +8,7 @@ its Lagrangian is
 
 which is regular wherever L is. Every method and solver applies to it; E is a parameter, the energy of the initial
 state. Time is the integral of g along the curve, computed by the method's own quadrature. Alternatively g may leave the
-system unchanged and control the step sizes of its runs: see :func:`with_time_transformation`.
+system unchanged and control the step sizes of its runs: see :mod:`scvi_codegen.controllers`.
 
 g is small where the motion is fast: a formula in the coordinates (for a Hamiltonian also in the momenta), or by name
 
@@ -47,9 +47,6 @@ from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import positive_parameters
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem, TimeTransformation
 from scvi_codegen.validation import checks_arguments
-
-CONTROLLERS = ("symplectic", "reversible")
-"""Uses of a time-rescaling function: transform the time of a system, or control the step sizes of its runs."""
 
 ENERGY_NAMES = ("E", "E_0", "energy", "initial_energy")
 """Candidate names of the energy parameter; the first that is unused is taken."""
@@ -122,41 +119,6 @@ def reparametrise(system: MechanicalSystem, time_transformation: str | Expr) -> 
     assert isinstance(named, LagrangianSystem)
     slowed = named.lagrangian.xreplace({v: v / rate for v in named.velocities})
     return replace(named, lagrangian=_distributed(rate, slowed + energy_symbol))
-
-
-def with_time_transformation(
-    system: MechanicalSystem, g: str | Expr | None, controller: str | None = None
-) -> tuple[MechanicalSystem, str | Expr | None]:
-    """Return the system to integrate under a time transformation, and the ``time_transformation`` for its stepper.
-
-    Args:
-        system: the mechanical system.
-        g: rate of dt = g dtau, or ``None`` for no time transformation.
-        controller: ``"symplectic"`` (also ``None``): the system in transformed time, :func:`reparametrise`;
-            ``"reversible"``: unchanged, for ``compile_stepper(..., time_transformation=...)``. Source of the names:
-            E. Hairer, Ch. Lubich, G. Wanner, *Geometric Numerical Integration*, VIII.2 and VIII.3.
-
-    Raises:
-        SystemDefinitionError: for a controller without a time transformation, an unknown controller, and as
-            :func:`reparametrise`.
-    """
-    if controller is not None and controller not in CONTROLLERS:
-        raise SystemDefinitionError(f"controller must be {' or '.join(CONTROLLERS)}, not {controller!r}")
-    if g is None:
-        if controller is not None:
-            raise SystemDefinitionError(
-                f'the {controller} controller requires a time transformation: give "frequency", or a formula'
-            )
-        return system, None
-    if controller != "reversible":
-        return reparametrise(system, g), None
-    if system.clock is not None:
-        raise SystemDefinitionError(
-            f"'{system.name}' has a time transformation already, which controls its steps: leave out "
-            "the reversible controller, or use the system without the transformation"
-        )
-    time_rescaling_function(system, g, in_time=True)  # validated here rather than at the first step
-    return system, g
 
 
 def _distributed(factor: Expr, total: Expr) -> Expr:

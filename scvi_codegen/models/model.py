@@ -56,7 +56,7 @@ class Model(TimeSpan):
             or axis and angle.
         p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
         velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
-        h, tolerance, error, span, steps, save_every, t, time_transformation: as of
+        h, tolerance, error, span, steps, save_every, t, time_transformation, controller: as of
             :class:`~scvi_codegen.models.time_span.TimeSpan`.
         inputs: by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as :meth:`Stepper.integrate` accepts
             it, or a number; a run requires all inputs of the system.
@@ -242,8 +242,16 @@ class Model(TimeSpan):
         """Compile a stepper for runs of this model; raises as :func:`~scvi_codegen.compile_stepper`."""
         from scvi_codegen.compiler import compile_stepper  # imported here: not needed for reading a model
 
+        if self.controller is not None and self.time_transformation is None and self.h is not None:
+            raise ModelFileError(
+                f"the controller {self.controller} determines adaptive steps: leave out the step size or the controller"
+            )
         stepper = compile_stepper(
-            self.system, self.method, solver=self.solver, time_transformation=self.time_transformation
+            self.system,
+            self.method,
+            solver=self.solver,
+            time_transformation=self.time_transformation,
+            controller=self.controller,
         )
         if self.mesh is not None and stepper.interface.layout.mesh is None:
             stepper.interface = replace(stepper.interface, layout=replace(stepper.interface.layout, mesh=self.mesh))

@@ -11,8 +11,8 @@ from itertools import combinations
 from numbers import Real
 from typing import Any
 
+from scvi_codegen.controllers import CONTROLLERS, SYMPLECTIC
 from scvi_codegen.errors import ModelFileError
-from scvi_codegen.mechanics.time_transformation import CONTROLLERS
 from scvi_codegen.validation import checked_count
 
 NUMBER, COUNT, TEXT, CHOICE, SWITCH, METHOD = "number", "count", "text", "choice", "switch", "method"
@@ -147,8 +147,11 @@ OPTIONS = (
     ),
     Option(
         *("controller", "run", CHOICE, ""),
-        "With --time-transformation: symplectic (default; energy must be conserved), or reversible (any system).",
-        choices=(*CONTROLLERS,),
+        "Step-size controller. With --time-transformation: symplectic (default; energy must be conserved), or "
+        "reversible (any system); without it "
+        + ", ".join(f"{name}: {each.summary}" for name, each in CONTROLLERS.items() if not each.in_tau)
+        + ".",
+        choices=(SYMPLECTIC, *CONTROLLERS),
     ),
     Option("span", "run", NUMBER, "T", "Duration of the run.", determines=DURATION),
     Option("steps", "run", COUNT, "N", "Number of steps, instead of --span.", determines=DURATION),

@@ -28,6 +28,8 @@ class TimeSpan:
         t: initial time.
         time_transformation: time-rescaling function of the reversible controller, as text, see
             :func:`~scvi_codegen.compile_stepper`; requires a span. A system in transformed time has its own.
+        controller: name of the step-size controller, ``None`` for the default; without ``time_transformation`` it
+            requires adaptive steps.
     """
 
     h: float | None = None
@@ -38,6 +40,7 @@ class TimeSpan:
     save_every: int = 1
     t: float = 0.0
     time_transformation: str | None = None
+    controller: str | None = None
 
     def _check_time_span(self) -> None:
         """Raise :class:`ModelFileError`, naming the field, for invalid values, and convert the others."""

@@ -159,7 +159,7 @@ def test_steps_end_at_breakpoints_of_inputs() -> None:
     ("words", "printed"),
     [
         ("run kepler --controller reversible", "the reversible controller requires a time transformation"),
-        ("run kepler --controller pid", "'symplectic', 'reversible'"),
+        ("run kepler --controller pid", "'symplectic', 'predictive', 'reversible'"),
         ("run kepler --time-transformation z --controller reversible", "no time transformation 'z'"),
         ("run FILE --steps 10", "give span, not steps"),
         ("run FILE --advise 1e-9", "--advise is not available with a time transformation"),
@@ -182,7 +182,7 @@ def test_unsupported_model_fields_are_reported(shaken: Path, tmp_path: Path) -> 
         sc.Model(
             system=stretched, method=sc.SVI(4), q=(1, 0), p=(0, 1), h=0.1, span=3.0, time_transformation="frequency"
         )
-    with pytest.raises(ModelFileError, match="controller must be symplectic or reversible"):
+    with pytest.raises(ModelFileError, match="controller must be symplectic or predictive or reversible"):
         parse_model(SHAKEN.replace('"reversible"', '"pid"'))
 
 

@@ -68,7 +68,7 @@ def test_documented_additions_need_one_file_and_one_line() -> None:
     new, changes = additions()
     lines = [line for _, change in changes for line in change.splitlines() if line[:1] in "+-"]
     of_package = [path for path, _ in new if path.startswith("scvi_codegen/")]
-    assert len(of_package) == len(new) - 1 == 5, "an observer is a file of the user"
+    assert len(of_package) == len(new) - 1 == 6, "an observer is a file of the user"
     assert not any((ROOT / path).exists() for path, _ in new)
     assert all(line.startswith("+") for line in lines)
     assert sum("import" not in line for line in lines) == len(of_package)
@@ -125,6 +125,45 @@ print(6.5 < __import__("math").log2(errors[0] / errors[1]) < 9.5)
     weights, order = run(extended, script).splitlines()
     assert weights == "[41, 216, 27, 272, 27, 216, 41]"  # Abramowitz & Stegun 25.4.17, 6 h / 840
     assert order == "True"
+
+
+def test_documented_controller_determines_adaptive_steps(extended: Path) -> None:
+    """It is as accurate as the default one, in steps of its own; arrays, models and checkpoints have it as well."""
+    script = """
+import numpy as np
+from click.testing import CliRunner
+from scvi_codegen import LagrangianSystem, compile_stepper
+from scvi_codegen.cli import main
+from scvi_codegen.models.model_files.model_file import dump_model, parse_model
+from scvi_codegen.models.problems import problem
+given, own = problem("kepler"), "elementary"
+q, p, T = [0.1, 0.0], [0.0, np.sqrt(19.0)], 2 * np.pi
+by = {name: compile_stepper(given.system, "svi:6", controller=name) for name in (None, "predictive", own)}
+runs = {name: stepper.integrate(q, p, t_end=T, tolerance=1e-12) for name, stepper in by.items()}
+print(np.array_equal(runs[None].t, runs["predictive"].t), runs[own].steps != runs[None].steps)
+print(abs(runs[own].q[-1] - q).max() < 1e-8, runs[own].rejected_steps > runs[None].rejected_steps)
+run = by[own].start(q, p, t_end=T, tolerance=1e-12)
+run.advance(runs[own].steps // 2)
+run = by[own].from_checkpoint(run.checkpoint(), t_end=T, tolerance=1e-12)
+run.advance(10**6)
+print(np.array_equal(run.q, runs[own].q[-1]))
+sums = "sum(i in N, q_dot[i]**2/2) - sum(i in 0..N-2, exp(9*(q[i+1] - q[i])))"
+chain = LagrangianSystem.from_text("chain", ["q[N]"], sums)
+ends = []
+for sizes in (None, {"N": 4}):
+    for name in (None, own):
+        stepper = compile_stepper(chain, "svi:6", controller=name, sizes=sizes)
+        start = {"q": {"q": [0.3, 0.1, -0.2, 0.5]}, "velocity": {"q": [0.0] * 4}}
+        ends.append(stepper.integrate(**start, t_end=3.0, tolerance=1e-9))
+print(len(ends[0].t) != len(ends[1].t), np.abs(ends[1].q[-1] - ends[3].q[-1]).max() < 1e-6)
+model = parse_model(f"[system]\\ncatalogue = 'kepler'\\n[run]\\ncontroller = '{own}'\\nspan = 2.0\\ntolerance = 1e-9")
+again = parse_model(dump_model(model))
+print(again.controller, model.integrate().steps == again.integrate().steps)
+shown = CliRunner().invoke(main, ["run", "kepler", "--controller", own, "--tolerance", "1e-9", "--span", "2"])
+print(shown.exit_code, f"{model.integrate().steps} steps of adaptive size" in shown.output)
+"""
+    lines = run(extended, script).splitlines()
+    assert lines == ["True True", "True True", "True", "True True", "elementary True", "0 True"]
 
 
 def test_documented_format_writes_trajectories_and_ensembles(extended: Path) -> None:

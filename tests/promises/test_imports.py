@@ -27,7 +27,7 @@ FLOORS = """
     formulas display
     ir
     mechanics rendering
-    methods native pictures
+    methods native pictures controllers
     lowering exact runtime
     pipeline
     compiler fields frameworks

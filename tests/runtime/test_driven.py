@@ -283,7 +283,7 @@ def test_runs_with_inputs_have_finite_ends_and_valid_names(pendulum):
 
 def test_empty_and_contradictory_runs_with_inputs(pendulum):
     stepper, inputs = compile_stepper(pendulum, SVI(2)), {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}
-    with pytest.raises(StateError, match="either t_end or steps"):
+    with pytest.raises(StateError, match="give either steps=3 or t_end=2 with h"):
         stepper.integrate([0.3], [0.0], inputs=inputs, h=0.1, steps=3, t_end=2.0)
     with pytest.raises(StateError, match=r"h = -0.1 has the wrong sign for a run from t = 0 to t_end = 2"):
         stepper.integrate([0.3], [0.0], inputs=inputs, h=-0.1, t_end=2.0)

@@ -160,7 +160,7 @@ def motion_of(model: Model, names: Sequence[str]) -> dict[str, Any]:
     vectors = {key: getattr(model, name) for key, name in STATE.items()}
     initial = {key: _named(names, vector) for key, vector in vectors.items() if vector is not None}
     values = {option.key: getattr(model, option.field, None) for option in options_of("run")}
-    values["controller"] = "reversible" if model.time_transformation else None
+    values["controller"] = model.controller or ("reversible" if model.time_transformation else None)
     run = {key: value for key, value in values.items() if value is not None}
     specification = model.method.specification().items()
     method = {key: list(value) if isinstance(value, tuple) else value for key, value in specification}

@@ -12,13 +12,14 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+from scvi_codegen.controllers import SYMPLECTIC, default_controller, with_time_transformation
 from scvi_codegen.errors import ModelFileError, SystemDefinitionWarning
 from scvi_codegen.files.atomic import read_text, write_text
 from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.lowering.arrays import one_coordinate
 from scvi_codegen.mechanics.definition_checks import warn_of_mistakes
-from scvi_codegen.mechanics.time_transformation import time_rescaling_function, with_time_transformation
+from scvi_codegen.mechanics.time_transformation import time_rescaling_function
 from scvi_codegen.methods import fitted
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.document import document_of, motion_of, with_files
@@ -210,10 +211,12 @@ def _with_time_transformation(model: Model, document: Document, specification: S
     """Return the model with the time transformation of its file; warn of probable mistakes in the formulas."""
     g, controller = document.get("system", {}).get("time_transformation"), document["run"].get("controller")
     if g is not None or controller is not None:
-        model, where = model.with_known_sizes(), "[system] time_transformation"
+        model, where = model.with_known_sizes() if g else model, "[system] time_transformation"
         system, g = in_section(where, lambda: with_time_transformation(model.system, g, controller))
-        method = read_method(fitted(specification, system))
-        model = replace(model, system=system, method=method, time_transformation=g)
+        default = default_controller(in_tau=g is not None)
+        controller = None if controller in (SYMPLECTIC, default) else controller
+        method = model.method if model.array_system else read_method(fitted(specification, system))
+        model = replace(model, system=system, method=method, time_transformation=g, controller=controller)
     others = map(symbol, words_of(document))
     if model.array_system is not None:
         model.array_system.warn_of_mistakes(others)

@@ -148,6 +148,7 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
         embedded=embedded,
         controlled=not embedded or model.h is None,
         time_transformation=model.time_transformation,
+        controller=model.controller,
     )
     source = source.single_file() if single_file else source.specialised()
     texts = source.files

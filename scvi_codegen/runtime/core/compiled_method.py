@@ -88,6 +88,7 @@ class CompiledMethod:
         fallback: source with Newton's iteration, if the main source contains only the fixed-point iteration.
         events: events that every run records.
         changes_states: whether one of them changes the states of runs.
+        in_tau: whether the system is one in transformed time, whose steps are steps of tau.
         run_time_sizes: whether the sizes of its arrays are those of each call; the stepper is bound to them, or
             compiled with them if an integrator of run-time sizes is impossible.
         origin, problem: of a bound stepper, the stepper of run-time sizes, and the sizes and tables; else ``None``.
@@ -107,6 +108,7 @@ class CompiledMethod:
         problem: RunSizes | None = None,
     ) -> None:
         self.interface, self.flags, self.events = interface, flags, events
+        self.in_tau = bool(interface.energy_parameter)
         self.changes_states = any(event.changes_state for event in events)
         self.origin, self.problem, self._of_sizes, self._reason = origin, problem, of_sizes, reason
         self.run_time_sizes = problem is None and bool(interface.layout.coordinates)

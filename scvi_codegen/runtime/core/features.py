@@ -141,6 +141,7 @@ FEATURES = {
             "sizes, or compile roll_sums(system).system, whose runs take its tables and parameters",
         ),
         ("with sizes known at run time", "flow", f"pass stepper.with_sizes(..); {SIZES_REQUIRED}"),
+        ("with save_every", "t_eval", "give either t_eval or save_every, not both"),
         ("with inputs", "t_eval", "omit t_eval"),
         ("with inputs", "observe", "omit observe"),
         ("with inputs", "sensitivity chaos", "use tangent or pullback, or run.pieces"),
@@ -174,6 +175,14 @@ def refusal(operation: str, property_: str, title: str = "") -> ScviCodegenError
     of_stepper = property_ in PROPERTIES or property_ in PROPERTIES_OF_SIZES
     reason = f"{OPERATIONS[operation]} is not available {property_}{title and f' ({title})'}"
     return (MethodError if of_stepper else StateError)(f"{reason}: {FEATURES[operation, property_]}")
+
+
+def check_together(**arguments: Any) -> None:
+    """Raise the refusal of an argument of a run that another one excludes; ``None``: not given."""
+    given = [name for name, value in arguments.items() if value is not None]
+    for operation, property_ in FEATURES:
+        if operation in given and property_.removeprefix("with ") in given:
+            raise refusal(operation, property_)
 
 
 def require(stepper: Any, operation: str, *together: str) -> None:

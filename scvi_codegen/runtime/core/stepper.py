@@ -23,28 +23,20 @@ from scvi_codegen.runtime.chaos.ensemble import ChaosIndicatorsEnsemble
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
 from scvi_codegen.runtime.constraints.projection import consistent, constraint_values, multipliers, projected
 from scvi_codegen.runtime.core.compiled_method import Variants
-from scvi_codegen.runtime.core.features import require
+from scvi_codegen.runtime.core.features import check_together, require
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, Parameters, States
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, momenta_of_each
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 from scvi_codegen.runtime.events.event import Event, EventLike
-from scvi_codegen.runtime.inputs.segments import (
-    advance_to,
-    checked_data,
-    final_time,
-    first_inner_time,
-    parameters_of,
-    record_pieces,
-)
+from scvi_codegen.runtime.inputs.segments import InputSegments, checked_inputs, final_time
 from scvi_codegen.runtime.rotations.states import homogeneous_state, is_one_state
 from scvi_codegen.runtime.run.accuracy import (
     measure_growth,
     warn_of_energy_errors,
     warn_of_error_growth,
     warn_of_inaccuracy,
-    warn_of_unresolved_fields,
     warn_of_unresolved_members,
 )
 from scvi_codegen.runtime.run.global_error import checked_error, confirmed_run, warn_of_unconfirmed
@@ -149,49 +141,64 @@ class Stepper(Integrator):
         """
         if tables is not None or threads is not None:
             self._check_not_of_run(tables, threads)
-        stepper, interface = self if events is None else self.with_events(events), self.interface
-        data = None
+        stepper, interface, segments = self if events is None else self.with_events(events), self.interface, None
         if inputs is not None or t_eval is not None or observe is not None:
-            data = checked_data(interface, inputs, t_eval, save_every, observed=observe is not None)
+            given = None if save_every == 1 else save_every
+            check_together(inputs=inputs, t_eval=t_eval, observe=observe, save_every=given, error=error)
+            inputs = None if inputs is None else checked_inputs(interface, inputs)
         if interface.rotations or interface.variables:
             q, p, velocity = homogeneous_state(interface, q, p, velocity)
         if error is not None:
-            require(stepper, "error", *["observe"] * (observe is not None))
             wanted = checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance})
-            along: dict[str, Any] = {"t": t, "options": options, "parameters": parameters}
-            whole = partial(stepper.integrate, q, p, velocity=velocity, inputs=inputs, progress=progress, **along)
-            once = partial(whole, t_end=t_end, save_every=save_every, t_eval=t_eval)
-            all_saved = not stepper.events and save_every == 1 and t_eval is None
-            again = None if all_saved else partial(stepper.with_events(()).integrate, *whole.args, **whole.keywords)
-            of_tau: Callable[[float], float] | None = None
-            if self._has_tau:
-                of_tau = partial(stepper._largest_step, (q, p, velocity), t_end, along)
-            return confirmed_run(wanted, once, again, checked_number(t, "the time t"), of_tau)
-        if data is None:
-            begin = 0.0 if h is None or t_end is None else t
-            controller, in_tau = interface.time_transformation, bool(interface.energy_parameter)
-            plan, count = planned_steps(h, steps, t_end, tolerance, save_every, begin, controller, in_tau)
-            run, repeat = stepper._started(q, p, velocity, plan, t, parameters, options, reuse=True), None
-        else:
-            fixed = h is not None and not interface.time_transformation
-            end, values = final_time(t, h if fixed else None, steps, t_end), parameters_of(self, parameters, data)
-            plan, first = self._plan(h, None if fixed else end, tolerance), values(first_inner_time(t, end))
-            run = stepper._started(q, p, velocity, plan, t, first, options, reuse=True)
-            repeat = partial(advance_to, run, data, values=values)
+            start = {"velocity": velocity, "inputs": inputs, "t": t, "parameters": parameters, "options": options}
+            return stepper._confirmed(wanted, q, p, t_end, save_every, t_eval, progress, start)
+        begin = 0.0 if h is None or t_end is None else t  # one plan for all initial times where they do not matter
+        controller, in_tau = interface.time_transformation, stepper.in_tau
+        plan, count = planned_steps(h, steps, t_end, tolerance, save_every, begin, controller, in_tau)
+        if inputs is not None:
+            plan = StepPlan(h=plan.h) if plan.h else plan  # each segment ends where the next begins
+            segments = InputSegments(stepper, inputs, parameters, t, final_time(t, plan.h, steps, t_end))
+            parameters = segments.first
+        run = stepper._started(q, p, velocity, plan, t, parameters, options, reuse=True)
         if check_growth or not plan.h:
             measure_growth(run, check_growth)
-        if data is None:
+        if segments is None:
             times = None if t_eval is None else stepper._output_times(t_eval, run, count)
-            trajectory = run._recorded(count, save_every=save_every, times=times, progress=progress, observe=observe)
+            trajectory = run._recorded(count, save_every, times, progress, observe)
             warn_of_inaccuracy(trajectory, run)
         else:
-            save_every = checked_count(save_every, "save_every", least=1)
-            trajectory = record_pieces(run, data, end, save_every=save_every, values=values, progress=progress)
-            warn_of_unresolved_fields(trajectory)
+            trajectory = segments.record(run, save_every, progress)
         if not plan.h:
+            repeat = None if segments is None else partial(segments.advance, run)
             warn_of_error_growth(run, trajectory, check_growth, repeat)
         run._release()
         return trajectory
+
+    def _confirmed(
+        self,
+        error: float,
+        q: States,
+        p: States | None,
+        t_end: float | None,
+        save_every: int,
+        t_eval: ArrayLike | None,
+        progress: Callable[[int], None] | None,
+        start: dict[str, Any],
+    ) -> Trajectory:
+        """Return the run to t_end whose relative global error is confirmed; ``start``: further arguments of all runs.
+
+        Runs for comparison have neither events nor output times.
+        """
+        require(self, "error")
+        run = partial(
+            self.integrate, q, p, t_end=t_end, save_every=save_every, t_eval=t_eval, progress=progress, **start
+        )
+        again: Callable[..., Trajectory] | None = None
+        if self.events or save_every != 1 or t_eval is not None:
+            again = partial(self.with_events(()).integrate, q, p, progress=progress, **start)
+        along = {name: start[name] for name in ("t", "parameters", "options")}
+        of_tau = partial(self._largest_step, (q, p, start["velocity"]), t_end, along) if self._has_tau else None
+        return confirmed_run(error, run, again, checked_number(start["t"], "the time t"), of_tau)
 
     def _largest_step(
         self, state: tuple[Any, Any, Any], t_end: Any, along: Mapping[str, Any], tolerance: float
@@ -205,7 +212,7 @@ class Stepper(Integrator):
     @property
     def _has_tau(self) -> bool:
         """Return whether steps are steps of tau, by a transformed system or the reversible controller."""
-        return bool(self.interface.energy_parameter or self.interface.time_transformation)
+        return bool(self.in_tau or self.interface.time_transformation)
 
     @checks_arguments(StateError)
     def start(
@@ -258,13 +265,12 @@ class Stepper(Integrator):
 
     def _plan(self, h: float | None, t_end: float | None, tolerance: float | None) -> StepPlan:
         """Return the step plan of these arguments of :meth:`start`."""
-        interface = self.interface
-        return checked_plan(h, t_end, tolerance, interface.time_transformation, bool(interface.energy_parameter))
+        return checked_plan(h, t_end, tolerance, self.interface.time_transformation, self.in_tau)
 
     def _output_times(self, t_eval: ArrayLike, run: Run, steps: int | None) -> Array:
         if steps is None:
             return times_of_run(t_eval, run.t, run.plan.t_end)
-        if self.interface.energy_parameter:
+        if self.in_tau:
             raise StateError("t_eval requires t_end instead of steps in transformed time")
         end = times_after(run.t, run.h, checked_count(steps, "steps", least=0))[0]
         return times_of_run(t_eval, run.t, float(end))

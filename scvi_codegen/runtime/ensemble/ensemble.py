@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import EventError, StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import SolverOptions, checked_options
-from scvi_codegen.runtime.core.features import refusal, require
+from scvi_codegen.runtime.core.features import check_together, require
 from scvi_codegen.runtime.core.validation import Array, States, check_left_to_inputs, columns_of_inputs, parameter_index
 from scvi_codegen.runtime.ensemble.initial_states import (
     EnsembleParameters,
@@ -42,7 +42,7 @@ from scvi_codegen.runtime.inputs.segments import (
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.global_error import GlobalError
-from scvi_codegen.runtime.run.step_plan import StepPlan, checked_plan
+from scvi_codegen.runtime.run.step_plan import StepPlan, checked_plan, planned_steps
 from scvi_codegen.runtime.run.times import WHOLE
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
@@ -54,7 +54,6 @@ CHUNK_SECONDS = 0.02
 """Target duration of a chunk in seconds; bounds the delay of an interruption."""
 GROWTH = 8.0
 """Largest ratio of successive chunk sizes."""
-EITHER = "give either h with steps or t_end (fixed step size), or t_end alone (adaptive step size)"
 
 
 class SavedLane(NamedTuple):
@@ -101,7 +100,7 @@ class Ensemble:
         error: float | None = None,
     ) -> None:
         interface = stepper.interface
-        steps, t_end = _steps_or_end(t, h, steps, t_end, inputs, tolerance=tolerance, t_eval=t_eval)
+        steps, t_end = _steps_or_end(t, h, steps, t_end, inputs, tolerance, t_eval)
         require(stepper, "ensembles")
         if h is None:
             require(stepper, "adaptive")
@@ -158,8 +157,7 @@ class Ensemble:
             breakpoints_until(self.t0, plan.t_end, self.inputs)
         if t_eval is None:
             return None
-        if self.save_every != 1:
-            raise StateError(f"give either t_eval or save_every={self.save_every}, not both")
+        check_together(t_eval=t_eval, save_every=None if self.save_every == 1 else self.save_every)
         farthest = max((plan.t_end for plan in self.plans), key=lambda end: abs(end - self.t0))
         return times_of_run(t_eval, self.t0, farthest)
 
@@ -359,26 +357,26 @@ class Ensemble:
 
 
 def _steps_or_end(
-    t: float, h: float | None, steps: int | None, t_end: ArrayLike | None, inputs: object, **adaptive: object
+    t: float,
+    h: float | None,
+    steps: int | None,
+    t_end: ArrayLike | None,
+    inputs: object,
+    tolerance: float | None,
+    t_eval: object,
 ) -> tuple[int | None, ArrayLike | None]:
     """Return the number of common steps or the final time; with adaptive steps the final time or times.
 
     Raises:
         StateError: for missing or contradictory arguments.
     """
-    if inputs is not None and adaptive["t_eval"] is not None:
-        raise refusal("t_eval", "with inputs")
-    if (h is None and (t_end is None or steps is not None)) or (inputs is None and steps is t_end is None):
-        raise StateError(EITHER)
-    if h is None:
-        return None, t_end
-    if steps is not None and t_end is not None and inputs is None:
-        raise StateError(f"give either steps={steps} or t_end with h, not both")
-    for name, value in adaptive.items():
-        if value is not None:
-            raise StateError(f"{name} requires adaptive steps: give t_end without h and steps")
-    if t_end is not None and np.ndim(t_end):
+    check_together(inputs=inputs, t_eval=t_eval)
+    if h is not None and t_eval is not None:
+        raise StateError("t_eval requires adaptive steps: give t_end without h and steps")
+    if h is not None and t_end is not None and np.ndim(t_end):
         raise StateError("with h all trajectories have one t_end: give one number, or omit h (adaptive step size)")
-    if inputs is None and t_end is None:
-        return steps, None
-    return None, final_time(t, h, steps, None if t_end is None else checked_number(t_end, "t_end"))
+    first = None if t_end is None else float(real_array(t_end, "t_end").flat[0])
+    planned_steps(h, steps, first, tolerance, 1, checked_number(t, "the time t"), "", False)
+    if h is None or (inputs is None and first is None):
+        return steps, t_end
+    return None, final_time(t, h, steps, first)

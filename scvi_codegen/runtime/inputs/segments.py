@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from scvi_codegen.native.arguments import checked_number, checked_step, real_arr
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.core.features import refusal
 from scvi_codegen.runtime.core.validation import Array, check_left_to_inputs, no_input
-from scvi_codegen.runtime.run.accuracy import warn_of_large_steps
+from scvi_codegen.runtime.run.accuracy import warn_of_large_steps, warn_of_unresolved_fields
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.dense_output import checked_times
@@ -77,20 +77,6 @@ def checked_inputs(
             f"the input '{missing[0]}' is not set: pass inputs={{'{missing[0]}': (t, values)}}, or a number"
         )
     return {name: input_of(name, value, trajectories) for name, value in argument.items()}
-
-
-def checked_data(
-    interface: Interface, inputs: Mapping[str, Any] | None, t_eval: Any, save_every: int, *, observed: bool
-) -> dict[str, Input] | None:
-    """Return validated inputs; raise :class:`StateError` for output arguments that exclude each other or inputs."""
-    if t_eval is not None and save_every != 1:
-        raise StateError(f"give either t_eval or save_every={save_every}, not both")
-    for name, used in (("t_eval", t_eval is not None), ("observe", observed)):
-        if used and inputs is not None:
-            raise refusal(name, "with inputs")
-    if observed and t_eval is not None:
-        raise refusal("observe", "with t_eval")
-    return None if inputs is None else checked_inputs(interface, inputs)
 
 
 def input_of(name: str, argument: Any, trajectories: int | None = None) -> Input:
@@ -188,34 +174,6 @@ def inputs_of_slice(inputs: Mapping[str, Input], part: slice | int) -> dict[str,
     }
 
 
-def record_pieces(
-    run: Run,
-    inputs: Mapping[str, Input],
-    t_end: float,
-    *,
-    save_every: int,
-    values: Callable[[float], Array],
-    progress: Callable[[int], None] | None,
-) -> Trajectory:
-    """Integrate to t_end, piece by piece.
-
-    Args:
-        run: the run at its start; its ``plan`` is set for adaptive steps.
-        inputs: inputs by name.
-        t_end: final time.
-        save_every: steps between saved states; states at breakpoints are saved as well.
-        values: function that returns the parameters of the piece containing a time.
-        progress: called with the number of completed steps.
-    """
-    first, run._watch = run.steps, None
-    report = None if progress is None else lambda _: progress(run.steps - first)
-    recorded = partial(run.record, save_every=save_every, progress=report)
-    trajectory = record_segments(run, prepared_segments(run, inputs, t_end, values), recorded)
-    if run._leaving:
-        warn_of_large_steps(trajectory)
-    return trajectory
-
-
 def record_segments(
     run: Run,
     segments: Iterable[int | None],
@@ -243,6 +201,43 @@ def record_segments(
     return joined(pieces or [recorded(0)])
 
 
+class InputSegments:
+    """Segments of a run between the breakpoints of its inputs.
+
+    Args:
+        stepper: the compiled integrator.
+        inputs: validated inputs by name.
+        parameters: of the run, without those of inputs.
+        t, t_end: initial and final time.
+
+    Attributes:
+        values: function of time that returns the parameters of the piece containing it.
+        first: parameters at the start.
+    """
+
+    def __init__(
+        self, stepper: Integrator, inputs: Mapping[str, Input], parameters: Any, t: float, t_end: float
+    ) -> None:
+        self.inputs, self.t_end, self.values = inputs, t_end, parameters_of(stepper, parameters, inputs)
+        self.first = self.values(first_inner_time(t, t_end))
+
+    def record(self, run: Run, save_every: int, progress: Callable[[int], None] | None) -> Trajectory:
+        """Integrate segment by segment; states at breakpoints are saved as well."""
+        first, run._watch = run.steps, None
+        report = None if progress is None else lambda _: progress(run.steps - first)
+        recorded = partial(run.record, save_every=save_every, progress=report)
+        trajectory = record_segments(run, prepared_segments(run, self.inputs, self.t_end, self.values), recorded)
+        if run._leaving:
+            warn_of_large_steps(trajectory)
+        warn_of_unresolved_fields(trajectory)
+        return trajectory
+
+    def advance(self, run: Memory, t_end: float) -> None:
+        """Advance a run with adaptive steps to a time without saving intermediate states."""
+        for _ in prepared_segments(run, self.inputs, t_end, self.values):
+            run._run_to_target()
+
+
 def prepared_segments(
     run: Memory, inputs: Mapping[str, Input], t_end: float, values: Callable[[float], Array]
 ) -> Iterator[int | None]:
@@ -259,12 +254,6 @@ def prepared_segments(
     for end in breakpoints_until(run.t, t_end, inputs):
         run.update(parameters=values(run.t + 0.5 * (end - run.t)), plan=replace(run.plan, t_end=end))
         yield None
-
-
-def advance_to(run: Memory, inputs: Mapping[str, Input], t_end: float, values: Callable[[float], Array]) -> None:
-    """Advance a run with adaptive steps to a time without saving intermediate states."""
-    for _ in prepared_segments(run, inputs, t_end, values):
-        run._run_to_target()
 
 
 class Segment(NamedTuple):
@@ -337,20 +326,11 @@ def breakpoints_until(t: float, t_end: float, inputs: Mapping[str, Input]) -> li
 
 
 def final_time(t: float, h: float | None, steps: int | None, t_end: float | None) -> float:
-    """Return the final time of a run with inputs, given by t_end or by h and steps."""
+    """Return the final time of a run, given by t_end or by h and steps."""
     t = checked_number(t, "the time t")
-    if (t_end is None) == (steps is None):
-        raise StateError(f"give either t_end or steps with inputs; got {'neither' if steps is None else 'both'}")
-    if t_end is None:
-        if h is None:
-            raise StateError(
-                "steps requires h (fixed step size): give h, or t_end instead of steps (adaptive step size)"
-            )
-        return float(times_after(t, checked_step(h), checked_count(steps, "steps", least=0))[0])
-    end = checked_number(t_end, "t_end")
-    if h is not None and (end - t) * checked_step(h) < 0.0:
-        raise StateError(f"h = {h:g} has the wrong sign for a run from t = {t:g} to t_end = {end:g}: use h = {-h:g}")
-    return end
+    if t_end is not None:
+        return checked_number(t_end, "t_end")
+    return float(times_after(t, checked_step(cast(float, h)), checked_count(steps, "steps", least=0))[0])
 
 
 def first_inner_time(t: float, t_end: float) -> float:

@@ -74,9 +74,11 @@ class Memory(OneThread):
         self._watch: Any = None  # state of the search for events in C
         self._energies: Any = None  # function of C, and memory for its results
         self._rows: Any = None  # memory for states that every recording uses
+        self._times_in_rows: Any = None  # times of the trajectory whose states are in this memory
+        self._has_tau = stepper.in_tau  # whether steps are steps of tau
         self._discarded = *(binding.numbers(f"double[{stepper.dimension}]"),) * 3, binding.numbers("int *")
         self._report, self._workspace = binding.new("report *"), binding.workspace()
-        self._unsaved = *self._arguments, *self._discarded, self._report, self._workspace  # arguments of C
+        self._set_arguments(binding.null)
         self._untimed = len(self._q) <= MOST_UNTIMED  # whether ``advance`` takes steps without looking at the clock
         self._functions = {name: binding.function(name, memory) for name in FUNCTIONS if binding.has(name)}
         self._step_error = self._functions.get("step_error")
@@ -121,9 +123,14 @@ class Memory(OneThread):
         self.longest, self._watch = 0.0, None
 
     def _set_options(self, options: SolverOptions | None) -> None:
-        self._arguments = self._arguments[0], self.stepper.binding.options(checked_options(options))
-        self._unsaved = *self._arguments, *self._unsaved[2:]
+        self._set_arguments(self.stepper.binding.options(checked_options(options)))
         self._options = options
+
+    def _set_arguments(self, options: Any) -> None:
+        """Set the options, and the arguments of C calls that save no states and of those that save them in rows."""
+        self._arguments = self._arguments[0], options
+        self._unsaved = *self._arguments, *self._discarded, self._report, self._workspace
+        self._in_rows = *self._arguments, *(self._rows.next if self._rows else ()), self._report, self._workspace
 
     @classmethod
     def restored(
@@ -171,7 +178,8 @@ class Memory(OneThread):
     def plan(self, plan: StepPlan) -> None:
         if not (plan.fixed or self.stepper._has_error_estimate):
             require(self.stepper, "adaptive")
-        self._plan, self._plan_arguments = plan, () if plan.fixed else (plan.t_end, plan.tau or plan.tolerance)
+        self._plan, self._plan_arguments = plan, () if plan.h else (plan.t_end, plan.tau or plan.tolerance)
+        self._has_tau = bool(plan.tau) or self.stepper.in_tau
         self._advance_function = self._functions["advance" if plan.fixed else "advance_to"]
 
     @property
@@ -414,7 +422,8 @@ class Memory(OneThread):
         binding = self.stepper.binding
         if self._energies is None:
             self._energies = binding.function("energies"), binding.numbers("double[2]")
-        (function, energies), (at, positions, momenta) = self._energies, binding.pointers(t, q, p)
+        (function, energies), in_rows = self._energies, t is self._times_in_rows
+        at, positions, momenta = self._rows.starts[:3] if in_rows else binding.pointers(t, q, p)
         last, values, workspace = len(t) - 1, self._arguments[0], self._workspace
         status = function(1 + (last == 1), at, positions, momenta, values, energies, workspace)
         if last != 1 and not status:

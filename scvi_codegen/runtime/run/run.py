@@ -44,9 +44,10 @@ class Run(Memory, AttitudeHistory):
         try:
             run: Self = stepper._released_runs.pop()
         except IndexError:
-            run = cls(stepper)
-            if stepper.binding.reusable and stepper.binding._workspace + FIRST_STEPS * len(run._q) <= MOST_KEPT:
+            run, binding = cls(stepper), stepper.binding
+            if binding.reusable and binding._workspace + FIRST_STEPS * len(run._q) <= MOST_KEPT:
                 run._rows = StateRows(run, FIRST_STEPS + 3)
+                run._set_arguments(binding.null)
         return run
 
     def _release(self) -> None:
@@ -92,7 +93,6 @@ class Run(Memory, AttitudeHistory):
     def _recorded(
         self,
         steps: int | None,
-        *,
         save_every: int = 1,
         times: Array | None = None,
         progress: Callable[[int], None] | None = None,
@@ -100,8 +100,8 @@ class Run(Memory, AttitudeHistory):
         stop: Callable[[], bool] | None = None,
     ) -> Trajectory:
         """Return the states as :meth:`record` does, or those at ``times``, without its warnings and its lock."""
-        plan, further = self._plan, times is not None or observe is not None
-        if self.stepper.events or further or (plan.h and plan.t_end != math.inf):
+        plan = self._plan
+        if self.stepper.events or times is not None or observe is not None or (plan.h and plan.t_end != math.inf):
             recorder = Observation(self, save_every=save_every, times=times, observe=observe)
             return recorder.advance(steps, progress, stop or (lambda: False))
         return record(self, steps, save_every=save_every, progress=progress, stop=stop)

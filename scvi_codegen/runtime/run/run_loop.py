@@ -6,6 +6,7 @@ import math
 import struct
 from collections.abc import Callable
 from functools import lru_cache, partial
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -48,10 +49,11 @@ def record(
         StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
     """
     count = None if steps is None and not memory._plan.h else checked_count(steps, "steps", least=0)
-    save_every = checked_count(save_every, "save_every", least=1)
+    if save_every != 1:
+        save_every = checked_count(save_every, "save_every", least=1)
     first, filled, status = memory._memory.step, 0, 0
-    if progress is None and stop is None and memory._rows is not None:
-        trajectory, filled, status = _in_one_call(memory, memory._rows, count, save_every)
+    if progress is None and stop is None and memory._rows is not None and not memory._has_tau:
+        trajectory, filled, status = _in_one_call(memory, memory._rows, first, count, save_every)
         if trajectory is not None:
             return trajectory
     recorder = _StateRecorder(memory, save_every, count, first, filled)
@@ -75,21 +77,24 @@ def record(
 
 
 def _in_one_call(
-    memory: Memory, rows: StateRows, steps: int | None, save_every: int
+    memory: Memory, rows: StateRows, first: int, steps: int | None, save_every: int
 ) -> tuple[Trajectory | None, int, int]:
     """Record a short run by one C call; return the trajectory if the run has ended, number of states and status.
 
     No states: a longer run, or one that has arrived. Otherwise the recording continues after these states.
     """
-    run, plan, most = memory._memory, memory._plan, FIRST_STEPS * save_every
-    first, size = run.step, most if steps is None else steps
-    h = plan.h
-    if size > most or plan.tau or not (h or memory.t != plan.t_end) or memory.stepper.interface.energy_parameter:
+    h, most = memory._plan.h, FIRST_STEPS * save_every
+    size = most if steps is None else steps
+    if size > most:
         return None, 0, 0
     if first:
         rows.begin_checked(memory.t, memory._q, memory._p)
-    status = memory._advance(size, save_every, rows.next)
-    filled = 1 + (run.step // save_every - first // save_every if h else memory._report.stored)
+    if not h and rows.time == memory._plan.t_end:
+        return None, 0, 0
+    if memory._unset_inputs and size:
+        memory.check_inputs()
+    status = memory._advance_function(*memory._plan_arguments, size, save_every, *memory._in_rows)
+    filled = 1 + (memory._memory.step // save_every - first // save_every if h else memory._report.stored)
     if status or (steps is None and memory._report.steps == size):
         return None, filled, status
     states = rows.copies(filled)
@@ -97,6 +102,7 @@ def _in_one_call(
         step_sizes = _repeated(h, filled)
     else:
         step_sizes = rows.step_sizes() if save_every == 1 else _differences(states[0], whole=False)
+    memory._times_in_rows = states[0]
     return trajectory_of(memory, states, step_sizes), filled, status
 
 
@@ -133,11 +139,11 @@ class StateRows:
         if kind is np.ndarray:
             if not (q.shape == p.shape == self.shape and q.dtype is p.dtype is BINARY64):
                 return None
-            return self.begin_checked(t, q, p) if math.isfinite(sum(q.tolist()) + sum(p.tolist())) else None
-        if kind not in SEQUENCES or not NUMBERS.issuperset(map(type, q + p)):
+            q, p = q.tolist(), p.tolist()  # lists are checked and copied faster than short arrays
+        elif kind not in SEQUENCES or not NUMBERS.issuperset(map(type, q + p)):
             return None
         try:
-            if math.isfinite(sum(q) + sum(p)):
+            if isfinite(sum(q, sum(p))):
                 self._pack(self._q, 0, *q)
                 self._pack(self._p, 0, *p)
                 self._t[0] = t
@@ -145,6 +151,11 @@ class StateRows:
         except (OverflowError, struct.error):  # of an integer above all floats; of another number of entries
             pass
         return None
+
+    @property
+    def time(self) -> Any:
+        """Time of the first state."""
+        return self._t[0]
 
     def begin_checked(self, t: float, q: Array, p: Array) -> tuple[Any, Any]:
         """Set the first state and return pointers to it."""
@@ -266,7 +277,8 @@ def trajectory_of(
     tau: Array | None = None,
 ) -> Trajectory:
     """Return a trajectory of these states with the data of the run."""
-    plan, stepper, run, step_error = memory._plan, memory.stepper, memory._memory, memory.step_error
+    plan, stepper, run = memory._plan, memory.stepper, memory._memory
+    step_error = math.nan if memory._step_error is None else memory._step_error()
     # attribute by attribute: with 16 keywords the call of a class takes five times as long
     trajectory = Trajectory.__new__(Trajectory)
     t, q, p, trajectory.iterations = states
@@ -277,8 +289,10 @@ def trajectory_of(
     trajectory.plan, trajectory.stepper, trajectory.options = plan, stepper, memory._options
     trajectory.steps = run.step if steps is None else steps
     trajectory.rejected_steps = 0 if plan.h or plan.tau else run.rejected
-    trajectory.step_error = step_error
-    trajectory.worst_step_time = run.error_t if step_error >= 0.0 else math.nan
+    if step_error >= 0.0:
+        trajectory.step_error, trajectory.worst_step_time = step_error, run.error_t
+    else:
+        trajectory.step_error = trajectory.worst_step_time = math.nan
     trajectory.parameters, trajectory.events, trajectory.tau = memory._parameters.copy(), events, tau
     trajectory.confirmation = trajectory.observed = trajectory.conserved = None
     trajectory.pieces = ()

@@ -119,11 +119,11 @@ def planned_steps(
     """
     fixed = h is not None and not controller
     plan = checked_plan(h, None if fixed else t_end, tolerance, controller, in_tau)
-    if not fixed:
+    if not fixed:  # Adaptive, or equal steps of tau by the controller
         if steps is not None:
             raise StateError(f"adaptive steps end at t_end={plan.t_end:g}: omit steps={steps}, or give h and steps")
         return plan, None
-    if t_end is None:
+    if t_end is None:  # Steps
         if steps is None:
             raise StateError("h requires steps or t_end (fixed step size); give t_end without h for adaptive steps")
         return plan, steps

@@ -76,18 +76,6 @@ static inline real error_at(real error, int levels)
   return error;
 }
 
-/* Change of level for the next step, down by a factor of two at most. The error is expected to continue its growth; a
- * decrease is only partly trusted. */
-static int next_change(real error, real before, const error_limits *limits)
-{
-  const real expected =
-      before > 0 && error > before ? error * (error / before) : larger(error, before / (GROWTH * GROWTH));
-  int change = expected < limits->fewer ? 2 : expected < limits->few;
-  while (change > -LEVELS_PER_BINADE && error_at(expected, change) > limits->most)
-    change--;
-  return change;
-}
-
 /* Size of the next step, or the remaining interval if that is hardly longer; *last is then 1. */
 static real next_size(real length, real rest, int *last)
 {

@@ -6,7 +6,8 @@
 
 /* Adaptive steps: trials of a step until its error estimate is admissible (Hairer, Norsett & Wanner, Solving ODEs I,
  * sec. II.4), with comparisons with two half steps. The equations of a trial are solved by fixed-point iteration, by
- * Newton's method (NEWTON_ALONE) or, for arrays, by Newton-GMRES (NEWTON_KRYLOV). Requires: run.h or array_step.h. */
+ * Newton's method (NEWTON_ALONE) or, for arrays, by Newton-GMRES (NEWTON_KRYLOV). Requires: run.h or array_step.h,
+ * and next_change of a step-size controller. */
 
 #define ALLOWED_TO_HALVES 100 /* admissible difference of the half steps, relative to the admissible error estimate */
 #define SPURIOUS REAL(1e-8) /* relative to the state: spurious solutions of the equations differ by more */
@@ -265,7 +266,7 @@ static inline int confirm_step(run_memory *run, trial *now, const solver_options
  * size of such a step is not tried again for some steps (cf. Hairer & Wanner, Solving ODEs II, IV.8). */
 static inline void choose_size(run_memory *run, const trial *now)
 {
-  int change = next_change(now->error, run->error_before, &now->limits);
+  int change = next_change(run, now->error, run->error_before, &now->limits);
   if (run->avoiding > 0 && run->avoiding-- && run->grid_level + change >= run->failed)
     change = (int)(run->failed - 1 - run->grid_level);
   run->guess = now->guess;
