@@ -46,10 +46,10 @@ class Neighbours:
         return self.array.axes[1].number if len(self.array.axes) > 1 else 1
 
     @property
-    def lengths(self) -> tuple[str, ...]:
-        """Lengths as texts, ``"near cutoff 5*s/2"``, the cutoff first, for the checks of every run."""
+    def lengths(self) -> tuple[tuple[str, str, str], ...]:
+        """Lengths as texts, ``("near", "cutoff", "5*s/2")``, the cutoff first, for the checks of every run."""
         named = [("cutoff", self.cutoff), ("skin", self.skin), *(("box", period) for period in self.box)]
-        return tuple(f"{self.name} {kind} {format_expression(length)}" for kind, length in named)
+        return tuple((self.name, kind, format_expression(length)) for kind, length in named)
 
     def inside(self, one: str, other: str) -> str:
         """Return the formula that is 1 for points of two indices closer than the cutoff, else 0."""

@@ -184,7 +184,7 @@ class MechanicalSystem(Deferred, ABC):
     indices: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
     definition: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
     rotations: tuple[Homogeneous, ...] = ()
-    lengths: tuple[str, ...] = ()
+    lengths: tuple[tuple[str, ...], ...] = ()
 
     @property
     @abstractmethod

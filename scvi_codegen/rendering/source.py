@@ -29,6 +29,7 @@ KINDS: dict[str, Callable[[Any], bool]] = {
     "tuple[str, ...]": lambda value: isinstance(value, tuple) and all(isinstance(each, str) for each in value),
     "tuple[bool, ...]": lambda value: isinstance(value, tuple) and all(isinstance(each, bool) for each in value),
     "tuple[float, ...]": lambda value: isinstance(value, tuple) and all(map(_is_number, value)),
+    "tuple[tuple[str, ...], ...]": lambda value: isinstance(value, tuple) and all(map(KINDS["tuple[str, ...]"], value)),
     "ArrayLayout": lambda value: False,
 }
 """Checks of values read from JSON against the annotations of :class:`Interface`."""
@@ -130,8 +131,17 @@ class Source:
 
 COMPONENTS = {"rotation": 4, "direction": 3, "spin": 2}
 """Number of homogeneous coordinates by kind."""
-LENGTH_OF_NEIGHBOURS = re.compile(r"[A-Za-z]\w* (cutoff|skin|box) \S.*", re.ASCII)
+NUMBER = re.compile(r"\d+(\.\d*)?", re.ASCII)
+NAME_IN_FORMULA = re.compile(r"(?<![\w.])[A-Za-z_]\w*(?!\w*\()")
+"""Names in formulas but those of functions."""
 DECLARED = re.compile(r"rotation [A-Za-z]\w* [A-Za-z]\w*( momentum)?|(direction|spin) [A-Za-z]\w*", re.ASCII)
+
+
+def _as_tuples(value: Any) -> Any:
+    """Return a value of JSON with tuples in place of lists, and of lists in them."""
+    return (
+        tuple(tuple(each) if isinstance(each, list) else each for each in value) if isinstance(value, list) else value
+    )
 
 
 def _is_number(value: Any) -> bool:
@@ -160,14 +170,32 @@ def check_interface(source: Source, interface: Interface) -> None:
     for name, (found, wanted) in lengths.items():
         if found != wanted:
             raise ValueError(f"{name}: the interface has {found}; {wanted} is required")
-    with_cutoff = {each.split(" ")[0] for each in interface.lengths if LENGTH_OF_NEIGHBOURS.fullmatch(each)}
+    _check_lengths(interface)
+    _check_names(source, interface)
+
+
+def _check_lengths(interface: Interface) -> None:
+    """Raise :class:`ValueError` if the lengths of neighbours are not those of lists with a cutoff, in parameters."""
+    with_cutoff: set[str] = set()
     for each in interface.lengths:
-        if not LENGTH_OF_NEIGHBOURS.fullmatch(each) or each.split(" ")[0] not in with_cutoff:
-            raise ValueError(f"lengths: {each!r} must be the name of neighbours, cutoff, skin or box, and a formula")
-    if not set(interface.inputs) <= {name[:-2] for name in interface.parameters if name.endswith("_0")}:
-        raise ValueError(
-            f"the inputs {interface.inputs} must be among the parameters, each with its first parameter NAME_0"
-        )
+        with_cutoff |= {each[0]} if each[1:2] == ("cutoff",) else set()
+        if len(each) != 3 or each[0] not in with_cutoff or each[1] not in ("cutoff", "skin", "box"):
+            raise ValueError(f"lengths: {each!r} must be neighbours, cutoff, skin or box, and a formula, cutoffs first")
+        unknown = {*NAME_IN_FORMULA.findall(each[2])} - {*interface.parameters, "pi"}
+        if unknown or not (NUMBER.fullmatch(each[2]) or re.search("[A-Za-z]", each[2])):
+            raise ValueError(f"lengths: {each[2]!r} must be a formula of the parameters {interface.parameters}")
+
+
+def _check_names(source: Source, interface: Interface) -> None:
+    """Raise :class:`ValueError` if names that others refer to are missing."""
+    first = {name[:-2] for name in interface.parameters if name.endswith("_0")}
+    if not set(interface.inputs) <= first:
+        raise ValueError(f"the inputs {interface.inputs} must each have a first parameter NAME_0")
+    own, functions = interface.energy_parameter, f"{source.prefix}_rates(" in source.header
+    if functions != bool(own) or not {own} <= {"", *interface.parameters}:
+        raise ValueError(f"energy_parameter: {own!r} must be a parameter of systems in transformed time")
+    if interface.variables and not len(interface.variables) == 2 * len(interface.momentum_names):
+        raise ValueError(f"variables: {interface.variables} must be the coordinates and momenta")
 
 
 def _compare(name: str, size: int, found: re.Match[str] | None) -> None:
@@ -257,7 +285,8 @@ class Interface:
         layout: of arrays whose sizes are known at run time; the coordinates are their names.
         variables: of a first-order system all coordinates in the order of the user, half of which are ``coordinates``
             and half of which take the place of momenta; else none.
-        lengths: cutoffs, skins and periods of lists of neighbours, ``"near cutoff 5*s/2"``, which every run checks.
+        lengths: cutoffs, skins and periods of lists of neighbours, ``("near", "cutoff", "5*s/2")``, which every run
+            checks.
     """
 
     prefix: str
@@ -290,7 +319,7 @@ class Interface:
     rotations: tuple[str, ...] = ()
     layout: ArrayLayout = ArrayLayout()
     variables: tuple[str, ...] = ()
-    lengths: tuple[str, ...] = ()
+    lengths: tuple[tuple[str, ...], ...] = ()
 
     @property
     def dimension(self) -> int:
@@ -327,12 +356,16 @@ class Interface:
         Raises:
             ValueError, TypeError: for other fields, and values of other types.
         """
-        arguments: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in record.items()}
+        arguments: dict[str, Any] = {key: _as_tuples(value) for key, value in record.items()}
         for each in fields(cls):
             if each.name in arguments and not KINDS[str(each.type)](arguments[each.name]):
                 raise ValueError(f"{each.name} is {arguments[each.name]!r:.60}: it must be of type {each.type}")
         interface = cls(**arguments)
-        if not all(isinstance(value, int | list) for value in interface.index_values.values()):
+        try:
+            valid = all(isinstance(value, int | list) for value in interface.index_values.values())
+        except RecursionError:
+            valid = False
+        if not valid:
             raise ValueError(f"indices is {interface.indices!r:.60}: it must contain whole numbers")
         kinds = [kind for kind, *_ in map(str.split, filter(DECLARED.fullmatch, interface.rotations))]
         if len(kinds) < len(interface.rotations) or sum(COMPONENTS[kind] for kind in kinds) > interface.dimension:

@@ -5,6 +5,7 @@ exception must be a :class:`~scvi_codegen.errors.ScviCodegenError`.
 """
 
 import json
+import math
 import os
 import warnings
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.cli import main
+from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.native import building, compilers
 from scvi_codegen.rendering.source import Source
 
@@ -36,7 +38,7 @@ u = { t = [0.0, 10.0], values = [0.0, 1.0] }
 
 [initial]
 q = [1.0]
-velocity = [0.0]
+q_dot = [0.0]
 
 [method]
 method = "svi:2"
@@ -184,6 +186,15 @@ CSV = [
 ]
 
 
+def test_undamaged_model_is_accepted(tmp_path: Path) -> None:
+    """Or the tests below test nothing."""
+    (tmp_path / "u.csv").write_text("t,u\n0,0\n10,1\n")
+    for inputs in ("{ t = [0.0, 10.0], values = [0.0, 1.0] }", '{ file = "u.csv" }'):
+        text = MODEL.replace("{ t = [0.0, 10.0], values = [0.0, 1.0] }", inputs)
+        (tmp_path / "model.toml").write_text(text)
+        assert sc.load_model(tmp_path / "model.toml").all_inputs()
+
+
 @pytest.mark.parametrize("number", range(len(CSV)))
 def test_damaged_csv_tables_are_rejected(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Tables are inputs, index tables and ensembles of the command line."""
@@ -226,7 +237,7 @@ def test_damaged_manifests_are_rejected(recorded: Path, part: int) -> None:
     whole = path.read_text()
     document = json.loads(whole)
     del document["sha256"]
-    sealed, whole = whole, json.dumps(document)
+    sealed, whole = whole, json.dumps(document, indent=1)
     count = 0
     try:
         for place in paths_of(document):
@@ -236,7 +247,7 @@ def test_damaged_manifests_are_rejected(recorded: Path, part: int) -> None:
                 for key in place[:-1]:
                     inner = inner[key]
                 inner[place[-1]] = value
-                path.write_text(json.dumps(changed))
+                path.write_text(json.dumps(changed, indent=1))
                 count += refused(lambda: _read_whole(recorded)) is not None
     finally:
         path.write_text(sealed)
@@ -250,6 +261,89 @@ def _read_whole(folder: Path) -> None:
         assert np.isfinite(run[0:3].energy()).all()
     np.asarray(run.q)
     assert (len(run), run.steps, repr(run)) is not None
+
+
+GAS = """
+[system]
+name = "gas"
+coordinates = ["x", "q[3]"]
+lagrangian = "x_dot**2/2 + sum(i in 3, m[i]*q_dot[i]**2/2) - sum(i < j in near, (q[i] - q[j])**2) - x**2/2"
+neighbours = { near = { of = "q", cutoff = "2*s", box = "L" } }
+[parameters]
+s = 1.0
+L = 5.0
+"m[3]" = 1.0
+[initial]
+q = { x = 0.1, q = [0.1, 1.0, 2.0] }
+q_dot = { x = 0.0, q = 0.0 }
+[method]
+method = "svi:2"
+[run]
+step = 0.01
+steps = 3
+"""
+TRANSFORMED = """
+[system]
+name = "kepler"
+coordinates = ["x", "y"]
+lagrangian = "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)"
+time_transformation = "sqrt(x**2 + y**2)"
+[initial]
+q = [1.0, 0.0]
+q_dot = [0.0, 1.0]
+[method]
+method = "svi:2"
+[run]
+step = 0.01
+steps = 3
+"""
+WORDS = [
+    "",
+    " ",
+    "q[",
+    "q[-1]",
+    "q[9]",
+    "N = [[",
+    "N = " + "[" * 9000,
+    "near",
+    "0.1.2",
+    "((",
+    "zz",
+    "1/0",
+    "spin s",
+    "\0",
+]
+
+
+@pytest.mark.parametrize("text", [GAS, TRANSFORMED, MODEL], ids=["gas", "transformed", "driven"])
+def test_damaged_interfaces_of_packages_are_rejected(text: str, tmp_path: Path) -> None:
+    """Every entry with other values, entries left out and repeated: refused, or used without harm."""
+    (tmp_path / "model.toml").write_text(text)
+    folder = generate_package(sc.load_model(tmp_path / "model.toml"), tmp_path / "made_here")
+    path = folder / "interface.json"
+    record = json.loads(path.read_text())
+    values = [*WORDS, 0, -1, 1, 2**39, math.nan, None, True, [], {}, [["near", "box", "("]], [[]], "[" * 9000]
+    interface, count = record["interface"], 0
+    for key, old in interface.items():
+        changed = [*values]
+        if isinstance(old, list):
+            changed += [old[1:], old[:-1], old + old[:1], old[::-1], *([word, *old[1:]] for word in WORDS)]
+        for new in changed:
+            path.write_text(json.dumps(record | {"interface": interface | {key: new}}))
+            count += refused(lambda: _use(folder)) is not None
+    assert count > 200
+    declarations = [line for k, line in enumerate(record["declarations"]) if k != len(record["declarations"]) // 2]
+    for other in ('{"format": ' + "[" * 99999, json.dumps(record | {"declarations": declarations})):
+        path.write_text(other)
+        assert isinstance(refused(lambda: sc.load_package(folder)), sc.PackageError)
+
+
+def _use(folder: Path) -> None:
+    stepper = sc.load_package(folder)
+    q = np.linspace(0.3, 1.2, stepper.dimension)
+    run = stepper.integrate(q, 0 * q, h=0.01, steps=2, parameters=None if stepper.interface.energy_parameter else {})
+    run.save(folder / "a.csv")
+    assert (repr(stepper), repr(run), run.energy(), stepper.momentum_maps(q, q)) is not None
 
 
 def test_damaged_state_files_are_rejected(recorded: Path) -> None:

@@ -20,6 +20,7 @@ from unittest import mock
 import numpy as np
 import pytest
 from fuzzing import damaged, foreign_files, guarded, limited_memory, seeds
+from random_robots import Mjcf, Urdf
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
@@ -102,6 +103,20 @@ q = {{ R = [0.9, 0.3, -0.2, 0.1] }}
 q_dot = {{ omega = [0.1, 0.2, 3.0] }}
 {END}
 """
+CHAIN = f"""
+[system]
+name = "chain"
+coordinates = ["q[N]"]
+lagrangian = "sum(i in N, q_dot[i]**2/2) - sum(i in N periodic, k*(q[i+1] - q[i])**2/2)"
+[parameters]
+k = 1.0
+[sizes]
+N = 3
+[initial]
+q = {{ q = [0.1, 0.2, 0.3] }}
+q_dot = {{ q = 0.0 }}
+{END}
+"""
 FIELD = f"""
 [field]
 name = "string"
@@ -165,7 +180,8 @@ def kinds() -> dict[str, Kind]:
     sc.record_run(stepper.start([1.0], [0.0], h=0.1), folder / "a.run", steps=20, rows=8)
     made = load_written(folder, RING)
     package = generate_package(made, folder / "ring")
-    packed = {str(path.relative_to(package)): path.read_bytes() for path in package.rglob("*") if path.is_file()}
+    packed = files_in(package)
+    chain = sc.compile_stepper(load_written(folder, CHAIN).array_system, "svi:2", flags=QUICK_FLAGS)
     np.savez(folder / "v.npz", t=[0.0, 10.0], v=[0.0, 1.0])
     np.save(folder / "m.npy", [1.0, 2.0, 3.0])
     kepler = sc.Model.from_problem(sc.problem("kepler"))
@@ -207,7 +223,35 @@ def kinds() -> dict[str, Kind]:
             {"ball.xml": (ROBOTS / "ball.xml").read_bytes()},
             lambda folder: sc.LagrangianSystem.from_mjcf(folder / "ball.xml"),
         ),
+        "mjcf equalities": Kind(
+            {"figure.xml": (ROBOTS / "figure.xml").read_bytes()},
+            lambda folder: sc.LagrangianSystem.from_mjcf(folder / "figure.xml"),
+        ),
+        "random mjcf": Kind(
+            {"model.xml": (robot := Mjcf(3)).document.encode(), "included.xml": robot.included.encode()},
+            lambda folder: sc.LagrangianSystem.from_mjcf(folder / "model.xml"),
+        ),
+        "random urdf": Kind(
+            {"robot.urdf": Urdf(3).document.encode()},
+            lambda folder: sc.LagrangianSystem.from_urdf(folder / "robot.urdf", floating=True, actuated=True),
+        ),
+        "package of arrays": Kind(
+            files_in(generate_package(load_written(folder, CHAIN), folder / "package_of_arrays")), read_package
+        ),
+        "checkpoint of arrays": Kind(
+            {"saved": checkpoint_of(chain)}, lambda folder: chain.from_checkpoint((folder / "saved").read_bytes())
+        ),
     }
+
+
+def files_in(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def checkpoint_of(chain: sc.Stepper) -> bytes:
+    run = chain.start({"q": [0.1, 0.2, 0.3]}, {"q": [0.0, 0.0, 0.0]}, h=0.1)
+    run.advance(3)
+    return run.checkpoint()
 
 
 def load_written(folder: Path, text: str) -> sc.Model:
@@ -235,7 +279,8 @@ def try_file(number: int, root: Path) -> bool:
     random = Random(number)
     chosen = list(kinds())[number % len(kinds())]
     kind, folder = kinds()[chosen], root / chosen.replace(" ", "_")
-    name = random.choice(list(kind.files)) if chosen != "package" else "interface.json"
+    read = ["interface.json", "model.toml"] if chosen.startswith("package") else list(kind.files)
+    name = random.choice([each for each in kind.files if each in read])
     data = damaged(random, kind.files[name], seeds("models"))
     (folder / name).write_bytes(data)
     try:

@@ -116,7 +116,7 @@ class TestRecording:
         del former["sha256"]
         assert "every" in former
         assert "save_every" not in former["model"]
-        path.write_text(json.dumps(former))
+        path.write_text(json.dumps(former, indent=1))
         assert load_run("a.run").manifest == found.manifest
 
     def test_certificate_is_accepted_as_file_or_object(self, kepler):
@@ -225,22 +225,24 @@ class TestFolders:
         with pytest.raises(RecordingError, match=r"manifest\.json' is damaged"):
             resume_run("a.run")
 
-    def test_a_flipped_bit_in_a_recording_is_detected(self, kepler):
-        """Refused, or in what has no effect: the layout of the manifest, dates and attributes in the zip file."""
+    def test_a_flipped_bit_in_a_recording_is_rejected(self, kepler):
         run, random = recorded(kepler, 10), np.random.default_rng(3)
-        whole, q, memory = run.manifest, np.array(run.q), run._last.memory
         for path in (Path("a.run/manifest.json"), Path("a.run/states-000000.npz")):
-            data, refused = path.read_bytes(), 0
+            data = path.read_bytes()
             for place, bit in zip(random.integers(0, len(data), 100), random.integers(0, 8, 100), strict=True):
                 path.write_bytes(data[:place] + bytes([data[place] ^ 1 << int(bit)]) + data[place + 1 :])
-                try:
-                    again = load_run("a.run")
-                    same = again.manifest == whole and np.array_equal(again.q, q) and again._last.memory == memory
-                    assert same, place
-                except RecordingError:
-                    refused += 1
+                with pytest.raises(RecordingError, match=r"manifest\.json|states-000000\.npz"):
+                    np.array(load_run("a.run").q)
             path.write_bytes(data)
-            assert refused > 60
+        assert np.array_equal(load_run("a.run").q, run.q)
+
+    def test_states_of_earlier_versions_have_no_checksum(self, kepler):
+        run = recorded(kepler, 10)
+        path = Path("a.run/states-000000.npz")
+        with np.load(path) as file:
+            arrays = dict(file)
+        np.savez(path, **arrays)
+        assert np.array_equal(load_run("a.run").q, run.q)
 
     @pytest.mark.parametrize(
         ("place", "value"),
@@ -269,7 +271,7 @@ class TestFolders:
             inner = inner[key]
         inner[place[-1]] = value
         del document["sha256"]
-        path.write_text(json.dumps(document))
+        path.write_text(json.dumps(document, indent=1))
         before = sorted(tmp_path.rglob("*"))
         for act in (lambda: load_run("a.run")[0:3].energy(), lambda: resume_run("a.run", steps=20)):
             with pytest.raises(RecordingError, match=r"is not the name of a file|compiler flag .* is not allowed"):

@@ -159,12 +159,24 @@ def test_save_every_counts_from_the_start_of_the_run(kepler):
     assert run.record(10, save_every=4).t == pytest.approx(0.05 * np.array([5, 8, 12]))
 
 
-def test_restored_run_uses_parameters_only_if_supplied(kepler):
+def test_checkpoints_contain_the_parameters(kepler):
     run = kepler.start(*STATE, h=0.05, parameters={"mu": 0.9})
     saved = run.checkpoint()
     expected = run.record(5)
-    assert same(kepler.from_checkpoint(saved, parameters={"mu": 0.9}).record(5), expected)
-    assert not same(kepler.from_checkpoint(saved).record(5), expected)
+    assert same(kepler.from_checkpoint(saved).record(5), expected)
+    assert same(kepler.from_checkpoint(saved, parameters=[0.9]).record(5), expected)
+    assert not same(kepler.from_checkpoint(saved, parameters={"mu": 1.0}).record(5), expected)
+
+
+def test_checkpoints_of_other_systems_are_rejected(kepler):
+    """Their memory may have the same size."""
+    text = "a_dot**2/2 + b_dot**2/2 - (a - b)**4/4 - mu*a**2"
+    for name, coordinates in (("kepler", ["a", "b"]), ("other", [*kepler.coordinates])):
+        lagrangian = text.replace("a", coordinates[0]).replace("b", coordinates[1])
+        other = LagrangianSystem.from_text(name, coordinates, lagrangian, parameters={"mu": 1.0})
+        saved = compile_stepper(other, "svi:2").start([1.0, 0.5], [0.0, 0.0], h=0.1).checkpoint()
+        with pytest.raises(StateError, match=r"the saved run is one of .*, not of"):
+            kepler.from_checkpoint(saved)
 
 
 def test_damaged_checkpoints_are_rejected(kepler):

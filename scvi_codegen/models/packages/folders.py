@@ -83,7 +83,7 @@ def _recorded(folder: Path) -> dict[str, str] | None:
     try:
         record = json.loads((folder / INTERFACE_FILE).read_text(encoding="utf-8"))
         files = record["files"] if isinstance(record["format"], int) else None
-    except (FileNotFoundError, ValueError, KeyError, TypeError):
+    except (FileNotFoundError, ValueError, KeyError, TypeError, RecursionError):
         return None
     return files if isinstance(files, dict) else None
 
@@ -99,7 +99,7 @@ def read_record(folder: str | os.PathLike[str]) -> dict[str, Any]:
         record = json.loads(read_text(target / INTERFACE_FILE, "utf-8"))
     except OSError as error:
         raise PackageError(f"{target} is not a generated package: {error.filename}: {error.strerror}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise damaged(target, error) from error
     if not isinstance(record, dict) or record.get("format") != FORMAT:
         raise PackageError(f"{target / INTERFACE_FILE} has another format: generate the folder again")
@@ -129,7 +129,9 @@ def source_in(folder: Path, prefix: str) -> Source:
 def _source(folder: Path, prefix: str, declarations: Sequence[str]) -> Source:
     header, code = (read_text(folder / f"{prefix}.{kind}", "utf-8") for kind in "hc")
     support = included(code, lambda name: read_text(folder / name, "utf-8"))
-    return Source(prefix=prefix, header=header, code=code, declarations="\n".join(declarations), support=support)
+    if (text := "\n".join(declarations)) not in header:  # cffi would call other functions than those of the code
+        raise ValueError(f"the declarations are not those of {prefix}.h")
+    return Source(prefix=prefix, header=header, code=code, declarations=text, support=support)
 
 
 def damaged(folder: Path, error: Exception) -> PackageError:

@@ -92,8 +92,32 @@ def write_chunk(folder: Path, number: int, chunk: Chunk) -> None:
     memory = np.frombuffer(chunk.memory, dtype=np.uint8)
     further: dict[str, Any] = {"step": np.int64(chunk.step), "memory": memory, "crossings": chunk.crossings}
     np.savez(buffer, t=t, q=q, p=p, iterations=iterations, **further)
-    write_atomically(chunk_path(folder, number), lambda file: file.write(buffer.getbuffer()))
+    write_atomically(chunk_path(folder, number), lambda file: file.write(_sealed(buffer.getvalue())))
     sync_folder(folder)
+
+
+def _sealed(archive: bytes) -> bytes:
+    """Return a ZIP archive with a comment that contains the checksum of the bytes before.
+
+    The checksums of the format itself leave out names, times and attributes.
+    """
+    body = archive[: -len(NO_COMMENT)] + DIGEST.to_bytes(len(NO_COMMENT), "little")
+    return body + hashlib.sha256(body).digest()
+
+
+def _unsealed(data: bytes) -> io.BytesIO:
+    """Return an archive; raise :class:`ValueError` if its checksum differs. Earlier versions wrote none."""
+    if not (data[-len(END_OF_ARCHIVE) - 18 :].startswith(END_OF_ARCHIVE) and data.endswith(NO_COMMENT)):
+        body = data[:-DIGEST]
+        if data[-DIGEST:] != hashlib.sha256(body).digest():
+            raise ValueError("its checksum differs: restore it from a copy")
+    return io.BytesIO(data)
+
+
+DIGEST = 32
+"""Number of bytes of a checksum."""
+END_OF_ARCHIVE, NO_COMMENT = b"PK\x05\x06", b"\0\0"
+"""Signature of the last 22 bytes of an archive without comment, and the last of them, the length of the comment."""
 
 
 def read_chunk(path: Path, dimension: int | None = None, rows: int | None = None) -> Chunk:
@@ -103,7 +127,7 @@ def read_chunk(path: Path, dimension: int | None = None, rows: int | None = None
         RecordingError: if the file cannot be read or is damaged.
     """
     try:
-        with regular(path).open("rb") as file, loaded(file) as arrays:
+        with loaded(_unsealed(regular(path).read_bytes())) as arrays:
             t, q, p, iterations = (arrays[name] for name in COLUMNS)
             crossings = arrays["crossings"] if "crossings" in arrays else np.empty((0, 2 + 2 * q.shape[-1]))
             chunk = Chunk((t, q, p, iterations), int(arrays["step"]), arrays["memory"].tobytes(), crossings)
@@ -286,8 +310,8 @@ class Manifest:
         document = json.loads(text)
         if not isinstance(document, dict) or document.get("format") not in (FORMAT, FORMAT_TO_A_TIME):
             raise ValueError(f"its format is neither {FORMAT} nor {FORMAT_TO_A_TIME}")
-        if "sha256" in document:  # absent in earlier versions
-            start = SEAL % document["sha256"]
+        if not text.startswith(FIRST_LINE):  # of earlier versions, which have no checksum
+            start = SEAL % document.get("sha256")
             body = "{" + text.removeprefix(start)
             if not text.startswith(start) or hashlib.sha256(body.encode()).hexdigest() != document["sha256"]:
                 raise ValueError("its checksum differs: restore the file from a copy")
@@ -311,8 +335,8 @@ class Manifest:
         return manifest
 
 
-SEAL = '{\n "sha256": "%s",'
-"""First lines of a manifest: the checksum of the text without it."""
+FIRST_LINE, SEAL = '{\n "format": ', '{\n "sha256": "%s",'
+"""First line of the text of a manifest, and the lines before it: the checksum of the text."""
 PLAN = ("t_end", "tolerance", "tau")
 PLAIN = ("flags", "parameters", "h", "t", "save_every", "steps", "rows", "model", "certificate")
 

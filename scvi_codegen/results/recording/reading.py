@@ -23,7 +23,7 @@ from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.rotations.quantities import named_quantities
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.run_loop import first_step_size, trajectory_of
-from scvi_codegen.runtime.run.saving import MAGIC, sealed
+from scvi_codegen.runtime.run.saving import MAGIC
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.quantities import quantities
 from scvi_codegen.runtime.trajectory.saved_states import checked_row
@@ -151,10 +151,12 @@ class RecordedRun(AttitudeHistory):
         Raises:
             BuildError: if there is no C compiler.
         """
-        manifest, plan = self.manifest, self.manifest.plan
-        memory = self._last.memory  # without a checksum of its own in recordings of earlier versions
+        manifest, plan, memory = self.manifest, self.manifest.plan, self._last.memory
+        if not memory.startswith(MAGIC):  # of earlier versions, which stored no more than the memory
+            options = manifest.options
+            return Run.restored(self.stepper, memory, plan=plan, parameters=manifest.parameters, options=options)
         return self.stepper.from_checkpoint(
-            memory if memory.startswith(MAGIC) else sealed(memory),
+            memory,
             t_end=plan.t_end if plan else None,
             tolerance=(plan.tolerance or None) if plan else None,
             h=(plan.tau or None) if plan else None,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,7 +42,7 @@ from scvi_codegen.runtime.run.accuracy import (
 from scvi_codegen.runtime.run.global_error import checked_error, confirmed_run, warn_of_unconfirmed
 from scvi_codegen.runtime.run.largest_step import largest_step
 from scvi_codegen.runtime.run.run import Run
-from scvi_codegen.runtime.run.saving import read_checkpoint, unsealed
+from scvi_codegen.runtime.run.saving import read_checkpoint
 from scvi_codegen.runtime.run.step_plan import StepPlan, checked_plan, planned_steps
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
@@ -288,28 +288,26 @@ class Stepper(Integrator):
     ) -> Run:
         """Restore a run saved by :meth:`Run.checkpoint`; it continues bitwise equally if ``t_end`` is passed again.
 
-        ``h`` is required with a time transformation and not allowed otherwise. A run of arrays of run-time sizes
-        contains its tables and parameters; ``threads`` is the number of threads per step.
+        ``h`` is required with a time transformation and not allowed otherwise. A checkpoint contains the parameters,
+        which ``parameters`` changes, and the tables of arrays of run-time sizes; ``threads`` is the number of threads
+        per step.
 
         Raises:
             StateError: if the bytes are damaged (their checksum differs) or belong to another integrator.
         """
-        stepper: Any = self
-        if self._reason:
-            raise StateError(f"restore this run by with_sizes(...).from_checkpoint(saved): {self._reason}")
-        saved = unsealed(saved)
-        if self.interface.layout.coordinates:
-            stepper, saved, known = read_checkpoint(
-                saved, self.origin or self, threads=threads, adaptive=t_end is not None
-            )
-            parameters = known | dict(cast(Mapping[str, Any], parameters or {}))
-        else:
-            self._check_not_of_run(None, threads)
         transformed = bool(self.interface.time_transformation)
         if h is not None and not transformed:
             raise StateError("omit h: the saved run contains its step size")
         plan = self._plan(h, t_end, tolerance) if t_end is not None or transformed else None
-        return Run.restored(stepper, saved, parameters=parameters, options=options, plan=plan)
+        if self._reason:
+            raise StateError(f"restore this run by with_sizes(...).from_checkpoint(saved): {self._reason}")
+        if not self.interface.layout.coordinates:
+            self._check_not_of_run(None, threads)
+        stepper: Any
+        stepper, state, known = read_checkpoint(saved, self.origin or self, threads=threads, adaptive=t_end is not None)
+        if parameters is None or isinstance(parameters, Mapping):
+            parameters = known | dict(parameters or {})
+        return Run.restored(stepper, state, parameters=parameters, options=options, plan=plan)
 
     @checks_arguments(StateError)
     def integrate_ensemble(

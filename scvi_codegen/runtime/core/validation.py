@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.native.arguments import checked_number, real_array
-from scvi_codegen.rendering.source import Interface
+from scvi_codegen.rendering.source import NAME_IN_FORMULA, NUMBER, Interface
 
 Array = NDArray[np.float64]
 Shapes = Sequence[tuple[str, tuple[int, ...]]]
@@ -240,10 +240,10 @@ def check_lengths(interface: Interface, values: Array, where: str = "") -> None:
         where: words that follow the value in a message, as of which trajectory.
     """
     cutoffs: dict[str, tuple[str, float]] = {}
-    for near, kind, formula in (each.split(" ", 2) for each in interface.lengths):
+    for near, kind, formula in interface.lengths:
         length = _length(formula, interface.parameters, values)
         what = f"the {kind} of the neighbours '{near}'{where} is {formula}"
-        what += "" if _is_number(formula) else f" = {length:.15g}"
+        what += "" if NUMBER.fullmatch(formula) else f" = {length:.15g}"
         if not 0 < length < math.inf:
             raise StateError(f"{what}: it must be a positive number")
         if kind == "cutoff":
@@ -255,13 +255,9 @@ def check_lengths(interface: Interface, values: Array, where: str = "") -> None:
             )
 
 
-def _is_number(formula: str) -> bool:
-    return not re.search(r"[^\d.]", formula)
-
-
 def _length(formula: str, names: Sequence[str], values: Array) -> float:
     """Return the value of a formula of parameters; NaN where it is undefined."""
-    if _is_number(formula):
+    if NUMBER.fullmatch(formula):
         return float(formula)
     if formula.isidentifier() and formula in names:
         return float(values[names.index(formula)])
@@ -281,7 +277,7 @@ def _evaluation(formula: str) -> tuple[Callable[[Sequence[float]], float], tuple
     from scvi_codegen.formulas.symbols import symbol
     from scvi_codegen.tables.precision import mp
 
-    used = tuple(sorted({*re.findall(r"(?<![\w.])[A-Za-z_]\w*(?!\w*\()", formula)} - {"pi"}))
+    used = tuple(sorted({*NAME_IN_FORMULA.findall(formula)} - {"pi"}))
     symbols = {name: symbol(name) for name in used}
     tape = Tape([parse_expression(formula, symbols)], list(symbols.values()))
     return lambda numbers: float(tape([mp.mpf(x) for x in numbers])[0]), used

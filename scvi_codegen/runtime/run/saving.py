@@ -1,4 +1,4 @@
-"""Checkpoints: checksum and bytes of a run, of arrays of run-time sizes preceded by sizes, tables and parameters."""
+"""Checkpoints: a checksum, the sizes, tables and parameters of a run, and the bytes of its memory."""
 
 import hashlib
 import json
@@ -9,12 +9,12 @@ import numpy as np
 
 from scvi_codegen.errors import ScviCodegenError, StateError
 from scvi_codegen.indices import MOST_THREADS
-from scvi_codegen.rendering.source import Interface
+from scvi_codegen.representation import clipped
 from scvi_codegen.runtime.arrays.interface import RunSizes, check_accesses, read_tables
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.validation import checked_count
 
-MAGIC = b"scvi run 3\n"
+MAGIC = b"scvi run 4\n"
 """First bytes of checkpoints, before the checksum."""
 DIGEST = 32
 
@@ -38,31 +38,36 @@ def unsealed(saved: bytes) -> bytes:
 
 
 def checkpoint(run: Any) -> bytes:
-    """Return the bytes of a run; those of run-time sizes also contain what :meth:`Stepper.bind` requires."""
+    """Return the bytes of a run for :func:`read_checkpoint`."""
     stepper: Integrator = run.stepper
-    state: bytes = run.snapshot
-    if stepper.problem is None or stepper.origin is None:
-        return sealed(state)
-    arrays = [*stepper.problem.places.values(), run.parameters]
+    sizes, places = ({}, {}) if stepper.problem is None else (stepper.problem.sizes, stepper.problem.places)
     header = {
-        "integrator": _integrator(stepper.origin.interface),
-        "sizes": stepper.problem.sizes,
+        "integrator": _integrator(stepper),
+        "sizes": sizes,
         "unset inputs": run._unset_inputs,
         "adaptive": not run.plan.fixed,
     }
-    return sealed(b"".join([json.dumps(header).encode(), b"\n", *(array.tobytes() for array in arrays), state]))
+    arrays = [*places.values(), run.parameters]
+    return sealed(b"".join([json.dumps(header).encode(), b"\n", *(array.tobytes() for array in arrays), run.snapshot]))
 
 
 def read_checkpoint(
-    body: bytes, origin: Integrator, *, threads: int | None, adaptive: bool
+    saved: bytes, stepper: Integrator, *, threads: int | None, adaptive: bool
 ) -> tuple[Integrator, bytes, dict[str, Any]]:
-    """Return the bound stepper, the state and the parameters by name of an unsealed run of run-time sizes.
+    """Return the stepper, bound to the sizes of the run, the state and the parameters by name.
+
+    Args:
+        saved: bytes of :func:`checkpoint`.
+        stepper: of the system and method of the run; of run-time sizes, of any size.
+        threads: number of threads per step of run-time sizes.
+        adaptive: whether the run continues with adaptive steps.
 
     Raises:
-        StateError: if the bytes are invalid or belong to another integrator or another kind of steps.
+        StateError: if the bytes are damaged or belong to another integrator or another kind of steps.
     """
+    body = unsealed(saved)
     try:
-        return _read(body, origin, threads, adaptive=adaptive)
+        return _read(body, stepper, threads, adaptive=adaptive)
     except StateError:
         raise
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, MemoryError, ScviCodegenError) as error:
@@ -70,34 +75,37 @@ def read_checkpoint(
 
 
 def _read(
-    body: bytes, origin: Integrator, threads: int | None, *, adaptive: bool
+    body: bytes, stepper: Integrator, threads: int | None, *, adaptive: bool
 ) -> tuple[Integrator, bytes, dict[str, Any]]:
     text, _, rest = body.partition(b"\n")
-    header, layout = json.loads(text), origin.interface.layout
-    if header["integrator"] != _integrator(origin.interface):
-        raise StateError(f"the saved run is one of '{header['integrator']}', not of '{_integrator(origin.interface)}'")
+    header, layout = json.loads(text), stepper.interface.layout
+    if header["integrator"] != _integrator(stepper):
+        raise StateError(f"the saved run is one of '{header['integrator']}', not of '{_integrator(stepper)}'")
     if header["adaptive"] != adaptive:
         raise StateError(
             "the saved run has fixed steps: omit t_end" if adaptive else "the saved run has adaptive steps: give t_end"
         )
-    sizes = {name: checked_count(header["sizes"][name], name, least=0) for name in layout.sizes}
-    tables, first = {}, 0
-    for table in layout.tables:
-        tables[table.name] = np.frombuffer(rest, np.int32, math.prod(table.shape(sizes)), first).reshape(
-            table.shape(sizes)
-        )
-        first += tables[table.name].nbytes
-    places = read_tables(origin.interface, tables)
-    check_accesses(layout, sizes, places)
-    count = checked_count(1 if threads is None else threads, "threads", least=1, most=MOST_THREADS)
-    bound = origin._bound_to(RunSizes(sizes=sizes, places=places, threads=count)).with_events(origin.events)
-    values = np.frombuffer(rest, count=len(bound.defaults), offset=first)
-    known = bound.parameters_by_name(values)
+    first = 0
+    if layout.coordinates:
+        sizes = {name: checked_count(header["sizes"][name], name, least=0) for name in layout.sizes}
+        tables = {}
+        for table in layout.tables:
+            shape = table.shape(sizes)
+            tables[table.name] = np.frombuffer(rest, np.int32, math.prod(shape), first).reshape(shape)
+            first += tables[table.name].nbytes
+        places = read_tables(stepper.interface, tables)
+        check_accesses(layout, sizes, places)
+        count = checked_count(1 if threads is None else threads, "threads", least=1, most=MOST_THREADS)
+        problem = RunSizes(sizes=sizes, places=places, threads=count)
+        stepper = stepper._bound_to(problem).with_events(stepper.events)
+    values = np.frombuffer(rest, count=len(stepper.defaults), offset=first)
+    known = stepper.parameters_by_name(values)
     for name in header["unset inputs"]:
         del known[f"{name}_0"]
-    return bound, rest[first + values.nbytes :], known
+    return stepper, rest[first + values.nbytes :], known
 
 
-def _integrator(interface: Interface) -> str:
-    """Return the identification of saved runs; runs of another solver have another memory layout."""
-    return f"{interface.title}, {interface.solver}"
+def _integrator(stepper: Integrator) -> str:
+    """Return the identification of saved runs: the memory of a run depends on the method and the solver."""
+    interface = stepper.interface if stepper.origin is None else stepper.origin.interface
+    return f"{interface.title}, {interface.solver}, of {clipped(', '.join(interface.coordinates), 60)}"
