@@ -13,7 +13,7 @@ import json
 import os
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -38,13 +38,15 @@ def loaded(file: Any | IO[bytes]) -> Iterator[Any]:
         OSError: if the file cannot be read.
         ValueError: for any failure on a damaged file: of zipfile, zlib, the header parser, or memory.
     """
-    try:
-        content = np.load(regular(file) if isinstance(file, str | os.PathLike) else file, allow_pickle=False)
-        try:
-            yield content
-        finally:
-            if hasattr(content, "close"):
-                content.close()
+    named = isinstance(file, str | os.PathLike)
+    try:  # opened here, because ``numpy.load`` leaves files open that are damaged
+        with regular(file).open("rb") if named else nullcontext(file) as opened:
+            content = np.load(opened, allow_pickle=False)
+            try:
+                yield content
+            finally:
+                if hasattr(content, "close"):
+                    content.close()
     except (OSError, ValueError):
         raise
     except Exception as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from programs import needs
 import scvi_codegen as sc
 from scvi_codegen.errors import ExpressionError, StateError, StepFailedError, SystemDefinitionError
 from scvi_codegen.models.model_files.model_file import dump_model
+from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.native.compilers import find_compiler
 
 SQUARE = "sum(a in 3, wrap(r[i, a] - r[j, a], box)**2)"
@@ -324,6 +326,35 @@ def test_lengths_are_checked_before_every_run(kind: str) -> None:
         for call, parameters in calls[: 5 if kind == "run-time sizes" else 6]:
             with pytest.raises(StateError, match=message):
                 call(parameters=parameters)
+
+
+@pytest.mark.parametrize("size", ["3", "N"])
+def test_lengths_are_checked_before_c_is_generated(size: str, tmp_path: Path) -> None:
+    """The program of a package does not check them."""
+    text = f"""
+[system]
+name = "gas"
+coordinates = ["q[{size}]"]
+lagrangian = "sum(i in {size}, q_dot[i]**2/2) - sum(i < j in near, (q[i] - q[j])**2)"
+neighbours = {{ near = {{ of = "q", cutoff = "2*s", box = "L" }} }}
+{"[sizes]" if size == "N" else ""}
+{"N = 3" if size == "N" else ""}
+[parameters]
+s = 1.0
+L = 3.9
+[initial]
+q = {{ q = [0.1, 1.0, 2.0] }}
+q_dot = {{ q = 0.0 }}
+[method]
+method = "stoermer-verlet"
+[run]
+step = 0.01
+steps = 3
+"""
+    for length, message in (("3.9", r"L = 3.9: it must be at least two cutoffs"), ("4.1", "")):
+        (tmp_path / "model.toml").write_text(text.replace("3.9", length))
+        with pytest.raises(StateError, match=message) if message else nullcontext():
+            generate_package(sc.load_model(tmp_path / "model.toml"), tmp_path / "generated_gas")
 
 
 def test_lengths_may_be_formulas_and_defaults_are_checked() -> None:

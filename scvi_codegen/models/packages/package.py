@@ -34,6 +34,7 @@ from scvi_codegen.models.packages.folders import (
 from scvi_codegen.rendering.source import Interface, check_interface
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.core.validation import checked_parameters
 from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.validation import ArgumentType, checks_arguments
 
@@ -79,7 +80,7 @@ def generate_package(
     Raises:
         PackageError: if the name of the folder is invalid, it cannot be written, or a file in it would be lost.
         MethodError: for a solver that does not support the method, and for a number beyond single precision.
-        StateError: if the initial velocities have no momenta.
+        StateError: if the initial velocities have no momenta, or cutoffs and boxes of neighbours are invalid.
     """
     target = Path(folder)
     prefix = prefix_of(target)
@@ -150,6 +151,7 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
         time_transformation=model.time_transformation,
         controller=model.controller,
     )
+    checked_parameters(interface, model.parameters)  # C does not check cutoffs and boxes
     source = source.single_file() if single_file else source.specialised()
     texts = source.files
     texts |= render_example(interface, example_of(model, controlled=ADVANCE_TO in source.header), embedded or "double")
@@ -175,6 +177,7 @@ def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, si
 
     assert model.array_system is not None  # by the caller
     source, interface = Sources(model.array_system, model.method, model.solver, prefix).integrator(controlled=False)
+    checked_parameters(interface, model.parameters)
     example, arrays = array_example_of(model, interface)
     lines = {f"{name}.txt": "".join(f"{x!r}\n" for x in each.reshape(-1).tolist()) for name, each in arrays.items()}
     source = source.single_file() if single_file else source.specialised()
