@@ -38,9 +38,8 @@ def loaded(file: Any | IO[bytes]) -> Iterator[Any]:
         OSError: if the file cannot be read.
         ValueError: for any failure on a damaged file: of zipfile, zlib, the header parser, or memory.
     """
-    named = isinstance(file, str | os.PathLike)
     try:  # opened here, because ``numpy.load`` leaves files open that are damaged
-        with regular(file).open("rb") if named else nullcontext(file) as opened:
+        with regular(file).open("rb") if isinstance(file, str | os.PathLike) else nullcontext(file) as opened:
             content = np.load(opened, allow_pickle=False)
             try:
                 yield content
