@@ -227,11 +227,22 @@ def test_rotating_fixed_point_iterations_converge_to_rounding():
 
 SITES = 12
 NAMES = [f"q{i}" for i in range(SITES)]
+NEIGHBOURS = np.eye(SITES, k=1) + np.eye(SITES, k=-1) + np.eye(SITES, k=SITES - 1) + np.eye(SITES, k=1 - SITES)
 SPRINGS = " + ".join(f"(q{(i + 1) % SITES} - q{i})**2" for i in range(SITES))
 LATTICES = {
     "array": {
         "coordinates": ["q[N]"],
         "lagrangian": "sum(i in N, q_dot[i]**2) - sum(i in N periodic, (q[i+1]-q[i])**2)",
+    },
+    "array, matrix of pairs": {
+        "coordinates": ["q[N]"],
+        "lagrangian": "sum(i in N, q_dot[i]**2) - sum(i < j in N, c[i, j]*(q[i] - q[j])**2)",
+        "parameters": {"c[N, N]": NEIGHBOURS.tolist()},
+    },
+    "array, matrix of products": {
+        "coordinates": ["q[N]"],
+        "lagrangian": "sum(i in N, q_dot[i]**2) - sum(i in N, j in N, c[i, j]*q[i]*q[j])",
+        "parameters": {"c[N, N]": (2 * np.eye(SITES) - NEIGHBOURS).tolist()},
     },
     "array of momenta": {
         "coordinates": ["q[N]"],

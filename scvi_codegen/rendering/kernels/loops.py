@@ -6,7 +6,7 @@ from itertools import accumulate, combinations, groupby
 from math import prod
 from typing import Any
 
-from scvi_codegen.indices import MOST_THREADS, Array, Convolution
+from scvi_codegen.indices import MOST_THREADS, Access, Array, Convolution, Place
 from scvi_codegen.ir.equations import ConstrainedSteps
 from scvi_codegen.ir.kernel import Kernel, RolledKernel, is_divided
 from scvi_codegen.ir.program import Program
@@ -327,14 +327,19 @@ def _constraint_texts(program: Program, condition: RolledKernel, curvature: Roll
 
 
 def _is_field(array: Array, term_groups: Iterable[RolledKernel]) -> bool:
-    """Return whether forces couple elements of an array with their neighbours: at offsets, or by rows of a table."""
-    reads = ([each for each in one.reads if each.array == array] for one in term_groups)
+    """Return whether forces couple elements of an array: at offsets, by rows of a table, or by a matrix c[i, j]."""
     return any(
-        all(a.index == b.index and not (a.minus or b.minus) for a, b in zip(one.places, other.places, strict=True))
+        all(_are_coupled(a, b, each.given) for a, b in zip(one.places, other.places, strict=True))
         and any(a != b and a.index for a, b in zip(one.places, other.places, strict=True))
-        for group in reads
-        for one, other in combinations(group, 2)
+        for each in term_groups
+        for one, other in combinations([read for read in each.reads if read.array == array], 2)
     )
+
+
+def _are_coupled(a: Place, b: Place, coefficients: Iterable[Access]) -> bool:
+    if a.index == b.index:
+        return not (a.minus or b.minus)
+    return any({a.index, b.index} <= each.indices for each in coefficients)
 
 
 def _on_lattices(program: Program) -> bool:

@@ -130,16 +130,20 @@ class AttitudeHistory:
             return {"q": q, "p": p}[name] if name != "velocity" else self._velocities(q, p, None)
         shown = [name for name, _ in coordinate_shapes(interface)]
         shown += [name for _, name, *_ in map(str.split, interface.rotations)]
-        known = [
-            *shown,
-            *(f"p_{each}" for each in shown),
-            *(f"{each}{DOT}" for each in shown),
-            "t",
-            "energy",
-            "q",
-            "p",
-            "velocity",
-        ]
+        known = list(
+            dict.fromkeys(
+                [
+                    *shown,
+                    *(f"p_{each}" for each in shown),
+                    *(f"{each}{DOT}" for each in shown),
+                    "t",
+                    "energy",
+                    "q",
+                    "p",
+                    "velocity",
+                ]
+            )
+        )
         raise StateError(f"there is no quantity '{name}' of the states{closest(name, known)} Known: {', '.join(known)}")
 
     def _states(self, t: ArrayLike | None) -> tuple[Array, Array]:

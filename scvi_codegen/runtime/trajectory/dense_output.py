@@ -68,15 +68,17 @@ def states_and_steps_at(states: SavedStates, times: Array) -> tuple[Array, Array
 def _integrate_to_each(
     states: SavedStates, left: NDArray[np.intp], times: Array, plan: StepPlan
 ) -> tuple[Array, Array]:
-    """Integrate from the saved state before each time to that time, with adaptive steps or events."""
+    """Integrate from each saved state to the times before the next one, with adaptive steps or events."""
     q, p = states.q[left], states.p[left]
     stepper: Any = states.stepper
-    for k in np.flatnonzero(times != states.t[left]):
-        to_here = replace(plan, t_end=float(times[k]))
-        settings = {"t": states.t[left[k]], "parameters": states.parameters, "options": states.options}
-        run = stepper._run(q[k], p[k], plan=to_here, **settings)
-        reached = run._recorded(None, times=times[k : k + 1])
-        q[k], p[k] = reached.q[0], reached.p[0]
+    between = np.flatnonzero(times != states.t[left])
+    between = between[np.lexsort((states.forward * times[between], left[between]))]
+    for rows in np.split(between, np.flatnonzero(np.diff(left[between])) + 1) if between.size else ():
+        to_last = replace(plan, t_end=float(times[rows[-1]]))
+        settings = {"t": states.t[left[rows[0]]], "parameters": states.parameters, "options": states.options}
+        run = stepper._run(q[rows[0]], p[rows[0]], plan=to_last, **settings)
+        reached = run._recorded(None, times=times[rows])
+        q[rows], p[rows] = reached.q, reached.p
     return q, p
 
 
