@@ -28,7 +28,7 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.model_file import load_model, parse_model, save_model
-from scvi_codegen.models.problems import PROBLEMS, problem
+from scvi_codegen.models.problems import problem
 
 pytestmark = pytest.mark.long
 
@@ -479,11 +479,6 @@ class TestGenerate:
 class TestDerive:
     words = ("derive", "planar-pendulum", "--degree", "2")
 
-    def test_derive_prints_text(self):
-        text = output_of(*self.words)
-        assert "(27a)" in text
-        assert "sqrt" in output_of(*self.words, "--radicals")
-
     def test_derive_writes_latex_to_a_file(self):
         result = invoke(*self.words, "--latex", "-o", "step.tex")
         assert (result.exit_code, result.stdout) == (0, "")
@@ -494,12 +489,6 @@ class TestDerive:
 
 
 class TestListings:
-    def test_systems_lists_the_catalogue(self):
-        text = output_of("systems")
-        for name in PROBLEMS:
-            assert re.search(rf"^{name}(\[:(degree|stages|order)\])? ", text, re.MULTILINE)
-        assert "mu=1" in text
-
     def test_systems_prints_a_model_file(self):
         assert parse_model(output_of("systems", "kepler")) == chosen("kepler")
         assert "did you mean 'kepler'" in error_of("systems", "keplr")

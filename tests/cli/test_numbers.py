@@ -27,43 +27,6 @@ PARAMETERS = f"[parameters]\nm = 1.0\nk = 1.0\nc = 0.5\n[initial]\nt = {T}\n"
 CHANGED = ("--parameter", f"m={M}", "--parameter", f"k={K}", "--parameter", f"c={C}")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Kind:
-    """A model as text, and what it means.
-
-    Attributes:
-        rates: of t, q, p of shape (n, m): those of q, of p and of the work of forces; with a time transformation the
-            last is that of tau.
-        energy: of the same.
-        maps: by name: values and sizes of the terms.
-        drawn: why the energy changes, as the run says; "" where it does not.
-        words: of the command line; ``h`` the step size, ``None`` where steps choose theirs.
-        states: saved ones, where there are more than every ``save_every``-th.
-        tau: with a time transformation, how far tau between saved states may be off its steps, relative.
-        controlled: True if the reversible controller varies the steps of time.
-    """
-
-    system: str
-    start: str
-    rates: Callable[..., tuple[Array, Array, Array]]
-    energy: Callable[..., Array]
-    maps: Mapping[str, Callable[..., tuple[Array, Array]]] = field(default_factory=dict)
-    drawn: str = ""
-    words: tuple[str, ...] = ("--step", "0.125", "--steps", "90", "--save-every", "3")
-    steps: int | None = 90
-    save_every: int = 3
-    h: float | None = 0.125
-    method: tuple[str, str, int] = ("svi:2", "svi-2-gauss-legendre-2", 4)
-    coordinates: tuple[str, ...] = ("x", "y")
-    symplectic: str = "symplectic"
-    extra: str = ""
-    accounted: bool = False
-    pessimism: float = 100.0
-    states: int | None = None
-    tau: float = 0.0
-    controlled: bool = False
-
-
 def square(x: Array) -> Array:
     return np.sum(x**2, axis=-1, keepdims=True)
 
@@ -97,6 +60,49 @@ lagrangian = "m*(x_dot**2 + y_dot**2)/2 - k*(x**2 + y**2)/2 - c*(x**2 + y**2)**2
 START = "q = [1.0, 0.25]\nq_dot = [0.125, 0.5]\n"
 
 
+def springs(t: Array, q: Array, p: Array) -> tuple[Array, Array, Array]:
+    return p / M, spring(t, q, p), none(q)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kind:
+    """A model as text, and what it means.
+
+    Attributes:
+        rates: of t, q, p of shape (n, m): those of q, of p and of the work of forces; with a time transformation the
+            last is that of tau.
+        energy: of the same.
+        maps: by name: values and sizes of the terms.
+        drawn: why the energy changes, as the run says; "" where it does not.
+        words: of the command line; ``h`` the step size, ``None`` where steps choose theirs.
+        states: saved ones, where there are more than every ``save_every``-th.
+        tau: with a time transformation, how far tau between saved states may be off its steps, relative.
+        controlled: True if the reversible controller varies the steps of time.
+    """
+
+    system: str = SPRINGS
+    start: str = START
+    rates: Callable[..., tuple[Array, Array, Array]] = springs
+    energy: Callable[..., Array] = spring_energy
+    maps: Mapping[str, Callable[..., tuple[Array, Array]]] = field(
+        default_factory=lambda: {"angular momentum": angular}
+    )
+    drawn: str = ""
+    words: tuple[str, ...] = ("--step", "0.125", "--steps", "90", "--save-every", "3")
+    steps: int | None = 90
+    save_every: int = 3
+    h: float | None = 0.125
+    method: tuple[str, str, int] = ("svi:2", "svi-2-gauss-legendre-2", 4)
+    coordinates: tuple[str, ...] = ("x", "y")
+    symplectic: str = "symplectic"
+    extra: str = ""
+    accounted: bool = False
+    pessimism: float = 100.0
+    states: int | None = None
+    tau: float = 0.0
+    controlled: bool = False
+
+
 def forced(t: Array, q: Array, p: Array) -> tuple[Array, Array, Array]:
     v = p / M
     f = np.stack([-C * v[:, 0] ** 3 - v[:, 0] / 4, K * np.cos(t)], axis=1)
@@ -126,15 +132,11 @@ def constrained_pendulum(t: Array, q: Array, p: Array) -> tuple[Array, Array, Ar
     return v, M * (np.array([0.0, -G]) + factor * q), none(q)
 
 
+IN_TAU: dict[str, Any] = {"system": TRANSFORMED, "rates": in_tau}
 KINDS = {
-    "scalar": Kind(
-        system=SPRINGS,
-        start=START,
-        rates=lambda t, q, p: (p / M, spring(t, q, p), none(q)),
-        energy=spring_energy,
-        maps={"angular momentum": angular},
-    ),
+    "scalar": Kind(),
     "hamiltonian": Kind(
+        maps={},
         system="""
 [system]
 name = "twisted"
@@ -149,6 +151,7 @@ hamiltonian = "r**2*(1 + c*x**2)/(2*m) + k*x**2/2 + x*r/8"
         method=("gauss:2", "gauss-2", 4),
     ),
     "forced": Kind(
+        maps={},
         system="""
 [system]
 name = "forced"
@@ -158,7 +161,6 @@ lagrangian = "m*(x_dot**2 + y_dot**2)/2 - k*(x**2 + y**2)/2"
 x = "-c*x_dot**3 - x_dot/4"
 y = "k*cos(t)"
 """,
-        start=START,
         rates=forced,
         energy=lambda t, q, p: column(square(p) / (2 * M) + K * square(q) / 2),
         drawn="forces act",
@@ -166,15 +168,15 @@ y = "k*cos(t)"
         accounted=True,
     ),
     "damped": Kind(
+        maps={},
         system=SPRINGS.replace("lagrangian", 'damping = "c/4"\nlagrangian'),
-        start=START,
         rates=lambda t, q, p: (p / M, spring(t, q, p) - C / 4 * p, -C / 4 / M * column(square(p))),
-        energy=spring_energy,
         drawn="damping takes it",
         symplectic="not symplectic",
         accounted=True,
     ),
     "constrained": Kind(
+        maps={},
         system=f"""
 [system]
 name = "rod"
@@ -190,11 +192,6 @@ constraints = ["x**2 + y**2 = 1"]
         extra='quadrature = "gauss-lobatto:3"\n',
     ),
     "adaptive": Kind(
-        system=SPRINGS,
-        start=START,
-        rates=lambda t, q, p: (p / M, spring(t, q, p), none(q)),
-        energy=spring_energy,
-        maps={"angular momentum": angular},
         words=("--tolerance", "1e-5", "--span", "11.25", "--save-every", "2"),
         steps=None,
         save_every=2,
@@ -203,22 +200,13 @@ constraints = ["x**2 + y**2 = 1"]
     ),
     "time in L": Kind(
         system=SPRINGS.replace("- k*", "- k*(2 + cos(t))*"),
-        start=START,
         rates=lambda t, q, p: (p / M, spring(t, q, p) - K * (1 + np.cos(t)[:, None]) * q, none(q)),
         energy=lambda t, q, p: spring_energy(t, q, p) + K * (1 + np.cos(t)) * column(square(q)) / 2,
-        maps={"angular momentum": angular},
         drawn="L depends on time",
     ),
-    "shorter last step": Kind(
-        system=SPRINGS,
-        start=START,
-        rates=lambda t, q, p: (p / M, spring(t, q, p), none(q)),
-        energy=spring_energy,
-        maps={"angular momentum": angular},
-        words=("--step", "0.125", "--span", "11.1875", "--save-every", "3"),
-        states=32,
-    ),
+    "shorter last step": Kind(words=("--step", "0.125", "--span", "11.1875", "--save-every", "3"), states=32),
     "inputs": Kind(
+        maps={},
         system=f"""
 {SPRINGS}inputs = ["u"]
 [forces]
@@ -227,9 +215,7 @@ y = "-y_dot/4"
 [inputs]
 u = {{ t = {PUSHES[0]}, values = {PUSHES[1]} }}
 """,
-        start=START,
         rates=pushed,
-        energy=spring_energy,
         drawn="forces act",
         symplectic="not symplectic",
         accounted=True,
@@ -238,29 +224,11 @@ u = {{ t = {PUSHES[0]}, values = {PUSHES[1]} }}
         states=34,
     ),
     "transformed time": Kind(
-        system=TRANSFORMED,
-        start=START,
-        rates=in_tau,
-        energy=spring_energy,
-        maps={"angular momentum": angular},
-        words=("--step", "0.125", "--span", "11.25", "--save-every", "3"),
-        steps=None,
-        tau=1e-5,
+        **IN_TAU, words=("--step", "0.125", "--span", "11.25", "--save-every", "3"), steps=None, tau=1e-5
     ),
-    "steps of transformed time": Kind(
-        system=TRANSFORMED,
-        start=START,
-        rates=in_tau,
-        energy=spring_energy,
-        maps={"angular momentum": angular},
-        tau=1e-5,
-    ),
+    "steps of transformed time": Kind(**IN_TAU, tau=1e-5),
     "transformed time by tolerance": Kind(
-        system=TRANSFORMED,
-        start=START,
-        rates=in_tau,
-        energy=spring_energy,
-        maps={"angular momentum": angular},
+        **IN_TAU,
         words=("--tolerance", "1e-6", "--span", "11.25", "--save-every", "2"),
         steps=None,
         save_every=2,
@@ -268,11 +236,7 @@ u = {{ t = {PUSHES[0]}, values = {PUSHES[1]} }}
         tau=1e-5,
     ),
     "reversible controller": Kind(
-        system=TRANSFORMED,
-        start=START,
-        rates=in_tau,
-        energy=spring_energy,
-        maps={"angular momentum": angular},
+        **IN_TAU,
         words=("--controller", "reversible", "--step", "0.125", "--span", "11.25", "--save-every", "3"),
         steps=None,
         symplectic="symplectic only at fixed step size",

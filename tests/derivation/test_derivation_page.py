@@ -285,15 +285,6 @@ def test_page_renders_in_a_browser(browser, tmp_path, size, scheme):
 
 
 class TestCommand:
-    def test_derive_writes_a_page(self, tmp_path):
-        path = tmp_path / "page.html"
-        done = CliRunner().invoke(main, ["derive", "kepler", "--method", "svi", "--degree", "2", "--html", str(path)])
-        assert done.exit_code == 0, done.output
-        assert done.stderr == f"wrote {path}\n"
-        assert done.stdout == ""
-        assert path.read_text(encoding="utf-8").rstrip("\n") == kepler_page(sc.SVI(2)).rstrip("\n")
-        assert [file.name for file in tmp_path.iterdir()] == ["page.html"]
-
     @pytest.mark.parametrize("more", [["--latex"], ["--radicals"], ["-o", "text"]])
     def test_html_and_text_output_are_exclusive(self, more, tmp_path):
         done = CliRunner().invoke(main, ["derive", "kepler", "--html", str(tmp_path / "page.html"), *more])

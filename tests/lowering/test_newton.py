@@ -11,7 +11,6 @@ from samples import lowered, pumped_chain
 from scvi_codegen import (
     SCVI,
     SVI,
-    Gauss,
     LagrangianSystem,
     SolverOptions,
     SpectralCollocation,
@@ -46,17 +45,6 @@ def state(size: int = SIZE) -> tuple[np.ndarray, np.ndarray]:
 @cache
 def chain(method: object, *, pumped: bool = False) -> Stepper:
     return compile_stepper(pumped_chain(SIZE) if pumped else fput_chain(SIZE), method, solver="newton")
-
-
-@pytest.mark.parametrize("method", [SVI(3), SCVI(3), Gauss(3)], ids=lambda method: method.name)
-def test_band_solver_agrees_with_the_fixed_point_iteration(method):
-    q, p = state(6)
-    iterated, found = (
-        compile_stepper(fput_chain(6), method, solver=solver).integrate(q, p, h=0.2, steps=40)
-        for solver in ("fixed-point", "newton")
-    )
-    np.testing.assert_allclose(found.q, iterated.q, rtol=0, atol=2e-13)
-    np.testing.assert_allclose(found.p, iterated.p, rtol=0, atol=2e-13)
 
 
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.full)])
@@ -133,12 +121,6 @@ class TestReusedFactors:
             run = stepper.from_checkpoint(run.checkpoint())
         assert np.array_equal(last.q[-1], expected.q[-1])
         assert np.array_equal(last.p[-1], expected.p[-1])
-
-    def test_step_does_not_depend_on_preceding_calls(self, method):
-        q, p = state()
-        first = chain(method).step(q, p, 0.2)
-        chain(method).integrate(-q, p, h=0.4, steps=5)
-        assert np.array_equal(chain(method).step(q, p, 0.2), first)
 
     def test_failed_step_does_not_change_the_run(self, method):
         q, p = state()

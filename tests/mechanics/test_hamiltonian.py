@@ -89,11 +89,6 @@ def test_text_and_sympy_define_equal_systems() -> None:
     assert text._repr_latex_().startswith("$")
 
 
-def test_momenta_are_named_after_their_coordinates_by_default() -> None:
-    system = HamiltonianSystem.from_text(name="free", coordinates=["x", "y"], hamiltonian="(p_x**2 + p_y**2)/2")
-    assert [p.name for p in system.momenta] == ["p_x", "p_y"]
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

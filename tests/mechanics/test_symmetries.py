@@ -249,13 +249,6 @@ def test_parameter_with_default_zero_breaks_symmetries():
     assert symmetries(particle("(x**2 + y**2)**2 + eps*x**4", eps=0.0)) == ()
 
 
-def test_symmetries_of_point_vortices():
-    found = formulas(point_vortices(3))
-    assert found["linear invariant"] == "strength_1*x_1 + strength_2*x_2 + strength_3*x_3"
-    squares = [f"strength_{k}*x_{k}**2" for k in (1, 2, 3)] + [f"y_{k}**2/strength_{k}" for k in (1, 2, 3)]
-    assert found["quadratic invariant"] == " + ".join(squares)
-
-
 def test_a_hamiltonian_has_the_symmetries_of_its_lagrangian():
     for system in (particle("m*g*y", g=2.0), magnetic(), problem("kepler").system):
         assert formulas(hamiltonian_of(system)) == formulas(system)

@@ -45,12 +45,3 @@ def test_momenta_at_rest_are_not_velocities():
     )
     with pytest.raises(MethodError, match="separable"):
         compile_stepper(shifted, Composition(8))
-
-
-def test_unsupported_systems_are_rejected():
-    with pytest.raises(MethodError, match="separable"):
-        compile_stepper(DOUBLE_PENDULUM, Composition(8))
-    with pytest.raises(MethodError, match="order must be 2, 4, 6, 8 or 10"):
-        Composition(5)
-    with pytest.raises(MethodError, match="not explicit"):
-        compile_stepper(DOUBLE_PENDULUM, StoermerVerlet(), solver="explicit")

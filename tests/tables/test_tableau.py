@@ -6,7 +6,6 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-import scipy.special
 import sympy as sp
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -316,13 +315,6 @@ def test_nonnegativity_accounts_for_multiplicity_of_roots(roots: list[tuple[int,
         polynomial *= NumpyPolynomial([-root, 1]) ** multiplicity
     expected = all(polynomial(k + 0.5) >= 0 for k in range(6))
     assert is_nonnegative([mp.mpf(int(c)) for c in polynomial.coef]) == expected
-
-
-@pytest.mark.parametrize("s", [3, 5])
-def test_radau_iia_agrees_with_the_abscissae_of_scipy(s: int) -> None:
-    inside = scipy.special.roots_jacobi(s - 1, 1, 0)[0]
-    _, _, c = floats(radau_iia(s))
-    np.testing.assert_allclose(c, (1 + np.r_[inside, 1]) / 2, rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize(
