@@ -33,7 +33,7 @@ from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.arrays import check_solver as check_solver_of_arrays
 from scvi_codegen.lowering.control import control_of, error_growth_of
 from scvi_codegen.lowering.derivatives import derivatives_of
-from scvi_codegen.lowering.loops import with_sums
+from scvi_codegen.lowering.loops import transforms, with_sums
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.mechanics.arrays.legendre import SiteHamiltonian, site_hamiltonian
 from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
@@ -249,9 +249,13 @@ class Sources:
         try:
             if self.g is not None:
                 raise SizesRequiredError("time_transformation is not available for arrays of run-time sizes")
-            return lower(system, self.method, prefix=self.prefix, solver=self.solver)
+            program = lower(system, self.method, prefix=self.prefix, solver=self.solver)
         except SizesRequiredError as error:
             raise SizesRequiredError(f"{error}. This concerns '{self.system.name}': {SIZES_REQUIRED}") from error
+        layout = self.interface.layout
+        functions: dict[str, Any] = transforms(self.sites) if self.sites else {}
+        loops = replace(program.loops, maps=layout.maps, continued=layout.continued, **functions)
+        return replace(program, loops=loops)
 
     def program(self, *, fallback: bool = False) -> Program:
         """Return the lowered program; with ``fallback`` it also contains Newton's iteration as a fallback."""

@@ -9,7 +9,7 @@ the same for every method and system, and is in the templates.
 
 from dataclasses import dataclass
 
-from scvi_codegen.indices import Array, ArrayDeclarations, Convolution
+from scvi_codegen.indices import Array, ArrayDeclarations, ArrayMap, Convolution
 from scvi_codegen.ir.equations import (
     ConstrainedSteps,
     Constraints,
@@ -200,6 +200,10 @@ class RolledTerms:
         shifts: with Newton's method, the eigenvectors of the method's matrix (:class:`ShiftTables`).
         neighbours: lists of neighbours: name, number of components; a kernel of their periods (0: none), cutoff and
             skin, which writes to the first position.
+        velocities, momenta: H_p in (q, p) and L_v in (q, v) of a Lagrangian that is integrated by its Hamiltonian,
+            which write to the positions of their coordinates.
+        maps: momentum maps.
+        continued: whether the predictor extrapolates previous steps instead of reusing the forces at their end.
     """
 
     forces: tuple[RolledKernel, ...] = ()
@@ -211,6 +215,10 @@ class RolledTerms:
     reach: int = 0
     shifts: ShiftTables | None = None
     neighbours: tuple[tuple[str, int, RolledKernel], ...] = ()
+    velocities: tuple[RolledKernel, ...] = ()
+    momenta: tuple[RolledKernel, ...] = ()
+    maps: tuple[ArrayMap, ...] = ()
+    continued: bool = False
 
     @property
     def applied(self) -> tuple[RolledKernel, ...]:

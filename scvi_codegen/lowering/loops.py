@@ -11,12 +11,14 @@ from scvi_codegen.formulas.array_statements import ArrayForce
 from scvi_codegen.formulas.arrays import ArrayTerm, term_of
 from scvi_codegen.formulas.expressions import gradient
 from scvi_codegen.formulas.neighbours import MAX_COMPONENTS, Neighbours
+from scvi_codegen.formulas.symbols import DOT
 from scvi_codegen.indices import Access, Array, Place
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.equations import ConstrainedSteps
 from scvi_codegen.ir.kernel import Constant, Load, RolledKernel, exact_number
 from scvi_codegen.ir.program import Program, RolledTerms
 from scvi_codegen.lowering.stage_groups import rolled_kernel
+from scvi_codegen.mechanics.arrays.legendre import SiteHamiltonian
 from scvi_codegen.mechanics.arrays.system import ArraySystem, entries_of, force_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.term_groups import SplitSystem, TermGroup
@@ -52,6 +54,30 @@ def rolled_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, n
         reach=reach_of(system.coordinates, diagonals),
         neighbours=tuple(_list(system, each) for each in system.neighbours),
     )
+
+
+def transforms(sites: SiteHamiltonian) -> dict[str, tuple[RolledKernel, ...]]:
+    """Return the kernels of velocities in (q, p), and of momenta in (q, v), as functions of the joined state.
+
+    In both the momenta or velocities follow the positions, so both are read as entries of the momenta.
+    """
+    system, moving = sites.system, dict[str, tuple[Array, Array]]()
+    for array, momentum in zip(sites.system.coordinates, sites.system.momenta, strict=True):
+        moving |= {array.name + DOT: (array, momentum), momentum.name: (array, momentum)}
+
+    def looped(name: str, number: int, force: ArrayForce) -> RolledKernel:
+        slots = tuple(
+            (slot, replace(access, array=moving[access.array.name][1]) if access.array.name in moving else access)
+            for slot, access in force.slots
+        )
+        targets = tuple((replace(access, array=moving[access.array.name][0]), x) for access, x in force.targets)
+        of, purpose = replace(force, slots=slots, targets=targets), f"{name.capitalize()}."
+        return _added(system, f"{name}_{number}", of, system.state, f"{name} {_shown(force)}", purpose)
+
+    return {
+        "velocities": tuple(looped("velocities", *pair) for pair in enumerate(sites.velocities)),
+        "momenta": tuple(looped("momenta", *pair) for pair in enumerate(sites.momenta)),
+    }
 
 
 def _list(system: ArraySystem, near: Neighbours) -> tuple[str, int, RolledKernel]:

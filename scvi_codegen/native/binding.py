@@ -4,8 +4,9 @@ A library with only the fixed-point iteration uses Newton's method of a second l
 first requests it (:mod:`scvi_codegen.rendering.kernels.simd`); that call is then repeated from its start.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
+from threading import local
 from typing import Any, Self
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.native.building import Library
-from scvi_codegen.native.options import FALLBACK_REQUIRED, SolverOptions, checked_options
+from scvi_codegen.native.options import FAILURES, FALLBACK_REQUIRED, SolverOptions, checked_options
 
 DOUBLE_SIZE = np.dtype(np.float64).itemsize
 WITHOUT_STEPS = frozenset(("start", "step_error", "energies"))
@@ -31,11 +32,13 @@ class Binding:
         origin: an object that can be pickled and the name of its attribute that is this binding.
 
     Attributes:
+        count: number of coordinates of a run of run-time sizes, whose arrays are pointers; else ``None``.
         reusable: whether memory of runs may be kept for later runs.
         integers, whole_numbers: functions that return a pointer to the first element of a contiguous int32 or int64
             array that is not empty.
     """
 
+    count: int | None = None
     reusable = True
 
     def __init__(
@@ -54,12 +57,18 @@ class Binding:
         self.whole_numbers: Callable[[NDArray[np.int64]], Any] = partial(library.ffi.from_buffer, "long long[]")
         self._fallback = fallback if self.has("set_fallback") else None
         self._fallback_binding: Self | None = None
+        self._spare = local()
         self._shared_fallback = self.null
 
     def __reduce__(self) -> tuple[Any, ...]:
         if self._origin is None:
             raise TypeError("a binding cannot be pickled by itself: pickle its stepper")
         return getattr, self._origin
+
+    @property
+    def failures(self) -> Mapping[str, tuple[str, str]]:
+        """Cause and remedy of a failed step, by status."""
+        return FAILURES
 
     def function(self, name: str, memory: Any = None) -> Callable[..., Any]:
         """Return ``<prefix>_<name>``, bound to this memory if one is given; it releases the GIL while it runs."""
@@ -129,11 +138,15 @@ class Binding:
 
     def vector(self, part: Any) -> NDArray[np.float64]:
         """Return an array of doubles of a struct, in the same memory."""
-        return np.frombuffer(self._ffi.buffer(part))
+        if self.count is None:
+            return np.frombuffer(self._ffi.buffer(part))
+        return np.frombuffer(self._ffi.buffer(part, DOUBLE_SIZE * self.count)) if self.count else np.empty(0)
 
     def buffer(self, struct: Any) -> Any:
-        """Return the bytes of a struct, writable."""
-        return self._ffi.buffer(struct)
+        """Return the bytes of a struct, writable; of a run of run-time sizes those of its state."""
+        if (size := getattr(struct, "saved", None)) is None:
+            return self._ffi.buffer(struct)
+        return self._ffi.buffer(self._ffi.addressof(struct, "t"), size)
 
     def records(self, structs: Any, count: int | None = None) -> NDArray[np.void]:
         """Return an array of structs, by the names of their fields, in the same memory; a copy of the first few."""
@@ -157,8 +170,12 @@ class Binding:
         """Return pointers to the first elements of contiguous float64 arrays that are not empty."""
         return map(self._doubles, arrays)
 
-    def workspace(self) -> Any:
-        """Return memory for one call."""
+    def workspace(self, run: Any = None) -> Any:
+        """Return memory for one call; of run-time sizes that of a run: of this one, or of one for each thread."""
+        if self.count is not None:
+            if run is None:
+                run = self._spare.run = getattr(self._spare, "run", None) or self.new("run *")
+            return self._ffi.cast("double *", run)
         workspace = self.pointer(np.empty(self._workspace))
         if self._fallback is not None:
             self._refer_to_fallback(workspace)

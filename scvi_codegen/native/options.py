@@ -1,5 +1,6 @@
 """Solver options, status codes of steps, and advice for each failure."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,14 +87,22 @@ def checked_options(options: SolverOptions | None) -> SolverOptions | None:
     return options
 
 
-def step_failure(status: int, report: Any, *, step: int, h: float, remark: str = "") -> StepFailedError:
+def step_failure(
+    status: int,
+    report: Any,
+    *,
+    step: int,
+    h: float,
+    remark: str = "",
+    failures: Mapping[str, tuple[str, str]] = FAILURES,
+) -> StepFailedError:
     """Return the exception for a failed step: number, time, step size (0: adaptive), cause, remedy and a remark.
 
-    The report may have messages of its own, ``failures``.
+    ``failures``: those of the binding.
     """
     word = STATUS[status]
     length = f" with h = {h:g}" if h else ""
-    what, remedy = getattr(report, "failures", FAILURES)[word]
+    what, remedy = failures[word]
     if word == NOT_CONVERGED:
         what += f" (last update {report.change:.3g}; {report.iterations} iterations in this call)"
     message = f"step {step} at t = {report.t:.17g}{length} failed: {what}. {remedy}{remark}"

@@ -71,7 +71,6 @@ class ArrayEvents:
         positions, rates: arrays whose entries may occur: coordinates, fields and momenta; velocities, of which a
             system that is defined by a Hamiltonian has none.
         symbols: time and parameters by name.
-        velocities, momenta: calls that compute them, of a Lagrangian that is integrated by its Hamiltonian.
         uses_velocity: whether velocities occur.
 
     Raises:
@@ -94,9 +93,6 @@ class ArrayEvents:
         }
         self.uses_velocity, self.functions, self.kernels = False, list[str](), list[Kernel]()
         self.events = [self._event(k, event) for k, event in enumerate(events)]
-        changes = any(event.changes_state for event in events)
-        self.velocities = self._of_sites("velocity", layout.velocity_formulas if events else ())
-        self.momenta = self._of_sites("momentum", layout.momentum_formulas if changes else ())
 
     def terms(self, formula: Any, event: SearchedEvent) -> tuple[ArrayTerm, ...]:
         """Return the terms of a formula of an event; in the loops of the event, one term for each of their elements.
@@ -218,17 +214,6 @@ class ArrayEvents:
         if kinds >= {1, 2}:
             raise EventError(f"the event '{event.function}' sets momenta and velocities: set one or the other")
         return calls, str(len(event.changes))
-
-    def _of_sites(self, name: str, forces: Sequence[Any]) -> list[str]:
-        """Return calls that compute velocities from momenta, or momenta from velocities."""
-        used, calls = self.uses_velocity, list[str]()
-        for j, force in enumerate(forces):
-            lines = [f"to->value[{{{i}}}] = value[{i}];" for i in range(len(force.targets))]
-            to = [(name, access) for access, _ in force.targets]
-            values = [each for _, each in force.targets]
-            calls.append(self._function(f"{name}_{j}", force, values, lines, to, within=False))
-        self.uses_velocity = used
-        return calls
 
 
 array_events = lru_cache(maxsize=64)(ArrayEvents)

@@ -6,7 +6,6 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen import ExpressionError, FieldSystem, LagrangianSystem, SystemDefinitionError
-from scvi_codegen.native.binding import Binding
 
 RING = LagrangianSystem.from_text(
     "ring",
@@ -212,9 +211,8 @@ def test_products_of_large_steps_are_bounded(name):
     for ratio in (8, 20) if name == "plane" else (20, 100):
         run = stepper.start(start, h=ratio * limit)
         memory, binding = run._memory, run.stepper.binding
-        report = Binding.new(binding, "report *")
-        call = Binding.function(binding, "advance")
-        assert call(memory, 4, 0, binding._arrays[memory].problem, *[binding.null] * 5, report) == 0
+        report, null = binding.new("report *"), binding.null
+        assert binding.function("advance")(memory, 4, 0, run._arguments[0], *[null] * 5, report, null) == 0
         assert report.products / 4 <= (16 if ratio < 100 and name != "plane" else 32)
     end = stepper.integrate(start, h=4 * limit, steps=8).q["u"][-1]
     exact = explicit.integrate(start, h=limit / 2, steps=64).q["u"][-1]

@@ -35,22 +35,21 @@ int main(void)
 {{
   static double work[KEPLER_WORKSPACE], q[M] = {{0.4, 0.1}}, p[M] = {{0.0, 2.0}}, t;
   static kepler_run one;
-  static double all[N * (5 + RING_WORK)];
-  ring_problem problem = {{.size = {{N}}, .parameters = {{0.25}}}};
-  ring_run run = {{.h = {h}, .work = all}};
+  static double all[4096] __attribute__((aligned(64))), start[2 * N];
+  const long long sizes[] = {{N}};
+  const int *const tables[] = {{NULL}};
+  ring_run *run = ring_memory(sizes, tables) <= 4096 ? ring_bind(sizes, tables, all) : NULL;
   kepler_report of_one;
   ring_report of_all;
-  const double parameters[] = {{1.0}};
+  const double parameters[] = {{1.0}}, beta[] = {{0.25}};
   int count, status;
   kepler_start(&one, 0.0, {h}, q, p);
   status = kepler_advance(&one, {steps}, {steps}, parameters, NULL, &t, q, p, &count, &of_one, work);
-  run.q = all + RING_WORK * N, run.p = run.q + N, run.carry_q = run.p + N, run.carry_p = run.carry_q + N;
-  run.inverse_mass = run.carry_p + N;
-  status |= ring_inverse_masses(&problem, run.inverse_mass);
   for (int i = 0; i < N; i++)
-    run.q[i] = 0.125 * i, run.p[i] = 0.5 - 0.0625 * i;
-  status |= ring_advance(&run, {steps}, 0, &problem, NULL, NULL, NULL, NULL, NULL, &of_all);
-  show(one.q, M), show(one.p, M), show(run.q, N), show(run.p, N);
+    start[i] = 0.125 * i, start[N + i] = 0.5 - 0.0625 * i;
+  ring_start(run, 0.0, {h}, start, start + N);
+  status |= ring_advance(run, {steps}, 0, beta, NULL, NULL, NULL, NULL, NULL, &of_all, NULL);
+  show(one.q, M), show(one.p, M), show(run->q, N), show(run->p, N);
   return status;
 }}
 """

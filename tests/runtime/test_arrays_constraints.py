@@ -10,7 +10,6 @@ import scvi_codegen as sc
 from scvi_codegen.derivation.equations import derive
 from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, SystemDefinitionError
 from scvi_codegen.models.packages.package import generate_package
-from scvi_codegen.native.binding import Binding
 
 RATTLE = sc.SVI(1, "gauss-lobatto:2")
 ROUNDING = 2.0**-52
@@ -100,8 +99,8 @@ def test_chain_needs_one_product_per_correction(stepper):
     q, data = chain(500)
     run = stepper.start(q, h=1e-4, **data)
     memory, binding = run._memory, run.stepper.binding
-    report = Binding.new(binding, "report *")
-    Binding.function(binding, "advance")(memory, 10, 0, binding._arrays[memory].problem, *[binding.null] * 5, report)
+    report, null = binding.new("report *"), binding.null
+    binding.function("advance")(memory, 10, 0, run._arguments[0], *[null] * 5, report, null)
     assert report.products <= report.iterations
 
 

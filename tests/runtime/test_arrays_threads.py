@@ -367,21 +367,22 @@ RACES = """
 #include "shared.h"
 enum {{ N = {count} }};
 static const int bonds[] = {{{bonds}}};
-static double work[N * SHARED_WORK] __attribute__((aligned(64))), rest[5 * N];
+static double memory[128 * N + 4096] __attribute__((aligned(64))), start[2 * N];
 static double t[{steps}], q[{steps} * N], p[{steps} * N];
 static int iterations[{steps}];
 int main(void)
 {{
-  static shared_problem given = {{.size = {{{sizes}}}, .parameters = {{N}}}};
-  static shared_run run;
-  given.table[0] = bonds;
-  run.work = work, run.q = rest, run.p = rest + N, run.carry_q = rest + 2 * N, run.carry_p = rest + 3 * N;
-  run.inverse_mass = rest + 4 * N;
+  const long long sizes[] = {{{sizes}}};
+  const int *const tables[] = {{bonds, 0}};
+  const double parameters[] = {{N}};
+  shared_run *run = shared_bind(sizes, tables, memory);
+  if (shared_memory(sizes, tables) * 8 > (long long)sizeof memory)
+    return 9;
   for (int i = 0; i < N; i++)
-    run.q[i] = 0.3 * (i * 37 % 101) / 101.0;
-  shared_inverse_masses(&given, run.inverse_mass);
-  run.h = 0.01, run.threads = {threads};
-  return shared_advance(&run, {steps}, 1, &given, 0, t, q, p, iterations, 0);
+    start[i] = 0.3 * (i * 37 % 101) / 101.0;
+  shared_start(run, 0.0, 0.01, start, start + N);
+  run->threads = {threads};
+  return shared_advance(run, {steps}, 1, parameters, 0, t, q, p, iterations, 0, 0);
 }}
 """
 COUNTED = """

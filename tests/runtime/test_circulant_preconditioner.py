@@ -9,7 +9,6 @@ import scvi_codegen as sc
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.methods import as_method
-from scvi_codegen.native.binding import Binding
 from scvi_codegen.runtime.arrays import envelope
 
 RANDOM = np.random.default_rng(1)
@@ -58,13 +57,8 @@ def products_of(stepper, q, h, *, steps=1, **given):
     """Return the number of products of steps, which must converge."""
     run = stepper.start(q, h=h, **given)
     memory, binding = run._memory, run.stepper.binding
-    report = Binding.new(binding, "report *")
-    assert (
-        Binding.function(binding, "advance")(
-            memory, steps, 0, binding._arrays[memory].problem, *[binding.null] * 5, report
-        )
-        == 0
-    )
+    report, null = binding.new("report *"), binding.null
+    assert binding.function("advance")(memory, steps, 0, run._arguments[0], *[null] * 5, report, null) == 0
     return report.products
 
 

@@ -195,33 +195,28 @@ def arrays_driver(
 ) -> str:
     """A run over arrays, from a wave; several threads share a step where SCVI_THREADS is defined."""
     rows = "".join(f"static const int table_{k}[] = {{{', '.join(map(str, row))}}};\n" for k, row in enumerate(tables))
-    listed = ", ".join(f"table_{k}" for k in range(len(tables))) or "NULL"
+    listed = ", ".join(f"table_{k}" for k in range(len(tables)))
     run = (
-        f"CALL(advance_to)(&run, {t_end!r}, {tolerance!r}, {steps}, 0, &problem, NULL, NULL, NULL, NULL, NULL, &report)"
+        f"CALL(advance_to)(run, {t_end!r}, {tolerance!r}, {steps}, 0, all, NULL, NULL, NULL, NULL, NULL, &report, NULL)"
         if t_end
-        else f"CALL(advance)(&run, {steps}, 0, &problem, NULL, NULL, NULL, NULL, NULL, &report)"
+        else f"CALL(advance)(run, {steps}, 0, all, NULL, NULL, NULL, NULL, NULL, &report, NULL)"
     )
     held = """
-  CALL(constraint_sizes)(&problem, &run);
-  run.places = calloc((size_t)(3 * (run.constraints + run.entries) + n + 3), sizeof *run.places);
-  run.pairs = CALL(constraint_pairs)(&run, &problem);
-  run.columns = calloc((size_t)run.pairs + 1, sizeof *run.columns);
-  run.held = calloc((size_t)(11 * run.constraints + 2 * run.entries + 2 * run.pairs), sizeof *run.held);
-  CALL(constraint_pairs)(&run, &problem);
-  status = CALL(project)(&run, &problem, NULL, &report);
-  printf("project %d\\n", status);
+    printf("project %d\\n", CALL(project)(0.25, q, p, all, q, p, (double *)run));
 """
-    work = f"{prefix.upper()}_WORK"
-    body = f"""memset(x, 0, sizeof(double) * (size_t)(n * (5 + {work})));
-    run = initial;
-    run.work = x;
-    run.q = x + {work} * n, run.p = run.q + n, run.carry_q = run.p + n, run.carry_p = run.carry_q + n;
-    run.inverse_mass = run.carry_p + n;
-    status = CALL(inverse_masses)(&problem, run.inverse_mass);
+    body = f"""memset(memory, 0, sizeof(double) * (size_t)length);
+    run = CALL(bind)(sizes, tables, memory);
+    n = run->p - run->q;
     for (long long i = 0; i < n; i++) {{
       const double at = (double)((i * 37) % 101) / 101.0;
-      run.q[i] = {"at + (double)i / 16.0" if constrained else "at"}, run.p[i] = 0.5 - at * at;
-    }}{held if constrained else ""}
+      q[i] = {"at + (double)i / 16.0" if constrained else "at"}, p[i] = 0.5 - at * at;
+    }}
+    CALL(data_at)(all, memory);
+    for (int k = 0; k < {fields}; k++)
+      for (long long i = 0; i < n; i++)
+        ((double *)run->data.field[k])[i] = 1.0 + 0.125 * (double)(i % 3);{held if constrained else ""}
+    CALL(start)(run, 0.25, {0.0 if t_end and not tolerance else h!r}, q, p);
+    run->threads = {threads};
     from = now();
     status = {run};"""
     return (
@@ -229,24 +224,23 @@ def arrays_driver(
         + f"""
 {rows}int main(int count, char **arguments)
 {{
-  CALL(problem) problem = {{
-      {{{", ".join(map(str, sizes)) or "0"}}}, {{NULL}}, {{{listed}}}, {{{numbers(parameters)}}}}};
-  const CALL(run) initial = {{.t = 0.25, .h = {0.0 if t_end and not tolerance else h!r}, .threads = {threads}}};
-  CALL(run) run = initial;
+  const long long sizes[] = {{{", ".join(map(str, sizes)) or "0"}}};
+  const int *const tables[] = {{{f"{listed}, " if listed else ""}NULL}};
+  const long long length = CALL(memory)(sizes, tables);
+  double *memory = aligned_alloc(64, sizeof(double) * (size_t)((length + 7) / 8 * 8)), energies[3];
+  double *all = calloc((size_t)({fields + 1} * length + {len(parameters)}), sizeof(double));
+  double *q = malloc(sizeof(double) * (size_t)length), *p = malloc(sizeof(double) * (size_t)length);
+  const double scalars[] = {{{numbers(parameters)}}};
   CALL(report) report;
-  const long long n = CALL(coordinates)(&problem);
-  double *x = aligned_alloc(64, sizeof(double) * (size_t)(8 * ((n * (5 + {prefix.upper()}_WORK)) / 8 + 8)));
-  double *fields = malloc(sizeof(double) * (size_t)n), energies[3];
+  CALL(run) *run = NULL;
+  long long n = 0;
   int status;
-  for (long long i = 0; i < n; i++)
-    fields[i] = 1.0 + 0.125 * (double)(i % 3);
-  for (int k = 0; k < {fields}; k++)
-    problem.field[k] = fields;
+  memcpy(all, scalars, {len(parameters)} * sizeof(double));
   {repeated(body)}
-  printf("run %d %lld %lld %lld\\n", status, report.steps, report.iterations, run.step);
-  show("q", run.q, n), show("p", run.p, n), show("carry", run.carry_q, n), show("carry", run.carry_p, n);
-  show("t", &run.t, 1), show("t_low", &run.t_low, 1), show("h", &run.h, 1), show("error", &run.error, 1);
-  CALL(energies)(&problem, run.t, run.q, run.p, run.inverse_mass, energies);
+  printf("run %d %lld %lld %lld\\n", status, report.steps, report.iterations, run->step);
+  show("q", run->q, n), show("p", run->p, n), show("carry", run->carry_q, n), show("carry", run->carry_p, n);
+  show("t", &run->t, 1), show("t_low", &run->t_low, 1), show("h", &run->h, 1), show("error", &run->error, 1);
+  CALL(energy_parts)(1, &run->t, run->q, run->p, all, energies, (double *)run);
   show("energies", energies, 3);
   return 0;
 }}

@@ -55,6 +55,7 @@ def loop_context(program: Program) -> dict[str, Any]:
         scalars += [each.kernel for each in loops.forces]
     if constrained:
         scalars += [each.kernel for each in (*constrained.conditions, *constrained.curvatures)]
+    scalars += [each.kernel for each in (*loops.velocities, *loops.momenta)]
     return {
         "program": program,
         "most_threads": 1 if constrained else MOST_THREADS,
@@ -79,11 +80,44 @@ def loop_context(program: Program) -> dict[str, Any]:
         "fixed_point": fixed_point
         and iteration_source(fixed_point, POINTS, kernels=[each.kernel for each in loops.applied]),
         "work": _step_work(program) + _transform_work(program),
+        "continued": loops.continued,
+        "site_functions": [_site_text(program, each) for each in (*loops.velocities, *loops.momenta)],
+        **_field_lengths(program),
+        **_map_context(program),
         "hot": "static",
         "waves": _lattice_context(program) if _on_lattices(program) else None,
         "arrays": [(product_text(each), int(_is_field(each, loops.applied))) for each in program.layout.coordinates],
         **_constraint_context(program, constrained),
     }
+
+
+def _field_lengths(program: Program) -> dict[str, Any]:
+    """Return the numbers of entries of the fields in C."""
+    lengths = [product_text(array) for array in program.layout.fields]
+    return {"field_lengths": lengths, "field_sizes": list(sizes_text(program.layout, " ".join(lengths)))}
+
+
+def _map_context(program: Program) -> dict[str, Any]:
+    """Return the initialisers of the descriptions of momentum maps in C (templates/support/arrays/array_states.h)."""
+    arrays = {array.name: array for array in program.layout.coordinates}
+    texts = []
+    for of in program.loops.maps:
+        array, whole = arrays[of.array], of.component is None
+        kind = "PHASE" if of.phase else "TRANSLATION" if of.other is None else "ROTATION"
+        components, numbers = 1 if whole else array.axes[-1].number, f"{of.component or 0}, {of.other or 0}"
+        start = f"start_{array.name}"
+        texts.append(f"{{{start}, {start} + {product_text(array)}, {components}, {numbers}, {kind}}}")
+    starts = list(starts_text(program.layout, " ".join(texts)))
+    return {"maps": texts, "map_sizes": [*sizes_text(program.layout, " ".join([*texts, *starts])), *starts]}
+
+
+def _site_text(program: Program, looped: RolledKernel) -> str:
+    """Return a function that computes velocities or momenta of the elements of a term, from the joined state."""
+    place_of, name = Nest(program.layout, looped, "", "").place_of, looped.kernel.name
+    stored = [f"result[{place_of(access)}] = value[{k}];" for k, access in enumerate(looped.writes)]
+    arguments = ["const double *X", "double t", "double *result"]
+    lines = [f"{name}(u, t, parameters, value);", *stored]
+    return _function(program, looped, f"find_{name}", arguments, lines, values=len(stored))
 
 
 def _circulants(program: Program) -> list[RolledKernel]:

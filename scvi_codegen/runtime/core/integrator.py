@@ -73,7 +73,7 @@ class Integrator(LinearisedMethod):
             binding.workspace(),
         )
         if status:
-            raise step_failure(status, report, step=0, h=h)
+            raise step_failure(status, report, step=0, h=h, failures=binding.failures)
 
     def discrete_lagrangian(
         self,

@@ -129,7 +129,8 @@ class StateFunctions(CompiledMethod):
         parts = np.full((len(q), 3), np.nan)
         if self.binding.has("energy_parts"):
             arrays = (np.ascontiguousarray(each, dtype=float) for each in (t, q, p, parameters))
-            self.binding.function("energy_parts")(len(t), *map(self.binding.pointer, (*arrays, parts)))
+            pointers = map(self.binding.pointer, (*arrays, parts))
+            self.binding.function("energy_parts")(len(t), *pointers, self.binding.workspace())
         else:
             parts[:, 2] = self.energy(q, p, t, parameters)
         return parts
@@ -171,7 +172,8 @@ class StateFunctions(CompiledMethod):
         if not values.size:
             return values, sizes
         arrays = times, positions, momenta, self._parameters(parameters), values, sizes
-        status = self.binding.function("momentum_maps")(len(times), *map(self.binding.pointer, arrays))
+        sizes_of = () if self.problem is None else (self.binding.workspace(),)
+        status = self.binding.function("momentum_maps")(len(times), *map(self.binding.pointer, arrays), *sizes_of)
         if status:
             raise StateError(f"the momentum maps of a state cannot be computed: {REASONS[status]}")
         return values, sizes
@@ -202,6 +204,9 @@ class StateFunctions(CompiledMethod):
         return p
 
     def _called(self, name: str, t: float, q: Array, other: Array, values: Array) -> Array:
+        if self.interface.layout.momenta:
+            other_form = "give momenta p instead of velocity" if name == "momentum" else "use the momenta p"
+            raise StateError(f"velocities are unavailable for a system defined by a Hamiltonian: {other_form}")
         result = np.empty_like(other)
         pointers = map(self.binding.pointer, (q, other, values, result))
         status = self.binding.function(name)(t, *pointers, self.binding.workspace())

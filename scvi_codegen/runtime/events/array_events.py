@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from functools import partialmethod
+from functools import partial
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -13,10 +14,12 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import EventError, ScviCodegenError
 from scvi_codegen.native.building import Library
 from scvi_codegen.rendering.source import Interface
-from scvi_codegen.runtime.arrays.binding import REPORTED, ArrayBinding
+from scvi_codegen.runtime.arrays.binding import ArrayBinding
 from scvi_codegen.runtime.arrays.interface import Numbers, RunSizes, check_accesses
 from scvi_codegen.runtime.events.event import Event
 
+SEARCHES = ("crossings", "advance_with_changes")
+"""Functions of C that search for events."""
 LARGEST_NUMBER = 2**31 - 1
 """Largest number of functions of events, and of variables that a function changes."""
 
@@ -44,15 +47,13 @@ class EventBinding(ArrayBinding):
             except ScviCodegenError as error:
                 raise EventError(f"the event '{event.function}': {error}") from error
         self._first = np.zeros(len(events) + 1, dtype=np.int64)
-        self._changes = super(ArrayBinding, self).function("event_sizes")(
-            self._new_problem(), self.whole_numbers(self._first)
-        )
+        self._changes = super().function("event_sizes")(self.new("run *"), self.whole_numbers(self._first))
         if max(self._first[-1], self._changes) > LARGEST_NUMBER:
             raise EventError(f"the events have {self._first[-1]} functions, more than {LARGEST_NUMBER}: use fewer")
         self._rows: WeakKeyDictionary[Any, Numbers] = WeakKeyDictionary()
 
     def new(self, what: str) -> Any:
-        """Return memory of a run, a search or crossings, or a report."""
+        """Return memory of a run, a search or crossings."""
         if what == "watch *" and self.acts:
             return self._ffi.new(f"{self._prefix}_watch *", {"history": int(self._first[-1])})
         return super().new(what)
@@ -69,29 +70,22 @@ class EventBinding(ArrayBinding):
                 record[name] = getattr(crossing, name)
         return records
 
-    def _search(self, name: str, run: Any, watch: Any, *arguments: Any) -> int:
-        """Call a function of the search, with memory for it."""
-        *inputs, room, found, filled, report, workspace = arguments
-        n, functions = self.count, int(self._first[-1])
-        host, made = self.new("event_host *"), super(ArrayBinding, self).new("report *")
+    def function(self, name: str, memory: Any = None) -> Callable[..., Any]:
+        """Return a function of C; those of the search with memory for it."""
+        function = super().function(name, memory)
+        return partial(self._search, function, memory is not None) if name in SEARCHES else function
+
+    def _search(self, function: Callable[..., Any], advances: bool, watch: Any, *arguments: Any) -> int:
+        room, found, n, functions = arguments[-5], arguments[-4], self.count or 0, int(self._first[-1])
         size = self.constant("EVENT_STATES") * n + self.constant("EVENT_VALUES") * functions
         work, values, places = np.empty(size), np.empty(self._changes + n), np.zeros(self._changes, np.int32)
         if found not in self._rows:
             self._rows[found] = np.empty((room, 2 * n))
+        host = self.new("event_host *")
         host.count, host.functions, host.changes, host.first = n, functions, self._changes, self._first.tolist()
         host.memory, host.states = self.pointer(work), self.pointer(self._rows[found])
         host.values, host.places = self.pointer(values), self.pointer(places)
-        state = (run.q, run.p, inputs[3]) if run is not None else inputs[3:6]
-        with self._at(0.0, *state) as other:
-            host.other, host.problem = other, self._arrays[other].problem
-            host.own = host.problem if run is None else self._arrays[run].problem
-            leading = () if run is None else (run,)
-            watch.host, search = host, super(ArrayBinding, self).function(name)
-            status = search(*leading, watch, *inputs, room, found, filled, made, workspace)
-            watch.host, watch.used = self.null, 0
-        for field in REPORTED:
-            setattr(report, field, getattr(made, field))
+        watch.host = host
+        status = function(watch, *arguments[:-1], self.workspace() if advances else arguments[-1])
+        watch.host, watch.used = self.null, 0
         return int(status)
-
-    _crossings = partialmethod(_search, "crossings", None)
-    _advance_with_changes = partialmethod(_search, "advance_with_changes")

@@ -154,7 +154,7 @@ class CrossingSearch:
             if number and not (name == "accumulated" and self.ended):
                 function = self.stepper.events[abs(number) - 1].function
                 return EventError(message.format(function=function, t=report.t, g=behind))
-        return step_failure(status, report, step=step, h=h)
+        return step_failure(status, report, step=step, h=h, failures=self.binding.failures)
 
     def warn_of_accumulation(self) -> None:
         """Issue a :class:`EventWarning` if the run ended where crossings accumulate."""

@@ -45,7 +45,7 @@ STEPS_FROM_REST, STEPS_NEAR_REST = 2**20, 16
 """First value of the count of steps from rest in C; number of steps in which a force moves a state away from rest."""
 EVENT_NUMBERS = ("undefined", "accumulated", "through", "jammed")
 """Numbers of events, from 1 on, in the state of the search for events; 0 for none, < 0 for an undefined change."""
-FUNCTIONS = ("start", "set_parameters", "advance", "advance_to", "step_error")
+FUNCTIONS = ("start", "advance", "advance_to", "step_error")
 """Functions of C that take a run; sources of version 0.1 have no error estimate."""
 NO_OUTPUT, NO_PLAN = LARGEST_COUNT, StepPlan()
 """Output stride that saves no state; plan of a run that was not started."""
@@ -70,14 +70,14 @@ class Memory(OneThread):
         self._parameters = stepper.defaults
         self._arguments = binding.pointer(self._parameters), binding.null
         self._options: SolverOptions | None = None
-        self._has_defaults = False  # whether no parameter differs from its default, also in C
+        self._has_defaults = False  # whether no parameter differs from its default
         self._watch: Any = None  # state of the search for events in C
         self._energies: Any = None  # function of C, and memory for its results
         self._rows: Any = None  # memory for states that every recording uses
         self._times_in_rows: Any = None  # times of the trajectory whose states are in this memory
         self._has_tau = stepper.in_tau  # whether steps are steps of tau
         self._discarded = *(binding.numbers(f"double[{stepper.dimension}]"),) * 3, binding.numbers("int *")
-        self._report, self._workspace = binding.new("report *"), binding.workspace()
+        self._report, self._workspace = binding.new("report *"), binding.workspace(memory)
         self._set_arguments(binding.null)
         self._untimed = len(self._q) <= MOST_UNTIMED  # whether ``advance`` takes steps without looking at the clock
         self._functions = {name: binding.function(name, memory) for name in FUNCTIONS if binding.has(name)}
@@ -113,9 +113,9 @@ class Memory(OneThread):
         self._functions["start"](t, plan.h, *pointers)
         if parameters is not None or not self._has_defaults:
             self._parameters[:] = stepper._parameters_at(self._q, self._p, parameters)
-            self._pass_parameters()
+            self._check_masses()
             self._unset_inputs = inputs_not_given(interface, parameters)
-            self._has_defaults = parameters is None and not interface.energy_parameter and stepper.problem is None
+            self._has_defaults = parameters is None and not interface.energy_parameter
         if plan is not self._plan:
             self.plan = plan
         if options is not self._options:
@@ -162,8 +162,7 @@ class Memory(OneThread):
             raise StateError("the saved run has fixed steps: omit t_end")
         if not stepper._has_energy(parameters):
             raise StateError("a saved run in transformed time requires its energy: give parameters=run.parameters")
-        run._parameters[:] = stepper._parameters(parameters)
-        run._pass_parameters()
+        run._parameters[:], run._has_defaults = stepper._parameters(parameters), False
         run.plan = plan
         run._set_options(options)
         run._unset_inputs = inputs_not_given(stepper.interface, parameters)
@@ -246,14 +245,20 @@ class Memory(OneThread):
         """Set parameter values; raise ``StateError`` if position constraints jump."""
         if self.stepper.interface.constraints:
             check_reachable(self.stepper, self.q, self.p, self.t, values)
-        self._parameters[:] = values
-        self._pass_parameters()
+        self._parameters[:], self._has_defaults = values, False
+        self._check_masses()
 
-    def _pass_parameters(self) -> None:
-        """Pass the parameters to C where the functions of steps do not take them."""
-        self._has_defaults = False
-        if "set_parameters" in self._functions:
-            self._functions["set_parameters"](self._parameters)
+    def _check_masses(self) -> None:
+        """Raise ``StateError`` if a coordinate has no positive mass; of known sizes the steps fail."""
+        binding = self.stepper.binding
+        if not binding.has("data_at") or binding.function("data_at")(self._arguments[0], self._workspace):
+            return
+        inverse = binding.vector(self._memory.inverse_mass)
+        index = int(np.argmin(np.where((inverse > 0.0) & np.isfinite(inverse), 1.0, -1.0)))
+        raise StateError(
+            f"coordinate {index} of {len(inverse)} has no positive mass: add its kinetic energy to L, or check the "
+            "parameters"
+        )
 
     @property
     def steps(self) -> int:
@@ -350,7 +355,8 @@ class Memory(OneThread):
 
     def _failure(self, status: int) -> StepFailedError:
         remark = singular_position(self.stepper, self._q, self.t, self._parameters)
-        return step_failure(status, self._report, step=self.steps, h=self.h, remark=remark)
+        failures = self.stepper.binding.failures
+        return step_failure(status, self._report, step=self.steps, h=self.h, remark=remark, failures=failures)
 
     def _taken(self, steps: int) -> int:
         """Take steps in one C call and return their number."""

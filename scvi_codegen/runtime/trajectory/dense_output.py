@@ -101,7 +101,7 @@ def _take_partial_steps(states: SavedStates, t: Array, h: Array, q: Array, p: Ar
         q_k, p_k = q_start + k * m, p_start + k * m
         status = step(begin, length, q_k, p_k, parameters, options, q_k, p_k, report, workspace)
         if status:
-            raise step_failure(status, report, step=0, h=length)
+            raise step_failure(status, report, step=0, h=length, failures=binding.failures)
         iterations += report.iterations
     return iterations
 

@@ -2,6 +2,7 @@
 #define SUPPORT_ARRAY_RUN_H
 
 #include "../core/step.h"
+#include "array_memory.h"
 #include "arrays.h"
 
 /* Worker threads. They are started by a call and joined at its end, so that none exists when a process forks. Requires:
@@ -16,6 +17,7 @@ typedef struct job {
   const problem *given;
   const solver_options *options;
   double t_end, tolerance;
+  int is_adaptive;
   long long steps, every; /* at most; between stored states, 0: none is stored */
   double *t, *q, *p;
   int *iterations;
@@ -73,7 +75,8 @@ static int run_workers(run_memory *run, const job *way, solver_report *report)
 }
 #endif
 
-/* Runs of array systems in arrays of the caller. Requires: bind_work_arrays, perform_step of a solver, ERROR_POWER. */
+/* Runs of array systems. Requires: array_memory.h, bind_work_arrays, perform_step of a solver, ERROR_POWER; with
+ * CONSTRAINTS_OF_ARRAYS project_run. */
 
 solver_options NAME(default_options)(void)
 {
@@ -102,7 +105,7 @@ static void store_state(run_memory *run, const job *way, solver_report *report, 
 
 static int take_steps(run_memory *run, const job *way, solver_report *report)
 {
-  const work_arrays work = bind_work_arrays(run, NAME(coordinates)(way->given));
+  const work_arrays work = bind_work_arrays(run, coordinates_of(way->given));
   while (report->steps < way->steps) {
     const long long before = report->iterations;
     int status;
@@ -119,15 +122,51 @@ static int take_steps(run_memory *run, const job *way, solver_report *report)
   return OK;
 }
 
-int NAME(advance)(run_memory *run, long long steps, long long every, const problem *given,
-    const solver_options *options, double *t, double *q, double *p, int *iterations, solver_report *report)
+/* Performs the job with these parameters. Where they are new, rates of constraints may jump, positions may not. */
+static int perform(run_memory *run, job way, const double *parameters, const solver_options *options,
+    solver_report *report)
 {
   const solver_options standard = NAME(default_options)();
-  const job way = {take_steps, given, options ? options : &standard, 0.0, 0.0, steps, every, t, q, p, iterations};
   solver_report unread;
+  int status;
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
+  report->t = run->t;
+  status = use_parameters(run, parameters);
+  if (status != OK)
+    return status;
+  way.given = &run->data;
+  way.options = options || way.is_adaptive ? options : &standard;
+#ifdef CONSTRAINTS_OF_ARRAYS
+  if (run->is_changed)
+    project_run(run, report, 0);
+  memset(report, 0, sizeof *report);
+#endif
+  run->is_changed = 0;
   return run_workers(run, &way, report);
+}
+
+int NAME(advance)(run_memory *run, long long steps, long long every, const double *parameters,
+    const solver_options *options, double *t, double *q, double *p, int *iterations, solver_report *report,
+    double *workspace)
+{
+  const job way = {.go = take_steps, .steps = steps, .every = every, .t = t, .q = q, .p = p, .iterations = iterations};
+  (void)workspace;
+  return perform(run, way, parameters, options, report);
+}
+
+int NAME(step)(double t, double h, const double *q0, const double *p0, const double *parameters,
+    const solver_options *options, double *q1, double *p1, solver_report *report, double *workspace)
+{
+  run_memory *run = run_in(workspace);
+  const size_t size = sizeof(double) * (size_t)coordinates_of(&run->data);
+  int status;
+  NAME(start)(run, t, h, q0, p0);
+  run->error = INFINITY; /* not estimated */
+  status = NAME(advance)(run, 1, 0, parameters, options, NULL, NULL, NULL, NULL, report, NULL);
+  memcpy(q1, run->q, size);
+  memcpy(p1, run->p, size);
+  return status;
 }
 
 #ifdef NO_ERROR_ESTIMATE

@@ -19,7 +19,7 @@
  * Of an axis of even size, the places 2 j and 2 j + 1 of a line are real and imaginary part of a line of half the size.
  * From the transforms E, O of even and odd places follow the modes k and k + size/2, E + w O and E - w O with
  * w = exp(-2 pi i k / size); the eigenvalue of the latter is the conjugate of L_(size/2 - k). Requires:
- * lattice_transform.h, NAME(coordinates); PLANS, KINDS, SUM_VECTORS and STATES, the numbers of circulant matrices, of
+ * lattice_transform.h, coordinates_of; PLANS, KINDS, SUM_VECTORS and STATES, the numbers of circulant matrices, of
  * convolutions, of vectors of their values, and of vectors of a state. */
 
 enum {
@@ -62,7 +62,7 @@ static transforms transforms_in(const run_memory *run, double *memory, long long
 
 static transforms transforms_of(const run_memory *run, const problem *given)
 {
-  const long long count = NAME(coordinates)(given);
+  const long long count = coordinates_of(given);
   return transforms_in(run, run->work + (STATUS(WORK) - TRANSFORM_WORK) * count, count);
 }
 
@@ -342,7 +342,7 @@ static void multiply_by_plan(const transforms *in, const circulant *by, const pl
 /* Replaces the values of all places of a lattice by their mean, of each component; groups of F are n numbers apart. */
 static void average_places(const run_memory *run, const problem *given, lanes *F, long long n)
 {
-  const long long half = NAME(coordinates)(given);
+  const long long half = coordinates_of(given);
   lattice all[LATTICES];
   describe_lattices(given, all);
   for (const lattice *one = all; one < all + LATTICES && (!run->thread_barrier || run->part == 0); one++)
@@ -608,7 +608,7 @@ static void add_modes(const transforms *in, const problem *given, lanes *F, long
 /* Returns all convolutions of a single state in new memory, NULL without memory. */
 static double *sums_of_state(const problem *given, const double *q)
 {
-  const long long count = NAME(coordinates)(given), length = STATES * count;
+  const long long count = coordinates_of(given), length = STATES * count;
   const run_memory alone = {0};
   double *memory = calloc((size_t)(TRANSFORM_WORK * count + ALIGNMENT), sizeof(double));
   double *state = malloc(sizeof(double) * (size_t)(length * (GROUPS * WIDTH + KINDS) + ALIGNMENT));

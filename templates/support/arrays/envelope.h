@@ -29,17 +29,30 @@ typedef struct {
   double *valid_for; /* step size */
 } envelope;
 
-static envelope envelope_of(const linear_system *of)
+/* Reads the pattern for n coordinates. */
+static envelope envelope_in(const int *pattern, long long n)
 {
-  const int *pattern = of->run->pattern;
-  double *memory = of->step->first >= COMPARISON ? of->run->compared_factors : of->run->factors;
-  envelope all = {.n = UNKNOWNS * of->n, .stride = X_VECTORS * of->n, .width = pattern[0], .order = pattern + 2};
+  envelope all = {.n = UNKNOWNS * n, .stride = X_VECTORS * n, .width = pattern[0], .order = pattern + 2};
   all.apart = pattern[1];
   all.first = all.order + all.n;
   all.start = all.first + all.n;
   all.column = all.start + all.n;
   all.row = all.column + all.n + 1;
   all.entries = all.start[all.n - 1] + all.n - all.first[all.n - 1];
+  return all;
+}
+
+/* Length of the memory of the factors. */
+static long long numbers_of_factors(const int *pattern, long long n)
+{
+  const envelope all = envelope_in(pattern, n);
+  return 8 + 2 * SHIFTS * (all.n + SIDES * all.entries);
+}
+
+static envelope envelope_of(const linear_system *of)
+{
+  double *memory = of->step->first >= COMPARISON ? of->run->compared_factors : of->run->factors;
+  envelope all = envelope_in(of->run->pattern, of->n);
   all.valid_for = memory;
   all.unknown = (complex_shifts *)(memory + 8);
   all.factor = all.unknown + all.n;

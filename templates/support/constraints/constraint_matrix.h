@@ -77,9 +77,11 @@ static long long find_row(const pattern *of, int k, long long pairs)
   return pairs;
 }
 
-long long NAME(constraint_pairs)(run_memory *run, const problem *given)
+/* Computes the pattern of the constraints of a run; returns the number of pairs. */
+static long long find_pairs(run_memory *run)
 {
-  const long long n = NAME(coordinates)(given), count = run->constraints;
+  const problem *given = &run->data;
+  const long long n = coordinates_of(given), count = run->constraints;
   const pattern of = pattern_of(run, n);
   condition now = {.first = of.first, .place = of.place};
   long long pairs = 0;

@@ -24,7 +24,6 @@ enum {
 #define CHANGE_END 1e-6 /* relative to a step: remaining time at which an accumulation ends the run */
 
 typedef NAME(run) event_run;
-typedef NAME(report) array_report;
 
 /* Wall of an impact at a state: nonzero entries n of g_q, g_t, e; the rate of g in the direction of the run, a bound of
  * its terms, and how far rounding may move the state behind the wall. Of a map the variables (q, p, v) that it changes
@@ -66,7 +65,7 @@ static int changes_by(const event_step *step, int e, const event_sample *at, eve
   const int status = point_at(at->t, at->q, at->p, step->parameters, &here, step->workspace);
   find_element(event, e - event_host->first[event], in);
   if (status == OK)
-    add_changes(event, event_host->problem, &here, in, &to);
+    add_changes(event, event_data, &here, in, &to);
   wall->count = to.count;
   wall->place = to.place;
   wall->n = to.value;
@@ -100,12 +99,7 @@ static int satisfy_constraints(const event_step *step, real t, real *q, real *p,
   int status = OK;
 #ifdef EVENT_CONSTRAINTS
   real *const q1 = step->memory, *const p1 = q1 + M;
-#ifdef EVENTS_OF_ANY_SIZE
-  (void)step;
-  status = project_state(t, q, p, q1, p1);
-#else
   status = NAME(project)(t, q, p, step->parameters, q1, p1, step->workspace);
-#endif
   memcpy(p, p1, BYTES(M));
   if (moves)
     memcpy(q, q1, BYTES(M));
@@ -622,22 +616,6 @@ static int advance_run(event_run *run, real t_end, real tolerance, const event_s
     solver_report *own)
 {
   int status = NOT_CONVERGED;
-#ifdef EVENTS_OF_ANY_SIZE
-  array_report made;
-  if (run->h != 0.0)
-    status = NAME(advance)(run, 1, 0, event_host->own, step->options, NULL, NULL, NULL, NULL, &made);
-#if EVENTS_CONTROLLED
-  else {
-    status = NAME(advance_to)(run, t_end, tolerance, 1, 0, event_host->own, step->options, NULL, NULL, NULL, NULL,
-        &made);
-    run->h = 0.0;
-  }
-#endif
-  run->iterations = 0;
-  own->change = made.change;
-  own->iterations = made.iterations;
-  *iterations = (int)made.iterations;
-#else
   real t, *const q = step->memory, *const p = q + M;
   if (run->h != 0.0)
     status = NAME(advance)(run, 1, 1, step->parameters, step->options, &t, q, p, iterations, own, step->workspace);
@@ -645,7 +623,6 @@ static int advance_run(event_run *run, real t_end, real tolerance, const event_s
   else
     status = NAME(advance_to)(run, t_end, tolerance, 1, 1, step->parameters, step->options, &t, q, p, iterations, own,
         step->workspace);
-#endif
 #endif
   (void)t_end, (void)tolerance;
   return status;

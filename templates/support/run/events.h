@@ -158,6 +158,7 @@ enum { EVENT_VALUES = EVENT_DEGREE + 3 }; /* values of each function: at the nod
 #ifdef EVENTS_OF_ANY_SIZE
 #define EVENT_MEMORY(watch, name, size)                    \
   real *const name = (event_host = (watch)->host)->memory; \
+  event_data = NAME(data_at)(parameters, workspace);       \
   (watch)->used = 0;
 #else
 #define EVENT_MEMORY(watch, name, size) real name[(size) + EVENT_VALUES * EVENTS];

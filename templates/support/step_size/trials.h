@@ -326,7 +326,7 @@ static int take_trials(run_memory *run, const job *way, solver_report *report)
   solver_options standard = NAME(default_options)();
   const solver_options *options = way->options ? way->options : &standard;
   trial now = {.at = {run->t, run->t_low, run->q, run->p, run->carry_q, run->carry_p}, .t_end = way->t_end};
-  const work_arrays work = bind_work_arrays(run, NAME(coordinates)(way->given));
+  const work_arrays work = bind_work_arrays(run, coordinates_of(way->given));
   now.step = step_of(run, way->given, &work);
   now.step.h = 0.0;
   now.dq = work.dq, now.dp = work.dp;
@@ -340,7 +340,7 @@ static int take_trials(run_memory *run, const job *way, solver_report *report)
     if (status != OK)
       return status;
     accept_trial(run, &now);
-    run->t = now.at.t, run->t_low = now.at.t_low, run->h = now.step.h;
+    run->t = now.at.t, run->t_low = now.at.t_low;
     run->iterations += report->iterations - before;
     report->steps++;
     store_state(run, way, report, now.step.n, run->t == way->t_end && run->t_low == 0.0);
@@ -349,14 +349,21 @@ static int take_trials(run_memory *run, const job *way, solver_report *report)
 }
 
 int NAME(advance_to)(run_memory *run, double t_end, double tolerance, long long steps, long long every,
-    const problem *given, const solver_options *options, double *t, double *q, double *p, int *iterations,
-    solver_report *report)
+    const double *parameters, const solver_options *options, double *t, double *q, double *p, int *iterations,
+    solver_report *report, double *workspace)
 {
-  const job way = {take_trials, given, options, t_end, tolerance, steps, every, t, q, p, iterations};
-  solver_report unread;
-  report = report ? report : &unread;
-  memset(report, 0, sizeof *report);
-  return run_workers(run, &way, report);
+  const job way = {.go = take_trials,
+      .t_end = t_end,
+      .tolerance = tolerance,
+      .is_adaptive = 1,
+      .steps = steps,
+      .every = every,
+      .t = t,
+      .q = q,
+      .p = p,
+      .iterations = iterations};
+  (void)workspace;
+  return perform(run, way, parameters, options, report);
 }
 #endif
 
