@@ -65,7 +65,7 @@ def transforms(sites: SiteHamiltonian) -> dict[str, tuple[RolledKernel, ...]]:
     for array, momentum in zip(sites.system.coordinates, sites.system.momenta, strict=True):
         moving |= {array.name + DOT: (array, momentum), momentum.name: (array, momentum)}
 
-    def looped(name: str, number: int, force: ArrayForce) -> RolledKernel:
+    def rolled_of(name: str, number: int, force: ArrayForce) -> RolledKernel:
         slots = tuple(
             (slot, replace(access, array=moving[access.array.name][1]) if access.array.name in moving else access)
             for slot, access in force.slots
@@ -75,8 +75,8 @@ def transforms(sites: SiteHamiltonian) -> dict[str, tuple[RolledKernel, ...]]:
         return _added(system, f"{name}_{number}", of, system.state, f"{name} {_shown(force)}", purpose)
 
     return {
-        "velocities": tuple(looped("velocities", *pair) for pair in enumerate(sites.velocities)),
-        "momenta": tuple(looped("momenta", *pair) for pair in enumerate(sites.momenta)),
+        "velocities": tuple(rolled_of("velocities", *pair) for pair in enumerate(sites.velocities)),
+        "momenta": tuple(rolled_of("momenta", *pair) for pair in enumerate(sites.momenta)),
     }
 
 

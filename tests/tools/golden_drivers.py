@@ -204,7 +204,7 @@ def arrays_driver(
     held = """
     printf("project %d\\n", CALL(project)(0.25, q, p, all, q, p, (double *)run));
 """
-    body = f"""memset(memory, 0, sizeof(double) * (size_t)length);
+    body = f"""memset(memory, 255, sizeof(double) * (size_t)length); /* no values are required */
     run = CALL(bind)(sizes, tables, memory);
     n = run->p - run->q;
     for (long long i = 0; i < n; i++) {{

@@ -111,13 +111,13 @@ def _map_context(program: Program) -> dict[str, Any]:
     return {"maps": texts, "map_sizes": [*sizes_text(program.layout, " ".join([*texts, *starts])), *starts]}
 
 
-def _site_text(program: Program, looped: RolledKernel) -> str:
+def _site_text(program: Program, rolled: RolledKernel) -> str:
     """Return a function that computes velocities or momenta of the elements of a term, from the joined state."""
-    place_of, name = Nest(program.layout, looped, "", "").place_of, looped.kernel.name
-    stored = [f"result[{place_of(access)}] = value[{k}];" for k, access in enumerate(looped.writes)]
+    place_of, name = Nest(program.layout, rolled, "", "").place_of, rolled.kernel.name
+    stored = [f"result[{place_of(access)}] = value[{k}];" for k, access in enumerate(rolled.writes)]
     arguments = ["const double *X", "double t", "double *result"]
     lines = [f"{name}(u, t, parameters, value);", *stored]
-    return _function(program, looped, f"find_{name}", arguments, lines, values=len(stored))
+    return _function(program, rolled, f"find_{name}", arguments, lines, values=len(stored))
 
 
 def _circulants(program: Program) -> list[RolledKernel]:

@@ -107,6 +107,16 @@ def sizes_of_run(
     return RunSizes(sizes=arrays.sizes, places=arrays.places, threads=count)
 
 
+def shapes_of_call(q: Any, parameters: Any, threads: Any) -> Hashable:
+    """Return what determines the sizes of a call without tables: equal for equal ones; ``None`` if it is not known."""
+    named = q if type(q) is dict else {"": q}
+    numbers = parameters if type(parameters) is dict else {}
+    known = all(type(x) in (float, int) for x in numbers.values()) and (parameters is None or numbers is parameters)
+    if not known or any(type(x) is not np.ndarray for x in named.values()):
+        return None
+    return tuple(named), tuple(x.shape for x in named.values()), tuple(numbers), threads
+
+
 def _homogeneous(interface: Interface, q: Any) -> Any:
     """Return a state by name with homogeneous coordinates of the shape of rotations, directions and spins."""
     arrays = {each.name: each for each in interface.layout.coordinates if each.letters}

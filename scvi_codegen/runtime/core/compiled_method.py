@@ -20,6 +20,7 @@ from scvi_codegen.runtime.arrays.any_size import (
     check_few_coordinates,
     forwarding_methods,
     interface_of_sizes,
+    shapes_of_call,
     sizes_of_run,
     unavailable,
 )
@@ -118,6 +119,7 @@ class CompiledMethod:
         self._known: dict[Hashable, Self] = {}
         self._entries: dict[Event, tuple[Event, ...]] = {}
         self._bound: tuple[Hashable, Self] | None = None
+        self._last: tuple[Hashable, Self | None] = None, None
         self._plain = cast(Source, source)
         self.shapes = shapes_of(interface)
         self._load()
@@ -174,10 +176,13 @@ class CompiledMethod:
         if not self.run_time_sizes:
             self._check_not_of_run(tables, threads)
             return self, q
-        problem = sizes_of_run(self.interface, q, parameters, tables, threads)
-        if self._reason and problem.threads > 1:
-            raise MethodError(f"omit threads: this system is compiled with the sizes of each call. {self._reason}")
-        bound = self.with_sizes(problem.sizes, tables=problem.places) if self._reason else self._bound_to(problem)
+        shapes, (last, bound) = None if tables else shapes_of_call(q, parameters, threads), self._last
+        if shapes is None or shapes != last or bound is None:
+            problem = sizes_of_run(self.interface, q, parameters, tables, threads)
+            if self._reason and problem.threads > 1:
+                raise MethodError(f"omit threads: this system is compiled with the sizes of each call. {self._reason}")
+            bound = self.with_sizes(problem.sizes, tables=problem.places) if self._reason else self._bound_to(problem)
+            self._last = shapes, bound
         if self.events:
             bound = bound.with_events(self.events)
         return bound, q if bound.interface.rotations or bound.interface.variables else flat_state(

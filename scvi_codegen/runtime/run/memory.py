@@ -245,7 +245,8 @@ class Memory(OneThread):
         """Set parameter values; raise ``StateError`` if position constraints jump."""
         if self.stepper.interface.constraints:
             check_reachable(self.stepper, self.q, self.p, self.t, values)
-        self._parameters[:], self._has_defaults = values, False
+        self._parameters[:] = values
+        self._has_defaults = False
         self._check_masses()
 
     def _check_masses(self) -> None:

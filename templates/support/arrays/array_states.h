@@ -123,7 +123,9 @@ typedef struct {
   long long first, end;
   int components, component, other, kind;
 } momentum_map;
-enum { TRANSLATION, ROTATION, PHASE };
+enum { TRANSLATION,
+  ROTATION,
+  PHASE };
 
 static void describe_maps(const problem *given, momentum_map *all);
 
