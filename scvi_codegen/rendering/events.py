@@ -293,7 +293,6 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], header: str
         guarded=tuple(number for number, event in enumerate(events) for _ in event.conditions),
         impacts=tuple(int(event.restitution is not None) for event in events),
         controlled="_advance_to(" in header,
-        factored="*factors" in header,
     )
     if interface.layout.coordinates:
         arrays, changed = array_events(interface, events), (0,) * any(event.changes_state for event in events)

@@ -120,7 +120,6 @@ class EventSearch:
         guarded: index of the function of each condition of crossings; of arrays of run-time sizes of its event.
         impacts: 1 for each event that is the wall of an impact, else 0.
         controlled: whether the integrator has adaptive steps.
-        factored: whether its runs contain factors of the linear part of a step.
         kernels: the functions at u = (q, p, v); conditions; values of variables that crossings change, gradient and
             restitution of impacts. Of arrays of run-time sizes those of their functions.
         uses_velocity: whether v occurs in the formulas.
@@ -140,7 +139,6 @@ class EventSearch:
     guarded: tuple[int, ...]
     impacts: tuple[int, ...]
     controlled: bool
-    factored: bool
     kernels: tuple[Kernel, ...] = ()
     uses_velocity: bool = False
     changed: tuple[int, ...] = ()

@@ -68,8 +68,8 @@ def _call(
     **others: Any,
 ) -> Any:
     """Call a method of the stepper that is bound to the arrays of the call."""
-    threads = others.pop("threads", None) if name in ("start", "integrate") else None
-    if others.get("events") is not None:
+    threads = others.pop("threads", None) if "threads" in others and name in ("start", "integrate") else None
+    if "events" in others and others["events"] is not None:
         stepper = stepper.with_events(others.pop("events"))
     bound, state = stepper.bind(q, parameters, tables, threads)
     if len(arguments) == 1 and arguments[0] is None:  # p=None by position
@@ -109,6 +109,8 @@ def sizes_of_run(
 
 def shapes_of_call(q: Any, parameters: Any, threads: Any) -> Hashable:
     """Return what determines the sizes of a call without tables: equal for equal ones; ``None`` if it is not known."""
+    if type(q) is np.ndarray and parameters is None:
+        return q.shape, threads
     named = q if type(q) is dict else {"": q}
     numbers = parameters if type(parameters) is dict else {}
     known = all(type(x) in (float, int) for x in numbers.values()) and (parameters is None or numbers is parameters)

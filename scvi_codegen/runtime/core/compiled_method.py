@@ -185,9 +185,9 @@ class CompiledMethod:
             self._last = shapes, bound
         if self.events:
             bound = bound.with_events(self.events)
-        return bound, q if bound.interface.rotations or bound.interface.variables else flat_state(
-            bound.interface, q, "q"
-        )
+        if (type(q) is np.ndarray and q.ndim == 1) or bound.interface.rotations or bound.interface.variables:
+            return bound, q
+        return bound, flat_state(bound.interface, q, "q")
 
     def _check_not_of_run(self, tables: object, threads: object) -> None:
         """Raise :class:`MethodError` for arguments of arrays of run-time sizes."""

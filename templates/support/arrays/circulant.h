@@ -63,7 +63,7 @@ static transforms transforms_in(const run_memory *run, double *memory, long long
 static transforms transforms_of(const run_memory *run, const problem *given)
 {
   const long long count = coordinates_of(given);
-  return transforms_in(run, run->work + (STATUS(WORK) - TRANSFORM_WORK) * count, count);
+  return transforms_in(run, run->work + (WORK - TRANSFORM_WORK) * count, count);
 }
 
 /* The plan of a circulant matrix. */
