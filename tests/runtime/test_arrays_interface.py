@@ -54,7 +54,17 @@ def test_functions_have_the_prototypes_of_named_coordinates(steppers) -> None:
     any_size, known, *_ = steppers
     ours, theirs = (prototypes(each.source.header, each.interface.prefix) for each in (any_size, known))
     common = ours.keys() & theirs.keys()
-    assert common >= {"start", "advance", "advance_to", "step", "energy", "energies", "velocity", "momentum", "step_error"}
+    assert common >= {
+        "start",
+        "advance",
+        "advance_to",
+        "step",
+        "energy",
+        "energies",
+        "velocity",
+        "momentum",
+        "step_error",
+    }
     maps = [each.pop("momentum_maps", "") for each in (ours, theirs)]
     assert maps[0].replace(", double *)", ")") == maps[1]  # the sizes of a run are in its memory
     assert {name: ours[name] for name in common - {"momentum_maps"}} == {
