@@ -189,18 +189,3 @@ def test_tangents_are_differences_in_extended_precision_and_symplectic(stepper):
                     ends.append([*product(z[:4], g), *product(z[4:], g)])
                 expected = [float((x - y) / (2 * mpf(10) ** -20)) for x, y in zip(*ends, strict=True)]
                 np.testing.assert_allclose(tangent[:, column], expected, rtol=0, atol=3e-14 * size)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize(("order", "counts"), [(2, (40, 80, 160)), (4, (20, 40, 80)), (8, (10, 14, 20))])
-def test_orders_of_compositions_on_an_asymmetric_heavy_top(order, counts):
-    top = sc.LagrangianSystem.from_text(
-        "heavy", rotations={"R": "omega"}, lagrangian="omega_1**2/2 + 0.7*omega_2**2 + 0.3*omega_3**2 - R_33"
-    )
-    exact_run, tested = (sc.compile_stepper(top, each) for each in ("svi:10", f"composition:{order}"))
-    how = {"velocity": {"omega": [0.3, -0.5, 2.0]}}
-    reference = exact_run.integrate({"R": ATTITUDE}, **how, h=1 / 60, steps=120).q[-1]
-    ends = [tested.integrate({"R": ATTITUDE}, **how, h=2 / n, steps=n, save_every=n).q[-1] for n in counts]
-    errors = [np.abs(end - reference).max() for end in ends]
-    orders = np.log(np.divide(errors[:-1], errors[1:])) / np.log(np.divide(counts[1:], counts[:-1]))
-    np.testing.assert_allclose(orders, order, rtol=0, atol=0.4)

@@ -75,20 +75,6 @@ def test_a_predictor_turns_with_the_body():
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("degree", [1, 2, 3])
-def test_order_of_steps_with_turns(degree):
-    stepper, exact = (
-        sc.compile_stepper(body(f"{KINETIC} - w*R_33"), sc.SVI(degree)),
-        sc.compile_stepper(three(), "svi:8"),
-    )
-    end = exact.integrate(START, velocity=OMEGA, h=0.02, steps=50).rotation()[-1]
-    errors = [
-        abs(stepper.integrate(START, velocity=OMEGA, h=1 / n, steps=n).rotation()[-1] - end).max() for n in (20, 40)
-    ]
-    assert np.log2(errors[0] / errors[1]) == pytest.approx(2 * degree, abs=0.15)
-
-
-@pytest.mark.full
 def test_steps_with_turns_backward_at_other_times_and_with_adaptive_steps():
     ours, other = (sc.compile_stepper(each, "svi:8") for each in (body(f"{KINETIC} - w*R_33"), three()))
     run, expected = (each.integrate(START, velocity=OMEGA, t_end=5.0, tolerance=1e-12) for each in (ours, other))

@@ -63,20 +63,6 @@ def stepper():
     return sc.compile_stepper(net(), RATTLE)
 
 
-def test_steps_states_and_multipliers_equal_those_of_the_unrolled_system(stepper):
-    q, data = chain(3)
-    small = sc.unroll_sums(net(), {"N": 4, "B": 3, "P": 1}, **with_fields(data, 3))
-    other = sc.compile_stepper(small, RATTLE)
-    own = stepper.integrate(q, h=0.01, steps=100, **data)
-    expected = other.integrate(q.ravel(), np.zeros(8), h=0.01, steps=100)
-    assert np.abs(own.q["r"].reshape(101, 8) - expected.q).max() < 1e-13
-    assert np.abs(own.p["r"].reshape(101, 8) - expected.p).max() < 1e-13
-    end = own.q["r"][-1], own.p["r"][-1]
-    found = np.concatenate(stepper.start(*end, h=0.01, **data).multipliers)
-    exact = other.multipliers(end[0].ravel(), end[1].ravel())
-    assert np.abs(found - exact).max() < 1e-12 * np.abs(exact).max()
-
-
 def with_fields(data, count):
     """Arrays of parameters in full."""
     parameters = data["parameters"]
@@ -130,15 +116,6 @@ def test_compositions_have_their_order_and_satisfy_constraints():
     assert 2.0**7 < errors[0] / errors[1] < 2.0**10
 
 
-def test_backward_step_is_the_inverse(stepper):
-    q, data = chain(40)
-    there = stepper.start(q, h=1e-3, **data)
-    there.advance(30)
-    back = stepper.start(there.q, there.p, h=-1e-3, **data)
-    back.advance(30)
-    assert np.abs(back.q["r"] - q).max() < 1e-11
-
-
 def test_initial_state_is_projected_to_the_nearest_state(stepper):
     q, data = chain(3)
     off = q + 1e-3 * np.random.default_rng(1).normal(size=q.shape)
@@ -154,19 +131,6 @@ def test_initial_state_is_projected_to_the_nearest_state(stepper):
     assert np.abs(run.q["r"] - near["r"]).max() < 1e-14
     with pytest.raises(StateError, match=r"stepper\.project"):
         stepper.start(1.02 * q, h=0.01, **data)
-
-
-def test_observed_and_restored_runs_continue_bitwise(stepper):
-    q, data = chain(20)
-    one, other = (stepper.start(q, h=1e-3, **data) for _ in range(2))
-    one.advance(20)
-    for _ in range(10):
-        other.advance(1)
-        other.multipliers, other.constraint_values  # noqa: B018  (they leave what the next step begins with)
-    other = stepper.from_checkpoint(other.checkpoint())
-    other.advance(10)
-    assert (one.q["r"] == other.q["r"]).all()
-    assert (one.p["r"] == other.p["r"]).all()
 
 
 def test_momentum_maps_compatible_with_constraints_are_conserved():

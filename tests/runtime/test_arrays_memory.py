@@ -106,14 +106,6 @@ class TestPickles:
         assert run.steps == 9
         assert other.steps == 8
 
-    def test_pickled_runs_with_constraints(self, pendulums: Any) -> None:
-        run = start(pendulums)
-        run.advance(3)
-        other = copy.copy(run)
-        for each in (run, other):
-            each.advance(5)
-        assert all((run.q[name] == other.q[name]).all() for name in "xy")
-
     def test_input_that_is_not_set_remains_not_set(self, chain: Any) -> None:
         run = start(chain, parameters={"k": K})
         for other in (copy.copy(run), chain.from_checkpoint(run.checkpoint())):

@@ -34,27 +34,6 @@ def molecules():
     )
 
 
-@pytest.mark.sampled(2)
-@pytest.mark.covering
-@pytest.mark.parametrize("method", ["svi:2", "svi:4", "svi:8", "gauss:3"])
-@pytest.mark.parametrize(("strength", "h"), [(1.0, 0.1), (400.0, 0.5), (1e4, 0.5)])
-def test_newton_steps_equal_those_of_the_unrolled_system(method, strength, h):
-    system, masses = field(strength), np.linspace(1.0, 2.0, 5)
-    own = sc.compile_stepper(system, method, solver="newton")
-    small = sc.unroll_sums(system, {"N": 5}, parameters={"m": masses})
-    other = sc.compile_stepper(small, method, solver="newton")
-    q, v = RANDOM.normal(size=(2, 5))
-    for _ in range(5):
-        run = own.start(q, velocity=v, h=h, parameters={"m": masses})
-        run.advance(1)
-        end, momenta = other.step(q, masses * v, h)
-        size = max(np.abs(end).max(), np.abs(q).max(), np.abs(h * v).max())
-        stiffness = 1.0 + h * h * strength  # by which the forces at the points enlarge the rounding of these
-        assert np.abs(run.q["q"] - end).max() < 16 * ROUNDING * stiffness * size
-        assert np.abs(h * (run.p["q"] - momenta)).max() < 64 * ROUNDING * stiffness * size
-        q, v = run.q["q"], run.velocity["q"]
-
-
 def test_stiff_bonds_at_rest_do_not_limit_the_step_size():
     count, stiff = 40, 1e6
     chain = np.array([(i, i + 1) for i in range(count - 1)])
@@ -72,28 +51,6 @@ def test_stiff_bonds_at_rest_do_not_limit_the_step_size():
     assert run.energy_error() < 1e-9
     assert run.iterations.sum() < 6 * run.steps
     assert np.abs(np.ptp(run.momentum_maps(), axis=0)).max() < 1e-9
-
-
-def test_newton_supports_adaptive_steps():
-    system = field(100.0)
-    q, v = RANDOM.normal(size=(2, 6))
-    own, other = (sc.compile_stepper(system, "svi:6", solver=solver) for solver in ("newton", "fixed-point"))
-    ends = [each.integrate(q, velocity=v, t_end=1.0, tolerance=1e-10).q["q"][-1] for each in (own, other)]
-    assert np.abs(ends[0] - ends[1]).max() < 1e-7
-
-
-def test_saved_runs_continue_with_newton_only():
-    own, other = (sc.compile_stepper(field(1.0), "svi:4", solver=solver) for solver in ("newton", "fixed-point"))
-    run = own.start(np.sin(np.arange(8.0)), h=0.1)
-    run.advance(3)
-    saved = run.checkpoint()
-    again = own.from_checkpoint(saved)
-    for each in (run, again):
-        each.advance(3)
-    assert (run.q["q"] == again.q["q"]).all()
-    assert run.iterations == again.iterations
-    with pytest.raises(sc.StateError, match=r"one of '.*, newton', not of '.*, fixed-point'"):
-        other.from_checkpoint(saved)
 
 
 def test_step_without_convergence_fails():

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS
 from scipy.integrate import solve_ivp
 
@@ -40,25 +39,6 @@ def known():
     return sc.compile_stepper(body_on_ring("N"), "svi:4", sizes={"N": 5})
 
 
-def test_sizes_known_and_at_run_time_agree(at_run_time, known):
-    first = at_run_time.integrate(Q0, **GIVEN)
-    second = known.integrate(Q0, velocity=np.zeros(6), **GIVEN)
-    named = known.arrays(second.q)
-    assert {name: values.shape for name, values in named.items()} == {"x": (41,), "q": (41, 5)}
-    for name, values in named.items():
-        assert np.abs(values - first.q[name]).max() < 1e-14
-    for name, values in known.arrays(second.p).items():
-        assert np.abs(values - first.p[name]).max() < 1e-13
-
-
-def test_ensembles_start_at_rest(at_run_time, known):
-    starts = {"x": [0.3, 0.1], "q": [Q0["q"], -Q0["q"]]}
-    for arguments in (GIVEN, {"t_end": 4.0, "parameters": {"m": MASSES}}):
-        found = at_run_time.integrate_ensemble(starts, threads=2, **arguments)
-        expected = known.integrate_ensemble(starts, velocity=np.zeros((2, 6)), **arguments)
-        assert_allclose(found.ends[1], expected.ends[1], rtol=0, atol=1e-13)
-
-
 def test_threads_do_not_change_single_coordinates(at_run_time):
     start = {"x": 0.3, "q": np.random.default_rng(1).normal(size=20_000)}
     runs = [at_run_time.integrate(start, h=0.1, steps=3, parameters={"k": 1e-4}, threads=n) for n in (1, 2)]
@@ -85,16 +65,6 @@ def test_motion_solves_newtons_equations(known):
     start = np.concatenate([[Q0["x"]], Q0["q"], np.zeros(6)])
     exact = solve_ivp(rates, (0, 3), start, rtol=1e-12, atol=1e-13, method="DOP853").y[:6, -1]
     assert np.abs(run.q[-1] - exact).max() < 1e-10
-
-
-def test_states_by_name_in_ensembles_and_derivatives(known):
-    starts = {"x": np.array([0.3, 0.1]), "q": np.stack([Q0["q"], -Q0["q"]])}
-    masses = {"m": np.stack([MASSES, MASSES + 1])}
-    found = known.integrate_ensemble(starts, np.zeros((2, 6)), h=0.1, steps=40, parameters=masses)
-    single = known.integrate({"x": 0.1, "q": -Q0["q"]}, np.zeros(6), h=0.1, steps=40, parameters={"m": MASSES + 1})
-    assert np.abs(known.arrays(found.q[:, 1])["q"] - known.arrays(single.q)["q"]).max() < 1e-13
-    flow = known.jacobian(Q0, np.zeros(6), 0.1)
-    assert flow.shape == (12, 12)
 
 
 def test_the_only_array_needs_no_name():

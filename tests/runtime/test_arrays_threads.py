@@ -221,19 +221,6 @@ def test_hamiltonians_and_velocity_dependent_forces_with_threads() -> None:
         assert found[1:] == found[:1] * (len(THREADS) - 1)
 
 
-def test_run_continues_with_other_threads() -> None:
-    """Saved and restored, apart, and from step to step."""
-    stepper, q = stepper_of("pairs", "svi:4"), start_of("pairs")
-    whole = stepper.start(q, h=0.01)
-    whole.advance(6)
-    parts = stepper.start(q, h=0.01, threads=3)
-    parts.advance(3)
-    parts = stepper.from_checkpoint(parts.checkpoint(), threads=2)
-    parts.advance(3)
-    assert bits(parts) == bits(whole)
-    assert parts.stepper.problem.threads == 2
-
-
 def test_interrupt_ends_a_run_between_steps() -> None:
     run = stepper_of("pairs", "svi:4").start(start_of("pairs"), h=0.001, threads=3)
 
