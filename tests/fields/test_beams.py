@@ -6,7 +6,6 @@ from numpy import cos, cosh, pi, sin, sinh
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen import FieldSystem
 
 BEAM = "u_t**2/2 - u_xx**2/2"
 CLAMPED, CANTILEVER = 4.730040744862704, 1.8751040687119611
@@ -40,7 +39,7 @@ def integrated(field, options, start, *, method="svi:4", h=0.01, steps=10):
 @pytest.mark.parametrize("ends", ENDS)
 def test_errors_of_beams_fall_exponentially_with_the_degree(ends):
     boundary, k, shape = ENDS[ends]
-    field, errors = FieldSystem.from_text("beam", ["u"], {"x": (0, 1)}, BEAM, boundary={"x": boundary}), []
+    field, errors = sc.FieldSystem.from_text("beam", ["u"], {"x": (0, 1)}, BEAM, boundary={"x": boundary}), []
     elements = [0, 0.5, 1] if ends in ("supported", "clamped") else [0, 0.3, 0.6, 1]
     for degree in (4, 8):
         mesh, run = integrated(field, {"degree": degree, "elements": elements}, shape)
@@ -54,14 +53,14 @@ def test_errors_of_beams_fall_exponentially_with_the_degree(ends):
 
 def test_one_clamped_element():
     boundary, k, shape = ENDS["clamped"]
-    field = FieldSystem.from_text("beam", ["u"], {"x": (0, 1)}, BEAM, boundary={"x": boundary})
+    field = sc.FieldSystem.from_text("beam", ["u"], {"x": (0, 1)}, BEAM, boundary={"x": boundary})
     mesh, run = integrated(field, {"degree": 14, "elements": 1}, shape)
     assert run.q["u"][-1] == pytest.approx(shape(mesh.points["x"]) * cos(k * k * 0.1), abs=1e-9)
 
 
 def test_energy_of_a_nonlinear_density_is_its_quadrature():
     """Values, first and second derivatives and the coordinate at points within elements and between them."""
-    field = FieldSystem.from_text(
+    field = sc.FieldSystem.from_text(
         "beam",
         ["u"],
         {"x": (0, 2)},
@@ -80,7 +79,7 @@ def test_energy_of_a_nonlinear_density_is_its_quadrature():
 
 @pytest.mark.full
 def test_supported_plate():
-    field = FieldSystem.from_text(
+    field = sc.FieldSystem.from_text(
         "plate", ["u"], {"x": (0, 1), "y": (0, 2)}, "u_t**2/2 - (u_xx + u_yy)**2/2", boundary={"x": (0, 0), "y": (0, 0)}
     )
     shape = lambda x, y: sin(pi * x) * sin(pi * y / 2)  # noqa: E731
@@ -95,7 +94,7 @@ def test_solitary_wave_of_the_boussinesq_equation():
     """Soliton 6 k^2/cosh(k (x - c t))^2 of u_tt = (u - u^2 - u_xx)_xx in potential form, u = w_x."""
     c, k = 0.6, 0.4
     density = "w_t**2/2 - w_x**2/2 + w_x**3/3 - w_xx**2/2"  # w_tt = w_xx - (w_x^2)_x - w_xxxx
-    field = FieldSystem.from_text("Boussinesq", ["w"], {"x": (-40, 40)}, density)
+    field = sc.FieldSystem.from_text("Boussinesq", ["w"], {"x": (-40, 40)}, density)
     assert c**2 == pytest.approx(1 - 4 * k**2)
     wave = lambda x, t: 6 * k * np.tanh(k * (x - c * t))  # noqa: E731  (u = 6 k^2 / cosh^2)
     mesh = field.discretise("spectral-elements", degree=8, elements=40)

@@ -3,12 +3,11 @@
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen import FieldSystem
 
 PERIODIC = {"x": "periodic"}
 CASES = [
     pytest.param(
-        FieldSystem.from_text(
+        sc.FieldSystem.from_text(
             "Schroedinger",
             ["a"],
             {"x": (-5, 5)},
@@ -20,13 +19,15 @@ CASES = [
         id="differences",
     ),
     pytest.param(
-        FieldSystem.from_text("sine-Gordon", ["u"], {"x": (0, 6)}, "u_t**2/2 - u_x**2/2 + cos(u)", boundary=PERIODIC),
+        sc.FieldSystem.from_text(
+            "sine-Gordon", ["u"], {"x": (0, 6)}, "u_t**2/2 - u_x**2/2 + cos(u)", boundary=PERIODIC
+        ),
         ("fourier", {"points": 6, "derivative": "fft"}),
         id="fourier",
         marks=pytest.mark.full,
     ),
     pytest.param(
-        FieldSystem.from_text(
+        sc.FieldSystem.from_text(
             "string", ["u"], {"x": (0, 1)}, "u_t**2/2 - u_x**2/2", boundary={"x": ("sin(t)", "natural")}
         ),
         ("spectral-elements", {"degree": 2, "elements": 4}),

@@ -9,14 +9,13 @@ from samples import QUICK_FLAGS
 from scipy.optimize import brentq
 
 import scvi_codegen as sc
-from scvi_codegen import FieldSystem, SystemDefinitionError
 from scvi_codegen.fields.axes import differences
 
 WAVES = "u_t**2/2 - u_x**2/2"
 
 
 def line(ends, density=WAVES, **options):
-    return FieldSystem.from_text("line", ["u"], {"x": (0, 1)}, density, boundary={"x": ends}, **options)
+    return sc.FieldSystem.from_text("line", ["u"], {"x": (0, 1)}, density, boundary={"x": ends}, **options)
 
 
 def dense(axis, fixed):
@@ -104,7 +103,7 @@ def test_moving_ends_coefficients_and_a_plane():
     k = pi / np.log(2)
     run = sc.compile_stepper(mesh.system, "svi:4", flags=QUICK_FLAGS).integrate({"u": sin(k * s)}, h=0.005, steps=100)
     assert np.abs(run.q["u"][-1] - sin(k * s) * cos(k * 0.5)).max() < 2e-5
-    plane = FieldSystem.from_text(
+    plane = sc.FieldSystem.from_text(
         "membrane", ["u"], {"x": (0, 1), "y": (0, 1)}, f"{WAVES} - u_y**2/2", boundary={"x": (0, 0)}
     )
     mesh = plane.discretise("finite-differences", order=4, points={"x": 21, "y": 31})
@@ -147,7 +146,7 @@ def test_points_and_hamiltonian_densities_have_ends():
     u = sin(w * mesh.points["x"])
     run = sc.compile_stepper(mesh.system, "svi:4", flags=QUICK_FLAGS).integrate({"u": u}, h=0.01, steps=50)
     assert np.abs(run.q["u"][-1] - u * cos(w / 2)).max() < 2e-7
-    box = FieldSystem.from_text(
+    box = sc.FieldSystem.from_text(
         "box", ["a"], {"x": (0, 1)}, momenta=["b"], hamiltonian="(a_x**2 + b_x**2)/4", boundary={"x": (0, 0)}
     )
     mesh = box.discretise("finite-differences", order=6, points=41)
@@ -165,5 +164,5 @@ def test_points_and_hamiltonian_densities_have_ends():
     ],
 )
 def test_axes_with_ends_are_refused_by_name(density, method, options, message):
-    with pytest.raises(SystemDefinitionError, match=message):
+    with pytest.raises(sc.SystemDefinitionError, match=message):
         line((0, 0), density).discretise(method, **options)

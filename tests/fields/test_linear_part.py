@@ -5,7 +5,6 @@ import pytest
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen import FieldSystem, StateError
 
 RANDOM = np.random.default_rng(2)
 LINEAR = "u_t**2/2 - u_x**2/2 - u**2/2"
@@ -20,7 +19,7 @@ MESHES = {
 
 def mesh_of(name, density=LINEAR, fields=("u",)):
     boundary, method, options = MESHES[name]
-    field = FieldSystem.from_text(name, [*fields], {"x": (0, 2.5)}, density, boundary={"x": boundary})
+    field = sc.FieldSystem.from_text(name, [*fields], {"x": (0, 2.5)}, density, boundary={"x": boundary})
     return field.discretise(method, **options)
 
 
@@ -45,7 +44,7 @@ def test_one_correction_solves_linear_densities(name, method):
 def test_corrections_depend_on_the_step_size_alone(threads):
     counts = []
     for degree, elements in ((4, 30), (8, 30), (8, 60), (16, 30)):
-        field = FieldSystem.from_text(
+        field = sc.FieldSystem.from_text(
             "fields",
             ["u", "v"],
             {"x": (-20, 20)},
@@ -73,7 +72,7 @@ def test_steps_equal_those_of_fixed_point_iteration_and_of_other_threads():
 
 
 def test_restored_runs_and_other_parameters_have_the_right_factors():
-    field = FieldSystem.from_text(
+    field = sc.FieldSystem.from_text(
         "string", ["u"], {"x": (0, 1)}, "u_t**2/2 - c*u_x**2/2 - u**2", boundary={"x": (0, 0)}, parameters={"c": 1}
     )
     mesh = field.discretise("spectral-elements", degree=9, elements=5)
@@ -99,7 +98,7 @@ SCHROEDINGER = "(a_x**2 + b_x**2)/4 - (a**2 + b**2)**2/4"
 
 def pairs_on(name, hamiltonian, method=None, end=2.5, **options):
     boundary, default, further = MESHES[name]
-    field = FieldSystem.from_text(
+    field = sc.FieldSystem.from_text(
         "pairs", ["a"], {"x": (0, end)}, hamiltonian=hamiltonian, momenta=["b"], boundary={"x": boundary}
     )
     return field.discretise(method or default, **(options or further))
@@ -210,7 +209,7 @@ def test_one_correction_solves_linear_dissipation_and_gyroscopic_forces():
 
 
 def test_damped_steps_equal_those_of_fixed_point_iteration():
-    field = FieldSystem.from_text(
+    field = sc.FieldSystem.from_text(
         "layer",
         ["u"],
         {"x": (0, 2.5)},
@@ -231,5 +230,5 @@ def test_hamiltonians_with_too_many_couplings_are_refused():
         "all pairs", coordinates=["q[N]"], hamiltonian="sum(i in N, p_q[i]**2/2) + sum(i < j in N, (q[i] - q[j])**4)"
     )
     stepper = sc.compile_stepper(all_pairs, "svi:1", solver="newton", flags=QUICK_FLAGS)
-    with pytest.raises(StateError, match=r"at most 400 entries per row.*use solver='fixed-point'"):
+    with pytest.raises(sc.StateError, match=r"at most 400 entries per row.*use solver='fixed-point'"):
         stepper.integrate({"q": np.arange(450.0)}, h=0.01, steps=1)

@@ -6,13 +6,12 @@ from numpy import cos, pi, sin
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen import FieldSystem, StateError
 from scvi_codegen.pictures.animation import shape_of
 
 
 def run_of(axes, boundary, method, start, *, velocity=None, steps=20, **options):
     density = "u_t**2/2" + "".join(f" - u_{axis}**2/2" for axis in axes)
-    field = FieldSystem.from_text("waves", ["u"], dict.fromkeys(axes, (0, 1)), density, boundary=boundary)
+    field = sc.FieldSystem.from_text("waves", ["u"], dict.fromkeys(axes, (0, 1)), density, boundary=boundary)
     mesh = field.discretise(method, **options)
     u = start(*mesh.points.values())
     stepper = sc.compile_stepper(mesh.system, "svi:2", flags=QUICK_FLAGS)
@@ -91,7 +90,7 @@ def test_dataset_has_the_coordinates_of_the_mesh(tmp_path):
 
 
 def test_dataset_of_a_hamiltonian_density_has_the_density_of_momenta():
-    field = FieldSystem.from_text(
+    field = sc.FieldSystem.from_text(
         "q", ["q"], {"x": (0, 1)}, hamiltonian="q_x**2/2 + p**2/2", momenta=["p"], boundary={"x": "periodic"}
     )
     mesh = field.discretise("fourier", points=8)
@@ -104,11 +103,11 @@ def test_dataset_of_a_hamiltonian_density_has_the_density_of_momenta():
 
 def test_plots_of_fields_are_refused_by_name():
     _, run = on_a_line()
-    with pytest.raises(StateError, match="no array 'v'"):
+    with pytest.raises(sc.StateError, match="no array 'v'"):
         run.plot.field(field="v")
-    with pytest.raises(StateError, match="no state 21"):
+    with pytest.raises(sc.StateError, match="no state 21"):
         run.plot.field(state=21)
     lattice = sc.LagrangianSystem.from_text(name="free", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2)")
     alone = sc.compile_stepper(lattice, "svi:1", flags=QUICK_FLAGS).integrate({"q": np.ones(3)}, h=0.1, steps=2)
-    with pytest.raises(StateError, match="not discretised from a density"):
+    with pytest.raises(sc.StateError, match="not discretised from a density"):
         sc.plot_spectrum(alone)

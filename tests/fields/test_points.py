@@ -9,13 +9,12 @@ from samples import QUICK_FLAGS
 from scipy.optimize import brentq
 
 import scvi_codegen as sc
-from scvi_codegen import FieldSystem, SystemDefinitionError
 
 WAVES = "u_t**2/2 - u_x**2/2"
 
 
 def string(points, *, ends=(0, 0), scalars=(), length=1, density=WAVES, **parameters):
-    return FieldSystem.from_text(
+    return sc.FieldSystem.from_text(
         "string",
         fields=["u"],
         space={"x": (0, length)},
@@ -68,7 +67,7 @@ def test_spring_between_equidistant_points_is_of_first_order_and_on_elements_exa
     """2 w tan(w pi) = k on a ring; the derivative jumps at the spring."""
     k, a = 1.5, 1.0 + pi / 64
     w = brentq(lambda w: 2 * w * tan(w * pi) - k, 1e-3, 0.49)
-    system = FieldSystem.from_text(
+    system = sc.FieldSystem.from_text(
         "ring",
         ["u"],
         {"x": (0, "2*pi")},
@@ -93,7 +92,7 @@ def test_spring_between_equidistant_points_is_of_first_order_and_on_elements_exa
     ],
 )
 def test_interpolation_is_exact_for_the_functions_of_the_basis(method, options, degree):
-    ring = FieldSystem.from_text("ring", ["u"], {"x": (0, 2)}, WAVES, boundary={"x": "periodic"})
+    ring = sc.FieldSystem.from_text("ring", ["u"], {"x": (0, 2)}, WAVES, boundary={"x": "periodic"})
     axis = ring.discretise(method, **options).axes[0]
     for at in (0.03, 0.77, 1.99, 2.0):
         row = axis.interpolation(at)
@@ -119,7 +118,7 @@ def test_highest_frequency_contains_points():
 
 
 def test_plane_with_a_mass_conserves_energy_and_is_derived():
-    plane = FieldSystem.from_text(
+    plane = sc.FieldSystem.from_text(
         "membrane",
         ["u"],
         {"x": (0, 1), "y": (0, 1)},
@@ -159,18 +158,20 @@ def test_equal_elements_are_divided_at_places():
     ],
 )
 def test_errors_of_points_have_names(points, options, message):
-    with pytest.raises(SystemDefinitionError, match=message):
+    with pytest.raises(sc.SystemDefinitionError, match=message):
         string(points).discretise("legendre" if {*options} == {"degree"} else "spectral-elements", **options)
 
 
 def test_masses_need_a_point_and_hamiltonian_densities_have_none():
     ring = {"space": {"x": (0, 1)}, "boundary": {"x": "periodic"}}
     mass = [{"x": 0.3, "lagrangian": "m*u_t**2/2"}]
-    field = FieldSystem.from_text("ring", ["u"], density=WAVES, point_lagrangians=mass, parameters={"m": 1.0}, **ring)
-    with pytest.raises(SystemDefinitionError, match=r"at x = 0\.3 contains u_t, but no point of the mesh is there"):
+    field = sc.FieldSystem.from_text(
+        "ring", ["u"], density=WAVES, point_lagrangians=mass, parameters={"m": 1.0}, **ring
+    )
+    with pytest.raises(sc.SystemDefinitionError, match=r"at x = 0\.3 contains u_t, but no point of the mesh is there"):
         field.discretise("fourier", points=32)
     assert field.discretise("fourier", points=30).highest_frequency() > 0
-    with pytest.raises(SystemDefinitionError, match="which has no point_lagrangians=: omit it"):
-        FieldSystem.from_text("ring", ["u"], momenta=["v"], hamiltonian="u*v", point_lagrangians=mass, **ring)
-    with pytest.raises(SystemDefinitionError, match="'u' is"):
+    with pytest.raises(sc.SystemDefinitionError, match="which has no point_lagrangians=: omit it"):
+        sc.FieldSystem.from_text("ring", ["u"], momenta=["v"], hamiltonian="u*v", point_lagrangians=mass, **ring)
+    with pytest.raises(sc.SystemDefinitionError, match="'u' is"):
         string(mass, scalars=["u"], m=1.0)

@@ -8,7 +8,6 @@ from samples import QUICK_FLAGS
 from sympy import Function, symbols
 
 import scvi_codegen as sc
-from scvi_codegen import AccuracyWarning, FieldSystem, MethodError, StepFailedError, SystemDefinitionError
 
 STRING = "u_t**2/2 - u_x**2/2"
 MESHES = {
@@ -19,7 +18,7 @@ MESHES = {
 
 
 def ring(density=STRING, **others):
-    return FieldSystem.from_text("ring", ["u"], {"x": (0, "2*pi")}, density, boundary={"x": "periodic"}, **others)
+    return sc.FieldSystem.from_text("ring", ["u"], {"x": (0, "2*pi")}, density, boundary={"x": "periodic"}, **others)
 
 
 @pytest.mark.parametrize("method", MESHES)
@@ -33,11 +32,11 @@ def test_runs_report_the_unresolved_part_and_warn_of_it(method, recwarn):
     assert run.unresolved().max() < 1e-8
     assert not recwarn.list
     if method == "spectral-elements":  # the wave steepens: u_x has a shock at about t = 2
-        with pytest.warns(AccuracyWarning, match="does not resolve the fields: at t = "):
+        with pytest.warns(sc.AccuracyWarning, match="does not resolve the fields: at t = "):
             run = stepper.integrate({"u": np.sin(x)}, h=0.01, steps=300)
         assert run.unresolved()[0] < 1e-8 < 1e-5 < run.unresolved().max()
     else:
-        with pytest.warns(AccuracyWarning, match=r"highest modes have .*h times the highest frequency"):
+        with pytest.warns(sc.AccuracyWarning, match=r"highest modes have .*h times the highest frequency"):
             stepper.integrate({"u": np.random.default_rng(0).normal(size=x.shape)}, h=0.01, steps=3)
 
 
@@ -46,10 +45,10 @@ def test_recorded_pieces_and_ensembles_warn_of_unresolved_fields():
     stepper = sc.compile_stepper(mesh.system, "stoermer-verlet", flags=QUICK_FLAGS)
     rough, smooth = (-1.0) ** np.arange(16), np.cos(mesh.points["x"])
     run = stepper.start({"u": rough}, velocity={"u": 0 * rough}, h=0.01)
-    with pytest.warns(AccuracyWarning, match="does not resolve the fields: at t = "):
+    with pytest.warns(sc.AccuracyWarning, match="does not resolve the fields: at t = "):
         run.record(4)
     members = np.stack([smooth, rough])
-    with pytest.warns(AccuracyWarning, match="does not resolve the fields: trajectory 1, at t = 0"):
+    with pytest.warns(sc.AccuracyWarning, match="does not resolve the fields: trajectory 1, at t = 0"):
         stepper.integrate_ensemble({"u": members}, velocity={"u": 0 * members}, h=0.01, steps=4)
 
 
@@ -67,9 +66,9 @@ def test_recordings_report_the_unresolved_part_and_warn_of_it(tmp_path):
     mesh = ring().discretise("fourier", points=6)
     stepper = sc.compile_stepper(mesh.system, "stoermer-verlet", flags=QUICK_FLAGS)
     start = {"u": np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])}
-    with pytest.warns(AccuracyWarning, match="does not resolve the fields: at t = 0"):
+    with pytest.warns(sc.AccuracyWarning, match="does not resolve the fields: at t = 0"):
         recorded = sc.record_run(stepper.start(start, h=0.01), tmp_path / "run", steps=4)
-    with pytest.warns(AccuracyWarning, match="does not resolve the fields"):
+    with pytest.warns(sc.AccuracyWarning, match="does not resolve the fields"):
         expected = stepper.with_sizes(Nx=6).integrate(start, {"u": np.zeros(6)}, h=0.01, steps=4).unresolved()
     np.testing.assert_array_equal(recorded.unresolved(), expected)
     np.testing.assert_array_equal(sc.load_run(tmp_path / "run").unresolved(), expected)
@@ -77,7 +76,7 @@ def test_recordings_report_the_unresolved_part_and_warn_of_it(tmp_path):
 
 def test_recordings_contain_their_mesh(tmp_path):
     """A driven end, elements of several sizes, a parameter, a momentum and its weights: all from the folder."""
-    field = FieldSystem.from_text(
+    field = sc.FieldSystem.from_text(
         "schroedinger",
         ["a"],
         {"x": (0, "pi")},
@@ -91,7 +90,7 @@ def test_recordings_contain_their_mesh(tmp_path):
     x = mesh.points["x"]
     start = stepper.start({"a": np.sin(x)}, {"a": mesh.weights * np.cos(x)}, h=0.01, parameters={"k": 3.0})
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", AccuracyWarning)  # the mesh is coarse
+        warnings.simplefilter("ignore", sc.AccuracyWarning)  # the mesh is coarse
         sc.record_run(start, tmp_path / "run", steps=2)
     recorded = sc.load_run(tmp_path / "run")
     np.testing.assert_array_equal(recorded.mesh.points["x"], x)
@@ -112,7 +111,7 @@ def test_recordings_contain_their_mesh(tmp_path):
 def test_systems_without_a_mesh_report_no_resolution():
     chain = sc.LagrangianSystem.from_text("c", ["q[N]"], "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)")
     run = sc.compile_stepper(chain, "svi:2", flags=QUICK_FLAGS).integrate(np.ones(3), h=0.1, steps=2)
-    with pytest.raises(MethodError, match="requires a mesh"):
+    with pytest.raises(sc.MethodError, match="requires a mesh"):
         run.unresolved()
 
 
@@ -122,9 +121,9 @@ def test_explicit_steps_are_stable_up_to_the_largest_step(method):
     assert mesh.highest_frequency() == pytest.approx(8)
     stepper = sc.compile_stepper(mesh.system, method, flags=QUICK_FLAGS)
     highest, largest = np.cos(8 * mesh.points["x"]), mesh.largest_step(method)
-    with pytest.warns(AccuracyWarning):
+    with pytest.warns(sc.AccuracyWarning):
         stable = stepper.integrate({"u": highest}, h=0.998 * largest, steps=3000)
-    with pytest.warns(AccuracyWarning):
+    with pytest.warns(sc.AccuracyWarning):
         unstable = stepper.integrate({"u": highest}, h=1.002 * largest, steps=3000)
     assert np.abs(stable.q["u"]).max() < 50
     assert np.abs(unstable.q["u"]).max() > 1e3
@@ -135,9 +134,9 @@ def test_explicit_steps_are_stable_up_to_the_largest_step(method):
 def test_fixed_point_iterations_converge_up_to_the_largest_step(points):
     mesh, method = ring().discretise("fourier", points=32), f"svi:{points}"
     stepper = sc.compile_stepper(mesh.system, method, flags=QUICK_FLAGS)
-    with pytest.warns(AccuracyWarning):
+    with pytest.warns(sc.AccuracyWarning):
         stepper.integrate({"u": np.cos(16 * mesh.points["x"])}, h=0.98 * mesh.largest_step(method), steps=20)
-    with pytest.raises(StepFailedError, match="highest frequency is at most 16: choose h below"):
+    with pytest.raises(sc.StepFailedError, match="highest frequency is at most 16: choose h below"):
         stepper.integrate({"u": np.cos(16 * mesh.points["x"])}, h=3 * mesh.largest_step(method), steps=100)
 
 
@@ -159,7 +158,9 @@ DENSITIES = {
 @pytest.mark.parametrize("name", DISCRETISATIONS)
 def test_nodes_of_waves_do_not_slow_convergence(name, density):
     """Fields vanish at the nodes of a standing wave, where forces are rounding errors: at the largest steps."""
-    field = FieldSystem.from_text("waves", ["u"], {"x": (0, "2*pi")}, boundary={"x": "periodic"}, **DENSITIES[density])
+    field = sc.FieldSystem.from_text(
+        "waves", ["u"], {"x": (0, "2*pi")}, boundary={"x": "periodic"}, **DENSITIES[density]
+    )
     kind, options = DISCRETISATIONS[name]
     mesh = field.discretise(kind, **options)
     stepper, x = sc.compile_stepper(mesh.system, "svi:4", flags=QUICK_FLAGS), mesh.points["x"]
@@ -192,5 +193,5 @@ U = Function("u")(X, T)
 )
 def test_higher_derivatives_are_refused_by_name(density, name):
     arguments = {"name": "ring", "fields": [U], "space": {"x": (0, 1)}}
-    with pytest.raises(SystemDefinitionError, match=name):
-        ring(density) if isinstance(density, str) else FieldSystem.from_sympy(density=density, **arguments)
+    with pytest.raises(sc.SystemDefinitionError, match=name):
+        ring(density) if isinstance(density, str) else sc.FieldSystem.from_sympy(density=density, **arguments)

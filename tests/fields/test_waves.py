@@ -9,7 +9,6 @@ from samples import QUICK_FLAGS
 from scipy.special import ellipj, ellipk
 
 import scvi_codegen as sc
-from scvi_codegen import FieldSystem
 
 V, W = 0.5, 0.6
 GAMMA = 1 / sqrt(1 - V * V)
@@ -20,7 +19,7 @@ ELEMENTS, DIFFERENCES, FOURIER = "spectral-elements", "finite-differences", "fou
 def field(density, space, boundary="periodic", fields="u", **more):
     space = space if isinstance(space, dict) else {"x": space}
     boundary = boundary if isinstance(boundary, dict) else dict.fromkeys(space, boundary)
-    return FieldSystem.from_text("waves", [*fields], space, density, boundary=boundary, **more)
+    return sc.FieldSystem.from_text("waves", [*fields], space, density, boundary=boundary, **more)
 
 
 def rate_of(exact, grid, t, d=1e-3):
@@ -300,7 +299,7 @@ def solitons(x, t):
 @pytest.mark.full
 def test_korteweg_de_vries_solitons_collide():
     """The bracket {u(x), u(y)} = d/dx delta(x - y) is that of u = q_x/2 + p for canonical q and p; q_x/2 - p rests."""
-    field = FieldSystem.from_text(
+    field = sc.FieldSystem.from_text(
         "Korteweg-de Vries",
         ["q"],
         {"x": (-16, 16)},

@@ -4,13 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from scvi_codegen.methods import SVI
-from scvi_codegen.runtime.core.stepper import Stepper
+import scvi_codegen as sc
 
 
 @pytest.fixture(scope="session")
-def kepler(compiled) -> Stepper:
-    return compiled("kepler", SVI(4))
+def kepler(compiled) -> sc.Stepper:
+    return compiled("kepler", sc.SVI(4))
 
 
 @pytest.fixture(autouse=True)

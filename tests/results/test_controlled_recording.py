@@ -7,14 +7,9 @@ import pytest
 from click.testing import CliRunner
 from recorded_runs import STATE, StopsAfter, assert_same, digests, recorded
 
+import scvi_codegen as sc
 from scvi_codegen.cli import main, supervision
-from scvi_codegen.errors import RecordingError, StateError
-from scvi_codegen.methods import SVI
-from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
-from scvi_codegen.models.problems import problem
-from scvi_codegen.results.recording import load_run, record_run, resume_run
-from scvi_codegen.runtime.core.stepper import Stepper
 
 END, TOLERANCE = 60.0, 1e-10
 MODEL = f"""
@@ -29,9 +24,9 @@ span = {END}
 """
 
 
-def controlled(stepper: Stepper, folder: str, t_end: float = END, **settings: object):
+def controlled(stepper: sc.Stepper, folder: str, t_end: float = END, **settings: object):
     run = stepper.start(**STATE, t_end=t_end, tolerance=TOLERANCE)
-    return record_run(run, folder, **{"rows": 64} | settings)
+    return sc.record_run(run, folder, **{"rows": 64} | settings)
 
 
 @pytest.mark.parametrize("save_every", [1, 7, 5000])
@@ -52,7 +47,7 @@ def test_interrupted_recording_is_bytewise_equal(kepler, save_every):
     found, looks = controlled(kepler, "a.run", save_every=save_every, stop=StopsAfter(0), checkpoint_steps=31), 1
     while not found.finished:
         assert found.t[-1] < END
-        found, looks = resume_run("a.run", stop=StopsAfter(looks), checkpoint_steps=37), looks + 1
+        found, looks = sc.resume_run("a.run", stop=StopsAfter(looks), checkpoint_steps=37), looks + 1
     assert looks > 3
     assert found.steps == whole.steps
     assert digests("a.run") == digests("whole.run")
@@ -72,27 +67,27 @@ def test_slice_is_a_trajectory_with_dense_output(kepler):
 @pytest.mark.parametrize("t_end", [END, -END])
 def test_run_may_be_extended_or_shortened_but_not_reversed(kepler, t_end):
     controlled(kepler, "a.run", t_end, save_every=3)
-    longer = resume_run("a.run", t_end=1.5 * t_end)
+    longer = sc.resume_run("a.run", t_end=1.5 * t_end)
     assert longer.finished
     assert t_end in longer.t
     assert longer.t[-1] == 1.5 * t_end
     assert np.abs(longer.q[-1] - kepler.integrate(**STATE, t_end=1.5 * t_end).q[-1]).max() < 1e-6
-    with pytest.raises(StateError, match="beyond"):
-        resume_run("a.run", t_end=t_end)
-    with pytest.raises(StateError, match="omit steps"):
-        resume_run("a.run", steps=1000)
-    assert load_run("a.run").manifest == longer.manifest
+    with pytest.raises(sc.StateError, match="beyond"):
+        sc.resume_run("a.run", t_end=t_end)
+    with pytest.raises(sc.StateError, match="omit steps"):
+        sc.resume_run("a.run", steps=1000)
+    assert sc.load_run("a.run").manifest == longer.manifest
 
 
 def test_other_kind_of_steps_is_rejected(kepler):
     recorded(kepler, 10, folder="fixed.run")
-    with pytest.raises(StateError, match="steps instead of t_end"):
-        resume_run("fixed.run", t_end=3.0)
-    with pytest.raises(StateError, match="omit steps"):
+    with pytest.raises(sc.StateError, match="steps instead of t_end"):
+        sc.resume_run("fixed.run", t_end=3.0)
+    with pytest.raises(sc.StateError, match="omit steps"):
         controlled(kepler, "b.run", steps=10)
-    with pytest.raises(StateError, match="steps"):
-        record_run(kepler.start(**STATE, h=0.1), "c.run")
-    with pytest.raises(RecordingError, match="another folder"):
+    with pytest.raises(sc.StateError, match="steps"):
+        sc.record_run(kepler.start(**STATE, h=0.1), "c.run")
+    with pytest.raises(sc.RecordingError, match="another folder"):
         controlled(kepler, "fixed.run")
 
 
@@ -101,9 +96,9 @@ def test_model_file_contains_a_tolerance():
     assert (model.h, model.tolerance, model.covered) == (None, TOLERANCE, END)
     assert parse_model(dump_model(model)) == model
     assert parse_model(MODEL, {"run": {"step": 0.1}}).step_count == 600
-    exact = Model(system=model.system, method=SVI(4), q=(1.0, 0.0), p=(0.0, 1.0), span=-2.0)
+    exact = sc.Model(system=model.system, method=sc.SVI(4), q=(1.0, 0.0), p=(0.0, 1.0), span=-2.0)
     assert parse_model(dump_model(exact)) == exact
-    assert parse_model(dump_model(Model.from_problem(problem("kepler"))), {"run": {"tolerance": 0.5}}).h is None
+    assert parse_model(dump_model(sc.Model.from_problem(sc.problem("kepler"))), {"run": {"tolerance": 0.5}}).h is None
 
 
 def invoke(words: str):
@@ -125,7 +120,7 @@ def test_the_command_line_runs_records_and_resumes_it(kepler):
         run = kepler.integrate(file["q"][0], file["p"][0], t_end=END, tolerance=TOLERANCE)
         assert np.abs(file["q"][-1] - run.q[-1]).max() < 1e-9
         assert float(file["h"]) == file["t"][1]
-    assert np.abs(load_run("k.run").q[-1] - run.q[-1]).max() < 1e-7
+    assert np.abs(sc.load_run("k.run").q[-1] - run.q[-1]).max() < 1e-7
     refused = invoke("k.toml --steps 10")
     assert refused.exit_code != 0
     assert "give span, not steps" in refused.output

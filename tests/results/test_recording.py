@@ -14,18 +14,11 @@ import pytest
 from recorded_runs import COLUMNS, STATE, H, StopsAfter, assert_same, digests, recorded, start
 from samples import pushed_pendulum
 
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import MissingLibraryError, RecordingError, RecordingWarning, StateError
+import scvi_codegen as sc
 from scvi_codegen.files import export
-from scvi_codegen.methods import SVI, Gauss, StoermerVerlet
-from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.model_file import dump_model
-from scvi_codegen.models.problems import problem
-from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.results.recording import RecordedRun, load_run, manifest, record_run, resume_run, writing
-from scvi_codegen.runtime.run.run import Run
+from scvi_codegen.results.recording import manifest, writing
 from scvi_codegen.runtime.run.run_loop import record
-from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 
 class TestRecording:
@@ -41,14 +34,14 @@ class TestRecording:
         assert [len(piece) for piece in found.pieces()] == [100] * 10 + [2]
 
     @pytest.mark.sampled(3)
-    @pytest.mark.parametrize("method", [SVI(4), Gauss(2), StoermerVerlet()], ids=lambda method: method.name)
+    @pytest.mark.parametrize("method", [sc.SVI(4), sc.Gauss(2), sc.StoermerVerlet()], ids=lambda method: method.name)
     @pytest.mark.parametrize("save_every", [1, 40, 400])
     def test_interrupted_run_is_bytewise_equal(self, compiled, method, save_every):
         stepper = compiled("kepler", method)
         recorded(stepper, 600, save_every=save_every, folder="whole.run")
         found, looks = recorded(stepper, 600, save_every=save_every, stop=StopsAfter(0), checkpoint_steps=31), 1
         while not found.finished:
-            found, looks = resume_run("a.run", stop=StopsAfter(looks), checkpoint_steps=37), looks + 1
+            found, looks = sc.resume_run("a.run", stop=StopsAfter(looks), checkpoint_steps=37), looks + 1
         assert looks > 3
         assert digests("a.run") == digests("whole.run")
 
@@ -58,7 +51,7 @@ class TestRecording:
         recorded(kepler, 600, save_every=save_every, folder="whole.run")
         left = iter([*[False] * 5, True])
 
-        def interrupted(run: Run, steps: int | None = None, **settings: object) -> Trajectory:
+        def interrupted(run: sc.Run, steps: int | None = None, **settings: object) -> sc.Trajectory:
             made = record(run, steps, **settings)
             if next(left):
                 raise KeyboardInterrupt
@@ -68,39 +61,41 @@ class TestRecording:
             patch.setattr(writing, "record", interrupted)
             with pytest.raises(KeyboardInterrupt):
                 recorded(kepler, 600, save_every=save_every, checkpoint_seconds=1e9)
-        found = load_run("a.run")
+        found = sc.load_run("a.run")
         assert 0 < found.resumed().steps == found.steps < 600
-        assert resume_run("a.run").finished
+        assert sc.resume_run("a.run").finished
         assert digests("a.run") == digests("whole.run")
 
     def test_options_and_parameters_are_saved(self, kepler):
-        settings = {"parameters": {"mu": 1.1}, "options": SolverOptions(tolerance=1e-9), "t": 3.0}
+        settings = {"parameters": {"mu": 1.1}, "options": sc.SolverOptions(tolerance=1e-9), "t": 3.0}
         whole = kepler.integrate(**STATE, h=H, steps=300, **settings)
-        record_run(start(kepler, **settings), "a.run", steps=300, rows=64, stop=StopsAfter(2))
-        found = resume_run("a.run")
+        sc.record_run(start(kepler, **settings), "a.run", steps=300, rows=64, stop=StopsAfter(2))
+        found = sc.resume_run("a.run")
         assert_same(found, whole)
         assert found.manifest.options == settings["options"]
         assert found[:3].parameters == [1.1]
 
     def test_run_may_be_extended(self, kepler):
         recorded(kepler, 500)
-        assert not resume_run("a.run", steps=900, stop=StopsAfter(0)).finished
-        assert_same(resume_run("a.run"), kepler.integrate(**STATE, h=H, steps=900))
+        assert not sc.resume_run("a.run", steps=900, stop=StopsAfter(0)).finished
+        assert_same(sc.resume_run("a.run"), kepler.integrate(**STATE, h=H, steps=900))
 
     def test_resuming_a_finished_run_changes_nothing(self, kepler):
         recorded(kepler, 500)
         before = digests("a.run")
-        assert resume_run("a.run").finished
+        assert sc.resume_run("a.run").finished
         assert digests("a.run") == before
 
     def test_checkpoints_are_written_every_n_steps(self, kepler):
         seen = []
-        recorded(kepler, 100, checkpoint_steps=25, progress=lambda done: seen.append((done, load_run("a.run").steps)))
+        recorded(
+            kepler, 100, checkpoint_steps=25, progress=lambda done: seen.append((done, sc.load_run("a.run").steps))
+        )
         assert {25, 50, 75, 100} <= {done for done, _ in seen}
         assert all(written >= done - done % 25 for done, written in seen)
 
     def test_manifest_describes_the_run(self, kepler):
-        text = dump_model(Model.from_problem(problem("kepler")))
+        text = dump_model(sc.Model.from_problem(sc.problem("kepler")))
         found = recorded(kepler, 10, model=text, certificate={"symplectic": True})
         about = json.loads(Path("a.run/manifest.json").read_text())
         assert about["source"]["code"] == kepler.source.code.split("\n")
@@ -109,7 +104,7 @@ class TestRecording:
         assert found.manifest.about()["method"] == kepler.interface.method
 
     def test_a_manifest_with_the_keys_of_version_0_1_is_read(self, kepler):
-        text = dump_model(Model.from_problem(problem("kepler")))
+        text = dump_model(sc.Model.from_problem(sc.problem("kepler")))
         found = recorded(kepler, 10, save_every=5, model=text)
         path = Path("a.run/manifest.json")
         former = json.loads(path.read_text().replace("save_every", "every"))
@@ -117,7 +112,7 @@ class TestRecording:
         assert "every" in former
         assert "save_every" not in former["model"]
         path.write_text(json.dumps(former, indent=1))
-        assert load_run("a.run").manifest == found.manifest
+        assert sc.load_run("a.run").manifest == found.manifest
 
     def test_certificate_is_accepted_as_file_or_object(self, kepler):
         Path("c.json").write_text('{"order": 8}')
@@ -125,7 +120,7 @@ class TestRecording:
         given = SimpleNamespace(to_json=lambda: '{"order": 4}')
         assert recorded(kepler, 1, certificate=given, folder="b.run").manifest.certificate == {"order": 4}
         for wrong in ("none.json", {1, 2}):
-            with pytest.raises(StateError, match="the certificate"):
+            with pytest.raises(sc.StateError, match="the certificate"):
                 recorded(kepler, 1, certificate=wrong, folder="c.run")
 
     def test_memory_does_not_grow_with_run_length(self, kepler):
@@ -140,13 +135,13 @@ class TestRecording:
 
     def test_different_compiler_or_processor_is_reported_and_saved(self, kepler, monkeypatch):
         recorded(kepler, 500, stop=StopsAfter(3))
-        step = load_run("a.run").steps
+        step = sc.load_run("a.run").steps
         monkeypatch.setattr(manifest, "fingerprint", lambda source, flags: "another")
-        with pytest.warns(RecordingWarning, match=f"from step {step} on another build is used"):
-            resume_run("a.run", steps=600)
+        with pytest.warns(sc.RecordingWarning, match=f"from step {step} on another build is used"):
+            sc.resume_run("a.run", steps=600)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            found = resume_run("a.run", steps=700)
+            found = sc.resume_run("a.run", steps=700)
         assert [build.step for build in found.manifest.builds] == [0, step]
 
     @pytest.mark.parametrize(
@@ -161,29 +156,29 @@ class TestRecording:
         ids=str,
     )
     def test_invalid_numbers_are_named_before_writing(self, kepler, settings, message):
-        with pytest.raises(StateError, match=message):
-            record_run(start(kepler), "a.run", **{"steps": 3} | settings)
+        with pytest.raises(sc.StateError, match=message):
+            sc.record_run(start(kepler), "a.run", **{"steps": 3} | settings)
         assert not Path("a.run").exists()
 
     def test_active_run_is_rejected(self, kepler):
         run = start(kepler)
         run.record(3)
-        with pytest.raises(StateError, match="at its start, but this run has 3 steps"):
-            record_run(run, "a.run", steps=3)
+        with pytest.raises(sc.StateError, match="at its start, but this run has 3 steps"):
+            sc.record_run(run, "a.run", steps=3)
 
 
 class TestFolders:
     def test_a_folder_with_a_run_is_not_overwritten(self, kepler):
         recorded(kepler, 10)
         before = digests("a.run")
-        with pytest.raises(RecordingError, match=r"already contains a run: continue it .*--resume a\.run"):
+        with pytest.raises(sc.RecordingError, match=r"already contains a run: continue it .*--resume a\.run"):
             recorded(kepler, 10)
         assert digests("a.run") == before
 
     def test_foreign_folder_is_not_changed(self, kepler):
         Path("a.run").mkdir()
         Path("a.run/thesis.tex").touch()
-        with pytest.raises(RecordingError, match="is not empty"):
+        with pytest.raises(sc.RecordingError, match="is not empty"):
             recorded(kepler, 10)
         assert [path.name for path in Path("a.run").iterdir()] == ["thesis.tex"]
 
@@ -195,10 +190,10 @@ class TestFolders:
         assert sorted(os.listdir("a.run")) == ["manifest.json", "states-000000.npz"]  # noqa: PTH208  (hidden ones too)
 
     def test_folder_without_a_run_is_named(self, kepler):
-        for act in (load_run, resume_run):
-            with pytest.raises(RecordingError, match=r"'none\.run' contains no recorded run"):
+        for act in (sc.load_run, sc.resume_run):
+            with pytest.raises(sc.RecordingError, match=r"'none\.run' contains no recorded run"):
                 act("none.run")
-        with pytest.raises(RecordingError, match="Nothing was recorded"):
+        with pytest.raises(sc.RecordingError, match="Nothing was recorded"):
             recorded(kepler, 10, folder="no/such/a.run")
 
     @pytest.mark.parametrize("damage", ["flip", "truncate", "empty", "remove", "remove last"])
@@ -215,15 +210,15 @@ class TestFolders:
             path.unlink()
         else:
             path.write_bytes(data[:500] if damage == "truncate" else b"")
-        with pytest.raises(RecordingError, match=r"states-000001\.npz'|contains no states"):
-            np.asarray(load_run("a.run").q)
+        with pytest.raises(sc.RecordingError, match=r"states-000001\.npz'|contains no states"):
+            np.asarray(sc.load_run("a.run").q)
 
     @pytest.mark.parametrize("text", ["", "{", "[]", '{"format": 99}', '{"format": 1}'])
     def test_a_damaged_manifest_is_named(self, kepler, text):
         recorded(kepler, 10)
         Path("a.run/manifest.json").write_text(text)
-        with pytest.raises(RecordingError, match=r"manifest\.json' is damaged"):
-            resume_run("a.run")
+        with pytest.raises(sc.RecordingError, match=r"manifest\.json' is damaged"):
+            sc.resume_run("a.run")
 
     def test_a_flipped_bit_in_a_recording_is_rejected(self, kepler):
         run, random = recorded(kepler, 10), np.random.default_rng(3)
@@ -231,10 +226,10 @@ class TestFolders:
             data = path.read_bytes()
             for place, bit in zip(random.integers(0, len(data), 100), random.integers(0, 8, 100), strict=True):
                 path.write_bytes(data[:place] + bytes([data[place] ^ 1 << int(bit)]) + data[place + 1 :])
-                with pytest.raises(RecordingError, match=r"manifest\.json|states-000000\.npz"):
-                    np.array(load_run("a.run").q)
+                with pytest.raises(sc.RecordingError, match=r"manifest\.json|states-000000\.npz"):
+                    np.array(sc.load_run("a.run").q)
             path.write_bytes(data)
-        assert np.array_equal(load_run("a.run").q, run.q)
+        assert np.array_equal(sc.load_run("a.run").q, run.q)
 
     def test_states_of_earlier_versions_have_no_checksum(self, kepler):
         run = recorded(kepler, 10)
@@ -242,7 +237,7 @@ class TestFolders:
         with np.load(path) as file:
             arrays = dict(file)
         np.savez(path, **arrays)
-        assert np.array_equal(load_run("a.run").q, run.q)
+        assert np.array_equal(sc.load_run("a.run").q, run.q)
 
     @pytest.mark.parametrize(
         ("place", "value"),
@@ -273,27 +268,27 @@ class TestFolders:
         del document["sha256"]
         path.write_text(json.dumps(document, indent=1))
         before = sorted(tmp_path.rglob("*"))
-        for act in (lambda: load_run("a.run")[0:3].energy(), lambda: resume_run("a.run", steps=20)):
-            with pytest.raises(RecordingError, match=r"is not the name of a file|compiler flag .* is not allowed"):
+        for act in (lambda: sc.load_run("a.run")[0:3].energy(), lambda: sc.resume_run("a.run", steps=20)):
+            with pytest.raises(sc.RecordingError, match=r"is not the name of a file|compiler flag .* is not allowed"):
                 act()
         assert sorted(tmp_path.rglob("*")) == before
 
     def test_a_run_with_other_flags_is_not_recorded(self, kepler, monkeypatch):
         monkeypatch.setattr(kepler, "flags", (*kepler.flags, "-fplugin=x.so"))
-        with pytest.raises(StateError, match=r"'-fplugin=x\.so' is not allowed .* SCVI_CODEGEN_CFLAGS"):
+        with pytest.raises(sc.StateError, match=r"'-fplugin=x\.so' is not allowed .* SCVI_CODEGEN_CFLAGS"):
             recorded(kepler, 10)
 
     def test_two_processes_do_not_record_into_one_folder(self, kepler):
         def second(done: int) -> None:
-            with pytest.raises(RecordingError, match=r"another process is recording into 'a\.run'"):
-                resume_run("a.run")
+            with pytest.raises(sc.RecordingError, match=r"another process is recording into 'a\.run'"):
+                sc.resume_run("a.run")
 
         assert recorded(kepler, 500, progress=second).finished
 
 
 class TestReading:
     @pytest.fixture
-    def pair(self, kepler) -> tuple[RecordedRun, Trajectory]:
+    def pair(self, kepler) -> tuple[sc.RecordedRun, sc.Trajectory]:
         return recorded(kepler, 300), kepler.integrate(**STATE, h=H, steps=300)
 
     @pytest.mark.parametrize(
@@ -348,7 +343,7 @@ class TestReading:
         lengths = []
 
         def look(done: int) -> None:
-            lengths.append(len(np.asarray(load_run("a.run").q)))
+            lengths.append(len(np.asarray(sc.load_run("a.run").q)))
 
         recorded(kepler, 2000, checkpoint_steps=50, progress=look)
         assert lengths == sorted(lengths)
@@ -357,7 +352,7 @@ class TestReading:
 
 class TestFiles:
     @pytest.fixture(params=["recorded", "in memory"])
-    def saved(self, request, kepler) -> tuple[RecordedRun | Trajectory, Trajectory]:
+    def saved(self, request, kepler) -> tuple[sc.RecordedRun | sc.Trajectory, sc.Trajectory]:
         whole = kepler.integrate(**STATE, h=H, steps=300)
         return (recorded(kepler, 300, certificate={"order": 8}) if request.param == "recorded" else whole), whole
 
@@ -369,7 +364,7 @@ class TestFiles:
             assert list(file["coordinates"]) == ["q1", "q2"]
             assert (file["h"], file["parameters"], file["parameter_names"]) == (H, [1.0], ["mu"])
             assert str(file["title"]) == whole.stepper.title
-            assert ("certificate" in file) == isinstance(given, RecordedRun)
+            assert ("certificate" in file) == isinstance(given, sc.RecordedRun)
 
     def test_csv_round_trip(self, saved):
         given, whole = saved
@@ -390,7 +385,7 @@ class TestFiles:
             assert file.attrs["title"] == whole.stepper.title
             assert json.loads(file.attrs["parameters"]) == {"mu": 1.0}
             assert file["q"].dims[1][0][:].tolist() == [b"q1", b"q2"]
-            assert ("certificate" in file.attrs) == isinstance(given, RecordedRun)
+            assert ("certificate" in file.attrs) == isinstance(given, sc.RecordedRun)
 
     def test_zarr_is_read_by_xarray(self, saved):
         pytest.importorskip("zarr")
@@ -437,7 +432,7 @@ class TestFiles:
 
     @pytest.mark.parametrize(("path", "units"), [("a.csv", {"t": "s"}), ("a.h5", {"h": "s"}), ("a.h5", {"t": 1})])
     def test_unsupported_units_are_rejected(self, kepler, path, units):
-        with pytest.raises(StateError, match="units"):
+        with pytest.raises(sc.StateError, match="units"):
             kepler.integrate(**STATE, h=H, steps=3).save(path, units=units)
 
     def test_tables_are_exported(self, kepler):
@@ -455,16 +450,16 @@ class TestFiles:
         run = kepler.integrate(**STATE, h=H, steps=3)
         monkeypatch.setitem(export.LIBRARIES, ".h5", "no_such_library")
         monkeypatch.setitem(sys.modules, "xarray", None)
-        with pytest.raises(MissingLibraryError, match=r"no_such_library, .* pip install 'scvi-codegen\[data\]'"):
+        with pytest.raises(sc.MissingLibraryError, match=r"no_such_library, .* pip install 'scvi-codegen\[data\]'"):
             run.save("a.h5")
-        with pytest.raises(MissingLibraryError, match=r"xarray, .*scvi-codegen\[data\]"):
+        with pytest.raises(sc.MissingLibraryError, match=r"xarray, .*scvi-codegen\[data\]"):
             run.to_xarray()
         assert list(Path().iterdir()) == []
 
     def test_foreign_folder_is_not_replaced(self, kepler):
         pytest.importorskip("zarr")
         Path("a.zarr").mkdir()
-        with pytest.raises(StateError, match="a folder with other contents"):
+        with pytest.raises(sc.StateError, match="a folder with other contents"):
             kepler.integrate(**STATE, h=H, steps=3).save("a.zarr")
 
     def test_unfinished_file_preserves_the_old_one(self, kepler, monkeypatch):
@@ -484,10 +479,10 @@ class TestFiles:
 
 
 def test_missing_inputs_leave_no_folder():
-    stepper = compile_stepper(pushed_pendulum(), SVI(2))
+    stepper = sc.compile_stepper(pushed_pendulum(), sc.SVI(2))
     run = stepper.start([0.3], [0.0], h=0.1)
-    with pytest.raises(StateError, match=r"the input 'u' is not set.*only constant inputs"):
-        record_run(run, "pushed.run", steps=4)
+    with pytest.raises(sc.StateError, match=r"the input 'u' is not set.*only constant inputs"):
+        sc.record_run(run, "pushed.run", steps=4)
     assert not Path("pushed.run").exists()
     run.set_inputs(u=0.5, w=0.0)
-    assert len(record_run(run, "pushed.run", steps=4)) == 5
+    assert len(sc.record_run(run, "pushed.run", steps=4)) == 5

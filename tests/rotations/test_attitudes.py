@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scvi_codegen.errors import StateError
+import scvi_codegen as sc
 from scvi_codegen.runtime.rotations.attitudes import (
     angular_velocity,
     body_momentum,
@@ -73,7 +73,7 @@ def test_angular_velocity_in_the_body_frame_moves_the_matrix():
     ],
 )
 def test_values_that_are_no_rotation_are_rejected_by_name(value, message):
-    with pytest.raises(StateError, match=message):
+    with pytest.raises(sc.StateError, match=message):
         quaternions(value, "R")
 
 
@@ -92,9 +92,9 @@ def test_orders_of_quaternions_and_rotation_vectors_are_named():
     ):
         found = quaternions(given, "R")
         np.testing.assert_allclose(found * np.sign((found * wanted).sum(axis=1))[:, None], wanted, rtol=0, atol=1e-15)
-    with pytest.raises(StateError, match="must be 'wxyz' or 'xyzw', not 'xwyz'"):
+    with pytest.raises(sc.StateError, match="must be 'wxyz' or 'xyzw', not 'xwyz'"):
         quaternions({"quaternion": last, "order": "xwyz"}, "R")
-    with pytest.raises(StateError, match="the rotation vector of 'R' must have three components"):
+    with pytest.raises(sc.StateError, match="the rotation vector of 'R' must have three components"):
         quaternions({"rotation_vector": [1.0, 2.0]}, "R")
 
 

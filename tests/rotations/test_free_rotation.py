@@ -6,7 +6,6 @@ from samples import QUICK_FLAGS
 from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
-from scvi_codegen.errors import MethodError
 from scvi_codegen.runtime.rotations.reduction import Reduction
 
 ATTITUDE = Rotation.from_euler("ZXZ", [0.3, 0.8, -0.4])
@@ -161,5 +160,5 @@ def test_other_kinetic_energies_are_refused_with_the_reason(lagrangian, reason):
         rotations={"R": "omega"},
         parameters={"k": 0.25} if "k" in lagrangian else {},
     )
-    with pytest.raises(MethodError, match=reason):
+    with pytest.raises(sc.MethodError, match=reason):
         compiled(system, "composition:8")

@@ -5,7 +5,6 @@ import pytest
 
 import scvi_codegen as sc
 from scvi_codegen.cli import main
-from scvi_codegen.errors import ModelFileError
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 from scvi_codegen.rendering.source import Interface
 
@@ -94,12 +93,12 @@ def test_the_command_line_runs_a_file_with_rotations(tmp_path):
 
 
 def test_torques_in_the_section_of_the_system_are_located():
-    with pytest.raises(ModelFileError, match=r"'torques' in \[system\]; there is a section \[torques\]"):
+    with pytest.raises(sc.ModelFileError, match=r"'torques' in \[system\]; there is a section \[torques\]"):
         parse_model(TOP.replace("[torques]\nR", "torques.R"))
 
 
 def test_an_unknown_rotation_in_the_initial_state_is_named():
-    with pytest.raises(ModelFileError, match="no 'omeg' in velocity"):
+    with pytest.raises(sc.ModelFileError, match="no 'omeg' in velocity"):
         parse_model(TOP.replace("omega = [0.1", "omeg = [0.1"))
 
 
@@ -137,7 +136,7 @@ def test_models_in_python_take_attitudes(attitude):
     assert np.abs(run.rotation()[0] - MATRIX).max() < 1e-15
     np.testing.assert_allclose(run.angular_velocity()[0], [0.1, 0.0, 2.0], rtol=0, atol=1e-15)
     assert np.array_equal(parse_model(dump_model(model)).integrate().q, run.q)
-    with pytest.raises(ModelFileError, match="the matrix of 'R' is not a rotation"):
+    with pytest.raises(sc.ModelFileError, match="the matrix of 'R' is not a rotation"):
         sc.Model(
             system=system, method="svi:3", q={"x": 0, "R": np.ones((3, 3))}, velocity=None, p=[0] * 5, h=1, steps=1
         )

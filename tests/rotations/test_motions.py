@@ -16,8 +16,6 @@ from scipy.spatial.transform import Rotation
 from tops import free_top, lagrange_top
 
 import scvi_codegen as sc
-from scvi_codegen.methods import SVI, as_method
-from scvi_codegen.tables.quadrature import gauss_legendre
 
 ATTITUDE, TURNED = (Rotation.from_euler(axes, [[0.3, 0.8, -0.4]]) for axes in ("zxz", "ZXZ"))
 OMEGA, FAST = np.array([0.7, -0.4, 1.5]), np.array([0.7, -0.4, 4.5])
@@ -342,7 +340,7 @@ OTHERS = [
     ("gyrostat", "scvi:3", (16, 32), 6),
     ("Lagrange top", "stoermer-verlet", (120, 240), 2),
     ("Lagrange top", "composition:8", (16, 24), 8),
-    ("heavy top", SVI(2, gauss_legendre(3)), (40, 80), 4),
+    ("heavy top", sc.SVI(2, sc.gauss_legendre(3)), (40, 80), 4),
 ]
 OTHERS_FULL = [
     ("heavy top", "stoermer-verlet", (160, 320), 2),
@@ -372,14 +370,14 @@ def expected_of(name):
 @pytest.mark.parametrize(("name", "method", "counts", "order"), CASES)
 def test_motions_converge_with_the_order_of_the_method_and_reverse(name, method, counts, order):
     motion, errors = MOTIONS[name], []
-    stepper = sc.compile_stepper(motion.system, as_method(method, motion.system), flags=QUICK_FLAGS)
+    stepper = sc.compile_stepper(motion.system, sc.as_method(method, motion.system), flags=QUICK_FLAGS)
     for steps in counts:
         run = motion.run(stepper, steps)
         errors.append(np.abs(motion.state(run) - expected_of(name)).max())
     assert 1e-13 < errors[1] < 3e-3, errors
     found = np.log(errors[0] / errors[1]) / np.log(counts[1] / counts[0])
     assert order - (0.5 if order < 10 else 2.7) < found < order + (0.5 if order < 10 else 2.1)
-    if not as_method(method, motion.system).symmetric:
+    if not sc.as_method(method, motion.system).symmetric:
         return
     back = stepper.integrate(run.q[-1], run.p[-1], h=-motion.t_end / steps, steps=steps, t=motion.t_end)
     np.testing.assert_allclose(motion.state(back), motion.state(run, 0), rtol=0, atol=3e-12)

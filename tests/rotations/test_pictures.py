@@ -5,7 +5,6 @@ import pytest
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.errors import StateError
 
 pytest.importorskip("matplotlib")
 
@@ -34,10 +33,10 @@ def test_paths_of_a_body_axis_and_a_direction_are_drawn_on_the_sphere(run, tmp_p
     np.testing.assert_array_equal(curves["axis 1 of R"], run.rotation()[:, :, 0])
     np.testing.assert_allclose(curves["n"], run.direction(), rtol=0, atol=1e-15)
     assert (tmp_path / "attitude.svg").stat().st_size > 1000
-    with pytest.raises(StateError, match="axis must be 1, 2 or 3, not 4"):
+    with pytest.raises(sc.StateError, match="axis must be 1, 2 or 3, not 4"):
         run.plot.attitude(axis=4)
     pendulum = sc.compile_stepper(sc.problem("planar-pendulum").system, "svi:1", flags=QUICK_FLAGS)
-    with pytest.raises(StateError, match="has no rotation, direction or spin"):
+    with pytest.raises(sc.StateError, match="has no rotation, direction or spin"):
         sc.plot_attitude(pendulum.integrate([0.0], [1.0], h=0.1, steps=2), tmp_path / "none.png")
 
 

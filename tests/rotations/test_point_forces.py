@@ -5,7 +5,6 @@ import pytest
 import sympy
 
 import scvi_codegen as sc
-from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 
 BODY = {
@@ -109,7 +108,7 @@ def test_points_of_systems_without_rotations():
     ],
 )
 def test_wrong_entries_are_refused_by_name(entry, message):
-    with pytest.raises(SystemDefinitionError, match=message):
+    with pytest.raises(sc.SystemDefinitionError, match=message):
         end_of(point_forces=[entry])
 
 

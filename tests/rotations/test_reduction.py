@@ -11,7 +11,6 @@ from samples import QUICK_FLAGS
 from scipy.special import ellipk
 
 import scvi_codegen as sc
-from scvi_codegen.errors import StateError
 from scvi_codegen.runtime.rotations.reduction import Reduction
 from scvi_codegen.verification.structure import structure_checks
 from scvi_codegen.verification.system_under_test import State, SystemUnderTest
@@ -91,7 +90,7 @@ def test_directions_of_changes_are_projected_and_pure_gauge_is_rejected():
     change = np.random.default_rng(2).normal(size=8)
     plain, shifted = (run.chaos_indicators(directions=each).log_norms for each in (change, change + 3 * gauge))
     np.testing.assert_allclose(shifted, plain, rtol=0, atol=1e-12)
-    with pytest.raises(StateError, match="not only the lengths of quaternions"):
+    with pytest.raises(sc.StateError, match="not only the lengths of quaternions"):
         run.chaos_indicators(directions=gauge)
 
 

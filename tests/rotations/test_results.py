@@ -7,7 +7,6 @@ import pytest
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.errors import StateError
 
 TOP = sc.LagrangianSystem.from_text(
     "top on a spring beside a pendulum",
@@ -50,7 +49,7 @@ def test_quantities_of_states_have_names(stepper, run):
         np.testing.assert_array_equal(run[name], values)
         np.testing.assert_allclose(together[name][:, 1], values, rtol=0, atol=1e-13)
     np.testing.assert_array_equal(run["x_dot"], run.velocity[:, 0])
-    with pytest.raises(StateError, match="there is no quantity 'S' of the states"):
+    with pytest.raises(sc.StateError, match="there is no quantity 'S' of the states"):
         run["S"]
 
 
@@ -91,7 +90,7 @@ def test_attitudes_between_saved_states_are_dense_output(stepper, run):
         between = getattr(run, quantity)(t=0.05)
         np.testing.assert_allclose(between, getattr(middle, quantity)()[-1], rtol=0, atol=1e-13, err_msg=quantity)
     together = stepper.integrate_ensemble(Q | {"x": [0.0, 0.0]}, velocity=V, h=0.1, steps=2)
-    with pytest.raises(StateError, match="no dense output"):
+    with pytest.raises(sc.StateError, match="no dense output"):
         together.rotation(t=0.05)
 
 
@@ -108,5 +107,5 @@ def test_a_recorded_run_has_the_attitudes_of_the_run(stepper, tmp_path):
     recorded, run = sc.load_run(tmp_path / "top.run"), stepper.integrate(**start, steps=40, save_every=2)
     np.testing.assert_array_equal(recorded.rotation(), run.rotation())
     np.testing.assert_array_equal(recorded.angular_velocity(space=True), run.angular_velocity(space=True))
-    with pytest.raises(StateError, match="have no dense output"):
+    with pytest.raises(sc.StateError, match="have no dense output"):
         recorded.rotation(t=0.1)

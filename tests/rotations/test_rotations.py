@@ -10,14 +10,10 @@ from samples import QUICK_FLAGS
 from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
-from scvi_codegen.errors import ExpressionError, StateError, SystemDefinitionError
 from scvi_codegen.formulas.rotations import RotationNames
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.methods import SVI, as_method
 from scvi_codegen.methods.discretise import discretised_form
 from scvi_codegen.runtime.rotations.quantities import spins
 from scvi_codegen.runtime.rotations.states import state_by_name
-from scvi_codegen.tables.quadrature import gauss_legendre
 
 INERTIA = np.array([1.0, 2.0, 3.0])
 TOP = sc.LagrangianSystem.from_text(
@@ -36,8 +32,8 @@ def compiled(system, method, **more):
 
 
 def test_methods_with_as_many_points_as_degree_take_the_hamiltonian():
-    methods = {name: as_method(name) for name in ("svi:3", "gauss:2", "scvi:3", "sc:3", "stoermer-verlet")}
-    forms = {name: isinstance(discretised_form(TOP, method), HamiltonianSystem) for name, method in methods.items()}
+    methods = {name: sc.as_method(name) for name in ("svi:3", "gauss:2", "scvi:3", "sc:3", "stoermer-verlet")}
+    forms = {name: isinstance(discretised_form(TOP, method), sc.HamiltonianSystem) for name, method in methods.items()}
     assert forms == {"svi:3": True, "gauss:2": True, "scvi:3": False, "sc:3": False, "stoermer-verlet": True}
 
 
@@ -53,7 +49,7 @@ def test_velocities_are_rejected_where_there_are_spins():
     system = sc.HamiltonianSystem.from_text("cavity", ["x"], spins=["s"], hamiltonian="(p_x**2 + x**2)/2 + x*s_1 + s_3")
     q, p, _ = state_by_name(system, {"x": 0.1, "s": [0.3, 0.6, 0.8]}, {"x": 0.2}, None)
     np.testing.assert_allclose(spins(q[1:], p[1:]), [0.3, 0.6, 0.8], rtol=0, atol=1e-15)
-    with pytest.raises(StateError, match="spins have no velocities: give p"):
+    with pytest.raises(sc.StateError, match="spins have no velocities: give p"):
         state_by_name(system, {"x": 0.1, "s": [0.3, 0.6, 0.8]}, None, {"x": 0.2})
 
 
@@ -119,7 +115,7 @@ def test_initial_velocities_and_momenta_are_those_of_either_frame():
     ],
 )
 def test_wrong_rotations_are_rejected_by_name(arguments, message):
-    with pytest.raises((SystemDefinitionError, ExpressionError), match=message):
+    with pytest.raises((sc.SystemDefinitionError, sc.ExpressionError), match=message):
         sc.LagrangianSystem.from_text("top", **arguments)
 
 
@@ -137,7 +133,7 @@ def test_wrong_rotations_are_rejected_by_name(arguments, message):
     ],
 )
 def test_wrong_states_are_rejected_by_name(q, velocity, message):
-    with pytest.raises(StateError, match=message):
+    with pytest.raises(sc.StateError, match=message):
         compiled(TOP, "svi:4").integrate(q, velocity=velocity, h=0.1, steps=2)
 
 
@@ -205,7 +201,7 @@ def test_events_are_found_in_the_names_of_rotations():
 
 def test_the_derivation_shows_the_form_that_is_stepped():
     by_momenta = sc.derive(TOP, "svi:1").to_text()
-    by_velocities = sc.derive(TOP, SVI(1, gauss_legendre(2))).to_text()
+    by_velocities = sc.derive(TOP, sc.SVI(1, sc.gauss_legendre(2))).to_text()
     for text in (by_momenta, by_velocities):
         assert "rotation R = R(q), quaternion q = (R_w, R_x, R_y, R_z) of any length" in text
     assert "\nH = " in by_momenta
@@ -270,7 +266,7 @@ DIRECTED = ("spherical", ["q"], "(q_dot**2 + n_1_dot**2 + n_2_dot**2 + n_3_dot**
 def test_states_of_directions_that_are_refused(state, message):
     stepper = sc.compile_stepper(sc.LagrangianSystem.from_text(*DIRECTED, directions=["n"]), "svi:1")
     rest = {"velocity": {"q": 0, "n": [0.0, 0, 0]}} if "p" not in state else {}
-    with pytest.raises(StateError, match=message):
+    with pytest.raises(sc.StateError, match=message):
         stepper.integrate(**{"q": {"q": 0, "n": [0, 0, 1]}, **rest, **state}, h=0.1, steps=1)
 
 
@@ -287,5 +283,5 @@ def test_spins_and_directions_of_all_lengths_are_read():
     for length in (1e-200, 1.0, 1e200):
         run = stepper.integrate({"q": 0.1, "s": [length, 0, -2 * length]}, {"q": 0}, h=0.1, steps=0)
         assert run.spin("s")[0] == pytest.approx([length, 0, -2 * length], rel=1e-14)
-    with pytest.raises(StateError, match="the spin 's' must be finite"):
+    with pytest.raises(sc.StateError, match="the spin 's' must be finite"):
         stepper.integrate({"q": 0.1, "s": [0, np.nan, 0]}, {"q": 0}, h=0.1, steps=1)

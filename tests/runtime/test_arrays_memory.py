@@ -10,7 +10,6 @@ import pytest
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.errors import StateError
 from scvi_codegen.runtime.run.memory import RANGES
 from scvi_codegen.runtime.run.saving import DIGEST, MAGIC, sealed
 
@@ -85,7 +84,7 @@ class TestWhatACallerChangesLater:
 
     @pytest.mark.parametrize("table", [[[0, 1], [1]], [[0, [1]], [1, 2]], [[0, 2**70], [1, 2]], "ab"])
     def test_table_that_is_not_an_array_is_named(self, chain: Any, table: Any) -> None:
-        with pytest.raises(StateError, match="the table 'bonds'"):
+        with pytest.raises(sc.StateError, match="the table 'bonds'"):
             start(chain, tables={"bonds": table})
 
 
@@ -109,7 +108,7 @@ class TestPickles:
     def test_input_that_is_not_set_remains_not_set(self, chain: Any) -> None:
         run = start(chain, parameters={"k": K})
         for other in (copy.copy(run), chain.from_checkpoint(run.checkpoint())):
-            with pytest.raises(StateError, match="the input 'F' is not set"):
+            with pytest.raises(sc.StateError, match="the input 'F' is not set"):
                 other.advance(1)
 
     def test_trajectory_retains_its_dense_output(self, chain: Any) -> None:
@@ -146,7 +145,7 @@ class TestDamage:
         if least <= value <= most:
             chain.from_checkpoint(put_together(header, bytes(fields)), t_end=2.0).advance(3)
             return
-        with pytest.raises(StateError, match=name):
+        with pytest.raises(sc.StateError, match=name):
             chain.from_checkpoint(put_together(header, bytes(fields)), t_end=2.0)
 
     @pytest.mark.parametrize("which", ["chain", "pendulums"])
@@ -176,12 +175,12 @@ class TestDamage:
             try:
                 other = stepper.from_checkpoint(put_together(*each))
                 other.advance(2)
-            except (StateError, sc.StepFailedError):
+            except (sc.StateError, sc.StepFailedError):
                 refused += 1
         assert refused > 100
 
     def test_run_of_another_integrator_is_rejected(self, chain: Any, pendulums: Any) -> None:
-        with pytest.raises(StateError, match="not of 'pendulums"):
+        with pytest.raises(sc.StateError, match="not of 'pendulums"):
             pendulums.from_checkpoint(start(chain).checkpoint())
 
     def test_random_bytes_are_rejected(self, chain: Any) -> None:
@@ -191,18 +190,18 @@ class TestDamage:
             spoiled = bytearray(whole)
             for place in random.integers(0, len(whole), 3):
                 spoiled[place] ^= int(random.integers(1, 256))
-            with pytest.raises(StateError, match="checksum"):
+            with pytest.raises(sc.StateError, match="checksum"):
                 chain.from_checkpoint(bytes(spoiled))
         for spoiled in (b"", b"x", whole[:-1], whole[:100], np.zeros(3).tobytes()):
-            with pytest.raises(StateError, match="invalid saved run"):
+            with pytest.raises(sc.StateError, match="invalid saved run"):
                 chain.from_checkpoint(spoiled)
-        with pytest.raises(StateError, match="must be bytes, not int"):
+        with pytest.raises(sc.StateError, match="must be bytes, not int"):
             chain.from_checkpoint(3)
 
     def test_bytes_of_another_step_type_are_rejected(self, chain: Any) -> None:
-        with pytest.raises(StateError, match="give t_end"):
+        with pytest.raises(sc.StateError, match="give t_end"):
             chain.from_checkpoint(start(chain, h=None, t_end=2.0).checkpoint())
-        with pytest.raises(StateError, match="omit t_end"):
+        with pytest.raises(sc.StateError, match="omit t_end"):
             chain.from_checkpoint(start(chain).checkpoint(), t_end=2.0)
 
 
@@ -215,6 +214,6 @@ def test_invalid_step_size_levels_are_rejected_also_for_scalar_runs() -> None:
         for value in (-(2**63), 2**63 - 1, 2**20):
             before = getattr(run._memory, name)
             setattr(run._memory, name, value)
-            with pytest.raises(StateError, match=f"invalid saved run.*{name}"):
+            with pytest.raises(sc.StateError, match=f"invalid saved run.*{name}"):
                 stepper.from_checkpoint(run.checkpoint(), t_end=5.0, tolerance=1e-6)
             setattr(run._memory, name, before)

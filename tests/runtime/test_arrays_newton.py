@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.errors import MethodError, StepFailedError
 
 RANDOM = np.random.default_rng(1)
 ROUNDING = 2.0**-52
@@ -43,7 +42,7 @@ def test_stiff_bonds_at_rest_do_not_limit_the_step_size():
     data = {"tables": {"bonds": chain}, "parameters": {"k": k}}
     newton = sc.compile_stepper(molecules(), "svi:4", solver="newton")
     iterations = sc.compile_stepper(molecules(), "svi:4")
-    with pytest.raises(StepFailedError, match="solver='newton'"):
+    with pytest.raises(sc.StepFailedError, match="solver='newton'"):
         iterations.integrate(start, velocity=velocity, h=0.05, steps=1, **data)
     run = newton.integrate(start, velocity=velocity, h=0.05, steps=20, **data)
     exact = iterations.integrate(start, velocity=velocity, h=0.001, steps=1000, save_every=1000, **data)
@@ -61,7 +60,7 @@ def test_step_without_convergence_fails():
     )
     stepper, q = sc.compile_stepper(system, "svi:4", solver="newton"), RANDOM.normal(size=800)
     run = stepper.start(q, h=1.0)
-    with pytest.raises(StepFailedError, match="GMRES"):
+    with pytest.raises(sc.StepFailedError, match="GMRES"):
         run.advance(1)
     assert (run.q["q"] == q).all()
 
@@ -74,5 +73,5 @@ def test_newton_of_explicit_methods_is_compiled_with_the_sizes_of_the_call():
 
 
 def test_unknown_solvers_are_rejected():
-    with pytest.raises(MethodError, match="use 'fixed-point' or 'newton'"):
+    with pytest.raises(sc.MethodError, match="use 'fixed-point' or 'newton'"):
         sc.compile_stepper(field(1.0), "svi:4", solver="krylov")

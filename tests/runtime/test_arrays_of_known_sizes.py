@@ -6,7 +6,6 @@ from samples import QUICK_FLAGS
 from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
-from scvi_codegen.errors import StateError
 
 LAGRANGIAN = (
     "M*x_dot**2/2 + sum(i in {N}, m[i]*q_dot[i]**2/2) - k*x**2/2"
@@ -88,7 +87,7 @@ def test_the_only_array_needs_no_name():
     ],
 )
 def test_invalid_states_are_rejected(known, q, message):
-    with pytest.raises(StateError, match=message):
+    with pytest.raises(sc.StateError, match=message):
         known.integrate(q, np.zeros(6), h=0.1, steps=1)
 
 

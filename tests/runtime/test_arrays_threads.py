@@ -16,9 +16,7 @@ import pytest
 from programs import needs
 
 import scvi_codegen as sc
-from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.lowering.program import lower
-from scvi_codegen.methods import as_method
 from scvi_codegen.native.compilers import find_compiler
 from scvi_codegen.pipeline import Sources
 from scvi_codegen.rendering.kernels.loop_nests import Sharing, sharing_of
@@ -139,7 +137,7 @@ def bits(run: Any) -> tuple[Any, ...]:
 @pytest.mark.parametrize("name", CASES)
 def test_terms_are_distributed_over_threads(name: str) -> None:
     system = system_of(CASES[name])
-    program = lower(system, as_method("svi:2"), prefix="shared")
+    program = lower(system, sc.as_method("svi:2"), prefix="shared")
     assert {sharing_of(rolled) for rolled in program.loops.forces} == {CASES[name].shared}
 
 
@@ -260,7 +258,7 @@ def test_failed_step_fails_in_all_threads() -> None:
 def test_invalid_thread_counts_are_rejected() -> None:
     stepper, q = stepper_of("ring", "svi:4"), start_of("ring")
     for threads in (0, -1, 65):
-        with pytest.raises(StateError, match="threads"):
+        with pytest.raises(sc.StateError, match="threads"):
             stepper.start(q, h=0.1, threads=threads)
     rods = sc.LagrangianSystem.from_text(
         name="rods",
@@ -268,7 +266,7 @@ def test_invalid_thread_counts_are_rejected() -> None:
         lagrangian="sum(i in N, sum(a in 2, r_dot[i, a]**2)/2)",
         constraints=["sum(a in 2, r[i, a]**2) = 1 for i in N"],
     )
-    with pytest.raises(MethodError, match="the step uses one"):
+    with pytest.raises(sc.MethodError, match="the step uses one"):
         sc.compile_stepper(rods, "stoermer-verlet").start(np.array([[1.0, 0.0]]), h=0.1, threads=2)
 
 
@@ -302,7 +300,7 @@ int main(void)
 def windows(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], list[list[int]]]:
     """Return rounds and windows of term groups of several sizes, as computed in C."""
     folder = tmp_path_factory.mktemp("windows")
-    source, _ = Sources(system_of(CASES["ring"]), as_method("stoermer-verlet"), prefix="shared").integrator()
+    source, _ = Sources(system_of(CASES["ring"]), sc.as_method("stoermer-verlet"), prefix="shared").integrator()
     for path, text in {**source.files, "main.c": WINDOWS}.items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_text(text)
@@ -387,7 +385,7 @@ static int create(pthread_t *thread, const pthread_attr_t *attributes, void *(*g
 
 def program(name: str, method: str, solver: str, folder: Path, **numbers: int) -> None:
     """Write the source of a run with threads, and the C program that makes it."""
-    source, interface = Sources(system_of(CASES[name]), as_method(method), solver, "shared").integrator()
+    source, interface = Sources(system_of(CASES[name]), sc.as_method(method), solver, "shared").integrator()
     for path, text in source.files.items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_text(text)

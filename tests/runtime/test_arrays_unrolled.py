@@ -16,7 +16,6 @@ from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen import HamiltonianSystem, LagrangianSystem, StateError
 
 RATTLE = "svi:1:gauss-lobatto:2"
 KINETIC = "sum(i in N, q_dot[i]**2/2)"
@@ -73,7 +72,7 @@ def lagrangian(
     own = {name: more.pop(name) for name in ("h", "events", "inputs") if name in more}
     more |= {"inputs": ["F"]} if "inputs" in own else {}
     names = coordinates.split("; ")
-    system = LagrangianSystem.from_text("case", names, formula, parameters=dict(declared), tables=tables, **more)
+    system = sc.LagrangianSystem.from_text("case", names, formula, parameters=dict(declared), tables=tables, **more)
     data = ({"tables": rows} if rows else {}) | ({"parameters": values} if values else {})
     return Motion(system, q, sizes, velocity, data=data, **own)
 
@@ -215,7 +214,7 @@ MOTIONS = {
     ),
     "rods": lagrangian("r[N, 2]", WEIGHT, HANGING, SIZES, **CHAIN),
     "waves": Motion(
-        HamiltonianSystem.from_text(
+        sc.HamiltonianSystem.from_text(
             name="waves",
             coordinates=["q[N]"],
             momenta=["p[N]"],
@@ -230,7 +229,7 @@ MOTIONS = {
         data={"tables": {"bonds": [[0, 1], [1, 2], [2, 0], [2, 3]]}},
     ),
     "driven waves": Motion(
-        HamiltonianSystem.from_text(
+        sc.HamiltonianSystem.from_text(
             name="driven waves",
             coordinates=["q[N]"],
             parameters={"c": 0.3},
@@ -398,7 +397,7 @@ def test_inputs_are_set_between_steps():
             run.set_inputs(F=force)
             run.advance(5)
     assert_close(np.asarray(runs[0].q), runs[1].q, 1e-14)
-    with pytest.raises(StateError, match="'G' is not an input"):
+    with pytest.raises(sc.StateError, match="'G' is not an input"):
         runs[0].set_inputs(G=1.0)
 
 
@@ -427,9 +426,9 @@ def test_velocities_of_hamiltonians_are_unavailable():
     motion = MOTIONS["waves"]
     stepper = motion.stepper("gauss:3")
     assert stepper.momentum_map_names == ("norm of q",)
-    with pytest.raises(StateError, match="give momenta p"):
+    with pytest.raises(sc.StateError, match="give momenta p"):
         stepper.start(motion.q, velocity=motion.p, h=0.05, **motion.data)
     run = stepper.start(**motion.start(), h=0.05)
     for each in (run, stepper.integrate(**motion.start(), h=0.05, steps=1)):
-        with pytest.raises(StateError, match="velocities are unavailable"):
+        with pytest.raises(sc.StateError, match="velocities are unavailable"):
             each.velocity  # noqa: B018  (the access is the point)

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.errors import StepFailedError
 from scvi_codegen.lowering.program import lower
-from scvi_codegen.methods import as_method
 from scvi_codegen.runtime.arrays import envelope
 
 RANDOM = np.random.default_rng(1)
@@ -122,7 +120,7 @@ def test_preconditioned_steps_equal_those_of_the_unrolled_system(name, k):
 def test_corrections_are_accurate_in_badly_scaled_systems(name):
     """The size has a factor that is not transformed, and the diagonal is a poor preconditioner for long waves."""
     run = stepper_of(name).start(smooth(503), h=0.5, parameters={"k": 1e5})
-    with pytest.raises(StepFailedError, match="GMRES"):
+    with pytest.raises(sc.StepFailedError, match="GMRES"):
         run.advance(1)
 
 
@@ -169,7 +167,7 @@ def test_systems_with_a_circulant_preconditioner(term, reach):
         tables=["bonds[B, 2]"],
         lagrangian=f"sum(i in N, sum(a in 2, u_dot[i, a]**2/2)) - {term}",
     )
-    assert lower(system, as_method("svi:2"), prefix="some", solver="newton").loops.reach == reach
+    assert lower(system, sc.as_method("svi:2"), prefix="some", solver="newton").loops.reach == reach
 
 
 @pytest.mark.parametrize(("coordinates", "reach"), [(["u[N]"], 1), (["u[N]", "s"], 0), (["u[N]", "r[3]"], 0)])
@@ -182,4 +180,4 @@ def test_circulant_preconditioner_requires_lattices_only(coordinates, reach):
             reach
         ],
     )
-    assert lower(system, as_method("svi:2"), prefix="some", solver="newton").loops.reach == reach
+    assert lower(system, sc.as_method("svi:2"), prefix="some", solver="newton").loops.reach == reach

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from counting import TooMuchWorkError, at_most
 
-from scvi_codegen import SVI, LagrangianSystem, StateError, StepFailedError, compile_stepper, problem
+import scvi_codegen as sc
 from scvi_codegen.runtime.run import chunks, run_loop
 from scvi_codegen.runtime.run import run as runs
 
@@ -19,7 +19,7 @@ FIXED, ADAPTIVE = {"h": 0.05, "steps": 1}, {"t_end": 0.05, "tolerance": 1e-10}
 
 @pytest.fixture(scope="module")
 def stepper():
-    return compile_stepper(problem("kepler").system, SVI(8))
+    return sc.compile_stepper(sc.problem("kepler").system, sc.SVI(8))
 
 
 @pytest.mark.parametrize("convert", [list, tuple, np.array])
@@ -52,7 +52,7 @@ def test_lists_and_arrays_start_bitwise_equal_runs(stepper, values):
 @pytest.mark.parametrize("q", [[0.4], [0.4, 0.0, 1.0], ["0.4", 1.0], [0.4, np.inf], [10**400, 0.0], [[0.4, 1]]])
 def test_invalid_lists_raise_after_valid_ones(stepper, q):
     saved = numbers(stepper.integrate([0.4, 0.0], [0.0, 2.0], **FIXED))
-    with pytest.raises(StateError):
+    with pytest.raises(sc.StateError):
         stepper.integrate(q, [0.0, 2.0], **FIXED)
     assert saved == numbers(stepper.integrate([0.4, 0.0], [0.0, 2.0], **FIXED))
 
@@ -66,12 +66,12 @@ def test_memory_of_earlier_calls_does_not_matter(stepper, plan):
     first = stepper.integrate(Q, P, **plan)
     saved = numbers(first)
     stepper.integrate(2.0 * Q, P, **plan, t=3.0 if "h" in plan else 1.0, parameters={"mu": 1.5})
-    with pytest.raises(StepFailedError):
+    with pytest.raises(sc.StepFailedError):
         stepper.integrate(Q, 0.0 * P, **({"h": 0.05, "steps": 400} if "h" in plan else {"t_end": 9.0}))
-    with pytest.raises(StateError):
+    with pytest.raises(sc.StateError):
         stepper.integrate([np.nan, 0.0], P, **plan)
     assert numbers(first) == saved == numbers(stepper.integrate(Q, P, **plan))
-    assert saved == numbers(compile_stepper(problem("kepler").system, SVI(8)).integrate(Q, P, **plan))
+    assert saved == numbers(sc.compile_stepper(sc.problem("kepler").system, sc.SVI(8)).integrate(Q, P, **plan))
 
 
 def test_calls_within_calls_and_from_threads_have_runs_of_their_own(stepper):
@@ -107,7 +107,7 @@ def chains():
     common = {"coordinates": ["x[N]", "y[N]"], "parameters": {"k": 0.7}, "lagrangian": kinetic}
     held = {"constraints": ["x[i]**2 + y[i]**2 - 1 for i in N"]}
     kinds = ({}, "svi:4"), (held, "stoermer-verlet")
-    return [compile_stepper(LagrangianSystem.from_text(name="chain", **common, **each), by) for each, by in kinds]
+    return [sc.compile_stepper(sc.LagrangianSystem.from_text(name="chain", **common, **each), by) for each, by in kinds]
 
 
 def test_calls_of_arrays_take_few_function_calls(chains):

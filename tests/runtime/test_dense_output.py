@@ -5,29 +5,11 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp as scipy_solve_ivp
-from scipy.interpolate import CubicHermiteSpline
 
-from scvi_codegen.advice.solve_ivp import solve_ivp
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.methods import (
-    SCVI,
-    SVI,
-    Composition,
-    ExplicitEuler,
-    Gauss,
-    RadauIIA,
-    SpectralCollocation,
-    StoermerVerlet,
-)
-from scvi_codegen.models.problems import problem
-from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.events.event import Event
+import scvi_codegen as sc
 
-METHODS = (SVI(3), SpectralCollocation(4), Composition(8), StoermerVerlet())
-MORE_METHODS = (SCVI(3), Gauss(2), RadauIIA(2), ExplicitEuler(), SVI(4, "gauss-lobatto:5"))
+METHODS = (sc.SVI(3), sc.SpectralCollocation(4), sc.Composition(8), sc.StoermerVerlet())
+MORE_METHODS = (sc.SCVI(3), sc.Gauss(2), sc.RadauIIA(2), sc.ExplicitEuler(), sc.SVI(4, "gauss-lobatto:5"))
 each_method = pytest.mark.parametrize(
     "method",
     [*METHODS, *(pytest.param(method, marks=pytest.mark.full) for method in MORE_METHODS)],
@@ -47,8 +29,8 @@ def ellipse(t: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def kepler() -> Stepper:
-    return compile_stepper(problem("kepler").system, SVI(4), flags=FLAGS)
+def kepler() -> sc.Stepper:
+    return sc.compile_stepper(sc.problem("kepler").system, sc.SVI(4), flags=FLAGS)
 
 
 # Order, continuity, ends.
@@ -56,7 +38,7 @@ def kepler() -> Stepper:
 
 @each_method
 def test_dense_output_has_the_order_of_the_method(method):
-    stepper = compile_stepper(problem("kepler").system, method, flags=FLAGS)
+    stepper = sc.compile_stepper(sc.problem("kepler").system, method, flags=FLAGS)
     counts = (40, 80) if stepper.interface.method != "euler" else (400, 800)
     between, saved = [], []
     for n in counts:
@@ -68,14 +50,6 @@ def test_dense_output_has_the_order_of_the_method(method):
     assert between[1] > 1e-13
     assert math.log2(between[0] / between[1]) == pytest.approx(expected, abs=0.6)
     assert between[1] < 1.3 * saved[1]
-
-
-def test_hermite_cubics_are_less_accurate(kepler):
-    run = kepler.integrate(**START, h=2 * math.pi / 40, steps=40)
-    velocities = [kepler.velocity(q, p) for q, p in zip(run.q, run.p, strict=True)]
-    t = np.linspace(0, run.t[-1], 501)
-    cubic = np.abs(CubicHermiteSpline(run.t, run.q, velocities)(t) - ellipse(t)).max()
-    assert cubic > 1000 * np.abs(run.at(t)[0] - ellipse(t)).max()
 
 
 @each_method
@@ -107,7 +81,7 @@ def test_dense_output_for_any_order_shape_and_save_interval(kepler):
 
 
 def test_options_of_the_run_apply_to_dense_output(kepler):
-    rough = kepler.integrate(**START, h=0.3, steps=10, options=SolverOptions(tolerance=1e-3))
+    rough = kepler.integrate(**START, h=0.3, steps=10, options=sc.SolverOptions(tolerance=1e-3))
     fine = kepler.integrate(**START, h=0.3, steps=10)
     t = 0.3 * np.arange(10) + 0.29
     assert np.abs(rough.at(t)[0] - fine.at(t)[0]).max() > 1e-10
@@ -115,12 +89,12 @@ def test_options_of_the_run_apply_to_dense_output(kepler):
 
 def test_times_outside_the_span_are_rejected(kepler):
     run = kepler.integrate(**START, h=0.1, steps=10)
-    with pytest.raises(StateError, match=r"t = 1\.5 is outside the trajectory from t = 0 to 1"):
+    with pytest.raises(sc.StateError, match=r"t = 1\.5 is outside the trajectory from t = 0 to 1"):
         run.at([0.5, 1.5])
-    with pytest.raises(StateError, match="nan"):
+    with pytest.raises(sc.StateError, match="nan"):
         run.at(math.nan)
     chosen = kepler.integrate(**START, h=0.1, steps=10, t_eval=[0.123, 0.456, 0.9])
-    with pytest.raises(StateError, match="t_eval"):
+    with pytest.raises(sc.StateError, match="t_eval"):
         chosen.at(0.5)
 
 
@@ -151,14 +125,14 @@ def test_states_at_requested_times_equal_the_dense_output(kepler, h):
 )
 def test_requested_times_are_checked(kepler, arguments, words):
     for way in ({"h": 0.1, "steps": 10}, {"t_end": 1.0}):
-        with pytest.raises(StateError, match=words):
+        with pytest.raises(sc.StateError, match=words):
             kepler.integrate(**START, **way, **arguments)
 
 
 def test_states_before_a_failure_are_available():
-    runaway = LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
-    stepper = compile_stepper(runaway, SVI(3), flags=FLAGS)
-    with pytest.raises(StepFailedError) as failure:
+    runaway = sc.LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
+    stepper = sc.compile_stepper(runaway, sc.SVI(3), flags=FLAGS)
+    with pytest.raises(sc.StepFailedError) as failure:
         stepper.integrate([1.0], [1.0], h=0.1, steps=100, t_eval=np.linspace(0, 10, 101))
     assert 5 < len(failure.value.trajectory) < 50
 
@@ -169,15 +143,15 @@ def test_states_before_a_failure_are_available():
 def test_solve_ivp_agrees_with_scipy():
     """Arguments, attributes and shapes are equal; pendulum from rest at 2, four turning points."""
     asked = np.linspace(0, 10, 33)
-    system = problem("planar-pendulum").system
-    ours = solve_ivp(
+    system = sc.problem("planar-pendulum").system
+    ours = sc.solve_ivp(
         system,
         (0, 10),
         [2.0, 0.0],
         h=0.2,
         t_eval=asked,
         dense_output=True,
-        events=["q", Event("p_q", 1)],
+        events=["q", sc.Event("p_q", 1)],
         parameters={"g": 1.0, "m": 1.0, "l": 1.0},
     )
 
@@ -212,18 +186,18 @@ def test_solve_ivp_agrees_with_scipy():
 
 
 def test_solve_ivp_ends_at_a_terminal_event(kepler):
-    half = solve_ivp(kepler, (0, 100), [*START["q"], *START["p"]], h=0.1, events=Event("q2", -1, terminal=True))
+    half = sc.solve_ivp(kepler, (0, 100), [*START["q"], *START["p"]], h=0.1, events=sc.Event("q2", -1, terminal=True))
     assert (half.status, half.success) == (1, True)
     assert "'q2'" in half.message
     assert half.t[-1] == pytest.approx(math.pi, abs=1e-8)
     assert half.t_events[0].tolist() == [half.t[-1]]
     assert np.array_equal(half.y[:, -1], half.y_events[0][0])
-    chosen = solve_ivp(
+    chosen = sc.solve_ivp(
         kepler,
         (0, 100),
         [*START["q"], *START["p"]],
         h=0.1,
-        events=Event("q2", -1, terminal=True),
+        events=sc.Event("q2", -1, terminal=True),
         t_eval=np.arange(0, 100, 0.5),
         dense_output=True,
     )
@@ -231,16 +205,9 @@ def test_solve_ivp_ends_at_a_terminal_event(kepler):
     assert np.array_equal(chosen.sol(half.t[-1]), half.y[:, -1])
 
 
-def test_solve_ivp_runs_backward_and_ends_exactly_at_the_span(kepler):
-    back = solve_ivp(kepler, (1.0, -2.0), [*START["q"], *START["p"]], h=0.07, dense_output=True)
-    assert back.t[0] == 1.0
-    assert back.t[-1] == pytest.approx(-2.0, abs=1e-15)
-    assert np.abs(back.sol(-0.5)[:2] - ellipse(np.array([-1.5]))[0]).max() < 1e-6
-
-
 def test_solve_ivp_reports_a_failed_step():
-    runaway = LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
-    failed = solve_ivp(compile_stepper(runaway, SVI(3), flags=FLAGS), (0, 10), [1.0, 1.0], h=0.1)
+    runaway = sc.LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
+    failed = sc.solve_ivp(sc.compile_stepper(runaway, sc.SVI(3), flags=FLAGS), (0, 10), [1.0, 1.0], h=0.1)
     assert (failed.status, failed.success) == (-1, False)
     assert "smaller step" in failed.message
     assert failed.y.shape == (2, len(failed.t))
@@ -248,7 +215,7 @@ def test_solve_ivp_reports_a_failed_step():
 
 def test_solve_ivp_uses_adaptive_steps_for_a_tolerance():
     y0 = [*START["q"], *START["p"]]
-    motion = solve_ivp(problem("kepler").system, (0, 20), y0, tolerance=1e-7, method=SVI(4))
+    motion = sc.solve_ivp(sc.problem("kepler").system, (0, 20), y0, tolerance=1e-7, method=sc.SVI(4))
     error = np.abs(motion.y[:2, -1] - ellipse(motion.t[-1:])[0]).max()
     assert 1e-11 < error < 1e-7
 
@@ -260,11 +227,11 @@ def test_solve_ivp_uses_adaptive_steps_for_a_tolerance():
         ({"t_span": (0,)}, "two times"),
         ({"y0": [1.0, 2.0, 3.0]}, "positions and then momenta"),
         ({"y0": [1.0, 2.0]}, "shape"),
-        ({"method": SVI(3)}, "need a system, not a compiled stepper"),
+        ({"method": sc.SVI(3)}, "need a system, not a compiled stepper"),
         ({"h": math.inf}, "inf"),
     ],
 )
 def test_arguments_of_solve_ivp_are_checked(kepler, arguments, words):
     usual = {"t_span": (0, 1), "y0": [*START["q"], *START["p"]], "h": 0.1}
-    with pytest.raises(StateError, match=words):
-        solve_ivp(kepler, **(usual | arguments))
+    with pytest.raises(sc.StateError, match=words):
+        sc.solve_ivp(kepler, **(usual | arguments))

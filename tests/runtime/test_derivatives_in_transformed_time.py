@@ -7,20 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS
 
-from scvi_codegen import (
-    SVI,
-    Event,
-    Gauss,
-    HamiltonianSystem,
-    LagrangianSystem,
-    LobattoIIIA,
-    MethodError,
-    StateError,
-    compile_stepper,
-    hamiltonian_of,
-    problem,
-    reparametrise,
-)
+import scvi_codegen as sc
 from scvi_codegen.exact.solution import exact_motion
 from scvi_codegen.exact.step import compiled_equations
 from scvi_codegen.formulas.expressions import Tape
@@ -28,15 +15,15 @@ from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
 from scvi_codegen.tables.precision import mp
 
-KEPLER = problem("kepler").system
-PENDULA = problem("double-pendulum").system
+KEPLER = sc.problem("kepler").system
+PENDULA = sc.problem("double-pendulum").system
 Q, P, H, T0 = np.array([0.5, 0.1]), np.array([-0.2, 1.7]), 0.15, 0.4
 FORMS = {
-    "L": (reparametrise(KEPLER, "frequency"), SVI(3)),
-    "L, other points": (reparametrise(KEPLER, "distance"), SVI(2, "gauss-lobatto:4")),
-    "K": (reparametrise(hamiltonian_of(KEPLER), "frequency"), LobattoIIIA(3)),
-    "K, momenta": (reparametrise(hamiltonian_of(KEPLER), "arclength"), Gauss(2)),
-    "pendula": (reparametrise(PENDULA, "1/(2 + cos(theta1 - theta2))"), SVI(2)),
+    "L": (sc.reparametrise(KEPLER, "frequency"), sc.SVI(3)),
+    "L, other points": (sc.reparametrise(KEPLER, "distance"), sc.SVI(2, "gauss-lobatto:4")),
+    "K": (sc.reparametrise(sc.hamiltonian_of(KEPLER), "frequency"), sc.LobattoIIIA(3)),
+    "K, momenta": (sc.reparametrise(sc.hamiltonian_of(KEPLER), "arclength"), sc.Gauss(2)),
+    "pendula": (sc.reparametrise(PENDULA, "1/(2 + cos(theta1 - theta2))"), sc.SVI(2)),
 }
 EXACT = 1e-13
 WIDTH = mp.mpf(10) ** -15
@@ -45,7 +32,7 @@ WIDTH = mp.mpf(10) ** -15
 @cache
 def stepper(form):
     system, method = FORMS[form]
-    return compile_stepper(system, method, flags=QUICK_FLAGS)
+    return sc.compile_stepper(system, method, flags=QUICK_FLAGS)
 
 
 class Digits:
@@ -173,7 +160,7 @@ WAYS = {
     "checkpoints": {"steps": 12, "save_every": 4},
     "to a time": {"t_end": 2.7},
     "backward": {"t_end": -1.5, "h": -H},
-    "to an event": {"t_end": 9.0, "events": Event(KEPLER.coordinates[1].name, terminal=1)},
+    "to an event": {"t_end": 9.0, "events": sc.Event(KEPLER.coordinates[1].name, terminal=1)},
 }
 
 
@@ -212,23 +199,27 @@ def test_run_that_ends_at_a_step_ends_at_its_time():
 
 def test_derivatives_at_an_end_time_agree_with_fixed_steps_of_time():
     """The flow of the motion itself, to the error of both: a period later all but the phase returns."""
-    period, made = 2 * np.pi, compile_stepper(reparametrise(KEPLER, "distance"), SVI(8), flags=QUICK_FLAGS)
+    period, made = 2 * np.pi, sc.compile_stepper(sc.reparametrise(KEPLER, "distance"), sc.SVI(8), flags=QUICK_FLAGS)
     q, p = [0.2, 0.0], [0.0, 3.0]
     ended = made.integrate(q, p, h=0.1, t_end=period).tangent()[-1]
-    own = compile_stepper(KEPLER, SVI(8), flags=QUICK_FLAGS).integrate(q, p, h=period / 512, steps=512).tangent()[-1]
+    own = (
+        sc.compile_stepper(KEPLER, sc.SVI(8), flags=QUICK_FLAGS)
+        .integrate(q, p, h=period / 512, steps=512)
+        .tangent()[-1]
+    )
     assert_allclose(ended, own, rtol=0, atol=1e-8 * np.abs(own).max())
 
 
 def test_derivatives_of_a_rod_in_transformed_time():
     """With a constraint, compare with the transpose and with differences of steps."""
-    rod = LagrangianSystem.from_text(
+    rod = sc.LagrangianSystem.from_text(
         name="rod",
         coordinates=["x", "y"],
         lagrangian="(x_dot**2 + y_dot**2)/2 - g*y",
         parameters={"g": 1.0},
         constraints=["x**2 + y**2 - 1"],
     )
-    made = compile_stepper(reparametrise(rod, "1/(3 + y)"), SVI(2, "gauss-lobatto:3"), flags=QUICK_FLAGS)
+    made = sc.compile_stepper(sc.reparametrise(rod, "1/(3 + y)"), sc.SVI(2, "gauss-lobatto:3"), flags=QUICK_FLAGS)
     q, p = made.project([0.6, -0.8], [0.8, 0.6])
     starts, size = Starts.chain(q, p, np.array([0.0]), np.array([0.3])), made._input_size
     values, (forward, back) = made._parameters_at(q, p), np.zeros((2, 2, size, size))
@@ -243,21 +234,21 @@ def test_derivatives_of_a_rod_in_transformed_time():
 def test_unsupported_derivatives_in_transformed_time():
     made = stepper("L")
     run = made.integrate(Q, P, h=H, steps=3)
-    with pytest.raises(MethodError, match="hessian_product is not available in transformed time"):
+    with pytest.raises(sc.MethodError, match="hessian_product is not available in transformed time"):
         run.hessian_product(np.ones((4, 4)), np.eye(4))
-    with pytest.raises(MethodError, match="chaos_indicators is not available in transformed time"):
+    with pytest.raises(sc.MethodError, match="chaos_indicators is not available in transformed time"):
         run.lyapunov_exponents()
-    with pytest.raises(StateError, match=r"shape \(4, 4\), or \(4, 5\) with those by t, or"):
+    with pytest.raises(sc.StateError, match=r"shape \(4, 4\), or \(4, 5\) with those by t, or"):
         run.pullback(np.zeros((4, 6)))
-    with pytest.raises(StateError, match="save all states"):
+    with pytest.raises(sc.StateError, match="save all states"):
         made.integrate(Q, P, h=H, t_end=2.7, save_every=4).tangent()
 
 
 def test_hamiltonian_linear_in_momenta_has_an_energy_surface():
-    vortex = HamiltonianSystem.from_text(
+    vortex = sc.HamiltonianSystem.from_text(
         name="turn", coordinates=["q"], momenta=["p"], hamiltonian="w*(q**2 + p**2)/2", parameters={"w": 1.5}
     )
-    made = compile_stepper(reparametrise(vortex, "1/(1 + q**2)"), Gauss(2), flags=QUICK_FLAGS)
+    made = sc.compile_stepper(sc.reparametrise(vortex, "1/(1 + q**2)"), sc.Gauss(2), flags=QUICK_FLAGS)
     assert_allclose(
         made._energy_gradient(np.array([0.6]), np.array([0.3]), made.defaults), [0.9, 0.45, 0.225, 0.0, 0.0, 0.0]
     )

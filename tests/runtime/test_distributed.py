@@ -15,19 +15,15 @@ import numpy as np
 import pytest
 from samples import QUICK_FLAGS, pushed_pendulum
 
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import StateError
-from scvi_codegen.methods import SVI
-from scvi_codegen.models.problems import problem
-from scvi_codegen.runtime.core.stepper import Stepper
+import scvi_codegen as sc
 from scvi_codegen.runtime.distributed import _slices, _stepper, integrate_ensemble
 
 COUNT = 70
 
 
 @pytest.fixture(scope="module")
-def kepler() -> Stepper:
-    return compile_stepper(problem("kepler").system, SVI(5), flags=QUICK_FLAGS)
+def kepler() -> sc.Stepper:
+    return sc.compile_stepper(sc.problem("kepler").system, sc.SVI(5), flags=QUICK_FLAGS)
 
 
 def states() -> tuple[np.ndarray, np.ndarray]:
@@ -61,7 +57,7 @@ def test_parts_are_multiples_of_the_register_width():
 
 
 class TestCluster:
-    def test_default_is_the_current_process(self, distributed: Any, kepler: Stepper):
+    def test_default_is_the_current_process(self, distributed: Any, kepler: sc.Stepper):
         q, p = states()
         mu = np.linspace(0.9, 1.1, COUNT)
         arguments = {"h": 0.05, "steps": 100, "save_every": 30, "t": 1.0, "parameters": {"mu": mu}}
@@ -75,7 +71,7 @@ class TestCluster:
 
     @pytest.mark.parametrize("way", [{"h": 0.1, "t_end": 2.0}, {"t_end": np.linspace(1.0, 2.0, COUNT)}])
     def test_ensembles_with_inputs_are_distributed(self, distributed: Any, way: dict[str, Any]):
-        stepper = compile_stepper(pushed_pendulum(), SVI(3))
+        stepper = sc.compile_stepper(pushed_pendulum(), sc.SVI(3))
         knots, values = np.array([0.0, 0.7, 2.0]), np.linspace(-1.0, 1.0, 3 * COUNT).reshape(COUNT, 3)
         given = {"inputs": {"u": (knots, values), "w": (knots, [0.0, 0.1, 0.0])}, **way}
         q = np.linspace(0.1, 1.0, COUNT)[:, np.newaxis]
@@ -86,13 +82,13 @@ class TestCluster:
             assert np.array_equal(found, expected, equal_nan=True)
         assert np.array_equal(result.energy(), here.energy(), equal_nan=True)
 
-    def test_invalid_arguments_are_reported_before_distribution(self, kepler: Stepper):
+    def test_invalid_arguments_are_reported_before_distribution(self, kepler: sc.Stepper):
         q, p = states()
         for faults in ({"h": 0.0}, {"steps": -1}, {"blocks": 0}, {"parameters": {"nu": 1.0}}):
-            with pytest.raises(StateError):
+            with pytest.raises(sc.StateError):
                 integrate_ensemble(kepler, q, p, **({"h": 0.1, "steps": 1} | faults))  # type: ignore[arg-type]
 
-    def test_failures_of_trajectories_are_returned(self, distributed: Any, cluster: Any, kepler: Stepper):
+    def test_failures_of_trajectories_are_returned(self, distributed: Any, cluster: Any, kepler: sc.Stepper):
         q, p = states()
         mu = np.where(np.arange(COUNT) == 5, 1e9, 1.0)  # the sixth falls into the centre
         result = integrate_ensemble(
@@ -101,7 +97,7 @@ class TestCluster:
         assert np.flatnonzero(~result.ok).tolist() == [5]
         assert result.steps[5] < 50
 
-    def test_killed_worker_loses_nothing(self, distributed: Any, cluster: Any, kepler: Stepper):
+    def test_killed_worker_loses_nothing(self, distributed: Any, cluster: Any, kepler: sc.Stepper):
         q, p = states()
         arguments = {"h": 0.05, "steps": 15_000, "save_every": 5_000}
         here = kepler.integrate_ensemble(q, p, **arguments)
@@ -121,7 +117,7 @@ class TestCluster:
         assert np.array_equal(result.q, here.q)
         assert np.array_equal(result.p, here.p)
 
-    def test_worker_compiles_the_source_into_its_cache(self, distributed: Any, kepler: Stepper, tmp_path: Path):
+    def test_worker_compiles_the_source_into_its_cache(self, distributed: Any, kepler: sc.Stepper, tmp_path: Path):
         q, p = states()
         with distributed.LocalCluster(
             n_workers=1,
@@ -134,7 +130,7 @@ class TestCluster:
         assert np.array_equal(result.q, kepler.integrate_ensemble(q, p, h=0.05, steps=20).q)
         assert any(tmp_path.iterdir())
 
-    def test_no_process_remains(self, distributed: Any, kepler: Stepper):
+    def test_no_process_remains(self, distributed: Any, kepler: sc.Stepper):
         q, p = states()
         counts = []
         for _ in range(6):
@@ -144,7 +140,7 @@ class TestCluster:
         left = np.subtract(counts[-1], counts[1])  # one may be about to close
         assert max(left) < 3
 
-    def test_interrupt_cancels_remaining_parts(self, distributed: Any, cluster: Any, kepler: Stepper):
+    def test_interrupt_cancels_remaining_parts(self, distributed: Any, cluster: Any, kepler: sc.Stepper):
         def interrupt(done: int) -> None:
             raise KeyboardInterrupt
 
@@ -160,13 +156,13 @@ class TestCluster:
             assert not any(client.processing().values())
 
 
-def test_workers_compile_the_source_once(kepler: Stepper):
+def test_workers_compile_the_source_once(kepler: sc.Stepper):
     pickled = pickle.dumps(kepler)
     assert kepler.source.code.encode() in pickled
     assert _stepper(pickled) is _stepper(pickled)
 
 
-def test_missing_extra_names_what_to_install(kepler: Stepper, monkeypatch: pytest.MonkeyPatch):
+def test_missing_extra_names_what_to_install(kepler: sc.Stepper, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ImportError, match=r"pip install 'scvi-codegen\[distributed\]'"):
         integrate_ensemble(kepler, *states(), h=0.1, steps=1)

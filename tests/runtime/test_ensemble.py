@@ -22,20 +22,13 @@ from numpy.testing import assert_allclose
 from samples import pushed_pendulum, sample_named, stepper_for
 from scipy.interpolate import CubicSpline
 
+import scvi_codegen as sc
 from benchmarks.cases.robots import chain
 from scvi_codegen.cli import main
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import ModelFileError, StateError, StepFailedError
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.methods import SCVI, SVI, Gauss, Method, RadauIIA, StoermerVerlet
-from scvi_codegen.models.model import Model
+from scvi_codegen.methods import Method
 from scvi_codegen.models.model_files.ensemble_file import load_ensemble
-from scvi_codegen.models.problems import problem
-from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.lanes import LaneBlock
-from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 
 KINDS = {
     "separable": "kepler",
@@ -45,7 +38,7 @@ KINDS = {
     "not quadratic": "relativistic-particle",
     "magnetic": "charged-particle",
 }
-METHODS = [SVI(5), Gauss(3), RadauIIA(2), StoermerVerlet(), SCVI(3)]
+METHODS = [sc.SVI(5), sc.Gauss(3), sc.RadauIIA(2), sc.StoermerVerlet(), sc.SCVI(3)]
 KNOTS = np.array([0.0, 0.37, 0.9, 1.41, 2.05, 2.6])
 VALUES = np.array([0.0, 1.2, -0.7, 0.4, 1.9, -1.0])
 COUNT = 11
@@ -57,9 +50,9 @@ ECCENTRICITIES = np.array([0.0, 0.3, 0.6, 0.9])
 ENDS = [5.0, 10.0, 20.0, 15.0]
 
 
-def coupled_with_inputs() -> LagrangianSystem:
+def coupled_with_inputs() -> sc.LagrangianSystem:
     """Return a system with position-dependent masses, whose iterations start with velocities."""
-    return LagrangianSystem.from_text(
+    return sc.LagrangianSystem.from_text(
         name="coupled",
         coordinates=["x", "y"],
         lagrangian="(1 + x**2/4)*x_dot**2/2 + x_dot*y_dot/3 + (1 + w/5)*y_dot**2 - x**4/4 - (x - y)**2/2",
@@ -73,10 +66,10 @@ WITH_INPUTS = {"pushed pendulum": pushed_pendulum, "coupled with inputs": couple
 
 
 @cache
-def stepper_of(system: str, method: Method) -> Stepper:
+def stepper_of(system: str, method: Method) -> sc.Stepper:
     if system in WITH_INPUTS:
-        solver = "newton" if isinstance(method, SCVI) else "auto"  # which has no lanes
-        return compile_stepper(WITH_INPUTS[system](), method, solver=solver)
+        solver = "newton" if isinstance(method, sc.SCVI) else "auto"  # which has no lanes
+        return sc.compile_stepper(WITH_INPUTS[system](), method, solver=solver)
     return stepper_for("kepler" if system == "eccentric" else system, method)
 
 
@@ -86,7 +79,7 @@ def states(name: str, count: int) -> tuple[np.ndarray, np.ndarray]:
         zero, e = np.zeros(4), ECCENTRICITIES
         return np.column_stack([1 - e, zero])[:count], np.column_stack([zero, np.sqrt((1 + e) / (1 - e))])[:count]
     if name in WITH_INPUTS:
-        dimension = stepper_of(name, SVI(3)).dimension
+        dimension = stepper_of(name, sc.SVI(3)).dimension
         return tuple(np.random.default_rng(2).uniform(-1, 1, (2, count, dimension)))
     q, p = sample_named(name).state
     generator = np.random.default_rng(7)
@@ -118,7 +111,7 @@ class Case:
     arguments: dict[str, Any]
     tolerance: float = 0.0
 
-    def run(self, **more: Any) -> EnsembleTrajectory:
+    def run(self, **more: Any) -> sc.EnsembleTrajectory:
         q, p = states(self.system, self.count)
         return stepper_of(self.system, self.method).integrate_ensemble(q, p, **self.arguments, **more)
 
@@ -150,7 +143,7 @@ CASES = {
     **{
         str(count): Case(
             "kepler",
-            SVI(5),
+            sc.SVI(5),
             count,
             {"h": 0.05, "steps": 40, "save_every": 3, "parameters": {"mu": np.linspace(0.8, 1.2, count)}},
             3e-13,
@@ -159,46 +152,52 @@ CASES = {
     },
     **{
         f"backward {method.name}": Case("driven-duffing", method, 9, {"h": -0.02, "steps": 50, "t": 2.0}, 3e-13)
-        for method in (SVI(5), SCVI(3))
+        for method in (sc.SVI(5), sc.SCVI(3))
     },
     "newton": Case(
-        "harmonic-oscillator", SVI(5), 9, {"h": 0.5, "steps": 50, "save_every": 7, "parameters": {"k": STIFF}}, 1e-10
+        "harmonic-oscillator", sc.SVI(5), 9, {"h": 0.5, "steps": 50, "save_every": 7, "parameters": {"k": STIFF}}, 1e-10
     ),
     **{
-        f"h = {h}, {threads} threads": Case("eccentric", SVI(4), 4, {"h": h, "t_end": t_end, "threads": threads}, 1e-15)
+        f"h = {h}, {threads} threads": Case(
+            "eccentric", sc.SVI(4), 4, {"h": h, "t_end": t_end, "threads": threads}, 1e-15
+        )
         for h, t_end in ((0.03, 0.1), (-0.03, -0.1), (0.25, 0.1))
         for threads in (1, 2)
     },
-    "adaptive": Case("eccentric", SVI(4), 4, ADAPTIVE),
-    "adaptive in threads": Case("eccentric", SVI(4), 4, ADAPTIVE | {"save_every": 7, "threads": 3}),
-    "at times": Case("eccentric", SVI(4), 4, ADAPTIVE | {"t_eval": np.linspace(0.0, 20.0, 9)}),
+    "adaptive": Case("eccentric", sc.SVI(4), 4, ADAPTIVE),
+    "adaptive in threads": Case("eccentric", sc.SVI(4), 4, ADAPTIVE | {"save_every": 7, "threads": 3}),
+    "at times": Case("eccentric", sc.SVI(4), 4, ADAPTIVE | {"t_eval": np.linspace(0.0, 20.0, 9)}),
     "adaptive backward": Case(
-        "eccentric", SVI(4), 2, {"t_end": -3.0, "tolerance": 1e-10, "parameters": {"mu": [1.0, 1.2]}}
+        "eccentric", sc.SVI(4), 2, {"t_end": -3.0, "tolerance": 1e-10, "parameters": {"mu": [1.0, 1.2]}}
     ),
     **{
         f"{name} constants": Case(
-            "pushed pendulum", SVI(2), 3, {"inputs": {"u": np.array([0.3, -1.2, 0.3]), "w": 0.5}, **plan}, tolerance
+            "pushed pendulum", sc.SVI(2), 3, {"inputs": {"u": np.array([0.3, -1.2, 0.3]), "w": 0.5}, **plan}, tolerance
         )
         for name, plan, tolerance in (("fixed", {"h": 0.1, "steps": 7}, 1e-14), ("adaptive", {"t_end": 0.7}, 1e-14))
     },
     "inputs": Case(
-        "coupled with inputs", SVI(3), COUNT, {"inputs": INPUTS, "parameters": DAMPING, "h": 0.05, "t_end": 2.3}, 2e-14
+        "coupled with inputs",
+        sc.SVI(3),
+        COUNT,
+        {"inputs": INPUTS, "parameters": DAMPING, "h": 0.05, "t_end": 2.3},
+        2e-14,
     ),
     "inputs without lanes": Case(
         "pushed pendulum",
-        SCVI(2),
+        sc.SCVI(2),
         COUNT,
         {"inputs": INPUTS, "parameters": DAMPING, "h": 0.02, "t_end": 2.3, "save_every": 4},
     ),
     "adaptive inputs": Case(
         "pushed pendulum",
-        SVI(4),
+        sc.SVI(4),
         COUNT,
         {"inputs": CUBIC, "parameters": DAMPING, "t_end": np.linspace(0.2, 2.5, COUNT)},
     ),
     "adaptive inputs backward": Case(
         "pushed pendulum",
-        SVI(4),
+        sc.SVI(4),
         COUNT,
         {"inputs": CUBIC, "parameters": DAMPING, "t": 2.5, "t_end": 0.0, "tolerance": 1e-6, "save_every": 5},
     ),
@@ -223,7 +222,7 @@ def test_systems_and_methods_equal_single_runs(kind: str, method: Method) -> Non
 @pytest.mark.sampled(3)
 @pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
 @pytest.mark.parametrize("kind", ["constant", "linear", "cubic"])
-@pytest.mark.parametrize("method", [SVI(3), StoermerVerlet(), Gauss(2)], ids=lambda method: method.name)
+@pytest.mark.parametrize("method", [sc.SVI(3), sc.StoermerVerlet(), sc.Gauss(2)], ids=lambda method: method.name)
 def test_trajectories_with_inputs_equal_single_runs(method: Method, kind: str) -> None:
     assert stepper_of("pushed pendulum", method).ensemble is not None
     common = {"inputs": {"u": (KNOTS, OWN_VALUES, kind), "w": W}, "parameters": DAMPING}
@@ -232,14 +231,14 @@ def test_trajectories_with_inputs_equal_single_runs(method: Method, kind: str) -
 
 
 def test_iterations_of_coupled_systems_start_with_velocities() -> None:
-    stepper = stepper_of("coupled with inputs", SVI(3))
+    stepper = stepper_of("coupled with inputs", sc.SVI(3))
     assert stepper.ensemble is not None
     assert "_NEEDS_VELOCITIES = 1" in stepper.ensemble.header
-    assert stepper_of("pushed pendulum", SCVI(2)).ensemble is None
+    assert stepper_of("pushed pendulum", sc.SCVI(2)).ensemble is None
 
 
 def test_constant_inputs_are_parameters() -> None:
-    stepper, start = stepper_of("pushed pendulum", SVI(3)), ([0.2], [0.1])
+    stepper, start = stepper_of("pushed pendulum", sc.SVI(3)), ([0.2], [0.1])
     for plan in ({"h": 0.1, "steps": 7}, {"t_end": 0.7}):
         by_input = stepper.integrate(*start, inputs={"u": -1.2, "w": 0.5}, parameters={"c": 0.1}, **plan)
         by_name = stepper.integrate(*start, parameters={"c": 0.1, "u_0": -1.2, "w_0": 0.5}, **plan)
@@ -247,7 +246,7 @@ def test_constant_inputs_are_parameters() -> None:
 
 
 def test_parameters_are_named_rows_or_one_row_per_trajectory() -> None:
-    stepper = stepper_for("planar-pendulum", SVI(5))
+    stepper = stepper_for("planar-pendulum", sc.SVI(5))
     q, p = states("planar-pendulum", 3)
     each = stepper.integrate_ensemble(q, p, h=0.1, steps=5, parameters={"g": [1.0, 2.0, 3.0], "l": 2.0})
     columns = [stepper.parameters.index(name) for name in ("g", "l")]
@@ -259,25 +258,25 @@ def test_parameters_are_named_rows_or_one_row_per_trajectory() -> None:
 
 
 def test_options_are_passed_to_the_lanes() -> None:
-    stepper = stepper_for("double-pendulum", SVI(5))
+    stepper = stepper_for("double-pendulum", sc.SVI(5))
     q, p = states("double-pendulum", 8)
-    loose = stepper.integrate_ensemble(q, p, h=0.05, steps=20, options=SolverOptions(tolerance=1e-4))
+    loose = stepper.integrate_ensemble(q, p, h=0.05, steps=20, options=sc.SolverOptions(tolerance=1e-4))
     exact = stepper.integrate_ensemble(q, p, h=0.05, steps=20)
     assert loose.ok.all()
     assert 1e-14 < np.abs(loose.q - exact.q).max() < 1e-3
 
 
 def test_ensembles_with_few_or_no_steps() -> None:
-    stepper = stepper_for("kepler", SVI(5))
+    stepper = stepper_for("kepler", sc.SVI(5))
     q, p = states("kepler", 9)
     assert stepper.integrate_ensemble(q, p, h=0.1, steps=0).q.shape == (1, 9, 2)
     result = stepper.integrate_ensemble(q, p, h=0.1, steps=3, save_every=5)
     assert result.q.shape == (1, 9, 2)
     assert result.steps.tolist() == [3] * 9
     assert len(stepper.integrate_ensemble([1.0, 0.0], [0.0, 1.0], h=0.1, steps=5)) == 1
-    shorter_last = Case("eccentric", SVI(4), 4, {"h": 0.03, "t_end": 0.1, "save_every": 2}).run()
+    shorter_last = Case("eccentric", sc.SVI(4), 4, {"h": 0.03, "t_end": 0.1, "save_every": 2}).run()
     assert shorter_last.t[[0, -1]].tolist() == [0.0, 0.1]
-    still = Case("pushed pendulum", SVI(3), COUNT, {"inputs": INPUTS, "h": 0.1, "t": 0.4, "t_end": 0.4}).run()
+    still = Case("pushed pendulum", sc.SVI(3), COUNT, {"inputs": INPUTS, "h": 0.1, "t": 0.4, "t_end": 0.4}).run()
     assert still.t.tolist() == [0.4]
     assert still.ok.all()
     assert still.energy().shape == (1, COUNT)
@@ -292,20 +291,20 @@ def test_results_have_target_times_and_are_pickled() -> None:
     assert np.array_equal(q[2], list(runs.each())[2][1][-1])
     driven = CASES["inputs"].run()
     assert np.array_equal(pickle.loads(pickle.dumps(driven)).energy(), driven.energy())
-    stepper = stepper_for("kepler", SVI(5))
+    stepper = stepper_for("kepler", sc.SVI(5))
     again, start = pickle.loads(pickle.dumps(stepper)), states("kepler", 9)
     first, second = (each.integrate_ensemble(*start, h=0.05, steps=20) for each in (stepper, again))
     assert np.array_equal(first.q, second.q)
 
 
 @pytest.fixture(scope="module")
-def kepler() -> Stepper:
-    return stepper_for("kepler", SVI(5))
+def kepler() -> sc.Stepper:
+    return stepper_for("kepler", sc.SVI(5))
 
 
 class TestFailures:
     def test_diverging_trajectory_does_not_affect_others(self):
-        stepper = stepper_for("runaway", SVI(5))
+        stepper = stepper_for("runaway", sc.SVI(5))
         generator = np.random.default_rng(3)
         q, p = generator.uniform(-1.2, -0.8, (16, 1)), generator.uniform(-0.6, -0.4, (16, 1))
         alone = stepper.integrate_ensemble(q, p, h=0.05, steps=50)
@@ -315,7 +314,7 @@ class TestFailures:
         assert result.ok.tolist() == others.tolist()
         assert np.array_equal(result.q[:, 8:], alone.q[:, 8:])
         assert np.abs(result.q[:, others] - alone.q[:, others]).max() < 1e-13  # measured 1e-15
-        with pytest.raises(StepFailedError) as failure:
+        with pytest.raises(sc.StepFailedError) as failure:
             stepper.integrate(q[3], p[3], h=0.05, steps=50)
         assert result.status[3] == failure.value.status
         assert result.steps[3] == failure.value.step
@@ -330,7 +329,7 @@ class TestFailures:
     def test_lane_that_fails_at_the_start_does_not_affect_others(self, place: int):
         """Between others, and as the last, whose place is filled up with copies: to roundings, as lanes that step
         together take as many sweeps as the slowest of them needs."""
-        stepper = stepper_for("relativistic-particle", SVI(5))
+        stepper = stepper_for("relativistic-particle", sc.SVI(5))
         q, p = states("relativistic-particle", 7)
         values, others = np.tile(stepper.defaults, (7, 1)), np.arange(7) != place
         values[place] = 0.0
@@ -342,7 +341,7 @@ class TestFailures:
         np.testing.assert_allclose(result.p[:, others], without.p, rtol=0, atol=1e-14)
 
     def test_block_without_active_trajectories_stops(self):
-        stepper = stepper_for("relativistic-particle", SVI(5))
+        stepper = stepper_for("relativistic-particle", sc.SVI(5))
         q, p = states("relativistic-particle", 8)
         nothing = dict.fromkeys(stepper.parameters, 0.0)
         reports: list[int] = []
@@ -355,7 +354,7 @@ class TestFailures:
         result = stepper.integrate_ensemble(q, p, h=0.05, steps=10**9, save_every=10**8, **settings)
         assert set(result.steps) == {0}
 
-    @pytest.mark.parametrize("method", [SVI(5), SCVI(3), StoermerVerlet()], ids=lambda method: method.name)
+    @pytest.mark.parametrize("method", [sc.SVI(5), sc.SCVI(3), sc.StoermerVerlet()], ids=lambda method: method.name)
     def test_failures_are_per_trajectory_for_every_method(self, method: Method):
         stepper = stepper_for("runaway", method)
         result = stepper.integrate_ensemble([[-1.0], [1.0], [-0.9]], [[-0.5], [1.0], [-0.4]], h=0.05, steps=60)
@@ -368,7 +367,7 @@ class TestFailures:
     def test_failed_adaptive_trajectory_does_not_affect_the_others(self) -> None:
         q, p = states("eccentric", 4)
         p[1] = 0.0  # falls into the centre
-        runs = stepper_of("eccentric", SVI(4)).integrate_ensemble(q, p, **ADAPTIVE)
+        runs = stepper_of("eccentric", sc.SVI(4)).integrate_ensemble(q, p, **ADAPTIVE)
         assert runs.ok.tolist() == [True, False, True, True]
         assert 0.0 < runs.ends[0][1] < 1.0
         assert runs.status[1] not in ("ok", "interrupted")
@@ -376,7 +375,7 @@ class TestFailures:
 
 
 class TestThreadsAndInterruption:
-    def test_results_do_not_depend_on_the_number_of_threads(self, kepler: Stepper):
+    def test_results_do_not_depend_on_the_number_of_threads(self, kepler: sc.Stepper):
         q, p = states("kepler", 64)
         q[20] = 0.0
         one, two = (kepler.integrate_ensemble(q, p, h=0.05, steps=300, threads=threads) for threads in (1, 2))
@@ -384,7 +383,7 @@ class TestThreadsAndInterruption:
         assert one.p.tobytes() == two.p.tobytes()
         assert one.status.tolist() == two.status.tolist()
 
-    @pytest.mark.parametrize("method", [SVI(5), SCVI(2)], ids=lambda method: method.name)
+    @pytest.mark.parametrize("method", [sc.SVI(5), sc.SCVI(2)], ids=lambda method: method.name)
     def test_progress_counts_up_to_the_end(self, method: Method):
         stepper = stepper_for("kepler", method)
         q, p = states("kepler", 32)
@@ -393,7 +392,7 @@ class TestThreadsAndInterruption:
         assert calls == sorted(calls)
         assert calls[-1] == 4000
 
-    def test_interrupt_ends_all_threads_and_returns_completed_states(self, kepler: Stepper):
+    def test_interrupt_ends_all_threads_and_returns_completed_states(self, kepler: sc.Stepper):
         q, p = states("kepler", 64)
         work = Ensemble(kepler, q, p, h=0.05, steps=10**9, save_every=10**7)
 
@@ -408,7 +407,7 @@ class TestThreadsAndInterruption:
         assert set(result.status) == {"interrupted"}
         assert 0 < result.steps.max() < 10**9
 
-    def test_error_in_a_block_is_raised(self, kepler: Stepper, monkeypatch: pytest.MonkeyPatch):
+    def test_error_in_a_block_is_raised(self, kepler: sc.Stepper, monkeypatch: pytest.MonkeyPatch):
         def fail(*arguments: object) -> None:
             raise RuntimeError("out of order")
 
@@ -416,7 +415,7 @@ class TestThreadsAndInterruption:
         with pytest.raises(RuntimeError, match="out of order"):
             kepler.integrate_ensemble(*states("kepler", 20), h=0.05, steps=10)
 
-    def test_memory_is_bounded_by_save_every(self, kepler: Stepper):
+    def test_memory_is_bounded_by_save_every(self, kepler: sc.Stepper):
         q, p = states("kepler", 64)
         kepler.integrate_ensemble(q, p, h=0.05, steps=1)
         gc.collect()
@@ -430,7 +429,7 @@ class TestThreadsAndInterruption:
 
     def test_interrupted_adaptive_runs_return_completed_states(self) -> None:
         q, p = states("eccentric", 4)
-        work = Ensemble(stepper_of("eccentric", SVI(4)), q, p, t_end=[5.0, 5.0, 5.0, 1e7], tolerance=1e-10)
+        work = Ensemble(stepper_of("eccentric", sc.SVI(4)), q, p, t_end=[5.0, 5.0, 5.0, 1e7], tolerance=1e-10)
 
         def interrupt(done: int) -> None:
             if done:
@@ -512,17 +511,17 @@ BASE: dict[str, dict[str, Any]] = {
     ],
 )
 def test_invalid_arguments_are_named(name: str, changes: dict[str, object], message: str) -> None:
-    with pytest.raises(StateError, match=message):
-        stepper_of(name, SVI(3)).integrate_ensemble(**BASE[name] | changes)
+    with pytest.raises(sc.StateError, match=message):
+        stepper_of(name, sc.SVI(3)).integrate_ensemble(**BASE[name] | changes)
 
 
 class TestFiles:
     @pytest.fixture
-    def result(self, kepler: Stepper) -> EnsembleTrajectory:
+    def result(self, kepler: sc.Stepper) -> sc.EnsembleTrajectory:
         values = {"mu": [1.0, 1e9, 1.2]}  # the second falls into the centre
         return kepler.integrate_ensemble(*states("kepler", 3), h=0.05, steps=100, save_every=10, parameters=values)
 
-    def test_npz_round_trip(self, result: EnsembleTrajectory, tmp_path):
+    def test_npz_round_trip(self, result: sc.EnsembleTrajectory, tmp_path):
         result.save(tmp_path / "runs.npz")
         with np.load(tmp_path / "runs.npz") as file:
             for name in ("t", "q", "p", "status", "steps", "h", "parameters"):
@@ -530,7 +529,7 @@ class TestFiles:
             assert file["coordinates"].tolist() == ["q1", "q2"]
             assert file["parameter_names"].tolist() == ["mu"]
 
-    def test_csv_has_long_format_and_omits_failures(self, result: EnsembleTrajectory, tmp_path):
+    def test_csv_has_long_format_and_omits_failures(self, result: sc.EnsembleTrajectory, tmp_path):
         result.save(tmp_path / "runs.csv")
         assert (tmp_path / "runs.csv").read_text().startswith("trajectory,mu,t,q1,q2,p_q1,p_q2\n0,1,0,")
         table = np.loadtxt(tmp_path / "runs.csv", delimiter=",", skiprows=1)
@@ -540,8 +539,8 @@ class TestFiles:
             assert np.array_equal(rows[:, 3:5], result.q[: len(rows), j])
             assert set(rows[:, 1]) == {result.parameters[j, 0]}
 
-    def test_unknown_suffixes_are_rejected(self, result: EnsembleTrajectory, tmp_path):
-        with pytest.raises(StateError, match=r"use \.npz, \.csv, \.h5"):
+    def test_unknown_suffixes_are_rejected(self, result: sc.EnsembleTrajectory, tmp_path):
+        with pytest.raises(sc.StateError, match=r"use \.npz, \.csv, \.h5"):
             result.save(tmp_path / "runs.txt")
 
 
@@ -553,8 +552,8 @@ mu = 1.5
 """
 
 
-def model(**changes: object) -> Model:
-    entry = Model.from_problem(problem("kepler"), SVI(4))
+def model(**changes: object) -> sc.Model:
+    entry = sc.Model.from_problem(sc.problem("kepler"), sc.SVI(4))
     return replace(entry, h=0.1, span=None, steps=50, save_every=10, **changes)  # type: ignore[arg-type]
 
 
@@ -566,7 +565,7 @@ class TestEnsembleFiles:
         assert states.q[:, 0].tolist() == [0.8, 0.8, 1.0, 1.0, 1.2, 1.2]
         assert set(states.q[:, 1]) == {model().q[1]}
         assert states.parameters.tolist() == [[1.5]] * 6
-        p = states.momenta(stepper_for("kepler", SVI(4)))
+        p = states.momenta(stepper_for("kepler", sc.SVI(4)))
         assert p[:, 1].tolist() == [0.9, 1.0] * 3
         assert set(p[:, 0]) == {model().velocity[0]}  # type: ignore[index]
 
@@ -575,7 +574,7 @@ class TestEnsembleFiles:
         states = load_ensemble(tmp_path / "table.csv", model())
         assert states.parameters[:, 0].tolist() == [1.0, 2.0]
         assert states.q.tolist() == [[model().q[0], 0.1], [model().q[0], 0.2]]
-        stepper = stepper_for("kepler", SVI(4))
+        stepper = stepper_for("kepler", sc.SVI(4))
         assert states.momenta(stepper).tolist() == [
             [0.5, model().momenta(stepper)[1]],
             [-0.5, model().momenta(stepper)[1]],
@@ -587,13 +586,13 @@ class TestEnsembleFiles:
 
     def test_velocities_are_transformed_with_individual_parameters(self, tmp_path):
         (tmp_path / "table.csv").write_text("q,q_dot,m\n0.1,0.5,1.0\n0.1,0.5,3.0\n")
-        pendulum = Model.from_problem(problem("planar-pendulum"))
+        pendulum = sc.Model.from_problem(sc.problem("planar-pendulum"))
         states = load_ensemble(tmp_path / "table.csv", pendulum)
-        p = states.momenta(stepper_for("planar-pendulum", SVI(4)))
+        p = states.momenta(stepper_for("planar-pendulum", sc.SVI(4)))
         assert p[1, 0] == 3.0 * p[0, 0]
 
     def test_velocities_override_momenta_of_a_model_and_vice_versa(self, tmp_path):
-        stepper = stepper_for("kepler", SVI(4))
+        stepper = stepper_for("kepler", sc.SVI(4))
         with_momenta = model(p=(0.3, 0.7), velocity=None)
         (tmp_path / "a.csv").write_text("q1_dot\n0.1\n")
         assert load_ensemble(tmp_path / "a.csv", with_momenta).momenta(stepper)[0].tolist() == [0.1, 0.7]
@@ -637,7 +636,7 @@ class TestEnsembleFiles:
     def test_invalid_entries_are_named(self, name: str, text: str | None, message: str, tmp_path):
         if text is not None:
             (tmp_path / name).write_text(text)
-        with pytest.raises(ModelFileError, match=message) as error:
+        with pytest.raises(sc.ModelFileError, match=message) as error:
             load_ensemble(tmp_path / name, model())
         assert str(error.value).startswith(str(tmp_path / name))
 
@@ -721,10 +720,10 @@ class TestCommandLine:
 @pytest.mark.parametrize("name", ["kepler", "double-pendulum"])
 def test_absolute_tolerance_equals_that_of_single_trajectories(name):
     """With the absolute tolerance, lanes need as many iterations and reach the same states."""
-    chosen = problem(name)
-    stepper = compile_stepper(chosen.system, SVI(4))
+    chosen = sc.problem(name)
+    stepper = sc.compile_stepper(chosen.system, sc.SVI(4))
     p = stepper.momentum(chosen.q, chosen.velocity)
-    options = SolverOptions(tolerance=1e-6, absolute=True)
+    options = sc.SolverOptions(tolerance=1e-6, absolute=True)
     single = stepper.integrate(chosen.q, p, h=0.05, steps=20, save_every=20, options=options)
     many = stepper.integrate_ensemble([chosen.q] * 8, [p] * 8, h=0.05, steps=20, save_every=20, options=options)
     exact = stepper.integrate(chosen.q, p, h=0.05, steps=20, save_every=20)
@@ -733,24 +732,24 @@ def test_absolute_tolerance_equals_that_of_single_trajectories(name):
 
 
 def test_diverging_trajectory_retains_its_previous_states():
-    singular = LagrangianSystem.from_text(
+    singular = sc.LagrangianSystem.from_text(
         name="falling", coordinates=["x"], lagrangian="x_dot**2/2 + 1/x", forces={"x": "u"}, inputs=["u"]
     )
     inputs = {"u": ([0.0, 0.5, 3.0], [0.0, 0.1, 0.1])}
-    stepper = compile_stepper(singular, SVI(4))
+    stepper = sc.compile_stepper(singular, sc.SVI(4))
     runs = stepper.integrate_ensemble([[1.0], [9.0]], [[0.0], [0.0]], inputs=inputs, t_end=2.5)
     assert runs.status.tolist() == ["step size underflow", "ok"]
     t = next(runs.each())[0]
     assert (t[0], 0.5 in t) == (0.0, True)
     assert 0.9 < t[-1] < 1.3
     assert (np.diff(t) >= 0).all()
-    with pytest.raises(StepFailedError) as failed:
+    with pytest.raises(sc.StepFailedError) as failed:
         stepper.integrate([1.0], [0.0], inputs=inputs, t_end=2.5)
     assert np.array_equal(failed.value.trajectory.t, t)
 
 
 def test_velocities_use_the_inputs_at_the_start():
-    stepper = stepper_of("coupled with inputs", SVI(3))
+    stepper = stepper_of("coupled with inputs", sc.SVI(3))
     q, v = states("coupled with inputs", COUNT)
     inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], np.outer(np.arange(COUNT), [1.0, 0.0]))}
     runs = stepper.integrate_ensemble(q, velocity=v, inputs=inputs, h=0.1, t_end=0.2)
@@ -758,7 +757,7 @@ def test_velocities_use_the_inputs_at_the_start():
 
 
 def test_splines_of_scipy_are_accepted():
-    stepper = stepper_of("pushed pendulum", SVI(3))
+    stepper = stepper_of("pushed pendulum", sc.SVI(3))
     by_spline, by_values = (
         stepper.integrate_ensemble(*states("pushed pendulum", COUNT), inputs={"u": u, "w": W}, h=0.05, steps=40)
         for u in (CubicSpline(KNOTS, OWN_VALUES, axis=1), (KNOTS, OWN_VALUES, "cubic"))
@@ -769,10 +768,10 @@ def test_splines_of_scipy_are_accepted():
 
 def test_failed_trajectory_does_not_affect_others():
     """The third pendulum's push has no square root in the fourth piece."""
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="root", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)", forces={"q": "sqrt(u)"}, inputs=["u"]
     )
-    stepper, u = compile_stepper(system, SVI(3)), np.abs(OWN_VALUES) + 0.1
+    stepper, u = sc.compile_stepper(system, sc.SVI(3)), np.abs(OWN_VALUES) + 0.1
     fine = stepper.integrate_ensemble(*states("pushed pendulum", COUNT), inputs={"u": (KNOTS, u)}, h=0.1, t_end=2.3)
     u[2, 4] = -3.0
     runs = stepper.integrate_ensemble(*states("pushed pendulum", COUNT), inputs={"u": (KNOTS, u)}, h=0.1, t_end=2.3)
@@ -787,10 +786,10 @@ def test_failed_trajectory_does_not_affect_others():
 @pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
 def test_lane_with_failed_iteration_continues_as_scalar_across_breakpoints():
     """Stiff from the second piece on, where Newton's iteration alone leads on."""
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="stiffening", coordinates=["q"], lagrangian="q_dot**2/2 - (1 + u)*q**2/2 - q**4/4", inputs=["u"]
     )
-    stepper, u = compile_stepper(system, SVI(2)), np.tile(VALUES**2, (COUNT, 1))
+    stepper, u = sc.compile_stepper(system, sc.SVI(2)), np.tile(VALUES**2, (COUNT, 1))
     u[4, 2:] = 4000.0
     q, p = states("pushed pendulum", COUNT)
     runs = stepper.integrate_ensemble(q, p, inputs={"u": (KNOTS, u)}, h=0.1, t_end=2.3)
@@ -801,7 +800,7 @@ def test_lane_with_failed_iteration_continues_as_scalar_across_breakpoints():
 
 
 def test_threads_chunks_and_save_every_do_not_change_results():
-    stepper = stepper_of("pushed pendulum", SVI(3))
+    stepper = stepper_of("pushed pendulum", sc.SVI(3))
     inputs, reported = {"u": (KNOTS, OWN_VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}, []
     arguments = {"inputs": inputs, "h": 0.001, "t_end": 2.3}
     full = stepper.integrate_ensemble(*states("pushed pendulum", COUNT), **arguments, progress=reported.append)
@@ -814,7 +813,7 @@ def test_threads_chunks_and_save_every_do_not_change_results():
 
 
 def test_files_contain_the_energies_of_each_segment(tmp_path):
-    stepper = stepper_of("pushed pendulum", SVI(3))
+    stepper = stepper_of("pushed pendulum", sc.SVI(3))
     w = np.outer(np.arange(COUNT), [0.0, 0.1])
     runs = stepper.integrate_ensemble(
         *states("pushed pendulum", COUNT), inputs={"u": (KNOTS, VALUES), "w": ([0.0, 3.0], w)}, h=0.05, t_end=2.3
@@ -830,7 +829,7 @@ def test_ensemble_to_end_times_over_a_cluster() -> None:
     pytest.importorskip("distributed")
     from scvi_codegen.runtime.distributed import integrate_ensemble
 
-    stepper, ends = stepper_of("eccentric", SVI(4)), np.tile(ENDS, 4)
+    stepper, ends = stepper_of("eccentric", sc.SVI(4)), np.tile(ENDS, 4)
     q, p = (np.tile(x, (4, 1)) for x in states("eccentric", 4))
     here = stepper.integrate_ensemble(q, p, t_end=ends, tolerance=1e-10)
     there = integrate_ensemble(stepper, q, p, t_end=ends, tolerance=1e-10, blocks=2)
@@ -874,7 +873,7 @@ def test_lanes_converge_as_single_runs(h: float) -> None:
     Changes below rounding are random, and relative to a velocity near 0 they exceed any fixed level.
     """
     count, steps = 32, 64
-    stepper = compile_stepper(chain(4).system, "svi:2")
+    stepper = sc.compile_stepper(chain(4).system, "svi:2")
     generator = np.random.default_rng(1)
     q, v = generator.uniform(-1, 1, (count, 4)), generator.normal(size=(count, 4))
     p = np.array([stepper.momentum(*each) for each in zip(q, v, strict=True)])

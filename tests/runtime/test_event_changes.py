@@ -16,57 +16,42 @@ from programs import needs
 
 import scvi_codegen as sc
 from scvi_codegen.cli import main
-from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.derivation.page.document import derivation_html
-from scvi_codegen.errors import (
-    AccuracyWarning,
-    EventError,
-    EventWarning,
-    MethodError,
-    ModelFileError,
-    StateError,
-    SystemDefinitionError,
-)
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
-from scvi_codegen.models.packages.package import generate_package, load_package
-from scvi_codegen.pipeline import generate_source
 from scvi_codegen.rendering.events import with_events
-from scvi_codegen.results.recording import record_run, resume_run
 from scvi_codegen.runtime.core.compiled_method import Variants
-from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.events.event import Event, impact
 from scvi_codegen.verification.certificate import Outcome
 from scvi_codegen.verification.impacts import impact_checks
 from scvi_codegen.verification.system_under_test import State, SystemUnderTest
 
 FLAGS = ("-O1",)
-BALL = LagrangianSystem.from_text(name="ball", coordinates=["y"], lagrangian="y_dot**2/2 - g*y", parameters={"g": 1.0})
-POINT = LagrangianSystem.from_text(name="point", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2")
-FREE = LagrangianSystem.from_text(name="free", coordinates=["y"], lagrangian="y_dot**2/2")
+BALL = sc.LagrangianSystem.from_text(
+    name="ball", coordinates=["y"], lagrangian="y_dot**2/2 - g*y", parameters={"g": 1.0}
+)
+POINT = sc.LagrangianSystem.from_text(name="point", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2")
+FREE = sc.LagrangianSystem.from_text(name="free", coordinates=["y"], lagrangian="y_dot**2/2")
 BOUNCES = {
-    "momentum": Event("y", direction=-1, then={"p_y": "-4*p_y/5"}),
-    "velocity": Event("y", direction=-1, then={"y_dot": "-4*y_dot/5"}),
-    "impact": impact("y", 0.8),
-    "sympy": impact(sympy.Symbol("y"), sympy.Rational(4, 5)),
+    "momentum": sc.Event("y", direction=-1, then={"p_y": "-4*p_y/5"}),
+    "velocity": sc.Event("y", direction=-1, then={"y_dot": "-4*y_dot/5"}),
+    "impact": sc.impact("y", 0.8),
+    "sympy": sc.impact(sympy.Symbol("y"), sympy.Rational(4, 5)),
 }
 STADIUM = [
-    impact("1 - y", where=["x > -1", "x < 1"]),
-    impact("1 + y", where=["x > -1", "x < 1"]),
-    impact("1 - (x - 1)**2 - y**2", where="x > 1"),
-    impact("1 - (x + 1)**2 - y**2", where="x < -1"),
+    sc.impact("1 - y", where=["x > -1", "x < 1"]),
+    sc.impact("1 + y", where=["x > -1", "x < 1"]),
+    sc.impact("1 - (x - 1)**2 - y**2", where="x > 1"),
+    sc.impact("1 - (x + 1)**2 - y**2", where="x < -1"),
 ]
 
 
 @pytest.fixture(scope="module")
-def ball() -> Stepper:
-    return compile_stepper(BALL, "svi:2", flags=FLAGS)
+def ball() -> sc.Stepper:
+    return sc.compile_stepper(BALL, "svi:2", flags=FLAGS)
 
 
 @pytest.fixture(scope="module")
-def point() -> Stepper:
-    return compile_stepper(POINT, "svi:1", flags=FLAGS)
+def point() -> sc.Stepper:
+    return sc.compile_stepper(POINT, "svi:1", flags=FLAGS)
 
 
 def folded(start: float, v: float, t: float) -> float:
@@ -92,8 +77,8 @@ def test_bounces_of_a_ball_form_a_geometric_series(ball, kind):
 def test_accumulation_ends_the_run_and_is_named(ball, e):
     """The ball does not fall through the floor where infinitely many bounces take a finite time."""
     exact = math.sqrt(2.0) * (1.0 + e) / (1.0 - e)
-    with pytest.warns(EventWarning, match="accumulate at t = ") as warned:
-        run = ball.integrate([1.0], [0.0], h=0.1, t_end=exact + 10.0, events=impact("y", e))
+    with pytest.warns(sc.EventWarning, match="accumulate at t = ") as warned:
+        run = ball.integrate([1.0], [0.0], h=0.1, t_end=exact + 10.0, events=sc.impact("y", e))
     named = float(str(warned[0].message).split("t = ")[1].split(" ")[0])
     assert abs(named - exact) < 2e-12
     assert exact - 1e-6 < run.t[-1] < exact
@@ -103,24 +88,16 @@ def test_accumulation_ends_the_run_and_is_named(ball, e):
 def test_start_behind_a_wall(ball):
     """A start on the wall, up to rounding, and one behind a wall of finite size are inside the region."""
     for arguments in ({"t_end": 4.0}, {"h": 0.1, "steps": 3}):
-        with pytest.raises(EventError, match=r"behind the wall 'y', which is -0\.5 at t = 3 and must not be negative"):
+        with pytest.raises(
+            sc.EventError, match=r"behind the wall 'y', which is -0\.5 at t = 3 and must not be negative"
+        ):
             ball.integrate([-0.5], [0.0], t=3.0, events=BOUNCES["impact"], **arguments)
     for y in (0.0, -1e-17):
         run = ball.integrate([y], [1.0], h=0.1, t_end=1.5, events=BOUNCES["impact"])
         assert not run.events[0]
-    open_at_first = impact("y", where="t > 2")
+    open_at_first = sc.impact("y", where="t > 2")
     run = ball.integrate([-0.5], [1.5], h=0.1, t_end=4.0, events=open_at_first)
     assert abs(run.events[0].t[0] - (1.5 + math.sqrt(1.25))) < 1e-14
-
-
-def test_accumulation_of_a_nonlinear_force_does_not_depend_on_the_step():
-    spring = LagrangianSystem.from_text(name="spring", coordinates=["y"], lagrangian="y_dot**2/2 - y - y**2")
-    stepper, named = compile_stepper(spring, "svi:8", flags=FLAGS), []
-    for h in (0.1, 0.05):
-        with pytest.warns(EventWarning) as warned:
-            stepper.integrate([1.0], [0.0], h=h, t_end=20.0, events=impact("y", 0.7))
-        named.append(float(str(warned[0].message).split("t = ")[1].split(" ")[0]))
-    assert abs(named[0] - named[1]) < 1e-13
 
 
 def test_accumulation_of_a_relativistic_ball():
@@ -128,14 +105,14 @@ def test_accumulation_of_a_relativistic_ball():
 
     The crossings within the last step are more than one call of C returns.
     """
-    stepper = compile_stepper(
-        LagrangianSystem.from_text(name="relativistic", coordinates=["y"], lagrangian="-sqrt(1 - y_dot**2) - y/10"),
+    stepper = sc.compile_stepper(
+        sc.LagrangianSystem.from_text(name="relativistic", coordinates=["y"], lagrangian="-sqrt(1 - y_dot**2) - y/10"),
         "svi:8",
         flags=FLAGS,
     )
     e, fall = 0.99, 10.0 * math.sqrt(1.1**2 - 1.0)
-    with pytest.warns(EventWarning, match="accumulate"):
-        run = stepper.integrate([1.0], [0.0], h=0.1, t_end=2000.0, events=impact("y", e))
+    with pytest.warns(sc.EventWarning, match="accumulate"):
+        run = stepper.integrate([1.0], [0.0], h=0.1, t_end=2000.0, events=sc.impact("y", e))
     bounces = run.events[0].t
     assert len(bounces) > 2000
     exact = fall * (1.0 + 2.0 * e * (1.0 - e ** np.arange(len(bounces))) / (1.0 - e))
@@ -147,7 +124,7 @@ def test_accumulation_of_a_relativistic_ball():
 @pytest.mark.parametrize("h", [50.0, 5.0, 0.5])
 def test_corners_of_a_square_are_met_exactly(point, h, t0):
     """Both walls of a corner act, up to 40 bounces occur in a step."""
-    walls = [impact(g) for g in ("x", "y", "1 - x", "1 - y")]
+    walls = [sc.impact(g) for g in ("x", "y", "1 - x", "1 - y")]
     run = point.integrate([0.5, 0.5], velocity=[0.5, 0.3], t=t0, h=h, t_end=t0 + 400.0, events=walls)
     q = np.array([[folded(0.5, v, t - t0) for v in (0.5, 0.3)] for t in run.t])
     assert sum(map(len, run.events)) == 320
@@ -159,8 +136,8 @@ def test_corners_of_a_square_are_met_exactly(point, h, t0):
 def test_moving_wall_accelerates_a_point():
     """Fermi-Ulam: times of impacts against a map iterated in 60 digits."""
     amplitude = 0.05
-    walls = [impact("y - sin(t)/20"), impact("1 - y")]
-    run = compile_stepper(FREE, "svi:1", flags=FLAGS).integrate(
+    walls = [sc.impact("y - sin(t)/20"), sc.impact("1 - y")]
+    run = sc.compile_stepper(FREE, "svi:1", flags=FLAGS).integrate(
         [0.5], velocity=[0.3], h=0.05, t_end=190.0, events=walls
     )
     t = np.sort(np.concatenate([each.t for each in run.events]))
@@ -178,33 +155,33 @@ def test_moving_wall_accelerates_a_point():
 
 def test_energy_of_a_double_pendulum_at_a_wall():
     """The mass matrix depends on the state; impulses conserve energy to round-off, trajectories have order 16."""
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="double pendulum",
         coordinates=["a", "b"],
         lagrangian="a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)",
     )
-    stepper = compile_stepper(system, "svi:8")
-    wall = impact("3/10 - sin(a) - sin(b)", terminal=60)
+    stepper = sc.compile_stepper(system, "svi:8")
+    wall = sc.impact("3/10 - sin(a) - sin(b)", terminal=60)
     run = stepper.integrate([-1.0, -0.5], [0.0, 0.0], h=0.2, t_end=1e4, events=wall)
     assert len(run.events[0]) == 60
     assert np.ptp(run.energy()) < 3e-14
     assert abs(run.events[0].t[20] - 97.0188870109503) < 1e-11
-    adaptive = stepper.integrate([-1.0, -0.5], [0.0, 0.0], t_end=100.0, events=impact("3/10 - sin(a) - sin(b)"))
+    adaptive = stepper.integrate([-1.0, -0.5], [0.0, 0.0], t_end=100.0, events=sc.impact("3/10 - sin(a) - sin(b)"))
     assert abs(adaptive.events[0].t[20] - 97.0188870109503) < 1e-10
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.2])
 def test_impulse_of_a_relativistic_particle_conserves_energy(speed):
     """Reversing the velocity would change the energy by 3 per cent; the frame of a moving wall exchanges lambda g_t."""
-    system = HamiltonianSystem.from_text(
+    system = sc.HamiltonianSystem.from_text(
         name="relativistic",
         coordinates=["x", "y"],
         momenta=["p", "r"],
         hamiltonian="sqrt(1 + p**2 + 4*r**2) + p*r/(5 + 5*p**2) + y/2",
         parameters={"b": 0.0},
     )
-    stepper = compile_stepper(system, "svi:8", flags=FLAGS)
-    wall = impact("y + x/3 + x**2/5 - b*t")
+    stepper = sc.compile_stepper(system, "svi:8", flags=FLAGS)
+    wall = sc.impact("y + x/3 + x**2/5 - b*t")
     run = stepper.integrate([0.3, 1.0], [0.3, -0.2], h=0.1, t_end=12.0, events=wall, parameters={"b": speed})
     (bounces,) = run.events
     assert len(bounces)
@@ -221,7 +198,7 @@ def test_impulse_of_a_relativistic_particle_conserves_energy(speed):
 
 def test_impulses_at_given_times_and_states_within_steps(ball):
     """A kick at t = 0.35 within a step; dense output and t_eval on both sides of it."""
-    kick = Event("t - 0.35", then={"p_y": "p_y + 2"})
+    kick = sc.Event("t - 0.35", then={"p_y": "p_y + 2"})
     run = ball.integrate([0.0], [1.0], h=0.1, steps=10, events=kick)
     exact = lambda t: t - t * t / 2 + 2 * np.maximum(t - 0.35, 0.0)  # noqa: E731
     assert run.t.tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.35, *(0.1 * np.arange(4, 11))])
@@ -255,7 +232,7 @@ def test_run_in_parts_equals_a_whole_one(ball):
     assert pickle.loads(pickle.dumps(watched)).events == watched.events
     some = watched.integrate([1.0], [0.0], h=0.1, steps=60, save_every=10)
     assert some.at(1.73)[0] == pytest.approx(whole.at(1.73)[0], abs=1e-15)
-    third = ball.with_events(impact("y", 0.8, terminal=3)).start([1.0], [0.0], h=0.1)
+    third = ball.with_events(sc.impact("y", 0.8, terminal=3)).start([1.0], [0.0], h=0.1)
     assert [len(third.record(20).events[0]) for _ in range(3)] == [1, 1, 1]
     assert third.ended
 
@@ -264,28 +241,30 @@ def test_run_in_parts_equals_a_whole_one(ball):
 @pytest.mark.parametrize("save_every", [1, 7])
 def test_recordings_continue_with_events(ball, tmp_path, plan, steps, save_every):
     """Interrupted runs have the states, crossings and counts of uninterrupted ones, and dense output across changes."""
-    kick = Event("t - 4.05", 1, then={"p_y": "p_y + 1/2"})
-    watched = ball.with_events([impact("y", 0.9, terminal=4), kick, Event("y_dot", -1)])
+    kick = sc.Event("t - 4.05", 1, then={"p_y": "p_y + 1/2"})
+    watched = ball.with_events([sc.impact("y", 0.9, terminal=4), kick, sc.Event("y_dot", -1)])
     arguments = plan | ({} if steps is None else {"steps": steps})
     whole, calls = watched.integrate([1.0], [0.0], **arguments), iter(range(9))
     settings = {"steps": steps, "save_every": save_every}
-    record_run(watched.start([1.0], [0.0], **plan), tmp_path / "a", rows=20, stop=lambda: next(calls) == 3, **settings)
-    one = resume_run(tmp_path / "a", checkpoint_steps=5)
-    two = record_run(watched.start([1.0], [0.0], **plan), tmp_path / "b", **settings)
+    sc.record_run(
+        watched.start([1.0], [0.0], **plan), tmp_path / "a", rows=20, stop=lambda: next(calls) == 3, **settings
+    )
+    one = sc.resume_run(tmp_path / "a", checkpoint_steps=5)
+    two = sc.record_run(watched.start([1.0], [0.0], **plan), tmp_path / "b", **settings)
     assert one.finished
     assert whole.t[-1] == one.t[-1] == whole.events[0].t[3] < 12.0
     assert [len(each) for each in one.events] == [4, 1, 3]
     for this, other in ((one, two), *zip(one.events * 2, two.events + whole.events, strict=True)):
         assert all(np.array_equal(getattr(this, name), getattr(other, name)) for name in ("t", "q", "p"))
     assert np.abs([one[:].at(t)[0] - whole.at(t)[0] for t in (1.43, 3.99, 4.07)]).max() < 1e-14
-    assert len(resume_run(tmp_path / "a").events[0]) == 4
+    assert len(sc.resume_run(tmp_path / "a").events[0]) == 4
 
 
 def test_a_checkpoint_with_numbers_of_other_events_is_rejected(ball):
-    run = ball.with_events(impact("y", 0.9)).start([1.0], [0.0], h=0.1)
+    run = ball.with_events(sc.impact("y", 0.9)).start([1.0], [0.0], h=0.1)
     run.advance(20)
     run._watch.accumulated = 2
-    with pytest.raises(StateError, match=r"invalid saved run: accumulated is 2, not a whole number from 0 to 1"):
+    with pytest.raises(sc.StateError, match=r"invalid saved run: accumulated is 2, not a whole number from 0 to 1"):
         run.stepper.from_checkpoint(run.checkpoint())
 
 
@@ -298,9 +277,9 @@ def test_runs_backward_undo_impacts(ball):
 
 def test_maps_in_both_directions_act_once_at_each_crossing(ball):
     """Rounding leaves the new state on either side of the zero that it departs from."""
-    one = ball.integrate([1.0], [0.0], h=0.1, t_end=60.0, events=Event("y", then={"y_dot": "-y_dot"}))
+    one = ball.integrate([1.0], [0.0], h=0.1, t_end=60.0, events=sc.Event("y", then={"y_dot": "-y_dot"}))
     assert np.abs(one.events[0].t - math.sqrt(2.0) * (1 + 2 * np.arange(21))).max() < 1e-12
-    event = Event("y", then={"y_dot": "-0.01*y_dot"}, terminal=3)
+    event = sc.Event("y", then={"y_dot": "-0.01*y_dot"}, terminal=3)
     slow = ball.integrate([0.7], [0.0], h=1.0, steps=2, events=event)
     assert np.abs(slow.events[0].t - math.sqrt(1.4) * np.array([1.0, 1.02, 1.0202])).max() < 1e-12
 
@@ -308,7 +287,7 @@ def test_maps_in_both_directions_act_once_at_each_crossing(ball):
 @pytest.mark.parametrize(("y0", "e", "h"), [(1.0, 0.01, 0.3), (0.4875, 0.1545, 0.0562), (1.9522, 0.00775, 0.1552)])
 def test_slow_departures_from_zeros_located_at_high_speed(ball, y0, e, h):
     """The residual of a located zero is that of the fast arrival, not of the slow departure after the map."""
-    reverse = Event("y", then={"y_dot": f"-{e}*y_dot"})
+    reverse = sc.Event("y", then={"y_dot": f"-{e}*y_dot"})
     fall = math.sqrt(2 * y0)
     t = fall * (1 + 2 * e + e * e)  # at the top of the second flight
     for steps in ({"h": h}, {}):
@@ -317,7 +296,7 @@ def test_slow_departures_from_zeros_located_at_high_speed(ball, y0, e, h):
         assert abs(run.q[-1, 0] - (fall * e * e) ** 2 / 2) < 1e-13
 
 
-DROP = LagrangianSystem.from_text(
+DROP = sc.LagrangianSystem.from_text(
     name="drop",
     coordinates=["x", "y"],
     lagrangian="(1 + x**2/9)*(x_dot**2 + y_dot**2)/2 - g*y - x**2*y/5",
@@ -333,14 +312,14 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_certificates_measure_impacts(fault):
     """A planted error of 1e-7 of the impulse, or of 1e-9 of the state, is noticed."""
-    events = (impact("y + x**2/9 - sin(t)/40"), impact("2 - x", where="y > 0"))
-    plain = compile_stepper(DROP, "svi:2", flags=FLAGS)
+    events = (sc.impact("y + x**2/9 - sin(t)/40"), sc.impact("2 - x", where="y > 0"))
+    plain = sc.compile_stepper(DROP, "svi:2", flags=FLAGS)
     source = with_events(plain.source, plain.interface, events)
     old, new = FAULTS[fault]
     texts = tuple((name, text.replace(old, new) if old else text) for name, text in source.beside.support)
     faulty = {events: replace(source, beside=replace(source.beside, support=texts))}
     variants = Variants(faulty, plain._variants.__getitem__, plain._variants.lacks)
-    stepper = Stepper(plain.source, plain.interface, flags=FLAGS, events=events, variants=variants)
+    stepper = sc.Stepper(plain.source, plain.interface, flags=FLAGS, events=events, variants=variants)
     start = State(np.array([0.1, 1.0]), np.array([0.2, 0.0]), 0.0, 0.05)
     checks = list(impact_checks(SystemUnderTest(DROP, sc.SVI(2), stepper, None, start), stepper))
     names = {"event surfaces", "saltation", "impacts", "symplecticity, impacts", "reversal, impacts"}
@@ -357,8 +336,8 @@ def test_certificates_measure_impacts(fault):
 )
 def test_impacts_on_moving_curved_walls_are_satisfied(wall, restitution, flags):
     """Bounds are from rounding alone, so that they hold for every optimisation and every approach speed."""
-    ball = LagrangianSystem.from_text("ball", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - y - x**2/8")
-    stepper = compile_stepper(ball, "svi:4", flags=flags, events=impact(wall, restitution=restitution))
+    ball = sc.LagrangianSystem.from_text("ball", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - y - x**2/8")
+    stepper = sc.compile_stepper(ball, "svi:4", flags=flags, events=sc.impact(wall, restitution=restitution))
     start = State(np.array([0.3, 1.2]), np.array([0.4, -0.2]), 0.0, 0.05)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", sc.EventWarning)
@@ -370,7 +349,7 @@ def test_impacts_on_moving_curved_walls_are_satisfied(wall, restitution, flags):
 
 @pytest.mark.full
 def test_certificates_of_models_with_events():
-    watched = compile_stepper(DROP, "svi:2", flags=FLAGS, events=impact("y + x**2/9"))
+    watched = sc.compile_stepper(DROP, "svi:2", flags=FLAGS, events=sc.impact("y + x**2/9"))
     certificate = sc.verify(DROP, "svi:2", [0.1, 1.0], [0.2, 0.0], h=0.05, stepper=watched)
     assert {"impacts", "saltation"} <= {each.name for each in certificate.checks}
     assert all(each.outcome is not Outcome.VIOLATED for each in certificate.checks)
@@ -378,7 +357,7 @@ def test_certificates_of_models_with_events():
 
 def test_conditions_select_crossings(point):
     """A plate of finite length: a point that passes beside it is not reflected."""
-    plate = Event("y", then={"p_y": "-p_y"}, where=("x > 0", sympy.Symbol("x") < 1))
+    plate = sc.Event("y", then={"p_y": "-p_y"}, where=("x > 0", sympy.Symbol("x") < 1))
     for x, end in ((0.5, 0.5), (1.5, -0.5), (-0.5, -0.5)):
         run = point.integrate([x, 0.5], velocity=[0.0, -1.0], h=0.3, t_end=1.0, events=plate)
         assert run.q[-1, 1] == pytest.approx(end, abs=1e-15)
@@ -387,16 +366,16 @@ def test_conditions_select_crossings(point):
 
 @pytest.mark.parametrize("save_every", [1, 7])
 def test_terminal_event_ends_a_run_after_the_change(ball, save_every):
-    run = ball.integrate([1.0], [0.0], h=0.1, t_end=9.0, events=impact("y", 0.8, terminal=3), save_every=save_every)
+    run = ball.integrate([1.0], [0.0], h=0.1, t_end=9.0, events=sc.impact("y", 0.8, terminal=3), save_every=save_every)
     assert run.steps == math.floor(run.t[-1] / 0.1)  # whole ones
-    assert run.ended_by == impact("y", 0.8, terminal=3)
+    assert run.ended_by == sc.impact("y", 0.8, terminal=3)
     assert len(run.events[0]) == 3
     assert run.t[-1] == run.events[0].t[-1]
     assert run.p[-1, 0] == pytest.approx(-0.8 * run.events[0].p[-1, 0])
 
 
 def test_states_after_impacts_count_as_ends_of_adaptive_steps(ball):
-    given = {"t_end": 7.0, "tolerance": 1e-3, "events": impact("y", 0.8)}
+    given = {"t_end": 7.0, "tolerance": 1e-3, "events": sc.impact("y", 0.8)}
     every, some = (ball.integrate([1.0], [0.0], save_every=k, **given) for k in (1, 3))
     rows = [*range(0, len(every), 3), *([len(every) - 1] if (len(every) - 1) % 3 else [])]
     assert len(every.events[0]) > 2
@@ -405,7 +384,7 @@ def test_states_after_impacts_count_as_ends_of_adaptive_steps(ball):
 
 
 def test_ensembles_of_bouncing_balls(ball):
-    stepper = compile_stepper(BALL, "svi:4", flags=FLAGS, events=BOUNCES["impact"])
+    stepper = sc.compile_stepper(BALL, "svi:4", flags=FLAGS, events=BOUNCES["impact"])
     heights = np.array([[0.5], [1.0], [2.0]])
     lanes = stepper.integrate_ensemble(
         heights, velocity=0.0 * heights, t_end=5.0, t_eval=[1.0, 3.0, 5.0], tolerance=1e-9
@@ -418,7 +397,7 @@ def test_ensembles_of_bouncing_balls(ball):
 @pytest.mark.parametrize("plan", [{"steps": 60}, {"t_end": 6.03}])
 def test_ensembles_with_fixed_steps(plan):
     """Rows are the ends of steps, as without events; states within steps are left out."""
-    stepper = compile_stepper(BALL, "svi:4", flags=FLAGS, events=impact("y", 0.8, terminal=9))
+    stepper = sc.compile_stepper(BALL, "svi:4", flags=FLAGS, events=sc.impact("y", 0.8, terminal=9))
     heights, strengths = np.array([[0.02], [0.5], [1.0]]), np.array([1.0, 1.2, 0.9])
     arguments = {"h": 0.1, "save_every": 7, **plan}
     lanes = stepper.integrate_ensemble(heights, 0.0 * heights, parameters={"g": strengths}, **arguments)
@@ -435,30 +414,14 @@ def test_ensembles_with_fixed_steps(plan):
 
 def test_energy_of_a_billiard_stays_at_round_off():
     """Rounding errors of 20,000 impulses of circular walls have the mean 0; without correction 2e-17 each adds up."""
-    stepper = compile_stepper(POINT, "svi:1", flags=FLAGS, events=STADIUM)
+    stepper = sc.compile_stepper(POINT, "svi:1", flags=FLAGS, events=STADIUM)
     run = stepper.integrate([0.3, -0.2], velocity=[0.8, 0.6], h=2.0, steps=22_000, save_every=2000)
     assert sum(map(len, run.events)) > 19_000
     energies = [(Fraction(x) ** 2 + Fraction(y) ** 2) / 2 for x, y in run.p.tolist()]
     assert max(abs(energy - energies[0]) for energy in energies) < 2e-14
 
 
-def test_particles_in_a_box_are_arrays():
-    """Index notation: the sizes are those of the call."""
-    gas = LagrangianSystem.from_text(
-        name="gas", coordinates=["r[N, 2]"], lagrangian="sum(i in N, (r_dot[i, 0]**2 + r_dot[i, 1]**2)/2)"
-    )
-    stepper = compile_stepper(gas, "svi:1", flags=FLAGS)
-    r, v = np.array([[0.5, 0.5], [0.2, 0.7], [0.9, 0.1]]), np.array([[0.5, 0.3], [-1.0, 0.2], [0.4, -0.7]])
-    entries = [f"r[{i}, {k}]" for i in range(3) for k in range(2)]
-    walls = [impact(g) for each in entries for g in (each, f"1 - {each}")]
-    run = stepper.integrate({"r": r}, velocity={"r": v}, h=0.7, t_end=20.0, events=walls)
-    assert np.abs(run.q["r"][-1] - np.abs((r + 20.0 * v + 1.0) % 2.0 - 1.0)).max() < 1e-13
-    kick = Event("sum(i in N, r[i, 0]) - 1", then={"p_r[N-1, 1]": "2*p_r[0, 1]"}, where="r[0, 0] > 0")
-    kicked = stepper.integrate({"r": r}, velocity={"r": v}, h=0.5, steps=20, events=kick)
-    assert kicked.p["r"][-1, 2, 1] == pytest.approx(0.6)
-
-
-CHAIN = LagrangianSystem.from_text(
+CHAIN = sc.LagrangianSystem.from_text(
     name="chain",
     coordinates=["q[N]"],
     parameters={"m": 1.5, "e": 0.9, "b": 0.1},
@@ -471,17 +434,17 @@ CHAIN = LagrangianSystem.from_text(
 )
 def test_events_in_index_notation_equal_those_of_known_sizes(plan, bound):
     """Walls that move, sums, maps of velocities and parameters: formulas by NumPy against compiled ones."""
-    stepper, n = compile_stepper(CHAIN, "svi:4", flags=FLAGS), 20
+    stepper, n = sc.compile_stepper(CHAIN, "svi:4", flags=FLAGS), 20
     known = stepper.with_sizes(N=n)
     squares = " + ".join(f"q_{i}**2" for i in range(n))
     pairs = [
-        (impact("1/2 + b*sin(t) - q[0]", "e"), impact("1/2 + b*sin(t) - q_0", "e")),
-        (impact("4 - sum(i in N, q[i]**2)"), impact(f"4 - ({squares})")),
+        (sc.impact("1/2 + b*sin(t) - q[0]", "e"), sc.impact("1/2 + b*sin(t) - q_0", "e")),
+        (sc.impact("4 - sum(i in N, q[i]**2)"), sc.impact(f"4 - ({squares})")),
         (
-            Event("t - 11.3", then={"q_dot[N-1]": "-e*q_dot[N-1] + q[0]"}, where="q[0] < 9"),
-            Event("t - 11.3", then={f"q_{n - 1}_dot": f"-e*q_{n - 1}_dot + q_0"}),
+            sc.Event("t - 11.3", then={"q_dot[N-1]": "-e*q_dot[N-1] + q[0]"}, where="q[0] < 9"),
+            sc.Event("t - 11.3", then={f"q_{n - 1}_dot": f"-e*q_{n - 1}_dot + q_0"}),
         ),
-        (Event("q[3]", 1, then={"p_q[2]": "p_q[2] + b"}), Event("q_3", 1, then={"p_q_2": "p_q_2 + b"})),
+        (sc.Event("q[3]", 1, then={"p_q[2]": "p_q[2] + b"}), sc.Event("q_3", 1, then={"p_q_2": "p_q_2 + b"})),
     ]
     q, v = np.exp(-(((np.arange(n) - 6.0) / 3.0) ** 2)), 0.1 * np.cos(np.arange(n))
     runs = [
@@ -490,7 +453,7 @@ def test_events_in_index_notation_equal_those_of_known_sizes(plan, bound):
     ]
     assert [len(each) for each in runs[0].events] == [len(each) for each in runs[1].events]
     assert min(map(len, runs[0].events)) > 0
-    with pytest.raises(EventError, match=r"behind the wall '1/2 \+ b\*sin\(t\) - q\[0\]', which is -0\.51"):
+    with pytest.raises(sc.EventError, match=r"behind the wall '1/2 \+ b\*sin\(t\) - q\[0\]', which is -0\.51"):
         stepper.integrate(q + 1.0, events=[pair[0] for pair in pairs], **plan)
     assert np.abs(runs[0].q["q"][-1] - np.asarray(runs[1].q)[-1]).max() < bound
     for own, other in zip(runs[0].events, runs[1].events, strict=True):
@@ -501,10 +464,10 @@ def test_events_in_index_notation_equal_those_of_known_sizes(plan, bound):
 @pytest.mark.full
 def test_wall_of_a_long_chain():
     """The reflected wave returns as that of a short chain: 10^4 coordinates are not compiled one by one."""
-    stepper, ends = compile_stepper(CHAIN, "svi:4", flags=FLAGS), []
+    stepper, ends = sc.compile_stepper(CHAIN, "svi:4", flags=FLAGS), []
     for n in (100, 10_000):
         q = np.exp(-(((np.arange(n) - 10.0) / 3.0) ** 2))
-        run = stepper.integrate(q, velocity=0 * q, h=0.5, steps=40, save_every=40, events=impact("1/2 - q[0]"))
+        run = stepper.integrate(q, velocity=0 * q, h=0.5, steps=40, save_every=40, events=sc.impact("1/2 - q[0]"))
         ends.append((run.events[0].t, run.q["q"][-1, :50]))
     assert len(ends[0][0]) > 0
     assert np.abs(ends[0][0] - ends[1][0]).max() < 1e-13
@@ -512,10 +475,10 @@ def test_wall_of_a_long_chain():
 
 
 def test_derivatives_through_events_in_index_notation():
-    stepper, q = compile_stepper(CHAIN, "svi:4", flags=FLAGS), np.exp(-(((np.arange(8) - 3.0) / 2.0) ** 2))
+    stepper, q = sc.compile_stepper(CHAIN, "svi:4", flags=FLAGS), np.exp(-(((np.arange(8) - 3.0) / 2.0) ** 2))
     known = stepper.with_sizes(N=8)
     runs = [
-        each.integrate(q, velocity=0 * q, h=0.25, steps=40, events=impact(wall, "e"))
+        each.integrate(q, velocity=0 * q, h=0.25, steps=40, events=sc.impact(wall, "e"))
         for each, wall in ((stepper, "1/2 - q[0]"), (known, "1/2 - q_0"))
     ]
     assert len(runs[0].events[0]) > 0
@@ -526,28 +489,28 @@ def test_derivatives_through_events_in_index_notation():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: impact("q[0] - q_dot[1]"), "contains 'q_dot'"),
-        (lambda: impact("3"), "constant and never crosses zero"),
-        (lambda: Event("q[0]", then={"m": "1"}), "'m' is not an entry of a coordinate"),
-        (lambda: Event("q[0]", then={"sum(i in N, q[i])": "1"}), "is not an entry of a coordinate"),
-        (lambda: Event("q[0]", then={"q_dot[0]": "1", "p_q[1]": "1"}), "sets momenta and velocities"),
-        (lambda: Event("q[0] - 1/4", then={"p_q[0]": "log(q[0] - 9)"}), "not finite"),
+        (lambda: sc.impact("q[0] - q_dot[1]"), "contains 'q_dot'"),
+        (lambda: sc.impact("3"), "constant and never crosses zero"),
+        (lambda: sc.Event("q[0]", then={"m": "1"}), "'m' is not an entry of a coordinate"),
+        (lambda: sc.Event("q[0]", then={"sum(i in N, q[i])": "1"}), "is not an entry of a coordinate"),
+        (lambda: sc.Event("q[0]", then={"q_dot[0]": "1", "p_q[1]": "1"}), "sets momenta and velocities"),
+        (lambda: sc.Event("q[0] - 1/4", then={"p_q[0]": "log(q[0] - 9)"}), "not finite"),
     ],
 )
 def test_errors_of_index_notation_name_the_symbol(make, words):
     q = np.exp(-(((np.arange(8) - 3.0) / 2.0) ** 2))
-    with pytest.raises(EventError, match=words):
-        compile_stepper(CHAIN, "svi:4", flags=FLAGS).integrate(q, velocity=0 * q, h=0.25, steps=40, events=make())
+    with pytest.raises(sc.EventError, match=words):
+        sc.compile_stepper(CHAIN, "svi:4", flags=FLAGS).integrate(q, velocity=0 * q, h=0.25, steps=40, events=make())
 
 
-ROD = LagrangianSystem.from_text(
+ROD = sc.LagrangianSystem.from_text(
     name="rod",
     coordinates=["x", "y"],
     lagrangian="(x_dot**2 + y_dot**2)/2 - y",
     constraints=["(x - b*sin(t))**2 + y**2 - 1"],
     parameters={"b": 0.0, "e": 1.0},
 )
-ANGLE = LagrangianSystem.from_text(
+ANGLE = sc.LagrangianSystem.from_text(
     name="angle",
     coordinates=["a"],
     lagrangian="a_dot**2/2 + b*a_dot*cos(a)*cos(t) + cos(a)",
@@ -570,10 +533,10 @@ def chart(x, t):
 @pytest.mark.parametrize(("b", "e"), [(0.0, 1.0), (0.0, 0.8), (0.2, 1.0), (0.2, 0.7)])
 def test_impacts_of_constrained_systems_equal_those_of_free_coordinates(b, e):
     """A pendulum as a point on a rod, also with a moving pivot, hits a moving wall and is kicked."""
-    rod, angle = compile_stepper(ROD, "svi:6"), compile_stepper(ANGLE, "svi:6")
+    rod, angle = sc.compile_stepper(ROD, "svi:6"), sc.compile_stepper(ANGLE, "svi:6")
     y, x = ("y_dot", "a_dot") if e == 1.0 else ("p_y", "p_a")
-    kicks = Event("t - 7.7", then={y: f"{y} + 1/5"}), Event("t - 7.7", then={x: f"{x} + sin(a)/5"})
-    walls = impact("3/10 + sin(2*t)/20 - x", "e"), impact("3/10 + sin(2*t)/20 - b*sin(t) - sin(a)", "e")
+    kicks = sc.Event("t - 7.7", then={y: f"{y} + 1/5"}), sc.Event("t - 7.7", then={x: f"{x} + sin(a)/5"})
+    walls = sc.impact("3/10 + sin(2*t)/20 - x", "e"), sc.impact("3/10 + sin(2*t)/20 - b*sin(t) - sin(a)", "e")
     plan = {"h": 0.05, "t_end": 20.0, "parameters": {"b": b, "e": e}}
     a, w = -0.8, 0.9
     one = rod.integrate(
@@ -604,15 +567,15 @@ def test_impacts_of_constrained_systems_equal_those_of_free_coordinates(b, e):
 def test_impacts_of_relativistic_pendulums_contain_the_work_of_a_moving_constraint():
     """The impulse of a moving rod does work: H(p + lambda g_q + G^T mu) - H(p) = -lambda g_t - mu c_t."""
     options = {"coordinates": ["x", "y"], "parameters": {"b": 0.3}, "constraints": ["(x - b*sin(t))**2 + y**2 - 1"]}
-    rod = LagrangianSystem.from_text(name="fast", lagrangian="-sqrt(1 - x_dot**2 - y_dot**2) - y/4", **options)
+    rod = sc.LagrangianSystem.from_text(name="fast", lagrangian="-sqrt(1 - x_dot**2 - y_dot**2) - y/4", **options)
     speed = "a_dot**2 + 2*b*a_dot*cos(a)*cos(t) + b**2*cos(t)**2"
-    angle = LagrangianSystem.from_text(
+    angle = sc.LagrangianSystem.from_text(
         name="fast_angle", coordinates=["a"], lagrangian=f"-sqrt(1 - ({speed})) + cos(a)/4", parameters={"b": 0.3}
     )
     plan, a, w = {"h": 0.05, "t_end": 16.0}, -0.4, 0.3
-    walls = impact("3/10 + sin(2*t)/20 - x", 0.9), impact("3/10 + sin(2*t)/20 - b*sin(t) - sin(a)", 0.9)
+    walls = sc.impact("3/10 + sin(2*t)/20 - x", 0.9), sc.impact("3/10 + sin(2*t)/20 - b*sin(t) - sin(a)", 0.9)
     start = [np.sin(a), -np.cos(a)], [0.3 + w * np.cos(a), w * np.sin(a)]
-    steppers = [compile_stepper(each, "svi:4", flags=FLAGS) for each in (rod, angle)]
+    steppers = [sc.compile_stepper(each, "svi:4", flags=FLAGS) for each in (rod, angle)]
     one = steppers[0].integrate(start[0], velocity=start[1], events=walls[0], **plan)
     two = steppers[1].integrate([a], velocity=[w], events=walls[1], **plan)
     assert len(one.events[0]) == len(two.events[0]) > 1
@@ -621,14 +584,14 @@ def test_impacts_of_relativistic_pendulums_contain_the_work_of_a_moving_constrai
 
 def test_derivatives_through_impacts_of_a_moving_rod_with_a_quartic_kinetic_energy():
     """Differences of sixth order also require impacts that depend smoothly on the initial state, to round-off."""
-    rod = LagrangianSystem.from_text(
+    rod = sc.LagrangianSystem.from_text(
         name="quartic",
         coordinates=["x", "y"],
         lagrangian="(x_dot**2 + y_dot**2)/2 + (x_dot**2 + y_dot**2)**2/8 - y/4",
         constraints=["(x - 3*sin(t)/10)**2 + y**2 - 1"],
     )
-    stepper, q = compile_stepper(rod, "svi:4", flags=FLAGS), np.array([np.sin(-0.4), -np.cos(-0.4)])
-    wall, unit = impact("3/10 + sin(2*t)/20 - x", 0.9), np.array([np.cos(-0.4), np.sin(-0.4)])
+    stepper, q = sc.compile_stepper(rod, "svi:4", flags=FLAGS), np.array([np.sin(-0.4), -np.cos(-0.4)])
+    wall, unit = sc.impact("3/10 + sin(2*t)/20 - x", 0.9), np.array([np.cos(-0.4), np.sin(-0.4)])
 
     def derivative(function):
         halves = [(function(0.1 + d) - function(0.1 - d)) / (2 * d) for d in (2.5e-5, 5e-5, 1e-4)]
@@ -651,7 +614,7 @@ def test_derivatives_through_impacts_of_a_moving_rod_with_a_quartic_kinetic_ener
 
 def test_impacts_of_constrained_arrays():
     """A pendulum of five links that hits a wall, in index notation and with known sizes."""
-    links = LagrangianSystem.from_text(
+    links = sc.LagrangianSystem.from_text(
         name="links",
         coordinates=["r[N, 2]"],
         lagrangian="sum(i in N, (r_dot[i, 0]**2 + r_dot[i, 1]**2)/2 - r[i, 1])",
@@ -660,12 +623,12 @@ def test_impacts_of_constrained_arrays():
             "(r[i+1, 0] - r[i, 0])**2 + (r[i+1, 1] - r[i, 1])**2 - 1 for i in N-1",
         ],
     )
-    stepper = compile_stepper(links, sc.SVI(1, "gauss-lobatto:2"))
+    stepper = sc.compile_stepper(links, sc.SVI(1, "gauss-lobatto:2"))
     r = np.column_stack([np.arange(1.0, 6.0), np.zeros(5)])
     arguments = {"h": 0.01, "steps": 300}
-    one = stepper.integrate(r, velocity=0 * r, events=impact("3 + r[N-1, 1]"), **arguments)
+    one = stepper.integrate(r, velocity=0 * r, events=sc.impact("3 + r[N-1, 1]"), **arguments)
     two = stepper.with_sizes(N=5).integrate(
-        r.reshape(-1), velocity=0 * r.reshape(-1), events=impact("3 + r_4_1"), **arguments
+        r.reshape(-1), velocity=0 * r.reshape(-1), events=sc.impact("3 + r_4_1"), **arguments
     )
     assert len(one.events[0]) == len(two.events[0]) > 0
     assert np.abs(one.q["r"][-1].reshape(-1) - np.asarray(two.q)[-1]).max() < 1e-9
@@ -676,15 +639,15 @@ def test_impacts_of_constrained_arrays():
 
 def test_impacts_with_a_time_transformation():
     """Reversible steps through close encounters, against adaptive ones."""
-    kepler = LagrangianSystem.from_text(
+    kepler = sc.LagrangianSystem.from_text(
         name="kepler",
         coordinates=["x", "y"],
         lagrangian="(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2) + 0*e",
         parameters={"e": 0.97},
     )
-    arguments = {"velocity": [0.0, 0.5], "t_end": 6.0, "events": impact("1/10 + x - y/5", "e")}
-    plain = compile_stepper(kepler, "svi:6").integrate([1.0, 0.0], **arguments)
-    stepper = compile_stepper(kepler, "svi:6", time_transformation="sqrt(x**2 + y**2)**(3/2)")
+    arguments = {"velocity": [0.0, 0.5], "t_end": 6.0, "events": sc.impact("1/10 + x - y/5", "e")}
+    plain = sc.compile_stepper(kepler, "svi:6").integrate([1.0, 0.0], **arguments)
+    stepper = sc.compile_stepper(kepler, "svi:6", time_transformation="sqrt(x**2 + y**2)**(3/2)")
     run = stepper.integrate([1.0, 0.0], h=0.05, **arguments)
     assert len(run.events[0]) == len(plain.events[0]) > 5
     assert np.abs(run.events[0].t - plain.events[0].t).max() < 1e-11
@@ -693,14 +656,14 @@ def test_impacts_with_a_time_transformation():
     assert np.ptp(elastic.energy()) < 1e-11
     tangents = [
         each.integrate(
-            [1.0, 0.0], velocity=[0.0, 0.7], t_end=2.0, events=impact("1/5 + x - y/5", "e"), **plan
+            [1.0, 0.0], velocity=[0.0, 0.7], t_end=2.0, events=sc.impact("1/5 + x - y/5", "e"), **plan
         ).tangent()
-        for each, plan in ((compile_stepper(kepler, "svi:6"), {}), (stepper, {"h": 0.05}))
+        for each, plan in ((sc.compile_stepper(kepler, "svi:6"), {}), (stepper, {"h": 0.05}))
     ]
     assert np.abs(tangents[1][-1] - tangents[0][-1]).max() < 1e-8 * np.abs(tangents[0][-1]).max()
 
 
-BODY = LagrangianSystem.from_text(
+BODY = sc.LagrangianSystem.from_text(
     "body",
     coordinates=["x", "y", "z"],
     rotations={"R": "omega"},
@@ -711,14 +674,14 @@ BODY = LagrangianSystem.from_text(
 
 def test_corners_of_a_rigid_body_hit_the_floor():
     """Energy and what the floor does not change are conserved; momenta stay tangent to the unit quaternions."""
-    stepper = compile_stepper(BODY, "svi:6")
+    stepper = sc.compile_stepper(BODY, "svi:6")
     corners = [(0.5, 0.6, 0.2), (-0.5, 0.4, -0.3), (0.1, -0.6, 0.2)]
     run = stepper.integrate(
         {"x": 0.0, "y": 0.0, "z": 1.5, "R": [1, 0.2, 0.1, 0]},
         velocity={"x": 0.1, "y": 0.0, "z": 0.0, "omega": [0.3, 0.2, 0.5]},
         h=0.05,
         t_end=30.0,
-        events=[impact(f"z + {a}*R_31 + {b}*R_32 + {c}*R_33") for a, b, c in corners],
+        events=[sc.impact(f"z + {a}*R_31 + {b}*R_32 + {c}*R_33") for a, b, c in corners],
     )
     assert sum(map(len, run.events)) > 15
     assert np.ptp(run.energy()) < 1e-14
@@ -736,7 +699,7 @@ def test_corners_of_a_rigid_body_hit_the_floor():
 @pytest.mark.parametrize("k", [0, 2, 4])
 def test_derivatives_through_impacts_of_a_rigid_body(k):
     """Tangent vectors in quaternions against differences of sixth order."""
-    stepper, corner = compile_stepper(BODY, "svi:6"), impact("z + R_31/2 + 3*R_32/5 + R_33/5", 0.9)
+    stepper, corner = sc.compile_stepper(BODY, "svi:6"), sc.impact("z + R_31/2 + 3*R_32/5 + R_33/5", 0.9)
 
     def state(d):
         v = np.array([0.1, 0.0, 0.0, 0.3, 0.2, 0.5]) + d * (np.arange(6) == k)
@@ -759,18 +722,18 @@ def test_derivatives_through_impacts_of_a_rigid_body(k):
 
 def test_impacts_of_a_body_that_turns_in_a_plane():
     """A rod that falls on its ends: with a rotation about one axis and with an angle."""
-    rod = LagrangianSystem.from_text("plane", coordinates=["z", "a"], lagrangian="z_dot**2/2 + 2*a_dot**2/10 - z")
-    ends = [impact("z + sin(a)/2", 0.9), impact("z - sin(a)/2", 0.9)]
-    turned = Event("t - 3", then={"a_dot": "a_dot + 1/2"})
+    rod = sc.LagrangianSystem.from_text("plane", coordinates=["z", "a"], lagrangian="z_dot**2/2 + 2*a_dot**2/10 - z")
+    ends = [sc.impact("z + sin(a)/2", 0.9), sc.impact("z - sin(a)/2", 0.9)]
+    turned = sc.Event("t - 3", then={"a_dot": "a_dot + 1/2"})
     plan = {"h": 0.05, "t_end": 12.0}
-    flat = compile_stepper(rod, "svi:6").integrate([1.0, 0.3], velocity=[0.0, 0.4], events=[*ends, turned], **plan)
-    space = compile_stepper(BODY, "svi:6").integrate(
+    flat = sc.compile_stepper(rod, "svi:6").integrate([1.0, 0.3], velocity=[0.0, 0.4], events=[*ends, turned], **plan)
+    space = sc.compile_stepper(BODY, "svi:6").integrate(
         {"x": 0.0, "y": 0.0, "z": 1.0, "R": {"axis": [0, 1, 0], "angle": -0.3}},
         velocity={"x": 0.0, "y": 0.0, "z": 0.0, "omega": [0.0, -0.4, 0.0]},
         events=[
-            impact("z + R_31/2", 0.9),
-            impact("z - R_31/2", 0.9),
-            Event("t - 3", then={"omega_2": "omega_2 - 1/2"}),
+            sc.impact("z + R_31/2", 0.9),
+            sc.impact("z - R_31/2", 0.9),
+            sc.Event("t - 3", then={"omega_2": "omega_2 - 1/2"}),
         ],
         **plan,
     )
@@ -782,14 +745,14 @@ def test_impacts_of_a_body_that_turns_in_a_plane():
 
 # Derivatives.
 
-BOX = LagrangianSystem.from_text(
+BOX = sc.LagrangianSystem.from_text(
     name="box",
     coordinates=["x", "y"],
     lagrangian="(x_dot**2 + y_dot**2)/2 - k*y - x**2*y**2/4 + 0*(e + b + c + a + w)",
     parameters={"k": 0.5, "e": 0.8, "b": 1.0, "c": 1.0, "a": 0.1, "w": 2.0},
 )
-ELLIPSE, FLOOR = impact("1 - (x/2)**2 - (y - b)**2/c", "e"), impact("y + 1 - a*sin(w*t) - x**2/5", "e")
-SHIFT = Event("y + b", -1, then={"p_y": "-e*p_y", "p_x": "p_x*(1 + a)", "x": "x + a*k"})
+ELLIPSE, FLOOR = sc.impact("1 - (x/2)**2 - (y - b)**2/c", "e"), sc.impact("y + 1 - a*sin(w*t) - x**2/5", "e")
+SHIFT = sc.Event("y + b", -1, then={"p_y": "-e*p_y", "p_x": "p_x*(1 + a)", "x": "x + a*k"})
 FORM = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.eye(2), np.zeros((2, 2))]])
 
 
@@ -825,7 +788,7 @@ def differences(run, z, values):
     ids=["ellipse-2", "restitution", "adaptive", "moving", "map"],
 )
 def test_derivatives_are_those_of_the_computed_run(event, method, e, tolerance):
-    stepper = compile_stepper(BOX, method)
+    stepper = sc.compile_stepper(BOX, method)
     values = dict(zip(stepper.parameters, stepper.defaults, strict=True)) | {"e": e}
     plan = {"h": 0.1 if method != "svi:8" else 0.2} if tolerance is None else {"tolerance": tolerance}
 
@@ -862,43 +825,31 @@ def test_lyapunov_exponent_of_the_stadium_billiard(point):
     assert abs(exponents[0] + exponents[3]) < 1e-10
 
 
-@pytest.mark.full
-def test_gravity_wedge_is_integrable_at_45_degrees_only():
-    """Lehtihet & Miller, Physica D 21 (1986) 93: wedges of more than 45 degrees are chaotic."""
-    falling = LagrangianSystem.from_text(name="wedge", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y")
-    stepper, exponents = compile_stepper(falling, "svi:2", flags=FLAGS), []
-    for angle in (45, 50, 60):
-        walls = [impact(f"sin({angle}*pi/180)*y {sign} cos({angle}*pi/180)*x") for sign in "+-"]
-        run = stepper.integrate([0.05, 0.6], velocity=[0.4, 0.0], h=0.5, steps=1000, events=walls)
-        exponents.append(run.lyapunov_exponents()[0] * run.t[-1] / sum(map(len, run.events)))
-        assert np.ptp(run.energy()) < 2e-14
-    assert exponents[0] < 0.02
-    assert min(exponents[1:]) > 0.3
-
-
 def test_derivatives_are_refused_where_they_do_not_exist(point, ball):
     grazing = point.integrate(
-        [-3.0, 1.0 - 1e-14], velocity=[1.0, 0.0], h=0.37, t_end=6.0, events=impact("x**2 + y**2 - 1")
+        [-3.0, 1.0 - 1e-14], velocity=[1.0, 0.0], h=0.37, t_end=6.0, events=sc.impact("x**2 + y**2 - 1")
     )
     assert len(grazing.events[0]) == 1
-    with pytest.raises(StateError, match="grazing"):
+    with pytest.raises(sc.StateError, match="grazing"):
         grazing.tangent()
     corner = point.integrate(
-        [0.5, 0.5], velocity=[1.0, 1.0], h=0.3, t_end=1.0, events=[impact("1 - x"), impact("1 - y")]
+        [0.5, 0.5], velocity=[1.0, 1.0], h=0.3, t_end=1.0, events=[sc.impact("1 - x"), sc.impact("1 - y")]
     )
-    with pytest.raises(StateError, match="corner"):
+    with pytest.raises(sc.StateError, match="corner"):
         corner.tangent()
-    with pytest.raises(StateError, match="save_every=1"):
+    with pytest.raises(sc.StateError, match="save_every=1"):
         ball.integrate([1.0], [0.0], h=0.1, steps=20, save_every=5, events=BOUNCES["impact"]).tangent()
-    with pytest.raises(MethodError, match="hessian_product is not available with events"):
+    with pytest.raises(sc.MethodError, match="hessian_product is not available with events"):
         corner.hessian_product(np.zeros((len(corner), 4)), np.eye(4))
-    with pytest.raises(StateError, match="momenta instead of velocities"):
+    with pytest.raises(sc.StateError, match="momenta instead of velocities"):
         ball.integrate([1.0], [0.0], h=0.1, steps=20, events=BOUNCES["velocity"]).tangent()
 
 
 @pytest.mark.parametrize("depth", [1e-2, 1e-6, 1e-10])
 def test_grazing_impacts_are_found(point, depth):
-    run = point.integrate([-3.0, 1.0 - depth], velocity=[1.0, 0.0], h=0.37, t_end=6.0, events=impact("x**2 + y**2 - 1"))
+    run = point.integrate(
+        [-3.0, 1.0 - depth], velocity=[1.0, 0.0], h=0.37, t_end=6.0, events=sc.impact("x**2 + y**2 - 1")
+    )
     assert len(run.events[0]) == 1
     assert abs(math.atan2(run.p[-1, 1], run.p[-1, 0]) - 2 * math.acos(1 - depth)) < 1e-16 / math.sqrt(depth) + 1e-15
 
@@ -909,48 +860,48 @@ def test_grazing_impacts_are_found(point, depth):
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: Event("y", then={"p_z": "1"}), "'p_z' is not a coordinate.*did you mean 'p_y'"),
-        (lambda: Event("y", then={"g": "2*g"}), "'g' is not a coordinate"),
-        (lambda: Event("y", then={"p_y": "1", "y_dot": "1"}), "sets momenta and velocities"),
-        (lambda: Event("y", then={}), "must be new values by name"),
-        (lambda: Event("y", then={"p_y": sympy.Symbol("z")}), "'z' in the value 'z' of 'p_y'"),
-        (lambda: impact("y - p_y"), "contains 'p_y'"),
-        (lambda: impact("y", 1.2), "restitution of the wall 'y' is 1.2"),
-        (lambda: impact("y", "1.2"), "restitution of the wall 'y' is 1.2"),
-        (lambda: Event("y", restitution=1.0), "use impact"),
-        (lambda: Event("y", where="y"), "must be a comparison"),
-        (lambda: impact("y", 0.0), "passes the wall 'y'"),
-        (lambda: Event("y", then={"p_y": "p_y"}, where="y > 1 - 1"), None),
-        (lambda: Event("y", -1, then={"p_y": "log(y - 1)"}), "not finite"),
+        (lambda: sc.Event("y", then={"p_z": "1"}), "'p_z' is not a coordinate.*did you mean 'p_y'"),
+        (lambda: sc.Event("y", then={"g": "2*g"}), "'g' is not a coordinate"),
+        (lambda: sc.Event("y", then={"p_y": "1", "y_dot": "1"}), "sets momenta and velocities"),
+        (lambda: sc.Event("y", then={}), "must be new values by name"),
+        (lambda: sc.Event("y", then={"p_y": sympy.Symbol("z")}), "'z' in the value 'z' of 'p_y'"),
+        (lambda: sc.impact("y - p_y"), "contains 'p_y'"),
+        (lambda: sc.impact("y", 1.2), "restitution of the wall 'y' is 1.2"),
+        (lambda: sc.impact("y", "1.2"), "restitution of the wall 'y' is 1.2"),
+        (lambda: sc.Event("y", restitution=1.0), "use impact"),
+        (lambda: sc.Event("y", where="y"), "must be a comparison"),
+        (lambda: sc.impact("y", 0.0), "passes the wall 'y'"),
+        (lambda: sc.Event("y", then={"p_y": "p_y"}, where="y > 1 - 1"), None),
+        (lambda: sc.Event("y", -1, then={"p_y": "log(y - 1)"}), "not finite"),
     ],
 )
 def test_errors_name_the_symbol_and_the_remedy(ball, make, words):
     if words is None:
         ball.integrate([1.0], [0.0], h=0.1, steps=30, events=make())
         return
-    with pytest.raises(EventError, match=words):
+    with pytest.raises(sc.EventError, match=words):
         ball.integrate([1.0], [0.0], h=0.1, steps=30, events=make())
 
 
 def test_unsupported_combinations_are_refused(ball):
     pendulum = sc.problem("planar-pendulum").system
-    with pytest.raises(EventError, match="in transformed time, where the energy is the constant"):
-        compile_stepper(sc.reparametrise(pendulum, "1 + q**2"), "svi:4", events=Event("q", then={"p_q": "-p_q"}))
-    with pytest.raises(MethodError, match="error="):
+    with pytest.raises(sc.EventError, match="in transformed time, where the energy is the constant"):
+        sc.compile_stepper(sc.reparametrise(pendulum, "1 + q**2"), "svi:4", events=sc.Event("q", then={"p_q": "-p_q"}))
+    with pytest.raises(sc.MethodError, match="error="):
         ball.integrate([1.0], [0.0], t_end=2.0, error=1e-8, events=BOUNCES["impact"])
 
 
 @pytest.mark.parametrize("formula", ["abs(y)", "sign(y)", "max(y, 0)", "Heaviside(y)"])
 def test_formulas_that_switch_point_to_events(formula):
-    with pytest.raises(SystemDefinitionError, match=r"sc\.impact\(\.\.\), or sc\.Event"):
-        LagrangianSystem.from_text(name="stop", coordinates=["y"], lagrangian=f"y_dot**2/2 - {formula}")
+    with pytest.raises(sc.SystemDefinitionError, match=r"sc\.impact\(\.\.\), or sc\.Event"):
+        sc.LagrangianSystem.from_text(name="stop", coordinates=["y"], lagrangian=f"y_dot**2/2 - {formula}")
 
 
 def test_no_accuracy_warnings_of_energies_that_impacts_change(ball):
     with warnings.catch_warnings():
-        warnings.simplefilter("error", AccuracyWarning)
-        compile_stepper(BALL, "svi:4", flags=FLAGS).integrate(
-            [1.0], [0.0], t_end=5.0, events=impact("y", 0.5, terminal=3)
+        warnings.simplefilter("error", sc.AccuracyWarning)
+        sc.compile_stepper(BALL, "svi:4", flags=FLAGS).integrate(
+            [1.0], [0.0], t_end=5.0, events=sc.impact("y", 0.5, terminal=3)
         )
 
 
@@ -959,9 +910,9 @@ def test_source_compiles_without_warnings(compiler, tmp_path):
     import subprocess
 
     needs(compiler)
-    events = [impact("y - sin(t)", where="y > 0"), Event("y", then={"y_dot": "-y_dot"})]
+    events = [sc.impact("y - sin(t)", where="y > 0"), sc.Event("y", then={"y_dot": "-y_dot"})]
     for controlled in (False, True):
-        source, _ = generate_source(BALL, "svi:4", prefix="hit", events=events, controlled=controlled)
+        source, _ = sc.generate_source(BALL, "svi:4", prefix="hit", events=events, controlled=controlled)
         for each in source.amalgamated().sources:
             (tmp_path / f"{each.prefix}.h").write_text(each.header)
             (tmp_path / f"{each.prefix}.c").write_text(each.code)
@@ -1015,11 +966,11 @@ span = 8.03
 def test_model_files_contain_events(tmp_path):
     model = parse_model(MODEL)
     assert parse_model(dump_model(model)) == model
-    assert model.events == (impact("y", "e"), Event("x - 3", 1, then={"p_x": "-p_x"}, where="y >= 0"))
+    assert model.events == (sc.impact("y", "e"), sc.Event("x - 3", 1, then={"p_x": "-p_x"}, where="y >= 0"))
     run = model.integrate()
     assert [len(each) for each in run.events] == [4, 1]
     assert run.q[-1, 0] == pytest.approx(3.0 - 5.03, abs=1e-14)
-    with pytest.raises(ModelFileError, match=r"'were'.*did you mean 'where'"):
+    with pytest.raises(sc.ModelFileError, match=r"'were'.*did you mean 'where'"):
         parse_model(MODEL.replace("where", "were"))
 
 
@@ -1027,12 +978,12 @@ def test_model_files_contain_events(tmp_path):
 def test_generated_programs_print_events(tmp_path, steps):
     """The C program and the Python package of a folder have the events of a run of the model."""
     model = parse_model(MODEL.replace("step = 0.1\n", steps).replace("8.03", "8.0"))
-    run, folder = model.integrate(), generate_package(model, tmp_path / "ball_c")
+    run, folder = model.integrate(), sc.generate_package(model, tmp_path / "ball_c")
     printed = check_output(["make", "-s", "-C", folder, "run", "CFLAGS=-O1 -std=c99"], text=True).splitlines()
     found = [[float(line.split()[-1]) for line in printed if f"event {e.function} " in line] for e in model.events]
     last = [float(x) for x in [line for line in printed if line[0] != "#"][-1].split()[:5]]
-    package, plan = load_package(folder), {"t_end": 8.0} | ({"h": 0.1} if steps else {})
-    assert package.events[0] == impact("y", "e")
+    package, plan = sc.load_package(folder), {"t_end": 8.0} | ({"h": 0.1} if steps else {})
+    assert package.events[0] == sc.impact("y", "e")
     for made in (run, package.integrate(model.q, velocity=model.velocity, **plan)):
         for times, each in zip(found, made.events, strict=True):
             assert np.abs(times - each.t).max() < 1e-13

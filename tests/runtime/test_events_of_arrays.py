@@ -4,32 +4,28 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import EventError
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.runtime.events import detection
-from scvi_codegen.runtime.events.event import Event, impact
 from scvi_codegen.verification.certificate import Outcome
 
 FLAGS = ("-O1",)
-GAS = LagrangianSystem.from_text(
+GAS = sc.LagrangianSystem.from_text(
     name="gas",
     coordinates=["r[N, 2]"],
     lagrangian="sum(i in N, (r_dot[i, 0]**2 + r_dot[i, 1]**2)/2 + 0*d)",
     parameters={"d": 0.25},
 )
-CHAIN = LagrangianSystem.from_text(
+CHAIN = sc.LagrangianSystem.from_text(
     name="chain",
     coordinates=["q[N]"],
     parameters={"m": 1.5, "e": 0.9, "b": 0.1},
     lagrangian="sum(i in N, m*q_dot[i]**2/2 + 0*(e+b)) - sum(i in N-1, (q[i+1] - q[i])**2/2 + (q[i+1] - q[i])**4/20)",
 )
-BOX = [impact("r[i, k] for i in N, k in 2"), impact("1 - r[i, k] for i in N, k in 2")]
+BOX = [sc.impact("r[i, k] for i in N, k in 2"), sc.impact("1 - r[i, k] for i in N, k in 2")]
 
 
 @pytest.fixture(scope="module")
 def gas():
-    return compile_stepper(GAS, "svi:1", flags=FLAGS)
+    return sc.compile_stepper(GAS, "svi:1", flags=FLAGS)
 
 
 def folded(r, v, t):
@@ -65,7 +61,7 @@ def test_discs_exchange_momentum_in_pairs(gas):
     """Hard discs: energy and momentum are those of the start, and every crossing is that of the pair it names."""
     random = np.random.default_rng(4)
     r, v = np.stack(np.meshgrid(*[np.arange(3.0) / 2] * 2), -1).reshape(-1, 2), random.normal(size=(9, 2))
-    discs = impact("(r[i, 0] - r[j, 0])**2 + (r[i, 1] - r[j, 1])**2 - d**2 for i < j in N")
+    discs = sc.impact("(r[i, 0] - r[j, 0])**2 + (r[i, 1] - r[j, 1])**2 - d**2 for i < j in N")
     run = gas.integrate({"r": r}, velocity={"r": v}, h=0.03, steps=150, events=discs)
     (each,), pairs = run.events, np.transpose(np.triu_indices(9, 1))
     assert len(each) > 2
@@ -81,7 +77,7 @@ def test_discs_exchange_momentum_in_pairs(gas):
 def test_impacts_pass_through_discs_that_touch(gas):
     """Newton's cradle: the first disc stops, the last one leaves with its velocity, in one step and at once."""
     r, v = np.array([[0.0, 0.5], [0.5, 0.5], [0.75, 0.5], [1.0, 0.5]]), np.array([[1.0, 0.0], *[[0.0, 0.0]] * 3])
-    row = impact("r[i+1, 0] - r[i, 0] - d for i in N-1")
+    row = sc.impact("r[i+1, 0] - r[i, 0] - d for i in N-1")
     run = gas.integrate({"r": r}, velocity={"r": v}, h=0.3, steps=2, events=row)
     assert np.abs(run.p["r"][-1] - v[::-1]).max() < 1e-15
     assert sorted(run.events[0].element) == [0, 1, 2]
@@ -100,16 +96,16 @@ def test_more_impacts_in_a_step_than_memory_for_them(gas, monkeypatch):
 
 def test_an_event_of_every_element_equals_events_of_entries():
     """Conditions, maps of velocities and restitution in loops, their derivatives, and adaptive steps."""
-    stepper, n = compile_stepper(CHAIN, "svi:4", flags=FLAGS), 4
+    stepper, n = sc.compile_stepper(CHAIN, "svi:4", flags=FLAGS), 4
     known = stepper.with_sizes(N=n)
     q, v = np.linspace(0.2, 1.0, n), np.cos(3.0 * np.arange(n))
     loops = [
-        impact("13/10 + b - q[i] for i in N", "e", where="q_dot[i] > q[0]/9"),
-        Event("q[i] + 1/2 for i in 1..N-1", -1, then={"q_dot[i]": "-e*q_dot[i] + q[i-1]/99"}, where="q[i] < 3"),
+        sc.impact("13/10 + b - q[i] for i in N", "e", where="q_dot[i] > q[0]/9"),
+        sc.Event("q[i] + 1/2 for i in 1..N-1", -1, then={"q_dot[i]": "-e*q_dot[i] + q[i-1]/99"}, where="q[i] < 3"),
     ]
-    single = [impact(f"13/10 + b - q_{i}", "e", where=f"q_{i}_dot > q_0/9") for i in range(n)]
+    single = [sc.impact(f"13/10 + b - q_{i}", "e", where=f"q_{i}_dot > q_0/9") for i in range(n)]
     single += [
-        Event(f"q_{i} + 1/2", -1, then={f"q_{i}_dot": f"-e*q_{i}_dot + q_{i - 1}/99"}, where=f"q_{i} < 3")
+        sc.Event(f"q_{i} + 1/2", -1, then={f"q_{i}_dot": f"-e*q_{i}_dot + q_{i - 1}/99"}, where=f"q_{i} < 3")
         for i in range(1, n)
     ]
     for plan in ({"h": 0.1, "steps": 60}, {"t_end": 6.0, "tolerance": 1e-11}):
@@ -122,8 +118,10 @@ def test_an_event_of_every_element_equals_events_of_entries():
         assert [each.element.tolist() for each in same.events] == [each.element.tolist() for each in one.events]
         assert np.abs(one.q["q"][-1] - np.asarray(two.q)[-1]).max() < (1e-13 if "h" in plan else 1e-8)
     runs = [
-        stepper.integrate(q, velocity=v, h=0.1, steps=30, events=impact("13/10 + b - q[i] for i in N", "e")),
-        known.integrate(q, velocity=v, h=0.1, steps=30, events=[impact(f"13/10 + b - q_{i}", "e") for i in range(n)]),
+        stepper.integrate(q, velocity=v, h=0.1, steps=30, events=sc.impact("13/10 + b - q[i] for i in N", "e")),
+        known.integrate(
+            q, velocity=v, h=0.1, steps=30, events=[sc.impact(f"13/10 + b - q_{i}", "e") for i in range(n)]
+        ),
     ]
     tangents = [np.asarray(run.tangent()[-1]) for run in runs]
     assert np.abs(tangents[0] - tangents[1]).max() < 1e-11 * np.abs(tangents[1]).max()
@@ -132,11 +130,11 @@ def test_an_event_of_every_element_equals_events_of_entries():
 @pytest.mark.parametrize("of_known_sizes", [False, pytest.param(True, marks=pytest.mark.full)])
 def test_gradients_through_events_of_elements(of_known_sizes):
     """The adjoint equals the tangents to round-off, and extrapolated differences of the run."""
-    stepper, n = compile_stepper(CHAIN, "svi:4", flags=FLAGS), 4
+    stepper, n = sc.compile_stepper(CHAIN, "svi:4", flags=FLAGS), 4
     stepper = stepper.with_sizes(N=n) if of_known_sizes else stepper
     loops = [
-        impact("13/10 + b - q[i] for i in N", "e"),
-        Event("q[i] + 1/2 for i in 1..N-1", -1, then={"p_q[i]": "-e*p_q[i] + q[i-1]/99"}),
+        sc.impact("13/10 + b - q[i] for i in N", "e"),
+        sc.Event("q[i] + 1/2 for i in 1..N-1", -1, then={"p_q[i]": "-e*p_q[i] + q[i-1]/99"}),
     ]
     q, w = np.linspace(0.2, 1.0, n), np.cos(np.arange(2 * n) + 1.0)
     x = np.concatenate([q, 1.5 * np.cos(3.0 * np.arange(n)), [1.5, 0.9, 0.1]])
@@ -168,7 +166,7 @@ def test_memory_of_a_wall_has_all_its_entries(gas):
     """A wall that contains all coordinates, of more than 2000: a sphere around particles in 3000 dimensions."""
     r = np.full((1500, 2), 0.01)
     run = gas.integrate(
-        {"r": r}, velocity={"r": r}, h=0.7, steps=3, events=impact("1 - sum(i in N, r[i, 0]**2 + r[i, 1]**2)")
+        {"r": r}, velocity={"r": r}, h=0.7, steps=3, events=sc.impact("1 - sum(i in N, r[i, 0]**2 + r[i, 1]**2)")
     )
     radius = np.linalg.norm(run.q["r"].reshape(len(run.t), -1), axis=1)
     assert len(run.events[0]) == 1
@@ -193,7 +191,7 @@ def test_states_of_crossings_have_a_limit_of_memory(gas, monkeypatch):
     assert np.isnan(run.events[0].q["r"]).all()
 
 
-GRAINS = LagrangianSystem.from_text(
+GRAINS = sc.LagrangianSystem.from_text(
     name="grains",
     coordinates=["r[N, 2]"],
     parameters={"g": 1.0},
@@ -202,10 +200,10 @@ GRAINS = LagrangianSystem.from_text(
     forces={"r[i, 0]": "u - r_dot[i, 0]/10"},
 )
 AROUND = [
-    impact("r[i, 1] + r[i, 0]**2/20 for i in N", 0.8),
-    impact("2 + sin(t)/5 - r[i, 0] for i in N"),
-    impact("r[i, 0] + 1 for i in N", where="r[i, 1] < 3"),
-    Event("r_dot[i, 1] for i in N", -1),
+    sc.impact("r[i, 1] + r[i, 0]**2/20 for i in N", 0.8),
+    sc.impact("2 + sin(t)/5 - r[i, 0] for i in N"),
+    sc.impact("r[i, 0] + 1 for i in N", where="r[i, 1] < 3"),
+    sc.Event("r_dot[i, 1] for i in N", -1),
 ]
 
 
@@ -213,7 +211,7 @@ AROUND = [
 @pytest.mark.parametrize("h", [0.05, None])
 def test_ensembles_with_inputs_and_events_equal_single_runs(of_known_sizes, h):
     """Moving walls, walls of finite size, inputs whose breakpoints end steps; known sizes equal any size."""
-    stepper, random = compile_stepper(GRAINS, "svi:4", flags=FLAGS, events=AROUND), np.random.default_rng(0)
+    stepper, random = sc.compile_stepper(GRAINS, "svi:4", flags=FLAGS, events=AROUND), np.random.default_rng(0)
     r = np.stack([random.uniform(-0.9, 1.8, 4), random.uniform(0.5, 2.0, 4)], axis=1)
     v, plan = random.normal(size=(4, 2)), {"t_end": 3.0} | ({"h": h} if h else {"tolerance": 1e-10})
     given = {"inputs": {"u": ([-1.0, 1.31, 2.7, 9.0], [0.0, 1.0, -1.0, 0.5])}, **plan}
@@ -232,7 +230,7 @@ def test_cloth_in_wind_at_a_wall():
     """Constraints of arrays, forces that depend on velocities, and impacts: order 2, rods and pins to round-off."""
     squares = [f"(r[{{0}}, {k}] - r[i, j, {k}])**2" for k in range(3)]
     along, across = (" + ".join(squares).format(each) for each in ("i+1, j", "i, j+1"))
-    cloth = LagrangianSystem.from_text(
+    cloth = sc.LagrangianSystem.from_text(
         name="cloth",
         coordinates=["r[N, N, 3]"],
         parameters={"l": 0.25, "y[N]": 0.0},
@@ -246,10 +244,10 @@ def test_cloth_in_wind_at_a_wall():
             f"{across} = l**2 for i in 1..N-1, j in N-1",
         ],
     )
-    stepper, n = compile_stepper(cloth, "stoermer-verlet", flags=FLAGS), 5
+    stepper, n = sc.compile_stepper(cloth, "stoermer-verlet", flags=FLAGS), 5
     i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
     r, given = np.stack([0 * i, 0.25 * j, -0.25 * i], axis=-1), {"t_end": 1.0, "parameters": {"y": 0.25 * np.arange(n)}}
-    wall = impact("1/10 - r[i, j, 0] for i in N, j in N", 0.5)
+    wall = sc.impact("1/10 - r[i, j, 0] for i in N, j in N", 0.5)
     runs = [stepper.integrate({"r": r}, h=h, events=wall, **given) for h in (0.01, 0.005, 0.0025)]
     ends = [run.q["r"][-1] for run in runs]
     assert len(runs[0].events[0]) > 5
@@ -265,9 +263,9 @@ def test_cloth_in_wind_at_a_wall():
 def test_certificates_of_known_sizes_measure_impacts(tolerance):
     """Adaptive steps, and sites with Hamiltonians of their own, which are verified at known sizes."""
     sites = "-4*sum(i in N, sqrt(1 - q_dot[i]**2/4)) - sum(i in N-1, (q[i+1] - q[i])**2/2)"
-    system = CHAIN if tolerance else LagrangianSystem.from_text(name="sites", coordinates=["q[N]"], lagrangian=sites)
-    walls = [impact("q[i] + 1 for i in N"), impact("3/2 - q[i] for i in N")]
-    stepper = compile_stepper(system, "svi:2", flags=FLAGS, events=walls)
+    system = CHAIN if tolerance else sc.LagrangianSystem.from_text(name="sites", coordinates=["q[N]"], lagrangian=sites)
+    walls = [sc.impact("q[i] + 1 for i in N"), sc.impact("3/2 - q[i] for i in N")]
+    stepper = sc.compile_stepper(system, "svi:2", flags=FLAGS, events=walls)
     certificate = sc.verify(system, "svi:2", [0.1, 0.5], [1.0, 0.2], h=0.1, stepper=stepper, tolerance=tolerance)
     names = {"event surfaces", "saltation", "impacts", "symplecticity, impacts", "reversal, impacts"}
     assert names <= {each.name for each in certificate.checks if each.outcome is Outcome.SATISFIED}
@@ -275,8 +273,8 @@ def test_certificates_of_known_sizes_measure_impacts(tolerance):
 
 @pytest.mark.full
 def test_certificate_of_a_chain_between_walls():
-    walls = [impact("q[i] + 1 for i in N"), impact("3/2 - q[i] for i in N")]
-    stepper = compile_stepper(CHAIN, "svi:2", flags=FLAGS, events=walls)
+    walls = [sc.impact("q[i] + 1 for i in N"), sc.impact("3/2 - q[i] for i in N")]
+    stepper = sc.compile_stepper(CHAIN, "svi:2", flags=FLAGS, events=walls)
     certificate = sc.verify(CHAIN, "svi:2", [0.1, 0.5], [1.0, 0.2], h=0.1, stepper=stepper)
     names = {"event surfaces", "saltation", "impacts", "symplecticity, impacts", "reversal, impacts"}
     assert names <= {each.name for each in certificate.checks}
@@ -286,15 +284,15 @@ def test_certificate_of_a_chain_between_walls():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: impact("q[i+1] for i in N"), "q\\[i\\+1\\]"),
-        (lambda: impact("sum(k in N, q[k]) - q[i] for i in N"), "a sum within a sum must have whole numbers"),
-        (lambda: Event("q[i] for i in N", then={"q[i] + 1": "0"}), "is not an entry of a coordinate"),
-        (lambda: impact("q[0]", where="q[i] > 0"), "'i' is not an index"),
+        (lambda: sc.impact("q[i+1] for i in N"), "q\\[i\\+1\\]"),
+        (lambda: sc.impact("sum(k in N, q[k]) - q[i] for i in N"), "a sum within a sum must have whole numbers"),
+        (lambda: sc.Event("q[i] for i in N", then={"q[i] + 1": "0"}), "is not an entry of a coordinate"),
+        (lambda: sc.impact("q[0]", where="q[i] > 0"), "'i' is not an index"),
     ],
 )
 def test_errors_name_the_formula(make, words):
-    with pytest.raises(EventError, match=words):
-        compile_stepper(CHAIN, "svi:4", flags=FLAGS).integrate(np.ones(3), h=0.1, steps=1, events=make())
+    with pytest.raises(sc.EventError, match=words):
+        sc.compile_stepper(CHAIN, "svi:4", flags=FLAGS).integrate(np.ones(3), h=0.1, steps=1, events=make())
 
 
 def test_a_recorded_run_has_its_events(gas, tmp_path):

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.errors import StepFailedError
 
 START, H, STOP = 1.25, 0.125, 2.05
 """The seventh step, from t = 2 to t = 2.125, contains the end of the domain."""
@@ -38,11 +37,11 @@ def test_failed_step_reports_its_number_and_the_time_at_which_it_started(kind, m
         run = made.start(q, p, h=sign * H, **given)
         for steps in steps_before:
             run.advance(steps)
-        with pytest.raises(StepFailedError) as failed:
+        with pytest.raises(sc.StepFailedError) as failed:
             run.advance(100)
         assert (failed.value.t, failed.value.step) == (START + sign * 6 * H, 6)
         assert (run.t, run.steps) == (START + sign * 6 * H, 6)
-    with pytest.raises(StepFailedError) as failed:
+    with pytest.raises(sc.StepFailedError) as failed:
         made.integrate(q, p, h=sign * H, steps=100, save_every=4, **given)
     assert (failed.value.t, failed.value.step) == (START + sign * 6 * H, 6)
 
@@ -53,7 +52,7 @@ def test_message_reports_the_last_update_of_an_iteration_that_did_not_converge(k
     """Steps of 4 are too long for the fixed-point iteration of a unit oscillator."""
     stop = START + 0.5 * H if words == "" else 1e9
     run = stepper(kind, "svi:3").start([0.4], [0.2], h=h, t=START, parameters={"stop": stop, "k": 4.0})
-    with pytest.raises(StepFailedError) as failed:
+    with pytest.raises(sc.StepFailedError) as failed:
         run.advance(1)
     assert failed.value.status == status
     assert ("last update" in str(failed.value)) == bool(words)

@@ -7,16 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import StepFailedError
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
-from scvi_codegen.models.problems import problem
+import scvi_codegen as sc
 from scvi_codegen.native import building
 from scvi_codegen.native.building import PORTABLE_FLAGS
-from scvi_codegen.pipeline import generate_source
-from scvi_codegen.results.recording import record_run, resume_run
-from scvi_codegen.runtime.core.stepper import Stepper
 
 pytestmark = pytest.mark.usefixtures("as_users_compile")
 
@@ -25,7 +18,10 @@ LONG = 0.2
 
 each_method = pytest.mark.parametrize(
     "method",
-    [SVI(4), *(pytest.param(each, marks=pytest.mark.full) for each in (Gauss(3), SCVI(2), SpectralCollocation(2)))],
+    [
+        sc.SVI(4),
+        *(pytest.param(each, marks=pytest.mark.full) for each in (sc.Gauss(3), sc.SCVI(2), sc.SpectralCollocation(2))),
+    ],
     ids=lambda method: method.name,
 )
 
@@ -33,16 +29,16 @@ each_method = pytest.mark.parametrize(
 @cache
 def both(method):
     """Return a stepper with a fallback library and one with a built-in iteration."""
-    chosen = problem("double-pendulum")
-    source, interface = generate_source(chosen.system, method)
-    return compile_stepper(chosen.system, method, flags=PORTABLE_FLAGS), Stepper(
+    chosen = sc.problem("double-pendulum")
+    source, interface = sc.generate_source(chosen.system, method)
+    return sc.compile_stepper(chosen.system, method, flags=PORTABLE_FLAGS), sc.Stepper(
         source, interface, flags=PORTABLE_FLAGS
     )
 
 
 @pytest.fixture
 def start():
-    chosen = problem("double-pendulum")
+    chosen = sc.problem("double-pendulum")
     return np.array(chosen.q), 0.3 * np.array(chosen.q)
 
 
@@ -50,7 +46,7 @@ def outcome(stepper, start, h, **more):
     """Every number of a run, as far as it goes."""
     try:
         run, status = stepper.integrate(*start, h=h, steps=60, **more), ""
-    except StepFailedError as error:
+    except sc.StepFailedError as error:
         run, status = error.trajectory, f"{error.status} {error.t} {error.residual}"
     events = [(found.t.tolist(), found.q.tolist()) for found in run.events] if more else []
     return [*(x.tolist() for x in (run.t, run.q, run.p, run.iterations)), status, events]
@@ -68,7 +64,7 @@ def test_fallback_library_gives_equal_bits(method, h, events, start):
 
 def test_error_estimate_of_a_fallback_step_is_equal(start):
     errors = []
-    for stepper in both(SVI(4)):
+    for stepper in both(sc.SVI(4)):
         run = stepper.start(*start, h=LONG)
         run.advance(6)
         errors.append((run.step_error, run.worst_step_time))
@@ -80,20 +76,20 @@ def test_newton_iteration_is_compiled_on_demand(start, monkeypatch):
     built = []
     load = building.load
     monkeypatch.setattr(building, "load", lambda source, **flags: built.append(source.prefix) or load(source, **flags))
-    stepper = compile_stepper(problem("double-pendulum").system, SVI(5), prefix="late", flags=PORTABLE_FLAGS)
+    stepper = sc.compile_stepper(sc.problem("double-pendulum").system, sc.SVI(5), prefix="late", flags=PORTABLE_FLAGS)
     stepper.integrate(*start, h=0.02, steps=100)
     assert built == ["late"]
     assert "_derivatives(" not in stepper.source.code
-    with pytest.raises(StepFailedError):
+    with pytest.raises(sc.StepFailedError):
         stepper.step(*start, 40.0)
     assert built == ["late"] * 2
-    with pytest.raises(StepFailedError):
+    with pytest.raises(sc.StepFailedError):
         stepper.step(*start, 40.0)
     assert built == ["late"] * 2
 
 
 def test_discrete_lagrangian_comes_from_the_fallback_library(start):
-    borrowing, owning = both(SVI(4))
+    borrowing, owning = both(sc.SVI(4))
     assert "discrete_legendre" not in borrowing.source.declarations
     q, _ = start
     values = [stepper.discrete_lagrangian(q, q + 0.01, 0.1) for stepper in (borrowing, owning)]
@@ -101,7 +97,9 @@ def test_discrete_lagrangian_comes_from_the_fallback_library(start):
 
 
 def test_concurrent_threads_compile_the_fallback_once(start):
-    stepper = compile_stepper(problem("double-pendulum").system, SVI(3), prefix="threads", flags=PORTABLE_FLAGS)
+    stepper = sc.compile_stepper(
+        sc.problem("double-pendulum").system, sc.SVI(3), prefix="threads", flags=PORTABLE_FLAGS
+    )
     with ThreadPoolExecutor(8) as pool:
         found = list(pool.map(lambda _: outcome(stepper, start, LONG), range(16)))
     assert all(each == found[0] for each in found)
@@ -109,15 +107,15 @@ def test_concurrent_threads_compile_the_fallback_once(start):
 
 
 def test_copy_in_another_process_uses_the_fallback(start):
-    borrowing, owning = both(SVI(4))
+    borrowing, owning = both(sc.SVI(4))
     assert outcome(pickle.loads(pickle.dumps(borrowing)), start, LONG) == outcome(owning, start, LONG)
 
 
 def test_recorded_run_continues_with_its_fallback(start, tmp_path):
-    borrowing, owning = both(SVI(4))
+    borrowing, owning = both(sc.SVI(4))
     expected = owning.start(*start, h=LONG).record(60)
-    record_run(borrowing.start(*start, h=LONG), tmp_path / "run", steps=20)
-    whole = resume_run(tmp_path / "run", steps=60)[:]
+    sc.record_run(borrowing.start(*start, h=LONG), tmp_path / "run", steps=20)
+    whole = sc.resume_run(tmp_path / "run", steps=60)[:]
     assert np.array_equal(whole.q, expected.q)
     assert np.array_equal(whole.iterations, expected.iterations)
 
@@ -125,7 +123,7 @@ def test_recorded_run_continues_with_its_fallback(start, tmp_path):
 @pytest.mark.full
 def test_low_words_do_not_depend_on_the_split_of_a_run():
     """Low words of fixed-point and Newton steps are separate, for one call as for many."""
-    stepper = compile_stepper(problem("kepler").system, SVI(4), flags=PORTABLE_FLAGS)
+    stepper = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(4), flags=PORTABLE_FLAGS)
     whole, cut = (stepper.start([0.3, 0.0], [0.0, (1.7 / 0.3) ** 0.5], h=0.8) for _ in range(2))
     whole.advance(40)
     for _ in range(40):
@@ -134,25 +132,25 @@ def test_low_words_do_not_depend_on_the_split_of_a_run():
 
 
 def test_failed_run_ends_before_the_step(start):
-    borrowing, _ = both(SVI(4))
+    borrowing, _ = both(sc.SVI(4))
     run = borrowing.start(*start, h=40.0)
     before = run.checkpoint()
-    with pytest.raises(StepFailedError):
+    with pytest.raises(sc.StepFailedError):
         run.advance(1)
     assert run.checkpoint() == before
 
 
 def test_prepare_compiles_everything_later_calls_need(tmp_path, monkeypatch):
     monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path))
-    swing, flags = problem("planar-pendulum").system, ("-O0",)
-    stepper, state = compile_stepper(swing, "svi:2", flags=flags), ([1.0], [0.0])
-    lattice = LagrangianSystem.from_text(
+    swing, flags = sc.problem("planar-pendulum").system, ("-O0",)
+    stepper, state = sc.compile_stepper(swing, "svi:2", flags=flags), ([1.0], [0.0])
+    lattice = sc.LagrangianSystem.from_text(
         name="chain", coordinates=["q[N]"], lagrangian="sum(a in N, q_dot[a]**2/2 - q[a]**2/2)"
     )
-    chain = compile_stepper(lattice, "svi:2", flags=flags)
+    chain = sc.compile_stepper(lattice, "svi:2", flags=flags)
     stepper.prepare(tangent=True, second=True, ensemble=True, events=["q", "q_dot"])
     chain.prepare()
-    compile_stepper(problem("kepler").system, "stoermer-verlet", flags=flags).prepare()  # nothing to borrow
+    sc.compile_stepper(sc.problem("kepler").system, "stoermer-verlet", flags=flags).prepare()  # nothing to borrow
     built: list[str] = []
     monkeypatch.setattr(building, "_publish", lambda *given: built.append(given[0].prefix))
     for events in (None, ["q", "q_dot"]):

@@ -4,11 +4,6 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import EventError
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.events.event import impact
 
 FLAGS = ("-O1",)
 E = 0.8
@@ -16,12 +11,12 @@ E = 0.8
 
 
 @pytest.fixture(scope="module")
-def table() -> Stepper:
+def table() -> sc.Stepper:
     """Ball on the table A sin t: y is the distance from it."""
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="table", coordinates=["y"], lagrangian="y_dot**2/2 - (1 - A*sin(t))*y", parameters={"A": 0.8}
     )
-    return compile_stepper(system, "svi:6", flags=FLAGS, events=impact("y", E))
+    return sc.compile_stepper(system, "svi:6", flags=FLAGS, events=sc.impact("y", E))
 
 
 def start_of_period_one(amplitude: float) -> tuple[float, float]:
@@ -65,13 +60,13 @@ def test_ball_on_a_vibrating_table_has_orbits_of_period_one_and_two(table):
 
 def test_orbits_of_billiards_have_the_multipliers_of_mirrors():
     """Two mirrors of radius R at distance L: half the trace of the round trip is 2 g^2 - 1, g = 1 - L/R."""
-    point = compile_stepper(
-        LagrangianSystem.from_text(name="point", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2"),
+    point = sc.compile_stepper(
+        sc.LagrangianSystem.from_text(name="point", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2"),
         "svi:1",
         flags=FLAGS,
     )
-    ellipse = point.with_events(impact("1 - (x/1.5)**2 - y**2"))
-    discs = point.with_events([impact("(x - 3/2)**2 + y**2 - 1"), impact("(x + 3/2)**2 + y**2 - 1")])
+    ellipse = point.with_events(sc.impact("1 - (x/1.5)**2 - y**2"))
+    discs = point.with_events([sc.impact("(x - 3/2)**2 + y**2 - 1"), sc.impact("(x + 3/2)**2 + y**2 - 1")])
     for stepper, velocity, ratio, period in ((ellipse, [0.01, 1.0], 2 / 2.25, 4.0), (discs, [1.0, 0.01], -1.0, 2.0)):
         orbit = sc.periodic_orbit(stepper, [0.02, 0.03], velocity=velocity, period=period + 0.05, steps=9, energy=0.5)
         half = 2 * (1 - ratio) ** 2 - 1
@@ -86,10 +81,10 @@ def test_orbits_of_billiards_have_the_multipliers_of_mirrors():
 def test_fit_of_restitution_and_wall_from_bounces():
     """Exact parameters from exact heights, and parameters within their errors from noisy ones."""
     with pytest.warns(sc.SystemDefinitionWarning, match="'e' does not occur"):
-        ball = LagrangianSystem.from_text(
+        ball = sc.LagrangianSystem.from_text(
             name="ball", coordinates=["y"], lagrangian="y_dot**2/2 - g*y", parameters={"g": 1.0, "e": 0.8, "w": 0.1}
         )
-    stepper = compile_stepper(ball, "svi:2", flags=FLAGS, events=impact("y - w", "e"))
+    stepper = sc.compile_stepper(ball, "svi:2", flags=FLAGS, events=sc.impact("y - w", "e"))
     exact, t = {"g": 1.05, "e": 0.77, "w": 0.12}, np.linspace(0.05, 6.3, 40)
     heights = stepper.integrate([1.0], [0.0], h=0.1, t_end=6.4, parameters=exact, t_eval=t).q[:, 0]
     given = {"q": [1.0], "p": [0.0], "h": 0.2, "start": 0.0, "fit_initial_state": False}
@@ -98,23 +93,23 @@ def test_fit_of_restitution_and_wall_from_bounces():
     errors = np.array(list(noisy.standard_errors.values()))
     assert (abs(noisy.values - list(exact.values())) < 4 * errors).all()
     assert (errors < 0.02).all()
-    ended = stepper.with_events(impact("y - w", "e", terminal=2))
-    with pytest.raises(EventError, match="end the run at t = 3"):
+    ended = stepper.with_events(sc.impact("y - w", "e", terminal=2))
+    with pytest.raises(sc.EventError, match="end the run at t = 3"):
         sc.fit(ended, t, heights, **given)
 
 
 @pytest.fixture(scope="module")
-def billiard() -> Stepper:
+def billiard() -> sc.Stepper:
     """Point without forces in a plane."""
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="billiard", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 + 0*w", parameters={"w": 0.5}
     )
-    return compile_stepper(system, "svi:1", flags=FLAGS)
+    return sc.compile_stepper(system, "svi:1", flags=FLAGS)
 
 
 def test_derivatives_through_impacts_at_the_ends_of_steps(billiard):
     """Impacts within roundings of the end of a step: x(T) = 2 w - x - v T, T = 12 h, by (x, y, v), w, t and h."""
-    walled = billiard.with_events(impact("w - x"))
+    walled = billiard.with_events(sc.impact("w - x"))
     for v, h, n in ((1.0, 0.1, 7), (1.0, 1 / 3, 2), (0.99, 0.1, 10), (0.49, 0.37, 11)):
         x = billiard.integrate([0.0, 0.0], [v, 0.3], h=h, steps=n).q[-1, 0]
         for k in range(-6, 7):
@@ -132,7 +127,7 @@ def test_an_unstable_orbit_with_impacts_by_multiple_shooting(billiard):
     """
     angles = np.pi / 2 + 2 * np.pi * np.arange(3) / 3
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    discs = [impact(f"(x - ({x!r}))**2 + (y - ({y!r}))**2 - 1") for x, y in (np.sqrt(12) * directions).tolist()]
+    discs = [sc.impact(f"(x - ({x!r}))**2 + (y - ({y!r}))**2 - 1") for x, y in (np.sqrt(12) * directions).tolist()]
     hits = (np.sqrt(12) - 1) * directions
     q, p = (hits[0] + hits[1]) / 2, (hits[1] - hits[0]) / (3 * (2 - 3**-0.5))
     for seed in (1, 2, 4):  # one segment does not converge from these
@@ -144,13 +139,13 @@ def test_an_unstable_orbit_with_impacts_by_multiple_shooting(billiard):
 
 def test_fits_and_orbits_of_arrays():
     """A chain that bounces on its end: a fit of array coordinates, and the orbit of one ball by its distance."""
-    chain = LagrangianSystem.from_text(
+    chain = sc.LagrangianSystem.from_text(
         name="chain",
         coordinates=["y[N]"],
         lagrangian="sum(i in N, y_dot[i]**2/2 - y[i] + 0*e*w) - k*sum(i in N-1, (y[i+1] - y[i])**2/2)",
         parameters={"k": 6.0, "e": 0.7, "w": 0.12},
     )
-    stepper = compile_stepper(chain, "svi:4", flags=FLAGS, events=impact("y[0] - w", "e"))
+    stepper = sc.compile_stepper(chain, "svi:4", flags=FLAGS, events=sc.impact("y[0] - w", "e"))
     q, t = np.array([1.0, 1.6]), np.linspace(0.1, 4.0, 40)
     run = stepper.integrate(q, velocity=0 * q, h=0.1, steps=40, t_eval=t)
     assert len(run.events[0]) == 2

@@ -12,17 +12,7 @@ from samples import QUICK_FLAGS, linkage
 from scipy.integrate import solve_ivp
 from scipy.optimize import curve_fit
 
-from scvi_codegen import (
-    SVI,
-    AccuracyWarning,
-    FitError,
-    LagrangianSystem,
-    MethodError,
-    StateError,
-    StepFailedError,
-    compile_stepper,
-    fit,
-)
+import scvi_codegen as sc
 from scvi_codegen.runtime.estimation.multiple_shooting import _bounded_update, _equality_constrained_update
 
 TRUE = {"m": 1.3, "alpha": -1.0, "beta": 0.8, "delta": 0.2, "gamma": 0.3, "omega": 1.2}
@@ -34,7 +24,7 @@ SOME = ["alpha", "beta", "delta"]
 
 @cache
 def oscillator():
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="oscillator",
         coordinates=["x"],
         lagrangian="m*x_dot**2/2 - alpha*x**2/2 - beta*x**4/4",
@@ -42,7 +32,7 @@ def oscillator():
         forces={"x": "gamma*cos(omega*t)"},
         dissipation="delta*x_dot**2/2",
     )
-    return compile_stepper(system, SVI(6), flags=QUICK_FLAGS)
+    return sc.compile_stepper(system, sc.SVI(6), flags=QUICK_FLAGS)
 
 
 def exact(t, alpha, beta, delta, x, p):
@@ -66,7 +56,7 @@ def recorded(seed=None):
 
 
 def test_noise_free_data_give_the_true_values():
-    found = fit(oscillator(), TIMES, recorded()[0], unknown=SOME, **GUESS)
+    found = sc.fit(oscillator(), TIMES, recorded()[0], unknown=SOME, **GUESS)
     assert found.names == (*SOME, "x", "p_x")
     assert_allclose(found.values, [TRUE[name] for name in SOME] + [0.8, 0.1], rtol=1e-9)
     assert_allclose([found.q[0], found.p[0]], [0.8, 0.1], rtol=1e-9)
@@ -77,7 +67,7 @@ def test_noise_free_data_give_the_true_values():
 def test_estimates_and_errors_agree_with_curve_fit():
     """curve_fit integrates with DOP853 and uses finite differences."""
     measured = recorded(1)[0]
-    found = fit(oscillator(), TIMES, measured, unknown=SOME, **GUESS)
+    found = sc.fit(oscillator(), TIMES, measured, unknown=SOME, **GUESS)
     values, covariance = curve_fit(
         lambda t, *x: exact(t, *x)[0], TIMES, measured, p0=[-0.9, 0.8, 0.3, 0.7, 0.2], xtol=1e-12, ftol=1e-12
     )
@@ -94,7 +84,7 @@ def test_standard_errors_agree_with_the_covariance():
     """The sum of squares of 5 errors, in their own deviations, over 20 series of noise: chi squared, 100 +- 14."""
     true, total = np.array([*(TRUE[name] for name in SOME), 0.8, 0.1]), 0.0
     for seed in range(20):
-        found = fit(oscillator(), TIMES, recorded(100 + seed)[0], unknown=SOME, deviations=NOISE, **GUESS)
+        found = sc.fit(oscillator(), TIMES, recorded(100 + seed)[0], unknown=SOME, deviations=NOISE, **GUESS)
         away = found.values - true
         total += away @ np.linalg.solve(found.covariance, away)
     assert 58.0 < total < 142.0
@@ -105,20 +95,20 @@ def test_several_quantities_with_gaps_and_individual_noise():
     both[:, 1] += 9 * NOISE * np.random.default_rng(3).normal(size=len(TIMES))
     both[::7, 0] = np.nan
     sizes = [NOISE, np.sqrt(82.0) * NOISE]
-    found = fit(oscillator(), TIMES, both, observed=["x", "p_x"], deviations=sizes, unknown=SOME, **GUESS)
-    alone = fit(oscillator(), TIMES, both[:, 0], deviations=NOISE, unknown=SOME, **GUESS)
+    found = sc.fit(oscillator(), TIMES, both, observed=["x", "p_x"], deviations=sizes, unknown=SOME, **GUESS)
+    alone = sc.fit(oscillator(), TIMES, both[:, 0], deviations=NOISE, unknown=SOME, **GUESS)
     assert_allclose(found.values, alone.values, rtol=0, atol=4 * np.sqrt(np.diag(alone.covariance)).max())
     assert (np.diag(found.covariance) < np.diag(alone.covariance)).all()
     assert np.isnan(found.residuals[::7, 0]).all()
     assert found.deviations.tolist() == sizes
-    bounded = fit(oscillator(), TIMES, both[:, 0], bounds={"delta": (0.25, 0.5)}, unknown=SOME, **GUESS)
+    bounded = sc.fit(oscillator(), TIMES, both[:, 0], bounds={"delta": (0.25, 0.5)}, unknown=SOME, **GUESS)
     assert bounded.values[2] == pytest.approx(0.25, abs=1e-6)
 
 
 @pytest.fixture(scope="module")
 def pushed():
     """Return the stepper of a pushed oscillator, its input, a run, and times of measurements."""
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="pushed",
         coordinates=["x"],
         lagrangian="m*x_dot**2/2 - k*x**2/2",
@@ -126,7 +116,7 @@ def pushed():
         forces={"x": "u"},
         inputs=["u"],
     )
-    stepper = compile_stepper(system, SVI(4), flags=QUICK_FLAGS)
+    stepper = sc.compile_stepper(system, sc.SVI(4), flags=QUICK_FLAGS)
     push = {"u": (np.linspace(0.0, 8.0, 9), np.random.default_rng(4).normal(size=9))}
     run = stepper.integrate([0.5], [0.0], inputs=push, h=0.05, t_end=8.0)
     times = np.linspace(0.13, 7.9, 60)
@@ -136,7 +126,7 @@ def pushed():
 def test_fit_with_known_start_and_tabulated_inputs(pushed):
     """The cart is pushed as measured; what is known is not found."""
     stepper, push, run, times = pushed
-    found = fit(
+    found = sc.fit(
         stepper,
         times,
         run.at(times)[0],
@@ -172,8 +162,8 @@ def test_fit_with_known_start_and_tabulated_inputs(pushed):
     ],
 )
 def test_unidentifiable_parameters_are_named(options, message):
-    with pytest.raises(FitError, match=message):
-        fit(oscillator(), **{"t": TIMES, "measured": recorded(5)[0]} | GUESS | options)
+    with pytest.raises(sc.FitError, match=message):
+        sc.fit(oscillator(), **{"t": TIMES, "measured": recorded(5)[0]} | GUESS | options)
 
 
 @pytest.mark.parametrize(
@@ -200,76 +190,78 @@ def test_unidentifiable_parameters_are_named(options, message):
     ],
 )
 def test_invalid_arguments_are_named(options, message):
-    with pytest.raises(StateError, match=message):
-        fit(oscillator(), **{"t": TIMES, "measured": recorded()[0], "unknown": SOME} | GUESS | options)
+    with pytest.raises(sc.StateError, match=message):
+        sc.fit(oscillator(), **{"t": TIMES, "measured": recorded()[0], "unknown": SOME} | GUESS | options)
 
 
 def test_biased_parameters_warn_of_too_long_steps():
     """With large second-order steps, estimates are off by twelve standard errors, which is reported."""
-    soft = LagrangianSystem.from_text(
+    soft = sc.LagrangianSystem.from_text(
         name="hard", coordinates=["x"], lagrangian="x_dot**2/2 - a*x**2/2 - b*x**4/4", parameters={"a": 1.0, "b": 1.0}
     )
     times = np.linspace(0.0, 20.0, 101)
-    exact = compile_stepper(soft, SVI(8), flags=QUICK_FLAGS).integrate([1.0], [0.0], h=0.1, steps=200, save_every=2)
+    exact = sc.compile_stepper(soft, sc.SVI(8), flags=QUICK_FLAGS).integrate(
+        [1.0], [0.0], h=0.1, steps=200, save_every=2
+    )
     noisy = exact.q[:, 0] + 1e-3 * np.random.default_rng(0).normal(size=101)
-    coarse, given = compile_stepper(soft, SVI(1), flags=QUICK_FLAGS), {"q": [0.9], "p": [0.1]}
-    with pytest.warns(AccuracyWarning, match=r"h is too large for this fit: .* b changes by \S+ standard errors"):
-        found = fit(coarse, times, noisy, h=0.2, **given)
+    coarse, given = sc.compile_stepper(soft, sc.SVI(1), flags=QUICK_FLAGS), {"q": [0.9], "p": [0.1]}
+    with pytest.warns(sc.AccuracyWarning, match=r"h is too large for this fit: .* b changes by \S+ standard errors"):
+        found = sc.fit(coarse, times, noisy, h=0.2, **given)
     assert abs(found.parameters["b"] - 1.0) > 10.0 * found.standard_errors["b"]
-    assert abs(fit(coarse, times, noisy, h=0.02, **given).parameters["b"] - 1.0) < 0.02
+    assert abs(sc.fit(coarse, times, noisy, h=0.02, **given).parameters["b"] - 1.0) < 0.02
 
 
 def test_initial_guess_with_failing_runs_is_accepted():
     """A soft spring: on the way to the truth a trial leaves its well and goes to infinity."""
-    soft = LagrangianSystem.from_text(
+    soft = sc.LagrangianSystem.from_text(
         name="soft", coordinates=["x"], lagrangian="x_dot**2/2 - a*x**2/2 + x**4/4", parameters={"a": 1.0}
     )
-    stepper = compile_stepper(soft, SVI(4), flags=QUICK_FLAGS)
+    stepper = sc.compile_stepper(soft, sc.SVI(4), flags=QUICK_FLAGS)
     run = stepper.integrate([0.9], [0.0], h=0.1, steps=100)
-    found = fit(stepper, run.t, run.q[:, 0], q=[0.8], p=[0.0], h=0.1, parameters={"a": 1.2})
+    found = sc.fit(stepper, run.t, run.q[:, 0], q=[0.8], p=[0.0], h=0.1, parameters={"a": 1.2})
     assert_allclose(found.values, [1.0, 0.9, 0.0], rtol=0, atol=1e-9)
-    with pytest.raises(StepFailedError):
-        fit(stepper, run.t, run.q[:, 0], q=[2.0], p=[0.0], h=0.1)
+    with pytest.raises(sc.StepFailedError):
+        sc.fit(stepper, run.t, run.q[:, 0], q=[2.0], p=[0.0], h=0.1)
 
 
 def test_measurement_at_the_start_determines_the_state():
     """No step is taken: the state is the measured one, and parameters are undetermined."""
     known = {"q": [0.7], "p": [0.2], "h": 0.1}
-    with pytest.raises(FitError, match="do not determine delta: they do not depend on it"):
-        fit(oscillator(), [0.0], [0.5], unknown=["delta"], fit_initial_state=False, **known)
-    found = fit(oscillator(), [0.0], [[0.5, 0.4]], observed=["x", "p_x"], unknown=[], **known)
+    with pytest.raises(sc.FitError, match="do not determine delta: they do not depend on it"):
+        sc.fit(oscillator(), [0.0], [0.5], unknown=["delta"], fit_initial_state=False, **known)
+    found = sc.fit(oscillator(), [0.0], [[0.5, 0.4]], observed=["x", "p_x"], unknown=[], **known)
     assert_allclose(found.values, [0.5, 0.4], rtol=1e-12)
 
 
 def test_parameter_at_a_bound_has_no_standard_error():
     """The parameter counts as known; other errors are those to first order."""
     bound = {"alpha": (-0.95, 0.0)}
-    found = fit(oscillator(), TIMES, recorded(4)[0], unknown=SOME, bounds=bound, **GUESS)
+    found = sc.fit(oscillator(), TIMES, recorded(4)[0], unknown=SOME, bounds=bound, **GUESS)
     assert found.at_bounds == ("alpha",)
     assert "alpha = -0.95 at its bound" in str(found)
     assert np.isnan(found.standard_errors["alpha"])
     known = GUESS | {"parameters": GUESS["parameters"] | {"alpha": -0.95}}
-    other = fit(oscillator(), TIMES, recorded(4)[0], unknown=SOME[1:], **known)
+    other = sc.fit(oscillator(), TIMES, recorded(4)[0], unknown=SOME[1:], **known)
     assert other.at_bounds == ()
     for name, error in other.standard_errors.items():
         assert found.standard_errors[name] == pytest.approx(error, rel=1e-3)
 
 
 def test_constraints_are_not_fitted():
-    bars = compile_stepper(linkage(), SVI(1, "gauss-lobatto:2"), flags=QUICK_FLAGS)
-    with pytest.raises(MethodError, match="fit is not available with constraints"):
-        fit(bars, [0.0, 0.1], np.zeros((2, 4)), q=[0, 1, 1.94, 1.5], p=np.zeros(4), h=0.1)
+    bars = sc.compile_stepper(linkage(), sc.SVI(1, "gauss-lobatto:2"), flags=QUICK_FLAGS)
+    with pytest.raises(sc.MethodError, match="fit is not available with constraints"):
+        sc.fit(bars, [0.0, 0.1], np.zeros((2, 4)), q=[0, 1, 1.94, 1.5], p=np.zeros(4), h=0.1)
 
 
 def test_search_without_convergence_is_reported(monkeypatch):
     search = partial(scipy.optimize.least_squares, max_nfev=1)
     monkeypatch.setattr(scipy.optimize, "least_squares", search)
-    with pytest.raises(FitError, match=r"least squares did not converge: .* Give a better initial guess"):
-        fit(oscillator(), TIMES, recorded()[0], unknown=SOME, **GUESS)
+    with pytest.raises(sc.FitError, match=r"least squares did not converge: .* Give a better initial guess"):
+        sc.fit(oscillator(), TIMES, recorded()[0], unknown=SOME, **GUESS)
 
 
 def test_residuals_are_drawn():
-    found = fit(oscillator(), TIMES, recorded(6)[0], unknown=SOME, **GUESS)
+    found = sc.fit(oscillator(), TIMES, recorded(6)[0], unknown=SOME, **GUESS)
     axes = found.plot()
     assert_allclose(axes.get_lines()[0].get_ydata(), found.residuals[:, 0])
     inside = np.abs(found.residuals) < 2 * found.deviations
@@ -282,13 +274,13 @@ CHAOTIC = {"l": 0.8, "m": 1.3}
 @cache
 def two_rods():
     """A double pendulum, of masses as m to 1, and a noisy record of its angles over 17 Lyapunov times."""
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="two rods",
         coordinates=["a", "b"],
         lagrangian="(m + 1)*a_dot**2/2 + l**2*b_dot**2/2 + l*a_dot*b_dot*cos(a - b) + 9.81*((m + 1)*cos(a) + l*cos(b))",
         parameters={"m": 1.0, "l": 1.0},
     )
-    stepper = compile_stepper(system, SVI(6), flags=QUICK_FLAGS)
+    stepper = sc.compile_stepper(system, sc.SVI(6), flags=QUICK_FLAGS)
     run = stepper.integrate([2.0, 2.5], [0.0, 0.0], h=0.02, steps=600, save_every=2, parameters=CHAOTIC)
     return stepper, run, run.q + NOISE * np.random.default_rng(0).normal(size=run.q.shape)
 
@@ -297,9 +289,9 @@ def test_chaotic_record_is_fitted_in_segments():
     """Nearby motions part e^17-fold: from its start alone the motion is lost, in segments it is found."""
     stepper, run, noisy = two_rods()
     known = {"q": noisy[0], "p": [0.05, -0.05], "h": 0.02}
-    lost = fit(stepper, run.t, noisy, **known)
+    lost = sc.fit(stepper, run.t, noisy, **known)
     assert np.abs(lost.residuals).max() > 100 * NOISE
-    found = fit(stepper, run.t, noisy, segments=20, deviations=NOISE, **known)
+    found = sc.fit(stepper, run.t, noisy, segments=20, deviations=NOISE, **known)
     truth = np.array([*(CHAOTIC[name] for name in found.names[:2]), 2.0, 2.5, 0.0, 0.0])
     squares, axes = np.linalg.eigh(found.covariance)  # the least are those of what chaos tells far below rounding
     away = (axes.T @ (found.values - truth))[squares > 1e-10 * squares.max()]
@@ -313,19 +305,21 @@ def test_chaotic_record_is_fitted_in_segments():
 def test_segments_and_single_shooting_agree():
     """For a short regular record, least squares and errors are equal."""
     known = GUESS | {"unknown": SOME}
-    whole = fit(oscillator(), TIMES, recorded(1)[0], **known)
-    parts = fit(oscillator(), TIMES, recorded(1)[0], segments=5, **known)
+    whole = sc.fit(oscillator(), TIMES, recorded(1)[0], **known)
+    parts = sc.fit(oscillator(), TIMES, recorded(1)[0], segments=5, **known)
     assert_allclose(parts.values, whole.values, rtol=1e-7)
     assert_allclose(parts.covariance, whole.covariance, rtol=1e-4, atol=1e-6 * np.abs(whole.covariance).max())
     assert whole.jumps.shape == (0, 2)
-    momenta = fit(oscillator(), TIMES, recorded(1)[1], observed=["p_x"], segments=3, **known)  # no coordinate measured
+    momenta = sc.fit(
+        oscillator(), TIMES, recorded(1)[1], observed=["p_x"], segments=3, **known
+    )  # no coordinate measured
     assert_allclose(momenta.values[:3], [TRUE[name] for name in SOME], rtol=0, atol=0.05)
 
 
 def test_segments_with_known_start_and_inputs(pushed):
     stepper, push, run, times = pushed
     known = {"q": [0.5], "p": [0.0], "start": 0.0, "h": 0.05, "inputs": push, "fit_initial_state": False}
-    found = fit(stepper, times, run.at(times)[0], parameters={"m": 1.0, "k": 1.0}, segments=4, **known)
+    found = sc.fit(stepper, times, run.at(times)[0], parameters={"m": 1.0, "k": 1.0}, segments=4, **known)
     assert found.names == ("m", "k")
     assert_allclose(found.values, [1.5, 2.0], rtol=1e-7)
 
@@ -335,8 +329,8 @@ BOUNDS = [{"delta": (0.25, 0.5)}, {"delta": (0.0, 1.0)}, {"alpha": (-0.95, 0.0),
 
 @pytest.mark.parametrize("bounds", BOUNDS)
 def test_segments_with_bounds_agree_with_single_shooting(bounds):
-    one = fit(oscillator(), TIMES, recorded(3)[0], bounds=bounds, unknown=SOME, **GUESS)
-    parts = fit(oscillator(), TIMES, recorded(3)[0], bounds=bounds, unknown=SOME, segments=4, **GUESS)
+    one = sc.fit(oscillator(), TIMES, recorded(3)[0], bounds=bounds, unknown=SOME, **GUESS)
+    parts = sc.fit(oscillator(), TIMES, recorded(3)[0], bounds=bounds, unknown=SOME, segments=4, **GUESS)
     assert parts.at_bounds == one.at_bounds == tuple(name for name in bounds if bounds[name] != (0.0, 1.0))
     free = [k for k, name in enumerate(one.names) if name not in one.at_bounds]
     errors = np.sqrt(np.diag(one.covariance))[free]
@@ -373,13 +367,13 @@ def test_least_squares_with_equality_constraints_and_bounds():
 
 @cache
 def kepler():
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="Kepler and a spring",
         coordinates=["x", "y", "z"],
         lagrangian="(x_dot**2 + y_dot**2 + z_dot**2)/2 + mu/sqrt(x**2 + y**2) - k*z**2/2",
         parameters={"mu": 1.0, "k": 1.0},
     )
-    return compile_stepper(system, SVI(8), flags=QUICK_FLAGS)
+    return sc.compile_stepper(system, sc.SVI(8), flags=QUICK_FLAGS)
 
 
 @pytest.mark.sampled(2)
@@ -395,8 +389,8 @@ def test_diagnosis_does_not_depend_on_units(length, time, segments):
     guess = {"q": state[:3], "p": state[3:], "h": 0.05 * time, "start": 0.0, "segments": segments}
     t, q = motion.t[2::2], motion.q[2::2]
     with warnings.catch_warnings():
-        warnings.simplefilter("error", AccuracyWarning)
-        found = fit(kepler(), t, q, parameters=[1.01 * mu, 0.99 * k], **guess)
+        warnings.simplefilter("error", sc.AccuracyWarning)
+        found = sc.fit(kepler(), t, q, parameters=[1.01 * mu, 0.99 * k], **guess)
     assert_allclose(found.values / units, true, rtol=0, atol=1e-8)
-    with pytest.raises(FitError, match=r"do not determine (k|z|p_z)"):
-        fit(kepler(), t, q[:, :2], observed=["x", "y"], parameters=[1.01 * mu, k], **guess)
+    with pytest.raises(sc.FitError, match=r"do not determine (k|z|p_z)"):
+        sc.fit(kepler(), t, q[:, :2], observed=["x", "y"], parameters=[1.01 * mu, k], **guess)

@@ -4,18 +4,13 @@ import numpy as np
 import pytest
 from samples import QUICK_FLAGS
 
-from scvi_codegen.advice.solve_ivp import solve_ivp
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import MethodError, StateError
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.methods import SCVI, SVI, Composition, Gauss, StoermerVerlet, as_method
-from scvi_codegen.models.problems import problem
+import scvi_codegen as sc
 
 Q, V = [1.2, 0.4], [0.3, -0.7]
 
 
 def pendulum_on_cart():
-    return compile_stepper(problem("cart-pole").system, "svi:2", flags=QUICK_FLAGS)
+    return sc.compile_stepper(sc.problem("cart-pole").system, "svi:2", flags=QUICK_FLAGS)
 
 
 def test_velocities_are_converted_with_the_parameters_and_time_of_the_run():
@@ -41,13 +36,13 @@ def test_velocities_are_converted_with_the_parameters_and_time_of_the_run():
     ],
 )
 def test_velocity_in_the_kernel_of_the_mass_matrix_is_rejected(coordinates, lagrangian, q, v, dropped):
-    system = LagrangianSystem.from_text(name="singular", coordinates=coordinates.split(), lagrangian=lagrangian)
-    stepper = compile_stepper(system, "svi:2", flags=QUICK_FLAGS)
+    system = sc.LagrangianSystem.from_text(name="singular", coordinates=coordinates.split(), lagrangian=lagrangian)
+    stepper = sc.compile_stepper(system, "svi:2", flags=QUICK_FLAGS)
     with pytest.raises(
-        StateError, match=f"the velocity {dropped} at .* the mass matrix is singular there .* Start from"
+        sc.StateError, match=f"the velocity {dropped} at .* the mass matrix is singular there .* Start from"
     ):
         stepper.integrate(q, velocity=v, h=0.1, steps=3)
-    with pytest.raises(StateError, match=f"the velocity {dropped} at "):
+    with pytest.raises(sc.StateError, match=f"the velocity {dropped} at "):
         stepper.integrate_ensemble([q, q], velocity=[np.zeros_like(v), v], h=0.1, steps=3)
     assert stepper.start(q, velocity=np.zeros_like(v), h=0.1).p.tolist() == [0.0] * len(q)
     assert stepper.start(np.add(q, 0.25), velocity=v, h=0.1).advance(1) is None
@@ -55,22 +50,22 @@ def test_velocity_in_the_kernel_of_the_mass_matrix_is_rejected(coordinates, lagr
 
 def test_velocity_with_zero_momentum_is_accepted():
     """In a magnetic field p = v - y may be 0."""
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="drifting", coordinates=["x", "y"], lagrangian="x_dot**2/2 + y_dot**2/2 - y*x_dot"
     )
-    run = compile_stepper(system, "svi:2", flags=QUICK_FLAGS).start([0.0, 1.0], velocity=[1.0, 0.0], h=0.1)
+    run = sc.compile_stepper(system, "svi:2", flags=QUICK_FLAGS).start([0.0, 1.0], velocity=[1.0, 0.0], h=0.1)
     assert run.p.tolist() == [0.0, 0.0]
 
 
 def test_velocities_of_nonlinear_momenta_are_found_to_round_off():
     """Newton's iteration for L_v = p, where one that ends early is seen only when it ends between two squares."""
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="relativistic particle in space",
         coordinates=["x", "y", "z"],
         lagrangian="-m*c**2*sqrt(1 - (x_dot**2 + y_dot**2 + z_dot**2)/c**2) - x*y - z**2",
         parameters={"m": 0.7, "c": 1.3},
     )
-    stepper = compile_stepper(system, SVI(1), flags=QUICK_FLAGS)
+    stepper = sc.compile_stepper(system, sc.SVI(1), flags=QUICK_FLAGS)
     generator, (m, c) = np.random.default_rng(5), (0.7, 1.3)
     for p in generator.normal(size=(100, 3)):
         energy = np.sqrt((m * c) ** 2 + p @ p)
@@ -86,9 +81,9 @@ def test_ensembles_accept_velocities_with_individual_parameters():
     runs = stepper.integrate_ensemble(q, velocity=v, parameters={name: [2.5, 0.8]}, **settings)
     for j, value in enumerate((2.5, 0.8)):
         assert runs.p[0, j] == pytest.approx(stepper.momentum(q[j], v[j], 0.7, {name: value}), rel=1e-15)
-    with pytest.raises(StateError, match="give either p or velocity"):
+    with pytest.raises(sc.StateError, match="give either p or velocity"):
         stepper.integrate_ensemble(q, **settings)
-    with pytest.raises(StateError, match=r"equal shapes, not \(2, 2\) and \(1, 2\)"):
+    with pytest.raises(sc.StateError, match=r"equal shapes, not \(2, 2\) and \(1, 2\)"):
         stepper.integrate_ensemble(q, velocity=V, **settings)
 
 
@@ -96,17 +91,17 @@ def test_solve_ivp_accepts_velocities_and_scipy_arguments():
     stepper = pendulum_on_cart()
     values = [2.0 * value for value in stepper.defaults]
     given = {"t_span": (0.0, 1.0), "h": 0.1}
-    motion = solve_ivp(stepper, y0=Q, velocity=V, args=values, **given)
+    motion = sc.solve_ivp(stepper, y0=Q, velocity=V, args=values, **given)
     p = stepper.momentum(Q, V, 0.0, values)
-    other = solve_ivp(stepper, y0=[*Q, *p], parameters=values, **given)
+    other = sc.solve_ivp(stepper, y0=[*Q, *p], parameters=values, **given)
     assert np.array_equal(motion.y, other.y)
     for name in ("atol", "max_step", "first_step"):
-        with pytest.raises(StateError, match=f"solve_ivp has no {name}=0.1: .*give"):
-            solve_ivp(stepper, y0=Q, velocity=V, **given, **{name: 0.1})
-    with pytest.raises(StateError, match="give args or parameters, not both"):
-        solve_ivp(stepper, y0=Q, velocity=V, args=values, parameters=values, **given)
-    with pytest.raises(MethodError, match="RK45"):
-        solve_ivp(problem("kepler").system, (0.0, 1.0), [1.0, 0.0, 0.0, 1.0], method="RK45")
+        with pytest.raises(sc.StateError, match=f"solve_ivp has no {name}=0.1: .*give"):
+            sc.solve_ivp(stepper, y0=Q, velocity=V, **given, **{name: 0.1})
+    with pytest.raises(sc.StateError, match="give args or parameters, not both"):
+        sc.solve_ivp(stepper, y0=Q, velocity=V, args=values, parameters=values, **given)
+    with pytest.raises(sc.MethodError, match="RK45"):
+        sc.solve_ivp(sc.problem("kepler").system, (0.0, 1.0), [1.0, 0.0, 0.0, 1.0], method="RK45")
 
 
 def test_velocities_and_momenta_of_many_states():
@@ -121,33 +116,33 @@ def test_velocities_and_momenta_of_many_states():
 
 def test_exactly_one_of_momenta_and_velocities_is_required():
     stepper = pendulum_on_cart()
-    with pytest.raises(StateError, match="give either p or velocity"):
+    with pytest.raises(sc.StateError, match="give either p or velocity"):
         stepper.integrate(Q, h=0.1, steps=1)
-    with pytest.raises(StateError, match="got both"):
+    with pytest.raises(sc.StateError, match="got both"):
         stepper.integrate(Q, V, velocity=V, h=0.1, steps=1)
-    with pytest.raises(StateError, match="velocity must have shape"):
+    with pytest.raises(sc.StateError, match="velocity must have shape"):
         stepper.integrate(Q, velocity=[1.0], h=0.1, steps=1)
 
 
 @pytest.mark.parametrize(
     ("name", "method"),
     [
-        ("svi", SVI(8)),
-        ("svi:6", SVI(6)),
-        ("scvi:3", SCVI(3)),
-        ("gauss:4", Gauss(4)),
-        ("stoermer-verlet", StoermerVerlet()),
-        ("composition:10", Composition(10)),
+        ("svi", sc.SVI(8)),
+        ("svi:6", sc.SVI(6)),
+        ("scvi:3", sc.SCVI(3)),
+        ("gauss:4", sc.Gauss(4)),
+        ("stoermer-verlet", sc.StoermerVerlet()),
+        ("composition:10", sc.Composition(10)),
     ],
 )
 def test_names_of_methods_are_accepted(name, method):
-    assert as_method(name) == method
-    assert as_method(method) is method
+    assert sc.as_method(name) == method
+    assert sc.as_method(method) is method
 
 
 @pytest.mark.parametrize("name", ["svy", "svi:", "svi:x", "svi:0", "svi:-3", "stoermer-verlet:3", "", "svi:2:3", 3])
 def test_invalid_names_are_rejected(name):
-    with pytest.raises(MethodError):
-        as_method(name)
-    with pytest.raises(MethodError):
-        compile_stepper(problem("kepler").system, name)
+    with pytest.raises(sc.MethodError):
+        sc.as_method(name)
+    with pytest.raises(sc.MethodError):
+        sc.compile_stepper(sc.problem("kepler").system, name)

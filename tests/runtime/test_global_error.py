@@ -338,18 +338,6 @@ class TestEnsembles:
         q[:, 0], v[:, 1] = 1 - e, np.sqrt((1 + e) / (1 - e))
         return {"q": q, "velocity": v}
 
-    @pytest.mark.parametrize("error", [1e-5, 1e-9])
-    def test_estimates_bound_the_errors_of_all_trajectories(self, kepler_stepper, error):
-        """Each has a tolerance of its own; exact positions come from Kepler's equation."""
-        runs = kepler_stepper.integrate_ensemble(**self._start(), t_end=self.ENDS, error=error, threads=2)
-        for j, (t, q, _, status, _) in enumerate(runs.each()):
-            exact = kepler_positions(self.ECCENTRICITIES[j], t)
-            sizes = np.maximum.accumulate(np.linalg.norm(exact, axis=1))
-            assert status == "ok"
-            assert (np.linalg.norm(q - exact, axis=1) / sizes).max() < runs.global_error[j] <= error
-        assert (runs.confirmed_until == self.ENDS).all()
-        assert (runs.confirmed_digits >= -np.log10(error)).all()
-
     @pytest.mark.parametrize("threads", [1, 2])
     def test_trajectories_are_those_of_single_runs_bitwise(self, kepler_stepper, threads):
         start = self._start()
@@ -515,13 +503,6 @@ class TestOtherRuns:
 
 
 class TestSolveMotion:
-    def test_error_argument_of_solve_ivp(self, kepler_stepper):
-        motion = sc.solve_ivp(kepler_stepper, (3.0, 23.0), [1.6, 0.0, 0.0, 0.5], error=1e-8)
-        exact = on_an_ellipse([1.6, 0.0], [0.0, 0.5], motion.t)
-        assert motion.success
-        assert np.abs(motion.y[:2].T - exact[:, :2]).max() <= 1.6 * motion.trajectory.global_error
-        assert motion.trajectory.global_error <= 1e-8
-
     def test_unconfirmed_result_is_not_a_success(self, burrau_stepper):
         with pytest.warns(sc.AccuracyWarning, match="confirmed until"):
             motion = sc.solve_ivp(burrau_stepper, (0.0, 30.0), np.concatenate(PYTHAGOREAN), error=1e-9)
@@ -559,30 +540,6 @@ class TestCommandLine:
         result = CliRunner().invoke(main, ["run", "double-pendulum", "--span", "40", "--error", "1e-9"])
         assert result.exit_code == 1
         assert re.search(r"the bound 1e-09 on the global error is confirmed only until t = [\d.]+", result.output)
-
-    @pytest.mark.parametrize("where", ["file", "option", "folder"])
-    def test_printed_run_equals_the_confirmed_one_bitwise(self, tmp_path, where):
-        """A file or an option requests the confirmation, in memory and in a folder."""
-        path = self._kepler(tmp_path)
-        output = tmp_path / ("orbit.run" if where == "folder" else "orbit.npz")
-        chosen = ["kepler", "--span", "20", "--error", "1e-9"] if where == "option" else [str(path)]
-        document = json.loads(CliRunner().invoke(main, ["run", *chosen, "-o", str(output), "--json"]).stdout)
-        model = sc.load_model(path)
-        stepper = model.stepper()
-        run = stepper.integrate(model.q, model.momenta(stepper), t_end=20.0, error=1e-9)
-        folder = sc.load_run(output) if where == "folder" else None
-        saved = {name: getattr(folder, name) for name in "tqp"} if folder else loaded(output)
-        assert document["global_error"]["estimate"] == run.global_error
-        assert np.array_equal(saved["t"], run.t)
-        assert np.array_equal(saved["q"], run.q)
-        assert np.array_equal(saved["p"], run.p)
-
-    def test_unconfirmed_recorded_run_exits_with_1(self, tmp_path):
-        words = ["run", "double-pendulum", "--span", "40", "--error", "1e-9", "-o", str(tmp_path / "d.run")]
-        result = CliRunner().invoke(main, words)
-        assert result.exit_code == 1
-        assert "the bound 1e-09 on the global error is confirmed only until t = " in result.output
-        assert sc.load_run(tmp_path / "d.run").t[-1] == 40.0
 
     ARRAYS = (
         '[system]\nname = "pendulums"\ncoordinates = ["q[N]"]\n'

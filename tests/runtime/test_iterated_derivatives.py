@@ -5,11 +5,10 @@ import pytest
 from numpy.testing import assert_allclose
 from samples import fixed_point, tangle
 
-from scvi_codegen import SVI, Gauss, LagrangianSystem, StepFailedError, compile_stepper, problem
+import scvi_codegen as sc
 from scvi_codegen.lowering import derivatives
-from scvi_codegen.native.options import SolverOptions
 
-WHIRL = LagrangianSystem.from_text(
+WHIRL = sc.LagrangianSystem.from_text(
     name="whirl in a moving trap",
     coordinates=["x", "y"],
     lagrangian="m*x_dot**2/2 + (m + n)*y_dot**2/2 - k*(x**2 + y**4/2)*(1 + cos(w*t)/3)",
@@ -18,7 +17,7 @@ WHIRL = LagrangianSystem.from_text(
 )
 """Forces without a potential, masses that are parameters, time."""
 
-RUBBED = LagrangianSystem.from_text(
+RUBBED = sc.LagrangianSystem.from_text(
     name="rubbed pendulum on a cart",
     coordinates=["x", "a"],
     lagrangian="m*x_dot**2/2 + x_dot*a_dot*cos(a) + a_dot**2/2 - (1 + cos(t)/3)*x**2 + cos(a)",
@@ -28,12 +27,12 @@ RUBBED = LagrangianSystem.from_text(
 """Velocity-dependent forces, so that no Jacobian is symmetric."""
 
 CASES = {
-    "whirl": (WHIRL, SVI(2, "gauss-lobatto:5"), 0.2),
-    "chain": (problem("fput-chain:10").system, Gauss(2), 0.2),
-    "tangle": (tangle(), SVI(2), 0.02),
-    "rubbed": (RUBBED, SVI(5), 0.1),
-    "rubbed, several vectors of points": (RUBBED, SVI(9), 0.2),
-    "whirl, several vectors of points": (WHIRL, SVI(2, "gauss-lobatto:9"), 0.2),
+    "whirl": (WHIRL, sc.SVI(2, "gauss-lobatto:5"), 0.2),
+    "chain": (sc.problem("fput-chain:10").system, sc.Gauss(2), 0.2),
+    "tangle": (tangle(), sc.SVI(2), 0.02),
+    "rubbed": (RUBBED, sc.SVI(5), 0.1),
+    "rubbed, several vectors of points": (RUBBED, sc.SVI(9), 0.2),
+    "whirl, several vectors of points": (WHIRL, sc.SVI(2, "gauss-lobatto:9"), 0.2),
 }
 STEPS = 70
 """More than are solved before vectors are carried over them."""
@@ -53,7 +52,7 @@ QUICK = ("whirl", "tangle", "rubbed, several vectors of points")
 def test_iterated_derivatives_equal_those_by_factorisation(name):
     """Forward and back, by all that is given; more directions than factors take at a time; runs kept now and then."""
     system, method, h = CASES[name]
-    iterated, factored = (compile_stepper(system, method, solver=solver) for solver in ("auto", "newton"))
+    iterated, factored = (sc.compile_stepper(system, method, solver=solver) for solver in ("auto", "newton"))
     assert "define VECTORS_BY_ITERATION" in iterated.derivatives.code
     assert "define VECTORS_BY_ITERATION" not in factored.derivatives.code
     random, m = np.random.default_rng(20261122), iterated.dimension
@@ -75,42 +74,48 @@ def test_iterated_derivatives_equal_those_by_factorisation(name):
 
 def test_unconverged_steps_are_differentiated_by_factorisation():
     """The spring is occasionally too stiff for the fixed-point iteration."""
-    spring = LagrangianSystem.from_text(
+    spring = sc.LagrangianSystem.from_text(
         name="spring that stiffens",
         coordinates=["x"],
         lagrangian="x_dot**2/2 - (1 + k*sin(t/4)**8)*x**2/2",
         parameters={"k": 900.0},
     )
-    steppers = {solver: compile_stepper(spring, SVI(2), solver=solver) for solver in ("auto", "newton", "fixed-point")}
+    steppers = {
+        solver: sc.compile_stepper(spring, sc.SVI(2), solver=solver) for solver in ("auto", "newton", "fixed-point")
+    }
     runs = [steppers[solver].integrate([1.0], [0.0], h=0.25, steps=STEPS) for solver in ("auto", "newton")]
     one, other = (run.sensitivity() for run in runs)
     assert_allclose(one.state, other.state, rtol=0, atol=1e-12 * np.abs(other.state).max())
     assert_allclose(one.parameters, other.parameters, rtol=0, atol=1e-12 * np.abs(other.parameters).max())
     back = [numbers_of(run.pullback(np.ones((STEPS + 1, 2)))) for run in runs]
     assert_allclose(*back, rtol=0, atol=1e-12 * np.abs(back[1]).max())
-    with pytest.raises(StepFailedError):
+    with pytest.raises(sc.StepFailedError):
         steppers["fixed-point"].integrate([1.0], [0.0], h=0.25, steps=STEPS)
 
 
 def test_steps_beyond_the_limit_of_iterations_are_differentiated_by_factorisation():
     """Six iterations are too few for the fixed-point iteration and enough for Newton's."""
-    quartic = LagrangianSystem.from_text(
+    quartic = sc.LagrangianSystem.from_text(
         name="quartic", coordinates=["x"], lagrangian="x_dot**2/2 - k*x**4/4", parameters={"k": 0.9}
     )
-    few, found = SolverOptions(max_iterations=6), []
+    few, found = sc.SolverOptions(max_iterations=6), []
     for solver in ("auto", "newton"):
-        run = compile_stepper(quartic, SVI(2), solver=solver).integrate([1.0], [0.2], h=0.4, steps=20, options=few)
+        run = sc.compile_stepper(quartic, sc.SVI(2), solver=solver).integrate(
+            [1.0], [0.2], h=0.4, steps=20, options=few
+        )
         one = run.sensitivity()
         found.append((one.state, one.parameters, numbers_of(run.pullback(np.ones((21, 2))))))
     for one, other in zip(*found, strict=True):
         assert_allclose(one, other, rtol=0, atol=1e-13 * np.abs(other).max())
-    with pytest.raises(StepFailedError):
-        compile_stepper(quartic, SVI(2), solver="fixed-point").integrate([1.0], [0.2], h=0.4, steps=1, options=few)
+    with pytest.raises(sc.StepFailedError):
+        sc.compile_stepper(quartic, sc.SVI(2), solver="fixed-point").integrate(
+            [1.0], [0.2], h=0.4, steps=1, options=few
+        )
 
 
 def test_large_jacobians_are_factorised(monkeypatch):
-    system = problem("kepler").system
-    found = fixed_point(system, SVI(2))
+    system = sc.problem("kepler").system
+    found = fixed_point(system, sc.SVI(2))
     partials = derivatives.point_derivatives_of(system, found)
     assert partials is not None
     monkeypatch.setattr(derivatives, "MOST_DERIVATIVES", partials.count + len(partials.given.entries) - 1)
@@ -122,12 +127,12 @@ def test_convergence_does_not_depend_on_units_of_coordinates():
     text = "x_dot**2/2 + {a}**2*y_dot**2/2 - (x**2 + 36*{a}**2*y**2)/2 - x**2*({a}*y) + ({a}*y)**3/3"
     derivatives = []
     for unit in ("1", "1000000", "1/1000000"):
-        system = LagrangianSystem.from_text(
+        system = sc.LagrangianSystem.from_text(
             name="two units", coordinates=["x", "y"], lagrangian=text.format(a=f"({unit})")
         )
         a = {"1": 1.0, "1000000": 1e6, "1/1000000": 1e-6}[unit]
         scale = np.array([1.0, a, 1.0, 1.0 / a])
-        stepper = compile_stepper(system, SVI(4))
+        stepper = sc.compile_stepper(system, sc.SVI(4))
         matrix = stepper.jacobian([0.3, 0.2 / a], [0.4, 0.1 * a], 0.2)
         derivatives.append(scale[:, np.newaxis] * matrix / scale)
     for other in derivatives[1:]:

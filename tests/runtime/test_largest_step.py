@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.runtime.run.largest_step import ALLOWED, REFINEMENTS, accuracy_message, largest_step
 
 KEPLER = sc.problem("kepler").system
@@ -48,7 +47,7 @@ def test_integrate_runs_in_transformed_time() -> None:
     rough = sc.solve_ivp(KEPLER, (0.0, 8 * np.pi), [*START[0], *START[1]], time_transformation="frequency", rtol=1e-6)
     assert rough.success
     assert 2.0**-53 < rough.trajectory.step_error < 1e-6 * ALLOWED
-    with pytest.raises(StateError, match="need a system, not a compiled stepper"):
+    with pytest.raises(sc.StateError, match="need a system, not a compiled stepper"):
         sc.solve_ivp(stepper(), (0.0, 1.0), [*START[0], *START[1]], h=0.1, time_transformation="frequency")
 
 
@@ -73,9 +72,9 @@ def test_invalid_tolerances_are_reported() -> None:
 
 def test_systems_without_a_largest_step_are_rejected() -> None:
     for span, tolerance in ((0.0, 1e-9), (1.0, 1.0), (1.0, -1.0)):
-        with pytest.raises(StateError, match=r"span = \S+ must not be 0, and tolerance"):
+        with pytest.raises(sc.StateError, match=r"span = \S+ must not be 0, and tolerance"):
             largest_step(stepper(), *START, span, tolerance)
     verlet = sc.compile_stepper(sc.reparametrise(KEPLER, "frequency"), sc.StoermerVerlet())
     if np.isnan(verlet.integrate(*START, h=0.1, steps=3).step_error):
-        with pytest.raises(MethodError, match="no error estimate: give h"):
+        with pytest.raises(sc.MethodError, match="no error estimate: give h"):
             largest_step(verlet, *START, 1.0, 1e-3)

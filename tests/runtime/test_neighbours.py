@@ -14,7 +14,6 @@ import pytest
 from programs import needs
 
 import scvi_codegen as sc
-from scvi_codegen.errors import ExpressionError, StateError, StepFailedError, SystemDefinitionError
 from scvi_codegen.models.model_files.model_file import dump_model
 from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.native.compilers import find_compiler
@@ -131,7 +130,7 @@ def test_steps_longer_than_the_skin_miss_no_pair(method: str) -> None:
     )
     assert abs(np.diff(run.q["r"], axis=0)).max() > 1.0
     assert run.q["r"] == pytest.approx(other.q["r"], abs=1e-11)
-    with pytest.raises(StepFailedError, match="infinite or NaN"):
+    with pytest.raises(sc.StepFailedError, match="infinite or NaN"):
         stepper("svi:2", 0.01, SOFT).integrate(r, velocity=20 * v, h=0.1, steps=1)
 
 
@@ -276,7 +275,7 @@ def test_a_list_in_sympy() -> None:
     ],
 )
 def test_lists_that_are_refused(near: Any, message: str) -> None:
-    with pytest.raises((SystemDefinitionError, ExpressionError), match=message):
+    with pytest.raises((sc.SystemDefinitionError, sc.ExpressionError), match=message):
         sc.LagrangianSystem.from_text(
             name="gas",
             coordinates=["x", "r[N, 3]"],
@@ -286,14 +285,14 @@ def test_lists_that_are_refused(near: Any, message: str) -> None:
 
 
 def test_a_list_of_another_name_and_of_no_pairs() -> None:
-    with pytest.raises(ExpressionError, match="near"):
+    with pytest.raises(sc.ExpressionError, match="near"):
         sc.LagrangianSystem.from_text(
             name="gas",
             coordinates=["r[N, 3]"],
             neighbours={"near": {"of": "r", "cutoff": 1}},
             lagrangian=f"{KINETIC} - sum(i < j in nears, r[i, 0]*r[j, 0])",
         )
-    with pytest.raises(StateError, match="3"):
+    with pytest.raises(sc.StateError, match="3"):
         stepper().integrate(np.zeros((4, 2)), h=0.1, steps=1)
 
 
@@ -324,7 +323,7 @@ def test_lengths_are_checked_before_every_run(kind: str) -> None:
             (partial(each.integrate_ensemble, *many, h=0.001, steps=1), per_trajectory),
         )
         for call, parameters in calls[: 5 if kind == "run-time sizes" else 6]:
-            with pytest.raises(StateError, match=message):
+            with pytest.raises(sc.StateError, match=message):
                 call(parameters=parameters)
 
 
@@ -353,7 +352,7 @@ steps = 3
 """
     for length, message in (("3.9", r"L = 3.9: it must be at least two cutoffs"), ("4.1", "")):
         (tmp_path / "model.toml").write_text(text.replace("3.9", length))
-        with pytest.raises(StateError, match=message) if message else nullcontext():
+        with pytest.raises(sc.StateError, match=message) if message else nullcontext():
             generate_package(sc.load_model(tmp_path / "model.toml"), tmp_path / "generated_gas")
 
 
@@ -364,8 +363,8 @@ def test_lengths_may_be_formulas_and_defaults_are_checked() -> None:
     line = sc.LagrangianSystem.from_text("line", ["q[N]"], text, parameters=numbers, neighbours=near)
     each = sc.compile_stepper(line, "stoermer-verlet", sizes={"N": 2})
     wrong = r"is 2\*cell = 4.8.* must be at least two cutoffs, 2\*\(5\*sqrt\(s\)/2\) = 5\b"
-    with pytest.raises(StateError, match=wrong):
+    with pytest.raises(sc.StateError, match=wrong):
         each.integrate({"q": [0.0, 1.0]}, {"q": [0.0, 0.0]}, h=0.1, steps=1)
     each.integrate({"q": [0.0, 1.0]}, {"q": [0.0, 0.0]}, h=0.1, steps=1, parameters={"s": 0.9})
-    with pytest.raises(StateError, match="must be a positive number"):
+    with pytest.raises(sc.StateError, match="must be a positive number"):
         each.integrate({"q": [0.0, 1.0]}, {"q": [0.0, 0.0]}, h=0.1, steps=1, parameters={"s": -1})

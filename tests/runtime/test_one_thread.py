@@ -12,7 +12,6 @@ import pytest
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.errors import StateError
 
 PENDULUM = "q_dot**2/2 + cos(q)"
 
@@ -75,7 +74,7 @@ def entries(run: Any) -> dict[str, Callable[[], Any]]:
 
 def check_refused(run: Any) -> None:
     for enter in entries(run).values():
-        with pytest.raises(StateError, match=r"in use by another thread.*Start a run for each thread"):
+        with pytest.raises(sc.StateError, match=r"in use by another thread.*Start a run for each thread"):
             enter()
 
 
@@ -123,7 +122,7 @@ def test_steps_of_racing_threads_are_all_counted(kind: str, stepper: sc.Stepper,
             try:
                 run.advance(size)
                 made.append(size)
-            except StateError:
+            except sc.StateError:
                 pass
 
     threads = [threading.Thread(target=work) for _ in range(4)]

@@ -7,18 +7,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from scipy.special import ellipk
 
-from scvi_codegen import (
-    SVI,
-    AccuracyWarning,
-    ExplicitEuler,
-    LagrangianSystem,
-    MethodError,
-    OrbitError,
-    StateError,
-    compile_stepper,
-    periodic_orbit,
-    problem,
-)
+import scvi_codegen as sc
 
 EARTH_MOON = 1.215058560962404e-2
 HALO = ([1.142732397667005, 0.0, 0.15915200933380999], [0.0, -0.22233902828510901, 0.0], 3.1327035113287223)
@@ -29,38 +18,40 @@ Jet Propulsion Laboratory (ssd.jpl.nasa.gov/tools/periodic_orbits.html)."""
 @pytest.fixture(scope="module")
 def restricted():
     """Three bodies in the rotating frame, by its Lagrangian."""
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="restricted three-body problem",
         coordinates=["x", "y", "z"],
         lagrangian="((x_dot - y)**2 + (y_dot + x)**2 + z_dot**2)/2"
         " + (1 - mu)/sqrt((x + mu)**2 + y**2 + z**2) + mu/sqrt((x - 1 + mu)**2 + y**2 + z**2)",
         parameters={"mu": EARTH_MOON},
     )
-    return compile_stepper(system, SVI(6))
+    return sc.compile_stepper(system, sc.SVI(6))
 
 
 @pytest.fixture(scope="module")
 def planar():
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="planar restricted three-body problem",
         coordinates=["x", "y"],
         lagrangian="((x_dot - y)**2 + (y_dot + x)**2)/2 + (1 - mu)/sqrt((x + mu)**2 + y**2)"
         " + mu/sqrt((x - 1 + mu)**2 + y**2)",
         parameters={"mu": 0.01215},
     )
-    return compile_stepper(system, SVI(8))
+    return sc.compile_stepper(system, sc.SVI(8))
 
 
 @pytest.fixture(scope="module")
 def galaxy():
-    return compile_stepper(problem("henon-heiles").system, SVI(4))
+    return sc.compile_stepper(sc.problem("henon-heiles").system, sc.SVI(4))
 
 
 def test_a_halo_orbit_is_the_published_one(restricted):
     """From a guess with an error in the third digit to ten digits; its monodromy is compared with DOP853."""
     x, v, period = HALO
     guess = [1.001 * x[0], 0.0, x[2]], [0.0, 0.998 * v[1], 0.0]
-    orbit = periodic_orbit(restricted, guess[0], velocity=guess[1], period=1.001 * period, steps=200, fixed=["y", "z"])
+    orbit = sc.periodic_orbit(
+        restricted, guess[0], velocity=guess[1], period=1.001 * period, steps=200, fixed=["y", "z"]
+    )
     assert_allclose(orbit.q, x, rtol=0, atol=1e-10)
     assert_allclose(restricted.velocity(orbit.q, orbit.p), v, rtol=0, atol=1e-10)
     assert orbit.period == pytest.approx(period, abs=1e-10)
@@ -104,7 +95,7 @@ def test_unstable_orbit_is_found_from_an_inaccurate_velocity(restricted, error):
     """A Lyapunov orbit about L1: tangent vectors grow by 1190 in a period. The reference is shooting by DOP853."""
     x, speed, period = 0.8069, *_lyapunov_orbit(0.8069)
     guess = {"velocity": [0.0, (1.0 + error) * speed, 0.0], "period": period}
-    orbit = periodic_orbit(restricted, [x, 0.0, 0.0], **guess, steps=200, fixed=["x", "y"])
+    orbit = sc.periodic_orbit(restricted, [x, 0.0, 0.0], **guess, steps=200, fixed=["x", "y"])
     assert restricted.velocity(orbit.q, orbit.p) == pytest.approx([0.0, speed, 0.0], abs=1e-9)
     assert orbit.period == pytest.approx(period, abs=1e-8)
     assert np.abs(orbit.stability_indices).max() == pytest.approx(594.2, abs=0.1)
@@ -127,23 +118,23 @@ def _lyapunov_orbit(x):
 
 def test_pendulum_period_is_the_elliptic_integral():
     """The amplitude held, then the period, then the energy; and one that turns over."""
-    pendulum = compile_stepper(problem("planar-pendulum").system, SVI(8))
+    pendulum = sc.compile_stepper(sc.problem("planar-pendulum").system, sc.SVI(8))
     values = {"m": 1.0, "l": 1.0, "g": 1.0}
     exact = 4 * ellipk(np.sin(0.5) ** 2)
-    amplitude = periodic_orbit(pendulum, [1.0], [0.1], period=7.0, steps=60, fixed=["q"], parameters=values)
-    at_rest = periodic_orbit(pendulum, [1.0], [0.0], period=7.0, steps=60, fixed=["q", "p_q"], parameters=values)
+    amplitude = sc.periodic_orbit(pendulum, [1.0], [0.1], period=7.0, steps=60, fixed=["q"], parameters=values)
+    at_rest = sc.periodic_orbit(pendulum, [1.0], [0.0], period=7.0, steps=60, fixed=["q", "p_q"], parameters=values)
     assert at_rest.period == pytest.approx(exact, rel=1e-12)
     assert amplitude.period > exact
-    timed = periodic_orbit(
+    timed = sc.periodic_orbit(
         pendulum, [1.1], [0.0], period=exact, steps=60, fixed=["p_q"], fixed_period=True, parameters=values
     )
     assert timed.q[0] == pytest.approx(1.0, abs=1e-9)
-    weighed = periodic_orbit(pendulum, [0.9], [0.05], period=6.5, steps=60, energy=-np.cos(1.0), parameters=values)
+    weighed = sc.periodic_orbit(pendulum, [0.9], [0.05], period=6.5, steps=60, energy=-np.cos(1.0), parameters=values)
     assert weighed.period == pytest.approx(exact, rel=1e-11)
     assert weighed.energy == pytest.approx(-np.cos(1.0), abs=1e-12)
     assert weighed.stable
     assert_allclose(weighed.stability_indices, [1.0], rtol=0, atol=1e-10)
-    over = periodic_orbit(
+    over = sc.periodic_orbit(
         pendulum, [0.0], [2.5], period=3.0, steps=60, fixed=["q", "p_q"], gain=[2 * np.pi], parameters=values
     )
     assert over.period == pytest.approx(2 * 2 / 2.5 * ellipk((2 / 2.5) ** 2), rel=1e-11)
@@ -152,8 +143,8 @@ def test_pendulum_period_is_the_elliptic_integral():
 def test_galactic_orbits_are_found_by_energy(galaxy):
     """The stable one at y = 0.3 or so, the unstable one below; and turned by a third, as the potential may be."""
     energy = 1 / 8
-    stable = periodic_orbit(galaxy, [0.0, 0.28], [0.4, 0.02], period=6.2, h=0.1, energy=energy)
-    unstable = periodic_orbit(galaxy, [0.0, -0.2], [0.45, 0.01], period=6.8, h=0.1, energy=energy)
+    stable = sc.periodic_orbit(galaxy, [0.0, 0.28], [0.4, 0.02], period=6.2, h=0.1, energy=energy)
+    unstable = sc.periodic_orbit(galaxy, [0.0, -0.2], [0.45, 0.01], period=6.8, h=0.1, energy=energy)
     for orbit in (stable, unstable):
         assert orbit.energy == pytest.approx(energy, abs=1e-13)
         assert orbit.residual < 1e-12
@@ -164,14 +155,14 @@ def test_galactic_orbits_are_found_by_energy(galaxy):
     assert stable.stable
     assert not unstable.stable
     turn = np.array([[-1.0, -np.sqrt(3.0)], [np.sqrt(3.0), -1.0]]) / 2.0
-    turned = periodic_orbit(galaxy, turn @ stable.q, turn @ stable.p, period=stable.period, steps=stable.steps)
+    turned = sc.periodic_orbit(galaxy, turn @ stable.q, turn @ stable.p, period=stable.period, steps=stable.steps)
     assert turned.iterations <= 1
     assert_allclose(turned.stability_indices, stable.stability_indices, rtol=0, atol=1e-9)
 
 
 def test_forced_oscillator_has_the_period_of_its_force():
     """x'' = -x - c x' + cos(w t): the closed form; multipliers exp(-c/2 +- i ..), no pairs."""
-    driven = LagrangianSystem.from_text(
+    driven = sc.LagrangianSystem.from_text(
         name="driven oscillator",
         coordinates=["x"],
         lagrangian="x_dot**2/2 - x**2/2",
@@ -179,16 +170,16 @@ def test_forced_oscillator_has_the_period_of_its_force():
         forces={"x": "cos(w*t)"},
         dissipation="c*x_dot**2/2",
     )
-    stepper, period = compile_stepper(driven, SVI(6)), 2 * np.pi / 1.5
-    orbit = periodic_orbit(stepper, [0.5], [0.5], period=period, steps=40, fixed_period=True)
+    stepper, period = sc.compile_stepper(driven, sc.SVI(6)), 2 * np.pi / 1.5
+    orbit = sc.periodic_orbit(stepper, [0.5], [0.5], period=period, steps=40, fixed_period=True)
     answer = 1.0 / (1.0 - 1.5**2 + 0.3j)
     assert_allclose([orbit.q[0], orbit.p[0]], [answer.real, (1.5j * answer).real], rtol=0, atol=1e-10)
     assert_allclose(np.abs(orbit.multipliers), np.exp(-0.1 * period), rtol=1e-9)
     assert orbit.stable
-    with pytest.raises(MethodError, match="not symplectic"):
+    with pytest.raises(sc.MethodError, match="not symplectic"):
         orbit.stability_indices  # noqa: B018  (the access is the point)
-    with pytest.raises(MethodError, match="not available with forces"):
-        periodic_orbit(stepper, [0.5], [0.5], period=period, steps=40, energy=1.0)
+    with pytest.raises(sc.MethodError, match="not available with forces"):
+        sc.periodic_orbit(stepper, [0.5], [0.5], period=period, steps=40, energy=1.0)
 
 
 @pytest.mark.parametrize(
@@ -196,7 +187,7 @@ def test_forced_oscillator_has_the_period_of_its_force():
 )
 def test_orbits_are_found_from_a_guess_that_is_15_percent_off(planar, speed, duration, fixed):
     q, velocity = [0.82, 0.0], [0.0, 0.1625133 * speed]
-    orbit = periodic_orbit(planar, q, velocity=velocity, period=2.780187 * duration, steps=200, fixed=fixed)
+    orbit = sc.periodic_orbit(planar, q, velocity=velocity, period=2.780187 * duration, steps=200, fixed=fixed)
     assert orbit.residual < 1e-9
     assert np.ptp(orbit.run().q, axis=0).max() > 0.05  # no equilibrium
     if fixed:
@@ -204,29 +195,29 @@ def test_orbits_are_found_from_a_guess_that_is_15_percent_off(planar, speed, dur
 
 
 def test_another_orbit_is_reported(planar):
-    with pytest.warns(AccuracyWarning, match=r"far from the guess: its period is .*, not 2\.78019"):
-        periodic_orbit(planar, [0.82, 0.0], velocity=[0.0, 0.18689], period=2.780187, steps=200, fixed=["x", "y"])
+    with pytest.warns(sc.AccuracyWarning, match=r"far from the guess: its period is .*, not 2\.78019"):
+        sc.periodic_orbit(planar, [0.82, 0.0], velocity=[0.0, 0.18689], period=2.780187, steps=200, fixed=["x", "y"])
 
 
 def test_invalid_orbits_are_rejected(galaxy):
-    with pytest.raises(OrbitError, match=r"an equilibrium|no periodic orbit was found"):
-        periodic_orbit(galaxy, [0.01, 0.01], [0.0, 0.0], period=2.0, steps=40, fixed_period=True)
-    with pytest.raises(OrbitError, match="no periodic orbit was found"):
-        periodic_orbit(galaxy, [0.0, 0.2], [0.3, 0.1], period=4.0, steps=40, fixed=["x", "y", "p_x", "p_y"])
-    losing = compile_stepper(problem("harmonic-oscillator").system, ExplicitEuler())
-    with pytest.raises(OrbitError, match=r"an equilibrium|no periodic orbit was found"):
-        periodic_orbit(losing, [1.0], [0.0], period=6.0, steps=40, fixed=["q"])
-    with pytest.raises(StateError, match=r"fixed names 'p_z', .*; did you mean"):
-        periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5, h=0.1, fixed=["p_z"])
-    with pytest.raises(StateError, match=r"number of steps per period .steps=200. or .* it got neither"):
-        periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5)
-    with pytest.raises(StateError, match="the period must be positive"):
-        periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=-6.5, h=0.1)
+    with pytest.raises(sc.OrbitError, match=r"an equilibrium|no periodic orbit was found"):
+        sc.periodic_orbit(galaxy, [0.01, 0.01], [0.0, 0.0], period=2.0, steps=40, fixed_period=True)
+    with pytest.raises(sc.OrbitError, match="no periodic orbit was found"):
+        sc.periodic_orbit(galaxy, [0.0, 0.2], [0.3, 0.1], period=4.0, steps=40, fixed=["x", "y", "p_x", "p_y"])
+    losing = sc.compile_stepper(sc.problem("harmonic-oscillator").system, sc.ExplicitEuler())
+    with pytest.raises(sc.OrbitError, match=r"an equilibrium|no periodic orbit was found"):
+        sc.periodic_orbit(losing, [1.0], [0.0], period=6.0, steps=40, fixed=["q"])
+    with pytest.raises(sc.StateError, match=r"fixed names 'p_z', .*; did you mean"):
+        sc.periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5, h=0.1, fixed=["p_z"])
+    with pytest.raises(sc.StateError, match=r"number of steps per period .steps=200. or .* it got neither"):
+        sc.periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5)
+    with pytest.raises(sc.StateError, match="the period must be positive"):
+        sc.periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=-6.5, h=0.1)
 
 
 def test_nonautonomous_orbits_have_a_period_of_the_system():
     """A forced oscillator closes after any time from some state, and goes elsewhere the next time round."""
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="forced",
         coordinates=["x"],
         lagrangian="x_dot**2/2 - x**2/2",
@@ -234,54 +225,54 @@ def test_nonautonomous_orbits_have_a_period_of_the_system():
         forces={"x": "cos(w*t)/10"},
         dissipation="x_dot**2/20",
     )
-    stepper, period = compile_stepper(system, SVI(3)), 2 * np.pi / 1.3
-    with pytest.raises(MethodError, match=r"give the period of .*, with fixed_period=True"):
-        periodic_orbit(stepper, [0.0], [0.1], period=period, steps=40)
-    with pytest.raises(OrbitError, match=r"is not periodic in time with the period 4\.7"):
-        periodic_orbit(stepper, [0.0], [0.1], period=4.7, steps=40, fixed_period=True)
-    twice = periodic_orbit(stepper, [0.0], [0.1], period=2 * period, steps=80, fixed_period=True)
-    once = periodic_orbit(stepper, [0.0], [0.1], period=period, steps=40, fixed_period=True)
+    stepper, period = sc.compile_stepper(system, sc.SVI(3)), 2 * np.pi / 1.3
+    with pytest.raises(sc.MethodError, match=r"give the period of .*, with fixed_period=True"):
+        sc.periodic_orbit(stepper, [0.0], [0.1], period=period, steps=40)
+    with pytest.raises(sc.OrbitError, match=r"is not periodic in time with the period 4\.7"):
+        sc.periodic_orbit(stepper, [0.0], [0.1], period=4.7, steps=40, fixed_period=True)
+    twice = sc.periodic_orbit(stepper, [0.0], [0.1], period=2 * period, steps=80, fixed_period=True)
+    once = sc.periodic_orbit(stepper, [0.0], [0.1], period=period, steps=40, fixed_period=True)
     assert_allclose(np.append(twice.q, twice.p), np.append(once.q, once.p), rtol=0, atol=1e-12)
 
 
 def test_orbit_has_the_requested_energy():
-    oscillator = LagrangianSystem.from_text(name="o", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
-    stepper = compile_stepper(oscillator, SVI(3))
-    with pytest.raises(OrbitError, match=r"has the energy 0\.5, not 0\.5001"):
-        periodic_orbit(stepper, [1.0], [0.0], period=2 * np.pi, steps=40, fixed=["x", "p_x"], energy=0.5001)
-    found = periodic_orbit(stepper, [1.0], [0.1], period=2 * np.pi, steps=40, energy=5.0)
+    oscillator = sc.LagrangianSystem.from_text(name="o", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
+    stepper = sc.compile_stepper(oscillator, sc.SVI(3))
+    with pytest.raises(sc.OrbitError, match=r"has the energy 0\.5, not 0\.5001"):
+        sc.periodic_orbit(stepper, [1.0], [0.0], period=2 * np.pi, steps=40, fixed=["x", "p_x"], energy=0.5001)
+    found = sc.periodic_orbit(stepper, [1.0], [0.1], period=2 * np.pi, steps=40, energy=5.0)
     assert found.energy == pytest.approx(5.0, rel=1e-12)
 
 
 def test_missing_inputs_are_not_zero_and_time_transformations_not_fixed_steps():
-    pushed = LagrangianSystem.from_text(
+    pushed = sc.LagrangianSystem.from_text(
         name="pushed", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2", forces={"x": "u"}, inputs=["u"]
     )
-    with pytest.raises(StateError, match="the input 'u' is not set"):
-        periodic_orbit(compile_stepper(pushed, SVI(2)), [1.0], [0.0], period=6.28, steps=20)
-    watched = compile_stepper(problem("kepler").system, SVI(2), time_transformation="frequency")
-    with pytest.raises(MethodError, match="periodic_orbit is not available with a time"):
-        periodic_orbit(watched, [1.0, 0.0], [0.0, 1.0], period=6.28, steps=20)
-    with pytest.raises(MethodError, match="chaos_indicators_ensemble is not available with a time"):
+    with pytest.raises(sc.StateError, match="the input 'u' is not set"):
+        sc.periodic_orbit(sc.compile_stepper(pushed, sc.SVI(2)), [1.0], [0.0], period=6.28, steps=20)
+    watched = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(2), time_transformation="frequency")
+    with pytest.raises(sc.MethodError, match="periodic_orbit is not available with a time"):
+        sc.periodic_orbit(watched, [1.0, 0.0], [0.0, 1.0], period=6.28, steps=20)
+    with pytest.raises(sc.MethodError, match="chaos_indicators_ensemble is not available with a time"):
         watched.chaos_indicators_ensemble([[1.0, 0.0]], [[0.0, 1.0]], h=0.1, steps=4)
 
 
 def test_names_of_a_state_are_unique():
     """A coordinate called p_x in addition to x: the momentum of x has another name."""
-    plane = LagrangianSystem.from_text(
+    plane = sc.LagrangianSystem.from_text(
         name="plane", coordinates=["x", "p_x"], lagrangian="(x_dot**2 + p_x_dot**2)/2 - x**2/2 - p_x**2"
     )
-    stepper = compile_stepper(plane, SVI(3))
+    stepper = sc.compile_stepper(plane, sc.SVI(3))
     assert stepper.interface.momenta == ("_p_x", "p_p_x")
     given = [0.9, 0.0], [0.3, 0.0]
-    along = periodic_orbit(stepper, *given, period=6.0, steps=60, fixed=["p_x", "p_p_x", "x"])
+    along = sc.periodic_orbit(stepper, *given, period=6.0, steps=60, fixed=["p_x", "p_p_x", "x"])
     assert along.p[0] != 0.3
-    assert periodic_orbit(stepper, *given, period=6.0, steps=60, fixed=["_p_x"]).p[0] == 0.3
+    assert sc.periodic_orbit(stepper, *given, period=6.0, steps=60, fixed=["_p_x"]).p[0] == 0.3
 
 
 @pytest.mark.parametrize("q", [0.0, np.pi])
 def test_equilibrium_is_reported(q):
     """Every period closes it."""
-    own = compile_stepper(problem("planar-pendulum").system, SVI(4))
-    with pytest.raises(OrbitError, match="an equilibrium"):
-        periodic_orbit(own, [q], [0.0], period=2.0, steps=40)
+    own = sc.compile_stepper(sc.problem("planar-pendulum").system, sc.SVI(4))
+    with pytest.raises(sc.OrbitError, match="an equilibrium"):
+        sc.periodic_orbit(own, [q], [0.0], period=2.0, steps=40)

@@ -14,14 +14,14 @@ from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS, damped_pendulum
 from scipy.interpolate import PPoly
 
-from scvi_codegen import SVI, LagrangianSystem, MethodError, StateError, compile_stepper, problem, reparametrise
+import scvi_codegen as sc
 
 BREAKS, COEFFICIENTS = np.array([0.0, 1.0, 2.3, 3.1, 4.0]), np.random.default_rng(5).normal(size=(4, 4))
 """An input; coefficients of descending powers."""
 
 
 def pendulum(force, parameters, **options):
-    return LagrangianSystem.from_text(
+    return sc.LagrangianSystem.from_text(
         name="damped pendulum with a force",
         coordinates=["q"],
         lagrangian="l*q_dot**2/2 + cos(q)",
@@ -45,7 +45,7 @@ class Motion:
 
     @cached_property
     def stepper(self):
-        return compile_stepper(self.system, self.method, flags=QUICK_FLAGS, **self.options)
+        return sc.compile_stepper(self.system, self.method, flags=QUICK_FLAGS, **self.options)
 
     def run(self, x=None, coefficients=COEFFICIENTS, **changes):
         """The run from x = (q, p) or (q, p, parameters, t, h)."""
@@ -60,21 +60,25 @@ class Motion:
 
 
 MOTIONS = {
-    "pendula": Motion(problem("double-pendulum").system, SVI(4), (0.9, -0.6, 1.0, 0.5), {"h": 0.05, "steps": 36}),
+    "pendula": Motion(sc.problem("double-pendulum").system, sc.SVI(4), (0.9, -0.6, 1.0, 0.5), {"h": 0.05, "steps": 36}),
     "driven": Motion(
-        pendulum("f*cos(t)", {"c": 0.1, "f": 0.3, "l": 1.2}), SVI(3), (0.4, -0.8), {"h": 0.07, "steps": 60}
+        pendulum("f*cos(t)", {"c": 0.1, "f": 0.3, "l": 1.2}), sc.SVI(3), (0.4, -0.8), {"h": 0.07, "steps": 60}
     ),
     "data": Motion(
-        pendulum("u", {"c": 0.1, "l": 1.2}, inputs=["u"]), SVI(3), (0.4, -0.8), {"h": 0.07, "t_end": 4.0}, has_data=True
+        pendulum("u", {"c": 0.1, "l": 1.2}, inputs=["u"]),
+        sc.SVI(3),
+        (0.4, -0.8),
+        {"h": 0.07, "t_end": 4.0},
+        has_data=True,
     ),
     "reversible": Motion(
-        problem("kepler").system,
-        SVI(4),
+        sc.problem("kepler").system,
+        sc.SVI(4),
         (0.5, 0.0, 0.0, 3**0.5),
         {"h": 0.05, "t_end": 3.3},
         {"time_transformation": "frequency"},
     ),
-    "damped": Motion(damped_pendulum(), SVI(2), (1.0, 1.0, 0.0, 0.0), {"h": 0.1, "steps": 12}),
+    "damped": Motion(damped_pendulum(), sc.SVI(2), (1.0, 1.0, 0.0, 0.0), {"h": 0.1, "steps": 12}),
 }
 SITUATIONS = {
     "all": {},
@@ -223,7 +227,7 @@ def test_long_runs_are_taken_in_segments():
 
 def test_derivatives_of_conserved_energies():
     """Energy at the end is that at the start; after a Kepler period only the phase depends on the energy."""
-    stepper = compile_stepper(problem("planar-pendulum").system, SVI(8), flags=QUICK_FLAGS)
+    stepper = sc.compile_stepper(sc.problem("planar-pendulum").system, sc.SVI(8), flags=QUICK_FLAGS)
     run = stepper.integrate([2.0], [0.3], h=0.05, steps=200)
     m, length, g = stepper.defaults
 
@@ -239,7 +243,7 @@ def test_derivatives_of_conserved_energies():
     assert_allclose([*first.q, *first.p], partials(2.0, 0.3), rtol=1e-9)
     assert abs(first.h) + abs(first.t) < 1e-9
     assert_allclose(np.vstack([second.q, second.p]), hessian(2.0), atol=1e-7)
-    kepler = compile_stepper(problem("kepler").system, SVI(8), flags=QUICK_FLAGS)
+    kepler = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(8), flags=QUICK_FLAGS)
     monodromy = kepler.integrate([0.5, 0.0], [0.0, 3**0.5], h=2 * np.pi / 64, steps=64).tangent()[-1]
     assert np.linalg.matrix_rank(monodromy - np.eye(4), tol=1e-4) == 1
     gradient = np.array([4.0, 0.0, 0.0, 3**0.5])  # of the energy
@@ -250,31 +254,41 @@ def test_derivatives_of_conserved_energies():
 
 W = np.zeros((61, 2))
 REJECTED = [
-    ("pendula", lambda run: run.tangent([1.0, 2.0]), StateError, r"shape \(4,\) or \(4, k\)"),
-    ("driven", lambda run: run.pullback(W[1:]), StateError, r"of each state, must have shape \(61, 2\)"),
-    ("driven", lambda run: run.pullback(W + np.nan), StateError, "cotangents must be finite"),
+    ("pendula", lambda run: run.tangent([1.0, 2.0]), sc.StateError, r"shape \(4,\) or \(4, k\)"),
+    ("driven", lambda run: run.pullback(W[1:]), sc.StateError, r"of each state, must have shape \(61, 2\)"),
+    ("driven", lambda run: run.pullback(W + np.nan), sc.StateError, "cotangents must be finite"),
     (
         "driven",
         lambda run: run.hessian_product(np.zeros((61, 2, 3)), [1.0, 0.0]),
-        StateError,
+        sc.StateError,
         r"cotangents of one function must have shape \(61, 2\)",
     ),
-    ("driven", lambda run: run.hessian_product(W, [1.0] * 3), StateError, r"or \(7,\) or \(7, k\), of .*, not \(3,\)"),
-    ("driven", lambda run: run.hessian_product(W, [1.0, 0.0], W), StateError, r"curvatures, Hessians .* not \(61, 2\)"),
-    ("driven", lambda run: moved(run).sensitivity(), StateError, r"from t = 2\.33, computed again, end in another"),
+    (
+        "driven",
+        lambda run: run.hessian_product(W, [1.0] * 3),
+        sc.StateError,
+        r"or \(7,\) or \(7, k\), of .*, not \(3,\)",
+    ),
+    (
+        "driven",
+        lambda run: run.hessian_product(W, [1.0, 0.0], W),
+        sc.StateError,
+        r"curvatures, Hessians .* not \(61, 2\)",
+    ),
+    ("driven", lambda run: moved(run).sensitivity(), sc.StateError, r"from t = 2\.33, computed again, end in another"),
     (
         "damped",
         lambda run: run.hessian_product(np.ones((13, 4)), np.ones(4)),
-        MethodError,
+        sc.MethodError,
         "damping have first derivatives only",
     ),
     (
         "data",
         lambda run: run.tangent(np.ones(run.stepper._input_size)),
-        StateError,
+        sc.StateError,
         "directions must be 0 for the parameters of inputs",
     ),
-    ("data", lambda run: run.pullback(np.zeros((3, 2))), StateError, "cotangents, derivatives by"),
+    ("data", lambda run: run.pullback(np.zeros((3, 2))), sc.StateError, "cotangents, derivatives by"),
 ]
 
 
@@ -290,12 +304,12 @@ def test_arguments_of_derivatives_are_checked(name, call, error, message):
 
 
 def test_runs_without_derivatives_are_rejected():
-    with pytest.raises(StateError, match="whole steps"):
+    with pytest.raises(sc.StateError, match="whole steps"):
         MOTIONS["driven"].run(steps=9, t=0.0, t_eval=[0.03, 0.1]).sensitivity()
-    kepler = problem("kepler")
-    clocked = compile_stepper(reparametrise(kepler.system, "frequency"), SVI(4), flags=QUICK_FLAGS)
-    with pytest.raises(MethodError, match="hessian_product is not available"):
+    kepler = sc.problem("kepler")
+    clocked = sc.compile_stepper(sc.reparametrise(kepler.system, "frequency"), sc.SVI(4), flags=QUICK_FLAGS)
+    with pytest.raises(sc.MethodError, match="hessian_product is not available"):
         clocked.integrate(kepler.q, [0.0, 1.0], h=0.1, steps=3).hessian_product(np.ones((4, 4)), np.ones(4))
-    hill = LagrangianSystem.from_text(name="hill", coordinates=["q"], lagrangian="q_dot**2/2 + q**2/2")
-    with pytest.raises(StateError, match="derivatives exceed the largest double"):
-        compile_stepper(hill, SVI(2)).integrate([0.0], [0.0], h=0.5, steps=1600).tangent()
+    hill = sc.LagrangianSystem.from_text(name="hill", coordinates=["q"], lagrangian="q_dot**2/2 + q**2/2")
+    with pytest.raises(sc.StateError, match="derivatives exceed the largest double"):
+        sc.compile_stepper(hill, sc.SVI(2)).integrate([0.0], [0.0], h=0.5, steps=1600).tangent()

@@ -10,7 +10,7 @@ from sabotage import Case
 from samples import QUICK_FLAGS
 from scipy.linalg import block_diag
 
-from scvi_codegen import SVI, LagrangianSystem, StateError, compile_stepper
+import scvi_codegen as sc
 from scvi_codegen.exact.step import DerivedStep
 from scvi_codegen.methods.discretise import is_symplectic, paper_equations
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
@@ -19,7 +19,7 @@ from scvi_codegen.tables.precision import mp
 
 def pushed_pendulum():
     """A damped pendulum with an input, whose five parameters are those of its piece."""
-    return LagrangianSystem.from_text(
+    return sc.LagrangianSystem.from_text(
         name="pushed pendulum",
         coordinates=["q"],
         lagrangian="l*q_dot**2/2 + cos(q)",
@@ -43,7 +43,7 @@ NAMES = [
 ]
 """Systems and methods: with forces, constraints, inputs, explicit time, of Hamiltonians; of every solver."""
 
-OWN = {"pushed/svi": Case(pushed_pendulum(), lambda: SVI(2), (0.4,), (-0.8,), 0.2)}
+OWN = {"pushed/svi": Case(pushed_pendulum(), lambda: sc.SVI(2), (0.4,), (-0.8,), 0.2)}
 T = 0.3
 EXACT, BOUND = 1e-13, 3e-13
 """Relative; of constrained systems, whose equations h makes ill-conditioned."""
@@ -55,7 +55,7 @@ SECOND, SECOND_BOUND = 1e-13, 1e-11
 def given(name):
     """A stepper, a state, and a step."""
     case = OWN.get(name) or certified(name)
-    stepper = compile_stepper(case.system, case.method(), flags=QUICK_FLAGS)
+    stepper = sc.compile_stepper(case.system, case.method(), flags=QUICK_FLAGS)
     q, p = stepper.project(case.q, case.p, t=T) if case.system.constraints else (case.q, case.p)
     return case, stepper, np.array(q, dtype=float), np.array(p, dtype=float), case.h
 
@@ -145,7 +145,9 @@ def test_vector_products_agree_with_the_jacobian(name):
     assert_allclose(pushed, vectors @ found.T, rtol=0, atol=1e-12 * np.abs(found).max())
     assert_allclose(pulled, vectors @ found, rtol=0, atol=1e-12 * np.abs(found).max())
     assert np.array_equal(stepper.vjp(*at, cotangents=vectors[0]), stepper.vjp(*at, cotangents=vectors[:1])[0])
-    with pytest.raises(StateError, match=rf"tangents must have the shape \({size},\) or \(k, {size}\), not \(2, 1\)"):
+    with pytest.raises(
+        sc.StateError, match=rf"tangents must have the shape \({size},\) or \(k, {size}\), not \(2, 1\)"
+    ):
         stepper.jvp(*at, tangents=np.zeros((2, 1)))
 
 

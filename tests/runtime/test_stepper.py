@@ -1,6 +1,5 @@
 """Steps, runs, transforms and errors of a compiled stepper, as a user meets them."""
 
-import math
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
@@ -9,29 +8,23 @@ import numpy as np
 import oracle
 import pytest
 
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import MethodError, StateError, StepFailedError
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.methods import SCVI, SVI, ExplicitEuler, Gauss, RadauIIA, SpectralCollocation, StoermerVerlet
-from scvi_codegen.models.problems import problem
-from scvi_codegen.native.options import SolverOptions
+import scvi_codegen as sc
 from scvi_codegen.runtime.core.validation import checked_parameters
 
 METHODS = (
-    SVI(3),
-    SCVI(3),
-    SCVI(2, variational=False),
-    SpectralCollocation(2),
-    RadauIIA(2),
-    StoermerVerlet(),
-    ExplicitEuler(),
+    sc.SVI(3),
+    sc.SCVI(3),
+    sc.SCVI(2, variational=False),
+    sc.SpectralCollocation(2),
+    sc.RadauIIA(2),
+    sc.StoermerVerlet(),
+    sc.ExplicitEuler(),
 )
-SYMMETRIC = (SVI(3), SVI(2, "gauss-lobatto:3"), StoermerVerlet(), Gauss(2))
-WITH_ACTION = (SVI(2, "gauss-legendre:3"), SCVI(3), Gauss(2), StoermerVerlet())
+SYMMETRIC = (sc.SVI(3), sc.SVI(2, "gauss-lobatto:3"), sc.StoermerVerlet(), sc.Gauss(2))
+WITH_ACTION = (sc.SVI(2, "gauss-legendre:3"), sc.SCVI(3), sc.Gauss(2), sc.StoermerVerlet())
 each_method = pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
 each_action = pytest.mark.parametrize("method", WITH_ACTION, ids=lambda method: method.name)
-KEPLER = problem("kepler")
+KEPLER = sc.problem("kepler")
 STATE = KEPLER.q, KEPLER.velocity
 
 
@@ -42,7 +35,7 @@ def same(left, right):
 
 @pytest.fixture
 def kepler(compiled):
-    return compiled("kepler", SVI(3))
+    return compiled("kepler", sc.SVI(3))
 
 
 # Steps and runs.
@@ -62,7 +55,7 @@ def test_run_equals_repeated_steps(sample, compiled, method):
 def test_run_has_smaller_rounding_errors_than_repeated_steps(sample, compiled):
     """Against the oracle: a hundred small steps of leapfrog, rounded only once at the end."""
     case, h, count = sample("planar-pendulum"), 2.0**-7, 200
-    stepper = compiled("planar-pendulum", StoermerVerlet())
+    stepper = compiled("planar-pendulum", sc.StoermerVerlet())
     q, p = case.state
     exact = oracle.numbers(q), oracle.numbers(p)
     for _ in range(count):
@@ -145,14 +138,6 @@ def test_restored_run_continues_bitwise(sample, compiled, method):
     assert same(one.record(200, save_every=3), other.record(200, save_every=3))
 
 
-def test_run_in_chunks_equals_one_run(kepler):
-    whole = kepler.integrate(*STATE, h=0.05, steps=100)
-    run = kepler.start(*STATE, h=0.05)
-    parts = [run.record(steps) for steps in (1, 0, 39, 60)]
-    assert np.array_equal(np.concatenate([part.q[1:] for part in parts]), whole.q[1:])
-    assert np.array_equal(parts[-1].p[0], whole.p[40])
-
-
 def test_save_every_counts_from_the_start_of_the_run(kepler):
     run = kepler.start(*STATE, h=0.05)
     run.record(5)
@@ -173,9 +158,9 @@ def test_checkpoints_of_other_systems_are_rejected(kepler):
     text = "a_dot**2/2 + b_dot**2/2 - (a - b)**4/4 - mu*a**2"
     for name, coordinates in (("kepler", ["a", "b"]), ("other", [*kepler.coordinates])):
         lagrangian = text.replace("a", coordinates[0]).replace("b", coordinates[1])
-        other = LagrangianSystem.from_text(name, coordinates, lagrangian, parameters={"mu": 1.0})
-        saved = compile_stepper(other, "svi:2").start([1.0, 0.5], [0.0, 0.0], h=0.1).checkpoint()
-        with pytest.raises(StateError, match=r"the saved run is one of .*, not of"):
+        other = sc.LagrangianSystem.from_text(name, coordinates, lagrangian, parameters={"mu": 1.0})
+        saved = sc.compile_stepper(other, "svi:2").start([1.0, 0.5], [0.0, 0.0], h=0.1).checkpoint()
+        with pytest.raises(sc.StateError, match=r"the saved run is one of .*, not of"):
             kepler.from_checkpoint(saved)
 
 
@@ -185,9 +170,9 @@ def test_damaged_checkpoints_are_rejected(kepler):
     places = map(int, random.integers(0, len(saved), 300))
     damaged = [saved[:i] + bytes([saved[i] ^ 1 << int(random.integers(8))]) + saved[i + 1 :] for i in places]
     for each in (*damaged, saved[:-1], saved + b"x", b"abc", b""):
-        with pytest.raises(StateError, match=r"invalid saved run: the checksum .* save the run again"):
+        with pytest.raises(sc.StateError, match=r"invalid saved run: the checksum .* save the run again"):
             kepler.from_checkpoint(each)
-    with pytest.raises(StateError, match="it has 3 bytes"):
+    with pytest.raises(sc.StateError, match="it has 3 bytes"):
         kepler.start(*STATE, h=0.05).rollback(b"abc")
 
 
@@ -220,10 +205,10 @@ def test_damaged_checkpoints_are_rejected(kepler):
     ],
 )
 def test_invalid_argument_is_named(kepler, arguments, words):
-    with pytest.raises(StateError, match=words):
+    with pytest.raises(sc.StateError, match=words):
         kepler.step(*arguments)
     q, p, h, *rest = arguments
-    with pytest.raises(StateError, match=words):
+    with pytest.raises(sc.StateError, match=words):
         kepler.integrate(q, p, h=h, steps=1, parameters=rest[1] if rest else None)
 
 
@@ -241,20 +226,20 @@ REJECTED = [
     (lambda stepper: stepper.energy(np.ones((3, 2)), np.ones((3, 2)), [0.0, 1.0]), "time"),
     (lambda stepper: stepper.energy([[1.0, 2.0, 3.0]], [[1.0, 2.0, 3.0]]), r"states must have shape \(n, 2\)"),
     (lambda stepper: stepper.energy([0.0, 0.0], [1.0, 0.0]), "energy of a state cannot be computed"),
-    (lambda _: SolverOptions(max_iterations=2.5), "max_iterations must be a whole number"),
-    (lambda _: SolverOptions(tolerance=0.0), "tolerance must be positive"),
-    (lambda _: SolverOptions(max_iterations=0), "max_iterations must be at least 1"),
+    (lambda _: sc.SolverOptions(max_iterations=2.5), "max_iterations must be a whole number"),
+    (lambda _: sc.SolverOptions(tolerance=0.0), "tolerance must be positive"),
+    (lambda _: sc.SolverOptions(max_iterations=0), "max_iterations must be at least 1"),
 ]
 
 
 @pytest.mark.parametrize(("call", "message"), REJECTED)
 def test_invalid_calls_are_rejected(kepler, call, message):
-    with pytest.raises(StateError, match=message):
+    with pytest.raises(sc.StateError, match=message):
         call(kepler)
 
 
 def test_parameters_may_be_given_by_name_or_in_order(compiled, sample):
-    stepper, state = compiled("pumped-cart-pole", SVI(3)), sample("pumped-cart-pole").state
+    stepper, state = compiled("pumped-cart-pole", sc.SVI(3)), sample("pumped-cart-pole").state
     values = stepper.defaults
     values[stepper.parameters.index("k")] = 0.7
     assert np.array_equal(stepper.step(*state, 0.1, 0.2, {"k": 0.7}), stepper.step(*state, 0.1, 0.2, values))
@@ -271,8 +256,8 @@ def test_defaults_cannot_be_changed_through_the_stepper(kepler):
 
 def test_step_beyond_the_domain_fails_with_a_message(compiled):
     """Leapfrog falls into the centre, where the potential is infinite."""
-    stepper = compiled("kepler", StoermerVerlet())
-    with pytest.raises(StepFailedError, match=r"infinite or NaN.*undefined there") as caught:
+    stepper = compiled("kepler", sc.StoermerVerlet())
+    with pytest.raises(sc.StepFailedError, match=r"infinite or NaN.*undefined there") as caught:
         stepper.step([0.0, 0.0], [1.0, 0.0], 0.1)
     assert (caught.value.status, caught.value.step, caught.value.t) == ("not finite", 0, 0.0)
     assert caught.value.trajectory is None
@@ -280,8 +265,8 @@ def test_step_beyond_the_domain_fails_with_a_message(compiled):
 
 def test_a_step_without_solution_fails_with_advice(compiled):
     """q'' = q^2 by the midpoint rule requires a root of h^2 x^2 / 2 - 2 x + 2 q + h v: none exists for this h."""
-    with pytest.raises(StepFailedError, match=r"step 0 at t = 1\.5 with h = 2 failed: .*smaller step") as caught:
-        compiled("runaway", SVI(1)).step([1.0], [1.0], 2.0, 1.5)
+    with pytest.raises(sc.StepFailedError, match=r"step 0 at t = 1\.5 with h = 2 failed: .*smaller step") as caught:
+        compiled("runaway", sc.SVI(1)).step([1.0], [1.0], 2.0, 1.5)
     assert caught.value.status in ("not converged", "singular")
     assert caught.value.residual > 0.0
     assert caught.value.trajectory is None
@@ -289,13 +274,13 @@ def test_a_step_without_solution_fails_with_advice(compiled):
 
 def falling(compiled):
     """A free fall into the centre of attraction, which every method with steps of this size must fail to survive."""
-    return compiled("kepler", SVI(4)), ([1.0, 0.0], [-0.5, 1e-9])
+    return compiled("kepler", sc.SVI(4)), ([1.0, 0.0], [-0.5, 1e-9])
 
 
 def test_failing_run_returns_completed_states_and_ends_before_the_failing_step(compiled):
     stepper, state = falling(compiled)
-    run = stepper.start(*state, h=0.05, options=SolverOptions(max_iterations=8))
-    with pytest.raises(StepFailedError) as caught:
+    run = stepper.start(*state, h=0.05, options=sc.SolverOptions(max_iterations=8))
+    with pytest.raises(sc.StepFailedError) as caught:
         run.record(400, save_every=2)
     error, saved_states = caught.value, caught.value.trajectory
     assert 5 < error.step < 400
@@ -305,7 +290,7 @@ def test_failing_run_returns_completed_states_and_ends_before_the_failing_step(c
     again = stepper.integrate(*state, h=0.05, steps=error.step, save_every=2)
     assert np.array_equal(saved_states.q, again.q)
     before = run.checkpoint()
-    with pytest.raises(StepFailedError) as repeated:
+    with pytest.raises(sc.StepFailedError) as repeated:
         run.record(1)
     assert repeated.value.step == error.step
     assert len(repeated.value.trajectory) == 1
@@ -313,9 +298,9 @@ def test_failing_run_returns_completed_states_and_ends_before_the_failing_step(c
 
 
 def test_failed_run_continues_with_other_options(compiled):
-    state = compiled("kepler", SVI(4)), STATE
-    run = state[0].start(*STATE, h=0.3, options=SolverOptions(max_iterations=1))
-    with pytest.raises(StepFailedError, match=r"did not converge.*larger max_iterations") as failed:
+    state = compiled("kepler", sc.SVI(4)), STATE
+    run = state[0].start(*STATE, h=0.3, options=sc.SolverOptions(max_iterations=1))
+    with pytest.raises(sc.StepFailedError, match=r"did not converge.*larger max_iterations") as failed:
         run.record(3)
     assert (failed.value.step, failed.value.t) == (run.steps, run.t)
     assert str(failed.value).startswith(
@@ -332,7 +317,7 @@ def test_failed_run_continues_with_other_options(compiled):
 
 def test_relative_tolerance_does_not_depend_on_units(compiled):
     """Lengths in units 2^30 times smaller, time unchanged: the same bits, but for the exponent."""
-    stepper, scale = compiled("kepler", SVI(3)), 2.0**30
+    stepper, scale = compiled("kepler", sc.SVI(3)), 2.0**30
     q, p = stepper.integrate(*STATE, h=0.1, steps=20).q, stepper.integrate(*STATE, h=0.1, steps=20).p
     large = stepper.integrate(
         np.multiply(scale, STATE[0]), np.multiply(scale, STATE[1]), h=0.1, steps=20, parameters={"mu": scale**3}
@@ -343,7 +328,7 @@ def test_relative_tolerance_does_not_depend_on_units(compiled):
 
 def test_looser_tolerance_needs_fewer_iterations_and_loses_digits(kepler):
     tight = kepler.integrate(*STATE, h=0.2, steps=50)
-    loose = kepler.integrate(*STATE, h=0.2, steps=50, options=SolverOptions(tolerance=1e-4))
+    loose = kepler.integrate(*STATE, h=0.2, steps=50, options=sc.SolverOptions(tolerance=1e-4))
     assert loose.iterations.sum() < tight.iterations.sum()
     assert 1e-13 < np.abs(loose.q - tight.q).max() < 1e-2
 
@@ -356,12 +341,12 @@ def test_absolute_tolerance_bounds_the_update(kepler):
     def iterations(options, q=STATE[0], p=STATE[1], parameters=None):
         return kepler.integrate(q, p, h=0.1, steps=20, parameters=parameters, options=options).iterations.sum()
 
-    relative, absolute = (SolverOptions(tolerance=1e-6, absolute=absolute) for absolute in (False, True))
+    relative, absolute = (sc.SolverOptions(tolerance=1e-6, absolute=absolute) for absolute in (False, True))
     assert iterations(relative) == iterations(relative, **large)
     assert iterations(absolute) < iterations(absolute, **large)
     exact = kepler.step(large["q"], large["p"], 0.1, 0.0, large["parameters"])
     for bound in (1e3, 1e-3):
-        options = SolverOptions(tolerance=bound, absolute=True)
+        options = sc.SolverOptions(tolerance=bound, absolute=True)
         found = kepler.step(large["q"], large["p"], 0.1, 0.0, large["parameters"], options=options)
         assert np.abs(np.array(found) - exact).max() < bound
 
@@ -371,7 +356,7 @@ def test_absolute_tolerance_bounds_the_update(kepler):
 
 @pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole", "charged-particle", "relativistic-particle"])
 def test_momentum_and_velocity_are_inverse_and_agree_with_the_oracle(sample, compiled, name):
-    case, stepper = sample(name), compiled(name, SVI(3))
+    case, stepper = sample(name), compiled(name, sc.SVI(3))
     q, p = case.state
     v = stepper.velocity(q, p, 0.7)
     assert stepper.momentum(q, v, 0.7) == pytest.approx(p, abs=1e-14)
@@ -381,10 +366,10 @@ def test_momentum_and_velocity_are_inverse_and_agree_with_the_oracle(sample, com
 
 def test_velocity_is_found_where_momenta_cancel(quickly_compiled):
     """p = v + 5 sin(q) in which the terms cancel, as of charges in magnetic fields."""
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="driven pivot", coordinates=["q"], lagrangian="q_dot**2/2 + 5.345*sin(q)*q_dot"
     )
-    stepper = quickly_compiled(system, SVI(2))
+    stepper = quickly_compiled(system, sc.SVI(2))
     q = np.linspace(0.05, 3.0, 500)[:, None]
     for p in (np.zeros_like(q), -0.0024 * q):
         assert stepper.velocity(q, p) == pytest.approx(p - 5.345 * np.sin(q), abs=2e-15)
@@ -392,18 +377,18 @@ def test_velocity_is_found_where_momenta_cancel(quickly_compiled):
 
 def test_velocity_is_undefined_beyond_the_range_of_the_momenta(compiled, sample):
     """A momentum that no velocity below c gives in a system where there is one to find; and one given as nan."""
-    stepper = compiled("relativistic-particle", SVI(3))
+    stepper = compiled("relativistic-particle", sc.SVI(3))
     v = stepper.velocity([0.0], [3.0])
     assert v == pytest.approx(3.0 / np.sqrt(10.0), abs=1e-12)
-    with pytest.raises(StateError, match="is nan"):
+    with pytest.raises(sc.StateError, match="is nan"):
         stepper.velocity([0.0], [np.nan])
-    with pytest.raises(StateError, match=r"momentum at q = .*cannot be computed"):
+    with pytest.raises(sc.StateError, match=r"momentum at q = .*cannot be computed"):
         stepper.momentum([0.0], [1.5])
 
 
 @pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole", "charged-particle", "relativistic-particle"])
 def test_energy_is_p_v_minus_l(sample, compiled, name):
-    case, stepper = sample(name), compiled(name, SVI(3))
+    case, stepper = sample(name), compiled(name, sc.SVI(3))
     q, p = case.state
     v = stepper.velocity(q, p, 0.7)
     L = case.mechanics.lagrangian([oracle.mp.mpf(0.7)], oracle.numbers([q]), oracle.numbers([v]))[0]
@@ -412,7 +397,7 @@ def test_energy_is_p_v_minus_l(sample, compiled, name):
 
 
 def test_energies_of_many_states_equal_single_energies(sample, compiled):
-    stepper = compiled("pumped-cart-pole", SVI(3))
+    stepper = compiled("pumped-cart-pole", sc.SVI(3))
     run = stepper.integrate(*sample("pumped-cart-pole").state, h=0.1, steps=9)
     each = [stepper.energy(q, p, t) for q, p, t in zip(run.q, run.p, run.t, strict=True)]
     assert np.array_equal(run.energy(), each)
@@ -461,7 +446,7 @@ def test_the_discrete_lagrangian_is_the_quadrature_along_the_oracles_curve(sampl
     q, p = map(oracle.numbers, case.state)
     nodes, h, t = oracle.points("lobatto", 3), oracle.mp.mpf(0.1), oracle.mp.mpf(0.3)
     q1, _ = oracle.svi(case.mechanics, t, q, p, h, nodes=nodes, c=c, w=w)
-    stepper = compiled("pumped-cart-pole", SVI(2, "gauss-legendre:3"))
+    stepper = compiled("pumped-cart-pole", sc.SVI(2, "gauss-legendre:3"))
 
     def along(middle):
         return oracle.action(case.mechanics, t, np.vstack([q[None], middle, q1[None]]), h, nodes, c, w)
@@ -472,15 +457,6 @@ def test_the_discrete_lagrangian_is_the_quadrature_along_the_oracles_curve(sampl
     middle = oracle.newton(derivative, (q + q1) / 2, digits=20, width="1e-9")[None]
     found = stepper.discrete_lagrangian(q.astype(float), q1.astype(float), 0.1, 0.3)
     assert found == pytest.approx(float(along(middle)), abs=1e-14)
-
-
-@pytest.mark.sampled(2)
-@each_action
-def test_the_discrete_lagrangian_approximates_the_action_of_the_trajectory(compiled, method):
-    """The oscillator released from rest, whose action over one step is known: -sin(2 h) / 4."""
-    stepper, h = compiled("harmonic-oscillator", method), 0.1
-    q1, action = np.cos(h), -np.sin(2 * h) / 4
-    assert stepper.discrete_lagrangian([1.0], [q1], h) == pytest.approx(action, abs=h ** (method.order + 1) / 10)
 
 
 @each_action
@@ -494,15 +470,15 @@ def test_two_point_form_gives_the_same_positions(sample, compiled, method):
 @pytest.mark.parametrize(
     "system",
     [
-        LagrangianSystem.from_text(name="L", coordinates=["x"], lagrangian="x_dot**2 - x**4/4 + x*cos(t)"),
-        HamiltonianSystem.from_text(
+        sc.LagrangianSystem.from_text(name="L", coordinates=["x"], lagrangian="x_dot**2 - x**4/4 + x*cos(t)"),
+        sc.HamiltonianSystem.from_text(
             name="H", coordinates=["x"], momenta=["y"], hamiltonian="y**2/4 + x**4/4 - x*cos(t)"
         ),
     ],
     ids=["lagrangian", "hamiltonian"],
 )
 def test_the_discrete_lagrangian_of_an_explicit_step_is_the_trapezoidal_sum(system):
-    stepper = compile_stepper(system, StoermerVerlet())
+    stepper = sc.compile_stepper(system, sc.StoermerVerlet())
     x, h, t = np.array([0.7, 0.75]), 0.1, np.array([0.3, 0.4])
     v, force = (x[1] - x[0]) / h, np.cos(t) - x**3
     action = h / 2 * np.sum(v**2 - x**4 / 4 + x * np.cos(t))
@@ -515,15 +491,15 @@ def test_the_discrete_lagrangian_of_an_explicit_step_is_the_trapezoidal_sum(syst
 
 
 def test_undefined_action_is_an_error(compiled):
-    with pytest.raises(StepFailedError):
-        compiled("kepler", StoermerVerlet()).discrete_lagrangian([0.0, 0.0], [1.0, 0.0], 0.1)
+    with pytest.raises(sc.StepFailedError):
+        compiled("kepler", sc.StoermerVerlet()).discrete_lagrangian([0.0, 0.0], [1.0, 0.0], 0.1)
 
 
 def test_methods_without_a_discrete_lagrangian_are_reported(compiled):
-    for method in (SpectralCollocation(2), RadauIIA(2), ExplicitEuler(), SCVI(3, variational=False)):
+    for method in (sc.SpectralCollocation(2), sc.RadauIIA(2), sc.ExplicitEuler(), sc.SCVI(3, variational=False)):
         stepper = compiled("kepler", method)
         for call in (stepper.discrete_lagrangian, stepper.discrete_legendre_minus, stepper.step_positions):
-            with pytest.raises(MethodError, match="discrete_lagrangian is not available without an action"):
+            with pytest.raises(sc.MethodError, match="discrete_lagrangian is not available without an action"):
                 call([1.0, 0.0], [1.0, 0.1], 0.1)
 
 
@@ -550,44 +526,21 @@ def test_a_stepper_shows_system_and_method(kepler):
 @pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", ["double-pendulum", "relativistic-particle", "planar-pendulum", "harmonic-oscillator"])
-@pytest.mark.parametrize("method", [SVI(8), SVI(4, "gauss-legendre:6"), SCVI(4)], ids=lambda method: method.name)
+@pytest.mark.parametrize(
+    "method", [sc.SVI(8), sc.SVI(4, "gauss-legendre:6"), sc.SCVI(4)], ids=lambda method: method.name
+)
 def test_fixed_point_iteration_starts_from_rest(name, method):
     """The first iteration from rest has no velocity as a scale for changes."""
-    chosen = problem(name)
+    chosen = sc.problem(name)
     rest = np.zeros(chosen.system.dimension)
     ends = [
-        compile_stepper(chosen.system, method, solver=solver).step(chosen.q, rest, 0.05)
+        sc.compile_stepper(chosen.system, method, solver=solver).step(chosen.q, rest, 0.05)
         for solver in ("fixed-point", "newton")
     ]
     np.testing.assert_allclose(ends[0], ends[1], rtol=1e-14, atol=1e-16)
 
 
-@pytest.mark.parametrize(
-    ("t_end", "more", "steps"), [(1.0, {}, 4), (0.9, {}, 3), (0.9, {"save_every": 2}, 3), (-1.0, {}, 4), (0.2, {}, 1)]
-)
-def test_shortened_last_step_to_t_end_is_counted_as_for_arrays(t_end, more, steps):
-    scalar = LagrangianSystem.from_text(name="o", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
-    arrays = LagrangianSystem.from_text(
-        name="o", coordinates=["x[N]"], lagrangian="sum(i in N, x_dot[i]**2/2 - x[i]**2/2)"
-    )
-    given = {"h": math.copysign(0.3, t_end), "t_end": t_end, **more}
-    run = compile_stepper(scalar, SVI(2)).integrate([1.0], velocity=[0.0], **given)
-    other = compile_stepper(arrays, "svi:2").integrate([1.0, 0.5], **given)
-    assert (run.t[-1], other.t[-1]) == pytest.approx((t_end, t_end), abs=1e-15)
-    assert run.steps == other.steps == steps
-
-
-@pytest.mark.parametrize("method", [SVI(3), SVI(4), SCVI(3), Gauss(2)], ids=lambda method: method.name)
-def test_the_worst_step_of_a_kepler_orbit_is_at_the_pericentre(method):
-    """Started at the apocentre of an orbit of period 2 pi, of eccentricity 0.6."""
-    run = compile_stepper(problem("kepler").system, method).integrate(
-        [1.6, 0.0], velocity=[0.0, 0.5], h=0.05, t_end=6.0
-    )
-    assert run.worst_step_time == pytest.approx(math.pi, abs=0.1)
-    assert run.step_error > 0.0
-
-
 def test_messages_name_the_first_parameters_of_many() -> None:
     names = [f"k{i}" for i in range(8)]
-    with pytest.raises(StateError, match=r"must have 8 values \(k0, k1, k2, k3, k4, k5, \.\.\.\), not 1"):
+    with pytest.raises(sc.StateError, match=r"must have 8 values \(k0, k1, k2, k3, k4, k5, \.\.\.\), not 1"):
         checked_parameters(SimpleNamespace(parameters=names, defaults=[1.0] * 8), [2.0])  # type: ignore[arg-type]

@@ -3,19 +3,7 @@
 import numpy as np
 import pytest
 
-from scvi_codegen import (
-    SCVI,
-    SVI,
-    Gauss,
-    HamiltonianSystem,
-    LagrangianSystem,
-    MethodError,
-    RadauIIA,
-    StateError,
-    StoermerVerlet,
-    compile_stepper,
-    impact,
-)
+import scvi_codegen as sc
 
 DRAG = {"x": "-c*x_dot*sqrt(x_dot**2 + y_dot**2) + w*cos(3*t)", "y": "-c*y_dot*sqrt(x_dot**2 + y_dot**2)"}
 
@@ -23,7 +11,7 @@ DRAG = {"x": "-c*x_dot*sqrt(x_dot**2 + y_dot**2) + w*cos(3*t)", "y": "-c*y_dot*s
 @pytest.fixture(scope="module")
 def thrown():
     """A body in the plane about a centre, with drag by the square of its speed and a push that is periodic."""
-    return LagrangianSystem.from_text(
+    return sc.LagrangianSystem.from_text(
         name="thrown",
         lagrangian="(x_dot**2 + y_dot**2)/2 + k/sqrt(x**2 + y**2)",
         coordinates=["x", "y"],
@@ -39,9 +27,9 @@ def balance(stepper, h, span=2.0, **options):
     return np.abs(energy - energy[0] - work).max(), np.abs(angular - angular[0] - run.impulses()[:, 0]).max()
 
 
-@pytest.mark.parametrize("method", [SVI(2), Gauss(3), StoermerVerlet()], ids=lambda method: method.name)
+@pytest.mark.parametrize("method", [sc.SVI(2), sc.Gauss(3), sc.StoermerVerlet()], ids=lambda method: method.name)
 def test_impulses_are_exact_and_work_is_of_the_order_of_the_method(thrown, method):
-    stepper = compile_stepper(thrown, method, solver="newton")
+    stepper = sc.compile_stepper(thrown, method, solver="newton")
     assert stepper.impulse_names == ("angular momentum",)
     coarse, fine = balance(stepper, 0.05), balance(stepper, 0.025)
     assert max(coarse[1], fine[1]) < 2e-14
@@ -49,7 +37,7 @@ def test_impulses_are_exact_and_work_is_of_the_order_of_the_method(thrown, metho
 
 
 def test_shooting_has_a_work_balance_of_the_order_of_its_curve(thrown):
-    stepper = compile_stepper(thrown, SCVI(2))
+    stepper = sc.compile_stepper(thrown, sc.SCVI(2))
     coarse, fine = balance(stepper, 0.1), balance(stepper, 0.05)
     assert np.log2(coarse[0] / fine[0]) > 2.8
     assert np.log2(coarse[1] / fine[1]) > 2.8
@@ -57,7 +45,7 @@ def test_shooting_has_a_work_balance_of_the_order_of_its_curve(thrown):
 
 def test_work_balance_of_hamiltonians_iterations_and_parameters(thrown):
     """The balance of H is equal; fixed-point steps use the fallback; parameters and time are those of the run."""
-    hamiltonian = HamiltonianSystem.from_text(
+    hamiltonian = sc.HamiltonianSystem.from_text(
         name="thrown",
         hamiltonian="(p_x**2 + p_y**2)/2 - k/sqrt(x**2 + y**2)",
         coordinates=["x", "y"],
@@ -67,7 +55,7 @@ def test_work_balance_of_hamiltonians_iterations_and_parameters(thrown):
     values = {"c": 0.2, "w": 0.4}
     found = []
     for system in (thrown, hamiltonian):
-        run = compile_stepper(system, SVI(3)).integrate(
+        run = sc.compile_stepper(system, sc.SVI(3)).integrate(
             [1.0, 0.0], [0.0, 1.1], h=0.02, steps=60, t=0.7, parameters=values
         )
         found.append((run.work(), run.impulses()))
@@ -82,7 +70,7 @@ def test_work_balance_of_hamiltonians_iterations_and_parameters(thrown):
 
 
 def test_work_balance_with_dense_output_and_adaptive_steps(thrown):
-    stepper = compile_stepper(thrown, SVI(4))
+    stepper = sc.compile_stepper(thrown, sc.SVI(4))
     start = ([1.0, 0.0], [0.0, 1.1])
     save_every, some = (stepper.integrate(*start, h=0.05, steps=40, save_every=n) for n in (1, 8))
     assert np.abs(some.work() - save_every.work()[::8]).max() < 1e-13
@@ -92,31 +80,33 @@ def test_work_balance_with_dense_output_and_adaptive_steps(thrown):
     assert np.abs(later[1].work() - later[0].work()[::7]).max() < 1e-8  # of forces of time
     free = stepper.integrate(*start, t_end=2.0)
     assert np.abs(free.energy() - free.energy()[0] - free.work()).max() < 1e-12
-    with pytest.raises(StateError, match="save_every=1"):
+    with pytest.raises(sc.StateError, match="save_every=1"):
         stepper.integrate(*start, t_end=2.0, t_eval=[0.3, 1.1]).work()
 
 
 @pytest.mark.parametrize("plan", [{"h": 0.05}, {}])
 def test_work_balance_with_impacts(thrown, plan):
     """Steps end in the states before impacts, which conserve the energy."""
-    run = compile_stepper(thrown, SVI(6)).integrate([1.0, 0.0], [0.0, 1.1], t_end=6.0, events=impact("x + 1/5"), **plan)
+    run = sc.compile_stepper(thrown, sc.SVI(6)).integrate(
+        [1.0, 0.0], [0.0, 1.1], t_end=6.0, events=sc.impact("x + 1/5"), **plan
+    )
     assert len(run.events[0]) > 1
     assert np.abs(run.energy() - run.energy()[0] - run.work()).max() < 1e-9
-    with pytest.raises(StateError, match="states after changes by events"):
+    with pytest.raises(sc.StateError, match="states after changes by events"):
         run.stepper.integrate([1.0, 0.0], [0.0, 1.1], h=0.05, t_end=6.0, save_every=7).work()
 
 
 def test_unsupported_systems_have_no_work_balance(thrown):
-    free = LagrangianSystem.from_text(name="oscillator", lagrangian="x_dot**2/2 - x**2/2", coordinates=["x"])
-    with pytest.raises(MethodError, match="work_and_impulses is not available without"):
-        compile_stepper(free, SVI(2)).integrate([1.0], [0.0], h=0.1, steps=2).work()
-    stepper = compile_stepper(thrown, RadauIIA(2))
-    with pytest.raises(MethodError, match="SVI, SCVI"):
+    free = sc.LagrangianSystem.from_text(name="oscillator", lagrangian="x_dot**2/2 - x**2/2", coordinates=["x"])
+    with pytest.raises(sc.MethodError, match="work_and_impulses is not available without"):
+        sc.compile_stepper(free, sc.SVI(2)).integrate([1.0], [0.0], h=0.1, steps=2).work()
+    stepper = sc.compile_stepper(thrown, sc.RadauIIA(2))
+    with pytest.raises(sc.MethodError, match="SVI, SCVI"):
         stepper.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=2).impulses()
 
 
 def test_missing_newton_iteration_is_an_error_message(thrown):
-    stepper = compile_stepper(thrown, SVI(3), solver="fixed-point")
+    stepper = sc.compile_stepper(thrown, sc.SVI(3), solver="fixed-point")
     run = stepper.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=2)
-    with pytest.raises(MethodError, match="requires Newton's method"):
+    with pytest.raises(sc.MethodError, match="requires Newton's method"):
         run.work()

@@ -17,7 +17,6 @@ from scvi_codegen import compiler, pipeline
 from scvi_codegen.cli import main
 from scvi_codegen.ir.equations import Control
 from scvi_codegen.ir.program import Program
-from scvi_codegen.methods import as_method
 from scvi_codegen.rendering.program_source import render
 from scvi_codegen.rendering.source import Source
 
@@ -132,7 +131,7 @@ QUICK = ("a ring that closes one place off",)
 def test_planted_faults_find_their_source_lines(name: str, method: str) -> None:
     """Rewritten source would otherwise disable its planted faults, noticed only by the full tier."""
     system = either_system(name=name, **SYSTEMS[name][0])
-    code = pipeline.Sources(system, as_method(method)).integrator()[0].amalgamated().code
+    code = pipeline.Sources(system, sc.as_method(method)).integrator()[0].amalgamated().code
     here = {what: fault[2] for what, fault in FAULTS.items() if fault[:2] == (name, method)}
     assert [what for what, pattern in here.items() if not re.search(pattern, code)] == []
 

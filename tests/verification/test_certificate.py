@@ -15,20 +15,11 @@ from mutations import MUTATIONS
 from sabotage import certified
 from samples import QUICK_FLAGS, pushed_pendulum
 
-from scvi_codegen import SVI, Certificate, verify
+import scvi_codegen as sc
 from scvi_codegen.cli import main
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.derivation.equations import derive
-from scvi_codegen.errors import StateError
 from scvi_codegen.exact.solution import exact_motion
 from scvi_codegen.exact.step import derived_step
 from scvi_codegen.formulas.expressions import evaluate
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.methods import Gauss, SpectralCollocation
-from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_files.model_file import save_model
-from scvi_codegen.models.packages.package import generate_package
-from scvi_codegen.models.problems import problem
 from scvi_codegen.native import announcements
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification import system_under_test
@@ -103,9 +94,9 @@ def test_constrained_systems_are_certified(name: str) -> None:
 
 
 def test_inputs_are_certified_between_breakpoints() -> None:
-    system, stepper = pushed_pendulum(), compile_stepper(pushed_pendulum(), SVI(2), flags=QUICK_FLAGS)
+    system, stepper = pushed_pendulum(), sc.compile_stepper(pushed_pendulum(), sc.SVI(2), flags=QUICK_FLAGS)
     for given in ({}, {"q": [0.6], "p": [-0.3], "stepper": stepper}):
-        certificate = verify(system, SVI(2), flags=QUICK_FLAGS, **given)
+        certificate = sc.verify(system, sc.SVI(2), flags=QUICK_FLAGS, **given)
         assert certificate.passed, certificate.to_text()
         assert not certificate.not_measured
 
@@ -113,9 +104,9 @@ def test_inputs_are_certified_between_breakpoints() -> None:
 # Contents of a certificate.
 
 
-def pendulum_certificate(**changes: object) -> Certificate:
-    system = problem("planar-pendulum").system
-    return verify(system, SVI(2), [0.7], [0.9], h=0.2, flags=QUICK_FLAGS, **changes)
+def pendulum_certificate(**changes: object) -> sc.Certificate:
+    system = sc.problem("planar-pendulum").system
+    return sc.verify(system, sc.SVI(2), [0.7], [0.9], h=0.2, flags=QUICK_FLAGS, **changes)
 
 
 def test_a_certificate_is_text_json_and_a_verdict(tmp_path: Path) -> None:
@@ -135,8 +126,8 @@ def test_a_certificate_is_text_json_and_a_verdict(tmp_path: Path) -> None:
 @pytest.mark.parametrize("method", ["svi:4", "svi:8"])
 def test_rounding_of_growing_motions_is_no_drift(method: str) -> None:
     """A body falls 10^5 times its initial distance: terms of the energy and of the boost grow alike in all runs."""
-    falling = LagrangianSystem.from_text("falling", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - 9.81*y")
-    certificate = verify(falling, method, q=[0.1, 1.0], p=[0.3, 0.0], h=0.02)
+    falling = sc.LagrangianSystem.from_text("falling", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - 9.81*y")
+    certificate = sc.verify(falling, method, q=[0.1, 1.0], p=[0.3, 0.0], h=0.02)
     drifts = [check for check in certificate.checks if check.name.startswith("drift")]
     assert len(drifts) == 2
     assert all(
@@ -145,25 +136,25 @@ def test_rounding_of_growing_motions_is_no_drift(method: str) -> None:
 
 
 def test_missing_state_is_generated() -> None:
-    certificate = verify(problem("planar-pendulum").system, Gauss(2), flags=QUICK_FLAGS, solver="newton")
+    certificate = sc.verify(sc.problem("planar-pendulum").system, sc.Gauss(2), flags=QUICK_FLAGS, solver="newton")
     assert certificate.passed
     assert certificate.h > 0
-    with pytest.raises(StateError, match="give both, or neither"):
-        verify(problem("planar-pendulum").system, Gauss(2), [0.1], flags=QUICK_FLAGS)
+    with pytest.raises(sc.StateError, match="give both, or neither"):
+        sc.verify(sc.problem("planar-pendulum").system, sc.Gauss(2), [0.1], flags=QUICK_FLAGS)
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize("method", [SVI(2), Gauss(2)], ids=lambda method: method.name)
+@pytest.mark.parametrize("method", [sc.SVI(2), sc.Gauss(2)], ids=lambda method: method.name)
 def test_inputs_are_certified_at_small_values(method) -> None:
     """Nobody gives any: their parts are moved off 0 as all parameters are."""
-    certificate = verify(pushed_pendulum(), method, flags=QUICK_FLAGS)
+    certificate = sc.verify(pushed_pendulum(), method, flags=QUICK_FLAGS)
     assert certificate.passed, certificate.to_text()
     assert len(certificate.checks) > 15
 
 
 def test_constraints_are_certified_with_constant_inputs() -> None:
     """Cubics of time would push with 5000 after 50 units of it, and steps fail."""
-    pushed = LagrangianSystem.from_text(
+    pushed = sc.LagrangianSystem.from_text(
         name="pushed rod",
         coordinates=["x", "y"],
         lagrangian="(x_dot**2 + y_dot**2)/2 - y",
@@ -171,16 +162,16 @@ def test_constraints_are_certified_with_constant_inputs() -> None:
         forces={"x": "u"},
         inputs=["u", "w"],
     ).with_parameters(w_0=1.0)
-    method = SVI(2, "gauss-lobatto:3")
-    stepper = compile_stepper(pushed, method, flags=QUICK_FLAGS)
+    method = sc.SVI(2, "gauss-lobatto:3")
+    stepper = sc.compile_stepper(pushed, method, flags=QUICK_FLAGS)
     given = system_under_test.State(np.array([0.6, -0.8]), np.array([0.4, 0.3]), 0.0, 0.05)
     checks = structure_checks(system_under_test.SystemUnderTest(pushed, method, stepper, None, given))
     assert {check.name: check.outcome for check in checks}["constraints"] is Outcome.SATISFIED
 
 
 def test_different_integrator_is_not_certified() -> None:
-    system = problem("planar-pendulum").system
-    other = compile_stepper(system, SpectralCollocation(2), flags=QUICK_FLAGS)
+    system = sc.problem("planar-pendulum").system
+    other = sc.compile_stepper(system, sc.SpectralCollocation(2), flags=QUICK_FLAGS)
     names = {check.name for check in pendulum_certificate(stepper=other).violated}
     assert {"stage equations", "symplecticity", "reversal"} <= names
 
@@ -194,7 +185,7 @@ def test_different_integrator_is_not_certified() -> None:
         (lambda: Finding(float("nan"), 2.0), Outcome.VIOLATED),
         (lambda: Finding(float("nan"), 2.0, at_least=True), Outcome.VIOLATED),
         (lambda: violated(ViolationError("it fails")), Outcome.VIOLATED),
-        (lambda: violated(StateError("it is singular")), Outcome.NOT_MEASURED),
+        (lambda: violated(sc.StateError("it is singular")), Outcome.NOT_MEASURED),
         (lambda: violated(ZeroDivisionError("by zero")), Outcome.NOT_MEASURED),
     ],
 )
@@ -212,7 +203,7 @@ def violated(error: Exception) -> Finding:
 
 
 def test_exact_solution_is_exact() -> None:
-    oscillator = problem("harmonic-oscillator").system
+    oscillator = sc.problem("harmonic-oscillator").system
     q, p = exact_motion(oscillator).flow([1.0], [0.0], 2)
     assert abs(q[0] - mp.cos(2)) < mp.mpf("1e-43")
     assert abs(p[0] + mp.sin(2)) < mp.mpf("1e-43")
@@ -220,7 +211,7 @@ def test_exact_solution_is_exact() -> None:
 
 @pytest.mark.parametrize("name", ["relativistic-particle", "double-pendulum"])
 def test_velocities_are_found_where_newton_leaves_the_domain(name: str) -> None:
-    motion = exact_motion(problem(name).system)
+    motion = exact_motion(sc.problem(name).system)
     size = motion.system.dimension
     q, v = np.array([mp.mpf("0.3")] * size), np.array([mp.mpf("0.9")] * size)
     found = motion.velocity(q, motion.momentum(q, v, mp.zero), mp.zero)
@@ -229,8 +220,8 @@ def test_velocities_are_found_where_newton_leaves_the_domain(name: str) -> None:
 
 def test_the_derived_step_is_that_of_the_closed_form() -> None:
     """Its unknowns satisfy the equations that ``derive`` prints."""
-    system, method = problem("planar-pendulum").system, SVI(2)
-    solved, derived = derived_step(system, method)([0.7], [0.4], 0.2), derive(system, method)
+    system, method = sc.problem("planar-pendulum").system, sc.SVI(2)
+    solved, derived = derived_step(system, method)([0.7], [0.4], 0.2), sc.derive(system, method)
     values = {entry.symbol: entry.value for entry in derived.entries} | dict(
         zip(derived.unknowns, solved.unknowns, strict=True)
     )
@@ -250,14 +241,14 @@ def command(*words: str) -> tuple[int, str]:
 
 
 def test_model_file_and_its_generated_folder_are_verified(tmp_path: Path) -> None:
-    entry = problem("planar-pendulum")
-    model = Model(system=entry.system, method=SVI(2), q=(0.7,), velocity=(0.1,), h=0.2, steps=10)
-    save_model(model, tmp_path / "pendulum.toml")
+    entry = sc.problem("planar-pendulum")
+    model = sc.Model(system=entry.system, method=sc.SVI(2), q=(0.7,), velocity=(0.1,), h=0.2, steps=10)
+    sc.save_model(model, tmp_path / "pendulum.toml")
     code, output = command(str(tmp_path / "pendulum.toml"))
     assert code == 0, output
     assert json.loads((tmp_path / "pendulum.certificate.json").read_text())["passed"] is True
 
-    folder = generate_package(model, tmp_path / "pendulum_svi")
+    folder = sc.generate_package(model, tmp_path / "pendulum_svi")
     source = folder / "pendulum_svi.c"
     text = source.read_text()
     source.write_text(text.replace("value[0] = -", "value[0] = -1.001*", 1))
@@ -270,16 +261,16 @@ def test_model_file_and_its_generated_folder_are_verified(tmp_path: Path) -> Non
 
 
 def test_certificate_reports_slow_checks_and_their_duration(quickly_compiled, monkeypatch, capsys):
-    entry = problem("harmonic-oscillator")
+    entry = sc.problem("harmonic-oscillator")
     message: list[str] = []
     monkeypatch.setattr(announcements, "PATIENCE_SECONDS", 0.0)
     monkeypatch.setattr(system_under_test, "ANNOUNCED_SECONDS", 0.0)
-    stepper = quickly_compiled(entry.system, SVI(1))
+    stepper = quickly_compiled(entry.system, sc.SVI(1))
     given = system_under_test.State(np.array([1.0]), np.array([0.5]), 0.0, 0.1)
     with announcements.announce_to(message.append):
-        next(step_checks(system_under_test.SystemUnderTest(entry.system, SVI(1), stepper, None, given)))
+        next(step_checks(system_under_test.SystemUnderTest(entry.system, sc.SVI(1), stepper, None, given)))
     assert capsys.readouterr().err == ""
-    next(step_checks(system_under_test.SystemUnderTest(entry.system, SVI(1), stepper, None, given)))
+    next(step_checks(system_under_test.SystemUnderTest(entry.system, sc.SVI(1), stepper, None, given)))
     assert "which takes about" in capsys.readouterr().err  # which is no terminal
     assert "measuring stage equations" in message
     assert any("unknowns per step are solved in 60 digits, which takes about" in line for line in message)

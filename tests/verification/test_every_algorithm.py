@@ -12,11 +12,9 @@ from certified_cases import CASES
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.errors import MethodError
 from scvi_codegen.files.cache import template_folder
 from scvi_codegen.lowering.arrays import one_coordinate
 from scvi_codegen.mechanics.arrays.system import ArraySystem
-from scvi_codegen.methods import as_method
 from scvi_codegen.pipeline import Sources
 from scvi_codegen.verification import Outcome
 
@@ -123,11 +121,11 @@ def headers_of(name: str) -> Iterator[str]:
     if "events" in options:
         sources += sc.compile_stepper(system, method, flags=QUICK_FLAGS, **options).source.sources
     else:
-        chosen = as_method(method, one_coordinate(system) if isinstance(system, ArraySystem) else system)
+        chosen = sc.as_method(method, one_coordinate(system) if isinstance(system, ArraySystem) else system)
         made = Sources(system, chosen, options.get("solver", "auto"), g=options.get("time_transformation"))
         sources.append(made.integrator()[0])
         for kind in ("ensemble", "derivatives", *(["second_derivatives"] if name == "kepler/svi-3" else [])):
-            with suppress(MethodError):
+            with suppress(sc.MethodError):
                 sources.append(made.variant(kind))
     for source in filter(None, sources):
         yield from (header.removeprefix("support/") for header, _ in source.support)

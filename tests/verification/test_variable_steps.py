@@ -8,7 +8,7 @@ from certified_cases import CONTROLLED, REVERSIBLE, case
 from sabotage import Case
 from samples import QUICK_FLAGS
 
-from scvi_codegen import compile_stepper, verify
+import scvi_codegen as sc
 from scvi_codegen.verification.certificate import Check, Outcome
 from scvi_codegen.verification.system_under_test import State, SystemUnderTest
 from scvi_codegen.verification.variable_steps import VariableSteps, at_fixed_energy, variable_step_checks
@@ -26,12 +26,12 @@ STEP_CHECKS = {
 def checks_of(given: Case) -> Iterator[Check]:
     """Without those of single steps, which ``test_certificate.py`` has."""
     own = given.system.clock.plain if given.system.clock else given.system
-    runs = compile_stepper(
+    runs = sc.compile_stepper(
         given.system, given.method(), flags=QUICK_FLAGS, time_transformation=given.time_transformation
     )
     q, p = np.array(given.q), np.array(given.p)
     steps = at_fixed_energy(given.system, runs.energy(q, p))
-    single = compile_stepper(steps, given.method(), flags=QUICK_FLAGS)
+    single = sc.compile_stepper(steps, given.method(), flags=QUICK_FLAGS)
     tested = SystemUnderTest(steps, given.method(), single, None, State(q, p, 0.0, given.h))
     return variable_step_checks(VariableSteps(tested, runs, own, given.system, given.tolerance))
 
@@ -48,10 +48,10 @@ def test_local_error_of_run_steps_is_measured(name: str) -> None:
 @pytest.mark.parametrize("name", STEP_CHECKS)
 def test_certificates_contain_the_local_error(name: str) -> None:
     given, claims = STEP_CHECKS[name]
-    stepper = compile_stepper(
+    stepper = sc.compile_stepper(
         given.system, given.method(), flags=QUICK_FLAGS, time_transformation=given.time_transformation
     )
-    certificate = verify(
+    certificate = sc.verify(
         given.system, given.method(), given.q, given.p, h=given.h, stepper=stepper, tolerance=given.tolerance
     )
     assert certificate.passed, certificate.to_text()
