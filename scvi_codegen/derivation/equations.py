@@ -284,9 +284,9 @@ class _Writer:
     def _momentum(self, column: int, row: Row) -> sympy.Expr:
         """Return the coefficient of p_k: the named entry of q_(k+1) in that column if it is one, else a number."""
         table = self.stages.end_position
-        name = table.names[0][column] if column < len(table.names[0]) else ""
-        if name.startswith("beta") and row.momentum == table.entries[0][column]:
-            return self._named(name, row.momentum)
+        name = table.names[0][column] if column < len(table.names[0]) else None
+        if name and name.of == "beta" and row.momentum == table.entries[0][column]:
+            return self._named(name.number, row.momentum)
         return _rational(row.momentum)
 
     def _scatter(self, group: StageGroup, n: int, powers: Sequence[int], rows: list[list[list[sympy.Expr]]]) -> None:
@@ -338,18 +338,19 @@ class _Writer:
         return tuple(sympy.Add(*terms) for terms in sums)
 
     def _entry(self, table: Table, n: int, b: int) -> sympy.Expr:
-        return self._named(table.names[n][b], table.entries[n][b])
+        name, value = table.names[n][b], table.entries[n][b]
+        if name is None:
+            return self._named("", value)
+        factor = sympy.Rational(name.factor.numerator, name.factor.denominator)
+        return factor * self._named(name.number, value / name.factor.numerator * name.factor.denominator)
 
     def _named(self, name: str, value: Number) -> sympy.Expr:
-        """Return the symbol of an entry (``name/2``: half a named one) and record its value."""
+        """Return the symbol of a number and record its value; without a name, the number."""
         if not name:
             return sympy.Integer(int(value))
-        if name.startswith("-"):
-            return -self._named(name[1:], -value)
-        base, _, divisor = name.partition("/")
-        symbol = self._symbol(base)
-        self.values[symbol] = value * int(divisor or 1)
-        return symbol / int(divisor or 1)
+        symbol = self._symbol(name)
+        self.values[symbol] = value
+        return symbol
 
 
 def _rational(value: Number) -> sympy.Expr:

@@ -24,7 +24,7 @@ from scvi_codegen.formulas.symbols import TIME, symbol
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.stage_system import StageSystem, Table
+from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.tables.closed_forms import exact_points, exact_rule, exact_tableau
 from scvi_codegen.tables.precision import DIGITS, Number, Vector, mp
@@ -186,14 +186,15 @@ def table_entries(stages: StageSystem, method: Method) -> tuple[TableEntry, ...]
     values: dict[sympy.Symbol, Number] = {}
     for group in stages.stage_groups:
         tables += [gather.table for gather in group.gathers] + [scatter.table for scatter in group.scatters]
-        tables.append(Table(entries=(group.weights,), names=(group.weight_names,)))
+        named = zip(group.weight_names, group.weights, strict=True)
+        values |= {sympy.Symbol(name, real=True): weight for name, weight in named if name}
     for table in tables:
         for names, numbers in zip(table.names, table.entries, strict=True):
             for name, value in zip(names, numbers, strict=True):
-                base, _, divisor = name.removeprefix("-").partition("/")
-                if base:
-                    sign = -1 if name.startswith("-") else 1
-                    values[sympy.Symbol(base, real=True)] = value * sign * int(divisor or 1)
+                if name:
+                    values[sympy.Symbol(name.number, real=True)] = (
+                        value / name.factor.numerator * name.factor.denominator
+                    )
     return entries(values, method)
 
 

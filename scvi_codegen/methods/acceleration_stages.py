@@ -19,6 +19,7 @@ from scvi_codegen.methods.galerkin_stages import (
 from scvi_codegen.methods.stage_system import (
     Accelerations,
     Block,
+    EntryName,
     Gather,
     PrintedCurve,
     Row,
@@ -53,7 +54,7 @@ def position_system(system: MechanicalSystem, tableau: Tableau) -> StageSystem:
     """Return (22) on (q, v): unknowns v0 and z_i = h a_i; v0 from p0 by the Legendre transform, p1 from v1."""
     b, size = tableau.b, len(tableau.b)
     ones, none = Table.constant(1, 1, 1), Table.constant(1, size)
-    b_row = Table(entries=(b,), names=(tuple(f"b_{i}" for i in range(1, size + 1)),))
+    b_row = Table(entries=(b,), names=(tuple(EntryName("b", column=i) for i in range(1, size + 1)),))
     end_row = Table.joined(ones, ones, Table.named("bA", matrix_product((b,), tableau.A)))
     zero, minus = Table.constant(1, 1), Table.constant(1, 1, -1)
     before, at_start = Table.joined(ones, zero, none), Table.joined(zero, ones, none)
@@ -112,7 +113,7 @@ def acceleration_gathers(
     size = len(A)
     ones, zeros, padding = Table.constant(size, 1, 1), Table.constant(size, 1), Table.constant(size, other_blocks)
     sums = Table.named("c", [(mp.fsum(line),) for line in A])
-    drift = Table(entries=sums.entries, names=tuple((name.rpartition("_")[0],) for (name,) in sums.names))
+    drift = replace(sums, names=tuple((name and replace(name, column=None),) for (name,) in sums.names))
     double = Table.named("aa", matrix_product(A, A))
     return (
         Gather(arguments=system.coordinates, table=Table.joined(ones, drift, double, padding), power=0),
@@ -188,7 +189,10 @@ def nodal_gathers(system: MechanicalSystem, nodes: Nodes, *, other_blocks: int =
     acceleration = Table.joined(
         Table.named("DD", matrix_product(inner, first), column=0),
         Table.named("DD", matrix_product(inner, inner)),
-        Table(entries=tuple((x / 2,) for (x,) in first), names=tuple((f"D_{n}_0/2",) for n in range(1, size + 1))),
+        Table(
+            entries=tuple((x / 2,) for (x,) in first),
+            names=tuple((EntryName("D", n, 0, factor=Fraction(1, 2)),) for n in range(1, size + 1)),
+        ),
     )
     return (
         Gather(arguments=system.coordinates, table=Table.joined(zeros, Table.identity(size), zeros, padding), power=0),

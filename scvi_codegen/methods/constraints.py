@@ -174,7 +174,7 @@ def _with_end(table: Table, rows: int, points: int) -> Table:
     last = table.columns([rows])
     negative = Table(
         entries=tuple((-line[0],) for line in last.entries),
-        names=tuple((f"-{line[0]}" if line[0] else "",) for line in last.names),
+        names=tuple((name and replace(name, factor=-name.factor),) for (name,) in last.names),
     )
     return Table.joined(table.columns(range(rows)), negative, Table.constant(len(table.entries), points), last)
 

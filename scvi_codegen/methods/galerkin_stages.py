@@ -13,6 +13,7 @@ from scvi_codegen.mechanics.derived_expressions import curve_rates, forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import (
     Block,
+    EntryName,
     Gather,
     Row,
     ScalarStageGroup,
@@ -203,7 +204,7 @@ def phase_space_system(system: MechanicalSystem, tableau: Tableau) -> StageSyste
     """Return (22) on Hamilton's equations, with momenta eliminated by p_i = L_v(q_i, V_i)."""
     size = len(tableau.b)
     gathers = curve_gathers(system, tableau.A, (identity_matrix(size),))
-    b_column = Table(entries=tuple((x,) for x in tableau.b), names=tuple((f"b_{n + 1}",) for n in range(size)))
+    b_column = Table(entries=tuple((x,) for x in tableau.b), names=tuple((EntryName("b", n + 1),) for n in range(size)))
     return StageSystem(
         blocks=tuple(Block(name=f"V_{i}", power=1, straight=(mp.zero, mp.one)) for i in range(1, size + 1)),
         rows=tuple(Row(number="22", kind="stage", momentum=mp.one) for _ in range(size)),

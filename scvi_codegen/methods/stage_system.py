@@ -45,24 +45,55 @@ ROUNDING = mp.mpf("1e-50")
 """Bound below which entries are set to 0: round-off of sums that are 0."""
 
 
+@dataclass(frozen=True, slots=True)
+class EntryName:
+    """Name of a table entry: a number of the method's tables by its indices, l_2(tau_n) or a_nj, times a factor.
+
+    Attributes:
+        of: letter of the table that the number belongs to.
+        point: index of the point, ``None`` for tables of one row without it: b_j.
+        column: index of the column, ``None`` for vectors over points: c_n.
+        column_first: whether the index of the column is the first one, as in a transposed table.
+        factor: of the number in this entry.
+    """
+
+    of: str
+    point: int | None = None
+    column: int | None = None
+    column_first: bool = False
+    factor: Fraction = Fraction(1)
+
+    @property
+    def number(self) -> str:
+        """The named number without its factor."""
+        indices = (self.column, self.point) if self.column_first else (self.point, self.column)
+        return "_".join([self.of, *(str(index) for index in indices if index is not None)])
+
+    @property
+    def transposed(self) -> EntryName:
+        """The same number where points are columns and columns are points."""
+        one_index = self.point is None or self.column is None
+        return replace(self, point=self.column, column=self.point, column_first=not (one_index or self.column_first))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
     """Matrix of numbers, each with a name for display.
 
     Attributes:
         entries: one row per point, one column per block; 60-digit numbers.
-        names: parallel to ``entries``; ``""`` marks an entry shown as its value (0, 1, -1).
+        names: parallel to ``entries``; ``None`` marks an entry shown as its value (0, 1, -1).
     """
 
     entries: Matrix
-    names: tuple[tuple[str, ...], ...]
+    names: tuple[tuple[EntryName | None, ...], ...]
 
     @classmethod
     def named(cls, prefix: str, entries: Sequence[Sequence[Number]], *, row: int = 1, column: int = 1) -> Table:
         """Return a table with names ``prefix_n_b``, counting from ``row`` and ``column``; 0, 1 and -1 get no name."""
         rows = tuple(tuple(mp.mpf(x) if abs(x) > ROUNDING else mp.zero for x in line) for line in entries)
         names = tuple(
-            tuple("" if x in (0, 1, -1) else f"{prefix}_{n}_{b}" for b, x in enumerate(line, column))
+            tuple(None if x in (0, 1, -1) else EntryName(prefix, n, b) for b, x in enumerate(line, column))
             for n, line in enumerate(rows, row)
         )
         return cls(entries=rows, names=names)
@@ -88,7 +119,8 @@ class Table:
     @property
     def transposed(self) -> Table:
         """The transposed table."""
-        return Table(entries=tuple(zip(*self.entries, strict=True)), names=tuple(zip(*self.names, strict=True)))
+        names = tuple(tuple(name and name.transposed for name in line) for line in zip(*self.names, strict=True))
+        return Table(entries=tuple(zip(*self.entries, strict=True)), names=names)
 
     def columns(self, indices: Sequence[int]) -> Table:
         """Return the columns with these indices, in that order."""

@@ -23,6 +23,7 @@ import scvi_codegen as sc
 from scvi_codegen.derivation import derivation_html
 from scvi_codegen.derivation.equations import derive
 from scvi_codegen.methods.discretise import discretise, paper_equations
+from scvi_codegen.methods.stage_system import EntryName
 from scvi_codegen.pipeline import program_of
 
 T, H, TIME = mp.mpf("1e-40"), 0.125, 0.375
@@ -223,9 +224,8 @@ def table_values(stages: Any) -> dict[str, Any]:
     return found
 
 
-def _taken_apart(name: str) -> tuple[str, int]:
-    base, _, divisor = name.removeprefix("-").partition("/")
-    return base, (-1 if name.startswith("-") else 1) * int(divisor or 1)
+def _taken_apart(name: EntryName) -> tuple[str, int]:
+    return name.number, int(1 / name.factor)
 
 
 class PrintedStep:

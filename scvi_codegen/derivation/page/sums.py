@@ -1,8 +1,8 @@
 """Stage equations in compact form: sums over points and unknowns, one line for rows that differ in an index.
 
-The index that a column of a table depends on follows from the names in the table: a column whose entries are called
-l_1_2, l_2_2, .. is l_2(tau_n) at point n. Entries without a name are 0, 1 and -1: all of them alike, or a single one
-that is not 0. Arguments and results of kernels have symbols: q_n, L_q at point n, the Euler-Lagrange residual E_n.
+The names of table entries contain the indices of point and column: a column whose entries are l_1_2, l_2_2, .. is
+l_2(tau_n) at point n. Entries without a name are 0, 1 and -1: all of them alike, or a single one that is not 0.
+Arguments and results of kernels have symbols: q_n, L_q at point n, the Euler-Lagrange residual E_n.
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ def meaning(group: StageGroup) -> str:
 
 CARDINAL = {"l": "l", "dl": "l_dot"}
 """Tables of functions at points tau_n."""
-LINES = ("b", "bA", "beta", "gamma")
-"""Tables of one line, q_(k+1), whose entries have one index."""
+LINES = ("bA", "beta", "gamma")
+"""Tables of one line, q_(k+1), whose entries are shown with one index."""
 ANY_POINT = "n"
 
 
@@ -97,18 +97,20 @@ class Column:
             points, then zeros), ``"named"`` or ``"other"``.
         points: number of entries.
         factor: of all entries, or of the single one.
-        prefix: of the names.
-        index: of the column in its names; the number of the point of the single entry, or of the last leading one,
+        of: letter of the table of its numbers.
+        index: of the column in that table; the number of the point of the single entry, or of the last leading one,
             counted from 1; or ``None``.
-        transposed: whether names have the index of the column first.
+        at_points: whether its numbers have the index of the point.
+        column_first: whether their index of the column is the first one.
     """
 
     kind: str
     points: int
     factor: sympy.Rational = sympy.S.One
-    prefix: str = ""
+    of: str = ""
     index: int | None = None
-    transposed: bool = False
+    at_points: bool = True
+    column_first: bool = False
 
     def entry(self, index: object) -> sympy.Expr:
         """Return the entry at point n, with ``index`` instead of the column's own; constants do not depend on it."""
@@ -116,27 +118,27 @@ class Column:
             return self.factor
         suffix = [] if self.index is None else [str(index)]
         point = ANY_POINT if self.points > 1 else "1"
-        if self.prefix in CARDINAL:
-            return self.factor * sympy.Function("_".join([CARDINAL[self.prefix], *suffix]))(Symbol(f"tau_{point}"))
-        row = [] if self.points == 1 and self.prefix in LINES else [point]
-        indices = [*suffix, *row] if self.transposed else [*row, *suffix]
-        return self.factor * Symbol("_".join([self.prefix, *indices]))
+        if self.of in CARDINAL:
+            return self.factor * sympy.Function("_".join([CARDINAL[self.of], *suffix]))(Symbol(f"tau_{point}"))
+        row = [] if not self.at_points or (self.points == 1 and self.of in LINES) else [point]
+        indices = [*suffix, *row] if self.column_first else [*row, *suffix]
+        return self.factor * Symbol("_".join([self.of, *indices]))
 
 
 def column_of(table: Table, number: int) -> Column:
     """Return one column of a table."""
     names = [line[number] for line in table.names]
     values = [line[number] for line in table.entries]
-    points, transposed = len(values), _is_transposed(table)
-    parsed = {_parts(name, points, transposed=transposed) for name in names if name}
-    if len(parsed) == 1:
-        prefix, index, divisor = parsed.pop()
-        return Column("named", points, sympy.Rational(1, divisor), prefix, index, transposed and index is not None)
+    points, named = len(values), [name for name in names if name]
+    if named and len({(name.of, name.column, name.column_first, name.factor) for name in named}) == 1:
+        first = named[0]
+        factor = sympy.Rational(first.factor.numerator, first.factor.denominator)
+        return Column("named", points, factor, first.of, first.column, first.point is not None, first.column_first)
     indices = [point for point, value in enumerate(values) if value != 0]
     if not indices:
         return Column("zero", points)
-    if parsed or len({values[point] for point in indices}) > 1:
-        return Column("other", points, prefix="G", index=number)
+    if named or len({values[point] for point in indices}) > 1:
+        return Column("other", points, of="G", index=number)
     factor = sympy.Integer(int(values[indices[0]]))
     if len(indices) == points:
         return Column("constant", points, factor)
@@ -144,26 +146,6 @@ def column_of(table: Table, number: int) -> Column:
         return Column("single", points, factor, index=indices[0] + 1)
     leading = indices == list(range(len(indices)))
     return Column("leading" if leading else "other", points, factor, "" if leading else "G", len(indices))
-
-
-def _is_transposed(table: Table) -> bool:
-    """Return whether the second index in the names is that of the point, and the first is not."""
-    pairs = [
-        (point, [int(index) for index in name.partition("/")[0].split("_")[1:]])
-        for point, line in enumerate(table.names, 1)
-        for name in line
-        if name.count("_") == 2
-    ]
-    second = all(indices[1] == point for point, indices in pairs)
-    return len(table.names) > 1 and bool(pairs) and second and any(indices[0] != point for point, indices in pairs)
-
-
-def _parts(name: str, points: int, *, transposed: bool) -> tuple[str, int | None, int]:
-    """Return prefix, index of the column or ``None``, divisor of a name: ``DD_1_0``, ``D_1_0/2``, ``-D_1_0``."""
-    base, _, divisor = name.removeprefix("-").partition("/")
-    prefix, *indices = base.split("_")
-    index = int(indices[0 if transposed else -1]) if len(indices) == 2 or points == 1 else None
-    return prefix, index, (-1 if name.startswith("-") else 1) * int(divisor or 1)
 
 
 h, n, j = Symbol("h"), Symbol("n", integer=True), Symbol("j", integer=True)
@@ -313,14 +295,14 @@ class _Line:
         """Key that is equal for lines that differ in an index alone."""
         momentum = self.momentum
         if isinstance(momentum, Column):
-            coefficient: tuple[object, ...] = (momentum.prefix, self._shift(momentum.index))
+            coefficient: tuple[object, ...] = (momentum.of, self._shift(momentum.index))
         else:
             coefficient = (momentum,)
         shapes = [
             (
                 part.column.kind,
                 part.column.factor,
-                part.column.prefix,
+                part.column.of,
                 self._shift(part.index),
                 id(part.scatter),
                 part.power,
@@ -368,7 +350,7 @@ def _momentum(stages: StageSystem, r: int) -> sympy.Expr | Column:
         return _small(stages.end_momentum)
     value = stages.rows[r].momentum
     column = column_of(stages.end_position, r + 1)
-    if column.prefix == "beta" and value == stages.end_position.entries[0][r + 1]:
+    if column.of == "beta" and value == stages.end_position.entries[0][r + 1]:
         return column
     return _small(value)
 
