@@ -108,6 +108,25 @@ def test_a_polynomial_between_joints_reduces_the_motion_to_one_coordinate(tmp_pa
     np.testing.assert_allclose(at_rest.q[-1], [0.7, -9.81 / 2], rtol=0, atol=1e-11)
 
 
+@pytest.mark.parametrize(("written", "whole"), [("0.3", "0.3 1 0 0 0"), ("0.3 2", "0.3 2 0 0 0"), ("", "0 1 0 0 0")])
+def test_coefficients_that_are_not_written_keep_their_defaults(written, whole, tmp_path):
+    slides = "".join(
+        f'<body><joint name="{name}" type="slide"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>'
+        for name in "ab"
+    )
+    attribute = f'polycoef="{written}"' if written else ""
+    short = model(tmp_path, slides, f'<joint joint1="a" joint2="b" {attribute}/>')
+    assert (
+        short.constraints == model(tmp_path, slides, f'<joint joint1="a" joint2="b" polycoef="{whole}"/>').constraints
+    )
+
+
+@pytest.mark.parametrize("shape", ["sphere", "capsule", "cylinder", "ellipsoid", "box"])
+def test_shapes_whose_volume_underflows_are_refused(shape, tmp_path):
+    with pytest.raises(SystemDefinitionError, match="use other units of length"):
+        model(tmp_path, f'<body><joint/><geom type="{shape}" size="1e-300 1e-300 1e-300"/></body>')
+
+
 BARS = (
     f'<body name="crank"><joint name="a" axis="0 1 0"/>{ROD}<body name="bar" pos="0 0 0.4">'
     f'<joint name="b" axis="0 1 0"/>{ROD}</body></body><body name="rocker" pos="1 0 0"><joint name="c" axis="0 1 0"/>'

@@ -247,7 +247,8 @@ class _MujocoModel:
         joint, other = equality.text("joint1"), equality.text("joint2", "") or None
         if joint == other:
             equality.refuse(f"is between joint '{joint}' and itself")
-        given = equality.vector("polycoef", (0, 1, 0, 0, 0), range(1, 6))
+        first = equality.vector("polycoef", (0,), range(1, 6))
+        given = (*first, *(0, 1, 0, 0, 0)[len(first) :])  # those that are not written keep their defaults
         coefficients = tuple(map(float, given if other else given[:1]))
         return Coupling(joint, other, coefficients, zeros.get(joint, 0.0), zeros.get(other or "", 0.0))
 
@@ -320,7 +321,10 @@ class _MujocoModel:
             size = np.array([size[0]] * (count - 1) + [float(np.linalg.norm(ends[3:] - ends[:3])) / 2])
         if len(size) < count or (size[:count] <= 0).any():
             geom.refuse(f"is a {shape} and has size='{geom.text('size')}': {count} numbers > 0 are needed")
-        volume, moments = volume_and_inertia(size[:count])
+        with np.errstate(all="ignore"):
+            volume, moments = volume_and_inertia(size[:count])
+        if not (0 < volume < np.inf and np.isfinite(moments).all()):
+            geom.refuse(f"has size='{geom.text('size')}', whose volume is {volume:g}: use other units of length")
         mass = density * volume if np.isnan(mass) else mass
         return Inertia(mass, matrix=mass * np.diag(moments)).seen_from(self.pose(geom))
 

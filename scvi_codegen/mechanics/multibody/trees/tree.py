@@ -171,9 +171,10 @@ def without_fixed(links: Sequence[Link]) -> list[Link]:
             "no body has a joint that moves: add one, or free the base (from_urdf: floating=True, MJCF: <freejoint>)"
         )
     for link in moving:
-        mass, moments = link.inertia.mass, np.linalg.eigvalsh(link.inertia.matrix)
+        mass, matrix = link.inertia.mass, link.inertia.matrix
+        moments = np.linalg.eigvalsh(matrix) if np.isfinite(matrix).all() else np.full(3, np.nan)
         excess, allowed = moments[2] - moments[1] - moments[0], ROUGH * moments[2] + POINT * mass
-        if moments[0] < -1e-9 * abs(moments).max() - 1e-12 * mass or excess > allowed:
+        if not (moments[0] >= -1e-9 * abs(moments).max() - 1e-12 * mass and excess <= allowed):
             raise SystemDefinitionError(
                 f"link '{link.name}', with the links fixed to it, has the mass {mass:g} and the moments of inertia "
                 f"{moments}, which no body has: none is < 0 or exceeds the sum of the others; correct its <inertial>"
