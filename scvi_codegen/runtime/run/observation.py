@@ -118,6 +118,9 @@ class Observation:
         if self.search is not None and self.search.changes:
             self._advance_with_changes(self.search, size)
             return
+        # The C run advances by whole chunks, so it may pass the final time or a terminal event. Then it is rolled back
+        # to the start of the chunk and the steps up to there are recorded again, with the same bits; the memory of the
+        # run (compensation terms, predictor) then belongs to the last of them. A partial step completes the motion.
         before, failure = self.run.snapshot, None
         try:
             part = record(self.run, size)
@@ -128,7 +131,7 @@ class Observation:
             part, failure = self._arrived(part, before), None
         if self.search is not None:
             reached = self.search.search(part, first=self.run.steps - len(part) + 1 + self.arrived)
-            if self.search.ended:
+            if self.search.ended:  # an error in a later step of the chunk is not part of the motion
                 self.run.rollback(before)
                 part, failure, self.arrived = record(self.run, reached), None, False
                 t, q, p = self.search.last
@@ -165,6 +168,8 @@ class Observation:
         q, p, tau = self._state_within_step(part, self.end)
         lengths = part.step_sizes.copy()
         lengths[-1] = self.run.left_to(self.end) if tau is None else tau - part.stepped[-1]
+        # The partial step starts from the state alone, not from the run: the memory of a run holds predictors for steps
+        # of size h, and its state stays at the last whole step.
         self.partial_steps = int(abs(lengths[-1]) > WHOLE * abs(self.run.h))
         if tau is None and lengths[-1] != 0.0:
             run = self.run
