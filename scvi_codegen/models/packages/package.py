@@ -177,7 +177,8 @@ def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, si
 
     assert model.array_system is not None  # by the caller
     source, interface = Sources(model.array_system, model.method, model.solver, prefix).integrator(controlled=False)
-    checked_parameters(interface, model.parameters)
+    scalars = {name: value for name, value in dict(model.parameters or {}).items() if name in interface.parameters}
+    checked_parameters(interface, scalars)  # C does not check cutoffs and boxes; fields are checked with the sizes
     example, arrays = array_example_of(model, interface)
     lines = {f"{name}.txt": "".join(f"{x!r}\n" for x in each.reshape(-1).tolist()) for name, each in arrays.items()}
     source = source.single_file() if single_file else source.specialised()
