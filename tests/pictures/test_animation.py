@@ -86,6 +86,10 @@ class TestShapes:
         save_every = shape.points(run.q, run.p)
         assert np.allclose(np.linalg.norm(np.diff(save_every, axis=1), axis=2), [2.0, 0.5])
 
+    def test_a_constant_in_the_potential_does_not_change_the_picture(self):
+        pendulums = "a1_dot**2 + a2_dot**2/2 + a1_dot*a2_dot*cos(a1 - a2) + 2*cos(a1) + cos(a2) - 7"
+        assert shape_of(run_with(pendulums, ["a1", "a2"])).joined
+
     def test_angle_from_the_upright_position_is_drawn_upright_at_zero(self):
         run = run_with("m*l**2*q_dot**2/2 - m*g*l*cos(q)", ["q"], m=1.0, l=3.0, g=9.81)
         (places,) = shape_of(run).points(np.array([[0.0]]), np.zeros((1, 1)))

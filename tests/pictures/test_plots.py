@@ -65,8 +65,13 @@ def test_each_kind_of_system_has_its_panels(name, titles):
     assert figure.axes[len(titles) - 1].get_yscale() == "log"
 
 
-def test_bodies_are_named_in_the_legend():
-    figure = plot_trajectory(trajectory_of("outer-solar-system"))[0].figure
+def test_bodies_are_named_in_the_legend_and_drawn_where_they_are():
+    trajectory = trajectory_of("outer-solar-system")
+    figure = plot_trajectory(trajectory)[0].figure
+    for axes, columns in zip(figure.axes[:2], ((3, 4), (3, 5)), strict=True):  # Jupiter in the planes x y and x z
+        first, last = trajectory.q[[0, -1]][:, columns]
+        drawn = [line.get_xydata()[0] for line in axes.get_lines() if len(line.get_xydata()) == 1]  # ends of curves
+        assert all(any(np.array_equal(each, end) for each in drawn) for end in (first, last))
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert labels == ["sun", "jupiter", "saturn", "uranus", "neptune", "pluto"]
 

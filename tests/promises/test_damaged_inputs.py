@@ -315,6 +315,7 @@ WORDS = [
 ]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("text", [GAS, TRANSFORMED, MODEL], ids=["gas", "transformed", "driven"])
 def test_damaged_interfaces_of_packages_are_rejected(text: str, tmp_path: Path) -> None:
     """Every entry with other values, entries left out and repeated: refused, or used without harm."""

@@ -226,6 +226,7 @@ def test_solve_ivp_uses_adaptive_steps_for_a_tolerance():
         ({"t_span": (0, 0)}, "nothing to integrate"),
         ({"t_span": (0,)}, "two times"),
         ({"y0": [1.0, 2.0, 3.0]}, "positions and then momenta"),
+        ({"y0": [[1.0, 0.0], [0.0, 1.0]]}, "positions and then momenta"),
         ({"y0": [1.0, 2.0]}, "shape"),
         ({"method": sc.SVI(3)}, "need a system, not a compiled stepper"),
         ({"h": math.inf}, "inf"),

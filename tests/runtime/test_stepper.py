@@ -187,6 +187,7 @@ def test_damaged_checkpoints_are_rejected(kepler):
         (([[1.0, 0.0]], [0.0, 0.0], 0.1), r"not \(1, 2\)"),
         (([1.0, np.nan], [0.0, 0.0], 0.1), r"q\[1\] \(q2\) is nan"),
         (([1.0, 0.0], [np.inf, 0.0], 0.1), r"p\[0\] \(q1\) is inf"),
+        ((np.array([1.0, 0.0]), np.array([0.0, np.nan]), 0.1), r"p\[1\] \(q2\) is nan"),
         (("ab", [0.0, 0.0], 0.1), "q must be real numbers"),
         (([1j, 0.0], [0.0, 0.0], 0.1), "real"),
         (([1.0, 0.0], [0.0, 1.0], 0.0), "the step size h is 0"),

@@ -176,7 +176,7 @@ class CompiledMethod:
         if not self.run_time_sizes:
             self._check_not_of_run(tables, threads)
             return self, q
-        shapes, (last, bound) = None if tables else shapes_of_call(q, parameters, threads), self._last
+        shapes, (last, bound) = None if tables is not None else shapes_of_call(q, parameters, threads), self._last
         if shapes is None or shapes != last or bound is None:
             problem = sizes_of_run(self.interface, q, parameters, tables, threads)
             if self._reason and problem.threads > 1:

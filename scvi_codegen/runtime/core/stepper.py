@@ -141,6 +141,8 @@ class Stepper(Integrator):
         """
         if tables is not None or threads is not None:
             self._check_not_of_run(tables, threads)
+        if type(save_every) is not int or save_every != 1:
+            save_every = checked_count(save_every, "save_every", least=1)
         stepper, interface, segments = self if events is None else self.with_events(events), self.interface, None
         if inputs is not None or t_eval is not None or observe is not None:
             given = None if save_every == 1 else save_every

@@ -49,7 +49,7 @@ def record(
         StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
     """
     count = None if steps is None and not memory._plan.h else checked_count(steps, "steps", least=0)
-    if save_every != 1:
+    if type(save_every) is not int or save_every != 1:
         save_every = checked_count(save_every, "save_every", least=1)
     first, filled, status = memory._memory.step, 0, 0
     if progress is None and stop is None and memory._rows is not None and not memory._has_tau:

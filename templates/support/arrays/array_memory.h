@@ -5,10 +5,13 @@
 #include "arrays.h"
 #include <stddef.h>
 
+#ifdef CONSTRAINTS_OF_ARRAYS
+#include "../constraints/constraint_matrix.h"
+#endif
+
 /* Memory of a run over arrays, and its parameters. Requires: WORK, the numbers of work per coordinate; SCALARS, the
  * number of parameters before the fields; CONTINUED, whether predictors are extrapolated; field_lengths,
- * compute_inverse_masses; with CONSTRAINTS_OF_ARRAYS constraint_matrix.h and count_constraints, with NEWTON_KRYLOV
- * envelope.h. */
+ * compute_inverse_masses; with CONSTRAINTS_OF_ARRAYS count_constraints, with NEWTON_KRYLOV envelope.h. */
 
 #define ALIGNED_NUMBERS 8 /* in 64 bytes, the widest SIMD register */
 
@@ -92,7 +95,7 @@ static long long divide_memory(run_memory *run, double *memory)
 #endif
   run->inverse_mass = next_numbers(memory, &end, n);
   run->values = next_numbers(memory, &end, parameters_of(&run->data));
-  run->state = next_numbers(memory, &end, 2 * n);
+  run->phase_state = next_numbers(memory, &end, 2 * n);
 #ifdef CONSTRAINTS_OF_ARRAYS
   run->places = next_numbers(memory, &end, doubles_of(indices_of(run, n), sizeof(int)));
   run->columns = next_numbers(memory, &end, doubles_of(run->pairs + 1, sizeof(int)));

@@ -12,9 +12,9 @@
 static const double *joined(const run_memory *run, const double *q, const double *p)
 {
   const long long n = coordinates_of(&run->data);
-  memcpy(run->state, q, sizeof(double) * (size_t)n);
-  memcpy(run->state + n, p, sizeof(double) * (size_t)n);
-  return run->state;
+  memcpy(run->phase_state, q, sizeof(double) * (size_t)n);
+  memcpy(run->phase_state + n, p, sizeof(double) * (size_t)n);
+  return run->phase_state;
 }
 #endif
 

@@ -1,10 +1,10 @@
 #ifndef SUPPORT_CONSTRAINT_STATES_H
 #define SUPPORT_CONSTRAINT_STATES_H
 
+#include "../arrays/array_memory.h"
 #include "constraint_projection.h"
 
-/* Functions of states on the constraints of arrays: projection, distances, values and multipliers. Requires:
- * constraint_projection.h, array_memory.h. */
+/* Functions of states on the constraints of arrays: projection, distances, values and multipliers. */
 
 #define REFINEMENTS 3
 #define REFINED 1e-6 /* reduction of the residual per refinement */
