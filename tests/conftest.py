@@ -16,10 +16,9 @@ from record_tiers import COSTS_VARIABLE
 from samples import UNOPTIMISED, Sample, compile_quickly, sample_named, stepper_for
 from tiers import UNOPTIMISED_TIERS, long_ones_first, mark_the_rest_full, mark_the_rest_second
 
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen import LagrangianSystem, Stepper
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import FLAGS_VARIABLE
-from scvi_codegen.runtime.core.stepper import Stepper
 
 sys.addaudithook(programs.audit)
 signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background of a shell

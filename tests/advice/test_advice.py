@@ -13,14 +13,10 @@ from mpmath import mp
 from nbody_reference import integrate
 from outer_planets import GRAVITY, MASSES, POSITIONS, VELOCITIES
 
-from scvi_codegen.advice.advice import Advice, advise
+from scvi_codegen import Advice, LagrangianSystem, MethodError, StateError, advise, compile_stepper, problem
 from scvi_codegen.cli import main
 from scvi_codegen.cli.step_selection import _text
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import MethodError, StateError
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SVI, ExplicitEuler, Gauss, Method, RadauIIA, StoermerVerlet
-from scvi_codegen.models.problems import problem
 
 pytestmark = pytest.mark.long
 

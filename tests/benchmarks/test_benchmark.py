@@ -26,8 +26,7 @@ from benchmarks.contenders.ours import our_ensembles
 from benchmarks.contenders.tracing import rates_text
 from benchmarks.report import FLOOR, Contender, Point, ResultTable, common_error, frontier, time_at
 from benchmarks.tables import drift_row, fitted_rate
-from scvi_codegen.errors import StateError, SystemDefinitionError
-from scvi_codegen.methods import SVI
+from scvi_codegen import SVI, StateError, SystemDefinitionError
 from scvi_codegen.native import building
 
 ROOT = Path(bench.__file__).parents[1]

@@ -21,14 +21,12 @@ import pytest
 from click.shell_completion import ShellComplete
 from click.testing import CliRunner, Result
 
+from scvi_codegen import Model, compile_stepper, problem
 from scvi_codegen.cli import ABOUT, main
 from scvi_codegen.cli.model_options import read_model
 from scvi_codegen.cli.reports import energy_report
-from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
-from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.model_file import load_model, parse_model, save_model
-from scvi_codegen.models.problems import problem
 
 pytestmark = pytest.mark.long
 

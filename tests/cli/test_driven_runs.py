@@ -9,10 +9,9 @@ import pytest
 from click.testing import CliRunner
 from numpy.testing import assert_allclose
 
-from scvi_codegen import compile_stepper, load_model
+from scvi_codegen import Run, compile_stepper, load_model
 from scvi_codegen.cli import main
 from scvi_codegen.cli.running import integrate_model
-from scvi_codegen.runtime.run.run import Run
 
 MODEL = """
 [system]

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from scvi_codegen import SVI, LagrangianSystem, StateError, compile_stepper, load_model, verification
+from scvi_codegen import SVI, LagrangianSystem, StateError, compile_stepper, load_model, load_package, verification
 from scvi_codegen.cli import main
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.packages.package import load_package
 from scvi_codegen.native.compilers import find_compiler
 
 RING = """

@@ -6,9 +6,7 @@ import sys
 from certified_cases import case
 from samples import QUICK_FLAGS
 
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import BuildError
-from scvi_codegen.verification import verify
+from scvi_codegen import BuildError, compile_stepper, verify
 
 
 def certify(names: list[str]) -> None:

@@ -33,17 +33,16 @@ from iterations import ITERATIONS
 from paces import STEP_SIZE_FAULTS
 from sabotage import changed_property, changed_result, of_entries
 
+from scvi_codegen import HamiltonianSystem, Splines, Trigonometric
 from scvi_codegen.formulas import expressions
 from scvi_codegen.ir import arithmetic, kernel
 from scvi_codegen.lowering import stage_groups
 from scvi_codegen.lowering.solvers import curves, points
 from scvi_codegen.mechanics import derived_expressions as mechanics
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.methods import acceleration_stages, composition, leapfrog_stages, stage_system
 from scvi_codegen.rendering.kernels import printer as c_printer
 from scvi_codegen.tables import quadrature, tableau
 from scvi_codegen.tables.precision import mp
-from scvi_codegen.tables.spaces import Splines, Trigonometric
 
 ROUNDOFF = (
     ("carry lost", "kepler/svi-3", "add_compensated", r"\*low = rest - .*;", "*low = 0;"),

@@ -11,9 +11,8 @@ import pytest
 from click.testing import CliRunner
 
 import scvi_codegen as sc
-from scvi_codegen import pipeline
+from scvi_codegen import BuildError, CacheWarning, pipeline
 from scvi_codegen.cli import main
-from scvi_codegen.errors import BuildError, CacheWarning
 from scvi_codegen.files import cache
 from scvi_codegen.native import building
 from scvi_codegen.rendering.source import Source

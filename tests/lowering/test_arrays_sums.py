@@ -6,15 +6,13 @@ import numpy as np
 import sympy
 from samples import QUICK_FLAGS
 
+from scvi_codegen import SVI, LagrangianSystem, Stepper
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Kernel, RolledKernel
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.methods import SVI
 from scvi_codegen.models.systems import fput_chain
 from scvi_codegen.pipeline import describe, program_of
 from scvi_codegen.rendering.program_source import render, render_ensemble
 from scvi_codegen.runtime.core.compiled_method import Variants
-from scvi_codegen.runtime.core.stepper import Stepper
 
 FLAGS = (*(flag for flag in QUICK_FLAGS if "contract" not in flag), "-ffp-contract=off")
 

@@ -11,14 +11,8 @@ import pytest
 import sympy
 from samples import QUICK_FLAGS, pumped_cart_pole, tangle
 
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.legendre import hamiltonian_of
+from scvi_codegen import SVI, LagrangianSystem, SolverOptions, Stepper, compile_stepper, hamiltonian_of, problem
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods import SVI
-from scvi_codegen.models.problems import problem
-from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.core.stepper import Stepper
 
 H, T, STATES = 0.1, 0.7, 20
 ONE_ITERATION = SolverOptions(tolerance=1e300)

@@ -13,10 +13,7 @@ import pytest
 from certified_cases import case
 from samples import QUICK_FLAGS
 
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.models.problems import problem
-from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen import SolverOptions, Stepper, compile_stepper, problem
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.lanes import LaneBlock
 

@@ -17,12 +17,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import lowered
 
-from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen import SCVI, SVI, Gauss, SpectralCollocation, SystemDefinitionError, problem
 from scvi_codegen.formulas.expressions import gradient, jacobian
 from scvi_codegen.ir.arithmetic import DEEPEST_EXPRESSION, lower_kernel
 from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
-from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
-from scvi_codegen.models.problems import problem
 from scvi_codegen.models.systems import fput_chain
 from scvi_codegen.native.compilers import find_compiler
 from scvi_codegen.rendering.kernels.printer import print_expression, print_number

@@ -7,9 +7,8 @@ import pytest
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
+from scvi_codegen import as_method, symmetries
 from scvi_codegen.mechanics import term_groups as module
-from scvi_codegen.mechanics.symmetry.symmetry import symmetries
-from scvi_codegen.methods import as_method
 from scvi_codegen.pipeline import program_of
 
 FLAGS = {"flags": QUICK_FLAGS}

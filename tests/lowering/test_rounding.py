@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 import sympy
 
-from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen import SCVI, SVI, RadauIIA, SpectralCollocation, SystemDefinitionError, problem
 from scvi_codegen.ir.kernel import exact_number, lower_matrix, lower_vector
-from scvi_codegen.methods import SCVI, SVI, RadauIIA, SpectralCollocation
-from scvi_codegen.models.problems import problem
 from scvi_codegen.pipeline import generate_source, program_of
 from scvi_codegen.rendering.kernels.printer import DOUBLE, SINGLE
 from scvi_codegen.tables.basis import cardinal_derivatives, cardinal_integrals, next_step

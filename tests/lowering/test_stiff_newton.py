@@ -4,12 +4,8 @@ import numpy as np
 import pytest
 from samples import QUICK_FLAGS
 
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import StepFailedError
+from scvi_codegen import SVI, LagrangianSystem, RadauIIA, SolverOptions, StepFailedError, compile_stepper
 from scvi_codegen.exact.step import derived_step
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.methods import SVI, RadauIIA
-from scvi_codegen.native.options import SolverOptions
 
 STIFFNESS = 1e8
 EPSILON = 2.0**-52

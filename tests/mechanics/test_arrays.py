@@ -4,13 +4,10 @@ import numpy as np
 import pytest
 import sympy
 
-from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen import HamiltonianSystem, LagrangianSystem, SystemDefinitionError, unroll_sums
 from scvi_codegen.mechanics.arrays.reading import arrays_from_text
-from scvi_codegen.mechanics.arrays.rolling import unroll_sums
 from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
 from scvi_codegen.mechanics.arrays.system import ArraySystem, force_of
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 
 GRAVITY = "sum(i in N, m[i]*sum(a in 3, r_dot[i, a]**2)/2) + "
 DISTANCE = "sqrt(sum(a in 3, (r[i, a] - r[j, a])**2))"

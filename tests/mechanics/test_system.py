@@ -12,10 +12,9 @@ import sympy
 from sympy import Rational, Symbol, cos, sin
 from sympy.physics.mechanics import LagrangesMethod, Particle, Point, ReferenceFrame, dynamicsymbols
 
-from scvi_codegen.errors import ExpressionError, SystemDefinitionError, SystemDefinitionWarning
+from scvi_codegen import ExpressionError, LagrangianSystem, SystemDefinitionError, SystemDefinitionWarning
 from scvi_codegen.formulas.symbols import C_KEYWORDS
 from scvi_codegen.mechanics.derived_expressions import curve_rates, forms_of
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 
 T = dynamicsymbols._t
 Q1, Q2 = dynamicsymbols("q1 q2")

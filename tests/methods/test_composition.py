@@ -3,11 +3,7 @@
 import numpy as np
 import pytest
 
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.methods import Composition, StoermerVerlet
-from scvi_codegen.models.problems import problem
+from scvi_codegen import Composition, LagrangianSystem, MethodError, StoermerVerlet, compile_stepper, problem
 
 DOUBLE_PENDULUM, DUFFING, KEPLER = (problem(name).system for name in ("double-pendulum", "duffing", "kepler"))
 

@@ -4,12 +4,8 @@ import numpy as np
 import pytest
 from samples import QUICK_FLAGS
 
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import MethodError, StepFailedError
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen import HamiltonianSystem, LagrangianSystem, MethodError, StepFailedError, compile_stepper, problem
 from scvi_codegen.methods import SVI, Composition, StoermerVerlet, method_from_specification
-from scvi_codegen.models.problems import problem
 
 DRIFTS_FIRST = "drift-kick-drift"
 RELATIVISTIC = HamiltonianSystem.from_text(

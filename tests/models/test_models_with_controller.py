@@ -11,10 +11,9 @@ import pytest
 from click.testing import CliRunner
 
 import scvi_codegen as sc
+from scvi_codegen import ModelFileError, StateError, SystemDefinitionError, generate_package, load_package
 from scvi_codegen.cli import main
-from scvi_codegen.errors import ModelFileError, StateError, SystemDefinitionError
 from scvi_codegen.models.model_files.model_file import catalogue_model, dump_model, parse_model
-from scvi_codegen.models.packages.package import generate_package, load_package
 from scvi_codegen.runtime.run.largest_step import REFINEMENTS, largest_step
 
 SHAKEN = """

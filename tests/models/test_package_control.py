@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.errors import MethodError
-from scvi_codegen.models.packages.package import generate_package
+from scvi_codegen import MethodError, generate_package
 
 STRICT = "-O2 -std=c99 -Wall -Wextra -Werror -Wno-psabi -ffp-contract=off"
 SPAN = 10.0

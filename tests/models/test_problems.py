@@ -6,9 +6,7 @@ import sympy
 from counting import at_most
 from sympy import Symbol, cos, sin
 
-from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen import HamiltonianSystem, LagrangianSystem, SystemDefinitionError
 from scvi_codegen.models.problems import PROBLEMS, Problem, problem
 from scvi_codegen.models.systems import fput_chain
 

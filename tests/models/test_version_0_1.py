@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scvi_codegen.models.packages.package import load_package
-from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen import Stepper, load_package
 
 FOLDER = Path(__file__).parents[1] / "corpus" / "version_0_1" / "pendulum_verlet"
 

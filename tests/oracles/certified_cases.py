@@ -20,8 +20,8 @@ from samples import (
     two_rods,
 )
 
+from scvi_codegen import problem, reparametrise
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.mechanics.time_transformation import reparametrise
 from scvi_codegen.methods import (
     SCVI,
     SVI,
@@ -36,7 +36,6 @@ from scvi_codegen.methods import (
     SpectralCollocation,
     StoermerVerlet,
 )
-from scvi_codegen.models.problems import problem
 from scvi_codegen.models.systems import point_vortices
 
 STATES: dict[str, tuple[MechanicalSystem, tuple[float, ...], tuple[float, ...], float]] = {

@@ -18,12 +18,10 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
+from scvi_codegen import SVI, RecordedRun, Stepper, record_run
 from scvi_codegen.files import cache
-from scvi_codegen.methods import SVI
 from scvi_codegen.native import building
 from scvi_codegen.rendering.source import Source
-from scvi_codegen.results.recording import RecordedRun, record_run
-from scvi_codegen.runtime.core.stepper import Stepper
 
 PROCESSES = 16
 FAST = ("-O0",)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import sympy
 
-from scvi_codegen import methods
-from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen import MethodError, StateError, methods
 from scvi_codegen.validation import LARGEST_COUNT, checked_count
 
 

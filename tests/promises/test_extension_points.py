@@ -10,11 +10,9 @@ from pathlib import Path
 import pytest
 
 import scvi_codegen
-from scvi_codegen.errors import MethodError
+from scvi_codegen import SVI, LagrangianSystem, MethodError
 from scvi_codegen.lowering.stage_groups import layout_of
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.discretise import discretise
-from scvi_codegen.methods.galerkin import SVI
 
 ROOT = Path(scvi_codegen.__file__).parents[1]
 PAGE = ROOT / "docs" / "extending.md"

@@ -11,9 +11,8 @@ from click.testing import CliRunner
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
+from scvi_codegen import ScviCodegenError, StateError, Stepper
 from scvi_codegen.cli import main
-from scvi_codegen.errors import ScviCodegenError, StateError
-from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.inputs.segments import input_of
 from scvi_codegen.validation import hints, keyword_hint
 

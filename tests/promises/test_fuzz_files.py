@@ -24,10 +24,8 @@ from random_robots import Mjcf, Urdf
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.errors import BuildError, ModelFileError
+from scvi_codegen import BuildError, ModelFileError, generate_package, load_model
 from scvi_codegen.models.model_files.ensemble_file import load_ensemble
-from scvi_codegen.models.model_files.model_file import load_model
-from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.native import building
 from scvi_codegen.results.recording import writing
 

@@ -14,9 +14,7 @@ import pytest
 from programs import needs
 
 import scvi_codegen
-from scvi_codegen.models.model import Model
-from scvi_codegen.models.packages.package import generate_package
-from scvi_codegen.models.problems import problem
+from scvi_codegen import Model, generate_package, problem
 
 PACKAGE = Path(scvi_codegen.__file__).parent
 

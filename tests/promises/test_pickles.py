@@ -13,10 +13,7 @@ import pytest
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.models.problems import problem
-from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.run.run import Run
+from scvi_codegen import Run, Stepper, compile_stepper, problem
 from scvi_codegen.runtime.run.step_plan import StepPlan
 
 Q, P = [0.3, 0.8], [-1.1, 0.4]

@@ -9,11 +9,8 @@ from pathlib import Path
 import pytest
 from programs import needs
 
-from scvi_codegen.methods import SCVI, SVI, StoermerVerlet
+from scvi_codegen import SCVI, SVI, Model, StoermerVerlet, generate_package, problem
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.model import Model
-from scvi_codegen.models.packages.package import generate_package
-from scvi_codegen.models.problems import problem
 
 pytestmark = [
     pytest.mark.full,

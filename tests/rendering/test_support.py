@@ -9,10 +9,8 @@ from pathlib import Path
 import pytest
 from programs import needs
 
-from scvi_codegen import SVI, SolverOptions, compile_stepper, problem
-from scvi_codegen.errors import StepFailedError
+from scvi_codegen import SVI, LagrangianSystem, SolverOptions, StepFailedError, compile_stepper, problem
 from scvi_codegen.lowering.control import REACH
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.rendering.source import Source
 
 SUPPORT = Path(__file__).parents[2] / "templates/support"

@@ -15,12 +15,10 @@ import pytest
 import sympy
 
 import scvi_codegen as sc
-from scvi_codegen import compiler, pipeline
+from scvi_codegen import as_method, compiler, pipeline, problem
 from scvi_codegen.files import cache
 from scvi_codegen.files.cache import key_of
 from scvi_codegen.mechanics.system import _text_of
-from scvi_codegen.methods import as_method
-from scvi_codegen.models.problems import problem
 from scvi_codegen.native import building
 
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scvi_codegen.errors import MethodError
+from scvi_codegen import MethodError, chebyshev_lobatto, equispaced, gauss_legendre, legendre_lobatto
 from scvi_codegen.tables.basis import (
     cardinal_derivatives,
     cardinal_integrals,
@@ -16,9 +16,7 @@ from scvi_codegen.tables.basis import (
     extrapolation,
     legendre_functional,
 )
-from scvi_codegen.tables.nodes import chebyshev_lobatto, equispaced, legendre_lobatto
 from scvi_codegen.tables.precision import Matrix, Vector, mp
-from scvi_codegen.tables.quadrature import gauss_legendre
 
 FIFTY_DIGITS = mp.mpf("1e-50")
 

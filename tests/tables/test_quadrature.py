@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from scvi_codegen.errors import MethodError
+from scvi_codegen import MethodError, chebyshev_lobatto, legendre_lobatto
 from scvi_codegen.tables.closed_forms import exact_rule
-from scvi_codegen.tables.nodes import chebyshev_lobatto, legendre_lobatto
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.quadrature import (
     Quadrature,

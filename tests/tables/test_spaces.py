@@ -3,11 +3,8 @@
 import numpy as np
 import pytest
 
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import MethodError, MethodWarning
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen import LagrangianSystem, MethodError, MethodWarning, compile_stepper, problem
 from scvi_codegen.methods import SVI, method_from_specification
-from scvi_codegen.models.problems import problem
 from scvi_codegen.tables.basis import cardinal_values
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.quadrature import Quadrature, gauss_legendre, hermite, quadrature_by_name

@@ -16,13 +16,9 @@ from pathlib import Path
 import samples
 from golden_drivers import arrays_driver, ensemble_driver, run_driver, tangent_driver
 
+from scvi_codegen import HamiltonianSystem, LagrangianSystem, as_method, problem, reparametrise
 from scvi_codegen.mechanics.arrays.system import ArraySystem
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.mechanics.time_transformation import reparametrise
-from scvi_codegen.methods import as_method
-from scvi_codegen.models.problems import problem
 from scvi_codegen.native.compilers import find_compiler
 from scvi_codegen.pipeline import Sources, generate_source
 from scvi_codegen.rendering.source import Source

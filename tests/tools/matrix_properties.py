@@ -22,10 +22,8 @@ from samples import QUICK_FLAGS
 from scipy.optimize import brentq
 
 import scvi_codegen as sc
-from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen import SolverOptions, StateError, StepFailedError, load_run, record_run, resume_run
 from scvi_codegen.frameworks.flow import FlowOfRows
-from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.results.recording import load_run, record_run, resume_run
 from scvi_codegen.runtime.run import chunks, memory
 from scvi_codegen.runtime.sensitivity import gradients
 

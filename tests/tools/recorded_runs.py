@@ -5,10 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scvi_codegen.results.recording import RecordedRun, record_run
-from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.run.run import Run
-from scvi_codegen.runtime.trajectory.trajectory import Trajectory
+from scvi_codegen import RecordedRun, Run, Stepper, Trajectory, record_run
 
 COLUMNS = ("t", "q", "p", "iterations")
 STATE = {"q": [0.5, 0.0], "p": [0.0, 1.7]}

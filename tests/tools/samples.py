@@ -8,18 +8,14 @@ from functools import cache, cached_property
 import numpy as np
 from oracle import Mechanics, numbers, oracle_step
 
-from scvi_codegen.compiler import compile_stepper
+from scvi_codegen import HamiltonianSystem, LagrangianSystem, Stepper, compile_stepper, problem
 from scvi_codegen.ir.equations import FixedPointIteration
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.program import iteration_of, lower
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.problems import problem
 from scvi_codegen.native.building import FLAGS_VARIABLE, TUNED_FLAGS
-from scvi_codegen.runtime.core.stepper import Stepper
 
 
 def lowered(system: MechanicalSystem, method: Method) -> Program:
