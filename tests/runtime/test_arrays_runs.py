@@ -79,22 +79,6 @@ class TestControlledSteps:
         assert error < 10.0 * run.steps * tolerance
         assert error > 1e-3 * tolerance  # no more work than was asked for
 
-    def test_unsupported_adaptive_arguments_are_rejected(self, steppers, ring):
-        stepper, _ = steppers
-        with pytest.raises(sc.MethodError, match="not available without an error estimate"):
-            sc.compile_stepper(ring, "stoermer-verlet").integrate(Q, t_end=1.0)
-        for given, message in (
-            ({}, "give either h .fixed step size. or t_end"),
-            ({"h": 0.1}, "h requires steps or t_end"),
-            ({"steps": 3}, "give either h .fixed step size. or t_end"),
-            ({"h": 0.1, "steps": 3, "t_end": 1.0}, "give either steps=3 or t_end=1"),
-            ({"h": 0.1, "t_end": -1.0}, "wrong sign for a run from t = 0 to t_end = -1"),
-            ({"h": 0.1, "steps": 3, "tolerance": 1e-3}, "tolerance requires adaptive steps"),
-            ({"t_end": 1.0, "tolerance": 2.0}, "positive and below 1"),
-        ):
-            with pytest.raises(sc.StateError, match=message):
-                stepper.integrate(Q, **given)
-
 
 class TestStatesBetween:
     def test_unsaved_states_are_not_available(self, steppers):

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import sympy
 from click.testing import CliRunner
-from programs import needs
 
 import scvi_codegen as sc
 from scvi_codegen.cli import main
@@ -347,14 +346,6 @@ def test_impacts_on_moving_curved_walls_are_satisfied(wall, restitution, flags):
     assert impacts.measured < 2.0
 
 
-@pytest.mark.full
-def test_certificates_of_models_with_events():
-    watched = sc.compile_stepper(DROP, "svi:2", flags=FLAGS, events=sc.impact("y + x**2/9"))
-    certificate = sc.verify(DROP, "svi:2", [0.1, 1.0], [0.2, 0.0], h=0.05, stepper=watched)
-    assert {"impacts", "saltation"} <= {each.name for each in certificate.checks}
-    assert all(each.outcome is not Outcome.VIOLATED for each in certificate.checks)
-
-
 def test_conditions_select_crossings(point):
     """A plate of finite length: a point that passes beside it is not reflected."""
     plate = sc.Event("y", then={"p_y": "-p_y"}, where=("x > 0", sympy.Symbol("x") < 1))
@@ -383,20 +374,9 @@ def test_states_after_impacts_count_as_ends_of_adaptive_steps(ball):
     assert np.array_equal(some.q, every.q[rows])
 
 
-def test_ensembles_of_bouncing_balls(ball):
-    stepper = sc.compile_stepper(BALL, "svi:4", flags=FLAGS, events=BOUNCES["impact"])
-    heights = np.array([[0.5], [1.0], [2.0]])
-    lanes = stepper.integrate_ensemble(
-        heights, velocity=0.0 * heights, t_end=5.0, t_eval=[1.0, 3.0, 5.0], tolerance=1e-9
-    )
-    for j, q in enumerate(heights):
-        single = stepper.integrate(q, [0.0], t_end=5.0, t_eval=[1.0, 3.0, 5.0], tolerance=1e-9)
-        assert np.array_equal(lanes.q[:, j], single.q)
-
-
 @pytest.mark.parametrize("plan", [{"steps": 60}, {"t_end": 6.03}])
 def test_ensembles_with_fixed_steps(plan):
-    """Rows are the ends of steps, as without events; states within steps are left out."""
+    """Rows are the ends of steps, as without events; states within steps are left out. Adaptive ones: single runs."""
     stepper = sc.compile_stepper(BALL, "svi:4", flags=FLAGS, events=sc.impact("y", 0.8, terminal=9))
     heights, strengths = np.array([[0.02], [0.5], [1.0]]), np.array([1.0, 1.2, 0.9])
     arguments = {"h": 0.1, "save_every": 7, **plan}
@@ -410,6 +390,10 @@ def test_ensembles_with_fixed_steps(plan):
         run = stepper.integrate(heights[j], [0.0], parameters={"g": strengths[j]}, h=0.1, **plan)
         rows = np.searchsorted(run.t, lanes.t - 1e-9)
         assert np.abs(lanes.q[:, j] - run.q[rows]).max() < 1e-15
+    adaptive = {"t_end": 5.0, "t_eval": [1.0, 3.0, 5.0], "tolerance": 1e-9}
+    many = stepper.integrate_ensemble(heights[1:], 0.0 * heights[1:], **adaptive)
+    for j, q in enumerate(heights[1:]):
+        assert np.array_equal(many.q[:, j], stepper.integrate(q, [0.0], **adaptive).q)
 
 
 def test_energy_of_a_billiard_stays_at_round_off():
@@ -472,35 +456,6 @@ def test_wall_of_a_long_chain():
     assert len(ends[0][0]) > 0
     assert np.abs(ends[0][0] - ends[1][0]).max() < 1e-13
     assert np.abs(ends[0][1] - ends[1][1]).max() < 1e-13
-
-
-def test_derivatives_through_events_in_index_notation():
-    stepper, q = sc.compile_stepper(CHAIN, "svi:4", flags=FLAGS), np.exp(-(((np.arange(8) - 3.0) / 2.0) ** 2))
-    known = stepper.with_sizes(N=8)
-    runs = [
-        each.integrate(q, velocity=0 * q, h=0.25, steps=40, events=sc.impact(wall, "e"))
-        for each, wall in ((stepper, "1/2 - q[0]"), (known, "1/2 - q_0"))
-    ]
-    assert len(runs[0].events[0]) > 0
-    tangents = [np.asarray(run.tangent()[-1]) for run in runs]
-    assert np.abs(tangents[0] - tangents[1]).max() < 1e-11
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: sc.impact("q[0] - q_dot[1]"), "contains 'q_dot'"),
-        (lambda: sc.impact("3"), "constant and never crosses zero"),
-        (lambda: sc.Event("q[0]", then={"m": "1"}), "'m' is not an entry of a coordinate"),
-        (lambda: sc.Event("q[0]", then={"sum(i in N, q[i])": "1"}), "is not an entry of a coordinate"),
-        (lambda: sc.Event("q[0]", then={"q_dot[0]": "1", "p_q[1]": "1"}), "sets momenta and velocities"),
-        (lambda: sc.Event("q[0] - 1/4", then={"p_q[0]": "log(q[0] - 9)"}), "not finite"),
-    ],
-)
-def test_errors_of_index_notation_name_the_symbol(make, words):
-    q = np.exp(-(((np.arange(8) - 3.0) / 2.0) ** 2))
-    with pytest.raises(sc.EventError, match=words):
-        sc.compile_stepper(CHAIN, "svi:4", flags=FLAGS).integrate(q, velocity=0 * q, h=0.25, steps=40, events=make())
 
 
 ROD = sc.LagrangianSystem.from_text(
@@ -873,28 +828,43 @@ def test_grazing_impacts_are_found(point, depth):
         (lambda: sc.impact("y", 0.0), "passes the wall 'y'"),
         (lambda: sc.Event("y", then={"p_y": "p_y"}, where="y > 1 - 1"), None),
         (lambda: sc.Event("y", -1, then={"p_y": "log(y - 1)"}), "not finite"),
+        (lambda: sc.impact("q[0] - q_dot[1]"), "contains 'q_dot'"),
+        (lambda: sc.impact("3"), "constant and never crosses zero"),
+        (lambda: sc.Event("q[0]", then={"m": "1"}), "'m' is not an entry of a coordinate"),
+        (lambda: sc.Event("q[0]", then={"sum(i in N, q[i])": "1"}), "is not an entry of a coordinate"),
+        (lambda: sc.Event("q[0]", then={"q_dot[0]": "1", "p_q[1]": "1"}), "sets momenta and velocities"),
+        (lambda: sc.Event("q[0] - 1/4", then={"p_q[0]": "log(q[0] - 9)"}), "not finite"),
+        (lambda: sc.impact("q[i+1] for i in N"), "q\\[i\\+1\\]"),
+        (lambda: sc.impact("sum(k in N, q[k]) - q[i] for i in N"), "a sum within a sum must have whole numbers"),
+        (lambda: sc.Event("q[i] for i in N", then={"q[i] + 1": "0"}), "is not an entry of a coordinate"),
+        (lambda: sc.impact("q[0]", where="q[i] > 0"), "'i' is not an index"),
     ],
 )
 def test_errors_name_the_symbol_and_the_remedy(ball, make, words):
+    def run(events):
+        if "q" not in str(events.function):
+            return ball.integrate([1.0], [0.0], h=0.1, steps=30, events=events)
+        q = np.exp(-(((np.arange(8) - 3.0) / 2.0) ** 2))
+        return sc.compile_stepper(CHAIN, "svi:4", flags=FLAGS).integrate(
+            q, velocity=0 * q, h=0.25, steps=40, events=events
+        )
+
     if words is None:
-        ball.integrate([1.0], [0.0], h=0.1, steps=30, events=make())
+        run(make())
         return
     with pytest.raises(sc.EventError, match=words):
-        ball.integrate([1.0], [0.0], h=0.1, steps=30, events=make())
+        run(make())
 
 
 def test_unsupported_combinations_are_refused(ball):
+    for formula in ("abs(y)", "sign(y)", "max(y, 0)", "Heaviside(y)"):
+        with pytest.raises(sc.SystemDefinitionError, match=r"sc\.impact\(\.\.\), or sc\.Event"):
+            sc.LagrangianSystem.from_text(name="stop", coordinates=["y"], lagrangian=f"y_dot**2/2 - {formula}")
     pendulum = sc.problem("planar-pendulum").system
     with pytest.raises(sc.EventError, match="in transformed time, where the energy is the constant"):
         sc.compile_stepper(sc.reparametrise(pendulum, "1 + q**2"), "svi:4", events=sc.Event("q", then={"p_q": "-p_q"}))
     with pytest.raises(sc.MethodError, match="error="):
         ball.integrate([1.0], [0.0], t_end=2.0, error=1e-8, events=BOUNCES["impact"])
-
-
-@pytest.mark.parametrize("formula", ["abs(y)", "sign(y)", "max(y, 0)", "Heaviside(y)"])
-def test_formulas_that_switch_point_to_events(formula):
-    with pytest.raises(sc.SystemDefinitionError, match=r"sc\.impact\(\.\.\), or sc\.Event"):
-        sc.LagrangianSystem.from_text(name="stop", coordinates=["y"], lagrangian=f"y_dot**2/2 - {formula}")
 
 
 def test_no_accuracy_warnings_of_energies_that_impacts_change(ball):
@@ -903,35 +873,6 @@ def test_no_accuracy_warnings_of_energies_that_impacts_change(ball):
         sc.compile_stepper(BALL, "svi:4", flags=FLAGS).integrate(
             [1.0], [0.0], t_end=5.0, events=sc.impact("y", 0.5, terminal=3)
         )
-
-
-@pytest.mark.parametrize("compiler", ["gcc", "clang"])
-def test_source_compiles_without_warnings(compiler, tmp_path):
-    import subprocess
-
-    needs(compiler)
-    events = [sc.impact("y - sin(t)", where="y > 0"), sc.Event("y", then={"y_dot": "-y_dot"})]
-    for controlled in (False, True):
-        source, _ = sc.generate_source(BALL, "svi:4", prefix="hit", events=events, controlled=controlled)
-        for each in source.amalgamated().sources:
-            (tmp_path / f"{each.prefix}.h").write_text(each.header)
-            (tmp_path / f"{each.prefix}.c").write_text(each.code)
-        strict = [
-            "-std=c99",
-            "-O1",
-            "-Wall",
-            "-Wextra",
-            "-Wpedantic",
-            "-Wshadow",
-            "-Wconversion",
-            "-Wno-psabi",
-            "-Werror",
-            "-c",
-        ]
-        result = subprocess.run(
-            [compiler, *strict, "hit.c", "hit_events.c"], cwd=tmp_path, capture_output=True, text=True, check=False
-        )
-        assert (result.returncode, result.stderr) == (0, "")
 
 
 # Model files and the command line.

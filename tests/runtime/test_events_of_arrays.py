@@ -271,30 +271,6 @@ def test_certificates_of_known_sizes_measure_impacts(tolerance):
     assert names <= {each.name for each in certificate.checks if each.outcome is Outcome.SATISFIED}
 
 
-@pytest.mark.full
-def test_certificate_of_a_chain_between_walls():
-    walls = [sc.impact("q[i] + 1 for i in N"), sc.impact("3/2 - q[i] for i in N")]
-    stepper = sc.compile_stepper(CHAIN, "svi:2", flags=FLAGS, events=walls)
-    certificate = sc.verify(CHAIN, "svi:2", [0.1, 0.5], [1.0, 0.2], h=0.1, stepper=stepper)
-    names = {"event surfaces", "saltation", "impacts", "symplecticity, impacts", "reversal, impacts"}
-    assert names <= {each.name for each in certificate.checks}
-    assert all(each.outcome is not Outcome.VIOLATED for each in certificate.checks)
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: sc.impact("q[i+1] for i in N"), "q\\[i\\+1\\]"),
-        (lambda: sc.impact("sum(k in N, q[k]) - q[i] for i in N"), "a sum within a sum must have whole numbers"),
-        (lambda: sc.Event("q[i] for i in N", then={"q[i] + 1": "0"}), "is not an entry of a coordinate"),
-        (lambda: sc.impact("q[0]", where="q[i] > 0"), "'i' is not an index"),
-    ],
-)
-def test_errors_name_the_formula(make, words):
-    with pytest.raises(sc.EventError, match=words):
-        sc.compile_stepper(CHAIN, "svi:4", flags=FLAGS).integrate(np.ones(3), h=0.1, steps=1, events=make())
-
-
 def test_a_recorded_run_has_its_events(gas, tmp_path):
     r, v = np.array([[0.3, 0.6]]), np.array([[0.5, -0.3]])
     run = gas.with_events(BOX).start({"r": r}, velocity={"r": v}, h=0.1)

@@ -87,12 +87,8 @@ def test_a_trajectory_begins_with_the_initial_state_and_has_float64_arrays(keple
     assert run.q.dtype == run.p.dtype == run.t.dtype == np.float64
     assert run.iterations[0] == 0
     assert (run.iterations[1:] > 0).all()
-
-
-def test_zero_steps_return_the_initial_state(kepler):
-    run = kepler.integrate(*STATE, h=0.1, steps=0)
-    assert np.array_equal([run.q[0], run.p[0]], STATE)
-    assert len(run) == 1
+    none = kepler.integrate(*STATE, h=0.1, steps=0)
+    assert (len(none), *none.q[0], *none.p[0]) == (1, *STATE[0], *STATE[1])
 
 
 @pytest.mark.parametrize("save_every", [1, 2, 7, 300, 1000, 5000])
@@ -172,6 +168,8 @@ def test_damaged_checkpoints_are_rejected(kepler):
     for each in (*damaged, saved[:-1], saved + b"x", b"abc", b""):
         with pytest.raises(sc.StateError, match=r"invalid saved run: the checksum .* save the run again"):
             kepler.from_checkpoint(each)
+    with pytest.raises(sc.StateError, match="must be bytes, not int"):
+        kepler.from_checkpoint(3)
     with pytest.raises(sc.StateError, match="it has 3 bytes"):
         kepler.start(*STATE, h=0.05).rollback(b"abc")
 
@@ -356,13 +354,16 @@ def test_absolute_tolerance_bounds_the_update(kepler):
 
 
 @pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole", "charged-particle", "relativistic-particle"])
-def test_momentum_and_velocity_are_inverse_and_agree_with_the_oracle(sample, compiled, name):
+def test_momentum_velocity_and_energy_agree_with_the_oracle(sample, compiled, name):
     case, stepper = sample(name), compiled(name, sc.SVI(3))
     q, p = case.state
     v = stepper.velocity(q, p, 0.7)
     assert stepper.momentum(q, v, 0.7) == pytest.approx(p, abs=1e-14)
     expected = case.mechanics.velocity(oracle.mp.mpf(0.7), oracle.numbers(q), oracle.numbers(p))
     assert v == pytest.approx(expected.astype(float), abs=1e-14)
+    L = case.mechanics.lagrangian([oracle.mp.mpf(0.7)], oracle.numbers([q]), oracle.numbers([v]))[0]
+    assert stepper.energy(q, p, 0.7) == pytest.approx(p @ v - float(L), abs=1e-14)
+    assert isinstance(stepper.energy(q, p, 0.7), float)
 
 
 def test_velocity_is_found_where_momenta_cancel(quickly_compiled):
@@ -385,16 +386,6 @@ def test_velocity_is_undefined_beyond_the_range_of_the_momenta(compiled, sample)
         stepper.velocity([0.0], [np.nan])
     with pytest.raises(sc.StateError, match=r"momentum at q = .*cannot be computed"):
         stepper.momentum([0.0], [1.5])
-
-
-@pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole", "charged-particle", "relativistic-particle"])
-def test_energy_is_p_v_minus_l(sample, compiled, name):
-    case, stepper = sample(name), compiled(name, sc.SVI(3))
-    q, p = case.state
-    v = stepper.velocity(q, p, 0.7)
-    L = case.mechanics.lagrangian([oracle.mp.mpf(0.7)], oracle.numbers([q]), oracle.numbers([v]))[0]
-    assert stepper.energy(q, p, 0.7) == pytest.approx(p @ v - float(L), abs=1e-14)
-    assert isinstance(stepper.energy(q, p, 0.7), float)
 
 
 def test_energies_of_many_states_equal_single_energies(sample, compiled):
