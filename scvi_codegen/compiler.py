@@ -111,7 +111,7 @@ def compile_stepper(
     else:
         if symmetries:
             raise MethodError(f"symmetries= is unavailable for '{system.name}': {SIZES_REQUIRED}")
-        method = as_method(method)
+        chosen, method = method, as_method(method)
     sources = CachedSources(system, method, solver, prefix, symmetries, time_transformation, controller)
     variants = Variants(make=sources.variant, lacking=lambda name: name == "second_derivatives" and system.damping != 0)
     if not known_sizes:
@@ -120,7 +120,7 @@ def compile_stepper(
         of_sizes = partial(
             compile_stepper,
             system,
-            SVI(1, "gauss-lobatto:2") if rattle else method,  # the name of RATTLE for known sizes
+            SVI(1, "gauss-lobatto:2") if rattle else chosen,  # the name of RATTLE for known sizes
             solver=solver,
             flags=flags,
             prefix=prefix,

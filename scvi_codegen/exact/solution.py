@@ -20,6 +20,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.exact.newton import Array as Numbers
 from scvi_codegen.exact.newton import Floats, NotConvergedError, Solve, newton, solver
 from scvi_codegen.formulas.expressions import Tape, jacobian
+from scvi_codegen.mechanics.constraints import position_conditions, velocity_conditions
 from scvi_codegen.mechanics.first_order import FirstOrderSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Number, mp
@@ -110,16 +111,14 @@ class ExactMotion:
 
     @cached_property
     def _constraint_tape(self) -> Tape:
-        """Constraint Jacobian G (dg/dv if nonholonomic); d/dt of the rates at constant v; constraints (0); rates."""
+        """Constraint Jacobian G, d/dt of the rates at constant v, conditions on positions, and rates."""
         q, v, t = self.system.coordinates, self.second, self.system.time
 
         def rate(f: sympy.Expr) -> sympy.Expr:
             return sympy.Add(f.diff(t), *(f.diff(x) * y for x, y in zip(q, v, strict=True)))
 
-        constraints = self.system.constraints
-        rolling = [any(g.has(x) for x in v) for g in constraints]
-        positions = [sympy.S.Zero if nonholonomic else g for g, nonholonomic in zip(constraints, rolling, strict=True)]
-        rates = [g if nonholonomic else rate(g) for g, nonholonomic in zip(constraints, rolling, strict=True)]
+        positions = position_conditions(self.system)
+        rates = list(map(sympy.Add, map(rate, positions), velocity_conditions(self.system)))
         derivatives = [moving.diff(x) for moving in rates for x in v]
         return Tape([*derivatives, *map(rate, rates), *positions, *rates], self.symbols)
 

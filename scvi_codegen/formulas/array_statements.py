@@ -22,32 +22,49 @@ Entries of arrays of known sizes: formulas in index notation as formulas of q_0,
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 
 import numpy as np
 from numpy.typing import NDArray
-from sympy import Add, Expr, Idx, Indexed, Mod, Sum, Symbol, Tuple, latex
+from sympy import Add, Expr, Idx, Indexed, Mod, S, Sum, Symbol, Tuple, latex
 from sympy.printing.str import StrPrinter
 
 from scvi_codegen.errors import ExpressionError, SystemDefinitionError
 from scvi_codegen.formulas.arrays import ArrayParser, ArrayTerm, Bound, term_of
+from scvi_codegen.formulas.expressions import gradient
 from scvi_codegen.formulas.grammar import parsed
 from scvi_codegen.formulas.symbols import DOT, symbol
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
 
 _FOR = re.compile(r"\bfor\b")
+Combination = Callable[[Sequence[Expr], Callable[[Expr], Expr]], Expr]
+"""Function of the formulas of the sides of an equation, and of a function that computes time derivatives."""
+
+
+def plain_sides(equation: str) -> tuple[Sequence[str], Combination]:
+    """Return the sides of ``left = right``, or the one formula that is 0, and the function left - right."""
+    return equation.split("="), lambda sides, _: Add(sides[0], *(-side for side in sides[1:]))
 
 
 def parse_constraint(
-    text: str, arrays: Sequence[Array], symbols: Mapping[str, Symbol], tables: Sequence[Array] = ()
+    text: str,
+    arrays: Sequence[Array],
+    symbols: Mapping[str, Symbol],
+    tables: Sequence[Array] = (),
+    *,
+    split: Callable[[str], tuple[Sequence[str], Combination]] = plain_sides,
+    velocities: Mapping[Array, Array | None] | None = None,
 ) -> ArrayTerm:
     """Parse a constraint g = 0 for all elements of loops; for ``left = right`` g is left - right.
 
     Args:
         text: the constraint.
         arrays, symbols, tables: as of :func:`~scvi_codegen.formulas.arrays.parse_sums`.
+        split: returns the sides of an equation, and the function that computes g from their formulas and from a
+            function that computes time derivatives.
+        velocities: for such derivatives, the array of velocities by that of coordinates, ``None`` by constant ones.
 
     Raises:
         ExpressionError: as there, and for a sum over a whole array, which would couple all of its entries.
@@ -58,19 +75,35 @@ def parse_constraint(
     (q[i+1] - q[i])**2 - 1 for i in 0..N-2
     """
     equation, *behind = _FOR.split(text)
-    sides = equation.split("=")
+    sides, combination = split(equation)
     if len(sides) > 2 or len(behind) > 1:
         raise ExpressionError("a constraint may contain one '=' and one 'for'", text, 0)
     loops = tuple(chain(*(_Loops(each, symbols, arrays, tables).read() for each in behind)))
     parsers = [ArrayParser(side, symbols, arrays, tables) for side in sides]
     for parser in parsers:
         parser.in_scope = {loop.index: loop for loop in loops}
-    left, *right = map(parsed, parsers)
+    formulas = [*map(parsed, parsers)]
     if any(parser.sums for parser in parsers):
         message = "a formula with 'for', and a constraint, must not contain a sum over a whole array"
         raise ExpressionError(message, text, text.find("sum"))
     accesses = dict(chain(*(parser.accesses.items() for parser in parsers)))
-    return term_of(loops, left - right[0] if right else left, accesses)
+    moving = {slot: (velocities or {}).get(access.array) for slot, access in accesses.items()}
+    pairs = {slot: replace(accesses[slot], array=array) for slot, array in moving.items() if array}
+    rates = {symbol("t"): S.One, **{slot: symbol(str(access)) for slot, access in pairs.items()}}
+
+    def rate(formula: Expr) -> Expr:
+        if others := [
+            accesses[each]
+            for each in formula.free_symbols & set(accesses)
+            if accesses[each].array not in (velocities or {})
+        ]:
+            raise ExpressionError(
+                f"the time derivative of {others[0]} is not available in constraints of arrays", text, 0
+            )
+        derivatives = gradient(formula, tuple(rates))
+        return Add(*(derivative * [*rates.values()][k] for k, derivative in derivatives.items()))
+
+    return term_of(loops, combination(formulas, rate), accesses | {symbol(str(each)): each for each in pairs.values()})
 
 
 class _Loops(ArrayParser):

@@ -25,8 +25,8 @@ from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.intermediates import written_out
 from scvi_codegen.formulas.symbols import PARTS, input_parameters, symbol
 from scvi_codegen.frameworks.flow import Flow
+from scvi_codegen.mechanics.constraints import constraint_rates, position_conditions
 from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.forces import constraint_rates, holonomic_expressions
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretise
@@ -121,7 +121,7 @@ class EndConditions:
         Raises:
             MethodError: if they contain an input.
         """
-        result = [each for each in (*holonomic_expressions(self.system), *constraint_rates(self.system)) if each != 0]
+        result = [each for each in (*position_conditions(self.system), *constraint_rates(self.system)) if each != 0]
         if any(each.free_symbols - {*self.symbols} for each in result):
             raise MethodError("a constraint depends on an input and would jump with it: use inputs only in forces")
         return self._function(result)

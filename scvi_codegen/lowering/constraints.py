@@ -43,14 +43,14 @@ from scvi_codegen.mechanics.arrays.system import (
     constraint_text,
     entries_of,
 )
-from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.forces import (
+from scvi_codegen.mechanics.constraints import (
     constraint_jacobian,
     constraint_rates,
-    holonomic_expressions,
-    nonholonomic_expressions,
+    position_conditions,
     time_derivatives,
+    velocity_conditions,
 )
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageSystem, Velocities
@@ -61,7 +61,7 @@ from scvi_codegen.tables.precision import Vector, mp
 def rattle_of(system: MechanicalSystem, stages: StageSystem) -> Rattle | None:
     """Return the tables of such steps; ``None`` if they are not applicable."""
     forms, tables = forms_of(system), velocity_tables(stages.shape)
-    if any(nonholonomic_expressions(system)) or not forms.separable or tables is None:
+    if any(velocity_conditions(system)) or not forms.separable or tables is None:
         return None
     partials = list(constraint_jacobian(system))
     at: dict[int, list[int]] = {}
@@ -132,7 +132,7 @@ def lowered_constraints(system: MechanicalSystem) -> Constraints:
         kernel=system_kernel(
             system,
             "constraints",
-            holonomic_expressions(system),
+            position_conditions(system),
             of=system.coordinates,
             partials=partials.values(),
             purpose="The constraints g of positions, and their nonzero derivatives G, at u = q.",

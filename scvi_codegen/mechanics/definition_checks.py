@@ -11,8 +11,9 @@ from sympy import Expr, Symbol
 from scvi_codegen.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
 from scvi_codegen.formulas.expressions import Tape, hessian, jacobian, unsupported_part
 from scvi_codegen.formulas.symbols import DOT, PARTS, TIME, check_names, number, symbol
+from scvi_codegen.mechanics.constraints import constraint_jacobian, forms_of_constraints
 from scvi_codegen.mechanics.derived_expressions import forms_of, null_direction, row_rank, sample_points, singular_part
-from scvi_codegen.mechanics.forces import check_damping, constraint_jacobian
+from scvi_codegen.mechanics.forces import check_damping
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Number, mp
 
@@ -226,14 +227,14 @@ def _check_constraints(system: MechanicalSystem) -> None:
     for name, g in zip(names, system.constraints, strict=True):
         if g.free_symbols.isdisjoint((*system.coordinates, *system.velocities)):
             raise SystemDefinitionError(
-                f"the constraint '{name}' contains no coordinate: constraints are g(q, t) = 0, or A(q, t) "
-                "v + b(q, t) = 0. Remove it, or write the condition in terms of the coordinates"
+                f"the constraint '{name}' contains no coordinate: constraints are {forms_of_constraints()}. Remove "
+                "it, or write the condition in terms of the coordinates"
             )
     for k, i in jacobian(list(constraint_jacobian(system).values()), system.velocities):
         name = names[list(constraint_jacobian(system))[k][0]]
         raise SystemDefinitionError(
             f"the constraint '{name}' is not linear in the velocity {system.velocities[i]}: "
-            "constraints must have the form g(q, t) = 0, or A(q, t) v + b(q, t) = 0"
+            f"constraints must have the form {forms_of_constraints()}"
         )
     if len(names) > system.dimension:
         raise SystemDefinitionError(

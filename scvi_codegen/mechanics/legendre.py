@@ -16,8 +16,8 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.expressions import evaluate, gradient, gradient_tuple, hessian, unsupported_part
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import input_formulas, symbol
+from scvi_codegen.mechanics.constraints import constraints_of, rate_of_positions
 from scvi_codegen.mechanics.derived_expressions import coupled_blocks, forms_of, sample_points
-from scvi_codegen.mechanics.forces import constraints_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.reading import default_momenta
@@ -188,9 +188,12 @@ def lagrangian_of(system: HamiltonianSystem, *, constraints: Sequence[str] = ())
     known = {x.name: x for x in (*system.coordinates, *lagrangian.velocities, system.time, *system.parameters)}
     known |= {name: symbol(name) for name in system.inputs}
     driven = input_formulas(system.inputs, system.time)
-    return replace(
-        lagrangian, constraints=constraints_of(constraints, lambda g: parse_expression(g, known).xreplace(driven))
+    expressions = constraints_of(
+        constraints,
+        lambda g: parse_expression(g, known).xreplace(driven),
+        lambda g: rate_of_positions(g, system.coordinates, system.time),
     )
+    return replace(lagrangian, constraints=expressions)
 
 
 @lru_cache(maxsize=64)

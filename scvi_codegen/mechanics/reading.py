@@ -22,8 +22,9 @@ from scvi_codegen.formulas.translation import Translation, sympy_expression
 from scvi_codegen.mechanics.arrays.elements import unrolled_fields
 from scvi_codegen.mechanics.arrays.reading import arrays_from_sympy, arrays_from_text, definition_of
 from scvi_codegen.mechanics.arrays.system import ArraySystem
+from scvi_codegen.mechanics.constraints import constraint_sides, constraints_of, rate_of_positions
 from scvi_codegen.mechanics.definition_checks import warn_of_mistakes
-from scvi_codegen.mechanics.forces import constraints_of, damping_rate, dissipative_forces, forces_by_coordinate
+from scvi_codegen.mechanics.forces import damping_rate, dissipative_forces, forces_by_coordinate
 from scvi_codegen.mechanics.rotations.points import forces_at_points, rotations_of_frames
 from scvi_codegen.mechanics.system import are_arrays
 
@@ -64,7 +65,7 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
 
     torques, points = (arguments.get("torques"), arguments.get("torques_space")), arguments.get("point_forces") or ()
     forces = _acting(names, ordinary, read, arguments["forces"], torques, arguments.get("dissipation"), points)
-    constraints = constraints_of(arguments["constraints"], read)
+    constraints = constraints_of(arguments["constraints"], read, _rates(names, coordinates))
     function = "hamiltonian" if of_momenta else "lagrangian"
     return _system(
         cls,
@@ -78,6 +79,12 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
         damping=damping_rate(arguments["damping"], lambda formula: read(str(formula))),
         inputs=tuple(inputs),
     )
+
+
+def _rates(names: RotationNames, coordinates: Sequence[str]) -> Callable[[Expr], Expr]:
+    """Return the function that computes time derivatives of formulas, in all coordinates and their velocities."""
+    variables = tuple(map(symbol, coordinates))
+    return lambda formula: rate_of_positions(names.in_coordinates(formula), variables, symbol(TIME))
 
 
 def _system(
@@ -181,7 +188,7 @@ def system_from_sympy(
     ]
     acted = [f for each in (applied, torques, torques_space, *points) for f in each.values() if not isinstance(f, str)]
     rate = damping_rate(damping, lambda each: sympy_expression(each, "damping"))
-    conditions = constraints_of(constraints, lambda g: expression_of(g, "constraint"))
+    conditions = [expression_of(g, "constraint") for each in constraints or () for g in constraint_sides(each)[0]]
     input_names = tuple(name_of_key(each) for each in inputs)
     constants = with_inputs(_named_parameters(parameters), input_names)
     translation = Translation(
@@ -204,13 +211,16 @@ def system_from_sympy(
     if names.members:
         check_names(ordinary, tuple(constants), (), (*names.coordinates, *names.symbols))
     acting = _acting(names, ordinary, reader("forces"), by_name, (torques, torques_space), friction, points)
-    expression, conditions = reader(function)(formula), constraints_of(conditions, reader("constraints"))
+    all_coordinates, read_side = (*ordinary, *names.coordinates), reader("constraints")
+    equations = constraints_of(
+        constraints, lambda g: read_side(expression_of(g, "constraint")), _rates(names, all_coordinates)
+    )
     return _system(
         cls,
         names,
-        (function.lower(), expression, acting, conditions),
+        (function.lower(), reader(function)(formula), acting, equations),
         name=name,
-        coordinates=(*ordinary, *names.coordinates),
+        coordinates=all_coordinates,
         momenta=(*(p.name for p in translation.momenta), *default_momenta(names.coordinates)),
         values=dict(zip((each.name for each in translation.parameters), constants.values(), strict=True)),
         damping=reader("damping")(rate),

@@ -255,7 +255,7 @@ class MechanicalSystem(Deferred, ABC):
             return "forces act" if self.forces else "damping takes it"
         if self._constraints_work():
             return "constraints do work"
-        return f"{'H' if self.auxiliaries else 'L'} depends on time" if self.depends_on_time else ""
+        return f"{'H' if self.auxiliaries else 'L'} depends on time" if self.formula.has(self.time) else ""
 
     @property
     def balances_energy(self) -> bool:
@@ -264,10 +264,9 @@ class MechanicalSystem(Deferred, ABC):
         return acted and not (self.formula.has(self.time) or self._constraints_work())
 
     def _constraints_work(self) -> bool:
-        """Return whether constraints can do work: they contain time, or A v + b = 0 with non-zero b."""
-        at_rest = dict.fromkeys(self.velocities, zero())
-        rolling = [g for g in self.constraints if g.free_symbols & set(self.velocities)]
-        return any(self.time in g.free_symbols for g in self.constraints) or any(g.xreplace(at_rest) for g in rolling)
+        from scvi_codegen.mechanics.constraints import constraints_work
+
+        return bool(self.constraints) and constraints_work(self)
 
     def to_text(self) -> str:
         """Return the function as text that ``from_text`` accepts, in the names of rotations and directions."""

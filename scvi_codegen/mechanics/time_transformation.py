@@ -40,8 +40,8 @@ from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.rotations import RotationNames
 from scvi_codegen.formulas.symbols import input_formulas, symbol
 from scvi_codegen.formulas.translation import format_expression
+from scvi_codegen.mechanics.constraints import velocity_conditions
 from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.forces import nonholonomic_expressions
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import positive_parameters
@@ -92,7 +92,7 @@ def reparametrise(system: MechanicalSystem, time_transformation: str | Expr) -> 
             f"{cause} on '{system.name}', so its energy is not conserved, which the symplectic time "
             f"transformation requires. Use adaptive steps (t_end=...), or {REVERSIBLE}"
         )
-    if any(nonholonomic_expressions(system)):
+    if any(velocity_conditions(system)):
         raise SystemDefinitionError(
             f"'{system.name}' has nonholonomic constraints, which a symplectic time transformation "
             f"does not support. Use adaptive steps (t_end=...), or {REVERSIBLE}"

@@ -31,14 +31,14 @@ from dataclasses import replace
 import sympy
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.forces import (
+from scvi_codegen.mechanics.constraints import (
     constraint_multipliers,
     constraint_rates,
-    holonomic_expressions,
-    nonholonomic_expressions,
+    position_conditions,
+    velocity_conditions,
     with_constraint_forces,
 )
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table, Velocities
 from scvi_codegen.tables.basis import cardinal_values
@@ -87,7 +87,7 @@ def with_constraints(system: MechanicalSystem, stages: StageSystem, name: str) -
 def _check_points(system: MechanicalSystem, stages: StageSystem, name: str) -> None:
     group, s = stages.stage_groups[0], len(stages.blocks)
     ends = (group.abscissae[0], group.abscissae[-1]) == (0, 1)
-    if any(nonholonomic_expressions(system)) and ends and not _is_polynomial(group):
+    if any(velocity_conditions(system)) and ends and not _is_polynomial(group):
         raise MethodError(
             f"{name} does not support the nonholonomic constraints of '{system.name}', because its curves "
             "are not polynomials: use an SVI with polynomials"
@@ -122,7 +122,7 @@ def _with_multipliers(system: MechanicalSystem, group: StageGroup) -> StageGroup
     scatters[0] = replace(scatters[0], results=with_constraint_forces(system, scatters[0].results))
     conditions = [[int(row == n - 1) for row in range(points)] for n in range(points)]
     conditions_table = Table.joined(Table.constant(points, rows), one, Table.named("", conditions), one)
-    positions = holonomic_expressions(system)
+    positions = position_conditions(system)
     if any(positions):
         scatters.append(Scatter(results=positions, table=conditions_table, power=-1, scale=scatters[0].scale))
     products = [factor * g for factor, g in zip(factors, positions, strict=True)]
@@ -132,13 +132,13 @@ def _with_multipliers(system: MechanicalSystem, group: StageGroup) -> StageGroup
         scatters=tuple(scatters),
         scalar=sympy.Add(group.scalar, *products),
         computes="L_q + G^T lambda, L_v and g",
-        forced=group.forced or any(nonholonomic_expressions(system)),
+        forced=group.forced or any(velocity_conditions(system)),
     )
 
 
 def _velocity_conditions(system: MechanicalSystem, stages: StageSystem, group: StageGroup) -> tuple[StageGroup, ...]:
     """Return the nonholonomic constraints at s Gauss points; empty if there are none."""
-    conditions_table, size, rows = nonholonomic_expressions(system), len(stages.blocks), len(stages.rows)
+    conditions_table, size, rows = velocity_conditions(system), len(stages.blocks), len(stages.rows)
     if not any(conditions_table):
         return ()
     points, gauss = len(group.abscissae), gauss_legendre(size)

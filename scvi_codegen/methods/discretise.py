@@ -20,8 +20,8 @@ from sympy import Add, Expr, Symbol
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.expressions import gradient_tuple
 from scvi_codegen.formulas.intermediates import intermediate
+from scvi_codegen.mechanics.constraints import velocity_conditions
 from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, forms_of
-from scvi_codegen.mechanics.forces import nonholonomic_expressions
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.rotations.axial import Turn, axial_turns, frame_potential, rotated
@@ -236,7 +236,7 @@ def is_symplectic(method: Method, system: MechanicalSystem) -> bool:
 def is_conformally_symplectic(method: Method, system: MechanicalSystem) -> bool:
     """Return whether the steps multiply dq ^ dp by exp(-gamma h), where gamma is the damping rate."""
     prescribed = 0 < len(system.constraints) == getattr(system, "dimension", 0)  # 0: sizes known at run time
-    return method.symplectic and not (system.forces or prescribed or any(nonholonomic_expressions(system)))
+    return method.symplectic and not (system.forces or prescribed or any(velocity_conditions(system)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -143,6 +143,19 @@ def test_holonomic_and_moving_nonholonomic_constraints_combine():
     assert_allclose(run.multipliers()[:, 0], -np.sin(run.t), rtol=0, atol=1e-13)
 
 
+def test_a_blade_of_prescribed_direction_does_no_work():
+    """Constraint forces do work only if the rates of constraints at rest are not 0, also where they contain time."""
+    system = LagrangianSystem.from_text(
+        name="blade",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + y_dot**2)/2 - y",
+        constraints=["x_dot*sin(t) = y_dot*cos(t)"],
+    )
+    assert not system.changes_energy
+    run = compile_stepper(system, lobatto(4)).integrate([0.0, 0.0], velocity=[1.0, 0.0], h=0.05, steps=60)
+    assert np.abs(run.energy() - 0.5).max() < 1e-12 < 0.1 < np.ptp(run.velocity[:, 0])
+
+
 def test_nonholonomic_constraints_from_sympy_mechanics():
     x, y, a = dynamicsymbols("x y a")
     m, j, d, k = sympy.symbols("m J d k")

@@ -66,7 +66,7 @@ def test_documented_additions_need_one_file_and_one_line() -> None:
     new, changes = additions()
     lines = [line for _, change in changes for line in change.splitlines() if line[:1] in "+-"]
     of_package = [path for path, _ in new if path.startswith("scvi_codegen/")]
-    assert len(of_package) == len(new) - 1 == 6, "an observer is a file of the user"
+    assert len(of_package) == len(new) - 1 == 7, "an observer is a file of the user"
     assert not any((ROOT / path).exists() for path, _ in new)
     assert all(line.startswith("+") for line in lines)
     assert sum("import" not in line for line in lines) == len(of_package)
@@ -162,6 +162,50 @@ print(shown.exit_code, f"{model.integrate().steps} steps of adaptive size" in sh
 """
     lines = run(extended, script).splitlines()
     assert lines == ["True True", "True True", "True", "True True", "elementary True", "0 True"]
+
+
+def test_documented_constraint_prescribes_rates(extended: Path) -> None:
+    """A winch agrees with the pendulum of known length, read in each way, as do rods of their initial lengths."""
+    script = """
+import numpy as np, sympy
+from scvi_codegen import LagrangianSystem, SystemDefinitionError, compile_stepper
+from scvi_codegen.models.model_files.model_file import dump_model, parse_model
+L, coordinates, rope = "(x_dot**2 + y_dot**2)/2 - 9.81*y", ["x", "y"], "sqrt(x**2 + y**2)"
+def error(system, **winch):
+    run = compile_stepper(system, "svi:6").integrate([1.0, 0.0], velocity=[0.2, 0.0], h=0.01, steps=100, **winch)
+    return np.abs(run.q[-1] - expected).max()
+polar = LagrangianSystem.from_text("polar", ["a"], "(1 + t/5)**2*a_dot**2/2 + 9.81*(1 + t/5)*cos(a)")
+a = compile_stepper(polar, "svi:8").integrate([np.pi/2], velocity=[0.0], h=0.01, steps=100).q[-1, 0]
+expected = 1.2*np.array([np.sin(a), -np.cos(a)])
+text = LagrangianSystem.from_text("winch", coordinates, L, constraints=[f"rate({rope}) = u"], inputs=["u"])
+x, y, v, w = sympy.symbols("x y x_dot y_dot")
+equation = sympy.Eq(sympy.Function("rate")(sympy.sqrt(x**2 + y**2)), sympy.Rational(1, 5))
+symbols = LagrangianSystem.from_sympy(
+    name="winch", coordinates=[x, y], lagrangian=(v**2 + w**2)/2 - 9.81*y, constraints=[equation])
+document = f"[system]\\nname = 'winch'\\ncoordinates = ['x', 'y']\\nlagrangian = '{L}'"
+document += f"\\nconstraints = ['rate({rope}) = 0.2']"
+document += "\\n[initial]\\nq = [1.0, 0.0]\\nq_dot = [0.2, 0.0]\\n[run]\\nstep = 0.01\\nsteps = 10"
+read = parse_model(document)
+again = parse_model(dump_model(read)).system
+print(*(each < 1e-9 for each in (error(text, inputs={"u": 0.2}), error(symbols), error(read.system), error(again))))
+rod = LagrangianSystem.from_text("rod", coordinates, L, constraints=["rate(x**2 + y**2)"])
+print(text.changes_energy, "|", rod.changes_energy)
+chain, rods = "sum(i in N, q_dot[i]**2/2 + s_dot[i]**2/2 - 9.81*s[i])", "(q[i+1] - q[i])**2 + (s[i+1] - s[i])**2"
+arrays = [
+    LagrangianSystem.from_text("chain", ["q[N]", "s[N]"], chain, constraints=[c + " for i in 0..N-2"])
+    for c in (f"rate({rods})", f"{rods} = 1")]
+start = {"q": {"q": [0.0, 1.0, 2.0], "s": [0.0] * 3}, "velocity": {"q": [0.0] * 3, "s": [0.0, 1.0, 0.0]}}
+ends = [
+    compile_stepper(each, "svi:6", sizes=sizes).integrate(**start, h=0.01, steps=50).q[-1]
+    for each, sizes in ((arrays[0], None), (arrays[0], {"N": 3}), (arrays[1], {"N": 3}))]
+print(np.array_equal(ends[0], ends[1]), np.abs(ends[1] - ends[2]).max() < 1e-9)
+try:
+    LagrangianSystem.from_text("accelerations", coordinates, L, constraints=["rate(x_dot) = 1"])
+except SystemDefinitionError as refusal:
+    print("the acceleration of x_dot: constraints are" in str(refusal), "rate(f(q, t)) = b(q, t)" in str(refusal))
+"""
+    lines = run(extended, script).splitlines()
+    assert lines == ["True True True True", "constraints do work | ", "True True", "True True"]
 
 
 def test_documented_format_writes_trajectories_and_ensembles(extended: Path) -> None:

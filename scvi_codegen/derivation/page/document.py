@@ -39,8 +39,8 @@ from scvi_codegen.display.page import (
 from scvi_codegen.formulas.expressions import gradient_tuple
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
+from scvi_codegen.mechanics.constraints import with_constraint_forces
 from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, forms_of, multipliers
-from scvi_codegen.mechanics.forces import with_constraint_forces
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import check_regular, discretise, paper_equations
 from scvi_codegen.methods.method import Method

@@ -18,8 +18,8 @@ from sympy import Symbol
 from scvi_codegen.display.mathml.names import RAISED
 from scvi_codegen.display.page import Formula
 from scvi_codegen.lowering.stage_groups import argument_name
+from scvi_codegen.mechanics.constraints import constraint_rates, position_conditions, velocity_conditions
 from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.forces import constraint_rates, holonomic_expressions, nonholonomic_expressions
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table
 from scvi_codegen.tables.precision import Number
@@ -54,9 +54,9 @@ def argument_symbol(system: MechanicalSystem, gather: Gather, suffix: str) -> Sy
 
 def result_symbol(system: MechanicalSystem, group: StageGroup, scatter: Scatter, suffix: str) -> Symbol:
     """Return the symbol of the results of a scatter at a point; for gradients, scatters are parallel to gathers."""
-    if system.constraints and scatter.results == holonomic_expressions(system):
+    if system.constraints and scatter.results == position_conditions(system):
         return Symbol(f"g_{suffix}")
-    if system.constraints and scatter.results in (nonholonomic_expressions(system), constraint_rates(system)):
+    if system.constraints and scatter.results in (velocity_conditions(system), constraint_rates(system)):
         return Symbol(f"g_dot_{suffix}")
     if group.scalar is None:
         forms = forms_of(system)

@@ -24,6 +24,7 @@ from scvi_codegen.mechanics.arrays.system import (
     substituted,
     table_of,
 )
+from scvi_codegen.mechanics.constraints import constraint_sides
 from scvi_codegen.mechanics.forces import damping_rate
 
 LISTED = ("coordinates", "directions", "spins", "momenta", "constraints", "inputs", "tables", "point_forces")
@@ -100,7 +101,15 @@ def arrays_from_text(arguments: Mapping[str, Any]) -> ArraySystem:
         forces=tuple(substituted(force, driven) for force in chain(*applied)),
         inputs=tuple(inputs),
         constraints=tuple(
-            parse_constraint(each, everything, known, index_tables) for each in arguments.get("constraints") or ()
+            parse_constraint(
+                each,
+                everything,
+                known,
+                index_tables,
+                split=constraint_sides,
+                velocities={**dict.fromkeys(fields.values()), **dict(zip(arrays, velocities, strict=False))},
+            )
+            for each in arguments.get("constraints") or ()
         ),
         damping=damping_rate(arguments.get("damping"), lambda formula: parse_expression(str(formula), known)),
         rotations=turning,

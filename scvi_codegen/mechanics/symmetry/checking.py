@@ -17,8 +17,8 @@ from sympy.integrals.manualintegrate import manualintegrate
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.expressions import evaluated, gradient, gradient_tuple, unsupported_part
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.mechanics.constraints import with_constraint_forces
 from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.forces import with_constraint_forces
 from scvi_codegen.mechanics.symmetry.invariants import combined, conserved, gauge_columns, polynomial_in
 from scvi_codegen.mechanics.symmetry.sampling import Sample, rates_of
 from scvi_codegen.mechanics.symmetry.symmetry import MAX_SEARCHED_COORDINATES, Symmetry

@@ -21,8 +21,8 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.formulas.expressions import LARGEST, Tape, evaluate, parts
 from scvi_codegen.formulas.numpy_values import array_value
+from scvi_codegen.mechanics.constraints import constraint_multipliers, with_constraint_forces
 from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.forces import constraint_multipliers, with_constraint_forces
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.term_groups import TermGroup
 from scvi_codegen.tables.precision import Number, mp
