@@ -8,7 +8,7 @@ import pytest
 import scvi_codegen as sc
 from scvi_codegen.reproduce import correction
 from scvi_codegen.reproduce.catalogue import EXPERIMENTS
-from scvi_codegen.reproduce.experiment import Verdict, draw, judged, statement
+from scvi_codegen.reproduce.experiment import Verdict, draw, judged, largest_in_bins, statement
 from scvi_codegen.reproduce.runs import (
     KEPLER,
     SECTION_4,
@@ -186,3 +186,9 @@ def test_the_correction_distinguishes_the_printed_form_from_the_full_one():
     assert draw(pickle.loads(pickle.dumps(found)).picture, "svg").startswith(b"<?xml")
     printed, *_ = EXPERIMENTS["figure-29"].result({}).checks
     assert printed.verdict is Verdict.FAILS
+
+
+def test_the_last_bin_of_an_error_contains_the_remainder():
+    t, largest = largest_in_bins(np.arange(11.0), [0, 1, 0, 0, 0, 0, -2, 0, 0, 0, 3], bins=2)
+    assert (t.tolist(), largest.tolist()) == ([0.0, 5.0], [1.0, 3.0])
+    assert largest_in_bins([0.0, 1.0], [1.0, 2.0], bins=600)[1].tolist() == [1.0, 2.0]

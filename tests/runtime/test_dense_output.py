@@ -236,3 +236,12 @@ def test_arguments_of_solve_ivp_are_checked(kepler, arguments, words):
     usual = {"t_span": (0, 1), "y0": [*START["q"], *START["p"]], "h": 0.1}
     with pytest.raises(sc.StateError, match=words):
         sc.solve_ivp(kepler, **(usual | arguments))
+
+
+def test_iterations_between_saved_states_are_those_of_the_steps(kepler):
+    every = kepler.integrate(**START, h=0.1, steps=60)
+    until = every.iterations.cumsum()
+    times = np.array([0.0, 0.05, 0.1, 0.3, 0.72, 5.0, 5.99, 6.0])
+    last = np.searchsorted(every.t, times, side="right") - 1
+    assert np.array_equal(kepler.integrate(**START, h=0.1, steps=60, t_eval=times).iterations.cumsum(), until[last])
+    assert np.array_equal(kepler.integrate(**START, h=0.1, steps=60, save_every=7).iterations.cumsum(), until[::7])

@@ -373,6 +373,22 @@ class TestFailures:
         assert runs.status[1] not in ("ok", "interrupted")
         assert np.array_equal(runs.ends[1][3], CASES["adaptive"].run().ends[1][3])
 
+    def test_inactive_lanes_change_neither_bits_nor_iterations_of_others(self, kepler: sc.Stepper):
+        """Nor the predictor: a narrow orbit and undefined states beside a circular one."""
+        ends = []
+        for radius in (1.0, 1e-4, 0.0, np.nan):
+            q, p = np.tile([1.0, 0.0], (2, 1)), np.tile([0.0, 1.0], (2, 1))
+            runs = Ensemble(kepler, q, p, h=0.1, steps=20).common
+            assert runs is not None
+            block = runs.blocks()[0](0)
+            assert isinstance(block, LaneBlock)
+            block.lanes("q")[0, 1:] = radius
+            block.active[1:] = 0.0
+            block.advance(20)
+            states = runs.q[:, 0].tobytes(), runs.p[:, 0].tobytes()
+            ends.append((*states, block.memory.iterations, block.memory.guess))
+        assert len(set(ends)) == 1
+
 
 class TestThreadsAndInterruption:
     def test_results_do_not_depend_on_the_number_of_threads(self, kepler: sc.Stepper):

@@ -17,6 +17,7 @@ import scvi_codegen as sc
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runtime.core import compiled_method
+from scvi_codegen.runtime.events.event import as_events
 
 METHODS = (sc.SVI(3), sc.SpectralCollocation(6), sc.Composition(8))
 MORE_METHODS = (
@@ -489,3 +490,10 @@ def test_equal_events_are_parsed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     for k in range(40):
         stepper.with_events(f"q - {k}")
     assert len(stepper._event_variants) == compiled_method.MOST_EVENT_SETS
+
+
+def test_tuples_of_events_and_conditions_are_those_of_lists():
+    wall, where = sc.Event("x", where=["y > 0", "y < 2"]), ("y > 0", "y < 2")
+    assert wall.where == sc.Event("x", where=where).where == where
+    assert [each.function for each in as_events(("x", wall))] == [each.function for each in as_events(["x", wall])]
+    assert as_events(wall) == (wall,)

@@ -63,3 +63,14 @@ def test_spans_are_divided_into_equal_steps_below_the_maximum():
         steps_within(1.0, 1e-12)
     with pytest.raises(sc.StateError, match="requires inf steps"):
         steps_within(1e300, 1e-300)
+
+
+@pytest.mark.parametrize(("t", "h", "t_end"), [(0.0, 0.1, 0.35), (1e16, 3.0, 1e16 + 8)])
+def test_runs_backward_end_as_those_forward(free, t, h, t_end):
+    """The third step of 3 from 1e16 ends beyond 1e16 + 8, which is its end when rounded: it is shortened."""
+    forward = free.integrate([0.1], [0.2], t=t, h=h, t_end=t_end)
+    backward = free.integrate([0.1], [-0.2], t=-t, h=-h, t_end=-t_end)
+    for name, sign in (("t", -1), ("q", 1), ("p", -1), ("step_sizes", -1)):
+        np.testing.assert_array_equal(getattr(backward, name), sign * getattr(forward, name))
+    assert (backward.steps, backward.t[-1]) == (forward.steps, -t_end)
+    assert (forward.step_sizes[:-1] > 0.0).all()

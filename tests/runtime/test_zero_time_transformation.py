@@ -1,8 +1,12 @@
 """Time transformations that come to 0: refused in bounded work, and never gone round."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 import scvi_codegen as sc
+from scvi_codegen.runtime.run.singular_time import check_energy_surface
 
 OSCILLATOR = sc.LagrangianSystem.from_text(name="oscillator", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
 KEPLER = sc.problem("kepler").system
@@ -38,3 +42,14 @@ def test_close_encounters_do_not_stop_a_run(time_transformation):
     stretched = sc.compile_stepper(sc.reparametrise(KEPLER, time_transformation), sc.SVI(8))
     run = stretched.integrate(*NEAR, h=0.1, t_end=7.0)
     assert run.t[-1] == 7.0
+
+
+def test_energy_is_checked_after_a_single_short_step():
+    stretched = sc.compile_stepper(sc.reparametrise(KEPLER, "q1**2 + q2**2"), sc.SVI(2))
+    run = stretched.integrate([1.0, 0.0], [0.0, 1.0], h=0.1, steps=5)
+    t, p = run.t.copy(), run.p.copy()
+    t[3] = np.nextafter(t[2], 9.0)
+    check_energy_surface(replace(run, t=t), 0.1)
+    p[2] *= 2.0
+    with pytest.raises(sc.StepFailedError, match=r"step 2 at .* reaches 0"):
+        check_energy_surface(replace(run, t=t, p=p), 0.1)

@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,9 @@ from scvi_codegen.ir.equations import Control
 from scvi_codegen.ir.program import Program
 from scvi_codegen.rendering.program_source import render
 from scvi_codegen.rendering.source import Source
+from scvi_codegen.runtime.arrays.interface import read_arrays
+from scvi_codegen.verification.arrays import small_start
+from scvi_codegen.verification.arrays.whole import WholeStart
 
 RANDOM = np.random.default_rng(3)
 BOND = "(r[bonds[b, 0], a] - r[bonds[b, 1], a])"
@@ -181,3 +185,24 @@ def test_model_file_is_verified(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     assert "all measured properties are satisfied" in result.output
     assert json.loads((tmp_path / "oscillators.certificate.json").read_text())["passed"]
+
+
+@pytest.mark.parametrize("place", [0, 20, 49])
+def test_small_systems_are_cut_out_where_the_motion_is_largest(place: int) -> None:
+    """By positions and by momenta, and at both ends of an array."""
+    system = either_system(name="ring", **SYSTEMS["ring"][0])
+    interface = pipeline.Sources(system, sc.as_method("svi:2")).integrator()[1]
+    still, moving = np.full(50, 0.1), np.where(np.arange(50) == place, -3.0, 0.1)
+    for q, p in ((moving, still), (still, moving)):
+        start = WholeStart(
+            system=system,
+            method=sc.as_method("svi:2"),
+            stepper=SimpleNamespace(interface=interface),
+            arrays=read_arrays(interface, {"q": q}, None, None),
+            p={"q": p},
+            h=0.1,
+            t=0.0,
+        )
+        small = small_start(start)
+        assert len(small.p["q"]) < 10
+        assert -3.0 in (*small.arrays.state["q"], *small.p["q"])
