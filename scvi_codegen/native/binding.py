@@ -151,10 +151,11 @@ class Binding:
     def records(self, structs: Any, count: int | None = None) -> NDArray[np.void]:
         """Return an array of structs, by the names of their fields, in the same memory; a copy of the first few."""
         item = self._ffi.typeof(structs).item
+        fields = [(name, field) for name, field in item.fields if field.type.kind != "struct"]
         layout: Any = {
-            "names": [name for name, _ in item.fields],
-            "formats": [_format(field.type) for _, field in item.fields],
-            "offsets": [field.offset for _, field in item.fields],
+            "names": [name for name, _ in fields],
+            "formats": [_format(field.type) for _, field in fields],
+            "offsets": [field.offset for _, field in fields],
             "itemsize": self._ffi.sizeof(item),
         }
         records: NDArray[np.void] = np.frombuffer(self._ffi.buffer(structs), dtype=layout)

@@ -12,14 +12,13 @@ frameworks.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import accumulate, chain
 from typing import Any, Literal, TypeAlias, cast, get_args
 
 from scvi_codegen.ir.derivatives import Derivatives
 from scvi_codegen.ir.equations import Control, StoredValues
 from scvi_codegen.ir.kernel import Kernel, is_divided
 from scvi_codegen.ir.program import Program
-from scvi_codegen.rendering.array_events import ArrayEvents
 from scvi_codegen.rendering.environment import support_text, template_environment
 from scvi_codegen.rendering.kernels.functions import unrolled_equations
 from scvi_codegen.rendering.kernels.loops import loop_context
@@ -119,14 +118,15 @@ class EventSearch:
         doubts: factors of the last two coefficients in the error estimate.
         guarded: index of the function of each condition of crossings; of arrays of run-time sizes of its event.
         impacts: 1 for each event that is the wall of an impact, else 0.
+        conditional: 1 for each event with conditions, else 0.
         controlled: whether the integrator has adaptive steps.
         kernels: the functions at u = (q, p, v); conditions; values of variables that crossings change, gradient and
             restitution of impacts. Of arrays of run-time sizes those of their functions.
         uses_velocity: whether v occurs in the formulas.
         changed: index among (q, p, v) of the variable of each value of the changes.
         first_values: index of the first value of each function, and the number of values.
-        elements: number of functions of each event if some are ``for`` elements of loops of known sizes; else empty.
-        arrays: the functions of arrays of run-time sizes, which have no kernels of all coordinates.
+        elements: number of functions of each event at known sizes, one for each element of its loops.
+        arrays: :class:`~scvi_codegen.rendering.events.ArrayEvents` at run-time sizes, without kernels of all functions.
     """
 
     prefix: str
@@ -138,13 +138,24 @@ class EventSearch:
     doubts: tuple[float, float]
     guarded: tuple[int, ...]
     impacts: tuple[int, ...]
+    conditional: tuple[int, ...]
     controlled: bool
     kernels: tuple[Kernel, ...] = ()
     uses_velocity: bool = False
     changed: tuple[int, ...] = ()
     first_values: tuple[int, ...] = ()
     elements: tuple[int, ...] = ()
-    arrays: ArrayEvents | None = None
+    arrays: Any = None
+
+    @property
+    def first_functions(self) -> list[int]:
+        """Index of the first function of each event, and the number of functions."""
+        return [0, *accumulate(self.elements)]
+
+    @property
+    def event_of_function(self) -> list[int]:
+        """Index of the event of each function."""
+        return [event for event, count in enumerate(self.elements) for _ in range(count)]
 
 
 def render(program: Program, control: Control | None = None, *, fallback: Fallback | None = None) -> Source:

@@ -36,7 +36,7 @@ class EventBinding(ArrayBinding):
     """
 
     def __init__(self, library: Library, interface: Interface, sizes: RunSizes, events: tuple[Event, ...]) -> None:
-        from scvi_codegen.rendering.array_events import array_events  # here: imports SymPy
+        from scvi_codegen.rendering.events import array_events  # here: imports SymPy
 
         super().__init__(library, interface, sizes)
         self.reusable = False

@@ -9,8 +9,7 @@
  * continued from there: fixed steps to the end of the step, adaptive ones by a new step. Frictionless impacts change p
  * by lambda n, n = g_q; lambda = (1 + e)/2 lambda_1, where lambda_1 conserves energy:
  * H(p + lambda_1 n) - H(p) = -lambda_1 g_t. With constraints (EVENT_CONSTRAINTS), of Jacobian G, n is g_q - G^T kappa,
- * G H_pp n = 0: momenta are projected. Requires: events.h, the kernel event_changes, CHANGE_VALUES, FIRST_VALUE,
- * CHANGED, IS_IMPACT, EVENTS_CONTROLLED; in index notation gradients and maps, their entries alone. */
+ * G H_pp n = 0: momenta are projected. Requires: events.h, changes_by, IS_IMPACT, IS_CONDITIONAL, EVENTS_CONTROLLED. */
 enum {
   CHANGE_ROUNDS = 20, /* largest number of passes over the walls of a corner */
   CHANGES_IN_STEP = 100000, /* largest number of changes of the state in a step */
@@ -22,75 +21,6 @@ enum {
 #define CHANGE_WHOLE 1e-9 /* relative to a step: a difference of its end from t_end that is rounding */
 #define CHANGE_RATIO 1e-3 /* relative spread of the ratios of intervals that accumulate */
 #define CHANGE_END 1e-6 /* relative to a step: remaining time at which an accumulation ends the run */
-
-typedef NAME(run) event_run;
-
-/* Wall of an impact at a state: nonzero entries n of g_q, g_t, e; the rate of g in the direction of the run, a bound of
- * its terms, and how far rounding may move the state behind the wall. Of a map the variables (q, p, v) that it changes
- * and their values n. */
-typedef struct {
-  int count;
-  const int *place;
-  const real *n;
-  real by_time, restitution, rate, size, slack;
-} event_wall;
-
-#ifndef EVENTS_OF_ANY_SIZE
-/* Changes by function e at a state. */
-static int changes_by(const event_step *step, int e, const event_sample *at, event_wall *wall)
-{
-  real u[3 * M], *const value = step->values + EVENT_VALUES * EVENTS;
-  const int status = event_arguments(at->t, at->q, at->p, step->parameters, u, step->workspace);
-  if (status != OK)
-    return status;
-  event_changes(u, at->t, step->parameters, value);
-  wall->n = value + FIRST_VALUE[e];
-  wall->place = CHANGED + FIRST_VALUE[e];
-  wall->count = FIRST_VALUE[e + 1] - FIRST_VALUE[e] - 2 * IS_IMPACT[EVENT_OF(e)];
-  wall->by_time = wall->restitution = 0.0;
-  if (IS_IMPACT[EVENT_OF(e)]) {
-    wall->by_time = wall->n[wall->count];
-    wall->restitution = wall->n[wall->count + 1];
-  }
-  return status;
-}
-#else
-/* Changes by function e at a state. */
-static int changes_by(const event_step *step, int e, const event_sample *at, event_wall *wall)
-{
-  const int event = event_of(e);
-  section in[EVENT_LOOPS];
-  event_point here;
-  event_entries to = {.place = event_host->places, .value = event_host->values};
-  const int status = point_at(at->t, at->q, at->p, step->parameters, &here, step->workspace);
-  find_element(event, e - event_host->first[event], in);
-  if (status == OK)
-    add_changes(event, event_data, &here, in, &to);
-  wall->count = to.count;
-  wall->place = to.place;
-  wall->n = to.value;
-  wall->by_time = to.by_time;
-  wall->restitution = to.restitution;
-  return status;
-}
-#endif
-
-/* Copies a run; in index notation also its arrays, into those of `to`. */
-static void copy_run(event_run *to, const event_run *from)
-{
-#ifdef EVENTS_OF_ANY_SIZE
-  const event_run own = *to;
-  *to = *from;
-  to->q = own.q;
-  to->p = own.p;
-  to->carry_q = own.carry_q;
-  to->carry_p = own.carry_p;
-  copy_state(to->q, to->p, from->q, from->p);
-  copy_state(to->carry_q, to->carry_p, from->carry_q, from->carry_p);
-#else
-  *to = *from;
-#endif
-}
 
 /* Momenta that satisfy the constraints at a state, of which the impulses of an impact and of its constraint forces
  * together are a multiple of the projected normal: P(p + lambda n). Positions are projected, too, if `moves`. */
@@ -110,18 +40,18 @@ static int satisfy_constraints(const event_step *step, real t, real *q, real *p,
 }
 
 /* Momenta p + lambda n. */
-static void add_impulse(const event_wall *wall, real lambda, const real *p, real *moved)
+static void add_impulse(const event_entries *wall, real lambda, const real *p, real *moved)
 {
   memcpy(moved, p, BYTES(M));
   for (int i = 0; i < wall->count; i++)
-    moved[wall->place[i]] += lambda * wall->n[i];
+    moved[wall->place[i]] += lambda * wall->value[i];
 }
 
 /* Velocities at p + lambda n, and n.v + g_t; wall NULL: at p. */
-static int approach(const event_step *step, const event_sample *at, const event_wall *wall, real lambda, real *v,
+static int approach(const event_step *step, const event_sample *at, const event_entries *wall, real lambda, real *v,
     real *rate)
 {
-  const event_wall none = {.count = 0};
+  const event_entries none = {.count = 0};
   real *const p = step->memory + 2 * M;
   int status;
   wall = wall ? wall : &none;
@@ -131,14 +61,15 @@ static int approach(const event_step *step, const event_sample *at, const event_
     status = NAME(velocity)(at->t, at->q, p, step->parameters, v, step->workspace);
   *rate = wall->by_time;
   for (int i = 0; i < wall->count; i++)
-    *rate += wall->n[i] * v[wall->place[i]];
+    *rate += wall->value[i] * v[wall->place[i]];
   return status;
 }
 
 /* Changes by function e; if it is a wall, with its rate at velocities v. */
-static int evaluate_changes(const event_step *step, int e, const event_sample *at, const real *v, event_wall *wall)
+static int evaluate_changes(const event_step *step, int e, const event_sample *at, const real *v, event_entries *wall)
 {
-  const int status = changes_by(step, e, at, wall);
+  const int status = changes_by(e, at->t, at->q, at->p, step->parameters, step->values + EVENT_VALUES * EVENTS, wall,
+      step->workspace);
   if (status != OK || !IS_IMPACT[EVENT_OF(e)])
     return status;
   wall->rate = wall->by_time;
@@ -146,9 +77,9 @@ static int evaluate_changes(const event_step *step, int e, const event_sample *a
   wall->slack = fabs(wall->by_time * at->t);
   for (int i = 0; i < wall->count; i++) {
     const int k = wall->place[i];
-    wall->rate += wall->n[i] * v[k];
-    wall->size += fabs(wall->n[i] * v[k]);
-    wall->slack += fabs(wall->n[i]) * (fabs(at->q[k]) + fabs(v[k] * step->whole));
+    wall->rate += wall->value[i] * v[k];
+    wall->size += fabs(wall->value[i] * v[k]);
+    wall->slack += fabs(wall->value[i]) * (fabs(at->q[k]) + fabs(v[k] * step->whole));
   }
   wall->slack *= CHANGE_SAFETY * DBL_EPSILON;
   wall->rate *= step->h < 0.0 ? -1.0 : 1.0;
@@ -156,7 +87,7 @@ static int evaluate_changes(const event_step *step, int e, const event_sample *a
 }
 
 /* Changes by function e at the velocities of a state. */
-static int changes_at(const event_step *step, int e, const event_sample *at, event_wall *wall)
+static int changes_at(const event_step *step, int e, const event_sample *at, event_entries *wall)
 {
   real rate, *const v = step->memory + 3 * M;
   const int status = IS_IMPACT[EVENT_OF(e)] ? approach(step, at, NULL, 0.0, v, &rate) : OK;
@@ -175,12 +106,12 @@ static void add_product(real a, real b, real *sum, real *low)
 /* Correction of lambda by Newton's method for the energy equation of a quadratic kinetic energy divided by lambda,
  * n.v + g_t + (lambda / 2) n.(W n) = 0, evaluated in twice the precision: the rounding error of lambda has a mean
  * that is not zero, from which energy would drift over many impacts. v, change: velocities before the impact, W n. */
-static real correct_impulse(const event_wall *wall, const real *v, const real *change, real lambda, real rate)
+static real correct_impulse(const event_entries *wall, const real *v, const real *change, real lambda, real rate)
 {
   real sum = wall->by_time, low = 0.0, bend = 0.0, bend_low = 0.0;
   for (int i = 0; i < wall->count; i++) {
-    add_product(wall->n[i], v[wall->place[i]], &sum, &low);
-    add_product(wall->n[i], change[wall->place[i]], &bend, &bend_low);
+    add_product(wall->value[i], v[wall->place[i]], &sum, &low);
+    add_product(wall->value[i], change[wall->place[i]], &bend, &bend_low);
   }
   add_product(0.5 * lambda, bend, &sum, &low);
   return lambda * (sum + (low + 0.5 * lambda * bend_low)) / rate;
@@ -188,7 +119,7 @@ static real correct_impulse(const event_wall *wall, const real *v, const real *c
 
 /* Mean of n.v + g_t on the way from p to p + lambda n by Gauss quadrature with three nodes: the energy equation divided
  * by lambda, without the cancellation of H(p + lambda n) - H(p) of small impulses. */
-static int mean_rate(const event_step *step, const event_sample *at, const event_wall *wall, real lambda, real *v,
+static int mean_rate(const event_step *step, const event_sample *at, const event_entries *wall, real lambda, real *v,
     real *mean)
 {
   static const real NODE[3] = {0.11270166537925831, 0.5, 0.88729833462074169};
@@ -206,7 +137,7 @@ static int mean_rate(const event_step *step, const event_sample *at, const event
 /* Impulse of an impact: p += (1 + e)/2 lambda_1 n. Where the kinetic energy is quadratic, i.e. W n, W = H_pp, is the
  * same at p and at 0, lambda_1 = -2 rate / (n.W n) reverses the rate; else Newton's method solves the energy equation,
  * whose derivative by lambda is the rate. A run backward in time undoes the impact. */
-static int impact(const event_step *step, event_sample *at, const event_wall *wall)
+static int impact(const event_step *step, event_sample *at, const event_entries *wall)
 {
   const real restitution = step->h < 0.0 ? 1.0 / wall->restitution : wall->restitution;
   const real rate = step->h < 0.0 ? -wall->rate : wall->rate;
@@ -225,7 +156,7 @@ static int impact(const event_step *step, event_sample *at, const event_wall *wa
   if (status == OK)
     status = approach(step, at, wall, 1.0, v, &there);
   for (int i = 0; i < wall->count; i++)
-    size += fabs(wall->n[i] * v[wall->place[i]]) + fabs(wall->n[i] * change[wall->place[i]]);
+    size += fabs(wall->value[i] * v[wall->place[i]]) + fabs(wall->value[i] * change[wall->place[i]]);
   lambda = -2.0 * rate / inverse_mass;
   if (status == OK && !(fabs(there - rate - inverse_mass) <= CHANGE_SAFETY * DBL_EPSILON * size)) {
     status = NAME(energy)(at->t, at->q, at->p, step->parameters, &energy, step->workspace);
@@ -266,15 +197,15 @@ static int impact(const event_step *step, event_sample *at, const event_wall *wa
   lambda *= 0.5 * (1.0 + restitution);
   low *= 0.5 * (1.0 + restitution);
   for (int i = 0; i < wall->count; i++) {
-    real *const p = at->p + wall->place[i], remainder = low * wall->n[i];
-    add_product(lambda, wall->n[i], p, &remainder);
+    real *const p = at->p + wall->place[i], remainder = low * wall->value[i];
+    add_product(lambda, wall->value[i], p, &remainder);
     *p += remainder;
   }
   return status == OK ? satisfy_constraints(step, at->t, at->q, at->p, 0) : status;
 }
 
 /* Sets the variables of a map to its values; velocities are set last, by their momenta. */
-static int apply_map(const event_step *step, event_sample *at, const event_wall *map)
+static int apply_map(const event_step *step, event_sample *at, const event_entries *map)
 {
   real *const v = step->memory + 3 * M;
   int by_velocity = 0, status = OK;
@@ -284,11 +215,11 @@ static int apply_map(const event_step *step, event_sample *at, const event_wall 
     status = NAME(velocity)(at->t, at->q, at->p, step->parameters, v, step->workspace);
   for (int i = 0; i < map->count; i++)
     if (map->place[i] < M)
-      at->q[map->place[i]] = map->n[i];
+      at->q[map->place[i]] = map->value[i];
     else if (map->place[i] < 2 * M)
-      at->p[map->place[i] - M] = map->n[i];
+      at->p[map->place[i] - M] = map->value[i];
     else
-      v[map->place[i] - 2 * M] = map->n[i];
+      v[map->place[i] - 2 * M] = map->value[i];
   return by_velocity && status == OK
       ? NAME(momentum)(at->t, at->q, v, step->parameters, at->p, step->workspace)
       : status;
@@ -297,7 +228,7 @@ static int apply_map(const event_step *step, event_sample *at, const event_wall 
 /* Changes the state by function e: by its map, or by an impact if the wall is approached. */
 static int change_state(const event_step *step, int e, event_sample *at)
 {
-  event_wall wall;
+  event_entries wall;
   const int is_impact = IS_IMPACT[EVENT_OF(e)];
   int status = changes_at(step, e, at, &wall);
   if (status == OK && is_impact && wall.rate < 0.0) {
@@ -327,10 +258,8 @@ static void note_hit(const event_step *step, event_crossing *crossing, real t)
   event_watch *watch = step->watch;
   NAME(event_history) *const history = watch->history + FUNCTION_OF(crossing);
   real *gaps = history->gaps, low = INFINITY, high = 0.0, ratio = 0.0, last;
-#ifdef EVENTS_OF_ANY_SIZE
   crossing->before = *history;
   crossing->acted = 1;
-#endif
   memmove(gaps, gaps + 1, sizeof(real) * (CHANGE_GAPS - 1));
   last = gaps[CHANGE_GAPS - 1] = fabs(watch->time - history->last);
   history->last = watch->time;
@@ -354,7 +283,7 @@ static void note_hit(const event_step *step, event_crossing *crossing, real t)
 static int refine_crossing(const event_step *step, long long first, event_sample *at, real *part)
 {
   event_crossing *crossing = step->found + first;
-  event_wall wall;
+  event_entries wall;
   solver_report own;
   real back = 0.0, *const q = step->memory, *const p = q + M;
   int status;
@@ -415,7 +344,7 @@ static int change_at_crossings(const event_step *step, long long first, event_sa
       status = approach(step, at, NULL, 0.0, v, &rate);
     for (int e = 0; status == OK && e < EVENTS; e++) {
       const int event = EVENT_OF(e);
-      event_wall wall;
+      event_entries wall;
       int open = 0, known = 0;
       if (!IS_IMPACT[event] || !step->watch->acts[event] || !may_be_touched(step, e))
         continue;
@@ -441,10 +370,8 @@ static int change_at_crossings(const event_step *step, long long first, event_sa
       step->found[*step->filled] = step->found[first];
       step->found[*step->filled].function = event;
       step->found[*step->filled].direction = -1;
-      SET_ELEMENT(step->found + *step->filled, e);
-#ifdef EVENTS_OF_ANY_SIZE
+      step->found[*step->filled].element = e - EVENT_FIRST[event];
       step->found[*step->filled].acted = 0;
-#endif
       ends_search(step->watch, step->found + *step->filled);
       ++*step->filled;
     }
@@ -461,8 +388,8 @@ static int check_walls(const event_step *step, const event_sample *left, const e
   int known = 0, status = OK;
   for (int e = 0; status == OK && e < EVENTS; e++) {
     const int event = EVENT_OF(e);
-    event_wall wall;
-    int open = 1;
+    event_entries wall;
+    int open = left || !IS_CONDITIONAL[event];
     if (after[e] >= 0.0 || !IS_IMPACT[event] || !step->watch->acts[event])
       continue;
     if (!known)
@@ -473,10 +400,6 @@ static int check_walls(const event_step *step, const event_sample *left, const e
     if (status == OK && left)
       status = conditions(e, right->t, right->q, right->p, step->parameters, &open, step->workspace);
     wall.slack = fmax(wall.slack, step->watch->history[e].slack); /* the velocity after an impact may be 0 */
-#if EVENT_GUARDS > 0
-    for (int i = 0; !left && i < EVENT_GUARDS; i++)
-      open &= GUARDED[i] != GUARD_OF(e);
-#endif
     if (status == OK && open && (!left || before[e] >= -wall.slack) && after[e] < -wall.slack) {
       step->watch->through = event + 1;
       step->watch->behind = left ? 0.0 : after[e];
@@ -667,20 +590,14 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, r
   memset(report, 0, sizeof *report);
   *filled = 0;
   while (report->steps < steps && !watch->ended && (t_end - run->t) - run->t_low != 0.0) {
-    event_run before = *run;
+    event_run before;
     const event_watch watched = *watch;
     const long long kept = report->stored, crossed = *filled;
     event_step step = {0.0, 0.0, 0.0, NULL, NULL, parameters, options, watch, found, room, filled, report, workspace,
         memory, memory + 15 * M, 0, &horizon};
     real size;
     int count = 0;
-#ifdef EVENTS_OF_ANY_SIZE
-    before.q = step.values + (long long)EVENT_VALUES * EVENTS;
-    before.p = before.q + M;
-    before.carry_q = before.p + M;
-    before.carry_p = before.carry_q + M;
-    copy_run(&before, run);
-#endif
+    keep_run(&before, run, step.values + (long long)EVENT_VALUES * EVENTS);
     status = take_step(run, t_end, tolerance, &step, &size, &count);
     if (status == OK)
       status = change_in_step(&before, run, &step, size, count, &to);
@@ -688,11 +605,9 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, r
       copy_run(run, &before);
       report->stored = kept;
       if (status == EVENT_NO_ROOM) {
-#ifdef EVENTS_OF_ANY_SIZE
         for (long long i = *filled - 1; i >= crossed; i--)
           if (found[i].acted)
             watch->history[FUNCTION_OF(found + i)] = found[i].before;
-#endif
         *watch = watched;
         *filled = crossed;
         return OK;

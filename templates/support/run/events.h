@@ -4,47 +4,12 @@
 #include "../core/numbers.h"
 #include "../core/status_codes.h"
 
-/* Events: zero crossings of functions along the steps of a run; TIME_TRANSFORMATION: h is a step in tau. */
-#ifdef TIME_TRANSFORMATION
-/* Velocities dq/dt as arguments of event functions of a time-transformed system, whose integrator has dq/dtau, and the
- * duration of a part h of a step in tau. Requires: status_codes.h. */
-static int event_velocity(real t, const real *q, const real *p, const real *parameters, real *v, real *workspace)
-{
-  real rate;
-  int status = NAME(velocity)(t, q, p, parameters, v, workspace);
-  if (status == OK)
-    status = NAME(rates)(1, q, p, parameters, &rate);
-  for (int i = 0; status == OK && i < M; i++)
-    v[i] /= rate;
-  return status;
-}
-
-static inline real duration_of_part(real h, const solver_report *part)
-{
-  (void)h;
-  return part->duration;
-}
-#else
-/* Velocities as arguments of event functions, and the duration of a part h of a step. Requires: status_codes.h. */
-static int event_velocity(real t, const real *q, const real *p, const real *parameters, real *v, real *workspace)
-{
-  return NAME(velocity)(t, q, p, parameters, v, workspace);
-}
-
-static inline real duration_of_part(real h, const solver_report *part)
-{
-  (void)part;
-  return h;
-}
-#endif
-
 /* Location of zero crossings of event functions, by the public functions of the integrator alone.
  *
  * A step is sampled at Chebyshev nodes; the interpolating polynomial separates the crossings, which are then enclosed
- * by a secant iteration on partial steps. Requires: numbers.h, event_velocity, BYTES, the kernel event_functions or, in
- * index notation, all_values, one_value and conditions; EVENTS, EVENT_DEGREE, EVENTS_USE_VELOCITIES; EVENT_NODES, the
- * nodes as fractions of a part of a step; EVENT_COEFFICIENTS, from values there to coefficients of x^k, -1 <= x <= 1;
- * EVENT_DOUBTS, the factors of the last two coefficients in the error estimate. */
+ * by a secant iteration on partial steps. Requires: numbers.h, BYTES, parts/event_functions.c.jinja; EVENT_DEGREE;
+ * EVENT_NODES, the nodes as fractions of a part of a step; EVENT_COEFFICIENTS, from values there to coefficients of x^k,
+ * -1 <= x <= 1; EVENT_DOUBTS, the factors of the last two coefficients in the error estimate. */
 enum {
   EVENT_SPLITS = 6, /* greatest depth of subdivision of a step */
   EVENT_TRIALS = 200, /* largest number of states evaluated for one crossing; bisection takes 52 */
@@ -62,12 +27,10 @@ enum {
 #define EVENT_SMALL_PART 0.03 /* a polynomial whose error estimate is less than this part of its range is accepted */
 #define EVENT_FAR 32.0 /* a function is far from zero beyond so many times its range at the nodes: polynomials and their
                         * error estimates deviate by at most 22 of them */
+#define EVENT_SINGLE 8 /* coordinates whose rounding is examined one by one */
 #define EVENT_FEW 16 /* functions that are all examined after a change */
 #define EVENT_OVERSHOOT 0x1p-10 /* part of a secant step by which it is longer, so that the sign changes */
 #define EVENT_STEEPNESS 8.0 /* a zero is simple if the derivative exceeds so many error estimates */
-
-typedef NAME(watch) event_watch;
-typedef NAME(crossing) event_crossing;
 
 /* Whether the state where a search starts is that of the last change by function e, within rounding of its zero. */
 #ifdef EVENT_CHANGES
@@ -77,92 +40,12 @@ typedef NAME(crossing) event_crossing;
 #define JUST_CHANGED(watch, e) 0
 #define RESIDUAL(watch, e) 0.0
 #endif
-
-#ifndef EVENT_GUARDS
-#define EVENT_GUARDS 0 /* conditions of crossings, of the function GUARDED: values of the kernel event_guards */
-#endif
-#ifdef EVENT_FIRST /* index notation: an event has a function for each element of its loops */
 #define FUNCTION_OF(crossing) ((int)(EVENT_FIRST[(crossing)->function] + (crossing)->element))
-#define SET_ELEMENT(crossing, e) ((crossing)->element = (e) - EVENT_FIRST[(crossing)->function])
-#else
-#define EVENT_OF(e) (e) /* event of a function */
-#define FUNCTION_OF(crossing) ((crossing)->function)
-#define SET_ELEMENT(crossing, e) ((void)(e))
-#endif
-#ifdef EVENTS_OF_ANY_SIZE
-#define GUARD_OF(e) EVENT_OF(e) /* conditions are those of an event */
-#else
-#define GUARD_OF(e) (e) /* those of a function */
-/* Arguments (q, p, v) of the kernels of events at a state. */
-static int event_arguments(real t, const real *q, const real *p, const real *parameters, real *u, real *workspace)
-{
-  memcpy(u, q, BYTES(M));
-  memcpy(u + M, p, BYTES(M));
-  memset(u + 2 * M, 0, BYTES(M));
-  return EVENTS_USE_VELOCITIES ? event_velocity(t, q, p, parameters, u + 2 * M, workspace) : OK;
-}
-
-/* Values of all functions, and of function e, at a state. */
-static int all_values(real t, const real *q, const real *p, const real *parameters, real *value, real *workspace)
-{
-  real u[3 * M];
-  const int status = event_arguments(t, q, p, parameters, u, workspace);
-  if (status == OK)
-    event_functions(u, t, parameters, value);
-  return status;
-}
-
-static int one_value(int e, real t, const real *q, const real *p, const real *parameters, real *value, real *workspace)
-{
-  real all[EVENTS];
-  const int status = all_values(t, q, p, parameters, all, workspace);
-  *value = all[e];
-  return status;
-}
-
-/* Sets *open to 1 if the conditions of function e are satisfied at a state, all >= 0, else to 0. */
-static int conditions(int e, real t, const real *q, const real *p, const real *parameters, int *open, real *workspace)
-{
-  int status = OK;
-  *open = 1;
-#if EVENT_GUARDS > 0
-  real u[3 * M], value[EVENT_GUARDS];
-  status = event_arguments(t, q, p, parameters, u, workspace);
-  if (status != OK)
-    return status;
-  event_guards(u, t, parameters, value);
-  for (int i = 0; i < EVENT_GUARDS; i++)
-    *open &= GUARDED[i] != e || value[i] >= 0.0;
-#else
-  (void)e, (void)t, (void)q, (void)p, (void)parameters, (void)workspace;
-#endif
-  return status;
-}
-
-int NAME(event_values)(real t, const real *q, const real *p, const real *parameters, real *value, real *workspace)
-{
-  const int status = all_values(t, q, p, parameters, value, workspace);
-  if (status != OK)
-    return status;
-  return all_finite(value, EVENTS) ? OK : NOT_FINITE;
-}
-#endif
 
 /* A function at a fraction of a step, and the state there, in memory that later samples may use as well. */
 typedef struct {
   real fraction, t, g, *q, *p;
 } event_sample;
-
-enum { EVENT_VALUES = EVENT_DEGREE + 3 }; /* values of each function: at the nodes, at a state, and their rounding */
-
-#ifdef EVENTS_OF_ANY_SIZE
-#define EVENT_MEMORY(watch, name, size)                    \
-  real *const name = (event_host = (watch)->host)->memory; \
-  event_data = NAME(data_at)(parameters, workspace);       \
-  (watch)->used = 0;
-#else
-#define EVENT_MEMORY(watch, name, size) real name[(size) + EVENT_VALUES * EVENTS];
-#endif
 
 /* A step that is searched, and the array for its crossings. */
 typedef struct {
@@ -184,12 +67,6 @@ typedef struct {
 static real *values_at(const event_step *step, int row)
 {
   return step->values + (long long)row * EVENTS;
-}
-
-static void copy_state(real *q, real *p, const real *q0, const real *p0)
-{
-  memcpy(q, q0, BYTES(M));
-  memcpy(p, p0, BYTES(M));
 }
 
 /* Evaluates all functions at the state of a sample; watch->undefined is 1 + the event of the first that is not
@@ -385,17 +262,12 @@ static int add_crossing(const event_step *step, int e, const event_sample *from,
     status = conditions(e, at.t, at.q, at.p, step->parameters, &open, step->workspace);
   if (status != OK || !open)
     return status;
-#ifdef EVENTS_OF_ANY_SIZE
-  if (step->watch->used == step->room)
+  if (!place_crossing(step->watch, crossing, step->room))
     return EVENT_NO_ROOM;
-  crossing->q = event_host->states + 2 * M * step->watch->used++;
-  crossing->p = crossing->q + M;
-  crossing->acted = 0;
-#endif
   crossing->t = at.t;
   crossing->fraction = at.fraction;
   crossing->function = event;
-  SET_ELEMENT(crossing, e);
+  crossing->element = e - EVENT_FIRST[event];
   crossing->direction = direction;
   copy_state(crossing->q, crossing->p, at.q, at.p);
   ++*step->filled;
@@ -484,34 +356,25 @@ static int search_part(const event_step *step, int e, const event_sample *left, 
   return status == OK ? search_part(step, e, &sample, right, NULL, splits - 1) : status;
 }
 
-/* Changes of the functions if each coordinate changes by one ulp: the effect of rounding of the state. In index
- * notation the largest change if all coordinates change at once, with alternating signs of three patterns. */
+/* Changes of the functions if each coordinate changes by one ulp: the effect of rounding of the state. Of many
+ * coordinates the largest change if all of them change at once, with alternating signs of three patterns. */
 static int rounding_of(const event_step *step, const event_sample *at)
 {
   real *const noise = values_at(step, EVENT_DEGREE + 2), *const now = values_at(step, EVENT_DEGREE + 1);
   const real *const before = values_at(step, 0);
+  const int each = M <= EVENT_SINGLE;
   event_sample next = *at;
   int status = OK;
   next.q = step->memory + 2 * M;
   memset(noise, 0, BYTES(EVENTS));
-#ifdef EVENTS_OF_ANY_SIZE
-  for (int pattern = 0; status == OK && pattern < 3; pattern++) {
+  for (int k = 0; status == OK && k < (each ? M : 3); k++) {
     for (int i = 0; i < M; i++)
-      next.q[i] = at->q[i] * (1.0 + ((i * pattern / 2) % 2 ? -DBL_EPSILON : DBL_EPSILON));
+      next.q[i] = at->q[i] * (each ? 1.0 + (i == k) * DBL_EPSILON
+                                   : 1.0 + ((i * k / 2) % 2 ? -DBL_EPSILON : DBL_EPSILON));
     status = evaluate_functions(step, &next, now);
     for (int e = 0; status == OK && e < EVENTS; e++)
-      noise[e] = fmax(noise[e], fabs(now[e] - before[e]));
+      noise[e] = each ? noise[e] + fabs(now[e] - before[e]) : fmax(noise[e], fabs(now[e] - before[e]));
   }
-#else
-  memcpy(next.q, at->q, BYTES(M));
-  for (int i = 0; status == OK && i < M; i++) {
-    next.q[i] *= 1.0 + DBL_EPSILON;
-    status = evaluate_functions(step, &next, now);
-    for (int e = 0; e < EVENTS; e++)
-      noise[e] += fabs(now[e] - before[e]);
-    next.q[i] = at->q[i];
-  }
-#endif
   return status;
 }
 
