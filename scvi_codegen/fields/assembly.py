@@ -9,143 +9,203 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from functools import reduce
+from operator import mul
+from typing import Any, TypeAlias
 
 import numpy as np
 import sympy
-from sympy import Add, Expr
+from sympy import Add, Expr, Float, Rational, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.fields.axes import Axis, Cells, digits, same
+from scvi_codegen.fields.axes import Axis, Cells, fixed_place, rational, same, span
 from scvi_codegen.fields.density import Density, place_text
 from scvi_codegen.fields.mesh import Mesh, MeshSystem
-from scvi_codegen.formulas.array_statements import array_text
-from scvi_codegen.formulas.arrays import MAX_UNROLLED_TERMS
-from scvi_codegen.formulas.symbols import TIME, symbol
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.tables.precision import mp
+from scvi_codegen.formulas.array_statements import ArrayForce, array_text
+from scvi_codegen.formulas.arrays import MAX_UNROLLED_TERMS, ArrayTerm, term_of
+from scvi_codegen.formulas.symbols import DOT, TIME, symbol
+from scvi_codegen.indices import Access, Array, Convolution, Loop, Place, Size
+from scvi_codegen.mechanics.arrays.system import ArrayHamiltonian, ArrayLagrangian, friction
 
-NAME = re.compile(r"[A-Za-z_]\w*")
+Slot: TypeAlias = Any
+"""Number of a point within a cell, or in the general term of a sum its index as text."""
+Summed: TypeAlias = tuple[tuple[Loop, ...], Expr]
+SHOWN_DENOMINATOR = 10**6
+"""Largest denominator of fractions that texts contain; other numbers are decimal."""
+
+
+class InnerSum(Expr):  # type: ignore[misc]  # SymPy has no types
+    """Sum over the points of a cell: its index, its general term, which is printed, and its terms."""
+
+    def doit(self, **hints: bool) -> Expr:
+        """Return the sum of the terms."""
+        return Add(*(term.doit(**hints) for term in self.args[2:]))
+
+    def scaled(self, number: Expr) -> InnerSum:
+        """Return the sum with each term multiplied by a number."""
+        return InnerSum(self.args[0], *(number * term for term in self.args[1:]))
+
+    def _sympystr(self, printer: Any) -> str:
+        index, general, *terms = self.args
+        return f"sum({index} in {len(terms)}, {printer._print(general)})"
 
 
 class Assembly:
-    """Texts of the sums of a semi-discrete Lagrangian, and the arrays that they use."""
+    """Terms of a semi-discrete Lagrangian, and the arrays that they use."""
 
     def __init__(self, system: Density, axes: Mapping[str, Axis]) -> None:
         self.system = system
         self.axes = axes
-        self.used: dict[str, tuple[str, Any]] = {}
+        self.sizes = tuple(Size(f"N{axis}") for axis in axes)
+        self.here = {axis: Place(index=f"i{axis}") for axis in axes}
+        self.used: dict[str, tuple[tuple[Size, ...], Any]] = {}
+        self.accesses: dict[Symbol, Access] = {}
 
     def result(self, discretisation: Mapping[str, Any]) -> MeshSystem:
         """Return the semi-discrete system of the density on the tensor product of the axes."""
         system = self.system
-        sizes = ", ".join(f"N{axis}" for axis in self.axes)
-        terms = [*self.kinetic(), *self.in_space(), *self.at_places()]
-        dissipation = None
+        coordinates = (*(Array(each, self.sizes) for each in system.fields), *(Array(x, ()) for x in system.scalars))
+        momenta = tuple(Array(each, self.sizes) for each in system.momenta)
+        function = "hamiltonian" if momenta else "lagrangian"
+        summed = [*self.kinetic(), *self.in_space(), *self.at_places()]
+        texts: dict[str, Any] = {"coordinates": [*map(str, coordinates)], "momenta": [*map(str, momenta)]}
+        texts |= {function: "\n+ ".join(map(text_of, summed))}
+        forces: list[ArrayForce] = []
         if system.dissipation != 0:
-            here = {axis: f"i{axis}" for axis in self.axes}
-            rates = {rate.name: self.at(f"{rate.name[:-2]}_dot", here) for rate in system.rates}
-            dissipation = self.over_points(
-                f"({self.written(system.dissipation, rates | self.at_points([*self.axes]))})"
-            )
+            damped = self.over_points(self.at_points(system.dissipation, system.rates))
+            velocities = {Array(each.name + DOT, each.axes): each for each in coordinates}
+            forces += friction(self.terms([damped]), velocities)
+            texts["dissipation"] = text_of(damped)
+        terms = self.terms(summed)
         tables = {f"nodes_{name}": axis.table for name, axis in self.axes.items() if axis.table is not None}
         tables |= {f"edges_{name}": axis.edges.table for name, axis in self.axes.items() if axis.edges is not None}
-        text = "\n+ ".join(terms)
-        tables = {name: table for name, table in tables.items() if f"{name}[" in text}
-        conjugate = [f"{each}[{sizes}]" for each in system.momenta]
-        arguments: dict[str, Any] = {
-            "name": system.name,
-            "coordinates": [*(f"{each}[{sizes}]" for each in system.fields), *system.scalars],
-            "parameters": {
-                **dict(zip(map(str, system.parameters), system.defaults, strict=True)),
-                **{f"{name}[{size}]": values for name, (size, values) in self.used.items()},
-            },
-            "tables": {
-                f"{name}[{'F' if name.startswith('edges') else 'E'}{name[6:]}, {table.shape[1]}]": table
-                for name, table in tables.items()
-            },
+        used = {place.table for access in self.accesses.values() for place in access.places}
+        tables = {name: table for name, table in tables.items() if name in used}
+        declared = {
+            name: Array(name, (Size(f"{'F' if name.startswith('edges') else 'E'}{name[6:]}"), Size("", table.shape[1])))
+            for name, table in tables.items()
         }
-        if conjugate:
-            assembled: Any = HamiltonianSystem.from_text(**arguments, momenta=conjugate, hamiltonian=text)
-        else:
-            assembled = LagrangianSystem.from_text(**arguments, lagrangian=text, dissipation=dissipation)
+        texts |= {"tables": [*map(str, declared.values())]}
         grids = np.meshgrid(*(axis.points for axis in self.axes.values()), indexing="ij")
         masses = np.meshgrid(*(axis.weights for axis in self.axes.values()), indexing="ij")
-        parts: dict[str, Any] = {
+        mesh: dict[str, Any] = {
             "field_system": system,
             "axes": tuple(self.axes.values()),
             "points": dict(zip(self.axes, grids, strict=True)),
             "weights": np.prod(masses, axis=0),
             "discretisation": discretisation,
         }
-        return MeshSystem(system=replace(assembled, mesh=Mesh(**parts)), **parts)
+        assembled = (ArrayHamiltonian if momenta else ArrayLagrangian)(
+            name=system.name,
+            coordinates=coordinates,
+            momenta=momenta,
+            time=symbol(TIME),
+            parameters=system.parameters,
+            defaults=system.defaults,
+            fields=tuple(Array(name, sizes) for name, (sizes, _) in self.used.items()),
+            field_defaults=(1.0,) * len(self.used),
+            tables=tuple(declared.values()),
+            terms=terms,
+            forces=tuple(forces),
+            definition={key: text for key, text in texts.items() if text},
+            data={name: values for name, (_, values) in self.used.items()} | tables,
+            mesh=Mesh(**mesh),
+        )
+        assembled.warn_of_mistakes()
+        return MeshSystem(system=assembled, **mesh)
 
-    def array(self, name: str, size: str, values: Any, index: str) -> str:
-        """Return the text of an entry of an array, or its number if all entries are equal."""
-        if (value := same(values)) is not None:
-            return digits(mp.mpf(value))
-        self.used[name] = (size, values)
-        return f"{name}[{index}]"
+    def terms(self, summed: Sequence[Summed]) -> tuple[ArrayTerm, ...]:
+        """Return one term for each tuple of loops, with all sums over the points of a cell carried out."""
+        by_loops: dict[tuple[Loop, ...], list[Expr]] = {}
+        for loops, formula in sorted(summed, key=lambda pair: not pair[0]):
+            by_loops.setdefault(loops, []).append(formula.doit())
+        return tuple(term_of(loops, Add(*parts), self.accesses) for loops, parts in by_loops.items())
 
-    def weight(self, axis: str) -> str:
-        """Return the text of the weight of a point along an axis."""
-        return self.array(f"weight_{axis}", f"N{axis}", self.axes[axis].weights, f"i{axis}")
+    def entry(self, name: str, sizes: tuple[Size, ...], places: Sequence[Place | Slot], *sums: Convolution) -> Symbol:
+        """Return the symbol of an entry of an array, or of convolutions of it."""
+        indices = (each if isinstance(each, Place) else place_of(each) for each in places)
+        access = Access(array=Array(name, sizes), places=tuple(indices), sums=sums)
+        slot = symbol(str(access))
+        self.accesses[slot] = access
+        return slot
 
-    def at_points(self, axes: Sequence[str]) -> dict[str, str]:
-        """Return the texts of the coordinates of points along axes."""
-        return {axis: f"{axis}_points[i{axis}]" for axis in axes}
+    def value(self, name: str, sizes: tuple[Size, ...], values: Any, *places: Place | Slot) -> Symbol:
+        """Return the symbol of an entry of an array of numbers."""
+        self.used[name] = (sizes, values)
+        return self.entry(name, sizes, places)
 
-    def at(self, each: str, indices: Mapping[str, str]) -> str:
-        """Return the text of a field at a point; that of a momentum is divided by the weight of the point."""
-        entry = f"{each}[{', '.join(indices.values())}]"
-        if each not in self.system.momenta:
+    def common(self, name: str, size: str, values: Any, place: Place) -> Expr:
+        """Return an entry of an array, or its number if all entries are equal."""
+        number = same(values)
+        return self.value(name, (Size(size),), values, place) if number is None else rational(number)
+
+    def weight(self, axis: str) -> Expr:
+        """Return the weight of a point along an axis."""
+        return self.common(f"weight_{axis}", f"N{axis}", self.axes[axis].weights, self.here[axis])
+
+    def at(self, name: str, places: Mapping[str, Place], *sums: Convolution) -> Expr:
+        """Return a field at a point; a momentum is divided by the weight of the point."""
+        entry = self.entry(name, self.sizes, [*places.values()], *sums)
+        if name not in self.system.momenta:
             return entry
         inverse = [
-            self.array(f"per_weight_{axis}", f"N{axis}", 1 / self.axes[axis].weights, index)
-            for axis, index in indices.items()
+            self.common(f"per_weight_{axis}", f"N{axis}", 1 / self.axes[axis].weights, place)
+            for axis, place in places.items()
         ]
-        return f"{'*'.join(inverse)}*{entry}"
+        return reduce(mul, [*inverse, entry])
 
-    def kinetic(self) -> Iterator[str]:
+    def at_points(self, formula: Expr, rates: Sequence[Symbol] = ()) -> Expr:
+        """Return a formula of fields, their velocities and places at a point."""
+        velocities = {rate: self.entry(f"{rate.name[:-2]}{DOT}", self.sizes, [*self.here.values()]) for rate in rates}
+        fields = {symbol(each): self.at(each, self.here) for each in self.names_in(formula, self.system.variables)}
+        places = {symbol(axis): self.coordinate(axis) for axis in self.names_in(formula, self.axes)}
+        return formula.xreplace(velocities | fields | places)
+
+    def names_in(self, formula: Expr, names: Iterable[str]) -> list[str]:
+        """Return the names that a formula contains."""
+        return [each for each in names if symbol(each) in formula.free_symbols]
+
+    def coordinate(self, axis: str) -> Expr:
+        """Return the coordinate of a point along an axis."""
+        return self.value(f"{axis}_points", (Size(f"N{axis}"),), self.axes[axis].points, self.here[axis])
+
+    def kinetic(self) -> Iterator[Summed]:
         """Yield the kinetic energy of each field."""
         if self.system.momenta:
             return
         for each, rate in zip(self.system.fields, self.system.rates, strict=True):
-            mass = self.system.density.diff(rate, 2)
-            here = ", ".join(f"i{axis}" for axis in self.axes)
-            yield self.over_points(f"({self.written(mass, self.at_points([*self.axes]))})*{each}_dot[{here}]**2/2")
+            mass = self.at_points(self.system.density.diff(rate, 2))
+            yield self.over_points(mass, self.entry(each + DOT, self.sizes, [*self.here.values()]) ** 2, Rational(1, 2))
 
-    def at_places(self) -> Iterator[str]:
+    def at_places(self) -> Iterator[Summed]:
         """Yield the point Lagrangians."""
         for place, formula in self.system.point_lagrangians:
             rows = [self.axes[axis].interpolation(at).items() for axis, at in place.items()]
-            terms = [
-                (", ".join(str(k) for k, _ in row), math.prod(x for _, x in row)) for row in itertools.product(*rows)
-            ]
-            known = {each.name for each in formula.free_symbols}
-            texts = {f"{each}_{TIME}": f"{each}_dot" for each in self.system.scalars}
+            points = [([k for k, _ in row], math.prod(x for _, x in row)) for row in itertools.product(*rows)]
+            values: dict[Symbol, Expr] = {}
+            for each in self.system.scalars:
+                values |= {symbol(each): self.entry(each, (), ())}
+                values |= {symbol(f"{each}_{TIME}"): self.entry(each + DOT, (), ())}
             for each in self.system.fields:
-                if f"{each}_{TIME}" in known and len(terms) > 1:
+                if (rate := symbol(f"{each}_{TIME}")) in formula.free_symbols and len(points) > 1:
                     raise SystemDefinitionError(
                         f"the point Lagrangian at {place_text(place)} contains {each}_{TIME}, but no point of the mesh "
                         'is there: choose points= such that one is, or "spectral-elements", whose elements end there'
                     )
-                texts[f"{each}_{TIME}"] = f"{each}_dot[{terms[0][0]}]"
-                texts[each] = " + ".join(f"{digits(x)}*{each}[{index}]" for index, x in terms)
+                values[rate] = self.entry(each + DOT, self.sizes, points[0][0])
+                values[symbol(each)] = Add(*(rational(x) * self.entry(each, self.sizes, k) for k, x in points))
             rates = [symbol(f"{each}_{TIME}") for each in (*self.system.fields, *self.system.scalars)]
             rest = formula.xreplace(dict.fromkeys(rates, sympy.S.Zero))
-            yield from (f"({self.written(part, texts)})" for part in (sympy.expand(formula - rest), rest) if part != 0)
+            yield from (((), part.xreplace(values)) for part in (sympy.expand(formula - rest), rest) if part != 0)
 
-    def over_points(self, body: str) -> str:
-        """Return the text of the quadrature of a body over all points."""
-        loops = ", ".join(f"i{axis} in N{axis}" for axis in self.axes)
-        return f"sum({loops}, {'*'.join(map(self.weight, self.axes))}*{body})"
+    def over_points(self, *factors: Expr) -> Summed:
+        """Return the quadrature of a product over all points."""
+        loops = tuple(span(f"i{axis}", f"N{axis}") for axis in self.axes)
+        return loops, reduce(mul, [*map(self.weight, self.axes), *factors])
 
-    def in_space(self) -> Iterator[str]:
+    def in_space(self) -> Iterator[Summed]:
         """Yield the sums of the terms without velocities, grouped by the axes of their derivatives."""
         derivatives = self.system.derivatives
         groups: dict[tuple[str, ...], Expr] = {}
@@ -162,11 +222,9 @@ class Assembly:
             elif key:
                 yield from self.over_cells(key, term)
             else:
-                here = {axis: f"i{axis}" for axis in self.axes}
-                texts = {each: self.at(each, here) for each in self.system.variables} | self.at_points([*self.axes])
-                yield self.over_points(f"({self.written(term, texts)})")
+                yield self.over_points(self.at_points(term))
 
-    def over_pairs(self, term: Expr) -> Iterator[str]:
+    def over_pairs(self, term: Expr) -> Iterator[Summed]:
         """Yield the terms of Fourier axes: sums over pairs of points of quadratic terms, then those of derivatives."""
         rest = term
         for name, (each, orders) in self.system.derivatives.items():
@@ -175,230 +233,236 @@ class Assembly:
                 continue
             ((axis, order),) = orders.items()
             rest -= factor * symbol(name) ** 2 / 2
-            matrix, values = f"pairs{order}_{axis}", self.axes[axis].pairs[order - 1]
-            pair = f"i{axis}, j{axis}" if values.ndim == 2 else f"j{axis}-i{axis}"
-            self.used[matrix] = (", ".join([f"N{axis}"] * values.ndim), values)
+            values, i, j = self.axes[axis].pairs[order - 1], f"i{axis}", f"j{axis}"
+            pair = (Place(index=i), Place(index=j)) if values.ndim == 2 else (Place(index=j, minus=i),)
             others = [a for a in self.axes if a != axis]
-            loops = ", ".join([*(f"i{a} in N{a}" for a in others), f"i{axis} < j{axis} in N{axis}"])
-            one, two = (self.at(each, {a: f"{letter if a == axis else 'i'}{a}" for a in self.axes}) for letter in "ij")
-            factors = "*".join([f"({self.written(factor, {})})", *map(self.weight, others), f"{matrix}[{pair}]"])
-            yield f"sum({loops}, {factors}*({one} - {two})**2/2)"
+            loops = (*(span(f"i{a}", f"N{a}") for a in others), span(i, f"N{axis}"))
+            matrix = self.value(f"pairs{order}_{axis}", (Size(f"N{axis}"),) * values.ndim, values, *pair)
+            difference = self.at(each, self.here) - self.at(each, self.here | {axis: Place(index=j)})
+            factors = [factor, *map(self.weight, others), matrix, difference**2, Rational(1, 2)]
+            yield (*loops, replace(span(j, f"N{axis}"), behind=i)), reduce(mul, factors)
         if sympy.expand(rest) != 0:
-            yield self.over_points(f"({self.written(rest, self.fourier_derivatives(rest))})")
+            derivatives = {
+                symbol(name): self.fourier_derivative(rest, *self.system.derivatives[name])
+                for name in self.names_in(rest, self.system.derivatives)
+            }
+            yield self.over_points(self.at_points(rest).xreplace(derivatives))
 
-    def fourier_derivatives(self, term: Expr) -> dict[str, str]:
-        """Return the texts of fields and their Fourier derivatives at a point, by convolutions or dense matrices."""
-        here = {axis: f"i{axis}" for axis in self.axes}
-        texts = {each: self.at(each, here) for each in self.system.variables} | self.at_points([*self.axes])
-        for name, (each, orders) in self.system.derivatives.items():
-            if symbol(name) not in term.free_symbols:
-                continue
-            texts[name] = self.at(each, {axis: f"j{axis}" if axis in orders else f"i{axis}" for axis in self.axes})
-            for axis, order in orders.items():
-                discretised, count = self.axes[axis], len(self.axes[axis].points)
-                if discretised.pairs[0].ndim == 1:
-                    self.used[f"derivative_{axis}"] = (f"N{axis}", discretised.rates)
-                    j, others = f"j{axis}", [f"k{axis}"] * (order - 1)
-                    for before, index in itertools.pairwise([j, *others, f"i{axis}"]):
-                        by = f"derivative_{axis}[{before}-{index}]"
-                        texts[name] = f"sum({before} in N{axis}, {by}*{texts[name]})"
-                    continue
-                if count > MAX_UNROLLED_TERMS:
-                    raise SystemDefinitionError(
-                        f"derivative=\"dense\" of more than {MAX_UNROLLED_TERMS} points of '{axis}' needs densities "
-                        "that are quadratic in derivatives along one axis with constant factors, not "
-                        f'{sympy.expand(term)}: use derivative="fft"'
-                    )
-                matrix = f"derivatives{order}_{axis}"
-                first = discretised.differentiated(np.eye(count), 0)
-                self.used[matrix] = (f"{count}, {count}", np.linalg.matrix_power(first, order))
-                texts[name] = f"sum(j{axis} in {count}, {matrix}[i{axis}, j{axis}]*{texts[name]})"
-        return texts
+    def fourier_derivative(self, term: Expr, each: str, orders: Mapping[str, int]) -> Expr:
+        """Return a Fourier derivative of a field at a point, by convolutions or dense matrices."""
+        sums, dense = [], {}
+        for position, axis in enumerate(self.axes):
+            order, discretised, count = orders.get(axis, 0), self.axes[axis], len(self.axes[axis].points)
+            if order and discretised.pairs[0].ndim == 1:
+                array = Array(f"derivative_{axis}", (Size(f"N{axis}"),))
+                self.used[array.name] = (array.axes, discretised.rates)
+                sums += [Convolution(position, array, f"{letter}{axis}") for letter in "jk"[:order]]
+            elif order and count > MAX_UNROLLED_TERMS:
+                raise SystemDefinitionError(
+                    f"derivative=\"dense\" of more than {MAX_UNROLLED_TERMS} points of '{axis}' needs densities "
+                    "that are quadratic in derivatives along one axis with constant factors, not "
+                    f'{sympy.expand(term)}: use derivative="fft"'
+                )
+            elif order:
+                dense[axis] = np.linalg.matrix_power(discretised.differentiated(np.eye(count), 0), order)
 
-    def over_cells(self, key: tuple[str, ...], term: Expr) -> Iterator[str]:
+        def value(places: Mapping[str, Place], left: Sequence[str]) -> Expr:
+            if not left:
+                return self.at(each, places, *sums)
+            *others, axis = left
+            name, size = f"derivatives{orders[axis]}_{axis}", Size("", len(dense[axis]))
+
+            def summand(k: Slot) -> Expr:
+                factor = self.value(name, (size, size), dense[axis], Place(index=f"i{axis}"), k)
+                return factor * value({**places, axis: place_of(k)}, others)
+
+            return total(f"j{axis}", size.number, summand)
+
+        return value(self.here, [*dense])
+
+    def over_cells(self, key: tuple[str, ...], term: Expr) -> Iterator[Summed]:
         """Yield the sums over cells of the axes of the derivatives, and over the points of the other axes."""
         others = [axis for axis in self.axes if axis not in key]
         for cells in itertools.product(*(self.kinds(axis, term) for axis in key)):
             chosen = dict(zip(key, cells, strict=True))
-            loops = [each.loop for each in cells if each.loop] + [f"i{axis} in N{axis}" for axis in others]
-            factors = [self.size(axis, each) for axis, each in chosen.items()]
+            loops = (*(each.loop for each in cells if each.loop), *(span(f"i{axis}", f"N{axis}") for axis in others))
+            factors = [factor for axis, each in chosen.items() for factor in self.size(axis, each)]
             factors += map(self.weight, others)
-            body = f"{'*'.join(factors)}*({self.quadrature(chosen, others, term)})"
-            yield f"sum({', '.join(loops)}, {body})" if loops else f"({body})"
+            yield loops, reduce(mul, [*factors, self.quadrature(chosen, others, term, {})])
 
     def kinds(self, axis: str, term: Expr) -> list[Cells]:
         """Return the cells of an axis, of elements with their edges if a term has second derivatives along it."""
         discretised, derivatives = self.axes[axis], self.system.derivatives
-        second = [name for name, (_, orders) in derivatives.items() if orders.get(axis) == 2]
-        if discretised.edges is None or not any(symbol(name) in term.free_symbols for name in second):
+        second = [name for name in self.names_in(term, derivatives) if derivatives[name][1].get(axis) == 2]
+        if discretised.edges is None or not second:
             return [*discretised.cells]
         return [*(replace(each, interior=True) for each in discretised.cells), *discretised.edges.cells]
 
-    def size(self, axis: str, cells: Cells) -> str:
-        """Return the text of the Jacobian of a cell, or of the weight of an edge."""
+    def size(self, axis: str, cells: Cells) -> list[Expr]:
+        """Return the factors of the Jacobian of a cell, or of the weight of an edge."""
         discretised = self.axes[axis]
         if cells.edge and discretised.edges:
-            return self.array(f"edge_weight_{axis}", f"F{axis}", discretised.edges.weights, cells.index)
-        size = self.array(f"jacobian_{axis}", self.extent(axis), discretised.jacobians, cells.index)
-        return size if cells.weight == 1 else f"{digits(cells.weight)}*{size}"
+            return [self.common(f"edge_weight_{axis}", f"F{axis}", discretised.edges.weights, cells.index)]
+        size = self.common(f"jacobian_{axis}", self.extent(axis), discretised.jacobians, cells.index)
+        return [size] if cells.weight == 1 else [rational(cells.weight), size]
 
     def extent(self, axis: str) -> str:
         """Return the size that counts the cells of an axis."""
         return f"N{axis}" if self.axes[axis].table is None and self.axes[axis].periodic else f"E{axis}"
 
-    def quadrature(self, chosen: Mapping[str, Cells], others: Sequence[str], term: Expr) -> str:
-        """Return the text of the weighted sum of a term over the quadrature points of a cell.
+    def quadrature(
+        self, chosen: Mapping[str, Cells], others: Sequence[str], term: Expr, node: Mapping[str, Slot]
+    ) -> Expr:
+        """Return the weighted sum of a term over the quadrature points of a cell.
 
-        Along an axis whose cells have as many points as quadrature points, all of them unknown, this is a sum over an
-        index, ``ax``; otherwise the terms are written out.
+        Args:
+            chosen: kind of cells by axis.
+            others: the other axes.
+            term: of the density.
+            node: index of the quadrature point along the axes that are summed already.
         """
-        nodes: list[list[str]] = []
-        sums: list[str] = []
-        for name, cells in chosen.items():
-            count = 1 if cells.edge else len(self.axes[name].quadrature)
-            alike = cells.rule is not None
-            nodes.append([f"a{name}"] if alike else [str(k) for k in range(count)])
-            sums += [f"a{name} in {count}"] * alike
-        parts = []
-        for node in itertools.product(*nodes):
-            at = dict(zip(chosen, node, strict=True))
-            texts = self.at_points(others)
-            for name, k in at.items():
-                edge, index = chosen[name].edge, chosen[name].index
-                texts[name] = f"{name}_at_edges[{index}]" if edge else f"{name}_in_cells[{index}, {k}]"
-            texts |= {each: self.combined(each, {}, chosen, at) for each in self.system.variables}
-            for name, (each, orders) in self.system.derivatives.items():
-                if set(orders) <= set(chosen) and symbol(name) in term.free_symbols:
-                    texts[name] = self.derivative(each, orders, chosen, at)
-            weights = ["1" if chosen[name].edge else self.quadrature_weight(name, chosen, k) for name, k in at.items()]
-            parts.append("*".join([*(each for each in weights if each != "1"), f"({self.written(term, texts)})"]))
-        body = " + ".join(parts)
-        for each in reversed(sums):
-            body = f"sum({each}, {body})"
-        return body
+        if left := [axis for axis in chosen if axis not in node]:
+            axis, cells = left[0], chosen[left[0]]
+            count = 1 if cells.edge else len(self.axes[axis].quadrature)
 
-    def coefficient(self, order: int | None, axis: str, index: tuple[str, ...], cells: Cells) -> str:
-        """Return the text of an entry of the operator of a derivative, or of the quadrature for ``None``."""
+            def part(k: Slot) -> Expr:
+                return self.quadrature(chosen, others, term, {**node, axis: k})
+
+            return total(f"a{axis}", count, part) if cells.table else Add(*map(part, range(count)))
+        system = self.system
+        values = {symbol(each): self.combined(each, {}, chosen, node) for each in self.names_in(term, system.variables)}
+        for name in self.names_in(term, system.derivatives):
+            each, orders = system.derivatives[name]
+            values[symbol(name)] = self.derivative(each, orders, chosen, node)
+        weights = [self.quadrature_weight(axis, chosen[axis], k) for axis, k in node.items() if not chosen[axis].edge]
+        for axis in self.names_in(term, [*others, *node]):
+            inside = axis in node
+            values[symbol(axis)] = self.in_cells(axis, chosen[axis], node[axis]) if inside else self.coordinate(axis)
+        return reduce(mul, [*weights, term.xreplace(values)])
+
+    def in_cells(self, axis: str, cells: Cells, k: Slot) -> Expr:
+        """Return the coordinate of a quadrature point of a cell, or of an edge."""
+        discretised = self.axes[axis]
+        if cells.edge and discretised.edges:
+            return self.value(f"{axis}_at_edges", (Size(f"F{axis}"),), discretised.edges.points, cells.index)
+        sizes = (Size(self.extent(axis)), Size("", len(discretised.quadrature)))
+        return self.value(f"{axis}_in_cells", sizes, discretised.cell_points, cells.index, k)
+
+    def coefficient(self, order: int | None, axis: str, index: tuple[Slot, ...], cells: Cells) -> Expr:
+        """Return an entry of the operator of a derivative, or of the quadrature for ``None``."""
         operators = cells.operators or self.axes[axis].operators
         entries: Any = self.axes[axis].quadrature if order is None else operators[order]
         if self.axes[axis].table is None:
             for k in index:
-                entries = entries[int(k)]
-            return digits(entries)
+                entries = entries[k]
+            return rational(entries)
         name = f"weights_{axis}" if order is None else f"D{order if order > 1 else ''}_{axis}"
-        if name not in self.used:
-            values = np.array([list(map(float, row)) for row in entries] if order else list(map(float, entries)))
-            self.used[name] = (", ".join(map(str, values.shape)), values)
-        return f"{name}[{', '.join(index)}]"
+        values = np.array([list(map(float, row)) for row in entries] if order else list(map(float, entries)))
+        return self.value(name, sizes_of(values), self.used.get(name, ((), values))[1], *index)
 
-    def quadrature_weight(self, axis: str, chosen: Mapping[str, Cells], k: str) -> str:
-        """Return the text of a quadrature weight, 0 at the ends of elements if these are edges."""
-        if not chosen[axis].interior:
-            return self.coefficient(None, axis, (k,), chosen[axis])
+    def quadrature_weight(self, axis: str, cells: Cells, k: Slot) -> Expr:
+        """Return a quadrature weight, 0 at the ends of elements if these are edges."""
+        if not cells.interior:
+            return self.coefficient(None, axis, (k,), cells)
         values = np.array([0.0, *map(float, self.axes[axis].quadrature[1:-1]), 0.0])
-        self.used[f"interior_weights_{axis}"] = (str(len(values)), values)
-        return f"interior_weights_{axis}[{k}]"
+        return self.value(f"interior_weights_{axis}", sizes_of(values), values, k)
 
-    def at_edge(self, axis: str, order: int, cells: Cells, values: Sequence[str]) -> str:
-        """Return the text of a derivative at an edge from the values to the left and to the right."""
+    def at_edge(self, axis: str, order: int, cells: Cells, values: Sequence[Expr]) -> Expr:
+        """Return a derivative at an edge from the values to the left and to the right."""
         edges, half, sides = self.axes[axis].edges, len(values) // 2, []
         assert edges is not None
-        name, factor = f"edge_rows{order}_{axis}", f"edge_factors{order}_{axis}"
-        self.used |= {name: (f"2, {half}", edges.rows[order]), factor: (f"F{axis}, 2", edges.scales[order])}
+        rows, scales = edges.rows[order], edges.scales[order]
         for side, part in enumerate((values[:half], values[half:])):
-            terms = [f"{name}[{side}, {b}]*{value}" for b, value in enumerate(part) if value != "0"]
-            sides.append(f"{factor}[{cells.index}, {side}]*({' + '.join(terms) or '0'})")
-        return f"({' + '.join(sides)})"
+            terms = [
+                self.value(f"edge_rows{order}_{axis}", sizes_of(rows), rows, side, b) * x for b, x in enumerate(part)
+            ]
+            factors = (Size(f"F{axis}"), Size("", 2)), scales, cells.index, side
+            sides.append(self.value(f"edge_factors{order}_{axis}", *factors) * Add(*terms))
+        return Add(*sides)
 
     def derivative(
-        self, each: str, orders: Mapping[str, int], chosen: Mapping[str, Cells], at: Mapping[str, str]
-    ) -> str:
-        """Return the text of a derivative of a field at a quadrature point of a cell."""
-        factors = []
+        self, each: str, orders: Mapping[str, int], chosen: Mapping[str, Cells], node: Mapping[str, Slot]
+    ) -> Expr:
+        """Return a derivative of a field at a quadrature point of a cell."""
+        factor = sympy.S.One
         for axis, order in orders.items():
-            discretised = self.axes[axis]
-            if chosen[axis].edge:
-                continue
-            by = self.array(f"inverse_{axis}", self.extent(axis), 1 / discretised.jacobians, chosen[axis].index)
-            factors += [by] * order
-        return "*".join([*factors, f"({self.combined(each, orders, chosen, at)})"])
+            if not chosen[axis].edge:
+                inverse = 1 / self.axes[axis].jacobians
+                factor *= self.common(f"inverse_{axis}", self.extent(axis), inverse, chosen[axis].index) ** order
+        value = self.combined(each, orders, chosen, node)
+        return value.scaled(factor) if isinstance(value, InnerSum) and factor.is_number else factor * value
 
     def combined(
         self,
         each: str,
         orders: Mapping[str, int],
         chosen: Mapping[str, Cells],
-        at: Mapping[str, str],
-        slots: Mapping[str, str] | None = None,
-    ) -> str:
-        """Return the text of sums over the points of a cell of coefficients times the values of a field.
+        node: Mapping[str, Slot],
+        slots: Mapping[str, Slot] | None = None,
+    ) -> Expr:
+        """Return sums over the points of a cell of coefficients times the values of a field.
 
         Args:
             each: the field.
             orders: order of the derivative by axis; along others values are interpolated.
-            chosen, at: kind of cells and index of the quadrature point by axis.
+            chosen, node: kind of cells and index of the quadrature point by axis.
             slots: index of the point within the cell along the axes that are summed already.
         """
         slots = slots or {}
         left = [axis for axis in chosen if axis not in slots]
         if not left:
-            return self.entry(each, chosen, slots)
+            return self.in_cell(each, chosen, slots)
         axis = left[0]
         cells, order = chosen[axis], orders.get(axis, 0)
+
+        def inner(slot: Slot) -> Expr:
+            return self.combined(each, orders, chosen, node, {**slots, axis: slot})
+
+        def summand(slot: Slot) -> Expr:
+            return self.coefficient(order, axis, (node[axis], slot), cells) * inner(slot)
+
+        count = len(cells.places)
         if cells.edge:
-            count = len(cells.places)
-            if order == 0:
-                return self.combined(each, orders, chosen, at, {**slots, axis: str(count // 2 - 1)})
-            known = (self.combined(each, orders, chosen, at, {**slots, axis: str(b)}) for b in range(count))
-            return self.at_edge(axis, order, cells, [*known])
+            return self.at_edge(axis, order, cells, [*map(inner, range(count))]) if order else inner(count // 2 - 1)
         if order == 0 and self.axes[axis].table is not None:
-            return self.combined(each, orders, chosen, at, {**slots, axis: at[axis]})
-        if cells.rule is not None:
-            index = f"b{axis}"
-            inner = self.combined(each, orders, chosen, at, {**slots, axis: index})
-            factor = self.coefficient(order, axis, (at[axis], index), cells)
-            return f"sum({index} in {len(cells.places)}, {factor}*{inner})"
-        terms = []
-        for slot in map(str, range(len(cells.places))):
-            value = self.combined(each, orders, chosen, at, {**slots, axis: slot})
-            factor = self.coefficient(order, axis, (at[axis], slot), cells)
-            if "0" not in (value, factor):
-                terms.append(f"({factor})*({value})")
-        return " + ".join(terms) or "0"
+            return inner(node[axis])
+        return total(f"b{axis}", count, summand) if cells.table else Add(*map(summand, range(count)))
 
-    def entry(self, each: str, chosen: Mapping[str, Cells], at: Mapping[str, str]) -> str:
-        """Return the text of a field at the points ``at`` of a cell, or of its prescribed value at an end."""
-        indices: dict[str, str] = {}
-        for axis in self.axes:
-            if axis not in chosen:
-                indices[axis] = f"i{axis}"
-            elif chosen[axis].rule is not None:
-                indices[axis] = f"{chosen[axis].rule}, {at[axis]}]"
+    def in_cell(self, each: str, chosen: Mapping[str, Cells], slots: Mapping[str, Slot]) -> Expr:
+        """Return a field at a point of a cell, or its prescribed value at an end."""
+        places = {**self.here}
+        for axis, cells in chosen.items():
+            if cells.table:
+                places[axis] = Place(index=cells.index.index, table=cells.table, column=slots[axis])
+            elif isinstance(place := cells.places[slots[axis]], Place):
+                places[axis] = place
             else:
-                place = chosen[axis].places[int(at[axis])]
-                if place.index is None:
-                    prescribed = self.system.boundary[axis][place.end][each]
-                    return "0" if prescribed == 0 else f"({self.written(prescribed, {})})"
-                indices[axis] = place.index
-        return self.at(each, indices)
+                prescribed: Expr = self.system.boundary[axis][place][each]
+                return prescribed
+        return self.at(each, places)
 
-    def written(self, formula: Expr, texts: Mapping[str, str]) -> str:
-        """Return a formula as text, with texts in place of names; arrays that it uses are recorded."""
 
-        def replaced(match: re.Match[str]) -> str:
-            name = match[0]
-            if name not in texts:
-                return name
-            if name in self.axes:
-                axis = self.axes[name]
-                if texts[name].startswith(f"{name}_at_edges") and axis.edges:
-                    self.used[f"{name}_at_edges"] = (f"F{name}", axis.edges.points)
-                    return f"({texts[name]})"
-                self.used |= (
-                    {f"{name}_points": (f"N{name}", axis.points)}
-                    if texts[name].startswith(f"{name}_points")
-                    else {f"{name}_in_cells": (f"{self.extent(name)}, {len(axis.quadrature)}", axis.cell_points)}
-                )
-            return f"({texts[name]})"
+def total(index: str, count: int, summand: Callable[[Slot], Expr]) -> Expr:
+    """Return the sum of terms 0, 1, .., count - 1."""
+    return InnerSum(symbol(index), summand(index), *map(summand, range(count)))
 
-        return NAME.sub(replaced, array_text(formula))
+
+def place_of(slot: Slot) -> Place:
+    """Return a number or an index as an index expression."""
+    return Place(index=slot) if isinstance(slot, str) else fixed_place(slot)
+
+
+def sizes_of(values: Any) -> tuple[Size, ...]:
+    """Return the shape of an array."""
+    return tuple(Size("", n) for n in values.shape)
+
+
+def text_of(summed: Summed) -> str:
+    """Return a sum in index notation, with decimal numbers."""
+    loops, formula = summed
+    numbers = {x: Float(x, 25) for x in formula.atoms(Rational) if x.q > SHOWN_DENOMINATOR}
+    behind = {loop.behind for loop in loops}
+    text = array_text(formula.xreplace(numbers))
+    return (
+        f"sum({', '.join(str(loop) for loop in loops if loop.index not in behind)}, {text})" if loops else f"({text})"
+    )

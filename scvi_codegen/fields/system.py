@@ -5,38 +5,31 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from inspect import signature
 from math import isfinite
 from typing import Any
 
-import numpy as np
 import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.fields.assembly import Assembly
-from scvi_codegen.fields.axes import (
-    NATURAL,
-    PERIODIC,
-    Axis,
-    clamped_ends,
-    differences,
-    fourier,
-    held_ends,
-    spectral_elements,
-)
+from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis
 from scvi_codegen.fields.density import Density, derivatives_of
+from scvi_codegen.fields.differences import FiniteDifferences
+from scvi_codegen.fields.elements import SpectralElements
+from scvi_codegen.fields.fourier import Fourier
 from scvi_codegen.fields.laws import FieldDerivation, derivation_of
 from scvi_codegen.fields.mesh import MeshSystem
 from scvi_codegen.formulas.array_statements import array_text
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import TIME, check_names, number, symbol
-from scvi_codegen.validation import checked_count, checks_arguments
+from scvi_codegen.validation import checks_arguments
 
 CLAMPED = "clamped"
 MOST_AXES = 3
 SHORTEST_AXIS, LONGEST_AXIS = 1e-50, 1e50
 """Bounds of lengths, whose fourth powers must be numbers."""
-OPTIONAL = "derivative"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -269,22 +262,23 @@ class FieldSystem(Density):
         if not isinstance(method, str) or method not in DISCRETISATIONS:
             known = ", ".join(DISCRETISATIONS)
             raise SystemDefinitionError(f"there is no discretisation '{method}'; possible: {known}")
-        needed, discretised_axis = DISCRETISATIONS[method]
+        _, _, *needed = signature(DISCRETISATIONS[method]).parameters.values()
         for name in options:
-            if name not in needed:
-                raise SystemDefinitionError(f"'{method}' has no option '{name}'; it has {' and '.join(needed)}")
-        if method != "fourier":
-            self._check_canonical_pairs(method)
+            if name not in {each.name for each in needed}:
+                known = " and ".join(each.name for each in needed)
+                raise SystemDefinitionError(f"'{method}' has no option '{name}'; it has {known}")
         axes = {}
         for axis in self.space:
             chosen = {}
-            for name in needed:
-                value = options.get(name)
+            for each in needed:
+                value = options.get(each.name)
                 value = value.get(axis) if isinstance(value, Mapping) else value
-                if value is None and name != OPTIONAL:
-                    raise SystemDefinitionError(f"'{method}' needs {name}= for the axis '{axis}'")
-                chosen[name] = value
-            axes[axis] = discretised_axis(self, axis, chosen)
+                if value is None and each.default is each.empty:
+                    raise SystemDefinitionError(f"'{method}' needs {each.name}= for the axis '{axis}'")
+                chosen[each.name] = value
+            axes[axis] = DISCRETISATIONS[method](self, axis, **chosen)
+        if not all(axis.pairs for axis in axes.values()):
+            self._check_canonical_pairs(method)
         return Assembly(self, axes).result({"method": method, **options})
 
     def _check_canonical_pairs(self, method: str) -> None:
@@ -375,57 +369,10 @@ def _at_place(system: Density, scalars: Sequence[str], entry: Any) -> tuple[Mapp
     return place, parse_expression(str(entry["lagrangian"]), {each: symbol(each) for each in names})
 
 
-def _breaks(axis: str, start: float, end: float, elements: Any, places: Sequence[float]) -> Any:
-    """Return the ends of the elements, including the places, at which equal elements are divided."""
-    if np.ndim(elements) == 0:
-        what = f"elements= of '{axis}' (a number of elements or their ends)"
-        count = checked_count(elements, what, least=1, error=SystemDefinitionError)
-        ends = np.unique([start, *places, end])
-        numbers = np.ceil(np.diff(ends) / (end - start) * count - 1e-9).astype(int)
-        parts = [np.linspace(a, b, n + 1) for a, b, n in zip(ends[:-1], ends[1:], numbers, strict=True)]
-        return np.unique(np.concatenate(parts))
-    breaks = np.asarray(elements, float)
-    if (
-        breaks.ndim != 1
-        or len(breaks) < 2
-        or not (np.diff(breaks) > 0).all()
-        or breaks[0] != start
-        or breaks[-1] != end
-    ):
-        raise SystemDefinitionError(f"the ends of the elements of '{axis}' must ascend from {start:g} to {end:g}")
-    return np.union1d(breaks, places)
-
-
-def _elements(system: FieldSystem, axis: str, options: Mapping[str, Any]) -> Axis:
-    places = [place[axis] for place, _ in system.point_lagrangians] if "elements" in options else []
-    breaks = _breaks(axis, *system.space[axis], options.get("elements", 1), places)
-    boundary = system.boundary[axis]
-    clamped = clamped_ends(boundary, f"{system.fields[0]}_{axis}")
-    return spectral_elements(axis, breaks, options["degree"], held_ends(boundary), clamped)
-
-
-def _fourier(system: FieldSystem, axis: str, options: Mapping[str, Any]) -> Axis:
-    if system.boundary[axis] != PERIODIC:
-        raise SystemDefinitionError(
-            f"'fourier' needs a periodic axis, and '{axis}' has ends: use \"spectral-elements\" or "
-            '"finite-differences"'
-        )
-    return fourier(axis, *system.space[axis], **options)
-
-
-def _differences(system: FieldSystem, axis: str, options: Mapping[str, Any]) -> Axis:
-    second = any(
-        orders.get(axis) == 2 and symbol(name) in system.density.free_symbols
-        for name, (_, orders) in system.derivatives.items()
-    )
-    fixed = held_ends(system.boundary[axis])
-    return differences(axis, system.space[axis], options["points"], options["order"], fixed, second=second)
-
-
-DISCRETISATIONS: Mapping[str, tuple[Sequence[str], Callable[[FieldSystem, str, Mapping[str, Any]], Axis]]] = {
-    "spectral-elements": (("degree", "elements"), _elements),
-    "legendre": (("degree",), _elements),
-    "finite-differences": (("order", "points"), _differences),
-    "fourier": (("points", "derivative"), _fourier),
+DISCRETISATIONS: Mapping[str, Callable[..., Axis]] = {
+    "spectral-elements": SpectralElements.of,
+    "legendre": SpectralElements.one,
+    "finite-differences": FiniteDifferences.of,
+    "fourier": Fourier.of,
 }
-"""Options of each discretisation in space, and the function that discretises an axis of a field system with them."""
+"""Function that discretises an axis of a field system, with its options, by the name of the discretisation."""

@@ -9,7 +9,6 @@ from samples import QUICK_FLAGS
 from scipy.optimize import brentq
 
 import scvi_codegen as sc
-from scvi_codegen.fields.axes import differences
 
 WAVES = "u_t**2/2 - u_x**2/2"
 
@@ -40,7 +39,7 @@ def dense(axis, fixed):
 @pytest.mark.parametrize("order", [2, 4, 6, 8])
 def test_operators_satisfy_summation_by_parts(order):
     """D is exact to degree m, the weights integrate to degree 2 m - 1, and D^T W g is -M g' with the ends."""
-    axis = differences("x", (0.0, 1.0), 41, order, (False, False), second=False)
+    (axis,) = line(("natural", "natural")).discretise("finite-differences", points=41, order=order).axes
     rows, weights, masses = dense(axis, (False, False))
     x = np.linspace(0, 1, 41)
     between = (x[1:] + x[:-1]) / 2
@@ -82,7 +81,7 @@ def test_frequencies_have_the_full_order(order):
     """Lowest but three of a string with one natural end, from a generalised eigenvalue problem."""
     errors = []
     for points in (33, 65):
-        axis = differences("x", (0.0, 1.0), points, order, (True, False), second=False)
+        (axis,) = line((0, "natural")).discretise("finite-differences", points=points, order=order).axes
         rows, weights, masses = dense(axis, (True, False))
         scaled = (np.sqrt(weights)[:, None] * rows / np.sqrt(masses))[:, 1:]
         found = np.sqrt(np.linalg.eigvalsh(scaled.T @ scaled)[3])

@@ -235,3 +235,48 @@ def test_model_file_contains_the_arrays_of_the_mesh(tmp_path):
     sc.save_model(model, tmp_path / "string.toml")
     again = sc.load_model(tmp_path / "string.toml")
     assert np.asarray(again.integrate().q) == pytest.approx(np.asarray(model.integrate().q), abs=1e-15)
+
+
+@pytest.mark.parametrize("ends", ["natural", (0, 0), (0, "natural"), ("natural", 0)])
+@pytest.mark.parametrize("others", ["natural", (0, 0)])
+def test_mixed_derivatives_are_exact_for_polynomials_at_all_ends(ends, others):
+    """Int u_xy^2/2 of u = x (1 - x) y (1 - y), which is 1/18, in elements at prescribed and natural ends."""
+    field = sc.FieldSystem.from_text(
+        "plate", ["u"], {"x": (0, 1), "y": (0, 1)}, "u_t**2/2 - u_xy**2/2", boundary={"x": ends, "y": others}
+    )
+    mesh = field.discretise("spectral-elements", degree=3, elements=2)
+    x, y = mesh.points["x"], mesh.points["y"]
+    stepper = sc.compile_stepper(mesh.system, "stoermer-verlet", flags=QUICK_FLAGS)
+    u = x * (1 - x) * y * (1 - y)
+    assert stepper.energy({"u": u}, {"u": 0 * u}) == pytest.approx(1 / 18, rel=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("ends", "method", "options"),
+    [
+        (("sin(t)", "natural"), "spectral-elements", {"degree": 3, "elements": [0, 0.25, 1]}),
+        (("clamped", 0), "spectral-elements", {"degree": 4, "elements": 4}),
+        ("periodic", "finite-differences", {"order": 2, "points": 16}),
+        ("periodic", "fourier", {"points": 32}),
+        ("periodic", "fourier", {"points": 8}),
+    ],
+)
+def test_semi_discrete_lagrangian_is_read_back_from_its_text(ends, method, options):
+    second = "" if ends == ("sin(t)", "natural") else " - u_xx**4*u"
+    system = string(f"(1 + x)*u_t**2/2 - x*u_x**2/2 - u_x**3{second}", boundary={"x": ends}).discretise(
+        method, **options
+    )
+    system = system.system
+    known = system.definition
+    read = sc.LagrangianSystem.from_text(
+        "read",
+        known["coordinates"],
+        known["lagrangian"],
+        tables=known.get("tables", ()),
+        parameters={str(array): 1.0 for array in system.fields},
+    )
+    at = {str(slot): k / 8 for k, slot in enumerate(sorted({s for term in read.terms for s, _ in term.slots}, key=str))}
+    rule = {sympy.Symbol(name, real=True): value for name, value in {**at, "t": 0.3}.items()}
+    assert [(term.loops, term.slots) for term in read.terms] == [(term.loops, term.slots) for term in system.terms]
+    for one, other in zip(read.terms, system.terms, strict=True):
+        assert float(one.formula.xreplace(rule)) == pytest.approx(float(other.formula.xreplace(rule)), rel=1e-12)
