@@ -9,10 +9,10 @@ import numpy as np
 
 from scvi_codegen.cli.reports import counted, duration, momentum_report
 from scvi_codegen.cli.supervision import check_memory, interruptions, progress_bar
-from scvi_codegen.files.energy import energy_reason
+from scvi_codegen.files.energy import MOST_BALANCED_STEPS, energy_account, energy_reason
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.ensemble_file import EnsembleStates
-from scvi_codegen.native.options import FAILURES, SolverOptions
+from scvi_codegen.native.options import FAILURES
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
@@ -42,7 +42,7 @@ class _Stop(Exception):  # noqa: N818  (no error)
     """Raised from the progress callback to end the run after a signal."""
 
 
-def integrate_states(states: EnsembleStates, *, options: SolverOptions | None = None) -> EnsembleOutcome:
+def integrate_states(states: EnsembleStates) -> EnsembleOutcome:
     """Integrate the model from each initial state, with a progress bar, until all end or a signal arrives.
 
     Raises:
@@ -53,7 +53,7 @@ def integrate_states(states: EnsembleStates, *, options: SolverOptions | None = 
     model, began = states.model, time.perf_counter()
     check_memory(model, len(states))
     stepper = model.stepper()
-    work = _work(model, stepper, states, options)
+    work = _work(model, stepper, states)
     started, interrupted = time.perf_counter(), False
     length = work.length
     with interruptions() as caught, progress_bar(length) as show_progress:
@@ -75,16 +75,16 @@ def integrate_states(states: EnsembleStates, *, options: SolverOptions | None = 
     )
 
 
-def _work(model: Model, stepper: Stepper, states: EnsembleStates, options: SolverOptions | None) -> Ensemble:
+def _work(model: Model, stepper: Stepper, states: EnsembleStates) -> Ensemble:
     """Return the compiled ensemble; Ctrl-C still ends the process here."""
     start = stepper, states.q, states.momenta(stepper)
-    work = Ensemble(*start, parameters=states.parameters, options=options, **model._run_arguments())
+    work = Ensemble(*start, parameters=states.parameters, options=model.solver_options, **model._run_arguments())
     if work.common is not None:
         work.common.blocks()
     return work
 
 
-def ensemble_summary(model: Model, outcome: EnsembleOutcome) -> str:
+def ensemble_summary(model: Model, outcome: EnsembleOutcome, balance: float | None) -> str:
     """Return a summary of an ensemble in a few lines."""
     result = outcome.result
     steps = int(result.steps.sum())
@@ -98,7 +98,7 @@ def ensemble_summary(model: Model, outcome: EnsembleOutcome) -> str:
         f"prepared in {outcome.preparation:.2f} s",
         ", ".join(f"{number} {status}" for status, number in [("ok", counts.pop("ok", 0)), *sorted(counts.items())]),
     ]
-    return "\n".join([*lines, *_failures(result), _energy_report(result), *momentum_report(result)])
+    return "\n".join([*lines, *_failures(result), _energy_report(result, balance), *momentum_report(result)])
 
 
 def _describe_steps(model: Model, result: EnsembleTrajectory) -> str:
@@ -120,17 +120,28 @@ def _failures(result: EnsembleTrajectory) -> Iterator[str]:
         yield f"  and {len(lost) - SHOWN_FAILURES} more"
 
 
-def _energy_report(result: EnsembleTrajectory) -> str:
-    """Return one line: the largest change of the energy among all trajectories."""
+def energy_balance(result: EnsembleTrajectory) -> float | None:
+    """Return the largest |E - E0 - W| of all trajectories where forces act; ``None`` if their work W is unknown."""
+    if not energy_reason(result.stepper) or result.steps.sum() > MOST_BALANCED_STEPS:
+        return None
+    accounts = [energy_account(result[int(j)], limited=True) for j in np.flatnonzero(result.ok)]
+    if not accounts or any(account.work is None for account in accounts):
+        return None
+    return max(float(np.abs(account.values).max()) for account in accounts)
+
+
+def _energy_report(result: EnsembleTrajectory, balance: float | None) -> str:
+    """Return one line: the largest error or change of the energy among all trajectories."""
     energies = result.energy()
     sizes = np.abs(energies[0])
-    why = energy_reason(result.stepper)
-    relative = bool((sizes > 0.0).all()) and not why
+    reason = energy_reason(result.stepper)
+    relative = bool((sizes > 0.0).all()) and not reason
     changes = np.abs(energies - energies[0]) / (sizes if relative else 1.0)
     if not np.isfinite(changes).any():
         return "energy: not finite in any state"
     state, worst = (int(index) for index in np.unravel_index(np.nanargmax(changes), changes.shape))
-    if why:
-        return f"energy: {why}, it changed by {changes[state, worst]:.3g} at most"
-    what = "relative energy error" if relative else "energy error"
-    return f"{what}: {changes[state, worst]:.2e} at most, of trajectory {worst}"
+    if reason:
+        changed = f"energy: {reason}, it changed by {changes[state, worst]:.3g} at most"
+        return changed if balance is None else f"{changed}; energy balance |E - E0 - W| {balance:.1e} at most"
+    title = "relative energy error" if relative else "energy error"
+    return f"{title}: {changes[state, worst]:.2e} at most, of trajectory {worst}"

@@ -70,7 +70,7 @@ def recorded_numbers(recorded: RecordedRun) -> dict[str, Any]:
     }
 
 
-def ensemble_numbers(model: Model, outcome: EnsembleOutcome) -> dict[str, Any]:
+def ensemble_numbers(model: Model, outcome: EnsembleOutcome, balance: float | None) -> dict[str, Any]:
     """Return the numbers of an ensemble."""
     result = outcome.result
     return {
@@ -82,12 +82,14 @@ def ensemble_numbers(model: Model, outcome: EnsembleOutcome) -> dict[str, Any]:
         "seconds": outcome.seconds,
         "preparation_seconds": outcome.preparation,
         **_conserved(result),
+        "energy_balance": balance,
         "failure": "interrupted" if outcome.interrupted else None,
     }
 
 
 def _about(model: Model) -> dict[str, Any]:
-    return {"system": model.system.name, "method": model.method.name, "order": model.method.order}
+    method = {"method": model.method.name, "order": model.method.order}
+    return {"system": model.system.name, **method, "run": model.run_section()}
 
 
 def _array_numbers(model: Model, outcome: RunOutcome) -> dict[str, Any]:

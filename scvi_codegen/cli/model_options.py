@@ -133,7 +133,7 @@ def complete_model(context: click.Context, parameter: click.Parameter, incomplet
 PARSERS: Mapping[str, Mapping[str, Any]] = {
     NUMBER: {"type": float},
     COUNT: {"type": int},
-    SWITCH: {"default": None},
+    SWITCH: {"is_flag": True, "default": None},
     METHOD: {"shell_complete": complete_method},
     NUMBERS: {"callback": _numbers},
     NUMBERS_OR_NAME: {"callback": _numbers_or_name},
@@ -174,6 +174,12 @@ def check_exclusive(choices: Choices) -> None:
     given = [name for name, value in choices.items() if value is not None]
     if pair := next(excluded(given, "initial", "run"), None):
         raise click.UsageError(f"{pair[0].flag} and {pair[1].flag} exclude each other")
+
+
+def check_flag(option: Option, situation: str) -> None:
+    """Reject an option of the command line if it is not available in a situation."""
+    if situation in option.unavailable:
+        raise click.UsageError(f"{option.flag} is not available {situation}: {option.unavailable[situation]}")
 
 
 def _check_method(choices: Choices) -> None:

@@ -21,7 +21,6 @@ from scvi_codegen.files import export
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 from scvi_codegen.models.time_span import whole_steps_in
-from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.results.recording import RecordedRun, load_run, record_run, resume_run
 from scvi_codegen.runtime.run.run import Run
 
@@ -131,7 +130,7 @@ class Recording:
             if value is not None and not recorded:
                 raise click.UsageError(f"{name} requires a run recorded in a folder (-o NAME{SUFFIX})")
 
-    def record(self, model: Model, folder: str, *, options: SolverOptions | None) -> RecordedOutcome:
+    def record(self, model: Model, folder: str) -> RecordedOutcome:
         """Integrate a model into a folder until its end, a failure or a signal; raises as :func:`record_run`."""
         text = None
         with suppress(ModelFileError):
@@ -140,7 +139,7 @@ class Recording:
             raise click.UsageError(
                 "a recorded run in transformed time needs a number of steps: give --step and --steps"
             )
-        run = model.start(options=options)
+        run = model.start()
         return self._with_progress(
             record_run,
             run,

@@ -15,7 +15,6 @@ from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, wa
 from scvi_codegen.files.energy import EnergyAccount
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.models.model import Model
-from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.events.event import Crossings
@@ -63,7 +62,7 @@ class RunOutcome:
 
 
 @without_accuracy_warnings()
-def integrate_model(model: Model, *, options: SolverOptions | None = None, threads: int | None = None) -> RunOutcome:
+def integrate_model(model: Model) -> RunOutcome:
     """Integrate a model with a progress bar until its end, a failed step or a signal.
 
     Raises:
@@ -73,7 +72,7 @@ def integrate_model(model: Model, *, options: SolverOptions | None = None, threa
     """
     check_memory(model)
     began = time.perf_counter()
-    run = model.start(options=options, threads=threads)
+    run = model.start()
     preparation = time.perf_counter() - began
     by_time = model.ends_at_time or bool(model.system.inputs)  # the number of steps is not known in advance
     length = BAR_LENGTH if by_time else model.step_count

@@ -11,7 +11,6 @@ from scvi_codegen.cli.command_group import tell
 from scvi_codegen.cli.reports import duration
 from scvi_codegen.errors import AccuracyWarning, StateError
 from scvi_codegen.models.model import Model
-from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.features import refusal, require
 from scvi_codegen.runtime.run.global_error import GlobalError
 from scvi_codegen.validation import check_tolerance
@@ -32,12 +31,10 @@ def model_with_adaptive_steps(model: Model, tolerance: float) -> Model:
     if tolerance < ROUND_OFF:
         click.echo(f"Warning: tolerance {tolerance:g} is below double precision: round-off is used instead", err=True)
     allowed = tolerance if tolerance >= ROUND_OFF else None
-    return replace(model, h=None, tolerance=allowed, error=None, steps=None, span=model.covered)
+    return model.with_step_size(tolerance=allowed)
 
 
-def model_with_global_error(
-    model: Model, error: float, *, options: SolverOptions | None, threads: int | None = None
-) -> tuple[Model, GlobalError]:
+def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalError]:
     """Return the model with the steps that meet a global error bound, and the estimate of that error.
 
     The estimate compares runs with different steps and is printed. Steps of one tolerance are reproducible to the last
@@ -46,10 +43,10 @@ def model_with_global_error(
     Raises:
         StateError: unless the error is positive and below 1.
     """
-    wanted = replace(model, h=None, tolerance=None, error=error, steps=None, span=model.covered)
+    wanted = model.with_step_size(error=error)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AccuracyWarning)  # reported in the line printed below
-        result = wanted.confirmed(wanted.stepper(), options=options, threads=threads)
+        result = wanted.confirmed(wanted.stepper())
     local = f"local tolerance of {result.tolerance:.1e}" if result.tolerance else "local tolerance of round-off"
     local = f"step of tau of {result.h:.6g}" if result.h else local
     numbers = {
@@ -73,7 +70,7 @@ def model_with_global_error(
     return replace(wanted, tolerance=result.steps["tolerance"], error=None), result
 
 
-def model_with_advised_step(model: Model, tolerance: float, *, options: SolverOptions | None) -> Model:
+def model_with_advised_step(model: Model, tolerance: float) -> Model:
     """Return the model with the fixed step size that pilot runs recommend for an error at the end of the span.
 
     Prints the recommendation and its pilot runs to stdout, warnings to stderr.
@@ -96,7 +93,7 @@ def model_with_advised_step(model: Model, tolerance: float, *, options: SolverOp
         tolerance,
         t=model.t,
         solver=model.solver,
-        options=options,
+        options=model.solver_options,
     )
     numbers = {"h": advice.h, "steps": advice.steps, "message": advice.message, "warnings": list(advice.warnings)}
     tell(_text(advice), advice=numbers)
@@ -107,7 +104,7 @@ def model_with_advised_step(model: Model, tolerance: float, *, options: SolverOp
             f"the recommended run has {advice.steps} steps, more than {MAX_STEPS:g}: use a method of higher order, a "
             f"larger --advise or a shorter --span, or pass --step {advice.h:.6g} to run it"
         )
-    return replace(model, h=advice.h, tolerance=None, error=None, steps=advice.steps, span=None)
+    return model.with_step_size(h=advice.h, steps=advice.steps)
 
 
 def _text(advice: Advice) -> str:

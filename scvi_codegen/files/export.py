@@ -17,7 +17,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, TypeAlias
+from typing import IO, TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,7 +152,7 @@ def check_format(path: str | os.PathLike[str]) -> None:
     suffix = Path(path).suffix.lower()
     if suffix not in WRITERS:
         raise StateError(f"the format of a trajectory is the suffix of its file, one of {FORMATS}, not {str(path)!r}")
-    library = LIBRARIES.get(suffix)
+    library = LABELLED[suffix].library if suffix in LABELLED else None
     if library is not None and importlib.util.find_spec(library) is None:
         raise missing(library, "data")
 
@@ -169,7 +169,7 @@ def write_states(states: States, path: str | os.PathLike[str]) -> None:
     suffix = Path(path).suffix.lower()
     if states.units and suffix not in LABELLED:
         raise StateError(f"the format {suffix} does not support units; {', '.join(LABELLED)} do")
-    write_whole(path, lambda made: WRITERS[suffix](states, made))
+    write_whole(path, lambda new: WRITERS[suffix](states, new))
 
 
 def write_whole(path: str | os.PathLike[str], write: Callable[[Path], None]) -> None:
@@ -177,13 +177,13 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[Path], None]) -> 
     if Path(path).is_dir() and not (Path(path) / ".zgroup").exists():
         raise StateError(f"{str(path)!r} is a folder with other contents: choose another name")
     try:
-        with replaced(path) as made:
-            write(made)
+        with replaced(path) as new:
+            write(new)
     except OSError as error:
         if error.errno is None:
             raise
-        what = f"{os.strerror(error.errno)}: nothing was written, and existing files are unchanged"
-        raise OSError(error.errno, what, str(path)) from error
+        reason = f"{os.strerror(error.errno)}: nothing was written, and existing files are unchanged"
+        raise OSError(error.errno, reason, str(path)) from error
 
 
 def to_dataframe(states: States) -> pandas.DataFrame:
@@ -247,20 +247,26 @@ def _write_csv(states: States, path: Path) -> None:
             np.savetxt(file, np.column_stack(tuple(columns)), delimiter=",", fmt=formats)
 
 
-def _write_labelled(states: States, path: Path, *, write: Callable[[Labelled, Path], None]) -> None:
-    write(states.labelled(), path)
+def _write_labelled(states: States, path: Path, *, suffix: str) -> None:
+    LABELLED[suffix].write(states.labelled(), path)
 
 
-LABELLED: Mapping[str, Callable[[Labelled, Path], None]] = {
-    ".h5": write_hdf5,
-    ".hdf5": write_hdf5,
-    ".nc": write_hdf5,
-    ".zarr": write_zarr,
+class Format(NamedTuple):
+    """Output format: a function that writes a path, and the library that it requires."""
+
+    write: Callable[[Labelled, Path], None]
+    library: str | None = None
+
+
+LABELLED: Mapping[str, Format] = {
+    ".h5": Format(write_hdf5, "h5netcdf"),
+    ".hdf5": Format(write_hdf5, "h5netcdf"),
+    ".nc": Format(write_hdf5, "h5netcdf"),
+    ".zarr": Format(write_zarr, "zarr"),
 }
 """Formats with named dimensions and units, of trajectories and ensembles."""
 WRITERS: Mapping[str, Callable[[States, Path], None]] = {".npz": _write_npz, ".csv": _write_csv} | {
-    suffix: partial(_write_labelled, write=write) for suffix, write in LABELLED.items()
+    suffix: partial(_write_labelled, suffix=suffix) for suffix in LABELLED
 }
 FORMATS = ", ".join(WRITERS)
 """Suffixes of trajectories and ensembles."""
-LIBRARIES = {".h5": "h5netcdf", ".hdf5": "h5netcdf", ".nc": "h5netcdf", ".zarr": "zarr"}

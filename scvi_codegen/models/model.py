@@ -19,9 +19,9 @@ from scvi_codegen.mechanics.first_order import FirstOrderSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import Method, as_method
 from scvi_codegen.methods.galerkin import SVI
-from scvi_codegen.models.options import STATE, real
+from scvi_codegen.models.options import RUN_FIELDS, STATE, VELOCITY, check_alternatives, real
 from scvi_codegen.models.problems import Problem
-from scvi_codegen.models.time_span import TIME_FIELDS, TimeSpan, check_length, check_one_of
+from scvi_codegen.models.time_span import TimeSpan, check_length
 from scvi_codegen.representation import summary
 from scvi_codegen.validation import check_kind
 
@@ -56,8 +56,8 @@ class Model(TimeSpan):
             or axis and angle.
         p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
         velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
-        h, tolerance, error, span, steps, save_every, t, time_transformation, controller: as of
-            :class:`~scvi_codegen.models.time_span.TimeSpan`.
+        h, tolerance, error, span, steps, save_every, t, time_transformation, controller, solver_tolerance,
+            max_iterations, threads: as of :class:`~scvi_codegen.models.time_span.TimeSpan`.
         inputs: by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as :meth:`Stepper.integrate` accepts
             it, or a number; a run requires all inputs of the system.
         fields: arrays of parameters by name, for array sizes known at run time; others keep their default value.
@@ -96,15 +96,16 @@ class Model(TimeSpan):
                 object.__setattr__(self, name, half)
         if arrays is None:
             self._take_attitudes()
-            check_one_of("p", self.p, "velocity (q_dot)", self.velocity)
+            check_alternatives(self, VELOCITY)
+            if self.threads is not None:
+                raise ModelFileError(
+                    "threads require arrays whose sizes are names, coordinates = ['q[N]']: omit threads (--threads)"
+                )
             for name in STATE.values():
                 if (vector := getattr(self, name)) is not None:
                     object.__setattr__(self, name, self._vector(name, vector))
         else:
-            self._check_arrays()
-            for name, declared in (("fields", arrays.fields), ("tables", arrays.tables)):
-                default = {each.name: arrays.data[each.name] for each in declared if each.name in arrays.data}
-                object.__setattr__(self, name, default | dict(getattr(self, name)))
+            self._take_arrays(arrays)
         if self.time_transformation is not None and (self.system.clock is not None or self.span is None):
             raise ModelFileError(
                 f"the reversible controller of the time transformation {self.time_transformation} requires a time "
@@ -129,7 +130,8 @@ class Model(TimeSpan):
         for name, vector in zip(STATE.values(), state, strict=True):
             object.__setattr__(self, name, vector)
 
-    def _check_arrays(self) -> None:
+    def _take_arrays(self, arrays: ArraySystem) -> None:
+        """Check the fields of a model of arrays, and supplement the values of arrays and tables by their defaults."""
         if self.solver != "auto":
             check_solver(self.solver, ModelFileError)
         if self.p is not None and self.velocity is not None:
@@ -138,6 +140,9 @@ class Model(TimeSpan):
             raise ModelFileError(
                 "a time transformation requires known array sizes: use that of the model with_known_sizes()"
             )
+        for name, declared in (("fields", arrays.fields), ("tables", arrays.tables)):
+            default = {each.name: arrays.data[each.name] for each in declared if each.name in arrays.data}
+            object.__setattr__(self, name, default | dict(getattr(self, name)))
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Model):
@@ -242,10 +247,7 @@ class Model(TimeSpan):
         """Compile a stepper for runs of this model; raises as :func:`~scvi_codegen.compile_stepper`."""
         from scvi_codegen.compiler import compile_stepper  # imported here: not needed for reading a model
 
-        if self.controller is not None and self.time_transformation is None and self.h is not None:
-            raise ModelFileError(
-                f"the controller {self.controller} determines adaptive steps: leave out the step size or the controller"
-            )
+        self.check_controller()
         stepper = compile_stepper(
             self.system,
             self.method,
@@ -330,8 +332,8 @@ class Model(TimeSpan):
 
         Args:
             stepper: that of :meth:`stepper`, which is compiled by default.
-            options: convergence criterion of the solver.
-            threads: number of threads per step, for array sizes known at run time.
+            options: convergence criterion of the solver; by default :attr:`solver_options`.
+            threads: number of threads per step, for array sizes known at run time; by default those of the model.
         """
         stepper = stepper or self.stepper()
         state, h, common = self.initial_state(stepper), self.h, self._common(options, threads)
@@ -346,7 +348,7 @@ class Model(TimeSpan):
                 raise ModelFileError(
                     "with inputs, a step size in tau cannot be found by a pilot run: give one (--step, [run] step)"
                 )
-            arguments: dict[str, Any] = {"t": self.t, "parameters": self.parameters, "options": options}
+            arguments: dict[str, Any] = {"t": self.t, "parameters": self.parameters, "options": common["options"]}
             h = largest_step(stepper, self.q, state["p"], self.covered, self.tolerance or 0.0, **arguments)
         to_end = h is None or self.time_transformation is not None
         return stepper.start(
@@ -383,7 +385,12 @@ class Model(TimeSpan):
 
     def _run_arguments(self) -> dict[str, Any]:
         """Return the arguments of :meth:`Stepper.integrate` and ensembles for time, steps, saved states and inputs."""
-        arguments = {option.field: getattr(self, option.field) for option in TIME_FIELDS if option.field != "span"}
+        others = ("span", "threads")
+        arguments = {
+            option.field: getattr(self, option.field)
+            for option in RUN_FIELDS
+            if option.field not in others and not option.solver_option
+        }
         if self.system.inputs:
             arguments["inputs"] = self.all_inputs()
         if self.ends_at_time or self.has_shorter_last_step or (self.system.inputs and self.span is not None):
@@ -393,6 +400,7 @@ class Model(TimeSpan):
         return arguments | {"steps": self.step_count}
 
     def _common(self, options: SolverOptions | None, threads: int | None) -> dict[str, Any]:
+        options, threads = options or self.solver_options, threads or self.threads
         if threads is not None and self.array_system is None:
             raise ModelFileError("threads require arrays whose sizes are names, coordinates = ['q[N]']: omit threads")
         return {"options": options} if threads is None else {"options": options, "threads": threads}

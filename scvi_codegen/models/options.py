@@ -1,26 +1,38 @@
-"""Table of the options of a run: keys of model files, flags of the command line and fields of a :class:`Model`.
+"""Options of a run, one entry each: key of model files, flag of the command line, field of models, check and messages.
 
-Model files are read, checked and written, and the flags of the commands with an argument MODEL are made, from this
-table: an option that a model has as a field is added here and in that class.
+From an entry come the fields of a :class:`Model`, their checks, the reading and writing of model files, the flags of
+the commands with an argument MODEL, the JSON of ``run`` and the arguments of runs (docs/extending.md).
 """
 
+import dataclasses
 import math
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, fields, replace
 from itertools import combinations
 from numbers import Real
-from typing import Any
+from typing import Any, NamedTuple
 
 from scvi_codegen.controllers import CONTROLLERS, SYMPLECTIC
 from scvi_codegen.errors import ModelFileError
-from scvi_codegen.validation import checked_count
+from scvi_codegen.validation import TOLERANCE_RANGE, checked_count
 
 NUMBER, COUNT, TEXT, CHOICE, SWITCH, METHOD = "number", "count", "text", "choice", "switch", "method"
 NUMBERS, NUMBERS_OR_NAME = "numbers", "numbers or name"
 ASSIGNMENTS, INPUTS, SIZES, EVENTS = "assignments", "inputs", "sizes", "events"
 """Kinds of values of an option; those of the last four are a section of a model file."""
-STEP_SIZE, DURATION, VELOCITY = "the step size", "the duration", "the velocity"
-"""What alternative options determine."""
+
+
+class Alternatives(NamedTuple):
+    """Group of options of which at most one is given, or exactly one, and what they determine."""
+
+    purpose: str
+    required: bool = True
+
+
+STEP_SIZE = Alternatives("the step size", required=False)
+DURATION, VELOCITY = Alternatives("the duration"), Alternatives("the velocity")
+IN_ENSEMBLE, WITH_INPUTS = "with --ensemble", "for systems with inputs"
+"""Situations in which some options are not available."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,37 +40,46 @@ class Option:
     """Option of a run.
 
     Attributes:
-        name: parameter of commands; the flag is ``--name`` with hyphens unless ``flag`` is another.
         section: section of model files, "" for an option of the command line alone.
         kind: of its value.
         metavar, help: description of the flag.
+        name: parameter of commands; the flag is ``--name`` with hyphens unless ``flag`` is another.
         key, field: key in the section and field of a model, by default the name.
-        determines: what this option and its alternatives determine: at most one of them is given.
+        determines: what this option and its alternatives determine.
+        brief: its name among alternatives in messages, by default the field.
         least: smallest value of a count.
         choices: values of a choice.
         default: value that means the same as no value.
+        valid, invalid: condition on a number, and the message with ``{value:g}`` if it is not met.
+        unavailable: situations in which the option is not available, with a remedy or the reason.
+        solver_option: field of :class:`~scvi_codegen.SolverOptions` that it sets.
         common: whether all commands with an argument MODEL have it.
     """
 
-    name: str
     section: str
     kind: str
     metavar: str
     help: str
+    name: str = ""
     key: str = ""
     field: str = ""
     flag: str = ""
-    determines: str = ""
+    determines: Alternatives | None = None
+    brief: str = ""
     least: int = 0
     choices: tuple[str, ...] = ()
     default: str | None = None
+    valid: Callable[[float], bool] = math.isfinite
+    invalid: str = ""
+    unavailable: Mapping[str, str] = dataclasses.field(default_factory=dict, hash=False)
+    solver_option: str = ""
     common: bool = True
 
-    def __post_init__(self) -> None:
-        flag = f"--{self.name.replace('_', '-')}"
-        for name, default in (("key", self.name), ("field", self.name), ("flag", flag)):
-            if not getattr(self, name):
-                object.__setattr__(self, name, default)
+    def named(self, name: str) -> "Option":
+        """Return the option with this field, which is also the default of its other names."""
+        name, attribute = self.name or name, self.field or name
+        flag = self.flag or f"--{name.replace('_', '-')}"
+        return replace(self, name=name, field=attribute, key=self.key or name, flag=flag, brief=self.brief or attribute)
 
     @property
     def is_section(self) -> bool:
@@ -66,113 +87,167 @@ class Option:
         return self.kind in (ASSIGNMENTS, INPUTS, SIZES, EVENTS)
 
     def read(self, value: Any, where: str) -> Any:
-        """Return a number of the kind of the option, or raise :class:`ModelFileError` that begins with ``where``."""
+        """Return a value of the kind of the option, or raise :class:`ModelFileError` that begins with ``where``."""
         if self.kind == COUNT:
             return checked_count(value, where, least=self.least, error=ModelFileError)
+        if self.kind == SWITCH:
+            if not isinstance(value, bool):
+                raise ModelFileError(f"{where} must be true or false, not {value!r}")
+            return value
         return real(value, where)
 
+    def checked(self, value: Any) -> Any:
+        """Return a value of a field, or raise :class:`ModelFileError` with the message of the option."""
+        value = self.read(value, self.field)
+        if not self.valid(value):
+            raise ModelFileError(self.invalid.format(value=value))
+        return value
 
-OPTIONS = (
-    Option(
-        *("method", "method", METHOD, "NAME"),
-        "Method, with its degree or number of stages: svi:6, gauss:3, .. (see 'scvi-codegen methods').",
-    ),
-    Option("degree", "method", COUNT, "N", "Degree of the trial curve (svi, scvi, sc), as in svi:N."),
-    Option("stages", "method", COUNT, "N", "Number of stages (gauss, radau-iia, ..), as in gauss:N."),
-    Option("order", "method", COUNT, "N", "Order of a composition of Stoermer-Verlet: 2, 4, 6, 8 or 10."),
-    Option("quadrature", "method", TEXT, "NAME:N", "Quadrature, as in gauss-legendre:8 or clenshaw-curtis:9."),
-    Option("nodes", "method", TEXT, "NAME", "Nodes: chebyshev-lobatto, legendre-lobatto or equispaced."),
-    Option(
-        *("space", "method", TEXT, "NAME"),
-        "Trial space of an SVI: polynomials, trigonometric:RADIANS_A_STEP[:HARMONICS] or splines:PIECES.",
-    ),
-    Option("form", "method", TEXT, "NAME", "phase-space or position (sc and Runge-Kutta methods)."),
-    Option(
-        *("variational", "method", SWITCH, ""),
-        "SCVI: the variational method, or the form printed in the paper, which is not symplectic.",
-        flag="--variational/--printed",
-    ),
-    Option(
-        *("abscissae", "method", NUMBERS_OR_NAME, "C1,C2,.."),
-        "Abscissae in [0, 1] (collocation, scvi); scvi also: gauss, radau-iia, lobatto-iiia, ..",
-    ),
-    Option("parameter", "parameters", ASSIGNMENTS, "NAME=VALUE", "Value of a parameter; may be repeated."),
-    Option(
-        *("inputs", "inputs", INPUTS, "NAME=FILE[:KIND]"),
-        "Tabulated input: columns t and value of a .csv or .npz file, interpolated constant, linear (default) or "
-        "cubic; or a number, NAME=NUMBER; may be repeated.",
-        flag="--input",
-    ),
-    Option("size", "sizes", SIZES, "NAME=N", "Array size of an array model, as N=1000; may be repeated."),
-    Option(
-        *("event", "events", EVENTS, "G[; NAME=VALUE].."),
-        "Zero crossing of G that changes the state, as 'y; direction=-1; p_y=-0.8*p_y', or of a wall, as "
-        "'y; restitution=0.8; where=x > 0'; terminal=N ends the run at the N-th; may be repeated.",
-    ),
-    Option("q", "initial", NUMBERS, "Q1,Q2,..", "Initial coordinates."),
-    Option("p", "initial", NUMBERS, "P1,P2,..", "Initial momenta.", determines=VELOCITY),
-    Option(
-        *("velocity", "initial", NUMBERS, "V1,V2,..", "Initial velocities, instead of momenta."),
-        key="q_dot",
-        determines=VELOCITY,
-    ),
-    Option("time", "initial", NUMBER, "T", "Initial time.", key="t", field="t"),
-    Option(
-        *("step", "run", NUMBER, "H", "Fixed step size (of tau, if transformed); negative: backward."),
-        field="h",
+
+def run_option(section: str, kind: str, metavar: str, help: str, *, default: Any = None, **further: Any) -> Any:  # noqa: A002
+    """Return a field of :class:`RunOptions` with the description of its option."""
+    return dataclasses.field(default=default, metadata={"option": Option(section, kind, metavar, help, **further)})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RunOptions:
+    """Options of a run that are fields of a :class:`Model`: the entries of the table for steps and saved states."""
+
+    t: float = run_option("initial", NUMBER, "T", "Initial time.", name="time", key="t", default=0.0)
+    h: float | None = run_option(
+        *("run", NUMBER, "H", "Fixed step size (of tau, if transformed); negative: backward."),
+        name="step",
         determines=STEP_SIZE,
-    ),
-    Option(
-        *("tolerance", "run", NUMBER, "X"),
+        brief="h (step: fixed step size)",
+        valid=bool,
+        invalid="the step size is 0: it must be positive, or negative for a run backward in time",
+    )
+    tolerance: float | None = run_option(
+        *("run", NUMBER, "X"),
         "Adaptive step size with this relative local error (1e-16: round-off). With --time-transformation: a fixed "
         "step of tau is chosen for it.",
         determines=STEP_SIZE,
+        brief="tolerance (error of each adaptive step)",
+        valid=lambda value: 0.0 < value < 1.0,
+        invalid=TOLERANCE_RANGE,
         common=False,
-    ),
-    Option(
-        *("error", "run", NUMBER, "X"),
+    )
+    error: float | None = run_option(
+        *("run", NUMBER, "X"),
         "Adaptive step size with this bound on the relative global error, confirmed by runs with other step sizes.",
         determines=STEP_SIZE,
+        brief="error (error of the whole run)",
+        valid=lambda value: 0.0 < value < 1.0,
+        invalid="error is {value:g}: the bound of the relative global error must be between 0 and 1",
+        unavailable={IN_ENSEMBLE: "give a tolerance"},
         common=False,
-    ),
-    Option(
-        *("advise", "", NUMBER, "X"),
-        "Choose a fixed step size for this relative error of the positions at the end.",
-        determines=STEP_SIZE,
-        common=False,
-    ),
-    Option(
-        *("time_transformation", "system", TEXT, "G"),
+    )
+    time_transformation: str | None = run_option(
+        *("system", TEXT, "G"),
         "Time transformation dt = G dtau: frequency, distance, potential, arclength or a formula.",
-    ),
-    Option(
-        *("controller", "run", CHOICE, ""),
+    )
+    controller: str | None = run_option(
+        *("run", CHOICE, ""),
         "Step-size controller. With --time-transformation: symplectic (default; energy must be conserved), or "
         "reversible (any system); without it "
         + ", ".join(f"{name}: {each.summary}" for name, each in CONTROLLERS.items() if not each.in_tau)
         + ".",
         choices=(SYMPLECTIC, *CONTROLLERS),
+    )
+    span: float | None = run_option("run", NUMBER, "T", "Duration of the run.", determines=DURATION)
+    steps: int | None = run_option("run", COUNT, "N", "Number of steps, instead of --span.", determines=DURATION)
+    save_every: int = run_option("run", COUNT, "N", "Save every N-th state.", least=1, default=1)
+    solver_tolerance: float | None = run_option(
+        *("run", NUMBER, "X", "Convergence criterion: relative update of the stages [round-off]."),
+        valid=lambda value: value > 0.0,
+        invalid="solver_tolerance must be positive, not {value:g}",
+        solver_option="tolerance",
+        common=False,
+    )
+    max_iterations: int | None = run_option(
+        *("run", COUNT, "N", "Iterations after which a step fails [50]."),
+        least=1,
+        solver_option="max_iterations",
+        common=False,
+    )
+    threads: int | None = run_option(
+        *("run", COUNT, "N", "Worker threads per step of an array model [1]."),
+        least=1,
+        unavailable={IN_ENSEMBLE: "its trajectories are distributed over all cores"},
+        common=False,
+    )
+
+
+_TABLE: Mapping[str, Option] = {
+    "method": Option(
+        *("method", METHOD, "NAME"),
+        "Method, with its degree or number of stages: svi:6, gauss:3, .. (see 'scvi-codegen methods').",
     ),
-    Option("span", "run", NUMBER, "T", "Duration of the run.", determines=DURATION),
-    Option("steps", "run", COUNT, "N", "Number of steps, instead of --span.", determines=DURATION),
-    Option("save_every", "run", COUNT, "N", "Save every N-th state.", least=1),
-    Option(
-        *("solver", "method", CHOICE, ""),
+    "degree": Option("method", COUNT, "N", "Degree of the trial curve (svi, scvi, sc), as in svi:N."),
+    "stages": Option("method", COUNT, "N", "Number of stages (gauss, radau-iia, ..), as in gauss:N."),
+    "order": Option("method", COUNT, "N", "Order of a composition of Stoermer-Verlet: 2, 4, 6, 8 or 10."),
+    "quadrature": Option("method", TEXT, "NAME:N", "Quadrature, as in gauss-legendre:8 or clenshaw-curtis:9."),
+    "nodes": Option("method", TEXT, "NAME", "Nodes: chebyshev-lobatto, legendre-lobatto or equispaced."),
+    "space": Option(
+        *("method", TEXT, "NAME"),
+        "Trial space of an SVI: polynomials, trigonometric:RADIANS_A_STEP[:HARMONICS] or splines:PIECES.",
+    ),
+    "form": Option("method", TEXT, "NAME", "phase-space or position (sc and Runge-Kutta methods)."),
+    "variational": Option(
+        *("method", SWITCH, ""),
+        "SCVI: the variational method, or the form printed in the paper, which is not symplectic.",
+        flag="--variational/--printed",
+    ),
+    "abscissae": Option(
+        *("method", NUMBERS_OR_NAME, "C1,C2,.."),
+        "Abscissae in [0, 1] (collocation, scvi); scvi also: gauss, radau-iia, lobatto-iiia, ..",
+    ),
+    "parameter": Option("parameters", ASSIGNMENTS, "NAME=VALUE", "Value of a parameter; may be repeated."),
+    "inputs": Option(
+        *("inputs", INPUTS, "NAME=FILE[:KIND]"),
+        "Tabulated input: columns t and value of a .csv or .npz file, interpolated constant, linear (default) or "
+        "cubic; or a number, NAME=NUMBER; may be repeated.",
+        flag="--input",
+    ),
+    "size": Option("sizes", SIZES, "NAME=N", "Array size of an array model, as N=1000; may be repeated."),
+    "event": Option(
+        *("events", EVENTS, "G[; NAME=VALUE].."),
+        "Zero crossing of G that changes the state, as 'y; direction=-1; p_y=-0.8*p_y', or of a wall, as "
+        "'y; restitution=0.8; where=x > 0'; terminal=N ends the run at the N-th; may be repeated.",
+    ),
+    "q": Option("initial", NUMBERS, "Q1,Q2,..", "Initial coordinates."),
+    "p": Option("initial", NUMBERS, "P1,P2,..", "Initial momenta.", determines=VELOCITY),
+    "velocity": Option(
+        *("initial", NUMBERS, "V1,V2,..", "Initial velocities, instead of momenta."),
+        key="q_dot",
+        brief="velocity (q_dot)",
+        determines=VELOCITY,
+    ),
+    **{each.name: each.metadata["option"] for each in fields(RunOptions)},
+    "advise": Option(
+        *("", NUMBER, "X"),
+        "Choose a fixed step size for this relative error of the positions at the end.",
+        determines=STEP_SIZE,
+        unavailable={IN_ENSEMBLE: "give --step or --tolerance", WITH_INPUTS: "use --tolerance"},
+        common=False,
+    ),
+    "solver": Option(
+        *("method", CHOICE, ""),
         "Solver of the stage equations; auto: explicit or fixed-point iteration if possible, Newton as fallback; "
         "by default that of the model file.",
         choices=("auto", "fixed-point", "newton", "explicit"),
         default="auto",
         common=False,
     ),
-)
-
-
+}
+OPTIONS = tuple(option.named(name) for name, option in _TABLE.items())
 KEYED = tuple(option for option in OPTIONS if option.section and not option.is_section)
 """Options with a key of their own in a section of model files."""
-ALTERNATIVE_KEYS = tuple(
-    {option.key for option in KEYED if option.determines == result} for result in (VELOCITY, STEP_SIZE, DURATION)
+STEP_KEYS, *OTHER_ALTERNATIVES = (
+    {option.key for option in KEYED if option.determines == group} for group in (STEP_SIZE, DURATION, VELOCITY)
 )
-"""Groups of keys of which at most one is given."""
+ALTERNATIVE_KEYS = (STEP_KEYS, *OTHER_ALTERNATIVES)
+"""Groups of keys of which at most one is given, first those of the step size."""
 
 
 def options_of(section: str) -> tuple[Option, ...]:
@@ -182,6 +257,8 @@ def options_of(section: str) -> tuple[Option, ...]:
 
 FIELDS = tuple(option for option in (*options_of("run"), *options_of("initial")) if option.kind != CHOICE)
 """Options that are fields of a model."""
+RUN_FIELDS = tuple(option for option in FIELDS if option.kind != NUMBERS)
+"""Those of them that are fields of :class:`RunOptions`."""
 METHOD_KEYS = tuple(option.name for option in options_of("method") if option.common)
 """Options that specify the method."""
 STATE = {option.key: option.field for option in options_of("initial") if option.kind == NUMBERS}
@@ -198,6 +275,25 @@ def alternatives(*sections: str) -> Iterator[tuple[Option, Option]]:
 def excluded(given: Collection[str], *sections: str) -> Iterator[tuple[Option, Option]]:
     """Yield the pairs of :func:`alternatives` whose names are both given."""
     return (pair for pair in alternatives(*sections) if all(option.name in given for option in pair))
+
+
+def check_alternatives(values: Any, *groups: Alternatives) -> None:
+    """Raise an error unless at most one field of each group is set, and one of those that are required."""
+    for group in groups:
+        options = [option for option in OPTIONS if option.determines == group and option.section]
+        count = sum(getattr(values, option.field) is not None for option in options)
+        if count > 1 or (group.required and not count):
+            *names, last = (option.brief for option in options)
+            number = "exactly one of" if group.required else "only one of"
+            raise ModelFileError(f"give {number} {', '.join(names)} and {last}")
+
+
+def check_available(values: Any, situation: str) -> None:
+    """Raise an error if a field is set whose option is not available in a situation."""
+    for option in FIELDS:
+        if situation in option.unavailable and (value := getattr(values, option.field)) is not None:
+            shown = f"[{option.section}] {option.key} = {value:g} ({option.flag})"
+            raise ModelFileError(f"{shown} is not available {situation}: {option.unavailable[situation]}")
 
 
 def real(value: Any, where: str) -> float:

@@ -2,17 +2,26 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
+from scvi_codegen.controllers import default_controller
 from scvi_codegen.errors import MethodWarning, ModelFileError, warn
-from scvi_codegen.models.options import FIELDS, STATE
-from scvi_codegen.validation import LARGEST_COUNT, check_tolerance
-
-TIME_FIELDS = tuple(option for option in FIELDS if option.key not in STATE)
+from scvi_codegen.models.options import (
+    DURATION,
+    OPTIONS,
+    RUN_FIELDS,
+    STEP_SIZE,
+    RunOptions,
+    check_alternatives,
+    options_of,
+)
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.validation import LARGEST_COUNT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class TimeSpan:
+class TimeSpan(RunOptions):
     """Step size or tolerance, and time span or number of steps; models derive from it.
 
     Attributes:
@@ -30,30 +39,54 @@ class TimeSpan:
             :func:`~scvi_codegen.compile_stepper`; requires a span. A system in transformed time has its own.
         controller: name of the step-size controller, ``None`` for the default; without ``time_transformation`` it
             requires adaptive steps.
+        solver_tolerance, max_iterations: of the iteration on the stage equations, as of
+            :class:`~scvi_codegen.SolverOptions`.
+        threads: number of threads per step, for array sizes known at run time.
     """
-
-    h: float | None = None
-    tolerance: float | None = None
-    error: float | None = None
-    span: float | None = None
-    steps: int | None = None
-    save_every: int = 1
-    t: float = 0.0
-    time_transformation: str | None = None
-    controller: str | None = None
 
     def _check_time_span(self) -> None:
         """Raise :class:`ModelFileError`, naming the field, for invalid values, and convert the others."""
-        check_at_most_one(self.h, self.tolerance, self.error)
-        check_one_of("span", self.span, "steps", self.steps)
-        for option in TIME_FIELDS:
+        check_alternatives(self, STEP_SIZE, DURATION)
+        for option in RUN_FIELDS:
             if (value := getattr(self, option.field)) is not None:
-                object.__setattr__(self, option.field, option.read(value, option.field))
+                object.__setattr__(self, option.field, option.checked(value))
         if self.h is None:
-            check_adaptive(self.tolerance, self.span)
-            check_error(self.error)
-        else:
-            check_step(self.h, self.span)
+            if self.span is None:
+                raise ModelFileError("adaptive steps require a time span: give span, not steps")
+            if self.span == 0.0:
+                raise ModelFileError("span is 0: it must be positive, or negative for a run backward in time")
+            return
+        if self.span is not None and not 0.0 < self.span / abs(self.h) <= LARGEST_COUNT:
+            raise ModelFileError(
+                f"span is {self.span:g} with a step size of {self.h:g}: it must be positive, also for a run "
+                "backward in time, and less than 2^53 steps"
+            )
+
+    def check_controller(self) -> None:
+        """Raise an error if a controller of adaptive steps is given beside a step size."""
+        if self.controller is not None and self.time_transformation is None and self.h is not None:
+            raise ModelFileError(
+                f"the controller {self.controller} determines adaptive steps: leave out the step size or the controller"
+            )
+
+    def run_section(self) -> dict[str, Any]:
+        """Return the section ``[run]`` of the model file."""
+        section = {option.key: getattr(self, option.field) for option in options_of("run")}
+        if self.time_transformation is not None and self.controller is None:
+            section["controller"] = default_controller(in_tau=True)
+        return {key: value for key, value in section.items() if value is not None}
+
+    def with_step_size(self, *, steps: int | None = None, **chosen: Any) -> Self:
+        """Return the model whose step size another option determines, over the same time span or ``steps`` steps."""
+        others = {option.field: None for option in OPTIONS if option.determines == STEP_SIZE and option.section}
+        return replace(self, **{**others, **chosen, "steps": steps, "span": None if steps else self.covered})
+
+    @property
+    def solver_options(self) -> SolverOptions | None:
+        """Convergence criterion of the solver; ``None`` for the default one."""
+        values = {option.solver_option: getattr(self, option.field) for option in RUN_FIELDS if option.solver_option}
+        chosen = {name: value for name, value in values.items() if value is not None}
+        return SolverOptions(**chosen) if chosen else None
 
     @property
     def ends_at_time(self) -> bool:
@@ -113,27 +146,6 @@ class TimeSpan:
         return None if self.h is not None else self.tolerance or 0.0
 
 
-def check_step(h: float, span: float | None) -> None:
-    """Raise an error for a step size of 0, and a span that is not a positive number of steps."""
-    if h == 0.0:
-        raise ModelFileError("the step size is 0: it must be positive, or negative for a run backward in time")
-    if span is not None and not 0.0 < span / abs(h) <= LARGEST_COUNT:
-        raise ModelFileError(
-            f"span is {span:g} with a step size of {h:g}: it must be positive, also for a run "
-            "backward in time, and less than 2^53 steps"
-        )
-
-
-def check_adaptive(tolerance: float | None, span: float | None) -> None:
-    """Raise an error for an invalid tolerance or span of adaptive steps."""
-    if tolerance is not None:
-        check_tolerance(tolerance, ModelFileError)
-    if span is None:
-        raise ModelFileError("adaptive steps require a time span: give span, not steps")
-    if span == 0.0:
-        raise ModelFileError("span is 0: it must be positive, or negative for a run backward in time")
-
-
 def is_whole(span: float, h: float) -> bool:
     """Return True if a span is a whole number of steps, up to rounding."""
     from scvi_codegen.runtime.run.times import WHOLE  # imported here: not needed for reading a model
@@ -160,24 +172,3 @@ def check_length(values: Sequence[object], names: Sequence[str], where: str) -> 
     if len(values) != len(names):
         shown = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
         raise ModelFileError(f"{where} must have {len(names)} numbers for ({shown}), not {len(values)}")
-
-
-def check_at_most_one(h: float | None, tolerance: float | None, error: float | None) -> None:
-    """Raise an error for several step-size options; none means adaptive steps with errors at round-off level."""
-    if sum(each is not None for each in (h, tolerance, error)) > 1:
-        raise ModelFileError(
-            "give only one of h (step: fixed step size), tolerance (error of each adaptive step) and "
-            "error (error of the whole run)"
-        )
-
-
-def check_error(error: float | None) -> None:
-    """Raise an error for an invalid bound of the global error."""
-    if error is not None and not 0.0 < error < 1.0:
-        raise ModelFileError(f"error is {error:g}: the bound of the relative global error must be between 0 and 1")
-
-
-def check_one_of(one: str, first: object, other: str, second: object) -> None:
-    """Raise an error unless exactly one of two fields is given."""
-    if (first is None) == (second is None):
-        raise ModelFileError(f"give exactly one of {one} and {other}")

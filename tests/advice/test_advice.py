@@ -296,7 +296,7 @@ class TestCommandLine:
             ("kepler --tolerance 1e-6 --steps 10", "--tolerance determines the step size: omit --steps"),
             ("kepler --tolerance 0", "the tolerance must be positive"),
             ("kepler --advise 1e-6 --method explicit-euler", "steps, more than 1e+09: use a method of higher order"),
-            ("kepler --solver-tolerance 0", "the tolerance must be positive"),
+            ("kepler --solver-tolerance 0", "solver_tolerance must be positive"),
         ):
             result = self.invoke(words)
             assert result.exit_code == 2, result.output

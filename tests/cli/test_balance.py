@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from scvi_codegen import SVI, Event, LagrangianSystem, Model, StateError, compile_stepper, generate_package
+from scvi_codegen import SVI, Event, LagrangianSystem, Model, StateError, compile_stepper, generate_package, save_model
 from scvi_codegen.cli import main
 from scvi_codegen.files.energy import MOST_BALANCED_COORDINATES, MOST_BALANCED_STEPS, energy_account
 
@@ -130,3 +130,26 @@ def test_a_change_with_a_reason_is_no_error(name):
         text = (generate_package(model, Path("generated")) / "main.c").read_text()
         assert ("energy_error" in text) == (name == "free")
         assert ("energy_change" in text) == (name != "free")
+        assert all(title.partition(" |")[0] in text for text in reports_of(model))
+
+
+def reports_of(model):
+    """Yield what the command line prints of a run, a recorded run and an ensemble of a model."""
+    save_model(model, "model.toml")
+    Path("grid.toml").write_text("[grid]\nq = [0.5, 1.0]\n")
+    for words in ((), ("-o", "states.run"), ("--ensemble", "grid.toml")):
+        result = CliRunner().invoke(main, ["run", "model.toml", *words])
+        assert result.exit_code == 0, result.output
+        yield result.stdout.replace("energy: forces act, it changed", "energy change").replace(
+            "energy: L depends on time, it changed", "energy change"
+        )
+
+
+def test_balance_of_an_ensemble_is_the_largest_of_its_trajectories():
+    Path("grid.toml").write_text("[grid]\nx = [0.5, 1.0, 1.5]\n")
+    found = json.loads(output_of(MODEL, "--ensemble", "grid.toml", "--json"))["energy_balance"]
+    single = [json.loads(output_of(MODEL.replace("1.0, 0.0", f"{x}, 0.0"), "--json")) for x in (0.5, 1.0, 1.5)]
+    assert found == pytest.approx(max(each["energy_balance"] for each in single), rel=1e-3)
+    changed = output_of(MODEL.replace("(x - y)**4/4", "(2 + cos(t))*(x - y)**4/12"), "--ensemble", "grid.toml")
+    assert "it changed by" in changed
+    assert "E - E0 - W" not in changed

@@ -1,7 +1,11 @@
 """The table of run options agrees with the fields of models, the flags of commands, model files and their page."""
 
+import ast
+import io
 import re
-from dataclasses import fields
+import tokenize
+from dataclasses import fields, replace
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -10,7 +14,7 @@ import scvi_codegen
 from scvi_codegen import Model, ModelFileError, derive
 from scvi_codegen.cli.commands.run import run
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
-from scvi_codegen.models.options import FIELDS, OPTIONS, alternatives
+from scvi_codegen.models.options import FIELDS, OPTIONS, RUN_FIELDS, alternatives
 
 PAGE = (Path(scvi_codegen.__file__).parents[1] / "docs" / "model_files.md").read_text(encoding="utf-8")
 RUNS = {
@@ -20,6 +24,9 @@ RUNS = {
     "span": 3.0,
     "steps": 4,
     "save_every": 2,
+    "solver_tolerance": 1e-12,
+    "max_iterations": 30,
+    "threads": 2,
     "q": [0.5],
     "p": [0.25],
     "velocity": [0.125],
@@ -28,9 +35,11 @@ RUNS = {
 """A value of each option that is a field."""
 
 
-def model_file(sections):
-    """Return a model file of an oscillator with these lines in its sections."""
+def model_file(sections, *, arrays=False):
+    """Return a model file of an oscillator, or of an array of them, with these lines in its sections."""
     text = '[system]\nname = "one"\ncoordinates = ["q"]\nlagrangian = "q_dot**2/2 - q**2/2"\n'
+    if arrays:
+        text = text.replace('"q"', '"q[N]"').replace("q_dot**2/2 - q**2/2", "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)")
     return text + "".join("\n".join([f"[{name}]", *lines, ""]) for name, lines in sections.items())
 
 
@@ -52,7 +61,7 @@ def test_key_of_an_option_sets_its_field_and_is_written(option):
     for each in FIELDS:
         if each.name in values:
             sections[each.section].append(f"{each.key} = {values[each.name]!r}")
-    model = parse_model(model_file(sections))
+    model = parse_model(model_file(sections, arrays=option.name == "threads"))
     found = getattr(model, option.field)
     assert (list(found) if isinstance(found, tuple) else found) == RUNS[option.name]
     assert parse_model(dump_model(model)) == model
@@ -81,3 +90,66 @@ def test_flags_of_commands_are_those_of_the_table():
 def test_page_of_model_files_names_every_key_of_runs():
     written = [option.key for option in FIELDS if re.search(rf"\b{option.key} = ", PAGE)]
     assert written == [option.key for option in FIELDS]
+
+
+OCCURRENCES = {
+    "tolerance": {
+        *("cli/commands/run.py", "cli/step_selection.py", "cli/json_documents.py", "cli/commands/verify.py"),
+        *("models/model.py", "models/packages/example.py", "models/time_span.py"),
+    },
+    "error": {"cli/commands/run.py", "cli/step_selection.py", "models/model.py"},
+    "save_every": {"cli/recording.py", "cli/running.py", "models/packages/example.py"},
+    "solver_tolerance": set(),
+    "max_iterations": set(),
+    "threads": {"models/model.py"},
+}
+"""Files of models and commands beside the table in which an option is read: those that act on its value."""
+
+
+def words_of(path):
+    """Return the attributes and whole strings in a Python file."""
+    tokens = list(tokenize.generate_tokens(io.StringIO(path.read_text(encoding="utf-8")).readline))
+    attributes = {word.string for dot, word in pairwise(tokens) if dot.string == "."}
+    return attributes | {ast.literal_eval(each.string) for each in tokens if re.match("['\"]", each.string)}
+
+
+def test_an_option_occurs_in_the_table_and_where_its_value_acts():
+    package = Path(scvi_codegen.__file__).parent
+    paths = [path for name in ("cli", "models") for path in (package / name).rglob("*.py") if path.name != "options.py"]
+    words = {path.relative_to(package).as_posix(): words_of(path) for path in paths}
+    for option in RUN_FIELDS:
+        if option.field in OCCURRENCES:
+            found = {path for path, own in words.items() if option.field in own}
+            assert found <= OCCURRENCES[option.field] | {"models/model_files/model_file.py", "cli/supervision.py"}
+    assert {option.field for option in RUN_FIELDS} - OCCURRENCES.keys() == {"t", "h", "span", "steps"}
+
+
+@pytest.mark.parametrize("key", ["solver_tolerance", "max_iterations"])
+def test_generated_programs_warn_of_options_that_they_do_not_use(key, tmp_path):
+    from scvi_codegen import MethodWarning, generate_package
+
+    lines = {"initial": ["q = [0.5]", "p = [0.0]"], "run": ["step = 0.1", "steps = 2", f"{key} = {RUNS[key]!r}"]}
+    with pytest.warns(MethodWarning, match=f"default convergence criterion, not {key} of"):
+        generate_package(parse_model(model_file(lines)), tmp_path / "one")
+
+
+@pytest.mark.parametrize("generate", ["generate_package", "generate_fmu"])
+def test_generated_programs_refuse_a_controller_beside_a_step_size(generate, tmp_path):
+    import scvi_codegen as sc
+    from scvi_codegen.models.packages.fmu import generate_fmu
+
+    lines = {"initial": ["q = [0.5]", "p = [0.0]"], "run": ["step = 0.1", "steps = 2"]}
+    model = replace(parse_model(model_file(lines)), controller="predictive")
+    write = generate_fmu if generate == "generate_fmu" else sc.generate_package
+    with pytest.raises(ModelFileError, match="the controller predictive determines adaptive steps"):
+        write(model, tmp_path / "one.fmu" if generate == "generate_fmu" else tmp_path / "one")
+
+
+def test_iterations_of_a_model_are_limited():
+    from scvi_codegen import StepFailedError
+
+    lines = {"initial": ["q = [0.5]", "p = [0.0]"], "run": ["step = 1.5", "steps = 2", "max_iterations = 1"]}
+    text = model_file(lines).replace("q**2/2", "q**4/4")
+    with pytest.raises(StepFailedError, match="did not converge"):
+        parse_model(text).integrate()
+    assert parse_model(text.replace("max_iterations = 1", "max_iterations = 200")).integrate().steps == 2

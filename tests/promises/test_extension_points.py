@@ -69,7 +69,7 @@ def test_documented_additions_need_one_file_and_one_line() -> None:
     assert len(of_package) == len(new) - 1 == 7, "an observer is a file of the user"
     assert not any((ROOT / path).exists() for path, _ in new)
     assert all(line.startswith("+") for line in lines)
-    assert sum("import" not in line for line in lines) == len(of_package)
+    assert sum("import" not in line for line in lines) == len(of_package) + 1, "an option is one entry"
 
 
 def test_documented_method_is_the_midpoint_rule(extended: Path) -> None:
@@ -123,6 +123,28 @@ print(6.5 < __import__("math").log2(errors[0] / errors[1]) < 9.5)
     weights, order = run(extended, script).splitlines()
     assert weights == "[41, 216, 27, 272, 27, 216, 41]"  # Abramowitz & Stegun 25.4.17, 6 h / 840
     assert order == "True"
+
+
+def test_documented_option_is_in_models_files_commands_and_json(extended: Path) -> None:
+    script = """
+import json
+from click.testing import CliRunner
+from scvi_codegen import ModelFileError
+from scvi_codegen.cli import main
+from scvi_codegen.models.model_files.model_file import catalogue_model, dump_model, parse_model
+model = parse_model(dump_model(catalogue_model("kepler", {"run": {"absolute": True, "step": 0.1, "steps": 5}})))
+print(model.absolute, model.solver_options.absolute, "absolute = true" in dump_model(model))
+words = ["run", "kepler", "--step", "0.1", "--steps", "5", "--json"]
+for flags in ([], ["--absolute"]):
+    print(json.loads(CliRunner().invoke(main, [*words, *flags]).stdout)["run"].get("absolute"))
+try:
+    catalogue_model("kepler", {"run": {"absolute": 1}})
+except ModelFileError as error:
+    print(error)
+"""
+    first, *others = run(extended, script).splitlines()
+    assert first.split() == ["True"] * 3
+    assert others == ["None", "True", "[run] absolute must be true or false, not 1"]
 
 
 def test_documented_controller_determines_adaptive_steps(extended: Path) -> None:

@@ -448,7 +448,7 @@ class TestFiles:
 
     def test_missing_library_is_named_with_its_extra(self, kepler, monkeypatch):
         run = kepler.integrate(**STATE, h=H, steps=3)
-        monkeypatch.setitem(export.LIBRARIES, ".h5", "no_such_library")
+        monkeypatch.setitem(export.LABELLED, ".h5", export.Format(export.write_hdf5, "no_such_library"))
         monkeypatch.setitem(sys.modules, "xarray", None)
         with pytest.raises(sc.MissingLibraryError, match=r"no_such_library, .* pip install 'scvi-codegen\[data\]'"):
             run.save("a.h5")

@@ -15,9 +15,9 @@ from scvi_codegen.cli.command_group import (
     reporting,
     tell,
 )
-from scvi_codegen.cli.ensembles import ensemble_summary, integrate_states
+from scvi_codegen.cli.ensembles import energy_balance, ensemble_summary, integrate_states
 from scvi_codegen.cli.json_documents import ensemble_numbers, failure_text, recorded_numbers, run_numbers
-from scvi_codegen.cli.model_options import model_arguments, read_model, with_known_sizes
+from scvi_codegen.cli.model_options import check_flag, model_arguments, read_model, with_known_sizes
 from scvi_codegen.cli.recording import RecordedOutcome, Recording, check_format, check_resumed, is_run_folder
 from scvi_codegen.cli.reports import known_account
 from scvi_codegen.cli.running import RunOutcome, integrate_model, known_at_end, summary
@@ -25,8 +25,7 @@ from scvi_codegen.cli.step_selection import model_with_adaptive_steps, model_wit
 from scvi_codegen.files.export import FORMATS
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.ensemble_file import load_ensemble
-from scvi_codegen.models.options import OPTIONS, STEP_SIZE
-from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.models.options import IN_ENSEMBLE, OPTIONS, STEP_SIZE, WITH_INPUTS, check_available
 from scvi_codegen.pictures.animation import FILMS
 from scvi_codegen.pictures.canvas import PICTURES, check_plot_path
 from scvi_codegen.runtime.run.global_error import GlobalError
@@ -82,12 +81,14 @@ Examples:
   scvi-codegen run ring.toml --size N=10000 --plot ring.png
 """
 
-ERRORS = tuple(option.name for option in OPTIONS if option.determines == STEP_SIZE and not option.common)
-"""Options of an error that determines the step size."""
+OWN = tuple(option for option in OPTIONS if not option.common)
+"""Options that other commands do not have."""
+ERRORS = {option.name: option for option in OWN if option.determines == STEP_SIZE}
+"""Those of an error that determines the step size."""
 
 
 @click.command(help=ABOUT)
-@model_arguments(*ERRORS, "solver", required=False)
+@model_arguments(*(option.name for option in OWN), required=False)
 @click.option(
     "-o",
     "--output",
@@ -105,14 +106,6 @@ ERRORS = tuple(option.name for option in OPTIONS if option.determines == STEP_SI
 @click.option(
     "--ensemble", type=click.Path(), metavar="FILE", help="Many initial states: a grid (.toml) or a table (.csv)."
 )
-@click.option(
-    "--solver-tolerance",
-    type=float,
-    metavar="X",
-    help="Convergence criterion: relative update of the stages [round-off].",
-)
-@click.option("--max-iterations", type=int, metavar="N", help="Iterations after which a step fails [50].")
-@click.option("--threads", type=int, metavar="N", help="Worker threads per step of an array model [1].")
 @reporting
 def run(
     model_name: str | None,
@@ -123,9 +116,6 @@ def run(
     certificate: str | None,
     plot: str | None,
     ensemble: str | None,
-    solver_tolerance: float | None,
-    max_iterations: int | None,
-    threads: int | None,
     **choices: Any,
 ) -> None:
     """Integrate MODEL; the help text is ``ABOUT``."""
@@ -142,27 +132,24 @@ def run(
     wanted = {name: choices.pop(name) for name in ERRORS}
     _check_combination(choices, plot=plot, ensemble=ensemble, wanted=wanted, folder=output if recorded else None)
     model = read_model(model_name, choices)
-    arguments = {"tolerance": solver_tolerance, "max_iterations": max_iterations}
-    chosen: dict[str, Any] = {key: value for key, value in arguments.items() if value is not None}
-    options = SolverOptions(**chosen) if chosen else None
+    if ensemble is not None:
+        check_available(model, IN_ENSEMBLE)
     for option, needed in (
         ("--ensemble", ensemble is not None),
         ("--advise", wanted["advise"] is not None),
         (f"-o {output}", recorded),
     ):
         model = with_known_sizes(model, option) if needed else model
-    if threads is not None and model.array_system is None:
-        raise click.UsageError("--threads requires an array model (array coordinates)")
     if model.system.inputs:
         _check_driven(wanted["advise"], recorded=recorded)
+    model, confirmation = _with_steps(model, wanted)
     if ensemble is not None:
-        _run_ensemble(model, ensemble, (output, plot), options)
+        _run_ensemble(model, ensemble, (output, plot))
         return
-    model, confirmation = _with_steps(model, wanted, options, threads)
     if output is not None and recorded:
-        _finish_recording(recording.record(model, output, options=options))
+        _finish_recording(recording.record(model, output))
     else:
-        _run_one(model, output, plot, options, threads, advised=wanted["advise"])
+        _run_one(model, output, plot, advised=wanted["advise"])
     _check_confirmed(confirmation)
 
 
@@ -175,17 +162,15 @@ def _check_confirmed(confirmation: GlobalError | None) -> None:
         raise CommandFailure(unconfirmed, FAILURE)
 
 
-def _with_steps(
-    model: Model, wanted: dict[str, float | None], options: SolverOptions | None, threads: int | None
-) -> tuple[Model, GlobalError | None]:
+def _with_steps(model: Model, wanted: dict[str, float | None]) -> tuple[Model, GlobalError | None]:
     """Return the model with the steps that one of the requested errors determines, and the estimated global error."""
     tolerance, error, advise = wanted["tolerance"], wanted["error"], wanted["advise"]
     if tolerance is not None:
         return model_with_adaptive_steps(model, tolerance), None
     if advise is not None:
-        return model_with_advised_step(model, advise, options=options), None
+        return model_with_advised_step(model, advise), None
     if (wanted_error := model.error if error is None else error) is not None:
-        return model_with_global_error(model, wanted_error, options=options, threads=threads)
+        return model_with_global_error(model, wanted_error)
     return model, None
 
 
@@ -217,28 +202,19 @@ def _check_combination(
     for name in ("step", "steps") if arguments else ():
         if choices[name] is not None:
             raise click.UsageError(f"--{arguments[0]} determines the step size: omit --{name} (--span is the duration)")
-    for name, value in wanted.items():
-        if ensemble is not None and value is not None:
-            raise click.UsageError(f"--{name} is not available with --ensemble")
+    if ensemble is not None and arguments:
+        check_flag(ERRORS[arguments[0]], IN_ENSEMBLE)
 
 
 def _check_driven(advise: float | None, *, recorded: bool) -> None:
     if advise is not None:
-        raise click.UsageError("--advise is not available for systems with inputs: use --tolerance")
+        check_flag(ERRORS["advise"], WITH_INPUTS)
     if recorded:
         raise click.UsageError("a run with inputs cannot be recorded in a folder: write it to a file (-o NAME.npz)")
 
 
-def _run_one(
-    model: Model,
-    output: str | None,
-    plot: str | None,
-    options: SolverOptions | None,
-    threads: int | None,
-    *,
-    advised: float | None,
-) -> None:
-    outcome = integrate_model(model, options=options, threads=threads)
+def _run_one(model: Model, output: str | None, plot: str | None, *, advised: float | None) -> None:
+    outcome = integrate_model(model)
     known = known_at_end(model, outcome)
     account = known_account(outcome.trajectory)
     tell(summary(model, outcome, known, account), **run_numbers(model, outcome, known, account))
@@ -271,17 +247,14 @@ def _finish_recording(outcome: RecordedOutcome) -> None:
     tell(f"wrote {outcome.recorded.folder}", written=[outcome.recorded.folder])
 
 
-def _run_ensemble(
-    model: Model, path: str, outputs: tuple[str | None, str | None], options: SolverOptions | None
-) -> None:
-    if model.error is not None:
-        raise click.UsageError(f"[run] error = {model.error:g} is not available with --ensemble: set tolerance instead")
+def _run_ensemble(model: Model, path: str, outputs: tuple[str | None, str | None]) -> None:
     if model.has_time_transformation:
         raise click.UsageError(
             "--ensemble is not available with a time transformation: each trajectory has its own times"
         )
-    outcome = integrate_states(load_ensemble(path, model), options=options)
-    tell(ensemble_summary(model, outcome), **ensemble_numbers(model, outcome))
+    outcome = integrate_states(load_ensemble(path, model))
+    balance = energy_balance(outcome.result)
+    tell(ensemble_summary(model, outcome, balance), **ensemble_numbers(model, outcome, balance))
     written = _write_outputs(outcome.result, *outputs, draw=outcome.result.plot)
     continuation = (
         f"the computed states were {'written: ' + ' and '.join(written) if written else 'not written to a file (-o)'}"

@@ -13,7 +13,7 @@ from scvi_codegen.indices import Array
 from scvi_codegen.mechanics.first_order import FirstOrderSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.options import STATE, options_of
+from scvi_codegen.models.options import STATE
 
 if TYPE_CHECKING:
     from scvi_codegen.models.model_files.input_tables import InputTable
@@ -159,13 +159,10 @@ def motion_of(model: Model, names: Sequence[str]) -> dict[str, Any]:
     """Return the sections other than the system."""
     vectors = {key: getattr(model, name) for key, name in STATE.items()}
     initial = {key: _named(names, vector) for key, vector in vectors.items() if vector is not None}
-    values = {option.key: getattr(model, option.field, None) for option in options_of("run")}
-    values["controller"] = model.controller or ("reversible" if model.time_transformation else None)
-    run = {key: value for key, value in values.items() if value is not None}
     specification = model.method.specification().items()
     method = {key: list(value) if isinstance(value, tuple) else value for key, value in specification}
     solver = {} if model.solver == "auto" else {"solver": model.solver}
-    return {"initial": {"t": model.t, **initial}, "method": {**method, **solver}, "run": run}
+    return {"initial": {"t": model.t, **initial}, "method": {**method, **solver}, "run": model.run_section()}
 
 
 def _wrapped(formula: str) -> str:

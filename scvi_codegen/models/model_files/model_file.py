@@ -45,7 +45,7 @@ from scvi_codegen.models.model_files.sections import (
     words_of,
 )
 from scvi_codegen.models.model_files.values import read_values
-from scvi_codegen.models.options import options_of
+from scvi_codegen.models.options import STEP_KEYS, options_of
 from scvi_codegen.models.problems import Problem
 from scvi_codegen.validation import checks_arguments, of
 
@@ -229,9 +229,9 @@ def _with_time_transformation(model: Model, document: Document, specification: S
 def _without_inherited_step(layer: Document) -> Document:
     """Drop an inherited step size, one in t, if a time transformation is added without a step size in tau."""
     run = layer.get("run", {})
-    if "time_transformation" not in layer.get("system", {}) or {"step", "tolerance", "error"} & run.keys():
+    if "time_transformation" not in layer.get("system", {}) or STEP_KEYS & run.keys():
         return layer
-    return {**layer, "run": {**run, "tolerance": None}}
+    return {**layer, "run": {**run, **dict.fromkeys(STEP_KEYS)}}
 
 
 def _read_inputs(section: Section, folder: str | os.PathLike[str]) -> Mapping[str, InputTable | float]:

@@ -13,7 +13,7 @@ from scvi_codegen.mechanics.legendre import lagrangian_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification, sized, specification_of
 from scvi_codegen.models.model import DEFAULT_METHOD
-from scvi_codegen.models.options import ALTERNATIVE_KEYS, FIELDS, KEYED, alternatives, options_of, real
+from scvi_codegen.models.options import ALTERNATIVE_KEYS, FIELDS, KEYED, STEP_KEYS, alternatives, options_of, real
 from scvi_codegen.models.problems import Problem, problem
 from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.validation import FORMULA, checked_count, likely_names, synonym_hint
@@ -178,7 +178,7 @@ def read_run(section: Section) -> dict[str, Any]:
     section = {key: value for key, value in section.items() if value is not None}
     for one, other in alternatives("run"):
         check_one(section, "run", one.key, other.key)
-    if not {"step", "tolerance", "error"} & section.keys() and "steps" in section:
+    if not STEP_KEYS & section.keys() and "steps" in section:
         raise ModelFileError("[run] has steps but no step: give the step size")
     fields = [option for option in options_of("run") if option in FIELDS and option.key in section]
     return {option.field: option.read(section[option.key], f"[run] {option.key}") for option in fields}

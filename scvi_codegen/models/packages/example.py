@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.errors import ModelFileError, StateError
+from scvi_codegen.errors import MethodWarning, ModelFileError, StateError, warn
 from scvi_codegen.files.cache import template_folder
 from scvi_codegen.formulas.expressions import evaluate
 from scvi_codegen.mechanics.derived_expressions import forms_of
@@ -14,6 +14,7 @@ from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.input_tables import tables_of_example
+from scvi_codegen.models.options import RUN_FIELDS
 from scvi_codegen.rendering.environment import template_environment
 from scvi_codegen.rendering.program_source import Embedded, ExampleArrays, ExampleRun
 from scvi_codegen.rendering.source import Interface
@@ -51,6 +52,7 @@ COMPARED = 1e-9
 
 def example_of(model: Model, *, controlled: bool) -> ExampleRun:
     """Return the example run: the whole run of the model with twenty states after the first at most."""
+    _check_options(model)
     clock = model.system.clock
     if model.h is None and (clock or model.time_transformation is not None):
         raise ModelFileError(
@@ -87,6 +89,18 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
         end=model.end if inputs else 0.0,
         events=model.events,
     )
+
+
+def _check_options(model: Model) -> None:
+    """Reject a controller beside a fixed step size; warn of options that generated programs do not use."""
+    model.check_controller()
+    names = [option.key for option in RUN_FIELDS if option.solver_option and getattr(model, option.field) is not None]
+    if names:
+        warn(
+            f"generated programs and FMUs use the default convergence criterion, not {' and '.join(names)} of [run]: "
+            "pass them to the C functions as options",
+            MethodWarning,
+        )
 
 
 def _chosen_by(model: Model) -> float:
@@ -127,6 +141,7 @@ def _rate(system: MechanicalSystem, q: Sequence[float], p: Sequence[float]) -> A
 
 def array_example_of(model: Model, interface: Interface) -> tuple[ExampleRun, dict[str, Any]]:
     """Return the run of a model with array sizes known at run time, and its arrays by the name of their text file."""
+    _check_options(model)
     problem = read_arrays(interface, model.q, model.fields, model.tables)
     files = {"q": _joined(problem.state)}
     moving = "p" if model.velocity is None else "velocity"

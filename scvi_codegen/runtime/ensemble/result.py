@@ -218,7 +218,7 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
         self._check_common_times()
         if suffix in LABELLED:
             check_format(path)
-            write_whole(path, lambda made: LABELLED[suffix](self._labelled(known), made))
+            write_whole(path, lambda new: LABELLED[suffix].write(self._labelled(known), new))
             return
         write = {".npz": self._write_npz, ".csv": self._write_csv}.get(suffix)
         if write is None:
