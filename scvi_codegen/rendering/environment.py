@@ -101,5 +101,7 @@ def template_environment() -> Environment:
 
 @cache
 def support_text(name: str) -> str:
-    """Return the source of a support header ``support/<name>.h``."""
-    return (template_folder() / name).read_text(encoding="utf-8")
+    """Return the source of a support header, a file below the folder ``support`` of the templates, with its guard."""
+    path = template_folder() / name
+    guard = f"SUPPORT_{path.stem.upper()}_H"
+    return f"#ifndef {guard}\n#define {guard}\n\n{path.read_text(encoding='utf-8')}\n#endif\n"

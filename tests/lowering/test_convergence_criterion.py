@@ -1,6 +1,7 @@
 """Slowly converging iterations end at round-off, as fast ones do: compared with the same equations in 60 digits."""
 
 import ctypes
+import re
 import subprocess
 from contextlib import nullcontext, suppress
 from functools import cache
@@ -84,12 +85,11 @@ VERDICTS = """
 enum {{ M = 3, FINAL_ITERATIONS = {after} }};
 typedef double number;
 typedef struct {{ double tolerance; long long max_iterations; int absolute; }} solver_options;
-#define SUPPORT_NUMBERS_H
 #define SELDOM
 static double larger(double a, double b) {{ return a > b ? a : b; }}
 static double largest_number(const number *x) {{ return larger(x[0], larger(x[1], x[2])); }}
 static double number_of(double x) {{ return x; }}
-#include "{folder}/convergence.h"
+{header}
 int verdict(double change, double last, double before, double tolerance, int absolute, int k)
 {{
   const solver_options options = {{tolerance, 40, absolute}};
@@ -108,8 +108,8 @@ void scales(double absolute, double *size)
 def header(folder: Path, after: int):
     """The functions of the headers alone, of changes that are not squared."""
     compiler = needs("cc")
-    headers = Path(__file__).parents[2] / "templates/support/iteration"
-    (folder / f"{after}.c").write_text(VERDICTS.format(after=after, folder=headers))
+    text = (Path(__file__).parents[2] / "templates/support/iteration/convergence.h").read_text()
+    (folder / f"{after}.c").write_text(VERDICTS.format(after=after, header=re.sub(r'#include ".*"', "", text)))
     command = [compiler, "-std=c99", "-shared", "-fPIC", f"{after}.c", "-o", f"{after}.so", "-lm"]
     subprocess.run(command, cwd=folder, check=True, capture_output=True)
     found = ctypes.CDLL(str(folder / f"{after}.so"))

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_ARRAY_HAMILTONIAN_ITERATION_H
-#define SUPPORT_ARRAY_HAMILTONIAN_ITERATION_H
-
 #include "../core/progress.h"
 #include "../iteration/one_trajectory.h"
 #include "../iteration/point_weights.h"
@@ -229,6 +226,4 @@ static int fixed_point(const step_data *step, const iteration_data *data, histor
   *steps = next_guess(*steps, &now, report);
   return OK;
 }
-#endif
-
 #endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_ARRAY_MEMORY_H
-#define SUPPORT_ARRAY_MEMORY_H
-
 #include "../core/step.h"
 #include "arrays.h"
 #include <stddef.h>
@@ -211,5 +208,3 @@ void NAME(start)(run_memory *run, double t, double h, const double *q, const dou
   run->has_values = run->is_changed = 0;
   discard_factors(run);
 }
-
-#endif

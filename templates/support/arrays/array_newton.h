@@ -1,6 +1,3 @@
-#ifndef SUPPORT_ARRAY_NEWTON_H
-#define SUPPORT_ARRAY_NEWTON_H
-
 #include "../core/points.h"
 #include "../core/step.h"
 #include "../iteration/convergence.h"
@@ -163,5 +160,3 @@ static void make_zero(const linear_system *of, lanes *x)
   for (int g = 0; g < ROWS; g++)
     memset(x + g * of->n + of->own.first, 0, sizeof(lanes) * (size_t)(of->own.end - of->own.first));
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_ARRAY_RUN_H
-#define SUPPORT_ARRAY_RUN_H
-
 #include "../core/step.h"
 #include "array_memory.h"
 #include "arrays.h"
@@ -175,6 +172,4 @@ double NAME(step_error)(const run_memory *run)
   (void)run;
   return NAN;
 }
-#endif
-
 #endif

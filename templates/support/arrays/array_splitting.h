@@ -1,6 +1,3 @@
-#ifndef SUPPORT_ARRAY_SPLITTING_H
-#define SUPPORT_ARRAY_SPLITTING_H
-
 #include "../core/step.h"
 #include "arrays.h"
 
@@ -95,5 +92,3 @@ static int perform_step(run_memory *run, const problem *given, const work_arrays
   run->guess = ends_with_a_kick();
   return OK;
 }
-
-#endif

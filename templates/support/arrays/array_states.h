@@ -1,6 +1,3 @@
-#ifndef SUPPORT_ARRAY_STATES_H
-#define SUPPORT_ARRAY_STATES_H
-
 #include "array_memory.h"
 
 /* Functions of states: Legendre transform, energies and momentum maps, for all states of a call in one loop. Requires:
@@ -169,6 +166,4 @@ int NAME(momentum_maps)(long long count, const double *t, const double *q, const
     }
   return OK;
 }
-#endif
-
 #endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_ARRAY_STEP_H
-#define SUPPORT_ARRAY_STEP_H
-
 #include "../step_size/observed_error.h"
 #include "arrays.h"
 
@@ -52,5 +49,3 @@ static int perform_step(run_memory *run, const problem *given, const work_arrays
     run->guess = 0;
   return status;
 }
-
-#endif

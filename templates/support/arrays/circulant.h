@@ -1,6 +1,3 @@
-#ifndef SUPPORT_CIRCULANT_H
-#define SUPPORT_CIRCULANT_H
-
 #include <stdint.h>
 #include <stdlib.h>
 
@@ -629,6 +626,4 @@ static double *sums_of_state(const problem *given, const double *q)
   free(memory);
   return values;
 }
-#endif
-
 #endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_ENVELOPE_H
-#define SUPPORT_ENVELOPE_H
-
 #include "array_newton.h"
 
 /* Linear part of a step of coordinates that are coupled to near ones (meshes, beams, chains): the inverse of 1 - A F'
@@ -255,5 +252,3 @@ static void apply_factors(const linear_system *of, const lanes *x, lanes *y)
   follow_velocities(of, x, y);
 #endif
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_LATTICE_TRANSFORM_H
-#define SUPPORT_LATTICE_TRANSFORM_H
-
 #include "arrays.h"
 
 /* Fast Fourier transforms along the axes of lattices, at all points of a step, with one pass per factor of the size,
@@ -255,6 +252,4 @@ static long long positions_of(const lattice *one)
     places *= one->size[a];
   return places;
 }
-#endif
-
 #endif

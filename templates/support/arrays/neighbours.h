@@ -1,6 +1,3 @@
-#ifndef SUPPORT_NEIGHBOURS_H
-#define SUPPORT_NEIGHBOURS_H
-
 #include <stdlib.h>
 
 #include "arrays.h"
@@ -251,5 +248,3 @@ static void release(neighbours *list)
   free(list->at), free(list->first), free(list->others), free(list->smaller);
   memset(list, 0, sizeof *list);
 }
-
-#endif

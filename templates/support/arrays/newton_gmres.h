@@ -1,6 +1,3 @@
-#ifndef SUPPORT_NEWTON_GMRES_H
-#define SUPPORT_NEWTON_GMRES_H
-
 #include "../core/progress.h"
 #include "../iteration/one_trajectory.h"
 #include "array_newton.h"
@@ -273,5 +270,3 @@ static int solve(const step_data *step, const solver_data *data, history past, l
   *guess = next_guess(*guess, &now, report);
   return accept(step, dq, dp, report) ? OK : NOT_FINITE;
 }
-
-#endif

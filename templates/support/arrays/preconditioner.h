@@ -1,6 +1,3 @@
-#ifndef SUPPORT_PRECONDITIONER_H
-#define SUPPORT_PRECONDITIONER_H
-
 #include "array_newton.h"
 #include "envelope.h"
 
@@ -369,5 +366,3 @@ static void choose_preconditioner(linear_system *of, double left)
       find_inverses(of);
   }
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_SECOND_ORDER_POINTS_H
-#define SUPPORT_SECOND_ORDER_POINTS_H
-
 #include "../iteration/separable_iteration.h"
 
 /* Points of a step for Newton's method: positions, whose increments by the forces are h^2 A F / m, where A is PRODUCT;
@@ -86,5 +83,3 @@ static inline double first_size(const step_points *w, int part, long long i)
   const double size = size_of(w, find_drift(w, i), i);
   return part == 0 ? size : size / fabs(w->step->h);
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_WORK_ARRAYS_H
-#define SUPPORT_WORK_ARRAYS_H
-
 #include "../core/points.h"
 #include "arrays.h"
 
@@ -56,5 +53,3 @@ static work_arrays bind_work_arrays(const run_memory *run, long long n)
   of.dq = next_array(&rest, 2 * n);
   return of;
 }
-
-#endif

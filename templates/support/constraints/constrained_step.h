@@ -1,6 +1,3 @@
-#ifndef SUPPORT_CONSTRAINED_STEP_H
-#define SUPPORT_CONSTRAINED_STEP_H
-
 #include "../core/progress.h"
 #include "constraint_matrix.h"
 
@@ -254,5 +251,3 @@ static int perform_step(run_memory *run, const problem *given, const work_arrays
   run->guess = 1;
   return OK;
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_CONSTRAINT_MATRIX_H
-#define SUPPORT_CONSTRAINT_MATRIX_H
-
 #include "../arrays/arrays.h"
 #include "../core/step.h"
 
@@ -301,5 +298,3 @@ static int solve_constraint_system(const constraint_system *held, double toleran
   }
   return OK;
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_CONSTRAINT_PROJECTION_H
-#define SUPPORT_CONSTRAINT_PROJECTION_H
-
 #include "constrained_step.h"
 
 /* Projection onto the constraints. Requires: constrained_step.h. */
@@ -72,5 +69,3 @@ static int project_run(run_memory *run, solver_report *report, int positions)
   add_to(run->p, of.work->dp, 1.0, of.n);
   return OK;
 }
-
-#endif

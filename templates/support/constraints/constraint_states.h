@@ -1,6 +1,3 @@
-#ifndef SUPPORT_CONSTRAINT_STATES_H
-#define SUPPORT_CONSTRAINT_STATES_H
-
 #include "../arrays/array_memory.h"
 #include "constraint_projection.h"
 
@@ -131,5 +128,3 @@ int NAME(multipliers)(long long count, const double *t, const double *q, const d
   }
   return OK;
 }
-
-#endif

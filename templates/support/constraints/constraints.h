@@ -1,6 +1,3 @@
-#ifndef SUPPORT_CONSTRAINTS_H
-#define SUPPORT_CONSTRAINTS_H
-
 #include "../core/status_codes.h"
 #include "../newton/band.h"
 
@@ -295,5 +292,3 @@ int NAME(multipliers)(long long count, const real *t, const real *q, const real 
   }
   return OK;
 }
-
-#endif

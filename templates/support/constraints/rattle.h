@@ -1,6 +1,3 @@
-#ifndef SUPPORT_RATTLE_H
-#define SUPPORT_RATTLE_H
-
 #include "../newton/newton.h"
 
 /* Constrained steps on Lobatto points for constant diagonal masses (RATTLE for two points; Lobatto IIIA-IIIB: L.
@@ -277,5 +274,3 @@ static int rattle(const step_data *step, newton_data *data, real *dp, const solv
   status = solve_constraints(step, &now, data, options, report);
   return status == OK ? finish_step(step, &now, data, dp) : status;
 }
-
-#endif

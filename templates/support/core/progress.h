@@ -1,6 +1,3 @@
-#ifndef SUPPORT_PROGRESS_H
-#define SUPPORT_PROGRESS_H
-
 #include "stagnation.h"
 #include "status_codes.h"
 #include "step.h"
@@ -74,5 +71,3 @@ static inline long long next_guess(long long steps, const progress *now, const s
   (void)report;
   return steps_to_continue(steps, now->first);
 }
-
-#endif

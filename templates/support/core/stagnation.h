@@ -1,6 +1,3 @@
-#ifndef SUPPORT_STAGNATION_H
-#define SUPPORT_STAGNATION_H
-
 #include "../iteration/convergence.h"
 
 /* Stagnation of the iteration of one trajectory, by rounding or by slow convergence. Requires: convergence.h. */
@@ -77,5 +74,3 @@ static inline int is_to_amplify(trajectory_progress *now, const solver_options *
   }
   return 0;
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_TRAJECTORIES_H
-#define SUPPORT_TRAJECTORIES_H
-
 #include "numbers.h"
 #include "vectors.h"
 
@@ -154,5 +151,3 @@ typedef struct {
 typedef struct {
   long long first, end;
 } section;
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_COUPLED_DERIVATIVES_H
-#define SUPPORT_COUPLED_DERIVATIVES_H
-
 #include "../iteration/mass_matrix.h"
 #include "../iteration/one_trajectory.h"
 #include "../iteration/point_weights.h"
@@ -176,5 +173,3 @@ static __attribute__((noinline)) int vjp_by_iteration(iterated_step *at, double 
   v[INPUT_T + 1] += by_h / at->step->h;
   return OK;
 }
-
-#endif

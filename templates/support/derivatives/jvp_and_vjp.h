@@ -1,6 +1,3 @@
-#ifndef SUPPORT_JVP_AND_VJP_H
-#define SUPPORT_JVP_AND_VJP_H
-
 #include "../newton/newton_from_line.h"
 #include "../newton/newton.h"
 #include "linear_maps.h"
@@ -309,5 +306,3 @@ static int propagate_vectors(const linearised_step *at, int back, int count, con
   }
   return all_finite(to, count * STEP_INPUTS) ? OK : NOT_FINITE;
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_LINEAR_MAPS_H
-#define SUPPORT_LINEAR_MAPS_H
-
 #include "../core/step.h"
 #include "../newton/band.h"
 #include "../newton/stages.h"
@@ -279,5 +276,3 @@ static void solve_wide(const real *a, const band *shape, const real *pivot, int 
     else
       upper_wide(a, shape, k, back, x);
 }
-
-#endif

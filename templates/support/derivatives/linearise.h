@@ -1,6 +1,3 @@
-#ifndef SUPPORT_LINEARISE_H
-#define SUPPORT_LINEARISE_H
-
 #include "jvp_and_vjp.h"
 
 /* Tangent and adjoint vectors over steps solved by Newton's method. Requires: jvp_and_vjp.h. */
@@ -178,5 +175,3 @@ int NAME(linearise)(long long steps, const real *t, const real *h, const real *q
   }
   return status;
 }
-
-#endif

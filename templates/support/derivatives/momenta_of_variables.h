@@ -1,6 +1,3 @@
-#ifndef SUPPORT_MOMENTA_OF_VARIABLES_H
-#define SUPPORT_MOMENTA_OF_VARIABLES_H
-
 #include "linear_maps.h"
 
 /* Linearised momenta theta(q, y, parameters, t) of a first-order system, whose state is (q, y): entry e of
@@ -70,5 +67,3 @@ static void variables_wide(const momentum_factors *in, int back, wide *v)
   if (!back)
     solve_wide(in->factors, &ALL_MOMENTA, in->pivot, 0, v + M);
 }
-
-#endif

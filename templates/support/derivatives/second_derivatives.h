@@ -1,6 +1,3 @@
-#ifndef SUPPORT_SECOND_DERIVATIVES_H
-#define SUPPORT_SECOND_DERIVATIVES_H
-
 #include "jvp_and_vjp.h"
 
 /* Second derivatives of a step by forward-over-reverse differentiation: the tangent of the adjoint. The stage equations
@@ -221,5 +218,3 @@ int NAME(second_order)(long long steps, const real *t, const real *h, const real
   }
   return OK;
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_SEPARABLE_DERIVATIVES_H
-#define SUPPORT_SEPARABLE_DERIVATIVES_H
-
 #include "../core/status_codes.h"
 #include "../iteration/one_trajectory.h"
 #include "../iteration/separable_iteration.h"
@@ -206,5 +203,3 @@ static __attribute__((noinline)) int vjp_by_iteration(iterated_step *at, double 
 #endif
   return OK;
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_VECTOR_CONVERGENCE_H
-#define SUPPORT_VECTOR_CONVERGENCE_H
-
 #include "../iteration/convergence.h"
 
 /* Convergence criterion for the fixed-point iterations of tangent and adjoint vectors, and their dependence on
@@ -69,5 +66,3 @@ static inline void add_input_gradient(lanes (*given)[INPUT_DERIVATIVES], const l
   for (int j = 0; j < STEP_INPUTS - 2 * M; j++)
     v[2 * M + j] += points_total(by[j]);
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_CASADI_FLOW_H
-#define SUPPORT_CASADI_FLOW_H
-
 #include "flow.h"
 
 /* Flow of FLOW_STEPS steps with a state stored every FLOW_EVERY steps, and its derivatives, under the names by which
@@ -133,7 +130,5 @@ int EXTERNAL(jac_adj1_, )(const double **arg, double **res, casadi_int *iw, doub
     status = external_transposed(arg[0], res[2]);
   return status != OK;
 }
-
-#endif
 
 #endif

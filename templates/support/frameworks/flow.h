@@ -1,6 +1,3 @@
-#ifndef SUPPORT_FLOW_H
-#define SUPPORT_FLOW_H
-
 #include "../core/status_codes.h"
 #include "../core/step.h"
 
@@ -305,6 +302,4 @@ int NAME(hessian_rows)(long long steps, long long every, int count, long long ro
   return hessian_rows(&way, rows, x, partials, changes, found, report);
 }
 #endif
-#endif
-
 #endif

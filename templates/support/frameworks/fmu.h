@@ -1,6 +1,3 @@
-#ifndef SUPPORT_FMU_H
-#define SUPPORT_FMU_H
-
 /* Instances of an FMU and their modes (FMI 3.0, co-simulation). Requires: the integrator's header, the FMI header, and
  * NAME, STATUS, WORKSPACE, TOKEN, STEP, M, PARAMETERS, BY_VELOCITY, and the start values. */
 
@@ -671,5 +668,3 @@ FMI_EXPORT fmi3Instance FMI(InstantiateScheduledExecution)(fmi3String name, fmi3
     log(environment, fmi3Error, "logStatusError", "this FMU supports only co-simulation");
   return NULL;
 }
-
-#endif

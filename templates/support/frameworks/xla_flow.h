@@ -1,6 +1,3 @@
-#ifndef SUPPORT_XLA_FLOW_H
-#define SUPPORT_XLA_FLOW_H
-
 #include "flow.h"
 
 /* Flow as XLA custom calls through the XLA FFI. Requires: flow.h. */
@@ -99,6 +96,4 @@ XLA_FFI_Error *NAME(xla_vjp_derivative)(XLA_FFI_CallFrame *frame)
   status = hessian_rows(&way, rows_of(x), x->data, partials->data, changes->data, found->data, &report);
   return status == OK ? NULL : failure(frame, status, &report);
 }
-#endif
-
 #endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_COLLOCATION_ITERATION_H
-#define SUPPORT_COLLOCATION_ITERATION_H
-
 #include "curve.h"
 
 /* Fixed-point iteration of a collocation method, z_n = h a(q_n, v_n) on the curve of curve.h. The momenta at the ends
@@ -141,5 +138,3 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   *steps = next_guess(*steps, &now, report);
   return OK;
 }
-
-#endif

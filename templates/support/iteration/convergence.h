@@ -1,6 +1,3 @@
-#ifndef SUPPORT_CONVERGENCE_H
-#define SUPPORT_CONVERGENCE_H
-
 #include "../core/numbers.h"
 
 /* Convergence criterion of the fixed-point iteration. Requires: FINAL_ITERATIONS, the number of iterations after the
@@ -134,6 +131,4 @@ static inline void measure_by_largest(number stagnant, number *inverse_size)
   find_least(stagnant, sizes, found);
   memcpy(inverse_size, found, sizeof found);
 }
-#endif
-
 #endif

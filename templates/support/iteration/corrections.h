@@ -1,6 +1,3 @@
-#ifndef SUPPORT_CORRECTIONS_H
-#define SUPPORT_CORRECTIONS_H
-
 #include "mass_matrix.h"
 #include "point_weights.h"
 
@@ -114,6 +111,4 @@ static inline void converged_forces(const step_data *step, const iteration_data 
 #endif
   }
 }
-#endif
-
 #endif

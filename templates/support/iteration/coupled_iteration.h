@@ -1,6 +1,3 @@
-#ifndef SUPPORT_COUPLED_ITERATION_H
-#define SUPPORT_COUPLED_ITERATION_H
-
 #include "convergence.h"
 #include "corrections.h"
 
@@ -171,6 +168,4 @@ static inline void integrals_of_iteration(const step_data *step, const iteration
   for (int k = 0; k < INTEGRALS; k++)
     sum[k] = points_total(part[k]);
 }
-#endif
-
 #endif

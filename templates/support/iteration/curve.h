@@ -1,6 +1,3 @@
-#ifndef SUPPORT_CURVE_H
-#define SUPPORT_CURVE_H
-
 #include "../core/status_codes.h"
 #include "convergence.h"
 #include "mass_matrix.h"
@@ -127,6 +124,4 @@ static inline double correct_velocity(const lanes *mass, const double *misfit, c
   }
   return total;
 }
-#endif
-
 #endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_DAMPED_POINTS_H
-#define SUPPORT_DAMPED_POINTS_H
-
 /* Uniform damping at points that are SIMD lanes, or of trajectories that are; see damping.h. Requires: points.h or
  * trajectories.h, the table ABSCISSA, the kernel damping. */
 #define DAMPED
@@ -32,5 +29,3 @@ static inline void grow(const damping_data *data, int n, int count, lanes *x)
   for (int i = 0; i < count; i++)
     x[i] *= data->grown[n];
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_FREE_ROTATION_H
-#define SUPPORT_FREE_ROTATION_H
-
 #include "../core/step.h"
 
 #if defined(__GNUC__) && !defined(__clang__)
@@ -284,5 +281,3 @@ static inline void turn_body(const step_data *step, int first, int axis, const f
     dp[i] += changes[1][i];
   }
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_HAMILTONIAN_ITERATION_H
-#define SUPPORT_HAMILTONIAN_ITERATION_H
-
 #include "../core/progress.h"
 #include "one_trajectory.h"
 #include "point_weights.h"
@@ -235,8 +232,6 @@ static inline void integrals_of_iteration(const step_data *step, const iteration
   for (int k = 0; k < INTEGRALS; k++)
     sum[k] = points_total(part[k]);
 }
-#endif
-
 #endif
 
 #endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_ITERATION_SOLVER_H
-#define SUPPORT_ITERATION_SOLVER_H
-
 #include "../core/status_codes.h"
 #include "one_trajectory.h"
 
@@ -75,5 +72,3 @@ HOT int solve(const step_data *step, const solver_data *data, history memory, lo
   }
   return solve_afresh(step, data, memory, guess, dq, dp, options, report, workspace);
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_MANY_TRAJECTORIES_H
-#define SUPPORT_MANY_TRAJECTORIES_H
-
 #include "../core/trajectories.h"
 #include "../core/stagnation.h"
 
@@ -210,5 +207,3 @@ static inline long long next_guess(long long steps, const progress *now, const s
     largest = report->active[j] > 0.0 ? larger(view.lane[j], largest) : largest;
   return steps_to_continue(steps, largest);
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_MASS_MATRIX_H
-#define SUPPORT_MASS_MATRIX_H
-
 /* Linear systems with the mass matrix in every lane, which is diagonal (DIAGONAL_MASS), known by terms of its inverse
  * (MASS_TERMS), or full. */
 #ifdef DIAGONAL_MASS
@@ -74,6 +71,4 @@ static inline void solve_mass(const lanes *mass, lanes *r)
     for (int i = 0; i < j; i++)
       r[i] -= mass[j * M + i] * r[j];
 }
-#endif
-
 #endif

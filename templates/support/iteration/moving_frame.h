@@ -1,6 +1,3 @@
-#ifndef SUPPORT_MOVING_FRAME_H
-#define SUPPORT_MOVING_FRAME_H
-
 #include "../core/progress.h"
 #include "hamiltonian_iteration.h"
 #include "one_trajectory.h"
@@ -313,5 +310,3 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   *steps = next_guess(*steps, &now, report);
   return OK;
 }
-
-#endif

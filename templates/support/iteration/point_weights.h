@@ -1,6 +1,3 @@
-#ifndef SUPPORT_POINT_WEIGHTS_H
-#define SUPPORT_POINT_WEIGHTS_H
-
 #include "../core/vectors.h"
 
 /* Quadrature weights times h, constant during a run. Requires: the tables; with damping, damped_points.h. */
@@ -29,5 +26,3 @@ static inline void scale(const weight *weights, lanes (*x)[M], lanes (*scaled)[M
     for (int i = 0; i < M; i++)
       scaled[n][i] = weights[n] * x[n][i];
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_SECANTS_H
-#define SUPPORT_SECANTS_H
-
 #include "point_weights.h"
 
 /* Anderson acceleration of a fixed-point iteration g(z) = z + r(z) (D. G. Anderson, J. ACM 12 (1965), 547-560): with
@@ -124,5 +121,3 @@ static inline void accelerate(secants *past, int restart, const number *unit, nu
   for (int j = 0; j < past->count && j < SECANTS; j++)
     add_multiple(-share * inner_product(past->dr[j], r, unit), past->dg[j], z);
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_SEPARABLE_ITERATION_H
-#define SUPPORT_SEPARABLE_ITERATION_H
-
 #include "../core/vectors.h"
 
 /* Fixed-point iteration of a step for constant diagonal masses and forces F(q, t) (Li, Wu & Leok, eqs. (25)-(30)): X_n
@@ -402,6 +399,4 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   *steps = next_guess(*steps, &now, report);
   return OK;
 }
-#endif
-
 #endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_SHOOTING_ITERATION_H
-#define SUPPORT_SHOOTING_ITERATION_H
-
 #include "../core/progress.h"
 #include "curve.h"
 #include "mass_matrix.h"
@@ -130,5 +127,3 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   *steps = next_guess(*steps, &now, report);
   return OK;
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_SPLITTING_H
-#define SUPPORT_SPLITTING_H
-
 #include "../core/status_codes.h"
 #include "../core/step.h"
 
@@ -107,5 +104,3 @@ SPLITTING int solve(const step_data *step, const solver_data *data, real *memory
   *guess = 1;
   return OK;
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_DAMPING_H
-#define SUPPORT_DAMPING_H
-
 #include "../core/step.h"
 
 /* Uniform damping at a rate gamma, from the Lagrangian e^(gamma t) L: point n is weighted by e^(gamma c_n h), c_n h the
@@ -32,5 +29,3 @@ static inline void shrink(const step_data *step, real *dp)
   for (int i = 0; i < M; i++)
     dp[i] = factor * dp[i] + loss * (step->p0[i] + step->carry_p[i]);
 }
-
-#endif

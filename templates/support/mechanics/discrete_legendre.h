@@ -1,6 +1,3 @@
-#ifndef SUPPORT_DISCRETE_LEGENDRE_H
-#define SUPPORT_DISCRETE_LEGENDRE_H
-
 /* Discrete Lagrangian of an explicit method (EXPLICIT_STEPS) or of an implicit one (DISCRETE_LAGRANGIAN), with its
  * Legendre transforms; otherwise work and impulses of the forces of a step. */
 #if defined(EXPLICIT_STEPS)
@@ -100,6 +97,4 @@ SELDOM int NAME(work_and_impulses)(real t, real h, const real *q0, const real *p
   report->steps = 1;
   return OK;
 }
-#endif
-
 #endif

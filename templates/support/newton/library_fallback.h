@@ -1,6 +1,3 @@
-#ifndef SUPPORT_LIBRARY_FALLBACK_H
-#define SUPPORT_LIBRARY_FALLBACK_H
-
 #include "../core/status_codes.h"
 #include "../core/step.h"
 
@@ -65,6 +62,4 @@ const void *NAME(provided_fallback)(void)
   static const fallback shared_fallback = {provided_step};
   return &shared_fallback;
 }
-#endif
-
 #endif

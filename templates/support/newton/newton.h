@@ -1,6 +1,3 @@
-#ifndef SUPPORT_NEWTON_H
-#define SUPPORT_NEWTON_H
-
 #include "../core/status_codes.h"
 #include "../core/step.h"
 #include "band.h"
@@ -189,5 +186,3 @@ static int newton(const step_data *step, newton_data *data, const real *q1, real
     report->iterations++;
   }
 }
-
-#endif

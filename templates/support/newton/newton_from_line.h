@@ -1,6 +1,3 @@
-#ifndef SUPPORT_NEWTON_FROM_LINE_H
-#define SUPPORT_NEWTON_FROM_LINE_H
-
 #include "newton.h"
 
 /* Newton's method without previous steps. Requires: newton.h. */
@@ -42,6 +39,4 @@ static SELDOM int is_spurious(const step_data *step, const real *z, const real *
   return 0;
 #endif
 }
-#endif
-
 #endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_NEWTON_SOLVER_H
-#define SUPPORT_NEWTON_SOLVER_H
-
 #include "newton_from_line.h"
 #include "stages.h"
 
@@ -104,5 +101,3 @@ static int solve(const step_data *step, const solver_data *unused, real *memory,
   *guess = POINT > 0 && keep ? 2 : 1;
   return status;
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_STAGES_H
-#define SUPPORT_STAGES_H
-
 #include "../core/numbers.h"
 
 /* Interpolation from the unknowns z to values at points. Requires: real, B, MOST_POINTS. Unknown b of site i is z[i B +
@@ -107,6 +104,4 @@ static inline void begin_rows(const step_data *step, const real *z, real *rows, 
   if (jacobian)
     memset(jacobian, 0, sizeof(real) * band_size(shape));
 }
-#endif
-
 #endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_ADVANCE_TO_H
-#define SUPPORT_ADVANCE_TO_H
-
 #include "run.h"
 
 /* Adaptive integration to a given time t_end.
@@ -56,5 +53,3 @@ int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long step
   save_state(&now.at, run);
   return OK;
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_ENSEMBLE_RUN_H
-#define SUPPORT_ENSEMBLE_RUN_H
-
 #include "../iteration/many_trajectories.h"
 
 /* Ensemble runs with compensated sums; trajectories are SIMD lanes. Requires: many_trajectories.h, numbers.h, and
@@ -178,5 +175,3 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
   save_state(&now, block);
   memcpy(block->memory, memory, sizeof memory);
 }
-
-#endif

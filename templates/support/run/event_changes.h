@@ -1,6 +1,3 @@
-#ifndef SUPPORT_EVENT_CHANGES_H
-#define SUPPORT_EVENT_CHANGES_H
-
 #include "events.h"
 
 /* Runs whose events change the state: impacts, impulses, switches.
@@ -621,5 +618,3 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, r
   }
   return OK;
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_EVENTS_H
-#define SUPPORT_EVENTS_H
-
 #include "../core/numbers.h"
 #include "../core/status_codes.h"
 
@@ -369,8 +366,7 @@ static int rounding_of(const event_step *step, const event_sample *at)
   memset(noise, 0, BYTES(EVENTS));
   for (int k = 0; status == OK && k < (each ? M : 3); k++) {
     for (int i = 0; i < M; i++)
-      next.q[i] = at->q[i] * (each ? 1.0 + (i == k) * DBL_EPSILON
-                                   : 1.0 + ((i * k / 2) % 2 ? -DBL_EPSILON : DBL_EPSILON));
+      next.q[i] = at->q[i] * (1.0 + (each ? (i == k) : (i * k / 2) % 2 ? -1 : 1) * DBL_EPSILON);
     status = evaluate_functions(step, &next, now);
     for (int e = 0; status == OK && e < EVENTS; e++)
       noise[e] = each ? noise[e] + fabs(now[e] - before[e]) : fmax(noise[e], fabs(now[e] - before[e]));
@@ -654,5 +650,3 @@ int NAME(crossings)(event_watch *watch, long long count, const real *h, const re
   }
   return OK;
 }
-
-#endif

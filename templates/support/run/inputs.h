@@ -1,6 +1,3 @@
-#ifndef SUPPORT_INPUTS_H
-#define SUPPORT_INPUTS_H
-
 #include "../core/step.h"
 
 /* Inputs: piecewise polynomials of time. A run ends a step at their breakpoints and continues with the parameters of
@@ -61,5 +58,3 @@ long long NAME(next_steps)(run_memory *run, real t_end, real h, input_data *inpu
   run->h = length;
   return whole >= 1 ? (long long)whole : 1;
 }
-
-#endif

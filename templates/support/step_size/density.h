@@ -1,6 +1,3 @@
-#ifndef SUPPORT_DENSITY_H
-#define SUPPORT_DENSITY_H
-
 #include "../run/run.h"
 
 /* Reversible step-size control by an integrated step density; HAMILTONIAN_SYSTEM: the density depends on momenta,
@@ -107,5 +104,3 @@ static void accept_trial(run_memory *run, trial *now)
   now->turned = 0;
   run->step++;
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_ERROR_GROWTH_H
-#define SUPPORT_ERROR_GROWTH_H
-
 #include "../iteration/separable_iteration.h"
 #include "../run/run.h"
 
@@ -200,5 +197,3 @@ static __attribute__((noinline)) void measure_growth(run_memory *run, const step
   if (run->tangent_steps++ % SAMPLED_STEPS == 0 && run->measures_growth)
     sample_growth(run, step, data, dq, dp);
 }
-
-#endif

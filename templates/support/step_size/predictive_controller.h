@@ -1,6 +1,3 @@
-#ifndef SUPPORT_PREDICTIVE_CONTROLLER_H
-#define SUPPORT_PREDICTIVE_CONTROLLER_H
-
 #include "step_size_levels.h"
 
 /* Predictive step-size controller (Gustafsson, ACM Trans. Math. Softw. 20 (1994) 496). */
@@ -17,5 +14,3 @@ static int next_change(run_memory *run, real error, real before, const error_lim
     change--;
   return change;
 }
-
-#endif

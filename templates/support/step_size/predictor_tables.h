@@ -1,6 +1,3 @@
-#ifndef SUPPORT_PREDICTOR_TABLES_H
-#define SUPPORT_PREDICTOR_TABLES_H
-
 #include "../core/points.h"
 #include "../core/step.h"
 
@@ -26,5 +23,3 @@ static inline int choose_tables(const run_memory *run, struct predictor_tables_o
   }
   return 1;
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_STAGE_ERROR_H
-#define SUPPORT_STAGE_ERROR_H
-
 #include "../core/step.h"
 #include "../newton/band.h"
 
@@ -34,5 +31,3 @@ static real stage_error(const step_data *step, const real *z, const real *dq, re
   }
   return least;
 }
-
-#endif

@@ -1,6 +1,3 @@
-#ifndef SUPPORT_STEP_SIZE_LEVELS_H
-#define SUPPORT_STEP_SIZE_LEVELS_H
-
 #include "../core/numbers.h"
 
 /* Step-size control. Step sizes of adaptive steps are roots of 2 to the power of a grid level, and the error estimate
@@ -82,5 +79,3 @@ static real next_size(real length, real rest, int *last)
   *last = length * (1 + LAST_STEP) >= MATH(fabs)(rest);
   return *last ? rest : MATH(copysign)(length, rest);
 }
-
-#endif

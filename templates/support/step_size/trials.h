@@ -1,6 +1,3 @@
-#ifndef SUPPORT_TRIALS_H
-#define SUPPORT_TRIALS_H
-
 #include "observed_error.h"
 #include "step_size_levels.h"
 
@@ -365,6 +362,4 @@ int NAME(advance_to)(run_memory *run, double t_end, double tolerance, long long 
   (void)workspace;
   return perform(run, way, parameters, options, report);
 }
-#endif
-
 #endif
