@@ -85,9 +85,9 @@ def transposed(rows: Any) -> Any:
 
 
 def without_negation(original: Any) -> Any:
-    def printed(expression: Any, context: int, target: Any) -> Any:
+    def printed(expression: Any, *others: Any) -> Any:
         negated = isinstance(expression, Operation) and expression.operator == "neg"
-        return original(expression.operands[0] if negated else expression, context, target)
+        return original(expression.operands[0] if negated else expression, *others)
 
     return printed
 

@@ -77,7 +77,7 @@ MUTATIONS = (
     function(
         "numbers printed with 8 digits", case("pendulum/svi"), c_printer, "print_number", lambda _: eight_digits_text
     ),
-    function("minus signs lost", case("double/svi"), c_printer, "_print", without_negation),
+    function("minus signs lost", case("double/svi"), c_printer, "print_expression", without_negation),
     function("tables rounded to 8 digits", case("double/svi"), kernel, "lower_matrix", of_entries(eight_digits)),
     function(
         "weights rounded to 8 digits",

@@ -107,7 +107,7 @@ def certified(case: Case, apply: Callable[[Sabotage], None] | None = None, *, ed
     """The certificate of a case with a fault in force, or without one."""
     assert case.system.formula is not None  # read before the fault is in force
     flags = QUICK_FLAGS if apply is None else (*QUICK_FLAGS, f"-DFAULT_{next(_numbers)}")
-    with _sabotaged(apply) as sabotage:
+    with sabotaged(apply) as sabotage:
         stepper = compiler.compile_stepper(
             case.system, case.method(), flags=flags, time_transformation=case.time_transformation
         )
@@ -119,7 +119,7 @@ def certified(case: Case, apply: Callable[[Sabotage], None] | None = None, *, ed
 
 
 @contextlib.contextmanager
-def _sabotaged(apply: Callable[[Sabotage], None] | None) -> Iterator[Sabotage]:
+def sabotaged(apply: Callable[[Sabotage], None] | None) -> Iterator[Sabotage]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compiler, "cached_source", lambda *arguments: arguments[-1]())
         sabotage = Sabotage(patch)

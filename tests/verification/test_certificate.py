@@ -12,7 +12,7 @@ from checkout import ROOT
 from click.testing import CliRunner
 from faults import Mutation, inside
 from mutations import MUTATIONS
-from sabotage import certified
+from sabotage import certified, sabotaged
 from samples import QUICK_FLAGS, pushed_pendulum
 
 import scvi_codegen as sc
@@ -62,6 +62,9 @@ def test_planted_faults_find_their_source_lines() -> None:
     texts = [path.read_text("utf-8") for path in ROOT.glob("templates/support/*/*.h")]
     places = {what: inside(within, pattern) for what, _, within, pattern, _ in C_TEXT}
     assert [what for what, place in places.items() if not any(re.search(place, text) for text in texts)] == []
+    for mutation in MUTATIONS:
+        with sabotaged(mutation.apply):  # raises an error for a function that no longer exists
+            pass
 
 
 def test_planted_fault_leaves_no_trace_in_the_process() -> None:
