@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.native.building import Library
+from scvi_codegen.native.calls import FIRST_RESULT, RESULTS
 from scvi_codegen.native.options import FAILURES, FALLBACK_REQUIRED, SolverOptions, checked_options
 
 DOUBLE_SIZE = np.dtype(np.float64).itemsize
@@ -55,6 +56,7 @@ class Binding:
         self.null, self._doubles = library.ffi.NULL, partial(library.ffi.from_buffer, "double[]")
         self.integers: Callable[[NDArray[np.int32]], Any] = partial(library.ffi.from_buffer, "int[]")
         self.whole_numbers: Callable[[NDArray[np.int64]], Any] = partial(library.ffi.from_buffer, "long long[]")
+        self._has: dict[str, bool] = {}  # whether the library has a function
         self._fallback = fallback if self.has("set_fallback") else None
         self._fallback_binding: Self | None = None
         self._spare = local()
@@ -73,11 +75,20 @@ class Binding:
     def function(self, name: str, memory: Any = None) -> Callable[..., Any]:
         """Return ``<prefix>_<name>``, bound to this memory if one is given; it releases the GIL while it runs."""
         function: Callable[..., Any] = getattr(self._lib, f"{self._prefix}_{name}")
-        leading = () if memory is None else (memory,)
-        called = partial(function, *leading) if leading else function
-        if self._fallback is not None and name not in WITHOUT_STEPS:
-            return self._with_fallback(called, *leading)
-        return called
+        if memory is not None:
+            function = partial(function, memory)
+        if self._fallback is None or name in WITHOUT_STEPS:
+            return function
+        restored = bytearray() if memory is None else self._ffi.buffer(memory)
+        return self._with_fallback(function, restored)
+
+    def call(self, name: str, call: Any) -> Callable[[int, int], int]:
+        """Return the function ``<prefix>_call_<name>`` of numbers of steps and of those between stored states."""
+        function: Callable[[int, int], int] = partial(getattr(self._lib, f"{self._prefix}_call_{name}"), call)
+        if self._fallback is None:
+            return function
+        restored = bytearray() if name == "integrate" else self._ffi.buffer(call.run)
+        return self._with_fallback(function, restored, call.workspace)
 
     def with_function(self, name: str) -> Self:
         """Return this binding, or that of the fallback if only it has the function; MethodError if neither has it."""
@@ -106,20 +117,29 @@ class Binding:
 
     def has(self, name: str) -> bool:
         """Return whether the library has the function ``<prefix>_<name>``."""
-        return hasattr(self._lib, f"{self._prefix}_{name}")
+        if name not in self._has:
+            self._has[name] = hasattr(self._lib, f"{self._prefix}_{name}")
+        return self._has[name]
 
-    def _with_fallback(self, function: Callable[..., Any], *changed: Any) -> Callable[..., Any]:
-        """Return the function of a workspace, called again on the initial memory if it requests the fallback."""
-        memory = self._ffi.buffer(*changed) if changed else bytearray()
+    def results(self, call: Any) -> Callable[[], tuple[Any, ...]]:
+        """Return a function that returns the results of the last integration by a call."""
+        first = self._ffi.offsetof(self._ffi.typeof(call).item, FIRST_RESULT)
+        return partial(RESULTS.unpack_from, self._ffi.buffer(call), first)
+
+    def _with_fallback(self, function: Callable[..., Any], restored: Any, workspace: Any = None) -> Callable[..., Any]:
+        """Return the function, called again on the restored memory if it requests the fallback.
+
+        Its last argument is the workspace, unless one is given.
+        """
 
         def call(*arguments: Any) -> Any:
-            before = memory[:]
+            before = restored[:]
             status = function(*arguments)
             if status != FALLBACK_REQUIRED:
                 return status
             self.set_fallback()
-            self._refer_to_fallback(arguments[-1])
-            memory[:] = before
+            self._refer_to_fallback(arguments[-1] if workspace is None else workspace)
+            restored[:] = before
             return function(*arguments)
 
         return call

@@ -14,6 +14,7 @@ from scvi_codegen.errors import MethodError, ScviCodegenError
 from scvi_codegen.indices import SIZES_REQUIRED
 from scvi_codegen.native import building
 from scvi_codegen.native.binding import Binding
+from scvi_codegen.native.calls import with_calls
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.runtime.arrays.any_size import (
@@ -138,7 +139,7 @@ class CompiledMethod:
             from scvi_codegen.rendering.events import with_events  # here, because it imports SymPy
 
             self.source = with_events(self._plain, interface, events)
-        library = building.load(self.source, flags=self.flags)
+        library = building.load(with_calls(self.source), flags=self.flags)
         if self.problem is not None:
             arrays = library, interface, self.problem
             self.binding: Binding = EventBinding(*arrays, events) if events else ArrayBinding(*arrays)
@@ -328,7 +329,7 @@ class CompiledMethod:
         if not self.run_time_sizes:
             self.binding.set_fallback()
         elif not self._reason:
-            building.load(self.source, flags=self.flags)
+            building.load(with_calls(self.source), flags=self.flags)
 
     @cached_property
     def tangent(self) -> Binding:

@@ -33,10 +33,11 @@ REPORTED = 1e-3
 class StateFunctions(CompiledMethod):
     """Compiled method with functions of a state, which do not depend on the steps."""
 
-    def _parameters_at(self, q: Array, p: Array, parameters: Parameters = None) -> Array:
+    def _parameters_at(self, q: States, p: States, parameters: Parameters = None) -> Array:
         """Return (k,) values in order; in transformed time the energy defaults to that of the state (q, p)."""
         values = self._parameters(parameters)
         if not self._has_energy(parameters):
+            q, p = checked_pair(self.interface, q, p)
             values[parameter_index(self.interface, self.interface.energy_parameter)] = self.energy(q, p, 0.0, values)
         return values
 

@@ -33,7 +33,7 @@ from scvi_codegen.runtime.events.event import Event, EventLike
 from scvi_codegen.runtime.inputs.segments import InputSegments, checked_inputs, final_time
 from scvi_codegen.runtime.rotations.states import homogeneous_state, is_one_state
 from scvi_codegen.runtime.run.accuracy import (
-    measure_growth,
+    measured_growth,
     warn_of_energy_errors,
     warn_of_error_growth,
     warn_of_inaccuracy,
@@ -161,14 +161,18 @@ class Stepper(Integrator):
             plan = StepPlan(h=plan.h) if plan.h else plan  # each segment ends where the next begins
             segments = InputSegments(stepper, inputs, parameters, t, final_time(t, plan.h, steps, t_end))
             parameters = segments.first
-        run = stepper._started(q, p, velocity, plan, t, parameters, options, reuse=True)
-        if check_growth or not plan.h:
-            measure_growth(run, check_growth)
+        if p is None or velocity is not None or interface.constraints:
+            q, p = stepper._consistent_state(q, p, velocity, t, parameters)
+        growth = 0 if plan.h and not check_growth else measured_growth(stepper, plan, check_growth)
+        t = checked_number(t, "the time t")
+        times = None if t_eval is None else stepper._output_times(t_eval, t, plan, count)
+        run = Run._reused(stepper)
+        run._set_up(plan, parameters, options, q, p)
         if segments is None:
-            times = None if t_eval is None else stepper._output_times(t_eval, run, count)
-            trajectory = run._recorded(count, save_every, times, progress, observe)
+            trajectory = run._integrated(q, p, t, growth, count, save_every, times, progress, observe)
             warn_of_inaccuracy(trajectory, run)
         else:
+            run._begin(q, p, t, growth)
             trajectory = segments.record(run, save_every, progress)
         if not plan.h:
             repeat = None if segments is None else partial(segments.advance, run)
@@ -249,17 +253,18 @@ class Stepper(Integrator):
         t: float,
         parameters: Parameters,
         options: SolverOptions | None,
-        *,
-        reuse: bool = False,
     ) -> Run:
-        """Return a run with these arguments of :meth:`start`, in memory of an earlier one if ``reuse``."""
+        """Return a run with these arguments of :meth:`start`."""
+        q, p = self._consistent_state(q, p, velocity, t, parameters)
+        return Run.started(self, q, p, plan=plan, t=t, parameters=parameters, options=options)
+
+    def _consistent_state(
+        self, q: States, p: States | None, velocity: States | None, t: float, parameters: Parameters
+    ) -> tuple[States, States]:
+        """Return (q, p), or q and the momenta of a velocity, on the constraints."""
         if p is None or velocity is not None:
             p = self._initial_momenta(q, p, velocity, t, parameters)
-        if self.interface.constraints:
-            q, p = consistent(self, q, p, t, parameters)
-        run = Run._reused(self) if reuse else Run(self)
-        run._start(q, p, plan=plan, t=t, parameters=parameters, options=options)
-        return run
+        return consistent(self, q, p, t, parameters) if self.interface.constraints else (q, p)
 
     def _run(self, q: Array, p: Array, **arguments: Any) -> Run:
         """Return a run from a state that satisfies the constraints."""
@@ -269,13 +274,13 @@ class Stepper(Integrator):
         """Return the step plan of these arguments of :meth:`start`."""
         return checked_plan(h, t_end, tolerance, self.interface.time_transformation, self.in_tau)
 
-    def _output_times(self, t_eval: ArrayLike, run: Run, steps: int | None) -> Array:
+    def _output_times(self, t_eval: ArrayLike, t: float, plan: StepPlan, steps: int | None) -> Array:
         if steps is None:
-            return times_of_run(t_eval, run.t, run.plan.t_end)
+            return times_of_run(t_eval, t, plan.t_end)
         if self.in_tau:
             raise StateError("t_eval requires t_end instead of steps in transformed time")
-        end = times_after(run.t, run.h, checked_count(steps, "steps", least=0))[0]
-        return times_of_run(t_eval, run.t, float(end))
+        end = times_after(t, plan.h, checked_count(steps, "steps", least=0))[0]
+        return times_of_run(t_eval, t, float(end))
 
     def from_checkpoint(
         self,

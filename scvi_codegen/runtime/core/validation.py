@@ -183,22 +183,33 @@ def _declared(declaration: str) -> tuple[str, tuple[int, ...]]:
 
 
 BINARY64, FEW = np.dtype(np.float64), 64
+SEQUENCES, NUMBERS = (list, tuple), frozenset((float, int, np.float64))
+"""Types of short vectors, and of their entries, that are converted without NumPy."""
 States = ArrayLike | Mapping[str, ArrayLike]
 """Positions, momenta or velocities: numbers in order, or arrays by name."""
 Parameters = Mapping[str, Any] | Sequence[float] | Array | None
 """Parameters, also arrays of known sizes, by name (others have their defaults), or all in order."""
 
 
+def _short_vector(value: Any, count: int) -> Array | None:
+    """Return a copy of a short vector of finite numbers, faster than by NumPy's functions; else ``None``."""
+    kind = type(value)
+    try:
+        if count > FEW:
+            return None
+        if kind is np.ndarray and value.dtype is BINARY64 and value.shape == (count,):
+            return value.copy() if math.isfinite(sum(value.tolist())) else None
+        if kind in SEQUENCES and 0 < len(value) == count and NUMBERS.issuperset(map(type, value)):
+            return np.array(value, BINARY64) if math.isfinite(sum(value)) else None
+    except OverflowError:  # of an integer above all floats
+        pass
+    return None
+
+
 def checked_vector(interface: Interface, value: States, name: str) -> Array:
     """Return a finite, contiguous (m,) copy; for one coordinate a number suffices."""
-    if (
-        type(value) is np.ndarray
-        and value.dtype is BINARY64
-        and value.shape == (len(interface.coordinates),)
-        and len(value) <= FEW  # faster than NumPy's functions
-        and math.isfinite(sum(value.tolist()))  # else an entry, or only the sum, is not finite
-    ):
-        return value.copy()
+    if (vector := _short_vector(value, len(interface.coordinates))) is not None:
+        return vector
     array, coordinates = real_array(flat_state(interface, value, name), name), interface.coordinates
     if array.ndim == 0 and interface.dimension == 1:
         array = array.reshape(1)

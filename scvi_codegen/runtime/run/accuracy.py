@@ -293,24 +293,23 @@ def warn_of_error_growth(
         _Repetition(run, states, advance_until).warn(requested=bool(requested))
 
 
-def measure_growth(run: Memory, requested: bool | None) -> None:
-    """Let C propagate a tangent vector along a run that starts, if its check is wanted and C supports it.
+def measured_growth(stepper: Integrator, plan: StepPlan, requested: bool | None) -> int:
+    """Return how C measures the growth of errors along a run: 0 no, 1 or 2 by a tangent vector (``measures_growth``).
 
     Raises:
         MethodError: for a requested check, if events change the state.
         StateError: for a requested check, unless steps are adaptive.
     """
-    plan = run._plan
     if requested:
-        require(run.stepper, "check_growth")
+        require(stepper, "check_growth")
         if not plan.adaptive:
             raise StateError(
                 "check_growth=True requires adaptive steps, but the step size is fixed: give t_end without h, or omit "
                 "check_growth"
             )
-    elif requested is None and run._can_measure_growth and _warnings_enabled.get():
-        tangent = 1 + (plan.tolerance > LOOSE_TOLERANCE)
-        run._memory.measures_growth = 0 if plan.h or plan.tau or run.stepper.changes_states else tangent
+    if requested is not None or not plan.adaptive or stepper.changes_states or not _warnings_enabled.get():
+        return 0
+    return 1 + (plan.tolerance > LOOSE_TOLERANCE)
 
 
 def _warn_of_amplification(what: str) -> None:

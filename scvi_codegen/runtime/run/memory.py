@@ -1,7 +1,7 @@
 """Memory of a run: one plain C struct that is started, advanced, saved and restored bitwise."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any, Self
 
 import numpy as np
@@ -45,8 +45,6 @@ STEPS_FROM_REST, STEPS_NEAR_REST = 2**20, 16
 """First value of the count of steps from rest in C; number of steps in which a force moves a state away from rest."""
 EVENT_NUMBERS = ("undefined", "accumulated", "through", "jammed")
 """Numbers of events, from 1 on, in the state of the search for events; 0 for none, < 0 for an undefined change."""
-FUNCTIONS = ("start", "advance", "advance_to", "step_error")
-"""Functions of C that take a run; sources of version 0.1 have no error estimate."""
 NO_OUTPUT, NO_PLAN = LARGEST_COUNT, StepPlan()
 """Output stride that saves no state; plan of a run that was not started."""
 
@@ -72,19 +70,29 @@ class Memory(OneThread):
         self._options: SolverOptions | None = None
         self._has_defaults = False  # whether no parameter differs from its default
         self._watch: Any = None  # state of the search for events in C
-        self._energies: Any = None  # function of C, and memory for its results
-        self._rows: Any = None  # memory for states that every recording uses
-        self._times_in_rows: Any = None  # times of the trajectory whose states are in this memory
+        self._rows: Any = None  # memory for the states of short runs
+        self._ends: tuple[float, float] | None = None  # energies at both ends of a short run
         self._has_tau = stepper.in_tau  # whether steps are steps of tau
-        self._discarded = *(binding.numbers(f"double[{stepper.dimension}]"),) * 3, binding.numbers("int *")
         self._report, self._workspace = binding.new("report *"), binding.workspace(memory)
-        self._set_arguments(binding.null)
+        self._calls: tuple[Any, ...] = ()
+        self._discarded = *(binding.numbers(f"double[{stepper.dimension}]"),) * 3, binding.numbers("int *")
+        self._call = self._new_call(*self._discarded)
+        self._take = binding.call("advance", self._call)  # function of numbers of steps and of those between states
         self._untimed = len(self._q) <= MOST_UNTIMED  # whether ``advance`` takes steps without looking at the clock
-        self._functions = {name: binding.function(name, memory) for name in FUNCTIONS if binding.has(name)}
-        self._step_error = self._functions.get("step_error")
+        self._start_function = binding.function("start", memory)
+        self._step_error = binding.function("step_error", memory) if binding.has("step_error") else None
         self._plan, self.longest, self._can_measure_growth = NO_PLAN, 0.0, hasattr(memory, "measures_growth")
         firsts = {name: parameter_index(stepper.interface, f"{name}_0") for name in stepper.interface.inputs}
         self._inputs = {name: slice(first, first + 5) for name, first in firsts.items()}
+
+    def _new_call(self, t: Any, q: Any, p: Any, iterations: Any) -> Any:
+        """Return the arguments of C calls that store states in this memory."""
+        call = self.stepper.binding.new("call *")
+        call.run, (call.parameters, call.options) = self._memory, self._arguments
+        call.t, call.q, call.p, call.iterations = t, q, p, iterations
+        call.report, call.workspace, call.coordinates = self._report, self._workspace, len(self._q)
+        self._calls = *self._calls, call
+        return call
 
     @classmethod
     def started(cls, stepper: Integrator, q: States, p: States, **arguments: Any) -> Self:
@@ -104,15 +112,23 @@ class Memory(OneThread):
         options: SolverOptions | None = None,
     ) -> None:
         """Start at (q, p) and t; nothing of an earlier run remains."""
-        stepper, interface = self.stepper, self.stepper.interface
-        t, rows = checked_number(t, "the time t"), self._rows
-        pointers: Iterable[Any] | None = None if rows is None else rows.begin(t, q, p)
-        if pointers is None:
-            q0, p0 = checked_pair(interface, q, p)
-            pointers = stepper.binding.pointers(q0, p0) if rows is None else rows.begin_checked(t, q0, p0)
-        self._functions["start"](t, plan.h, *pointers)
+        self._set_up(plan, parameters, options, q, p)
+        self._begin(q, p, checked_number(t, "the time t"))
+
+    def _begin(self, q: States, p: States, t: float, growth: int = 0) -> None:
+        """Start at (q, p) and t after :meth:`_set_up`; ``growth``: value of ``measures_growth`` in C."""
+        q, p = checked_pair(self.stepper.interface, q, p)
+        self._start_function(t, self._plan.h, *self.stepper.binding.pointers(q, p))
+        if growth and self._can_measure_growth:
+            self._memory.measures_growth = growth
+
+    def _set_up(
+        self, plan: StepPlan, parameters: Parameters, options: SolverOptions | None, q: States, p: States
+    ) -> None:
+        """Set what holds for all steps of a run that starts at (q, p)."""
         if parameters is not None or not self._has_defaults:
-            self._parameters[:] = stepper._parameters_at(self._q, self._p, parameters)
+            stepper, interface = self.stepper, self.stepper.interface
+            self._parameters[:] = stepper._parameters_at(q, p, parameters)
             self._check_masses()
             self._unset_inputs = inputs_not_given(interface, parameters)
             self._has_defaults = parameters is None and not interface.energy_parameter
@@ -120,17 +136,13 @@ class Memory(OneThread):
             self.plan = plan
         if options is not self._options:
             self._set_options(options)
-        self.longest, self._watch = 0.0, None
+        self.longest, self._watch, self._ends = 0.0, None, None
 
     def _set_options(self, options: SolverOptions | None) -> None:
-        self._set_arguments(self.stepper.binding.options(checked_options(options)))
+        self._arguments = self._arguments[0], self.stepper.binding.options(checked_options(options))
+        for call in self._calls:
+            call.options = self._arguments[1]
         self._options = options
-
-    def _set_arguments(self, options: Any) -> None:
-        """Set the options, and the arguments of C calls that save no states and of those that save them in rows."""
-        self._arguments = self._arguments[0], options
-        self._unsaved = *self._arguments, *self._discarded, self._report, self._workspace
-        self._in_rows = *self._arguments, *(self._rows.next if self._rows else ()), self._report, self._workspace
 
     @classmethod
     def restored(
@@ -177,9 +189,9 @@ class Memory(OneThread):
     def plan(self, plan: StepPlan) -> None:
         if not (plan.fixed or self.stepper._has_error_estimate):
             require(self.stepper, "adaptive")
-        self._plan, self._plan_arguments = plan, () if plan.h else (plan.t_end, plan.tau or plan.tolerance)
-        self._has_tau = bool(plan.tau) or self.stepper.in_tau
-        self._advance_function = self._functions["advance" if plan.fixed else "advance_to"]
+        self._plan, self._has_tau = plan, bool(plan.tau) or self.stepper.in_tau
+        for call in self._calls:
+            call.h, call.t_end, call.tolerance = plan.h, plan.t_end, plan.tau or plan.tolerance
 
     @property
     def h(self) -> float:
@@ -342,7 +354,7 @@ class Memory(OneThread):
                     size = left if left < STEPS_PER_CALL else STEPS_PER_CALL
                     if self._unset_inputs:
                         self.check_inputs()
-                    if status := self._advance_function(*self._plan_arguments, size, NO_OUTPUT, *self._unsaved):
+                    if status := self._take(size, NO_OUTPUT):
                         raise self._failure(status)
                     left -= size if fixed else self._report.steps
             else:
@@ -361,7 +373,9 @@ class Memory(OneThread):
 
     def _taken(self, steps: int) -> int:
         """Take steps in one C call and return their number."""
-        if status := self._advance(steps, NO_OUTPUT, self._discarded):
+        if self._unset_inputs and steps:
+            self.check_inputs()
+        if status := self._take(steps, NO_OUTPUT):
             raise self._failure(status)
         taken: int = self._report.steps
         return taken
@@ -382,10 +396,12 @@ class Memory(OneThread):
         """Take steps in one C call; every ``save_every``-th state goes to ``output_arrays``. Return the status."""
         if self._unset_inputs and steps:
             self.check_inputs()
-        status: int = self._advance_function(
-            *self._plan_arguments, steps, save_every, *self._arguments, *output_arrays, self._report, self._workspace
-        )
-        return status
+        call = self._call
+        call.t, call.q, call.p, call.iterations = output_arrays
+        try:
+            return self._take(steps, save_every)
+        finally:
+            call.t, call.q, call.p, call.iterations = self._discarded
 
     @property
     def iterations(self) -> int:
@@ -426,17 +442,17 @@ class Memory(OneThread):
 
     def _end_energies(self, t: Array, q: Array, p: Array) -> tuple[float, float] | None:
         """Return the energies of the first and the last state of a run so far; ``None`` outside the domain of L."""
-        binding = self.stepper.binding
-        if self._energies is None:
-            self._energies = binding.function("energies"), binding.numbers("double[2]")
-        (function, energies), in_rows = self._energies, t is self._times_in_rows
-        at, positions, momenta = self._rows.starts[:3] if in_rows else binding.pointers(t, q, p)
-        last, values, workspace = len(t) - 1, self._arguments[0], self._workspace
-        status = function(1 + (last == 1), at, positions, momenta, values, energies, workspace)
-        if last != 1 and not status:
-            row = last * len(self._q)
-            status = function(1, at + last, positions + row, momenta + row, values, energies + 1, workspace)
-        return None if status else (energies[0], energies[1])
+        if self._ends is not None:
+            return self._ends
+        binding, values = self.stepper.binding, []
+        (start, positions, momenta), m = binding.pointers(t, q, p), len(self._q)
+        function, energy = binding.function("energies"), binding.numbers("double *")
+        for k in (0, len(t) - 1):
+            row = start + k, positions + k * m, momenta + k * m
+            if function(1, *row, self._arguments[0], energy, self._workspace):
+                return None
+            values.append(energy[0])
+        return values[0], values[1]
 
     @property
     def _growth(self) -> tuple[float, float] | None:

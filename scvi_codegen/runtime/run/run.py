@@ -12,14 +12,14 @@ from numpy.typing import ArrayLike
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.constraints.projection import constraint_values, multipliers
 from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.core.validation import Array, Parameters
+from scvi_codegen.runtime.core.validation import Array, Parameters, States
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.run.accuracy import warn_of_inaccuracy
 from scvi_codegen.runtime.run.descriptions import describe_run
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.observation import Observation
 from scvi_codegen.runtime.run.one_thread import alone
-from scvi_codegen.runtime.run.run_loop import FIRST_STEPS, StateRows, record
+from scvi_codegen.runtime.run.run_loop import FIRST_STEPS, ShortRuns, integrate_short, record
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import LARGEST_COUNT
@@ -46,8 +46,7 @@ class Run(Memory, AttitudeHistory):
         except IndexError:
             run, binding = cls(stepper), stepper.binding
             if binding.reusable and binding._workspace + FIRST_STEPS * len(run._q) <= MOST_KEPT:
-                run._rows = StateRows(run, FIRST_STEPS + 3)
-                run._set_arguments(binding.null)
+                run._rows = ShortRuns(run)
         return run
 
     def _release(self) -> None:
@@ -105,6 +104,27 @@ class Run(Memory, AttitudeHistory):
             recorder = Observation(self, save_every=save_every, times=times, observe=observe)
             return recorder.advance(steps, progress, stop or (lambda: False))
         return record(self, steps, save_every=save_every, progress=progress, stop=stop)
+
+    def _integrated(
+        self,
+        q: States,
+        p: States,
+        t: float,
+        growth: int,
+        steps: int | None,
+        save_every: int,
+        times: Array | None,
+        progress: Callable[[int], None] | None,
+        observe: Callable[[Run], ArrayLike] | None,
+    ) -> Trajectory:
+        """Start a run that is set up at (q, p) and record it as :meth:`_recorded`, a short one by one C call."""
+        plan, stores_all = self._plan, times is None and observe is None and progress is None
+        fits = steps is None if not plan.h else steps is not None and steps <= FIRST_STEPS * save_every
+        special = self._has_tau or self._unset_inputs or self.stepper.events or self._rows is None
+        if fits and stores_all and not special and t != plan.t_end:
+            return integrate_short(self, q, p, t, steps, save_every, growth)
+        self._begin(q, p, t, growth)
+        return self._recorded(steps, save_every, times, progress, observe)
 
     @property
     def velocity(self) -> Array:

@@ -7,15 +7,16 @@ import struct
 from collections.abc import Callable
 from functools import lru_cache, partial
 from math import isfinite
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.native.arguments import empty_array
-from scvi_codegen.runtime.core.validation import BINARY64, FEW, Array
+from scvi_codegen.runtime.core.validation import BINARY64, FEW, NUMBERS, SEQUENCES, Array
 from scvi_codegen.runtime.events.event import Crossings
+from scvi_codegen.runtime.rotations.states import checked_pair
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.singular_time import ProgressWatch, check_energy_surface
@@ -26,8 +27,6 @@ from scvi_codegen.validation import checked_count
 
 States = tuple[Array, Array, Array, NDArray[np.int32]]
 NATIVE_DOUBLE, INT32 = struct.Struct("d"), np.dtype(np.int32)
-SEQUENCES, NUMBERS = (list, tuple), frozenset((float, int, np.float64))
-"""Types of states, and of their entries, that are converted without NumPy."""
 FIRST_STEPS = 256
 """Number of saved states of the first C call, before the speed of the steps is known."""
 
@@ -39,11 +38,14 @@ def record(
     save_every: int = 1,
     progress: Callable[[int], None] | None = None,
     stop: Callable[[], bool] | None = None,
+    filled: int = 0,
+    status: int = 0,
 ) -> Trajectory:
     """Advance by ``steps``; save the present state and those whose step number is a multiple of ``save_every``.
 
     Adaptive steps end at the target time, whose state is saved as well; ``steps`` may then be omitted. The run ends
-    early if ``stop``, which is called before each chunk of steps, returns true.
+    early if ``stop``, which is called before each chunk of steps, returns true. ``filled``: states of the run that its
+    memory for short runs already contains; ``status``: of the step after them.
 
     Raises:
         StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
@@ -51,12 +53,7 @@ def record(
     count = None if steps is None and not memory._plan.h else checked_count(steps, "steps", least=0)
     if type(save_every) is not int or save_every != 1:
         save_every = checked_count(save_every, "save_every", least=1)
-    first, filled, status = memory._memory.step, 0, 0
-    if progress is None and stop is None and memory._rows is not None and not memory._has_tau:
-        trajectory, filled, status = _in_one_call(memory, memory._rows, first, count, save_every)
-        if trajectory is not None:
-            return trajectory
-    recorder = _StateRecorder(memory, save_every, count, first, filled)
+    recorder = _StateRecorder(memory, save_every, count, filled)
     try:
         recorder.check(status)
         drive(
@@ -76,120 +73,109 @@ def record(
     return trajectory
 
 
-def _in_one_call(
-    memory: Memory, rows: StateRows, first: int, steps: int | None, save_every: int
-) -> tuple[Trajectory | None, int, int]:
-    """Record a short run by one C call; return the trajectory if the run has ended, number of states and status.
-
-    No states: a longer run, or one that has arrived. Otherwise the recording continues after these states.
-    """
-    h, most = memory._plan.h, FIRST_STEPS * save_every
-    size = most if steps is None else steps
-    if size > most:
-        return None, 0, 0
-    if first:
-        rows.begin_checked(memory.t, memory._q, memory._p)
-    if not h and rows.time == memory._plan.t_end:
-        return None, 0, 0
-    if memory._unset_inputs and size:
-        memory.check_inputs()
-    status = memory._advance_function(*memory._plan_arguments, size, save_every, *memory._in_rows)
-    filled = 1 + (memory._memory.step // save_every - first // save_every if h else memory._report.stored)
-    if status or (steps is None and memory._report.steps == size):
-        return None, filled, status
-    states = rows.copies(filled)
-    if h:
-        step_sizes = _repeated(h, filled)
-    else:
-        step_sizes = rows.step_sizes() if save_every == 1 else _differences(states[0], whole=False)
-    memory._times_in_rows = states[0]
-    return trajectory_of(memory, states, step_sizes), filled, status
-
-
 class StateRows:
     """Memory for the times, positions, momenta and iterations of states of a run.
 
     Attributes:
         states: the arrays.
-        starts, next: pointers to their first and to their second rows.
+        starts: pointers to their first rows.
     """
-
-    __slots__ = (
-        *("_count", "_difference", "_p", "_pack", "_pointers", "_q", "_steps", "_t", "_views"),
-        *("next", "shape", "starts", "states"),
-    )
 
     def __init__(self, memory: Memory, rows: int) -> None:
         m, binding = len(memory._q), memory.stepper.binding
         t, q, p = empty_array((rows,)), empty_array((rows, m)), empty_array((rows, m))
         self.states: States = t, q, p, np.zeros(rows, INT32)
         self.starts = *binding.pointers(t, q, p), binding.integers(self.states[3])
-        first: Any = map(memoryview, (t, q[0], p[0]))  # faster to assign to than arrays
-        self._t, self._q, self._p = first
-        self._pointers = self.starts[1:3]
-        self.shape = (m,) if m <= FEW else None  # of vectors that are checked as lists, faster than as arrays
-        self._pack = struct.Struct(f"{m}d").pack_into
-        self.next, self._count, self._views = self.after(1), 0, self.states
-
-    def begin(self, t: float, q: Any, p: Any) -> tuple[Any, Any] | None:
-        """Set the first state; return pointers to it, ``None`` unless q and p are short vectors of finite numbers."""
-        kind = type(q)
-        if kind is not type(p) or self.shape is None:
-            return None
-        if kind is np.ndarray:
-            if not (q.shape == p.shape == self.shape and q.dtype is p.dtype is BINARY64):
-                return None
-            q, p = q.tolist(), p.tolist()  # lists are checked and copied faster than short arrays
-        elif kind not in SEQUENCES or not NUMBERS.issuperset(map(type, q + p)):
-            return None
-        try:
-            if isfinite(sum(q, sum(p))):
-                self._pack(self._q, 0, *q)
-                self._pack(self._p, 0, *p)
-                self._t[0] = t
-                return self._pointers
-        except (OverflowError, struct.error):  # of an integer above all floats; of another number of entries
-            pass
-        return None
-
-    @property
-    def time(self) -> Any:
-        """Time of the first state."""
-        return self._t[0]
-
-    def begin_checked(self, t: float, q: Array, p: Array) -> tuple[Any, Any]:
-        """Set the first state and return pointers to it."""
-        self._t[0] = t
-        try:
-            self._q[:] = q
-            self._p[:] = p
-        except ValueError:  # unaligned arrays, which memory views do not copy
-            self.states[1][0], self.states[2][0] = q, p
-        return self._pointers
 
     def after(self, row: int) -> tuple[Any, ...]:
         """Return pointers to a row."""
         (t, q, p, iterations), begin = self.starts, row * self.states[1].shape[1]
         return t + row, q + begin, p + begin, iterations + row
 
-    def copies(self, count: int) -> States:
-        """Return copies of the first rows."""
-        if count != self._count:
-            self._count, self._views, self._steps = count, self.first(count), np.full(count, math.nan)
-            t = self._views[0]
-            self._difference = partial(np.subtract, t[1:], t[:-1], self._steps[:-1])
-        t, q, p, iterations = self._views
-        return t.copy(), q.copy(), p.copy(), iterations.copy()
-
-    def step_sizes(self) -> Array:
-        """Return the steps that follow the states of :meth:`copies`, NaN for the last one."""
-        self._difference()
-        return self._steps.copy()
-
     def first(self, count: int) -> States:
         """Return the first rows, in the same memory."""
         t, q, p, iterations = self.states
         return t[:count], q[:count], p[:count], iterations[:count]
+
+    def copies(self, count: int) -> States:
+        """Return copies of the first rows."""
+        t, q, p, iterations = self.first(count)
+        return t.copy(), q.copy(), p.copy(), iterations.copy()
+
+
+class ShortRuns(StateRows):
+    """Memory of runs of at most ``FIRST_STEPS`` saved states, each started and recorded by one C call.
+
+    Args:
+        memory: the run, whose parameters, options and plan the call uses.
+    """
+
+    def __init__(self, memory: Memory) -> None:
+        super().__init__(memory, FIRST_STEPS + 3)
+        stepper, m = memory.stepper, len(memory._q)
+        self.interface, self._count = stepper.interface, 0
+        self.shape = (m,) if m <= FEW else None  # of vectors that are checked as lists, faster than as arrays
+        self._start, self._sizes = np.empty(1 + 2 * m), np.full(FIRST_STEPS + 3, math.nan)
+        self._pack = partial(struct.Struct(f"{1 + 2 * m}d").pack_into, cast(Any, self._start), 0)
+        self.call = memory._new_call(*self.starts)
+        self.call.start, self.call.sizes = stepper.binding.pointers(self._start, self._sizes)
+        self.call.has_energies = self.interface.conserves_energy and not stepper.changes_states
+        self.integrate = stepper.binding.call("integrate", self.call)
+        self.results = stepper.binding.results(self.call)
+
+    def begin(self, t: float, q: Any, p: Any) -> None:
+        """Set the initial state; raise :class:`StateError` unless q and p are (m,) finite numbers."""
+        numbers, kind = None, type(q)
+        if kind is type(p) and self.shape is not None:
+            if kind is np.ndarray:
+                if q.shape == p.shape == self.shape and q.dtype is p.dtype is BINARY64:
+                    numbers = q.tolist() + p.tolist()
+            elif kind in SEQUENCES and (len(q),) == (len(p),) == self.shape and NUMBERS.issuperset(map(type, q + p)):
+                numbers = q + p
+        try:
+            if numbers is not None and isfinite(sum(numbers)):
+                self._pack(t, *numbers)
+                return
+        except (OverflowError, struct.error):  # of an integer above all floats
+            pass
+        self._start[:] = t, *np.concatenate(checked_pair(self.interface, q, p))
+
+    def recorded(self, count: int, h: float, save_every: int) -> tuple[States, Array]:
+        """Return copies of the first states and of the steps that follow them."""
+        if count != self._count:
+            self._count, self._views = count, (*self.first(count), self._sizes[:count])
+            self._undefined = np.full(count, math.nan)
+        t, q, p, iterations, sizes = self._views
+        if h:
+            sizes = _repeated(h, count)
+        elif save_every == 1:
+            sizes[-1] = math.nan
+            sizes = sizes.copy()
+        else:
+            sizes = self._undefined.copy()
+        return (t.copy(), q.copy(), p.copy(), iterations.copy()), sizes
+
+
+def integrate_short(
+    run: Memory, q: Any, p: Any, t: float, steps: int | None, save_every: int, growth: int
+) -> Trajectory:
+    """Start a run that is set up at (q, p) and record it, all by one C call if it ends within ``FIRST_STEPS`` states.
+
+    ``growth``: value of ``measures_growth`` in C. Raises as :func:`record`.
+    """
+    short: ShortRuns = run._rows
+    h = run._plan.h
+    size = FIRST_STEPS * save_every if steps is None else steps
+    short.begin(t, q, p)
+    short.call.measures_growth = growth
+    status = short.integrate(size, save_every)
+    error, error_t, first, last, stored, done, rejected = short.results()
+    if status or (steps is None and done == size):
+        return record(run, steps, save_every=save_every, filled=1 + stored, status=status)
+    if not h:
+        run._ends = first, last
+    states, sizes = short.recorded(1 + stored, h, save_every)
+    return _trajectory(run, states, sizes, done, error, error_t, rejected)
 
 
 class _StateRecorder:
@@ -200,8 +186,8 @@ class _StateRecorder:
 
     __slots__ = ("earlier", "filled", "first", "first_size", "memory", "rows", "save_every", "watch")
 
-    def __init__(self, memory: Memory, save_every: int, steps: int | None, first: int, filled: int) -> None:
-        plan = memory._plan
+    def __init__(self, memory: Memory, save_every: int, steps: int | None, filled: int) -> None:
+        plan, first = memory._plan, 0 if filled else memory._memory.step
         self.memory, self.save_every, self.first, self.filled = memory, save_every, first, filled or 1
         if plan.h:
             assert steps is not None  # by the caller
@@ -213,7 +199,8 @@ class _StateRecorder:
         kept: StateRows | None = memory._rows
         self.rows = kept if kept is not None and rows <= len(kept.states[0]) else StateRows(memory, rows)
         if not filled:
-            self.rows.begin_checked(memory.t, memory._q, memory._p)
+            t, q, p, _ = self.rows.states
+            t[0], q[0], p[0] = memory.t, memory._q, memory._p
         self.earlier: list[States] = []
         self.watch = ProgressWatch(memory.stepper, plan.t_end) if plan.tau else None
 
@@ -226,7 +213,7 @@ class _StateRecorder:
             self.earlier.append(self._states())
             self.rows, self.filled = StateRows(memory, size // save_every + 2), 0
         rows, filled = self.rows, self.filled
-        status = memory._advance(size, save_every, rows.next if filled == 1 else rows.after(filled))
+        status = memory._advance(size, save_every, rows.after(filled))
         report = memory._report
         if to_end:
             self.filled += report.stored
@@ -277,9 +264,21 @@ def trajectory_of(
     tau: Array | None = None,
 ) -> Trajectory:
     """Return a trajectory of these states with the data of the run."""
-    plan, stepper, run = memory._plan, memory.stepper, memory._memory
-    step_error = math.nan if memory._step_error is None else memory._step_error()
-    # attribute by attribute: with 16 keywords the call of a class takes five times as long
+    run, error = memory._memory, math.nan if memory._step_error is None else memory._step_error()
+    done, rejected = run.step if steps is None else steps, run.rejected if memory._plan.adaptive else 0
+    trajectory = _trajectory(memory, states, step_sizes, done, error, run.error_t if error >= 0.0 else 0.0, rejected)
+    trajectory.events, trajectory.tau = events, tau
+    return trajectory
+
+
+def _trajectory(
+    memory: Memory, states: States, step_sizes: Array, steps: int, error: float, error_t: float, rejected: int
+) -> Trajectory:
+    """Return a trajectory without events.
+
+    Its attributes are set one by one, because a call of the class with 16 keywords takes five times as long.
+    """
+    plan, stepper = memory._plan, memory.stepper
     trajectory = Trajectory.__new__(Trajectory)
     t, q, p, trajectory.iterations = states
     if stepper.shapes is not None:
@@ -287,15 +286,14 @@ def trajectory_of(
     trajectory.t, trajectory.q, trajectory.p, trajectory.step_sizes = t, q, p, step_sizes
     trajectory.h = plan.h or first_step_size(plan, t)
     trajectory.plan, trajectory.stepper, trajectory.options = plan, stepper, memory._options
-    trajectory.steps = run.step if steps is None else steps
-    trajectory.rejected_steps = 0 if plan.h or plan.tau else run.rejected
-    if step_error >= 0.0:
-        trajectory.step_error, trajectory.worst_step_time = step_error, run.error_t
+    trajectory.steps, trajectory.rejected_steps = steps, rejected
+    if error >= 0.0:
+        trajectory.step_error, trajectory.worst_step_time = error, error_t
     else:
         trajectory.step_error = trajectory.worst_step_time = math.nan
-    trajectory.parameters, trajectory.events, trajectory.tau = memory._parameters.copy(), events, tau
-    trajectory.confirmation = trajectory.observed = trajectory.conserved = None
-    trajectory.pieces = ()
+    trajectory.parameters = memory._parameters.copy()
+    trajectory.events = trajectory.pieces = ()
+    trajectory.tau = trajectory.confirmation = trajectory.observed = trajectory.conserved = None
     return trajectory
 
 

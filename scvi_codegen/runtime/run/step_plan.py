@@ -126,7 +126,7 @@ def planned_steps(
     if t_end is None:  # Steps
         if steps is None:
             raise StateError("h requires steps or t_end (fixed step size); give t_end without h for adaptive steps")
-        return plan, steps
+        return plan, checked_count(steps, "steps", least=0)
     count = None if in_tau or steps is not None else steps_to(t, t_end, plan.h)
     if count is not None and count % checked_count(save_every, "save_every", least=1) == 0:
         return plan, count
