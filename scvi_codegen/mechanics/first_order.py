@@ -110,11 +110,6 @@ class FirstOrderSystem(HamiltonianSystem):
         return {each.name: values[each] for each in self.variables}
 
     @property
-    def depends_on_time(self) -> bool:
-        """True if time occurs in theta or H: along trajectories dH/dt = H_t - theta_t . q'."""
-        return self.time in self.lagrangian.free_symbols
-
-    @property
     def is_canonical(self) -> bool:
         """True if theta_x = y, so that the system is an ordinary Hamiltonian one."""
         return self.one_form == self.momenta

@@ -246,7 +246,7 @@ class MechanicalSystem(Deferred, ABC):
     @property
     def depends_on_time(self) -> bool:
         """True if time occurs in the function, a force or a constraint, so that energy is not conserved."""
-        return any(self.time in formula.free_symbols for formula in (self.formula, *self.forces, *self.constraints))
+        return any(self.time in formula.free_symbols for formula in (self.lagrangian, *self.forces, *self.constraints))
 
     @property
     def changes_energy(self) -> str:
@@ -255,7 +255,7 @@ class MechanicalSystem(Deferred, ABC):
             return "forces act" if self.forces else "damping takes it"
         if self._constraints_work():
             return "constraints do work"
-        return f"{'H' if self.auxiliaries else 'L'} depends on time" if self.formula.has(self.time) else ""
+        return f"{'H' if self.auxiliaries else 'L'} depends on time" if self.lagrangian.has(self.time) else ""
 
     @property
     def balances_energy(self) -> bool:

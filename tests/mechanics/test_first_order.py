@@ -427,3 +427,12 @@ def test_inputs(tmp_path) -> None:
     half = solve_ivp(right, (0.0, 1.0), [0.3, 0.2], method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
     expected = solve_ivp(right, (1.0, 2.0), half, method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
     assert np.abs(run.variables[-1] - expected).max() < 1e-10
+
+
+def test_one_forms_that_contain_time_change_the_energy():
+    """Adaptive runs then issue no warning of the changed energy; warnings are errors in these tests."""
+    text = "(y + sin(t)*y/2)*x_dot - (x**2 + y**2)/2"
+    system = sc.LagrangianSystem.from_text(name="one-form", coordinates=["x", "y"], lagrangian=text)
+    assert system.changes_energy == "H depends on time"
+    run = sc.compile_stepper(system, "svi:6").integrate([0.5], [0.3], t_end=7.0)
+    assert np.ptp(run.energy()) > 0.01
