@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 import scvi_codegen
-from scvi_codegen import Model, ModelFileError, derive
+from scvi_codegen import Model, ModelFileError
+from scvi_codegen.cli.commands.derive import derive
 from scvi_codegen.cli.commands.run import run
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 from scvi_codegen.models.options import FIELDS, OPTIONS, RUN_FIELDS, alternatives

@@ -1,5 +1,7 @@
 """Periodic orbits: published ones, closed forms, monodromies by DOP853, and what is no orbit."""
 
+import warnings
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -197,6 +199,21 @@ def test_orbits_are_found_from_a_guess_that_is_15_percent_off(planar, speed, dur
 def test_another_orbit_is_reported(planar):
     with pytest.warns(sc.AccuracyWarning, match=r"far from the guess: its period is .*, not 2\.78019"):
         sc.periodic_orbit(planar, [0.82, 0.0], velocity=[0.0, 0.18689], period=2.780187, steps=200, fixed=["x", "y"])
+
+
+def test_another_member_of_the_family_is_reported(planar):
+    """A velocity 10 % too large leads to an orbit of 2.5 times the amplitude; one 10 % too small to a neighbour."""
+    for speed, reported in ((1.1, True), (0.9, False)):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            velocity = [0.0, 0.1625133 * speed]
+            orbit = sc.periodic_orbit(planar, [0.82, 0.0], velocity=velocity, period=2.780187, steps=200)
+        states = np.concatenate([orbit.run().q, orbit.run().p], axis=1)
+        away = np.abs([*orbit.q, *orbit.p] - np.array([0.82, 0.0, 0.0, 0.82 + velocity[1]])).max()
+        amplitude = np.ptp(states, axis=0).max() / 2
+        text = f"period is {orbit.period:.6g}, not 2.78019, and its state differs by {away:.2g}, where the amplitude "
+        assert [text in str(each.message) for each in caught] == [True] * reported
+        assert (away > amplitude / 3) == reported
 
 
 def test_invalid_orbits_are_rejected(galaxy):

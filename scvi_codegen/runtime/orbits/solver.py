@@ -60,6 +60,8 @@ FREEDOM = 3.0
 """Largest factor by which the period of an orbit may differ from its guess."""
 FAR = 1.5
 """Factor between the periods, and part of the size of the state, beyond which an orbit is not the guessed one."""
+OTHER = 1.0 / 3.0
+"""Part of the amplitude of an orbit from which its distance to the guess is reported."""
 EQUILIBRIUM_MOTION = 1e-6
 """Motion over a period, relative to the size of the state, below which an orbit counts as an equilibrium."""
 
@@ -87,7 +89,8 @@ def periodic_orbit(
     Where the orbit is unstable, multiple shooting improves the guess first. Give a state on the orbit, the period, and
     ``steps`` or ``h``; without ``fixed`` or ``energy`` the orbit is one of a family near the guess. If the iteration
     fails or converges to an equilibrium, it is repeated from a closed curve near the guess, and with fixed positions.
-    An :class:`~scvi_codegen.AccuracyWarning` reports an orbit far from the guess.
+    An :class:`~scvi_codegen.AccuracyWarning` reports an orbit that differs from the guess by more than a third of its
+    amplitude, with its period, this distance and its amplitude: another member of the family, or another orbit.
 
     Args:
         stepper: the compiled stepper.
@@ -186,18 +189,12 @@ class _OrbitSearch:
             try:
                 orbit = search._orbit(guess, smoothed=smoothed)
                 if _is_near(orbit, guess):
-                    return orbit
+                    return _compared(orbit, guess)
                 far.append(orbit)
             except (OrbitError, StepFailedError, np.linalg.LinAlgError) as failure:
                 failures.append(failure)
         if far:
-            away = float(np.abs(np.concatenate([far[0].q, far[0].p]) - guess[:-1]).max())
-            warn(
-                f"the periodic orbit that was found is far from the guess: its period is {far[0].period:.6g}, "
-                f"not {guess[-1]:.6g}, and its state differs by {away:.2g}. Compare both, or fix an amplitude",
-                AccuracyWarning,
-            )
-            return far[0]
+            return _compared(far[0], guess, far=True)
         raise next((each for each in failures if isinstance(each, OrbitError)), failures[0])
 
     def _orbit(self, guess: Array, *, smoothed: bool) -> PeriodicOrbit:
@@ -436,6 +433,21 @@ class _OrbitSearch:
 
 def _listed(values: Array) -> str:
     return f"[{', '.join(f'{x:.6g}' for x in values[:6])}{', ..' if len(values) > 6 else ''}]"
+
+
+def _compared(orbit: PeriodicOrbit, guess: Array, *, far: bool = False) -> PeriodicOrbit:
+    """Return an orbit; warn if it is another member of its family than that of the guess, or ``far`` from it."""
+    states = orbit.run()
+    amplitude = float(np.ptp(np.concatenate([states.q, states.p], axis=1), axis=0).max()) / 2.0
+    away = float(np.abs(np.concatenate([orbit.q, orbit.p]) - guess[:-1]).max())
+    if far or away > OTHER * amplitude:
+        warn(
+            f"the periodic orbit that was found is far from the guess: its period is {orbit.period:.6g}, not "
+            f"{guess[-1]:.6g}, and its state differs by {away:.2g}, where the amplitude of the orbit is "
+            f"{amplitude:.2g}. Compare both, or fix an amplitude",
+            AccuracyWarning,
+        )
+    return orbit
 
 
 def _is_near(orbit: PeriodicOrbit, guess: Array) -> bool:
