@@ -26,7 +26,7 @@ enum {
   KEPLER_SVI_4_NOT_CONVERGED = 1, /* max_iterations reached */
   KEPLER_SVI_4_SINGULAR = 2, /* the Newton matrix is singular */
   KEPLER_SVI_4_NOT_FINITE = 3, /* a value is infinite or NaN */
-  KEPLER_SVI_4_STEP_SIZE_UNDERFLOW = 4, /* an adaptive step size fell below machine precision */
+  KEPLER_SVI_4_STEP_SIZE_UNDERFLOW = 4, /* step size underflow: the solution ends there */
   KEPLER_SVI_4_SPURIOUS_SOLUTION = 5 /* converged to a spurious solution of the stage equations */
 };
 
@@ -92,7 +92,8 @@ int kepler_svi_4_step(double t, double h, const double *q0, const double *p0, co
     const kepler_svi_4_options *options, double *q1, double *p1, kepler_svi_4_report *report, double *workspace);
 
 /* Runs with compensated sums and predictors: start a run, then advance it any number of times. Every `every` steps,
- * counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored one (k). */
+ * counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored one (k);
+ * options NULL: the defaults. */
 void kepler_svi_4_start(kepler_svi_4_run *run, double t, double h, const double *q, const double *p);
 int kepler_svi_4_advance(kepler_svi_4_run *run, long long steps, long long every, const double *parameters,
     const kepler_svi_4_options *options, double *t, double *q, double *p, int *iterations, kepler_svi_4_report *report,

@@ -27,7 +27,7 @@ enum {
   PENDULUM_STOERMER_VERLET_NOT_CONVERGED = 1, /* max_iterations reached */
   PENDULUM_STOERMER_VERLET_SINGULAR = 2, /* the Newton matrix is singular */
   PENDULUM_STOERMER_VERLET_NOT_FINITE = 3, /* a value is infinite or NaN */
-  PENDULUM_STOERMER_VERLET_STEP_SIZE_UNDERFLOW = 4, /* an adaptive step size fell below machine precision */
+  PENDULUM_STOERMER_VERLET_STEP_SIZE_UNDERFLOW = 4, /* step size underflow: the solution ends there */
   PENDULUM_STOERMER_VERLET_SPURIOUS_SOLUTION = 5 /* converged to a spurious solution of the stage equations */
 };
 
@@ -87,7 +87,8 @@ int pendulum_stoermer_verlet_step(double t, double h, const double *q0, const do
     double *workspace);
 
 /* Runs with compensated sums and predictors: start a run, then advance it any number of times. Every `every` steps,
- * counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored one (k). */
+ * counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored one (k);
+ * options NULL: the defaults. */
 void pendulum_stoermer_verlet_start(pendulum_stoermer_verlet_run *run, double t, double h, const double *q,
     const double *p);
 int pendulum_stoermer_verlet_advance(pendulum_stoermer_verlet_run *run, long long steps, long long every,

@@ -27,7 +27,7 @@ enum {
   TWO_POINT_PENDULUM_NOT_CONVERGED = 1, /* max_iterations reached */
   TWO_POINT_PENDULUM_SINGULAR = 2, /* the Newton matrix is singular */
   TWO_POINT_PENDULUM_NOT_FINITE = 3, /* a value is infinite or NaN */
-  TWO_POINT_PENDULUM_STEP_SIZE_UNDERFLOW = 4, /* an adaptive step size fell below machine precision */
+  TWO_POINT_PENDULUM_STEP_SIZE_UNDERFLOW = 4, /* step size underflow: the solution ends there */
   TWO_POINT_PENDULUM_SPURIOUS_SOLUTION = 5 /* converged to a spurious solution of the stage equations */
 };
 
@@ -87,7 +87,8 @@ int two_point_pendulum_step(double t, double h, const double *q0, const double *
     double *workspace);
 
 /* Runs with compensated sums and predictors: start a run, then advance it any number of times. Every `every` steps,
- * counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored one (k). */
+ * counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored one (k);
+ * options NULL: the defaults. */
 void two_point_pendulum_start(two_point_pendulum_run *run, double t, double h, const double *q, const double *p);
 int two_point_pendulum_advance(two_point_pendulum_run *run, long long steps, long long every, const double *parameters,
     const two_point_pendulum_options *options, double *t, double *q, double *p, int *iterations,

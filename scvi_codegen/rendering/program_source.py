@@ -38,7 +38,6 @@ DECLARATIONS = {
     "stepper": "parts/declarations.h.jinja",
     "ensemble": "parts/ensemble_declarations.h.jinja",
     "events": "parts/events_declarations.h.jinja",
-    "arrays": "parts/arrays_declarations.h.jinja",
 }
 """Inner part of a header by the name of its template."""
 
@@ -192,13 +191,14 @@ def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") 
     """Return the source of entry templates from their context, with defaults for all of them."""
     common = {"prefix": prefix, "target": DOUBLE, "real": DOUBLE.scalar, "max_iterations": MAX_ITERATIONS}
     environment, context = template_environment(), {**common, **context}
+    header = entry if entry in DECLARATIONS else "stepper"
     code = environment.get_template(f"{entry}.c.jinja").render(context)
     own = cast("Mapping[str, str]", context.get("own_headers", {}))
     return Source(
         prefix=prefix,
-        header=environment.get_template(f"{entry}.h.jinja").render(context),
+        header=environment.get_template(f"{header}.h.jinja").render(context),
         code=code,
-        declarations=environment.get_template(DECLARATIONS[entry]).render(context),
+        declarations=environment.get_template(DECLARATIONS[header]).render(context),
         support=included(code, lambda name: own.get(name) or support_text(name)),
     )
 

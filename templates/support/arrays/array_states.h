@@ -15,46 +15,38 @@ static const double *joined(const run_memory *run, const double *q, const double
 }
 #endif
 
-int NAME(velocity)(double t, const double *q, const double *p, const double *parameters, double *v,
-    double *workspace)
+/* Legendre transform: velocities of momenta x or, with `inverse`, momenta of velocities x. */
+static int legendre_transform(double t, const double *q, const double *x, const double *parameters, double *y,
+    int inverse, double *workspace)
 {
   run_memory *run = run_in(workspace);
   const int status = use_parameters(run, parameters);
   if (status != OK)
     return status;
 #ifdef SITE_TRANSFORM
-  find_velocities(&run->data, joined(run, q, p), t, v);
+  (inverse ? find_momenta : find_velocities)(&run->data, joined(run, q, x), t, y);
   return OK;
 #elif defined(HAMILTONIAN_SYSTEM)
-  (void)t, (void)q, (void)p, (void)v;
+  (void)t, (void)q, (void)x, (void)y, (void)inverse;
   return SINGULAR; /* unknown */
 #else
   (void)t, (void)q;
   for (long long i = 0; i < coordinates_of(&run->data); i++)
-    v[i] = p[i] * run->inverse_mass[i];
+    y[i] = inverse ? x[i] / run->inverse_mass[i] : x[i] * run->inverse_mass[i];
   return OK;
 #endif
+}
+
+int NAME(velocity)(double t, const double *q, const double *p, const double *parameters, double *v,
+    double *workspace)
+{
+  return legendre_transform(t, q, p, parameters, v, 0, workspace);
 }
 
 int NAME(momentum)(double t, const double *q, const double *v, const double *parameters, double *p,
     double *workspace)
 {
-  run_memory *run = run_in(workspace);
-  const int status = use_parameters(run, parameters);
-  if (status != OK)
-    return status;
-#ifdef SITE_TRANSFORM
-  find_momenta(&run->data, joined(run, q, v), t, p);
-  return OK;
-#elif defined(HAMILTONIAN_SYSTEM)
-  (void)t, (void)q, (void)p, (void)v;
-  return SINGULAR; /* unknown */
-#else
-  (void)t, (void)q;
-  for (long long i = 0; i < coordinates_of(&run->data); i++)
-    p[i] = v[i] / run->inverse_mass[i];
-  return OK;
-#endif
+  return legendre_transform(t, q, v, parameters, p, 1, workspace);
 }
 
 /* Stores the parts of the energies of count states, or their sum only. */
