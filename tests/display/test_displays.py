@@ -170,6 +170,7 @@ class TestTrajectory:
         shown = trajectory()._repr_html_()
         assert "0 to 100, h = 0.1" in shown
         assert "1001; q and p of shape (1001, 2)" in shown
+        assert re.search(r">iterations</th><td[^>]*>(\d+)<", shown)[1] == str(sum(trajectory().iterations))
         energies = trajectory().energy()[::3]
         assert f"{energies.min():.10g} to {energies.max():.10g}" in shown
         pictures = Page(shown).all("svg")

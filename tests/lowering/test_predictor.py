@@ -10,10 +10,11 @@ ENERGIES = {
     "coupled": ("(x_dot**2 + y_dot**2)/2 + x_dot*y_dot/3", "(x**2 + y**2)/2", "x + y", 4 / 3),
     "hamiltonian": ("p_x**2/2", "x**2/2", "x", 1.0),
     "array": ("sum(i in N, x_dot[i]**2/2)", "sum(i in N, x[i]**2/2)", "sum(i in N, x[i])", 1.0),
+    "array with friction": ("sum(i in N, x_dot[i]**2/2)", "sum(i in N, x[i]**2/2)", "sum(i in N, x[i])", 1.0),
     "array hamiltonian": ("sum(i in N, p_x[i]**2/2)", "sum(i in N, x[i]**2/2)", "sum(i in N, x[i])", 1.0),
 }
 """Kinetic energy, potential, sum of the coordinates, and mass of the motion in which all coordinates are equal."""
-STEPS, MOST = 6, 3
+STEPS, MOST, FRICTION = 6, 3, 0.25
 
 
 def motion(degree):
@@ -23,21 +24,23 @@ def motion(degree):
 def stepper(kind, method, degree):
     """Return a stepper for oscillators with a force for which the polynomial is the solution."""
     kinetic, potential, coordinates, mass = ENERGIES[kind]
-    force = motion(degree) + mass * motion(degree).deriv(2)
+    friction = FRICTION * ("friction" in kind)
+    force = motion(degree) + friction * motion(degree).deriv() + mass * motion(degree).deriv(2)
     pushed = "(" + " + ".join(f"{float(c)!r}*t**{k}" for k, c in enumerate(force.coef)) + f")*({coordinates})"
     if "hamiltonian" in kind:
         group, given = sc.HamiltonianSystem, {"hamiltonian": f"{kinetic} + {potential} - {pushed}"}
     else:
         group, given = sc.LagrangianSystem, {"lagrangian": f"{kinetic} - {potential} + {pushed}"}
     if "array" in kind:
-        system = group.from_text(name=kind, coordinates=["x[N]"], **given)
+        forces = {"x[i]": f"-{friction}*x_dot[i]"} if friction else None
+        system = group.from_text(name=kind, coordinates=["x[N]"], forces=forces, **given)
         return sc.compile_stepper(system, method, solver="fixed-point"), [mass] * 3
     names = ["x", "y"] if "y" in coordinates else ["x"]
     system = group.from_text(name=kind, coordinates=names, **given)
     return sc.compile_stepper(system, method, solver="fixed-point"), [mass] * len(names)
 
 
-@pytest.mark.sampled(5)
+@pytest.mark.covering
 @pytest.mark.parametrize("degree", [3, 9], ids=["one vector of points", "several"])
 @pytest.mark.parametrize("kind", ENERGIES)
 def test_polynomial_motions_need_no_iterations_after_the_first_step(kind, degree):

@@ -4,6 +4,7 @@ Each model is a text with the arguments that ``integrate`` takes for it. States 
 line and of the generated folder are equal bit by bit, those that the C program prints up to its compiler's flags.
 """
 
+import re
 import subprocess
 from pathlib import Path
 from typing import NamedTuple
@@ -244,6 +245,10 @@ def test_programs_print_the_states_of_integrate(name, compiler):
     same = np.abs(start.t[nearest] - found[:, 0]) < 1e-9
     assert same.all() if case.error == 0.0 else same[0] and same.sum() > 1
     assert_allclose(found[same], states[nearest[same]], rtol=0, atol=case.error)
+    if start.plan.adaptive:  # steps also end at the printed times
+        steps, rejected = map(int, re.fullmatch(r"# (\d+) steps, (\d+) rejected", comments[-1]).groups())
+        assert start.steps <= steps < start.steps + len(printed)
+        assert abs(rejected - start.rejected_steps) < 3
     energy = "energy_change" if model.system.changes_energy else "energy_error"
     names = [coordinate.name for coordinate in model.system.coordinates]
     assert comments[0].split() == ["#", "t", *names, *(f"p_{name}" for name in names), energy]

@@ -281,6 +281,8 @@ def test_missing_input_is_not_zero(pendulum):
         lambda: stepper.jacobian(*state, 0.1),
         lambda: stepper.work_and_impulses(*state, 0.1),
         lambda: stepper.integrate(*state, h=0.1, steps=2, parameters={"u_0": 1.0}),
+        lambda: stepper.integrate(*state, h=0.1, steps=1, observe=lambda run: run.q),
+        lambda: stepper.start(*state, h=0.1).record(1),
         lambda: stepper.integrate(*state, t_end=1.0, parameters={"w_0": 1.0}),
         lambda: stepper.integrate_ensemble([[0.3]], [[0.0]], h=0.1, steps=2),
         lambda: sc.periodic_orbit(stepper, *state, period=6.0, steps=20),
