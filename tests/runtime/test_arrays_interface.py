@@ -1,5 +1,6 @@
 """C interface of arrays whose sizes are known at run time: that of named coordinates, and runs bound to sizes."""
 
+import inspect
 import re
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
+from scvi_codegen.runtime.core.stepper import StepperOfRunTimeSizes
 
 BOUND = {"memory", "bind", "data_at", "energy_parts", "release"}
 """Functions of run-time sizes alone."""
@@ -122,3 +124,12 @@ def test_parameters_that_change_are_those_of_the_next_step(steppers) -> None:
     expected = any_size.step(*middle, 0.05, t=run.t - 0.05, parameters=parameters)
     np.testing.assert_allclose(run.q[array], expected[0][array], rtol=1e-14, atol=1e-14)
     np.testing.assert_allclose(run.p[array], expected[1][array], rtol=1e-13, atol=1e-13)
+
+
+def test_methods_of_states_bind_the_sizes_of_their_arrays():
+    """A new method of steppers whose first argument is a position needs a line in the class of run-time sizes."""
+    methods = {name: method for name, method in inspect.getmembers(sc.Stepper, inspect.isfunction) if name[0] != "_"}
+    positions = {"q", "q0", "q_previous"}
+    of_states = {name for name, each in methods.items() if positions & set([*inspect.signature(each).parameters][1:2])}
+    assert len(of_states) > 20
+    assert {name for name in of_states if getattr(StepperOfRunTimeSizes, name) is methods[name]} == set()

@@ -23,7 +23,7 @@ def stepper():
 
 
 @pytest.mark.parametrize("convert", [list, tuple, np.array])
-@pytest.mark.parametrize(("plan", "calls"), [(FIXED, 45), (ADAPTIVE, 70)])
+@pytest.mark.parametrize(("plan", "calls"), [(FIXED, 38), (ADAPTIVE, 60)])
 def test_a_call_takes_few_function_calls(stepper, convert, plan, calls):
     """The limit is a tenth above the present number, and does not depend on the machine."""
     q, p = convert(Q.tolist()), convert(P.tolist())

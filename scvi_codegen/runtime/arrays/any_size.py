@@ -1,87 +1,25 @@
-"""Steppers of arrays of run-time sizes: each call binds one to the sizes and tables of its arrays."""
+"""Sizes and tables of the arrays of a call, and interfaces with these sizes."""
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import replace
-from functools import cache, partial, update_wrapper
-from inspect import isfunction, signature
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import MethodError, StateError
-from scvi_codegen.indices import MOST_THREADS, SIZES_REQUIRED, Loop
+from scvi_codegen.indices import MOST_THREADS, Loop
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.rendering.source import ArrayLayout, Interface
 from scvi_codegen.runtime.arrays.interface import RunSizes, first_state, read_arrays
 from scvi_codegen.runtime.core.features import refusal
 from scvi_codegen.runtime.core.validation import EntryNames
 from scvi_codegen.runtime.rotations.attitudes import quaternions
-from scvi_codegen.runtime.rotations.states import homogeneous_state
 from scvi_codegen.validation import MAPPING, check_kind, checked_count
 
 MOST_COORDINATES, MOST_OF_MESH = 2000, 64
 """Largest numbers of coordinates that are compiled with known sizes for what requires it: in general, and for Newton's
 method on a mesh."""
-AT_REST = ("start", "integrate", "project", "integrate_ensemble", "chaos_indicators_ensemble")
-"""Methods whose initial velocity is 0 if neither p nor velocity is passed."""
-
-
-class UnavailableError(MethodError, AttributeError):
-    """Error of an attribute that requires known sizes; ``hasattr`` is false."""
-
-
-def unavailable(name: str, stepper: object) -> UnavailableError:
-    """Return the error for an attribute that a stepper of run-time sizes lacks."""
-    return UnavailableError(f"{name} is not available for {stepper!r}: {SIZES_REQUIRED}")
-
-
-def forwarding_methods(stepper: Any) -> dict[str, Callable[..., Any]]:
-    """Return the methods that take a state, for a stepper of run-time sizes: each binds it to its sizes first.
-
-    Each has the further argument ``tables``.
-    """
-    return {
-        name: update_wrapper(partial(_call, stepper, name), getattr(stepper, name))
-        for name in _methods_of_states(cast(Hashable, type(stepper)))
-    }
-
-
-@cache
-def _methods_of_states(cls: Hashable) -> tuple[str, ...]:
-    """Return the names of the methods whose first argument is a position."""
-    methods = ((name, getattr(cls, name)) for name in dir(cls) if not name.startswith("_") and name != "bind")
-    return tuple(
-        name
-        for name, method in methods
-        if isfunction(method) and [*signature(method).parameters, "", ""][1] in ("q", "q0", "q_previous")
-    )
-
-
-def _call(
-    stepper: Any,
-    name: str,
-    q: Any,
-    *arguments: Any,
-    parameters: Any = None,
-    tables: Mapping[str, ArrayLike] | None = None,
-    **others: Any,
-) -> Any:
-    """Call a method of the stepper that is bound to the arrays of the call."""
-    threads = others.pop("threads", None) if "threads" in others and name in ("start", "integrate") else None
-    if "events" in others and others["events"] is not None:
-        stepper = stepper.with_events(others.pop("events"))
-    bound, state = stepper.bind(q, parameters, tables, threads)
-    if len(arguments) == 1 and arguments[0] is None:  # p=None by position
-        arguments = ()
-    if name in AT_REST and not arguments and others.get("p") is None and others.get("velocity") is None:
-        layout = stepper.interface.layout
-        general = layout.momentum_formulas or (stepper._reason and not layout.momenta)
-        spins = any(each.startswith("spin") for each in bound.interface.rotations)
-        if not (spins or bound.interface.variables):  # their state has momenta of its own
-            positions, *_ = homogeneous_state(bound.interface, state, None, None)
-            others["velocity" if general else "p"] = np.zeros(np.shape(positions))
-    return getattr(bound, name)(state, *arguments, parameters=parameters, **others)
 
 
 def sizes_of_run(

@@ -11,24 +11,16 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.display.cards import card, listed, plain
 from scvi_codegen.errors import MethodError, ScviCodegenError
-from scvi_codegen.indices import SIZES_REQUIRED
 from scvi_codegen.native import building
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.calls import with_calls
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.representation import LONGEST, clipped
-from scvi_codegen.runtime.arrays.any_size import (
-    check_few_coordinates,
-    forwarding_methods,
-    interface_of_sizes,
-    shapes_of_call,
-    sizes_of_run,
-    unavailable,
-)
+from scvi_codegen.runtime.arrays.any_size import check_few_coordinates
 from scvi_codegen.runtime.arrays.binding import ArrayBinding
 from scvi_codegen.runtime.arrays.interface import RunSizes
 from scvi_codegen.runtime.core.features import Support, check_features, require
-from scvi_codegen.runtime.core.validation import Array, flat_state, named, shapes_of
+from scvi_codegen.runtime.core.validation import Array, named, shapes_of
 from scvi_codegen.runtime.events.array_events import EventBinding
 from scvi_codegen.runtime.events.event import Event, EventLike, as_events
 
@@ -96,6 +88,8 @@ class CompiledMethod:
         origin, problem: of a bound stepper, the stepper of run-time sizes, and the sizes and tables; else ``None``.
     """
 
+    run_time_sizes = False
+
     def __init__(
         self,
         source: Source | None,
@@ -113,26 +107,19 @@ class CompiledMethod:
         self.in_tau = bool(interface.energy_parameter)
         self.changes_states = any(event.changes_state for event in events)
         self.origin, self.problem, self._of_sizes, self._reason = origin, problem, of_sizes, reason
-        self.run_time_sizes = problem is None and bool(interface.layout.coordinates)
         self._variants = Variants() if variants is None else variants
         self._event_variants: dict[tuple[Event, ...], Self] = {}
         self._released_runs: list[Any] = []
         self._known: dict[Hashable, Self] = {}
         self._entries: dict[Event, tuple[Event, ...]] = {}
-        self._bound: tuple[Hashable, Self] | None = None
-        self._last: tuple[Hashable, Self | None] = None, None
         self._plain = cast(Source, source)
         self.shapes = shapes_of(interface)
+        self.source = self._plain
         self._load()
-        if self.run_time_sizes:
-            self.__dict__.update(forwarding_methods(self))
 
     def _load(self) -> None:
-        """Load the library with the events; of arrays of run-time sizes once these are known."""
+        """Load the library with the events."""
         interface, events = self.interface if self.origin is None else self.origin.interface, self.events
-        self.source = self._plain
-        if self.run_time_sizes:
-            return
         if events and (known := self._variants._made.get(events)) is not None:
             self.source = known
         elif events:
@@ -159,11 +146,6 @@ class CompiledMethod:
             problem=self.problem,
         )
 
-    def __getattr__(self, name: str) -> Any:
-        if self.__dict__.get("run_time_sizes") and name in ("binding", "dimension"):
-            raise unavailable(name, self)
-        raise AttributeError(f"'{type(self).__name__}' has no attribute '{name}'")
-
     def bind(
         self, q: Any, parameters: Any = None, tables: Mapping[str, ArrayLike] | None = None, threads: int | None = None
     ) -> tuple[Self, Any]:
@@ -174,21 +156,8 @@ class CompiledMethod:
         Raises:
             StateError: if a name, shape or number is invalid, or an index would leave its array.
         """
-        if not self.run_time_sizes:
-            self._check_not_of_run(tables, threads)
-            return self, q
-        shapes, (last, bound) = None if tables is not None else shapes_of_call(q, parameters, threads), self._last
-        if shapes is None or shapes != last or bound is None:
-            problem = sizes_of_run(self.interface, q, parameters, tables, threads)
-            if self._reason and problem.threads > 1:
-                raise MethodError(f"omit threads: this system is compiled with the sizes of each call. {self._reason}")
-            bound = self.with_sizes(problem.sizes, tables=problem.places) if self._reason else self._bound_to(problem)
-            self._last = shapes, bound
-        if self.events:
-            bound = bound.with_events(self.events)
-        if (type(q) is np.ndarray and q.ndim == 1) or bound.interface.rotations or bound.interface.variables:
-            return bound, q
-        return bound, flat_state(bound.interface, q, "q")
+        self._check_not_of_run(tables, threads)
+        return self, q
 
     def _check_not_of_run(self, tables: object, threads: object) -> None:
         """Raise :class:`MethodError` for arguments of arrays of run-time sizes."""
@@ -196,30 +165,9 @@ class CompiledMethod:
             if value is not None:
                 require(self, name)
 
-    def _bound_to(self, problem: RunSizes) -> Self:
-        """Return the stepper bound to these sizes and tables; the last one is kept for later calls."""
-        if self._bound is None or self._bound[0] != problem.key:
-
-            def make(name: str) -> Source | None:
-                known = bound.known if name.startswith(OF_KNOWN_SIZES) else self
-                return known._variants[name]
-
-            bound = type(self)(
-                self._plain,
-                interface_of_sizes(self.interface, problem.sizes),
-                variants=Variants(make=make),
-                flags=self.flags,
-                origin=self,
-                problem=problem,
-            )
-            self._bound = problem.key, bound
-        return self._bound[1]
-
     @property
     def known(self) -> Self:
         """Stepper compiled with known sizes; raises as :meth:`with_sizes`, and for a stepper of run-time sizes."""
-        if self.run_time_sizes:
-            raise MethodError(f"{self!r} requires sizes here: pass stepper.with_sizes(..). {SIZES_REQUIRED}")
         if self.problem is None or self.origin is None:
             return self
         return self.origin.with_sizes(self.problem.sizes, tables=self.problem.places)
@@ -265,7 +213,7 @@ class CompiledMethod:
         return values if self.shapes is None else named(values, self.shapes)
 
     def __repr__(self) -> str:
-        return f"<{type(self).__name__} {clipped(self.title, LONGEST - 20)}>"
+        return f"<Stepper {clipped(self.title, LONGEST - 20)}>"
 
     def _repr_html_(self) -> str:
         interface = self.interface
@@ -326,10 +274,7 @@ class CompiledMethod:
                 building.load(source, flags=self.flags)
 
     def _compile(self) -> None:
-        if not self.run_time_sizes:
-            self.binding.set_fallback()
-        elif not self._reason:
-            building.load(with_calls(self.source), flags=self.flags)
+        self.binding.set_fallback()
 
     @cached_property
     def tangent(self) -> Binding:
@@ -393,8 +338,6 @@ class CompiledMethod:
     @property
     def dimension(self) -> int:
         """Degrees of freedom m."""
-        if self.run_time_sizes:
-            raise unavailable("dimension", self)
         return self.interface.dimension
 
     def supports(self, feature: str, *together: str) -> Support:
@@ -439,6 +382,4 @@ class CompiledMethod:
     @property
     def _has_error_estimate(self) -> bool:
         """Whether the method has adaptive steps for this system; true if that follows from sizes at run time."""
-        if self.run_time_sizes:
-            return bool(self._reason) or "_advance_to(" in self.source.header
         return self.binding.has("advance_to")

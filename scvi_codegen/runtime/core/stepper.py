@@ -8,24 +8,29 @@ Neither SymPy nor Jinja is imported.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from typing import Any
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from functools import partial, wraps
+from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.errors import StateError
+from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.indices import SIZES_REQUIRED
+from scvi_codegen.native import building
 from scvi_codegen.native.arguments import checked_number
+from scvi_codegen.native.calls import with_calls
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.runtime.arrays.any_size import interface_of_sizes, shapes_of_call, sizes_of_run
 from scvi_codegen.runtime.arrays.interface import RunSizes
 from scvi_codegen.runtime.chaos.ensemble import ChaosIndicatorsEnsemble
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
 from scvi_codegen.runtime.constraints.projection import consistent, constraint_values, multipliers, projected
-from scvi_codegen.runtime.core.compiled_method import Variants
+from scvi_codegen.runtime.core.compiled_method import OF_KNOWN_SIZES, Variants
 from scvi_codegen.runtime.core.features import check_together, require
 from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.core.validation import Array, Parameters, States
+from scvi_codegen.runtime.core.validation import Array, Parameters, States, flat_state
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, momenta_of_each
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
@@ -49,11 +54,18 @@ from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import checked_count, checks_arguments, of
 
+Called = TypeVar("Called", bound=Callable[..., Any])
+
 
 class Stepper(Integrator):
     """Compiled integrator of one system: :class:`Integrator` with integrations, runs, ensembles and projections."""
 
     _trajectory_type = Trajectory
+
+    def __new__(cls, source: Source | None, interface: Interface, **further: Any) -> Self:
+        """Return a stepper whose methods bind one of the sizes of a call, for arrays of run-time sizes."""
+        run_time_sizes = bool(interface.layout.coordinates) and further.get("problem") is None
+        return cast(Self, object.__new__(StepperOfRunTimeSizes if run_time_sizes and cls is Stepper else cls))
 
     def __reduce__(self) -> tuple[Any, ...]:
         if self.origin is not None:
@@ -492,7 +504,141 @@ class Stepper(Integrator):
         return (g[0], rate[0]) if is_one_state(self.interface, q) else (g, rate)
 
 
-def _rebuild_bound(origin: Stepper, problem: RunSizes, events: tuple[Event, ...]) -> Stepper:
+class UnavailableError(MethodError, AttributeError):
+    """Error of an attribute that requires known sizes; ``hasattr`` is false."""
+
+
+def _bound(method: Called, *, at_rest: bool = False) -> Called:
+    """Return a method of steppers of run-time sizes that binds a stepper to its arrays and calls the method of this.
+
+    It has the further argument ``tables``. The first argument is a position; ``at_rest``: without p and velocity the
+    initial velocity is 0.
+    """
+
+    @wraps(method)
+    def call(self: StepperOfRunTimeSizes, q: Any, *arguments: Any, **named: Any) -> Any:
+        return self._call_bound(method, at_rest, q, arguments, **named)
+
+    return cast(Called, call)
+
+
+class StepperOfRunTimeSizes(Stepper):
+    """Stepper of arrays whose sizes each call determines: its methods bind a stepper to the arrays of the call."""
+
+    run_time_sizes = True
+    _last: tuple[Hashable, Stepper | None] = None, None
+    _latest: tuple[Hashable, Stepper] | None = None
+
+    integrate = _bound(Stepper.integrate, at_rest=True)
+    start = _bound(Stepper.start, at_rest=True)
+    project = _bound(Stepper.project, at_rest=True)
+    integrate_ensemble = _bound(Stepper.integrate_ensemble, at_rest=True)
+    chaos_indicators_ensemble = _bound(Stepper.chaos_indicators_ensemble, at_rest=True)
+    multipliers, constraint_values = _bound(Stepper.multipliers), _bound(Stepper.constraint_values)
+    step, step_positions = _bound(Stepper.step), _bound(Stepper.step_positions)
+    discrete_lagrangian = _bound(Stepper.discrete_lagrangian)
+    discrete_legendre_minus = _bound(Stepper.discrete_legendre_minus)
+    discrete_legendre_plus = _bound(Stepper.discrete_legendre_plus)
+    work_and_impulses, rates = _bound(Stepper.work_and_impulses), _bound(Stepper.rates)
+    energy, momentum_maps = _bound(Stepper.energy), _bound(Stepper.momentum_maps)
+    momentum, velocity = _bound(Stepper.momentum), _bound(Stepper.velocity)
+    initial_momentum = _bound(Stepper.initial_momentum)
+    jacobian, sensitivity = _bound(Stepper.jacobian), _bound(Stepper.sensitivity)
+    jvp, vjp = _bound(Stepper.jvp), _bound(Stepper.vjp)
+
+    def _call_bound(
+        self,
+        method: Callable[..., Any],
+        at_rest: bool,
+        q: Any,
+        arguments: tuple[Any, ...],
+        *,
+        parameters: Any = None,
+        tables: Mapping[str, ArrayLike] | None = None,
+        **named: Any,
+    ) -> Any:
+        """Call a method of the stepper that is bound to the arrays of the call."""
+        threads = named.pop("threads", None) if method in PER_STEP else None
+        stepper = self if named.get("events") is None else self.with_events(named.pop("events"))
+        bound, state = stepper.bind(q, parameters, tables, threads)
+        if len(arguments) == 1 and arguments[0] is None:  # p=None by position
+            arguments = ()
+        if at_rest and not arguments and named.get("p") is None and named.get("velocity") is None:
+            layout = self.interface.layout
+            general = layout.momentum_formulas or (self._reason and not layout.momenta)
+            spins = any(each.startswith("spin") for each in bound.interface.rotations)
+            if not (spins or bound.interface.variables):  # their state has momenta of its own
+                positions, *_ = homogeneous_state(bound.interface, state, None, None)
+                named["velocity" if general else "p"] = np.zeros(np.shape(positions))
+        return method(bound, state, *arguments, parameters=parameters, **named)
+
+    def bind(
+        self, q: Any, parameters: Any = None, tables: Mapping[str, ArrayLike] | None = None, threads: int | None = None
+    ) -> tuple[Any, Any]:
+        """See :meth:`CompiledMethod.bind`."""
+        shapes, (last, bound) = None if tables is not None else shapes_of_call(q, parameters, threads), self._last
+        if shapes is None or shapes != last or bound is None:
+            problem = sizes_of_run(self.interface, q, parameters, tables, threads)
+            if self._reason and problem.threads > 1:
+                raise MethodError(f"omit threads: this system is compiled with the sizes of each call. {self._reason}")
+            bound = self.with_sizes(problem.sizes, tables=problem.places) if self._reason else self._bound_to(problem)
+            self._last = shapes, bound
+        if self.events:
+            bound = bound.with_events(self.events)
+        if (type(q) is np.ndarray and q.ndim == 1) or bound.interface.rotations or bound.interface.variables:
+            return bound, q
+        return bound, flat_state(bound.interface, q, "q")
+
+    def _bound_to(self, problem: RunSizes) -> Stepper:
+        """Return the stepper bound to these sizes and tables; the latest one is kept for later calls."""
+        if self._latest is None or self._latest[0] != problem.key:
+
+            def make(name: str) -> Source | None:
+                known = bound.known if name.startswith(OF_KNOWN_SIZES) else self
+                return known._variants[name]
+
+            interface = interface_of_sizes(self.interface, problem.sizes)
+            further: dict[str, Any] = {"variants": Variants(make=make), "flags": self.flags}
+            bound = Stepper(self._plain, interface, origin=self, problem=problem, **further)
+            self._latest = problem.key, bound
+        return self._latest[1]
+
+    def _load(self) -> None:
+        """Load nothing: bound steppers load the library."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("binding", "dimension"):
+            raise self._unavailable(name)
+        raise AttributeError(f"'{type(self).__name__}' has no attribute '{name}'")
+
+    def _unavailable(self, name: str) -> UnavailableError:
+        return UnavailableError(f"{name} is not available for {self!r}: {SIZES_REQUIRED}")
+
+    @property
+    def dimension(self) -> int:
+        """Unavailable: it depends on the sizes."""
+        raise self._unavailable("dimension")
+
+    @property
+    def known(self) -> Self:
+        """Unavailable: a stepper of these sizes is required."""
+        raise MethodError(f"{self!r} requires sizes here: pass stepper.with_sizes(..). {SIZES_REQUIRED}")
+
+    def _compile(self) -> None:
+        if not self._reason:
+            building.load(with_calls(self.source), flags=self.flags)
+
+    @property
+    def _has_error_estimate(self) -> bool:
+        """Whether the method has adaptive steps; true if that follows from the sizes."""
+        return bool(self._reason) or "_advance_to(" in self.source.header
+
+
+PER_STEP = (Stepper.integrate, Stepper.start)
+"""Methods whose ``threads`` are those of each step."""
+
+
+def _rebuild_bound(origin: StepperOfRunTimeSizes, problem: RunSizes, events: tuple[Event, ...]) -> Stepper:
     return origin._bound_to(problem)._copy(events)
 
 

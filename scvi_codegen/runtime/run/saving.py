@@ -97,7 +97,8 @@ def _read(
         check_accesses(layout, sizes, places)
         count = checked_count(1 if threads is None else threads, "threads", least=1, most=MOST_THREADS)
         problem = RunSizes(sizes=sizes, places=places, threads=count)
-        stepper = stepper._bound_to(problem).with_events(stepper.events)
+        binding: Any = stepper  # of run-time sizes
+        stepper = binding._bound_to(problem).with_events(stepper.events)
     values = np.frombuffer(rest, count=len(stepper.defaults), offset=first)
     known = stepper.parameters_by_name(values)
     for name in header["unset inputs"]:
