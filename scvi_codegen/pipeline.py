@@ -323,14 +323,14 @@ class Sources:
     def variant(self, name: str) -> Source | None:
         """Return the source of a variant, named as in :class:`~scvi_codegen.runtime.core.compiled_method.Variants`."""
         kind, _, count = name.partition(" ")
-        made: dict[str, Callable[[], Source | None]] = {
+        variants: dict[str, Callable[[], Source | None]] = {
             "ensemble": lambda: render_ensemble(self.program()),
             "fallback": self.fallback,
             "derivatives": self.tangent,
             "second_derivatives": lambda: self.tangent(second=True),
             "changes": lambda: self.changes(int(count)),
         }
-        return None if self.of_arrays else made[kind]()
+        return None if self.of_arrays else variants[kind]()
 
 
 @checks_arguments(system=SYSTEM, symmetries=SYMMETRIES)

@@ -286,12 +286,17 @@ class Program:
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """All kernels, in the order of emission."""
-        stage_groups, found = self.equations.stage_groups, self.quantities
-        constraints, rattle, integrals = self.constraints, self.rattle, found.integrals
+        stage_groups, quantities = self.equations.stage_groups, self.quantities
+        constraints, rattle, integrals = self.constraints, self.rattle, quantities.integrals
         kernels = (
             *(kernel for group in stage_groups for kernel in (group.value, group.derivative)),
-            *(found.legendre, found.energy, *(group.integrand for group in stage_groups), found.momentum_kernel),
-            *(found.first_order_rates, found.inverse_legendre),
+            *(
+                quantities.legendre,
+                quantities.energy,
+                *(group.integrand for group in stage_groups),
+                quantities.momentum_kernel,
+            ),
+            *(quantities.first_order_rates, quantities.inverse_legendre),
             *(integrals.kernel if integrals else None, constraints and constraints.kernel),
             *(constraints and constraints.motion, self.damping, rattle and rattle.force, rattle and rattle.mass),
         )
@@ -300,8 +305,8 @@ class Program:
     @property
     def constraint_positions(self) -> tuple[int, ...]:
         """Position of each constraint among the constraints, in the order of the sites."""
-        own = self.equations.places[self.dimension :]
-        return tuple(sorted(own).index(place) for place in own)
+        extra = self.equations.places[self.dimension :]
+        return tuple(sorted(extra).index(place) for place in extra)
 
     @property
     def constraint_reach(self) -> int:

@@ -64,14 +64,14 @@ def rattle_of(system: MechanicalSystem, stages: StageSystem) -> Rattle | None:
     if any(velocity_conditions(system)) or not forms.separable or tables is None:
         return None
     partials = list(constraint_jacobian(system))
-    at: dict[int, list[int]] = {}
+    entries_at: dict[int, list[int]] = {}
     for e, (_, i) in enumerate(partials):
-        at.setdefault(i, []).append(e)
-    products = tuple((e, f) for own in at.values() for e in own for f in own)
+        entries_at.setdefault(i, []).append(e)
+    products = tuple((e, f) for entries in entries_at.values() for e in entries for f in entries)
     position, momentum = tables.position[1:], tuple(line[:-1] for line in tables.momentum)
     return Rattle(
-        force=system_kernel(system, "constrained_force", forms.force, of=system.coordinates, purpose="L_q at u = q."),
-        mass=system_kernel(system, "constrained_mass", forms.mass.values(), of=(), purpose="The constant masses."),
+        force=system_kernel(system, "constrained_force", forms.force, u=system.coordinates, purpose="L_q at u = q."),
+        mass=system_kernel(system, "constrained_mass", forms.mass.values(), u=(), purpose="The constant masses."),
         products=products,
         entries=tuple((partials[e][0], partials[f][0]) for e, f in products),
         abscissae=lower_vector(tables.abscissae),
@@ -117,7 +117,7 @@ def _kernels(system: ArraySystem) -> Iterator[tuple[RolledKernel, RolledKernel]]
         *partials, rate = constraint_gradient(term, system.coordinates, system.time)
         second = constraint_second_rate(term, system.coordinates, system.time, v)
         values, purpose = [term.formula, rate, *partials], "g, g_t, and the derivatives of g."
-        rolled = partial(rolled_kernel, system, of=term, u=u, text=constraint_text(term))
+        rolled = partial(rolled_kernel, system, term=term, u=u, text=constraint_text(term))
         yield (
             rolled(f"condition_{number}", values, purpose=purpose),
             rolled(f"curvature_{number}", [second], along=v, purpose="d^2 g / dt^2 along v."),
@@ -133,7 +133,7 @@ def lowered_constraints(system: MechanicalSystem) -> Constraints:
             system,
             "constraints",
             position_conditions(system),
-            of=system.coordinates,
+            u=system.coordinates,
             partials=partials.values(),
             purpose="The constraints g of positions, and their nonzero derivatives G, at u = q.",
         ),
@@ -142,7 +142,7 @@ def lowered_constraints(system: MechanicalSystem) -> Constraints:
             system,
             "constrained_motion",
             (*forms_of(system).applied_force, *rates, *time_derivatives(system, rates)),
-            of=(*system.coordinates, *system.velocities),
+            u=(*system.coordinates, *system.velocities),
             purpose="L_q - L_vq v - L_vt + f, then rates G v + .., and their derivatives in time at constant v.",
         ),
     )

@@ -70,7 +70,7 @@ def control_of(
             system,
             "step_density",
             controller.values(system, g),
-            of=forms_of(system).legendre_arguments,
+            u=forms_of(system).legendre_arguments,
             purpose="1/g and -d(log g)/dt of the time rescaling g at u = "
             f"{'(q, p)' if system.auxiliaries else '(q, v)'}.",
         )
@@ -196,11 +196,11 @@ def _nodes(points: Vector) -> tuple[int, ...]:
     return tuple(dict.fromkeys(inner[each.index(min(each))] for each in distances))
 
 
-def _twice_integrated(points: Vector, at: Vector) -> Matrix:
+def _twice_integrated(points: Vector, ends: Vector) -> Matrix:
     """Return the integrals of (c - u) l_j(u) from 0 to c for each c of ``at``."""
     rule = gauss_legendre(len(points) // 2 + 1)
     rows = []
-    for c in at:
+    for c in ends:
         u = [c * (1 + x) / 2 for x in rule.points]
         weights = [w * c / 2 * (c - x) for w, x in zip(rule.weights, u, strict=True)]
         rows.append(tuple(mp.fdot(weights, column) for column in transpose(cardinal_values(points, u))))

@@ -29,12 +29,12 @@ def derivatives_of(
     Args:
         second: whether second derivatives are included.
     """
-    given = tuple(
+    inputs = tuple(
         _input_derivatives(system, group.name, group.results, group.arguments) for group in stages.stage_groups
     )
     return Derivatives(
         program=program,
-        by_given=given,
+        by_given=inputs,
         curvatures=tuple(_curvature(system, group) for group in stages.stage_groups) if second else (),
         damping=_input_derivatives(system, "damping", (stages.damping,), ()) if program.damping else None,
         clock=_time_derivatives(system, stages.stage_groups[0].arguments) if system.clock else None,
@@ -53,7 +53,7 @@ def _input_derivatives(
         system,
         f"{name}_by_inputs",
         entries.values(),
-        of=arguments,
+        u=arguments,
         purpose="Nonzero derivatives with respect to parameters and time.",
     )
     return InputDerivatives(entries=tuple(entries), kernel=kernel)
@@ -65,7 +65,7 @@ def _momentum_derivatives(system: MechanicalSystem) -> InputDerivatives:
     entries = jacobian(forms.one_form, (*forms.legendre_arguments, *system.parameters, system.time))
     purpose = "Nonzero derivatives of the momenta with respect to q, y, parameters and time."
     kernel = system_kernel(
-        system, "momentum_derivatives", entries.values(), of=forms.legendre_arguments, purpose=purpose
+        system, "momentum_derivatives", entries.values(), u=forms.legendre_arguments, purpose=purpose
     )
     return InputDerivatives(entries=tuple(entries), kernel=kernel)
 
@@ -80,7 +80,7 @@ def _time_derivatives(system: MechanicalSystem, arguments: Sequence[Symbol]) -> 
             system,
             "rate_derivatives",
             (rate,),
-            of=arguments,
+            u=arguments,
             partials=partials.values(),
             purpose="The rate of time and its nonzero derivatives with respect to arguments and parameters.",
         ),
@@ -100,7 +100,7 @@ def _energy_derivatives(system: MechanicalSystem) -> Kernel:
         system,
         "energy_derivatives",
         [derivative / system.clock.rate for derivative in (*by_others[:m], *by_p, *by_others[m:])],
-        of=forms_of(system).legendre_arguments,
+        u=forms_of(system).legendre_arguments,
         purpose="Gradient of the energy with respect to q, p and parameters at "
         f"u = (q, {'p' if system.auxiliaries else 'v'}).",
     )
@@ -120,7 +120,7 @@ def _curvature(system: MechanicalSystem, group: StageGroup) -> Kernel | None:
         system,
         f"{group.name}_curvature",
         partials,
-        of=(*group.arguments, *multipliers, *changes),
+        u=(*group.arguments, *multipliers, *changes),
         purpose="Hessian-vector product of multipliers . results with a variation of all arguments.",
     )
 
@@ -134,8 +134,8 @@ NOTHING: Entries = {(0, 0): S.Zero}
 def point_derivatives_of(system: MechanicalSystem, fixed_point: FixedPointIteration) -> PointDerivatives | None:
     """Return the kernels for a system whose steps are solved by the iteration; ``None`` if unsupported or too large."""
     twin, make = equivalent_lagrangian(system), MAKERS.get(fixed_point.derivatives_part)
-    found = make(twin) if twin and make else None
-    return found if found and found.count + len(found.given.entries) <= MOST_DERIVATIVES else None
+    iteration = make(twin) if twin and make else None
+    return iteration if iteration and iteration.count + len(iteration.given.entries) <= MOST_DERIVATIVES else None
 
 
 def _separable(system: LagrangianSystem) -> PointDerivatives:
@@ -143,7 +143,7 @@ def _separable(system: LagrangianSystem) -> PointDerivatives:
     forms = forms_of(system)
     masses = jacobian(tuple(forms.mass.values()), system.parameters)
     purpose = "Derivatives of the constant masses with respect to parameters."
-    kernel = system_kernel(system, "mass_by_inputs", masses.values(), of=(), purpose=purpose)
+    kernel = system_kernel(system, "mass_by_inputs", masses.values(), u=(), purpose=purpose)
     partials, products = force_derivatives(system)
     return PointDerivatives(
         partials=partials,
@@ -160,15 +160,15 @@ def force_derivatives(system: LagrangianSystem) -> tuple[Kernel, tuple[Kernel, K
     partials = jacobian(forms_of(system).force, q) or NOTHING
     different = tuple(dict.fromkeys(partials.values()))
     purpose = "The distinct entries of L_qq at all points."
-    kernel = system_kernel(system, "point_derivatives", different, of=q, purpose=purpose)
+    kernel = system_kernel(system, "point_derivatives", different, u=q, purpose=purpose)
     return kernel, _products(system, partials, different, size=len(q))
 
 
 def _coupled(system: LagrangianSystem) -> PointDerivatives:
     """Return the derivatives of (L_q, -L_v) at u = (q, v); those of L_v with respect to v, the mass, separately."""
-    forms, of = forms_of(system), (*system.coordinates, *system.velocities)
+    forms, arguments = forms_of(system), (*system.coordinates, *system.velocities)
     m = system.dimension
-    partials = jacobian(forms.force, of)
+    partials = jacobian(forms.force, arguments)
     by_position = jacobian(forms.momentum, system.coordinates)
     partials |= {(m + i, j): Mul(S.NegativeOne, value) for (i, j), value in by_position.items()}
     partials = partials or NOTHING
@@ -177,7 +177,7 @@ def _coupled(system: LagrangianSystem) -> PointDerivatives:
         system,
         "point_derivatives",
         (*forms.momentum, *different),
-        of=of,
+        u=arguments,
         partials=forms.mass_terms,
         purpose="L_v, the distinct entries of L_qq, L_qv and -L_vq, and terms of L_vv at all points.",
     )
@@ -185,7 +185,7 @@ def _coupled(system: LagrangianSystem) -> PointDerivatives:
         partials=at_points,
         beside=m,
         products=_products(system, partials, different, size=2 * m),
-        given=_at_points_by_inputs(system, (*forms.force, *forms.momentum), of),
+        given=_at_points_by_inputs(system, (*forms.force, *forms.momentum), arguments),
     )
 
 
@@ -195,10 +195,12 @@ MAKERS: dict[str, Callable[[LagrangianSystem], PointDerivatives]] = {
 }
 
 
-def _at_points_by_inputs(system: LagrangianSystem, results: Sequence[Expr], of: Sequence[Symbol]) -> InputDerivatives:
+def _at_points_by_inputs(
+    system: LagrangianSystem, results: Sequence[Expr], arguments: Sequence[Symbol]
+) -> InputDerivatives:
     entries = jacobian(results, (*system.parameters, system.time)) or NOTHING
     purpose = "Their derivatives with respect to parameters and time, at all points."
-    kernel = system_kernel(system, "input_derivatives", entries.values(), of=of, purpose=purpose)
+    kernel = system_kernel(system, "input_derivatives", entries.values(), u=arguments, purpose=purpose)
     return InputDerivatives(entries=tuple(entries), kernel=kernel)
 
 
@@ -215,7 +217,7 @@ def _products(
         rows: list[list[Expr]] = [[] for _ in x]
         for (i, j), value in matrix.items():
             rows[i].append(Mul(values[number[value]], x[j]))
-        return system_kernel(system, name, [Add(*row) for row in rows], of=(*x, *values), purpose=purpose)
+        return system_kernel(system, name, [Add(*row) for row in rows], u=(*x, *values), purpose=purpose)
 
     forward = product("derivative_product", partials, "The matrix of derivatives times x, u = (x, its entries).")
     turned = product("transposed_product", back, "Its transpose times x.") if back != partials else forward

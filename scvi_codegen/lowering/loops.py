@@ -71,8 +71,8 @@ def transforms(sites: SiteHamiltonian) -> dict[str, tuple[RolledKernel, ...]]:
             for slot, access in force.slots
         )
         targets = tuple((replace(access, array=moving[access.array.name][0]), x) for access, x in force.targets)
-        of, purpose = replace(force, slots=slots, targets=targets), f"{name.capitalize()}."
-        return _added(system, f"{name}_{number}", of, system.state, f"{name} {_shown(force)}", purpose)
+        rates, purpose = replace(force, slots=slots, targets=targets), f"{name.capitalize()}."
+        return _added(system, f"{name}_{number}", rates, system.state, f"{name} {_shown(force)}", purpose)
 
     return {
         "velocities": tuple(rolled_of("velocities", *pair) for pair in enumerate(sites.velocities)),
@@ -91,12 +91,12 @@ def _list(system: ArraySystem, near: Neighbours) -> tuple[str, int, RolledKernel
 
 
 def _added(
-    system: ArraySystem, name: str, of: ArrayForce, arguments: Sequence[Array], text: str, purpose: str
+    system: ArraySystem, name: str, force: ArrayForce, arguments: Sequence[Array], text: str, purpose: str
 ) -> RolledKernel:
     """Return the kernel of formulas that are added to entries, as functions of entries of certain arrays."""
-    targets, formulas = zip(*of.targets, strict=True)
-    u = entries_of(of, arguments)
-    return rolled_kernel(system, name, formulas, of, u, targets=targets, text=text, purpose=purpose)
+    targets, formulas = zip(*force.targets, strict=True)
+    u = entries_of(force, arguments)
+    return rolled_kernel(system, name, formulas, force, u, targets=targets, text=text, purpose=purpose)
 
 
 def _potential(system: ArraySystem, term: ArrayTerm, axis: int | None, number: int) -> RolledKernel:
@@ -136,13 +136,13 @@ def _signed(system: ArraySystem, force: ArrayForce) -> ArrayForce:
     return replace(force, targets=tuple(signed))
 
 
-def _shown(of: ArrayTerm | ArrayForce) -> str:
+def _shown(term: ArrayTerm | ArrayForce) -> str:
     """Return a term or force as text for a comment; instead of long formulas, the arrays that they contain."""
-    formulas = [of.formula] if isinstance(of, ArrayTerm) else [formula for _, formula in of.targets]
+    formulas = [term.formula] if isinstance(term, ArrayTerm) else [formula for _, formula in term.targets]
     if sum(1 for _ in islice(chain(*map(preorder_traversal, formulas)), LONG_FORMULA)) < LONG_FORMULA:
-        return str(of)
-    loops = ", ".join(map(str, of.loops))
-    return f"a long formula of {', '.join(sorted({access.array.name for _, access in of.slots}))} for {loops}"
+        return str(term)
+    loops = ", ".join(map(str, term.loops))
+    return f"a long formula of {', '.join(sorted({access.array.name for _, access in term.slots}))} for {loops}"
 
 
 def _jacobian(
@@ -171,32 +171,32 @@ def _derived(
     if not any(rows):
         return None
     along = [Add(*(derivative * w[k] for k, derivative in row.items())) for row in rows]
-    own = [
+    targets = [
         Add(*(derivative for k, derivative in row.items() if moving[k][1] == access))
         for row, (access, _) in zip(rows, force.targets, strict=True)
     ]
     rolled = partial(
         rolled_kernel,
         system,
-        of=force,
+        term=force,
         u=moving,
         targets=[access for access, _ in force.targets],
         text=f"derivatives of {_shown(force)}",
     )
     jacobian = rolled(f"product_{number}", along, along=w, purpose="Jacobian of the forces times a direction.")
-    diagonal = rolled(f"diagonal_{number}", own, purpose="Diagonal of the Jacobian of the forces.")
+    diagonal = rolled(f"diagonal_{number}", targets, purpose="Diagonal of the Jacobian of the forces.")
     return replace(jacobian, circulant=axis), replace(diagonal, circulant=axis)
 
 
-def with_sums(program: Program, of: SplitSystem) -> Program | None:
+def with_sums(program: Program, split: SplitSystem) -> Program | None:
     """Return the program of ``of.rest`` with the forces and the energy of the term groups.
 
     ``None`` if forces enter otherwise than as values of kernels, in Newton's method and shooting, or if steps without
     the forces of ``of.rest`` have no kicks.
     """
-    rest, energy, sign = of.rest, program.quantities.energy, -1 if of.rest.auxiliaries else 1
+    rest, energy, sign = split.rest, program.quantities.energy, -1 if split.rest.auxiliaries else 1
     forces, terms = [], []
-    for number, group in enumerate(of.term_groups):
+    for number, group in enumerate(split.term_groups):
         first = ((0,),) * len(group.places)
         forces.append(_over_terms(rest, f"pull_{number}", group, group.partials, ()))
         terms.append(_over_terms(rest, f"term_{number}", group, (sign * group.formula,), first))
@@ -223,11 +223,11 @@ def _over_terms(
         constants=len(group.constants),
     )
     index = {parameter: k for k, parameter in enumerate(system.parameters)}
-    given = tuple(
+    coefficients = tuple(
         tuple(Load("parameters", index[x]) if x in index else Constant(exact_number(x)) for x in column)
         for column in group.values
     )
-    return RolledKernel.over_rows(kernel, group.places, given, targets)
+    return RolledKernel.over_rows(kernel, group.places, coefficients, targets)
 
 
 def reach_of(arrays: Iterable[Array], term_groups: Iterable[RolledKernel]) -> int:
@@ -253,8 +253,8 @@ def reach_of(arrays: Iterable[Array], term_groups: Iterable[RolledKernel]) -> in
     ]
     if not all(_same_loops(*pair) for pair in pairs):
         return 0
-    own = any(_distance(*pair) for pair in pairs if pair[0].array == pair[1].array)
-    return max(_distance(*pair) for pair in pairs) if own else 0
+    distant = any(_distance(*pair) for pair in pairs if pair[0].array == pair[1].array)
+    return max(_distance(*pair) for pair in pairs) if distant else 0
 
 
 def _same_loops(one: Access, other: Access) -> bool:

@@ -105,16 +105,16 @@ def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
         return None
     moved, (kicks, drifts) = split.system, kicks_and_drifts(method, split)
     turned = any(not each.is_diagonal() for each in split.axes)
-    turning = system_kernel(moved, "turning", sum(split.rates, ()), of=(), purpose="a_i, a_j - a_i, a_k - a_i.")
+    turning = system_kernel(moved, "turning", sum(split.rates, ()), u=(), purpose="a_i, a_j - a_i, a_k - a_i.")
     if split.velocity:
-        drift = system_kernel(moved, "drift_velocity", split.velocity, of=moved.auxiliaries, purpose="H_p at u = p.")
+        drift = system_kernel(moved, "drift_velocity", split.velocity, u=moved.auxiliaries, purpose="H_p at u = p.")
     else:
-        drift = system_kernel(moved, "mass", forms_of(moved).mass.values(), of=(), purpose="The constant masses.")
+        drift = system_kernel(moved, "mass", forms_of(moved).mass.values(), u=(), purpose="The constant masses.")
     return Splitting(
         kicks=lower_vector(kicks),
         drifts=lower_vector(drifts),
         abscissae=lower_vector(tuple(mp.fsum(drifts[:n]) for n in range(len(kicks)))),
-        force=system_kernel(moved, "force", split.force, of=moved.coordinates, purpose="L_q at u = q."),
+        force=system_kernel(moved, "force", split.force, u=moved.coordinates, purpose="L_q at u = q."),
         drift=drift,
         by_masses=not split.velocity,
         bodies=tuple((first, *axes) for first, _, *axes in split.bodies),
@@ -247,7 +247,7 @@ def _quantities(
             system,
             "legendre",
             forms.regular_legendre,
-            of=forms.legendre_arguments,
+            u=forms.legendre_arguments,
             partials=forms.legendre_jacobian.values(),
             purpose="Momenta theta and their derivatives by y at u = (q, y)."
             if forms.one_form
@@ -257,7 +257,7 @@ def _quantities(
         ),
         inverse_legendre=_inverse_legendre_kernel(system),
         mass_entries=tuple(forms.legendre_jacobian),
-        energy=system_kernel(system, name, (system.formula,), of=forms.legendre_arguments, purpose=purpose),
+        energy=system_kernel(system, name, (system.formula,), u=forms.legendre_arguments, purpose=purpose),
         hamiltonian=bool(system.auxiliaries),
         momentum_maps=tuple(_momentum_map(each, method) for each in symmetries),
         momentum_kernel=_momentum_kernel(system, symmetries),
@@ -324,8 +324,8 @@ def _highest_of(shape: Velocities, degree: int | None) -> list[Vector]:
 
 def _moves(stages: StageSystem, shape: Velocities) -> bool:
     """Return whether the velocities, the first blocks, are the only unknowns that displace positions."""
-    own = len(shape.blocks)
-    return own == len({*shape.blocks}) and all(block.moves == (b < own) for b, block in enumerate(stages.blocks))
+    degree = len(shape.blocks)
+    return degree == len({*shape.blocks}) and all(block.moves == (b < degree) for b, block in enumerate(stages.blocks))
 
 
 def _distinct(points: Vector) -> bool:
@@ -346,10 +346,12 @@ def _integrals(system: MechanicalSystem, method: Method, stages: StageSystem) ->
 
 def _inverse_legendre_kernel(system: MechanicalSystem) -> Kernel | None:
     """Return the kernel of the velocities at (q, p), ``None`` if they have no formula."""
-    inverse, of = forms_of(system).inverse_mass, (*system.coordinates, *system.momentum_symbols)
+    inverse, arguments = forms_of(system).inverse_mass, (*system.coordinates, *system.momentum_symbols)
     if inverse is None:
         return None
-    return system_kernel(system, "inverse_legendre", inverse.velocities, of=of, purpose="L_vv^-1 p at u = (q, p).")
+    return system_kernel(
+        system, "inverse_legendre", inverse.velocities, u=arguments, purpose="L_vv^-1 p at u = (q, p)."
+    )
 
 
 def _rates_of_first_order(system: MechanicalSystem) -> Kernel | None:
@@ -357,8 +359,8 @@ def _rates_of_first_order(system: MechanicalSystem) -> Kernel | None:
     if not isinstance(system, FirstOrderSystem) or system.is_canonical:
         return None
     right = gradient_tuple(system.hamiltonian, system.momenta)
-    of = forms_of(system).legendre_arguments
-    return system_kernel(system, "first_order_rates", right, of=of, purpose="H_y = theta_y^T q' at u = (q, y).")
+    arguments = forms_of(system).legendre_arguments
+    return system_kernel(system, "first_order_rates", right, u=arguments, purpose="H_y = theta_y^T q' at u = (q, y).")
 
 
 def _momentum_kernel(system: MechanicalSystem, symmetries: Sequence[Symmetry]) -> Kernel | None:
@@ -371,7 +373,7 @@ def _momentum_kernel(system: MechanicalSystem, symmetries: Sequence[Symmetry]) -
         system,
         "momentum_maps",
         (*maps, *squares),
-        of=(*symmetries[0].coordinates, *symmetries[0].momenta),
+        u=(*symmetries[0].coordinates, *symmetries[0].momenta),
         purpose="Momentum maps at u = (q, p), then the sums of the squares of their terms.",
     )
 

@@ -30,20 +30,18 @@ from scvi_codegen.methods.stage_system import Gather, Scatter, StageGroup, Stage
 from scvi_codegen.tables.precision import mp
 
 
-def integrand_kernel(system: MechanicalSystem, name: str, of: Iterable[Symbol]) -> Kernel | None:
+def integrand_kernel(system: MechanicalSystem, name: str, u: Iterable[Symbol]) -> Kernel | None:
     """Return the kernel of the functions that a run integrates along its curve; ``None`` if there are none."""
     if not system.integrands:
         return None
-    return system_kernel(
-        system, name, system.integrands, of=of, purpose="Functions that are integrated along the curve."
-    )
+    return system_kernel(system, name, system.integrands, u=u, purpose="Functions that are integrated along the curve.")
 
 
 def damping_kernel(system: MechanicalSystem) -> Kernel | None:
     """Return the kernel of the rate of a uniform damping; ``None`` without damping."""
     if system.damping == 0:
         return None
-    return system_kernel(system, "damping", (system.damping,), of=(), purpose="The rate gamma of the damping.")
+    return system_kernel(system, "damping", (system.damping,), u=(), purpose="The rate gamma of the damping.")
 
 
 def system_kernel(
@@ -51,7 +49,7 @@ def system_kernel(
     name: str,
     values: Iterable[Expr],
     *,
-    of: Iterable[Symbol],
+    u: Iterable[Symbol],
     partials: Iterable[Expr] = (),
     purpose: str = "",
     paired: bool = False,
@@ -61,14 +59,14 @@ def system_kernel(
     Args:
         system, name: the system, and the C identifier.
         values: expressions of the values.
-        of: the arguments u.
+        u: the arguments.
         partials: expressions of derivatives, stored after the values.
         purpose: one sentence on what it computes, for the comment above it.
         paired: whether its sums have short chains of operations instead of few operations.
     """
     kernel = lower_kernel(
         name,
-        arguments=tuple(of),
+        arguments=tuple(u),
         time=system.time,
         parameters=system.parameters,
         values=tuple(values),
@@ -82,7 +80,7 @@ def rolled_kernel(
     system: ArraySystem,
     name: str,
     values: Iterable[Expr],
-    of: ArrayTerm | ArrayForce,
+    term: ArrayTerm | ArrayForce,
     u: Sequence[tuple[Symbol, Access]] = (),
     *,
     along: Sequence[Symbol] = (),
@@ -94,27 +92,27 @@ def rolled_kernel(
 
     Args:
         system, name, values, purpose: as of :func:`system_kernel`.
-        of: the term, whose other entries are the last parameters.
+        term: the term, whose other entries are the last parameters.
         u: entries that are arguments.
         along: further arguments, the components of a direction by these entries.
         targets: entries that the values are added to; by default ``u``.
         text: formula for the comment.
     """
     symbols, accesses = [slot for slot, _ in u], tuple(access for _, access in u)
-    given = [(slot, access) for slot, access in of.slots if slot not in symbols]
+    constants = [(slot, access) for slot, access in term.slots if slot not in symbols]
     kernel = lower_kernel(
         name,
         arguments=(*symbols, *along),
         time=system.time,
-        parameters=(*system.parameters, *(slot for slot, _ in given)),
+        parameters=(*system.parameters, *(slot for slot, _ in constants)),
         values=tuple(values),
     )
     return RolledKernel(
         kernel=replace(kernel, purpose=purpose),
-        loops=of.loops,
+        loops=term.loops,
         reads=accesses * (2 if along else 1),
         writes=accesses if targets is None else tuple(targets),
-        given=tuple(access for _, access in given),
+        given=tuple(access for _, access in constants),
         text=comment_text(text),
         along=len(along),
     )
@@ -160,7 +158,7 @@ def layout_of(stages: StageSystem, dimension: int) -> UnknownLayout:
     sizes = [None, *sorted({size for size in (*blocks, *rows) if size is not None})]
     numbers = [dimension if size is None else size for size in sizes]
     columns, lines = (
-        {size: tuple(k for k, each in enumerate(of) if each == size) for size in sizes} for of in (blocks, rows)
+        {size: tuple(k for k, each in enumerate(items) if each == size) for size in sizes} for items in (blocks, rows)
     )
     if len({len(places) for group in (columns, lines) for places in group.values()}) > 1:
         counts = ", ".join(
@@ -205,8 +203,8 @@ def bandwidth_ordering(pairs: Pairs, count: int) -> tuple[int, ...]:
     original = tuple(range(count))
     if bandwidth(coupled, original) <= 1 or 2 * len(coupled) == count * (count - 1):
         return original
-    found = _cuthill_mckee(coupled, count)
-    return found if bandwidth(coupled, found) < bandwidth(coupled, original) else original
+    order = _cuthill_mckee(coupled, count)
+    return order if bandwidth(coupled, order) < bandwidth(coupled, original) else original
 
 
 def _cuthill_mckee(coupled: set[tuple[int, int]], count: int) -> tuple[int, ...]:
@@ -247,17 +245,13 @@ def lowered_stage_group(system: MechanicalSystem, group: StageGroup, sites: Unkn
         gathers=tuple(_gather_loop(group, g, sites) for g in range(len(group.gathers))),
         scatters=tuple(_scatter_loop(group, s, sites) for s in range(len(group.scatters))),
         value=system_kernel(
-            system,
-            f"{group.name}_value",
-            group.results,
-            of=group.arguments,
-            purpose=f"{_results(group, names)} at {u}.",
+            system, f"{group.name}_value", group.results, u=group.arguments, purpose=f"{_results(group, names)} at {u}."
         ),
         derivative=system_kernel(
             system,
             f"{group.name}_derivatives",
             group.results,
-            of=group.arguments,
+            u=group.arguments,
             partials=partials,
             purpose=f"The same, and the nonzero derivatives with respect to {u}.",
         ),
@@ -282,9 +276,9 @@ def _results(group: StageGroup, names: tuple[str, ...]) -> str:
 
 def _integrand(system: MechanicalSystem, group: StageGroup, u: str) -> Kernel | None:
     """Return the kernel that is summed along the curve: work and impulses of forces, or the action."""
-    if given := work_rates(system):
-        rates, purpose = [each.rate for each in given], f"Power and impulse rates of the forces at {u}."
-        return system_kernel(system, "exchanges", rates, of=group.arguments, purpose=purpose)
+    if rates_of_forces := work_rates(system):
+        rates, purpose = [each.rate for each in rates_of_forces], f"Power and impulse rates of the forces at {u}."
+        return system_kernel(system, "exchanges", rates, u=group.arguments, purpose=purpose)
     if not has_action(system):
         return None
     assert group.scalar is not None
@@ -294,7 +288,7 @@ def _integrand(system: MechanicalSystem, group: StageGroup, u: str) -> Kernel | 
         system,
         "lagrangian" if group.name == "quadrature" else f"{group.name}_action",
         (group.scalar,),
-        of=group.arguments,
+        u=group.arguments,
         purpose=f"{rate if k else 'p . v - H' if system.auxiliaries else 'L'} at {u}.",
     )
 
@@ -309,8 +303,8 @@ def argument_name(system: MechanicalSystem, gather: Gather) -> str:
         system.auxiliaries: "p",
         auxiliary_multipliers(system): "nu",
     }
-    own = gather.arguments[0].name.rpartition("_")[0] if gather.arguments else ""
-    return names.get(gather.arguments, own)
+    name = gather.arguments[0].name.rpartition("_")[0] if gather.arguments else ""
+    return names.get(gather.arguments, name)
 
 
 def _derivative_blocks(
@@ -325,12 +319,12 @@ def _derivative_blocks(
         for g, gather in enumerate(group.gathers):
             left = sum(len(other.arguments) for other in group.gathers[:g])
             rows, columns = range(top, top + len(scatter.results)), range(left, left + len(gather.arguments))
-            found = [(i - top, j - left) for i, j in entries if i in rows and j in columns]
-            if found:
+            nonzero = [(i - top, j - left) for i, j in entries if i in rows and j in columns]
+            if nonzero:
                 row, column = sites.first[_row_size(scatter, sites)], sites.first[_block_size(gather, sites)]
-                pairs = tuple((row + i, column + j) for i, j in found)
+                pairs = tuple((row + i, column + j) for i, j in nonzero)
                 blocks.append(DerivativeBlock(scatter=s, gather=g, first=len(partials), entries=pairs))
-                partials.extend(entries[top + i, left + j] for i, j in found)
+                partials.extend(entries[top + i, left + j] for i, j in nonzero)
     return tuple(partials), tuple(blocks)
 
 

@@ -142,11 +142,11 @@ class EventFormulas:
         time, parameters = symbol(TIME), self.parameters
         return lower_kernel(name, arguments=self.arguments, time=time, parameters=parameters, values=values)
 
-    def _read(self, formula: Formula, what: str) -> Expr:
+    def _read(self, formula: Formula, role: str) -> Expr:
         grammar = self._grammar
         if isinstance(formula, str) and grammar.arrays and is_indexed(formula):
             formula = formula_of_entries(formula, grammar.arrays, self._known, grammar.tables, grammar.rules)
-        expression = self._turning.in_coordinates(_expression(formula, self._known, what, self._turning.read))
+        expression = self._turning.in_coordinates(_expression(formula, self._known, role, self._turning.read))
         return cast(Expr, expression.xreplace(input_formulas(self.interface.inputs, symbol(TIME))))
 
     def _elements(self, event: SearchedEvent) -> list[SearchedEvent]:
@@ -246,27 +246,27 @@ def _names(interface: Interface) -> dict[str, Symbol]:
 
 
 def _expression(
-    formula: Formula, names: Mapping[str, Symbol], what: str, read: Callable[[str, Mapping[str, Symbol]], Expr]
+    formula: Formula, names: Mapping[str, Symbol], role: str, read: Callable[[str, Mapping[str, Symbol]], Expr]
 ) -> Expr:
     if isinstance(formula, str | int | float):
-        found = read(str(formula), names)
+        expression = read(str(formula), names)
     elif isinstance(formula, Expr):
-        found = _translated(formula, what)
+        expression = _translated(formula, role)
     else:
-        raise EventError(f"the {what} must be text or a SymPy expression; got {formula!r}")
-    problem = unsupported_part(found)
+        raise EventError(f"the {role} must be text or a SymPy expression; got {formula!r}")
+    problem = unsupported_part(expression)
     if problem:
-        raise EventError(f"in the {what}: {problem}")
-    unknown = sorted(free.name for free in found.free_symbols.difference(names.values()))
+        raise EventError(f"in the {role}: {problem}")
+    unknown = sorted(free.name for free in expression.free_symbols.difference(names.values()))
     if unknown:
         raise EventError(
-            f"'{unknown[0]}' in the {what} is neither a coordinate, a velocity, a momentum, time, an input nor a "
+            f"'{unknown[0]}' in the {role} is neither a coordinate, a velocity, a momentum, time, an input nor a "
             f"parameter{closest(unknown[0], names)} Known here: {', '.join(names)}"
         )
-    return found
+    return expression
 
 
-def _translated(function: Expr, what: str) -> Expr:
+def _translated(function: Expr, role: str) -> Expr:
     """Return the expression with functions of time, their derivatives and symbols as canonical symbols."""
     rules: dict[Expr, Expr] = {free: symbol(identifier(free.name)) for free in function.free_symbols}
     for moving in function.atoms(AppliedUndef):
@@ -274,13 +274,13 @@ def _translated(function: Expr, what: str) -> Expr:
     for rate in function.atoms(sympy.Derivative):
         if not isinstance(rate.expr, AppliedUndef) or rate.derivative_count != 1:
             raise EventError(
-                f"'{rate}' in the {what} is not the velocity of a coordinate: use first derivatives of coordinates"
+                f"'{rate}' in the {role} is not the velocity of a coordinate: use first derivatives of coordinates"
             )
         rules[rate] = symbol(identifier(rate.expr.func.__name__) + DOT)
     try:
         return evaluated(function, rules)
     except SystemDefinitionError as error:
-        raise EventError(f"in the {what}: {error}") from error
+        raise EventError(f"in the {role}: {error}") from error
 
 
 def _search(interface: Interface, events: tuple[SearchedEvent, ...], header: str) -> EventSearch:
@@ -403,33 +403,33 @@ class ArrayEvents:
         return terms
 
     def _function(
-        self, name: str, of: Any, values: Sequence[Expr], lines: Iterable[str], to: Slots = (), *, within: bool
+        self, name: str, term: Any, values: Sequence[Expr], lines: Iterable[str], to: Slots = (), *, within: bool
     ) -> str:
         """Add a function that evaluates formulas in the loops of a term; return its call.
 
         Args:
             name, values: of the kernel.
-            of: a term or force, with its loops and slots.
+            term: a term or force, with its loops and slots.
             lines: statements after each evaluation; ``{0}``, ``{1}``, .. for the indices of the entries ``to``.
             to: slots of these entries.
             within: whether the loops have the ranges of the caller.
         """
-        moving = [(slot, access) for slot, access in of.slots if access.array.name in self.moving and values]
-        given = [(slot, access) for slot, access in of.slots if access.array.name not in self.moving]
+        moving = [(slot, access) for slot, access in term.slots if access.array.name in self.moving and values]
+        constants = [(slot, access) for slot, access in term.slots if access.array.name not in self.moving]
         self.uses_velocity |= any(self.moving[access.array.name][0] == 2 for _, access in moving)
         kernel = lower_kernel(
             name,
             arguments=[slot for slot, _ in moving],
             time=symbol(TIME),
-            parameters=(*map(symbol, self.layout.parameters), *(slot for slot, _ in given)),
+            parameters=(*map(symbol, self.layout.parameters), *(slot for slot, _ in constants)),
             values=tuple(values),
         )
         rolled = RolledKernel(
             kernel=replace(kernel, purpose="Formulas of an event."),
-            loops=of.loops,
+            loops=term.loops,
             reads=tuple(access for _, access in moving),
             writes=(),
-            given=tuple(access for _, access in given),
+            given=tuple(access for _, access in constants),
             text=f"Adds {name.replace('_', ' ')}.",
         )
         nest = _Entries(self, rolled, within=within)

@@ -40,13 +40,13 @@ class Function:
 
 def functions_of(code: str) -> dict[str, Function]:
     """Return every function with a body, by name, in order; of preprocessor alternatives the first."""
-    found: dict[str, re.Match[str]] = {}
+    matches: dict[str, re.Match[str]] = {}
     prefix, stored = re.search(r"^#define NAME\(word\) (\w+)##word", code, re.MULTILINE), HOT.search(code)
     text = re.sub(r"\bNAME\((\w+)\)", rf"{prefix[1]}\1", code) if prefix else code
     text = re.sub(r"^(static )?SELDOM ", r"\1", text, flags=re.MULTILINE)
     for match in HEAD.finditer(re.sub(r"^HOT ", f"{stored[1]} ", text, flags=re.MULTILINE) if stored else text):
-        found.setdefault(match["name"], match)
-    return {name: _function(match, found) for name, match in found.items()}
+        matches.setdefault(match["name"], match)
+    return {name: _function(match, matches) for name, match in matches.items()}
 
 
 def _function(match: re.Match[str], known: Mapping[str, re.Match[str]]) -> Function:
@@ -68,11 +68,11 @@ def _last_word(argument: str) -> str:
 
 def reached(functions: Mapping[str, Function], start: str) -> tuple[Function, ...]:
     """Return ``start`` and the functions that it calls, directly or not, each once, callers first."""
-    found: dict[str, Function] = {}
+    functions_reached: dict[str, Function] = {}
     pending = [start]
     while pending:
         name = pending.pop()
-        if name not in found:
-            found[name] = functions[name]
+        if name not in functions_reached:
+            functions_reached[name] = functions[name]
             pending.extend(reversed(functions[name].calls))
-    return tuple(found.values())
+    return tuple(functions_reached.values())

@@ -193,13 +193,13 @@ def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") 
     environment, context = template_environment(), {**common, **context}
     header = entry if entry in DECLARATIONS else "stepper"
     code = environment.get_template(f"{entry}.c.jinja").render(context)
-    own = cast("Mapping[str, str]", context.get("own_headers", {}))
+    headers = cast("Mapping[str, str]", context.get("own_headers", {}))
     return Source(
         prefix=prefix,
         header=environment.get_template(f"{header}.h.jinja").render(context),
         code=code,
         declarations=environment.get_template(DECLARATIONS[header]).render(context),
-        support=included(code, lambda name: own.get(name) or support_text(name)),
+        support=included(code, lambda name: headers.get(name) or support_text(name)),
     )
 
 
@@ -321,9 +321,9 @@ def _context(
 def _scalar_kernels(
     program: Program, control: Control | None, kernels: Sequence[Kernel] | None = None
 ) -> tuple[Kernel, ...]:
-    own = program.kernels if kernels is None else kernels
+    kernels_of_step = program.kernels if kernels is None else kernels
     splitting = program.splitting.kernels if program.splitting else ()
-    return (*own, *splitting, *((control.density,) if control and control.density else ()))
+    return (*kernels_of_step, *splitting, *((control.density,) if control and control.density else ()))
 
 
 def _lane_context(program: Program, beside: Sequence[Kernel], *, changes: bool) -> dict[str, object]:
@@ -452,11 +452,11 @@ def _behind(source: Source, text: str, headers: Sequence[str], declarations: str
         + "#define SECOND_DERIVATIVES\n" * second
         + "".join(f'#include "support/frameworks/{header}.h"\n' for header in headers)
     )
-    own = dict(source.support)
+    texts = dict(source.support)
     code = source.code + tail
     return replace(
         source,
         code=code,
         declarations=source.declarations + declarations,
-        support=included(code, lambda name: own.get(name) or support_text(name)),
+        support=included(code, lambda name: texts.get(name) or support_text(name)),
     )

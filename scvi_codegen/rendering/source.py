@@ -57,8 +57,8 @@ class Source:
     @property
     def files(self) -> dict[str, str]:
         """File contents by file name, ``/`` between folders."""
-        own = {f"{self.prefix}.h": self.header, f"{self.prefix}.c": self.code, **dict(self.support)}
-        return own | (self.beside.files if self.beside else {})
+        files = {f"{self.prefix}.h": self.header, f"{self.prefix}.c": self.code, **dict(self.support)}
+        return files | (self.beside.files if self.beside else {})
 
     def write(self, folder: Path) -> None:
         """Write all files into a folder."""
@@ -167,9 +167,9 @@ def check_interface(source: Source, interface: Interface) -> None:
     lengths["defaults"] = (len(interface.defaults), len(interface.parameters))
     lengths["momentum_names"] = (len(interface.momentum_names), interface.dimension if interface.momentum_names else 0)
     lengths["map_formulas"] = (len(interface.map_formulas), len(interface.map_names))
-    for name, (found, wanted) in lengths.items():
-        if found != wanted:
-            raise ValueError(f"{name}: the interface has {found}; {wanted} is required")
+    for name, (length, wanted) in lengths.items():
+        if length != wanted:
+            raise ValueError(f"{name}: the interface has {length}; {wanted} is required")
     _check_lengths(interface)
     _check_names(source, interface)
 
@@ -191,15 +191,15 @@ def _check_names(source: Source, interface: Interface) -> None:
     first = {name[:-2] for name in interface.parameters if name.endswith("_0")}
     if not set(interface.inputs) <= first:
         raise ValueError(f"the inputs {interface.inputs} must each have a first parameter NAME_0")
-    own, functions = interface.energy_parameter, f"{source.prefix}_rates(" in source.header
-    if functions != bool(own) or not {own} <= {"", *interface.parameters}:
-        raise ValueError(f"energy_parameter: {own!r} must be a parameter of systems in transformed time")
+    parameter, functions = interface.energy_parameter, f"{source.prefix}_rates(" in source.header
+    if functions != bool(parameter) or not {parameter} <= {"", *interface.parameters}:
+        raise ValueError(f"energy_parameter: {parameter!r} must be a parameter of systems in transformed time")
     if interface.variables and not len(interface.variables) == 2 * len(interface.momentum_names):
         raise ValueError(f"variables: {interface.variables} must be the coordinates and momenta")
 
 
-def _compare(name: str, size: int, found: re.Match[str] | None) -> None:
-    wanted = int(found[1]) if found else 0
+def _compare(name: str, size: int, match: re.Match[str] | None) -> None:
+    wanted = int(match[1]) if match else 0
     if size != wanted:
         raise ValueError(f"{name} is {size} in the interface and {wanted} in the C source: they must be equal")
 

@@ -216,24 +216,24 @@ class _Preprocessor:
 
     def lines(self, text: str, folder: str) -> Generator[str, None, list[str]]:
         """Yield the lines with headers inserted; return those of the text itself."""
-        own: list[str] = []
+        lines: list[str] = []
         for line in text.split("\n"):
             match = DIRECTIVE.match(line)
             word, rest = (match["word"], match["rest"]) if match else ("", "")
             if word in ("if", "ifdef", "ifndef", "elif", "else", "endif"):
                 for kept in self.condition(word, COMMENT.sub("", rest), line):
-                    own.append(kept)
+                    lines.append(kept)
                     yield kept
             elif not any(chain.active is False for chain in self.chains):
                 if word in ("define", "undef"):
                     self.define(word, rest)
                 self.macros.failed |= word == "error"
-                own.append(line)
+                lines.append(line)
                 if word == "include" and (OWN if folder else SUPPORT).match(rest):
                     yield from self.include(posixpath.normpath(posixpath.join(folder, rest.strip('"'))))
                 else:
                     yield line
-        return own
+        return lines
 
     def define(self, word: str, rest: str) -> None:
         name, value = re.split(r"\b", COMMENT.sub("", rest) + " ", maxsplit=2)[1:]
@@ -246,10 +246,10 @@ class _Preprocessor:
         if name not in self.files:
             self.files[name] = self.read(name)
         text = self.files[name]
-        own = yield from self.lines(text.removesuffix("\n"), posixpath.dirname(name))
-        if any(own):
+        lines = yield from self.lines(text.removesuffix("\n"), posixpath.dirname(name))
+        if any(lines):
             guarded = text.startswith("#ifndef ")
-            kept = "\n".join([text.partition("\n")[0], *own, "#endif", ""] if guarded else [*own, ""])
+            kept = "\n".join([text.partition("\n")[0], *lines, "#endif", ""] if guarded else [*lines, ""])
             same = self.specialised.setdefault(name, kept) == kept
             self.specialised[name] = re.sub(r"\n{3,}", "\n\n", kept) if same else text
 
@@ -339,8 +339,8 @@ def with_own_names(code: str, prefix: str, header: str) -> str:
     names = {}
     for name in (*(match["name"] for match in MACRO.finditer(code)), *_names(code)):
         if not name.lower().startswith(f"{prefix.lower()}_"):
-            own, local = (prefix.upper(), "LOCAL") if name.isupper() else (prefix, "local")
-            names[name] = f"{own}_{name}" if f"{own}_{name}" not in taken else f"{own}_{local}_{name}"
+            upper, local = (prefix.upper(), "LOCAL") if name.isupper() else (prefix, "local")
+            names[name] = f"{upper}_{name}" if f"{upper}_{name}" not in taken else f"{upper}_{local}_{name}"
     renamed = TOKEN.sub(lambda found: names.get(found[0], found[0]), code)
     return "\n".join(_broken(renamed.split("\n")))
 
@@ -365,9 +365,9 @@ def _broken(lines: Sequence[str]) -> Iterator[str]:
 def _names(code: str) -> Iterator[str]:
     """Yield names with internal linkage, types and enumerators in order."""
     makers = {
-        match["name"]: ([each.strip() for each in match["parameters"].split(",")], made)
+        match["name"]: ([each.strip() for each in match["parameters"].split(",")], names)
         for match in MACRO.finditer(code)
-        if match["parameters"] and (made := re.findall(r"\bstatic\b[\w ]*?(\w+##\w+)\(", match["body"]))
+        if match["parameters"] and (names := re.findall(r"\bstatic\b[\w ]*?(\w+##\w+)\(", match["body"]))
     }
     local = {match["name"] for match in MACRO.finditer(code) if not match["parameters"] and "static" in match["body"]}
     for text in _declarations(ATTRIBUTE.sub("", IGNORED.sub("", code))):
@@ -400,9 +400,9 @@ def _declarations(text: str) -> Iterator[str]:
                 lines = []
 
 
-def _made(parameters: Iterable[str], made: Iterable[str], head: str) -> Iterator[str]:
+def _made(parameters: Iterable[str], names: Iterable[str], head: str) -> Iterator[str]:
     """Yield the names of functions that a macro defines, and those parts of them that the macro contains."""
     arguments = dict(zip(parameters, re.split(r"[(),]", head)[1:], strict=False))
-    for name in made:
+    for name in names:
         yield from [part for part in name.split("##") if part not in arguments]
         yield "".join(arguments.get(part, part).strip() for part in name.split("##"))

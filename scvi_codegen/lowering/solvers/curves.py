@@ -170,7 +170,7 @@ def _action_kernel(system: MechanicalSystem) -> Kernel:
         system,
         "action_lanes",
         (*forms.force, *forms.momentum),
-        of=(*system.coordinates, *system.velocities),
+        u=(*system.coordinates, *system.velocities),
         purpose="L_q and L_v at all points, u = (q, v).",
     )
 
@@ -181,7 +181,7 @@ def _node_kernel(system: MechanicalSystem) -> Kernel:
         system,
         "applied_force_lanes",
         forms_of(system).applied_force,
-        of=(*system.coordinates, *system.velocities),
+        u=(*system.coordinates, *system.velocities),
         partials=forms_of(system).lower_mass.values(),
         purpose="L_q - L_vq v - L_vt and the lower triangle of L_vv at all nodes, u = (q, v).",
     )
@@ -196,7 +196,7 @@ def _residual_kernel(system: MechanicalSystem) -> Kernel:
         system,
         "node_lanes",
         (*forms.euler_lagrange, *map(operator.add, partials, adjoint)),
-        of=(*state, *accelerations(system), *multipliers(system)),
+        u=(*state, *accelerations(system), *multipliers(system)),
         partials=forms.lower_mass.values(),
         purpose="E, (m . E)_q, (m . E)_v and the lower triangle of L_vv at all nodes, u = (q, v, a, m).",
     )

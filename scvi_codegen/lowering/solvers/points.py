@@ -115,13 +115,13 @@ def _separable(system: LagrangianSystem, tables: VelocityTables, *, velocities: 
         ),
         guess=predictor_tables_of(tables.abscissae, lanes, through=None if velocities else product, degree=highest),
         kernels=(
-            system_kernel(system, "force_lanes", forms.force, of=system.coordinates, purpose="L_q at all points."),
+            system_kernel(system, "force_lanes", forms.force, u=system.coordinates, purpose="L_q at all points."),
         ),
         forces=("force_lanes",),
         kept=StoredValues.FORCES,
         stored=2 * lanes,
         parts=("separable_iteration",),
-        constant_mass=system_kernel(system, "mass", forms.mass.values(), of=(), purpose="The constant masses."),
+        constant_mass=system_kernel(system, "mass", forms.mass.values(), u=(), purpose="The constant masses."),
         predictor_matrix=padded,
         matrix=matrix,
         derivatives_part="" if velocities else "separable_derivatives",
@@ -170,16 +170,16 @@ def hamiltonian_iteration(problem: StepProblem) -> FixedPointIteration | None:
     lanes, forms = lane_count(len(tables.abscissae)), forms_of(system)
     if lanes > MOST_LANES:
         return None
-    of, turning = forms.legendre_arguments, bool(system.rotations)
+    arguments, turning = forms.legendre_arguments, bool(system.rotations)
     joint = turning and lanes > 2 and sum(len(each.coordinates) for each in system.rotations) == system.dimension
-    kernel, potential = partial(system_kernel, system, of=of, paired=turning), frame_potential(problem.system)
+    kernel, potential = partial(system_kernel, system, u=arguments, paired=turning), frame_potential(problem.system)
     in_space = (
         kernel("velocity_lanes", forms.legendre, purpose="H_p at all points, u = (q, p)."),
         kernel("force_lanes", forms.force, purpose="-H_q at all points, u = (q, p)."),
         kernel("rate_lanes", (*forms.legendre, *forms.force), purpose="(H_p, -H_q) at all points, u = (q, p).")
         if joint
         else None,
-        integrand_kernel(system, "integrand_lanes", of),
+        integrand_kernel(system, "integrand_lanes", arguments),
         _turn_kernel(system, turns, lanes=True),
     )
     macros = {"JOINT_RATES": int(joint), "TURNS": len(turns), "MOVING_FRAME": int(potential is not None)}
@@ -203,7 +203,7 @@ def _frame_kernel(system: MechanicalSystem, turns: Sequence[Turn], potential: Ex
     sums = {Add(*(x**2 for x in q[4 * k : 4 * k + 4])): each for k, each in enumerate(squares)}
     values = [each.xreplace(sums) for each in gradient_tuple(potential, q)] + [turn.rate / 4 for turn in turns]
     purpose = "V_q and 1/(4 A) at all points, u = (q, |q|^2 of each body)."
-    return system_kernel(system, "frame_lanes", values, of=(*q, *squares), paired=True, purpose=purpose)
+    return system_kernel(system, "frame_lanes", values, u=(*q, *squares), paired=True, purpose=purpose)
 
 
 def _turn_kernel(system: MechanicalSystem, turns: Sequence[Turn], *, lanes: bool) -> Kernel | None:
@@ -214,12 +214,12 @@ def _turn_kernel(system: MechanicalSystem, turns: Sequence[Turn], *, lanes: bool
     if not lanes:
         values = sum((turn.rotation(q, p) for turn in turns), ())
         return system_kernel(
-            system, "rotations", values, of=(*q, *p), purpose="exp(kappa h Pi_k e_k/2) - 1, u = (q, h p)."
+            system, "rotations", values, u=(*q, *p), purpose="exp(kappa h Pi_k e_k/2) - 1, u = (q, h p)."
         )
     rotations = [tuple(Symbol(f"g_{k}_{i}", real=True) for i in range(4)) for k in range(len(turns))]
     changes = ((*t.change(q, g), *t.change(p, g)) for t, g in zip(turns, rotations, strict=True))
     purpose = "Changes q (g - 1) and p (g - 1) of vectors by rotations, u = (q, p, g - 1)."
-    return system_kernel(system, "turn_lanes", map(Add, *changes), of=(*q, *p, *sum(rotations, ())), purpose=purpose)
+    return system_kernel(system, "turn_lanes", map(Add, *changes), u=(*q, *p, *sum(rotations, ())), purpose=purpose)
 
 
 def _nearly_equal(one: Matrix, other: Matrix) -> bool:
@@ -250,19 +250,19 @@ def _coupled(system: LagrangianSystem, tables: VelocityTables) -> FixedPointIter
     full = not inverse and any(i != j for i, j in forms.lower_mass)
     if lanes > MOST_LANES or (full and lanes * system.dimension**2 > LARGEST_MASS_MATRICES):
         return None
-    of, projected = (*system.coordinates, *system.velocities), bool(tables.velocity)
+    arguments, projected = (*system.coordinates, *system.velocities), bool(tables.velocity)
     frozen = bool(inner_of(system.lagrangian))
     followed = () if tables.projection or frozen else _linearised_forces(system)
     evaluated = "L_q, L_v, their derivatives F_q, F_v and L_vq" if followed else "L_q, L_v"
     values = (*forms.force, *forms.momentum)
     force = (
-        system_kernel(system, "value_lanes", values, of=of, purpose="L_q, L_v at all points.")
+        system_kernel(system, "value_lanes", values, u=arguments, purpose="L_q, L_v at all points.")
         if frozen
-        else system_kernel(system, "force_lanes", forms.force, of=of, purpose="L_q at all points.")
+        else system_kernel(system, "force_lanes", forms.force, u=arguments, purpose="L_q at all points.")
     )
     macros = (("PROJECTED", projected), ("FOLLOWED", followed), ("FROZEN_MASS", frozen))
     sizes = (("MASS_TERMS", len(inverse.terms)),) if inverse else ()
-    integrands, damping = integrand_kernel(system, "integrand_lanes", of), damping_kernel(system)
+    integrands, damping = integrand_kernel(system, "integrand_lanes", arguments), damping_kernel(system)
     return _point_iteration(
         "coupled",
         tables,
@@ -272,7 +272,7 @@ def _coupled(system: LagrangianSystem, tables: VelocityTables) -> FixedPointIter
                 system,
                 "point_lanes",
                 (*values, *followed),
-                of=of,
+                u=arguments,
                 partials=forms.mass_terms,
                 purpose=f"{evaluated} and "
                 f"{'the terms of its inverse' if inverse else 'the lower triangle'} of L_vv at all points, u = (q, v).",
@@ -300,9 +300,13 @@ def _solution_kernel(system: LagrangianSystem) -> Kernel | None:
     inverse = forms_of(system).inverse_mass
     if inverse is None:
         return None
-    of = (*inverse.symbols, *system.momentum_symbols)
+    arguments = (*inverse.symbols, *system.momentum_symbols)
     return system_kernel(
-        system, "solve_lanes", inverse.solution, of=of, purpose="L_vv^-1 p at all points, u = (terms of L_vv^-1, p)."
+        system,
+        "solve_lanes",
+        inverse.solution,
+        u=arguments,
+        purpose="L_vv^-1 p at all points, u = (terms of L_vv^-1, p).",
     )
 
 

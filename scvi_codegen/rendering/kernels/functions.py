@@ -150,8 +150,8 @@ class _Statements:
         """Yield the statements of the magnitudes of p1, then of q1: sums of absolute values."""
         program = self.program
         for s in range(program.equations.sites):
-            own = [f"{self._momenta}[{s}]"] if s < program.dimension else []
-            terms = [*own, *(self._sum([term]) for term in self._row(s, program.equations.blocks) if term[0])]
+            momenta = [f"{self._momenta}[{s}]"] if s < program.dimension else []
+            terms = [*momenta, *(self._sum([term]) for term in self._row(s, program.equations.blocks) if term[0])]
             yield f"size_p[{s}] = {_magnitude(terms)};"
         for i in range(program.dimension):
             moves = [

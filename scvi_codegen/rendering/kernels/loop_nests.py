@@ -74,13 +74,13 @@ def sharing_of(rolled: RolledKernel) -> Sharing:
 
 def sharing_text(rolled: RolledKernel) -> str:
     """Return the C expression of the rounds."""
-    found, loops = sharing_of(rolled), rolled.loops
-    if found is Sharing.IN_TURN:
+    kind, loops = sharing_of(rolled), rolled.loops
+    if kind is Sharing.IN_TURN:
         span = f"{size_text(loops[0].first)}, {size_text(loops[0].end)}"
         return f"alternating_blocks({span}, {_width(rolled.writes, {loops[0].index})}, {count_text(loops[1:])})"
-    if found is Sharing.IN_TILES:
+    if kind is Sharing.IN_TILES:
         return f"pairs_of_blocks({size_text(loops[0].end)})"
-    return "by_elements(run, n)" if found is Sharing.BY_PLACES else "alternating_blocks(0, 1, 0, 1)"
+    return "by_elements(run, n)" if kind is Sharing.BY_PLACES else "alternating_blocks(0, 1, 0, 1)"
 
 
 def _common_axes(targets: Sequence[Access], indices: Collection[str]) -> dict[str, int]:

@@ -101,10 +101,10 @@ def _map_context(program: Program) -> dict[str, Any]:
     """Return the initialisers of the descriptions of momentum maps in C (templates/support/arrays/array_states.h)."""
     arrays = {array.name: array for array in program.layout.coordinates}
     texts = []
-    for of in program.loops.maps:
-        array, whole = arrays[of.array], of.component is None
-        kind = "PHASE" if of.phase else "TRANSLATION" if of.other is None else "ROTATION"
-        components, numbers = 1 if whole else array.axes[-1].number, f"{of.component or 0}, {of.other or 0}"
+    for each in program.loops.maps:
+        array, whole = arrays[each.array], each.component is None
+        kind = "PHASE" if each.phase else "TRANSLATION" if each.other is None else "ROTATION"
+        components, numbers = (1 if whole else array.axes[-1].number, f"{each.component or 0}, {each.other or 0}")
         start = f"start_{array.name}"
         texts.append(f"{{{start}, {start} + {product_text(array)}, {components}, {numbers}, {kind}}}")
     starts = list(starts_text(program.layout, " ".join(texts)))
@@ -132,7 +132,7 @@ def _has_sums(rolled: RolledKernel) -> bool:
 def _stages(sums: Sequence[Convolution]) -> list[tuple[int, str, int]]:
     """Return the axis, the array of coefficients and the power of each circulant matrix of convolutions in turn."""
     alike = groupby(sums, key=lambda each: (each.axis, each.coefficients.name))
-    return [(*of, len([*group])) for of, group in alike]
+    return [(*stage, len([*group])) for stage, group in alike]
 
 
 def _plans(program: Program) -> list[tuple[str, int]]:
@@ -148,12 +148,12 @@ def _convolutions(program: Program) -> list[str]:
         dict.fromkeys((each.sums, each.array) for one in kernels for each in getattr(one, kind) if each.sums)
         for kind in ("reads", "writes")
     )
-    found = []
+    texts = []
     for sums, array in reads:
         stages = [_circulant_matrix(program, array, *stage) for stage in _stages(sums)]
         number, target = program.layout.sums.index(sums), int((sums, array) in writes)
-        found.append(f"{{{number}, {target}, {len(stages)}, {{{', '.join(stages)}}}}}")
-    return found
+        texts.append(f"{{{number}, {target}, {len(stages)}, {{{', '.join(stages)}}}}}")
+    return texts
 
 
 def _transform_work(program: Program) -> int:
@@ -170,12 +170,12 @@ def _step_work(program: Program) -> int:
     if program.fixed_point is None:
         return CONSTRAINED_VECTORS + bool(program.layout.velocities) if program.loops.constrained else EXPLICIT_VECTORS
     momenta, velocities = bool(program.layout.momenta), bool(program.layout.velocities)
-    own = (1 + momenta) * ITERATION_VECTORS + velocities
+    iteration = (1 + momenta) * ITERATION_VECTORS + velocities
     newton = (1 + momenta + velocities) * NEWTON_VECTORS + program.fixed_point.lanes
     linear = newton if program.loops.products else 0
     roots = 2 * max(map(_axes, program.layout.coordinates))  # of unity, of every axis
     waves = (1 + momenta) * FOURIER_VECTORS * program.fixed_point.lanes + roots if _on_lattices(program) else 0
-    return (own + linear) * program.fixed_point.lanes + waves + STEP_VECTORS
+    return (iteration + linear) * program.fixed_point.lanes + waves + STEP_VECTORS
 
 
 def _vector_functions(program: Program) -> list[str]:
@@ -325,7 +325,7 @@ def _constraint_context(program: Program, held: ConstrainedSteps | None) -> dict
     counts = [count_text(each.loops) for each in held.conditions]
     entries = [f"{count} * {len(each.reads)}" for count, each in zip(counts, held.conditions, strict=True)]
     pairs = zip(held.conditions, held.curvatures, strict=True)
-    found = {
+    context = {
         "functions": [text for pair in pairs for text in _constraint_texts(program, *pair)],
         "conditions": [each.kernel.name for each in held.conditions],
         "curvatures": [each.kernel.name for each in held.curvatures],
@@ -333,7 +333,7 @@ def _constraint_context(program: Program, held: ConstrainedSteps | None) -> dict
         "count": " + ".join(counts),
         "entries": " + ".join(entries),
     }
-    return {"held": found, "part_ends": list(accumulate(held.parts))}
+    return {"held": context, "part_ends": list(accumulate(held.parts))}
 
 
 def _constraint_texts(program: Program, condition: RolledKernel, curvature: RolledKernel) -> Iterator[str]:

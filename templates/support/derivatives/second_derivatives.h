@@ -45,7 +45,7 @@ static void add_kernel_hessian(const stage_group *f, const step_data *step, cons
   const int arguments = f->arguments, results = f->results, parameters = STEP_INPUTS - 2 * M - 2;
   const wide *tangents = to->tangents + n * arguments, *adjoints = to->adjoints + f->points * arguments + n * results;
   const real c = f->abscissa ? f->abscissa[n] : 0;
-  real given[HESSIAN_ARGUMENTS], value[HESSIAN_VALUES], *next = given;
+  real u[HESSIAN_ARGUMENTS], value[HESSIAN_VALUES], *next = u;
   for (int i = 0; i < arguments; i++)
     *next++ = to->u[n * arguments + i];
   for (int i = 0; i < results; i++)
@@ -55,7 +55,7 @@ static void add_kernel_hessian(const stage_group *f, const step_data *step, cons
   for (int i = 0; i < parameters; i++)
     *next++ = to->change[2 * M + i].lane[j];
   *next = to->change[INPUT_H - 1].lane[j] + c * to->change[INPUT_H].lane[j];
-  f->curvature(given, time_of(f, step, n), step->parameters, value);
+  f->curvature(u, time_of(f, step, n), step->parameters, value);
   for (int i = 0; i < arguments; i++)
     to->tangents_of_adjoints[n * arguments + i].lane[j] += value[i];
   for (int i = 0; i <= parameters; i++)
@@ -107,12 +107,12 @@ static const real *add_group_hessian(const stage_group *f, const linearised_step
     const real *partials)
 {
   const real h = at->step->h, *by_h = partials + f->points * f->arguments, *derivative = by_h + f->points * f->results;
-  const real *given = derivative + f->points * f->partials;
+  const real *by_inputs = derivative + f->points * f->partials;
   const int first = f->points * f->arguments;
   memset(to->tangents, 0, sizeof(wide) * 3 * MOST_AT_POINTS);
   arguments_wide(f, h, 0, partials, to->change, to->dz, to->tangents);
   multiply_wide(f, 0, derivative, to->tangents, to->tangents + first);
-  inputs_wide(f, 0, by_h, given, to->change, to->tangents + first);
+  inputs_wide(f, 0, by_h, by_inputs, to->change, to->tangents + first);
   scatter_wide(f, h, at->growth, 1, 0, to->adjoints + first, at->rows);
   multiply_wide(f, 1, derivative, to->adjoints, to->adjoints + first);
   if (f->curvature)
@@ -122,11 +122,11 @@ static const real *add_group_hessian(const stage_group *f, const linearised_step
       add_kernel_hessian(f, at->step, to, n, j);
   add_result_hessian(f, h, to, by_h);
   multiply_wide(f, 1, derivative, to->tangents_of_adjoints, to->tangents_of_adjoints + first);
-  inputs_wide(f, 1, by_h, given, to->by_given, to->tangents_of_adjoints + first);
+  inputs_wide(f, 1, by_h, by_inputs, to->by_given, to->tangents_of_adjoints + first);
   start_wide(f, 1, partials, to->by_given, to->tangents_of_adjoints);
   add_argument_hessian(f, h, to, partials);
   gather_wide(f, h, 1, to->by_dz, to->tangents_of_adjoints);
-  return given + f->points * f->given;
+  return by_inputs + f->points * f->given;
 }
 
 /* Contributions of q1 = q0 + h (sum of unknowns). */
@@ -139,7 +139,7 @@ static void add_end_hessian(const second_order_memory *to)
     }
 }
 
-/* Replaces partials and adjoint_tangents, of (q1, p1, parameters, t + h, h), by those of (q0, p0, parameters, t, h). */
+/* Replaces input_adjoints and adjoint_tangents, of (q1, p1, parameters, t + h, h), by those of (q0, p0, parameters, t, h). */
 static void hessian_of_step(const linearised_step *at, const second_order_memory *to)
 {
   const real *partials = at->partials;
