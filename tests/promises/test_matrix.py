@@ -13,18 +13,13 @@ CASES = [
     for name, (_, applies) in PROPERTIES.items()
     if applies(Case(problem, method, situation))
 ]
+KINDS = [(x, y.kind) for x in PROPERTIES for y in PROBLEMS]
+STEPPERS = [(x.name, k) for x in PROBLEMS for k in range(len(x.methods))]
 INDICES = [
-    tuple(
-        (kind, names.index(value))
-        for kind, names, value in (
-            ("property of a kind", [(x, y.kind) for x in PROPERTIES for y in PROBLEMS], (name, case.kind)),
-            ("situation", [*SITUATIONS], case.situation),
-            (
-                "stepper",
-                [(x.name, k) for x in PROBLEMS for k in range(len(x.methods))],
-                (case.problem.name, case.method),
-            ),
-        )
+    (
+        ("property of a kind", KINDS.index((name, case.kind))),
+        ("situation", [*SITUATIONS].index(case.situation)),
+        ("stepper", STEPPERS.index((case.problem.name, case.method))),
     )
     for name, case in CASES
 ]

@@ -1,14 +1,20 @@
 """Ensembles as HDF5, Zarr and xarray: what is read back is what was computed, also where some failed."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from samples import compile_quickly
 
 import scvi_codegen as sc
 
-pytest.importorskip("h5netcdf")
-pytest.importorskip("zarr")
-xarray = pytest.importorskip("xarray")
+
+@pytest.fixture(scope="module", autouse=True)
+def xarray() -> Any:
+    """Import the libraries in this module's tests alone: that takes longer than collecting them."""
+    pytest.importorskip("h5netcdf")
+    pytest.importorskip("zarr")
+    return pytest.importorskip("xarray")
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +26,7 @@ def ensemble() -> sc.EnsembleTrajectory:
 
 
 @pytest.mark.parametrize("name", ["a.h5", "a.nc", "a.zarr"])
-def test_files_are_read_by_xarray(ensemble, tmp_path, name):
+def test_files_are_read_by_xarray(xarray, ensemble, tmp_path, name):
     path = tmp_path / name
     for _ in range(2):  # the second replaces the first
         ensemble.save(path, units={"t": "s", "q": "m"})
