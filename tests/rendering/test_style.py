@@ -1,10 +1,11 @@
 """Support headers satisfy ``.clang-format``; generated sources are short, and amalgamation does not change results."""
 
 import re
+import subprocess
 from pathlib import Path
 
 import pytest
-from style import check_style
+from style import CLANG_FORMAT, STYLE
 
 from scvi_codegen import SVI, LagrangianSystem, compile_stepper, generate_source, problem
 from scvi_codegen.files.cache import template_folder
@@ -14,16 +15,14 @@ FOLDER = Path(__file__).parents[2] / "generated"
 SUPPORT = sorted((template_folder() / "support").glob("*/*.h"))
 
 
-@pytest.mark.parametrize("path", SUPPORT, ids=lambda path: path.name)
-def test_support_headers_have_the_project_style(path):
-    check_style(path.read_text())
-
-
-@pytest.mark.parametrize(
-    "path", sorted([*FOLDER.glob("kepler_svi_4.[ch]"), *FOLDER.glob("support/**/*.h")]), ids=lambda path: path.name
-)
-def test_generated_files_have_the_project_style(path):
-    check_style(path.read_text())
+def test_support_headers_and_generated_files_have_the_project_style():
+    paths = [*SUPPORT, *FOLDER.glob("kepler_svi_4.[ch]"), *FOLDER.glob("support/**/*.h")]
+    command = [str(CLANG_FORMAT), f"--style=file:{STYLE}", "--dry-run", "--Werror", *map(str, paths)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    for path in paths:
+        assert [line for line in path.read_text().splitlines() if len(line) > 120] == [], path
+        assert "\n\n\n" not in path.read_text(), path
 
 
 @pytest.mark.parametrize(("name", "most"), [("two_point_pendulum", 250), ("kepler_svi_4", 400)])
