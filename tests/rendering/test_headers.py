@@ -13,8 +13,9 @@ import golden_cells
 import pytest
 from programs import needs
 
-from scvi_codegen import SVI, LagrangianSystem, SpectralCollocation, compile_stepper, impact, problem
+from scvi_codegen import SVI, LagrangianSystem, SpectralCollocation, StoermerVerlet, generate_source, impact, problem
 from scvi_codegen.files.cache import template_folder
+from scvi_codegen.pipeline import Sources
 from scvi_codegen.rendering.environment import support_text
 from scvi_codegen.rendering.program_source import with_casadi_flow, with_flow_of_rows
 from scvi_codegen.rendering.source import Source
@@ -62,24 +63,28 @@ NEEDED = re.compile(rf'#include "support/(?:{GENERATED}|{CHOSEN}|\w+_predictor)'
 def sources() -> tuple[Source, ...]:
     """Sources that use every header but those tested elsewhere."""
     made = [source for source, _ in (golden_cells.CELLS[name](name) for name in CELLS) if source]
-    kepler = compile_stepper(problem("kepler").system, SVI(2))
-    oscillator = compile_stepper(problem("harmonic-oscillator").system, SVI(1), events=[impact("q", where="t > 0")])
-    made += [kepler.source, compile_stepper(problem("double-pendulum").system, SpectralCollocation(3)).source]
+    kepler = Sources(problem("kepler").system, SVI(2))
+    walls = [impact("q", where="t > 0")]
+    oscillator = generate_source(problem("harmonic-oscillator").system, SVI(1), events=walls)[0]
     body = LagrangianSystem.from_text("body", rotations={"R": "w"}, lagrangian="w_1**2 + w_2**2 + 2*w_3**2")
-    made += [compile_stepper(body, method).source for method in (SVI(3), "stoermer-verlet")]
     pair = "sum(i in N, q_dot[i]**2/2) - sum(i < j in near, (q[i] - q[j])**2)"
     ring = "sum(i in N, q_dot[i]**2/2) - sum(i < j in N, c[j-i]*(q[i] - q[j])**2)"
-    circulant = LagrangianSystem.from_text("ring", ["q[N]"], ring, parameters={"c[N]": 1.0})
-    made.append(compile_stepper(circulant, "svi:1").source)
     near = {"near": {"of": "q", "cutoff": 1.0}}
-    made.append(compile_stepper(LagrangianSystem.from_text("pair", ["q[N]"], pair, neighbours=near), "svi:1").source)
-    drift = compile_stepper(LagrangianSystem.from_text("drift", ["x", "y"], "x**3*y_dot - x**2 - y**2"), SVI(1))
-    made.append(drift.derivatives)
     robot = Path(__file__).parents[1] / "mechanics" / "robots" / "figure.xml"
-    made.append(compile_stepper(LagrangianSystem.from_mjcf(robot), SVI(2)).source)
-    made.append(with_casadi_flow(kepler.second_derivatives, 10, 5, second=True))
-    made.append(with_flow_of_rows(kepler.derivatives))
-    return (*made, *oscillator.source.sources)
+    pairs = [
+        (problem("double-pendulum").system, SpectralCollocation(3)),
+        (body, SVI(3)),
+        (body, StoermerVerlet()),
+        (LagrangianSystem.from_text("ring", ["q[N]"], ring, parameters={"c[N]": 1.0}), SVI(1)),
+        (LagrangianSystem.from_text("pair", ["q[N]"], pair, neighbours=near), SVI(1)),
+        (LagrangianSystem.from_mjcf(robot), SVI(2)),
+    ]
+    made += [kepler.integrator()[0], *(Sources(system, method).integrator()[0] for system, method in pairs)]
+    drift = LagrangianSystem.from_text("drift", ["x", "y"], "x**3*y_dot - x**2 - y**2")
+    made.append(Sources(drift, SVI(1)).variant("derivatives"))
+    made.append(with_casadi_flow(kepler.variant("second_derivatives"), 10, 5, second=True))
+    made.append(with_flow_of_rows(kepler.variant("derivatives")))
+    return (*made, *oscillator.sources)
 
 
 @cache
