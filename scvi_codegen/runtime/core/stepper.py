@@ -21,7 +21,7 @@ from scvi_codegen.native import building
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.calls import with_calls
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.arrays.any_size import interface_of_sizes, shapes_of_call, sizes_of_run
 from scvi_codegen.runtime.arrays.interface import RunSizes
 from scvi_codegen.runtime.chaos.ensemble import ChaosIndicatorsEnsemble
@@ -61,11 +61,6 @@ class Stepper(Integrator):
     """Compiled integrator of one system: :class:`Integrator` with integrations, runs, ensembles and projections."""
 
     _trajectory_type = Trajectory
-
-    def __new__(cls, source: Source | None, interface: Interface, **further: Any) -> Self:
-        """Return a stepper whose methods bind one of the sizes of a call, for arrays of run-time sizes."""
-        run_time_sizes = bool(interface.layout.coordinates) and further.get("problem") is None
-        return cast(Self, object.__new__(StepperOfRunTimeSizes if run_time_sizes and cls is Stepper else cls))
 
     def __reduce__(self) -> tuple[Any, ...]:
         if self.origin is not None:
@@ -634,6 +629,7 @@ class StepperOfRunTimeSizes(Stepper):
         return bool(self._reason) or "_advance_to(" in self.source.header
 
 
+Stepper._of_run_time_sizes = StepperOfRunTimeSizes
 PER_STEP = (Stepper.integrate, Stepper.start)
 """Methods whose ``threads`` are those of each step."""
 
