@@ -25,6 +25,7 @@ FOLDER = template_folder()
 HEADERS = sorted(str(path.relative_to(FOLDER)) for path in FOLDER.glob("support/*/*.h"))
 ELSEWHERE = {
     "support/frameworks/fmu.h": "tests/models/test_fmu.py",
+    "support/frameworks/fmu_unsupported.h": "tests/models/test_fmu.py",
     "support/frameworks/xla_flow.h": "tests/rendering/test_flow_text.py",
     "support/run/inputs.h": "tests/models/test_package_inputs.py",
 }
@@ -46,7 +47,7 @@ CELLS = (
     "swings",
 )
 GENERATED = (
-    r"core/|newton/stages|newton/band|arrays/(?:arrays|lattice_transform|circulant)|derivatives/linear"
+    r"core/|newton/stages|newton/band|arrays/(?:arrays|lattice_transform|circulant|convolutions)|derivatives/linear"
     r"|mechanics/damping"
 )
 """Headers with types that the generated part uses."""

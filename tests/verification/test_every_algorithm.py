@@ -24,6 +24,7 @@ OTHERS = {
     "frameworks/casadi_flow.h": "interface of CasADi to a compiled step",
     "frameworks/flow.h": "interface of JAX and PyTorch to a compiled step",
     "frameworks/fmu.h": "interface of co-simulation",
+    "frameworks/fmu_unsupported.h": "interface of co-simulation",
     "frameworks/xla_flow.h": "interface of XLA to a compiled step",
 }
 """Headers that are not stepping algorithms, with the reason."""

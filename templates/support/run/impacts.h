@@ -1,0 +1,240 @@
+#include "events.h"
+
+/* Changes of the state by one event: impacts and maps.
+ *
+ * Frictionless impacts change p by lambda n, n = g_q; lambda = (1 + e)/2 lambda_1, where lambda_1 conserves energy:
+ * H(p + lambda_1 n) - H(p) = -lambda_1 g_t. With constraints (EVENT_CONSTRAINTS), of Jacobian G, n is g_q - G^T kappa,
+ * G H_pp n = 0: momenta are projected. Requires: events.h, changes_by, IS_IMPACT. */
+enum {
+  CHANGE_ITERATIONS = 50, /* of Newton's method for an impulse */
+  CHANGE_SAFETY = 64 /* roundings by which a state may be behind a wall */
+};
+
+/* Momenta that satisfy the constraints at a state, of which the impulses of an impact and of its constraint forces
+ * together are a multiple of the projected normal: P(p + lambda n). Positions are projected, too, if `moves`. */
+static int satisfy_constraints(const event_step *step, real t, real *q, real *p, int moves)
+{
+  int status = OK;
+#ifdef EVENT_CONSTRAINTS
+  real *const q1 = step->memory, *const p1 = q1 + M;
+  status = NAME(project)(t, q, p, step->parameters, q1, p1, step->workspace);
+  memcpy(p, p1, BYTES(M));
+  if (moves)
+    memcpy(q, q1, BYTES(M));
+#else
+  (void)step, (void)t, (void)q, (void)p, (void)moves;
+#endif
+  return status;
+}
+
+/* Momenta p + lambda n. */
+static void add_impulse(const event_entries *wall, real lambda, const real *p, real *moved)
+{
+  memcpy(moved, p, BYTES(M));
+  for (int i = 0; i < wall->count; i++)
+    moved[wall->place[i]] += lambda * wall->value[i];
+}
+
+/* Velocities at p + lambda n, and n.v + g_t; wall NULL: at p. */
+static int approach(const event_step *step, const event_sample *at, const event_entries *wall, real lambda, real *v,
+    real *rate)
+{
+  const event_entries none = {.count = 0};
+  real *const p = step->memory + 2 * M;
+  int status;
+  wall = wall ? wall : &none;
+  add_impulse(wall, lambda, at->p, p);
+  status = satisfy_constraints(step, at->t, at->q, p, 0);
+  if (status == OK)
+    status = NAME(velocity)(at->t, at->q, p, step->parameters, v, step->workspace);
+  *rate = wall->by_time;
+  for (int i = 0; i < wall->count; i++)
+    *rate += wall->value[i] * v[wall->place[i]];
+  return status;
+}
+
+/* Changes by function e; if it is a wall, with its rate at velocities v. */
+static int evaluate_changes(const event_step *step, int e, const event_sample *at, const real *v, event_entries *wall)
+{
+  const int status = changes_by(e, at->t, at->q, at->p, step->parameters, step->values + EVENT_VALUES * EVENTS, wall,
+      step->workspace);
+  if (status != OK || !IS_IMPACT[EVENT_OF(e)])
+    return status;
+  wall->rate = wall->by_time;
+  wall->size = fabs(wall->by_time);
+  wall->slack = fabs(wall->by_time * at->t);
+  for (int i = 0; i < wall->count; i++) {
+    const int k = wall->place[i];
+    wall->rate += wall->value[i] * v[k];
+    wall->size += fabs(wall->value[i] * v[k]);
+    wall->slack += fabs(wall->value[i]) * (fabs(at->q[k]) + fabs(v[k] * step->whole));
+  }
+  wall->slack *= CHANGE_SAFETY * DBL_EPSILON;
+  wall->rate *= step->h < 0.0 ? -1.0 : 1.0;
+  return status;
+}
+
+/* Changes by function e at the velocities of a state. */
+static int changes_at(const event_step *step, int e, const event_sample *at, event_entries *wall)
+{
+  real rate, *const v = step->memory + 3 * M;
+  const int status = IS_IMPACT[EVENT_OF(e)] ? approach(step, at, NULL, 0.0, v, &rate) : OK;
+  return status == OK ? evaluate_changes(step, e, at, v, wall) : status;
+}
+
+/* sum + low += a b with the rounding errors of product and sum (Dekker; Ogita, Rump & Oishi, SIAM J. Sci. Comput. 26
+ * (2005) 1955). */
+static void add_product(real a, real b, real *sum, real *low)
+{
+  const real product = a * b, total = *sum + product, moved = total - *sum;
+  *low += fma(a, b, -product) + ((*sum - (total - moved)) + (product - moved));
+  *sum = total;
+}
+
+/* Correction of lambda by Newton's method for the energy equation of a quadratic kinetic energy divided by lambda,
+ * n.v + g_t + (lambda / 2) n.(W n) = 0, evaluated in twice the precision: the rounding error of lambda has a mean
+ * that is not zero, from which energy would drift over many impacts. v, change: velocities before the impact, W n. */
+static real correct_impulse(const event_entries *wall, const real *v, const real *change, real lambda, real rate)
+{
+  real sum = wall->by_time, low = 0.0, bend = 0.0, bend_low = 0.0;
+  for (int i = 0; i < wall->count; i++) {
+    add_product(wall->value[i], v[wall->place[i]], &sum, &low);
+    add_product(wall->value[i], change[wall->place[i]], &bend, &bend_low);
+  }
+  add_product(0.5 * lambda, bend, &sum, &low);
+  return lambda * (sum + (low + 0.5 * lambda * bend_low)) / rate;
+}
+
+/* Mean of n.v + g_t on the way from p to p + lambda n by Gauss quadrature with three nodes: the energy equation divided
+ * by lambda, without the cancellation of H(p + lambda n) - H(p) of small impulses. */
+static int mean_rate(const event_step *step, const event_sample *at, const event_entries *wall, real lambda, real *v,
+    real *mean)
+{
+  static const real NODE[3] = {0.11270166537925831, 0.5, 0.88729833462074169};
+  static const real WEIGHT[3] = {5.0 / 18, 4.0 / 9, 5.0 / 18};
+  int status = OK;
+  *mean = 0.0;
+  for (int k = 0; status == OK && k < 3; k++) {
+    real rate = 0.0;
+    status = approach(step, at, wall, NODE[k] * lambda, v, &rate);
+    *mean += WEIGHT[k] * rate;
+  }
+  return status;
+}
+
+/* Impulse of an impact: p += (1 + e)/2 lambda_1 n. Where the kinetic energy is quadratic, i.e. W n, W = H_pp, is the
+ * same at p and at 0, lambda_1 = -2 rate / (n.W n) reverses the rate; else Newton's method solves the energy equation,
+ * whose derivative by lambda is the rate. A run backward in time undoes the impact. */
+static int impact(const event_step *step, event_sample *at, const event_entries *wall)
+{
+  const real restitution = step->h < 0.0 ? 1.0 / wall->restitution : wall->restitution;
+  const real rate = step->h < 0.0 ? -wall->rate : wall->rate;
+  event_sample moved = *at;
+  real *const v = step->memory + 3 * M, *const rest = v + 2 * M, *const change = rest + M;
+  real lambda, low = 0.0, at_rest = 0.0, after = 0.0, energy = 0.0, now = 0.0, mean = 0.0;
+  real correction, before = INFINITY;
+  real inverse_mass, there = 0.0, size = wall->size;
+  int status;
+  moved.p = step->memory + 4 * M;
+  memset(moved.p, 0, BYTES(M));
+  status = approach(step, &moved, wall, 0.0, rest, &at_rest);
+  if (status == OK)
+    status = approach(step, &moved, wall, 1.0, change, &after);
+  inverse_mass = after - at_rest;
+  if (status == OK)
+    status = approach(step, at, wall, 1.0, v, &there);
+  for (int i = 0; i < wall->count; i++)
+    size += fabs(wall->value[i] * v[wall->place[i]]) + fabs(wall->value[i] * change[wall->place[i]]);
+  lambda = -2.0 * rate / inverse_mass;
+  if (status == OK && !(fabs(there - rate - inverse_mass) <= CHANGE_SAFETY * DBL_EPSILON * size)) {
+    status = NAME(energy)(at->t, at->q, at->p, step->parameters, &energy, step->workspace);
+    if (status == OK)
+      status = approach(step, at, wall, lambda, v, &after);
+  } else {
+    before = 0.0; /* the kinetic energy is quadratic */
+    if (status == OK)
+      status = approach(step, at, wall, 0.0, v, &after);
+    for (int i = 0; i < M; i++)
+      change[i] -= rest[i];
+    low = correct_impulse(wall, v, change, lambda, rate);
+  }
+  for (int k = 0; before > 0.0 && status == OK && k < CHANGE_ITERATIONS && !(after * rate < 0.0); k++) {
+    lambda *= 2.0; /* beyond the minimum of the convex energy: Newton's method does not return to lambda = 0 */
+    status = approach(step, at, wall, lambda, v, &after);
+  }
+  for (int k = 0; status == OK && before > 0.0 && k < CHANGE_ITERATIONS; k++) {
+    add_impulse(wall, lambda, at->p, rest);
+    memcpy(moved.p, rest, BYTES(M));
+    status = satisfy_constraints(step, at->t, at->q, moved.p, 0);
+    if (status == OK)
+      status = NAME(energy)(at->t, at->q, moved.p, step->parameters, &now, step->workspace);
+    correction = now - energy + lambda * wall->by_time;
+    for (int i = 0; i < M; i++)
+      correction -= (moved.p[i] - rest[i]) * v[i]; /* work of the constraints, mu.c_t = -mu.(G v) */
+    if (status == OK)
+      status = mean_rate(step, at, wall, lambda, v, &mean);
+    if (fabs(correction - lambda * mean) <= 4.0 * DBL_EPSILON * (fabs(energy) + fabs(now) + fabs(lambda) * wall->size))
+      correction = lambda * mean; /* the difference is rounding of the energy */
+    correction /= after;
+    if (status != OK || !(fabs(correction) < before))
+      break; /* the correction is rounding */
+    before = fabs(correction);
+    lambda -= correction;
+    status = approach(step, at, wall, lambda, v, &after);
+  }
+  lambda *= 0.5 * (1.0 + restitution);
+  low *= 0.5 * (1.0 + restitution);
+  for (int i = 0; i < wall->count; i++) {
+    real *const p = at->p + wall->place[i], remainder = low * wall->value[i];
+    add_product(lambda, wall->value[i], p, &remainder);
+    *p += remainder;
+  }
+  return status == OK ? satisfy_constraints(step, at->t, at->q, at->p, 0) : status;
+}
+
+/* Sets the variables of a map to its values; velocities are set last, by their momenta. */
+static int apply_map(const event_step *step, event_sample *at, const event_entries *map)
+{
+  real *const v = step->memory + 3 * M;
+  int by_velocity = 0, status = OK;
+  for (int i = 0; i < map->count; i++)
+    by_velocity |= map->place[i] >= 2 * M;
+  if (by_velocity)
+    status = NAME(velocity)(at->t, at->q, at->p, step->parameters, v, step->workspace);
+  for (int i = 0; i < map->count; i++)
+    if (map->place[i] < M)
+      at->q[map->place[i]] = map->value[i];
+    else if (map->place[i] < 2 * M)
+      at->p[map->place[i] - M] = map->value[i];
+    else
+      v[map->place[i] - 2 * M] = map->value[i];
+  return by_velocity && status == OK
+      ? NAME(momentum)(at->t, at->q, v, step->parameters, at->p, step->workspace)
+      : status;
+}
+
+/* Changes the state by function e: by its map, or by an impact if the wall is approached. */
+static int change_state(const event_step *step, int e, event_sample *at)
+{
+  event_entries wall;
+  const int is_impact = IS_IMPACT[EVENT_OF(e)];
+  int status = changes_at(step, e, at, &wall);
+  if (status == OK && is_impact && wall.rate < 0.0) {
+    step->watch->history[e].slack = wall.slack;
+    step->watch->history[e].rounding = wall.slack / -wall.rate;
+    status = impact(step, at, &wall);
+    if (status == NOT_CONVERGED)
+      step->watch->jammed = EVENT_OF(e) + 1; /* such as of prescribed motion, whose momenta no impulse changes */
+  } else if (status == OK && !is_impact) {
+    if (evaluate_function(step, e, at) == OK)
+      step->watch->history[e].slack = fabs(at->g);
+    status = apply_map(step, at, &wall);
+    if (status == OK)
+      status = satisfy_constraints(step, at->t, at->q, at->p, 1);
+  }
+  if (status == OK && !(all_finite(at->q, M) && all_finite(at->p, M))) {
+    step->watch->undefined = -(EVENT_OF(e) + 1);
+    status = NOT_FINITE;
+  }
+  return status;
+}
