@@ -226,6 +226,8 @@ def test_wrong_shapes_and_axes_are_refused():
         mesh.derivative(np.zeros(8), "y")
     with pytest.raises(sc.StateError, match="no parameter 'c'"):
         mesh.highest_frequency(c=1)
+    with pytest.raises(sc.StateError, match=r"the field 'u' has the shape \(7,\): the mesh has 8 points"):
+        sc.compile_stepper(mesh.system, "stoermer-verlet").integrate({"u": np.zeros(7)}, h=0.1, steps=1)
 
 
 def test_model_file_contains_the_arrays_of_the_mesh(tmp_path):

@@ -819,6 +819,7 @@ def test_grazing_impacts_are_found(point, depth):
         (lambda: sc.Event("y", then={"g": "2*g"}), "'g' is not a coordinate"),
         (lambda: sc.Event("y", then={"p_y": "1", "y_dot": "1"}), "sets momenta and velocities"),
         (lambda: sc.Event("y", then={}), "must be new values by name"),
+        (lambda: sc.Event("y", then={"n": ["0", "1"]}), "one formula or number for each component"),
         (lambda: sc.Event("y", then={"p_y": sympy.Symbol("z")}), "'z' in the value 'z' of 'p_y'"),
         (lambda: sc.impact("y - p_y"), "contains 'p_y'"),
         (lambda: sc.impact("y", 1.2), "restitution of the wall 'y' is 1.2"),

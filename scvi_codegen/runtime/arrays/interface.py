@@ -53,6 +53,13 @@ def read_arrays(
     """
     index_tables, state = read_tables(interface, tables), read_state(interface, q, "positions")
     shapes = [(array, state[array.name].shape) for array in interface.layout.coordinates]
+    if (mesh := interface.layout.mesh) is not None:
+        for array, shape in shapes:
+            if len(shape) == mesh.weights.ndim != 0 and shape != mesh.weights.shape:
+                points = " x ".join(map(str, mesh.weights.shape))
+                raise StateError(
+                    f"positions: the field '{array.name}' has the shape {shape}: the mesh has {points} points"
+                )
     shapes += [(table, index_tables[table.name].shape) for table in interface.layout.tables]
     known = {field.name for field in interface.layout.fields}
     argument = {name: value for name, value in interface.layout.data.items() if name in known} | dict(parameters or {})

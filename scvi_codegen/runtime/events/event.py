@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
@@ -103,6 +104,12 @@ class Event:
             raise EventError(
                 f"then= of the event '{self.function}' must be new values by name, {{'p_y': '-p_y'}}, not {self.then!r}"
             )
+        for name, value in self.changes:
+            if not isinstance(value, str | Real) and not hasattr(value, "free_symbols"):
+                raise EventError(
+                    f"then= of the event '{self.function}' sets '{name}' to {value!r}: give one formula or number for "
+                    "each component, by its name"
+                )
         if isinstance(self.where, list):
             object.__setattr__(self, "where", tuple(self.where))
         _ = self.conditions
