@@ -70,6 +70,7 @@ def sources() -> tuple[Source, ...]:
     body = LagrangianSystem.from_text("body", rotations={"R": "w"}, lagrangian="w_1**2 + w_2**2 + 2*w_3**2")
     pair = "sum(i in N, q_dot[i]**2/2) - sum(i < j in near, (q[i] - q[j])**2)"
     ring = "sum(i in N, q_dot[i]**2/2) - sum(i < j in N, c[j-i]*(q[i] - q[j])**2)"
+    sums = "sum(i in N, q_dot[i]**2/2) - sum(i in N, sum(j in N, c[j-i]*q[j])**2)"
     near = {"near": {"of": "q", "cutoff": 1.0}}
     robot = Path(__file__).parents[1] / "mechanics" / "robots" / "figure.xml"
     pairs = [
@@ -77,6 +78,7 @@ def sources() -> tuple[Source, ...]:
         (body, SVI(3)),
         (body, StoermerVerlet()),
         (LagrangianSystem.from_text("ring", ["q[N]"], ring, parameters={"c[N]": 1.0}), SVI(1)),
+        (LagrangianSystem.from_text("sums", ["q[N]"], sums, parameters={"c[N]": 1.0}), SVI(1)),
         (LagrangianSystem.from_text("pair", ["q[N]"], pair, neighbours=near), SVI(1)),
         (LagrangianSystem.from_mjcf(robot), SVI(2)),
     ]

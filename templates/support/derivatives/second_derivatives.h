@@ -139,7 +139,8 @@ static void add_end_hessian(const second_order_memory *to)
     }
 }
 
-/* Replaces input_adjoints and adjoint_tangents, of (q1, p1, parameters, t + h, h), by those of (q0, p0, parameters, t, h). */
+/* Replaces input_adjoints and adjoint_tangents, of (q1, p1, parameters, t + h, h), by those of (q0, p0, parameters, t,
+ * h). */
 static void hessian_of_step(const linearised_step *at, const second_order_memory *to)
 {
   const real *partials = at->partials;
