@@ -279,8 +279,10 @@ static int rounding_of(const event_step *step, const event_sample *at)
   next.q = step->memory + 2 * M;
   memset(noise, 0, BYTES(EVENTS));
   for (int k = 0; status == OK && k < (each ? M : 3); k++) {
-    for (int i = 0; i < M; i++)
-      next.q[i] = at->q[i] * (1.0 + (each ? (i == k) : (i * k / 2) % 2 ? -1 : 1) * DBL_EPSILON);
+    for (int i = 0; i < M; i++) {
+      const int sign = (i * k / 2) % 2 ? -1 : 1, ulps = each ? i == k : sign;
+      next.q[i] = at->q[i] * (1.0 + ulps * DBL_EPSILON);
+    }
     status = evaluate_functions(step, &next, now);
     for (int e = 0; status == OK && e < EVENTS; e++)
       noise[e] = each ? noise[e] + fabs(now[e] - before[e]) : fmax(noise[e], fabs(now[e] - before[e]));
