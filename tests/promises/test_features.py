@@ -180,14 +180,16 @@ def test_refusals_of_the_table_are_those_of_the_operations(situation, situations
         assert remedy in str(error.value), (operation, situation)
 
 
+@pytest.mark.parametrize("half", [0, pytest.param(1, marks=pytest.mark.full)])
 @pytest.mark.parametrize("situation", [name for name in SITUATIONS if name != "without derivatives"])
-def test_operations_that_a_stepper_supports_work(situation, situations):
+def test_operations_that_a_stepper_supports_work(situation, half, situations):
+    """In the default tier half of the operations in each situation, each operation in half of the situations."""
     stepper, left_out = situations(situation), {"fit", "flow", "periodic_orbit", "energy"}
     of_sizes = {"work", "discrete_lagrangian", "chaos"} if stepper.run_time_sizes else set()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for operation, call in OPERATIONS.items():
-            if operation not in left_out | of_sizes and stepper.supports(operation):
+        for number, (operation, call) in enumerate(OPERATIONS.items(), [*SITUATIONS].index(situation)):
+            if number % 2 == half and operation not in left_out | of_sizes and stepper.supports(operation):
                 call(stepper)
 
 

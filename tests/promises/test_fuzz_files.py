@@ -306,7 +306,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_damaged_files_are_read_or_rejected(root: Path) -> None:
-    assert sum(try_file(number, root) for number in range(400)) > 20
+    assert sum(try_file(number, root) for number in range(240)) > 12
 
 
 @pytest.mark.full
@@ -340,8 +340,9 @@ def test_paths_with_null_characters_are_rejected(load: Callable[[str], Any]) -> 
         load("a\0b")
 
 
-def test_elements_of_high_degree_are_assembled_in_bounded_work(tmp_path: Path) -> None:
-    (tmp_path / "model.toml").write_text(FIELD.replace("degree = 4", "degree = 63"))
+@pytest.mark.parametrize("degree", [31, pytest.param(63, marks=pytest.mark.full)])
+def test_elements_of_high_degree_are_assembled_in_bounded_work(degree: int, tmp_path: Path) -> None:
+    (tmp_path / "model.toml").write_text(FIELD.replace("degree = 4", f"degree = {degree}"))
     with guarded(may_compile=True):
         load_model(tmp_path / "model.toml")
 

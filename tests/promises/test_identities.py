@@ -136,10 +136,23 @@ CASES = [(name, system, ways, None) for name, systems, ways in same_maps() for s
 CASES += [(name, system, ways, least) for name, systems, least, ways in different_maps() for system in systems]
 
 
+BETWEEN = (
+    "svi:2 is gauss:2",
+    "svi:3 with 3 lobatto points",
+    "scvi:3 on gauss points",
+    "svi:2 with 3 lobatto points",
+    "sc:2 by positions",
+    "sc:2 in phase space",
+)
+"""Degrees whose neighbours are in the default tier."""
+
+
 @pytest.mark.parametrize(
     ("name", "system", "ways", "least"),
     [
-        pytest.param(*case, id=f"{case[0]}-{case[1]}", marks=[] if case[0] != before else pytest.mark.full)
+        pytest.param(
+            *case, id=f"{case[0]}-{case[1]}", marks=pytest.mark.full if case[0] == before or case[0] in BETWEEN else []
+        )
         for case, (before, *_) in zip(CASES, [("",), *CASES], strict=False)
     ],
 )

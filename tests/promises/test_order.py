@@ -110,7 +110,7 @@ METHODS = (
 LOW = tuple(method for method in METHODS if method.order <= 6 and method not in SPECIAL)
 
 
-@pytest.mark.sampled(20)
+@pytest.mark.sampled(10)
 @pytest.mark.parametrize("method", first_of_each(METHODS, family), ids=lambda method: method.name)
 def test_global_error_on_kepler_has_the_claimed_order(compiled, sample, method):
     assert measured_order(compiled, sample, "kepler", method) == pytest.approx(method.order, abs=0.15)
@@ -134,7 +134,7 @@ def test_certificate_measures_the_order_below_rounding(compiled, sample, method)
     assert method.order - 0.25 < order.measured < method.order + 0.3
 
 
-@pytest.mark.sampled(6)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("method", LOW[::5], ids=lambda method: method.name)
 def test_global_error_on_a_coupled_time_dependent_system_has_the_claimed_order(compiled, sample, method):
     assert measured_order(compiled, sample, "pumped-cart-pole", method) == pytest.approx(method.order, abs=0.15)

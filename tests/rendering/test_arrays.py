@@ -14,7 +14,7 @@ from scvi_codegen.native.compilers import find_compiler
 from scvi_codegen.rendering.program_source import render
 from scvi_codegen.rendering.source import Source
 
-STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Wno-psabi", "-Werror"]
+STRICT = ["-std=c99", "-O0", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Wno-psabi", "-Werror"]
 
 FORMULAS = {
     "bodies": (

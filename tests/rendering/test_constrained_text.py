@@ -21,7 +21,7 @@ from scvi_codegen import (
 from scvi_codegen.exact.step import compiled_equations, derived_step
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 
-STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
+STRICT = ["-std=c99", "-O0", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
 LINKAGE = linkage()
 PENDULUM = LagrangianSystem.from_text(
     name="double pendulum",

@@ -13,7 +13,7 @@ from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.pipeline import program_of
 from scvi_codegen.rendering.program_source import render_derivatives
 
-STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
+STRICT = ["-std=c99", "-O0", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
 CASES = {
     "linkage": (linkage(), SVI(2, "gauss-lobatto:3")),
     "cart": (pumped_cart_pole(), SVI(1)),

@@ -93,6 +93,7 @@ CHAOTIC = {
 }
 
 
+@pytest.mark.covering(2)
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 @pytest.mark.parametrize("name", [*REGULAR, *CHAOTIC])
 def test_chaotic_motions_are_reported_and_regular_ones_are_not(name, tolerance):
