@@ -223,6 +223,10 @@ class TestPage:
         page = kepler_page(sc.SCVI(2))
         numbers = set(re.findall(r'<span class="number">\(([^)]*)\)', page))
         assert {"2", "33", "34a, i = 1, 2", "34c", "34d", "34e", "dG/dQ", "dG/dv0"} <= numbers
+        numbers = set(re.findall(r'<span class="number">\(([^)]*)\)', kepler_page(sc.SVI(2))))
+        assert {"2", "25"} <= numbers
+        assert "26" not in numbers
+        assert "of order 4" in kepler_page(sc.Gauss(2))
 
     def test_composition_is_shown_as_its_leapfrog_steps(self):
         method = sc.Composition(8)

@@ -1,9 +1,13 @@
 """Sums over indices: what is read, and what is refused with a remedy."""
 
+from itertools import combinations
+
+import numpy as np
 import pytest
 
 from scvi_codegen.errors import ExpressionError, SystemDefinitionError
 from scvi_codegen.formulas.arrays import ArrayTerm, parse_array, parse_sums
+from scvi_codegen.formulas.numpy_values import Elements
 from scvi_codegen.formulas.symbols import symbol
 
 ARRAYS = [parse_array(text) for text in ("q[N]", "r[N, 3]", "u[NX, NY]", "k[B]")]
@@ -92,3 +96,11 @@ def test_invalid_declarations_are_rejected(text: str) -> None:
     """An array has a name and axes."""
     with pytest.raises(SystemDefinitionError):
         parse_array(text)
+
+
+def test_values_of_pairs_are_those_of_each_pair_once():
+    """Also where the term of an index with itself does not vanish."""
+    (term,) = parse_sums("sum(i < j in N, q[i] + 10*q[j])", [parse_array("q[N]")], {})
+    q = np.array([1.0, 2.0, 4.0, 8.0])
+    found = Elements(term.loops, {"N": 4}, {}).values(term.formula, term.slots, {"q": q}, {})
+    assert found.tolist() == [a + 10 * b for a, b in combinations(q.tolist(), 2)]

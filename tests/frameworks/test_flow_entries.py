@@ -128,6 +128,34 @@ def test_external_functions_of_casadi_are_exported():
         assert_allclose(pulled, np.tensordot(weights(), partials(row), 2), rtol=1e-11, atol=1e-11)
 
 
+def test_second_derivatives_and_absent_adjoint_variables_of_casadi():
+    """CasADi passes NULL for adjoint variables that are zero and for results that it does not need."""
+    source, name = (
+        with_casadi_flow(flow().second_derivatives, STEPS, EVERY, second=True),
+        flow().second_derivatives.prefix,
+    )
+    functions = [f"{prefix}{casadi_name(name)}" for prefix in ("adj1_", "jac_adj1_")]
+    arguments = "(const double **arg, double **res, long long *iw, double *w, int mem);\n"
+    source = replace(source, declarations=source.declarations + "".join(f"int {each}{arguments}" for each in functions))
+    lib, ffi, _ = building.load(source, flags=compiled().flags)
+    adjoint, second = (getattr(lib, each) for each in functions)
+
+    def pointers(kind, *arrays):
+        return ffi.new(
+            f"{kind} *[]", [ffi.NULL if each is None else ffi.from_buffer("double *", each) for each in arrays]
+        )
+
+    row, along = np.array(ROWS[0], dtype=float), np.ascontiguousarray(weights())
+    gradient, matrix, transposed = np.ones(SIZE), np.ones((SIZE, SIZE)), np.ones((SAVED, 4, SIZE))
+    assert adjoint(pointers("const double", row, None, None), pointers("double", gradient), ffi.NULL, ffi.NULL, 0) == 0
+    for given, exact in ((None, np.zeros((SIZE, SIZE))), (along, hessian(ROWS[0]))):
+        results = pointers("double", matrix, None, transposed)
+        assert second(pointers("const double", row, None, given, None), results, ffi.NULL, ffi.NULL, 0) == 0
+        assert_allclose(matrix, exact, rtol=0, atol=1e-7 * abs(hessian(ROWS[0])).max())
+    assert not gradient.any()
+    assert_allclose(transposed, partials(ROWS[0]), rtol=1e-11, atol=1e-11)
+
+
 XLA = """
 #include <stddef.h>
 #include <stdint.h>

@@ -508,6 +508,7 @@ class TestPlatforms:
         found = {name for name in archive.namelist() if name.startswith("binaries")}
         ends = {"windows": ".dll", "darwin": ".dylib", "linux": ".so"}
         assert found == {f"binaries/{name}/push{ends[name.partition('-')[2]]}" for name in {*TARGETS, here}}
+        assert {entry.external_attr >> 16 for entry in archive.infolist()} == {0o100644}
         assert archive.read("binaries/aarch64-windows/push.dll") == b"aarch64-windows ('-O1',)"
 
     def test_unknown_or_unbuildable_platforms_are_reported_without_files(self, tmp_path, monkeypatch):

@@ -284,8 +284,13 @@ def test_more_trajectories_than_one_batch_are_distinguished(galaxy):
     """A row of a map equals its single trajectories for any number of threads."""
     y = np.linspace(-0.2, 0.3, TRAJECTORIES_TOGETHER + 5)
     start = np.column_stack([0 * y, y]), np.column_stack([0.3 + 0 * y, 0 * y])
-    both = [galaxy.chaos_indicators_ensemble(*start, h=0.2, steps=40, count=1, threads=threads) for threads in (1, 3)]
+    done, common = [], {"h": 0.2, "steps": 40, "count": 1, "t": 3.0}
+    both = [
+        galaxy.chaos_indicators_ensemble(*start, **common, threads=threads, progress=done.append) for threads in (1, 3)
+    ]
     assert_array_equal(both[0].log_norms, both[1].log_norms)
+    assert both[0].t[0] == 3.0
+    assert max(done) == done[-1] == len(y)
     for j in (0, TRAJECTORIES_TOGETHER - 1, TRAJECTORIES_TOGETHER, TRAJECTORIES_TOGETHER + 4):
         alone = galaxy.integrate(start[0][j], start[1][j], h=0.2, steps=40).chaos_indicators(1)
         assert_allclose(both[0].log_norms[-1, j], alone.log_norms[-1], rtol=0, atol=1e-13)

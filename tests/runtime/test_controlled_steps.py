@@ -138,6 +138,15 @@ def test_dense_output_and_states_at_requested_times(kepler):
         assert np.abs(position - exact_position(q, p, t)).max() < 1e-12
 
 
+def test_states_at_requested_times_of_a_run_backward(kepler):
+    """In any order, several of them within a step."""
+    q, p = orbit(0.6)
+    times = np.array([-1.01, -0.2, -3.0, -1.02, 0.0, -1.0])
+    there, _ = kepler.integrate(q, p, t_end=-3.0, save_every=50).at(times)
+    for t, position in zip(times, there, strict=True):
+        assert np.abs(position - exact_position(q, p, t)).max() < 1e-12
+
+
 def test_restored_adaptive_run_continues_bitwise(kepler):
     q, p = orbit(0.8)
     whole = kepler.integrate(q, p, t_end=20.0)

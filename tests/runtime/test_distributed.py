@@ -91,9 +91,10 @@ class TestCluster:
     def test_failures_of_trajectories_are_returned(self, distributed: Any, cluster: Any, kepler: sc.Stepper):
         q, p = states()
         mu = np.where(np.arange(COUNT) == 5, 1e9, 1.0)  # the sixth falls into the centre
-        result = integrate_ensemble(
-            kepler, q, p, h=0.05, steps=50, parameters={"mu": mu}, address=cluster.scheduler_address, blocks=3
-        )
+        done: list[int] = []
+        way = {"address": cluster.scheduler_address, "blocks": 3, "progress": done.append}
+        result = integrate_ensemble(kepler, q, p, h=0.05, steps=50, parameters={"mu": mu}, **way)
+        assert done[-1] == COUNT
         assert np.flatnonzero(~result.ok).tolist() == [5]
         assert result.steps[5] < 50
 

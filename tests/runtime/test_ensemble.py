@@ -27,6 +27,8 @@ from benchmarks.cases.robots import chain
 from scvi_codegen.cli import main
 from scvi_codegen.methods import Method
 from scvi_codegen.models.model_files.ensemble_file import load_ensemble
+from scvi_codegen.native import building
+from scvi_codegen.native.binding import Binding
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.lanes import LaneBlock
 
@@ -388,6 +390,26 @@ class TestFailures:
             states = runs.q[:, 0].tobytes(), runs.p[:, 0].tobytes()
             ends.append((*states, block.memory.iterations, block.memory.guess))
         assert len(set(ends)) == 1
+
+
+@pytest.mark.parametrize("name", ["kepler", "double-pendulum"])
+def test_trajectories_do_not_depend_on_their_lanes(name: str) -> None:
+    """Trajectories that exchange their lanes have equal bits, with coordinates and momenta of both signs."""
+    stepper = stepper_for(name, sc.SVI(5))
+    binding = Binding(building.load(stepper.ensemble, flags=stepper.flags), stepper.ensemble.prefix)
+    q, p = states(name, len(binding.new("block *").active))
+    q, p = (x * np.where(np.arange(len(x)) % 3 == k, -1.0, 1.0)[:, np.newaxis] for k, x in enumerate((q, p)))
+    ends = []
+    for shift in range(len(q)):
+        runs = Ensemble(stepper, np.roll(q, shift, axis=0), np.roll(p, shift, axis=0), h=0.02, steps=9).common
+        assert runs is not None
+        block = runs.blocks()[0](0)
+        block.advance(9)
+        assert isinstance(block, LaneBlock)
+        assert not block.left
+        states_now = (np.roll(x, -shift, axis=1).tobytes() for x in (runs.q, runs.p))
+        ends.append((*states_now, block.memory.iterations, block.memory.guess))
+    assert len(set(ends)) == 1
 
 
 class TestThreadsAndInterruption:

@@ -264,6 +264,8 @@ def test_residuals_are_drawn():
     found = sc.fit(oscillator(), TIMES, recorded(6)[0], unknown=SOME, **GUESS)
     axes = found.plot()
     assert_allclose(axes.get_lines()[0].get_ydata(), found.residuals[:, 0])
+    band = axes.patches[0].get_extents().transformed(axes.transData.inverted())
+    assert_allclose((band.y0, band.y1), (-2 * found.deviations[0], 2 * found.deviations[0]))
     inside = np.abs(found.residuals) < 2 * found.deviations
     assert 0.9 < inside.mean() < 1.0
 

@@ -4,6 +4,7 @@ import json
 import math
 import re
 import warnings
+from types import SimpleNamespace
 
 import mpmath
 import numpy as np
@@ -14,6 +15,7 @@ from motions import MOTIONS, recorded
 
 import scvi_codegen as sc
 from scvi_codegen.cli import main
+from scvi_codegen.runtime.run.global_error import _alternative
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.trajectory import dense_output
 
@@ -192,6 +194,14 @@ class TestMotions:
         off = off[np.searchsorted(run.t, found.t)]
         assert found.differences == pytest.approx(off, rel=0.05, abs=1e-14)
         assert (off[found.t <= 3.0] > 0).any()
+
+    def test_a_short_last_step_is_no_close_encounter(self):
+        oscillator = made("o", ["x"], "x_dot**2/2 - x**2/2")
+        stepper, lost = sc.compile_stepper(oscillator, "svi:6"), SimpleNamespace(estimate=1e-9)
+        whole = stepper.integrate([1.0], [0.0], t_end=9.0)
+        run = stepper.integrate([1.0], [0.0], t_end=whole.t[-3] + 1e-3)
+        assert run.step_sizes[-2] < 0.01 * run.step_sizes[-3]
+        assert _alternative(run, lost) == ""
 
     def test_time_transformations_can_be_combined(self):
         """Kepler's problem with e = 0.99: one is recommended, and confirms a hundredth of the error without it."""

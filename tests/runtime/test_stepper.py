@@ -330,6 +330,9 @@ def test_looser_tolerance_needs_fewer_iterations_and_loses_digits(kepler):
     loose = kepler.integrate(*STATE, h=0.2, steps=50, options=sc.SolverOptions(tolerance=1e-4))
     assert loose.iterations.sum() < tight.iterations.sum()
     assert 1e-13 < np.abs(loose.q - tight.q).max() < 1e-2
+    q, _ = kepler.step(*STATE, 0.2, options=sc.SolverOptions(tolerance=1e-4))
+    assert np.array_equal(q, loose.q[1])
+    assert not np.array_equal(q, tight.q[1])
 
 
 def test_absolute_tolerance_bounds_the_update(kepler):
