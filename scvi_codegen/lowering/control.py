@@ -197,7 +197,7 @@ def _nodes(points: Vector) -> tuple[int, ...]:
 
 
 def _twice_integrated(points: Vector, ends: Vector) -> Matrix:
-    """Return the integrals of (c - u) l_j(u) from 0 to c for each c of ``at``."""
+    """Return the integrals of (c - u) l_j(u) from 0 to c for each c of ``ends``."""
     rule = gauss_legendre(len(points) // 2 + 1)
     rows = []
     for c in ends:
