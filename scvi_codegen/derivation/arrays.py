@@ -100,37 +100,39 @@ def _step(program: Program, method: Method) -> Iterator[str]:
         yield from (_separable if program.fixed_point.name == "separable" else _hamiltonian)(program.fixed_point)
 
 
-def _splitting(of: Splitting) -> Iterator[str]:
+def _splitting(splitting: Splitting) -> Iterator[str]:
     yield "(m its mass, F the force on it):"
-    for kick, drift, abscissa in zip(of.kicks, of.drifts, of.abscissae, strict=True):
+    for kick, drift, abscissa in zip(splitting.kicks, splitting.drifts, splitting.abscissae, strict=True):
         if kick != 0:
             yield f"  p += h*({_number(kick)})*F at t + h*({_number(abscissa)})"
         if drift != 0:
             yield f"  q += h*({_number(drift)})*p/m"
 
 
-def _separable(of: FixedPointIteration) -> Iterator[str]:
+def _separable(scheme: FixedPointIteration) -> Iterator[str]:
     yield "(m its mass, F_n the force on it at the points X_n of all):"
-    (drift,), (abscissae,), product = of.numbers("DRIFT"), of.numbers("ABSCISSA"), of.numbers("PRODUCT")
-    for n in range(of.points):
-        terms = _combination(product[n], "F", of.points)
+    (drift,), (abscissae,), product = map(scheme.numbers, ("DRIFT", "ABSCISSA", "PRODUCT"))
+    for n in range(scheme.points):
+        terms = _combination(product[n], "F", scheme.points)
         yield f"  X_{n} = q + h*({_number(drift[n])})*p/m + h**2/m*({terms}) at t + h*({_number(abscissae[n])})"
-    q1, p1 = (_combination(of.numbers(f"POINT_END_{name}")[0], "F", of.points) for name in ("POSITION", "MOMENTUM"))
+    q1, p1 = (
+        _combination(scheme.numbers(f"POINT_END_{name}")[0], "F", scheme.points) for name in ("POSITION", "MOMENTUM")
+    )
     yield f"  q' = q + h*p/m + h**2/m*({q1})"
     yield f"  p' = p + h*({p1})"
 
 
-def _hamiltonian(of: FixedPointIteration) -> Iterator[str]:
+def _hamiltonian(scheme: FixedPointIteration) -> Iterator[str]:
     yield "(V_n = H_p and F_n = -H_q at the points Q_n, P_n of all):"
     kinds = (("Q", "q", "POSITION", "V"), ("P", "p", "MOMENTUM", "F"))
-    weights = {name: of.numbers(f"{name}_WEIGHT")[0] for _, _, name, _ in kinds}
-    for n in range(of.points):
+    weights = {name: scheme.numbers(f"{name}_WEIGHT")[0] for _, _, name, _ in kinds}
+    for n in range(scheme.points):
         for letter, start, name, rate in kinds:
-            row = _weighted(of.numbers(name)[n], weights[name])
-            yield f"  {letter}_{n} = {start} + h*({_combination(row, rate, of.points)})"
+            row = _weighted(scheme.numbers(name)[n], weights[name])
+            yield f"  {letter}_{n} = {start} + h*({_combination(row, rate, scheme.points)})"
     for _, start, name, rate in kinds:
-        end = _weighted(of.numbers(f"POINT_END_{name}")[0], weights[name])
-        yield f"  {start}' = {start} + h*({_combination(end, rate, of.points)})"
+        end = _weighted(scheme.numbers(f"POINT_END_{name}")[0], weights[name])
+        yield f"  {start}' = {start} + h*({_combination(end, rate, scheme.points)})"
 
 
 def _weighted(row: Sequence[Number], weights: Sequence[Number]) -> list[Number]:

@@ -182,7 +182,7 @@ class Assembly:
     def at_places(self) -> Iterator[Summed]:
         """Yield the point Lagrangians."""
         for place, formula in self.system.point_lagrangians:
-            rows = [self.axes[axis].interpolation(at).items() for axis, at in place.items()]
+            rows = [self.axes[axis].interpolation(coordinate).items() for axis, coordinate in place.items()]
             points = [([k for k, _ in row], math.prod(x for _, x in row)) for row in itertools.product(*rows)]
             values: dict[Symbol, Expr] = {}
             for each in self.system.scalars:

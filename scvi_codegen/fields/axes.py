@@ -137,7 +137,7 @@ class Axis(ABC):
     stiffness: tuple[float, ...] = ()
 
     @abstractmethod
-    def between(self, at: float, distance: Array) -> dict[int, float]:
+    def between(self, place: float, distance: Array) -> dict[int, float]:
         """Return the coefficients of :meth:`interpolation` at a coordinate with these distances from all points."""
 
     def modes(self, values: Array) -> Array:
@@ -148,14 +148,14 @@ class Axis(ABC):
         """
         return np.asarray(np.abs(np.fft.rfft(values)[..., None, 1:]) ** 2)
 
-    def interpolation(self, at: float) -> dict[int, float]:
+    def interpolation(self, place: float) -> dict[int, float]:
         """Return the coefficients of the values at points in the value at a coordinate, by the index of the point."""
-        distance = self.points - at
+        distance = self.points - place
         if self.periodic:
             distance -= self.length * np.round(distance / self.length)
         if np.abs(distance).min() <= 1e-12 * self.length:
             return {int(np.abs(distance).argmin()): 1.0}
-        return self.between(at, distance)
+        return self.between(place, distance)
 
     def differentiated(self, values: Array, along: int) -> Array:
         """Return the derivative at the points of values along one of their axes; see :meth:`MeshSystem.derivative`."""

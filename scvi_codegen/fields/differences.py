@@ -69,7 +69,7 @@ class FiniteDifferences(Axis):
         count, index = point_count_of(name, points, least=(2 if fixed is None else 3) * order), f"e{name}"
         cell_count = count - (fixed is not None)
         m, h = order // 2 + second, (bounds[1] - bounds[0]) / cell_count
-        at: Array = bounds[0] + h * np.arange(count, dtype=np.float64)
+        nodes: Array = bounds[0] + h * np.arange(count, dtype=np.float64)
         rows = _coefficients([mp.mpf(2 * k + 1) / 2 for k in range(-m, m)], 2 + second)
         stiffness = [float(sum(map(abs, row))) ** 2 / h ** (2 * k) for k, row in enumerate(rows)]
         places = tuple(Place(index=index, base=Size("", k)) for k in range(1 - m, m + 1))
@@ -83,11 +83,11 @@ class FiniteDifferences(Axis):
             inner_cells = Cells(within, Place(index=index, base=Size("", left)), places)
             cells = [inner_cells, *_end_cells(name, end_rows, midpoints, fixed)]
             inner = slice(left, count - right)
-            closed = _closed(at, masses, order, inner)
+            closed = _closed(nodes, masses, order, inner)
             stiffness[1] = max(stiffness[1], largest / h**2)
         return cls(
             name=name,
-            points=at[inner],
+            points=nodes[inner],
             weights=masses[inner],
             length=bounds[1] - bounds[0],
             stencil=order,
@@ -96,12 +96,12 @@ class FiniteDifferences(Axis):
             operators=tuple((row,) for row in rows),
             cells=tuple(cells),
             jacobians=np.full(cell_count, h),
-            cell_points=(at[:cell_count] + h / 2)[:, None],
+            cell_points=(nodes[:cell_count] + h / 2)[:, None],
             closed=closed,
             stiffness=tuple(stiffness[1:]),
         )
 
-    def between(self, at: float, distance: Array) -> dict[int, float]:
+    def between(self, place: float, distance: Array) -> dict[int, float]:
         """See :meth:`Axis.between`: the polynomial through the nearest points."""
         near = np.sort(np.abs(distance).argsort(kind="stable")[: self.stencil]).tolist()
         return dict(zip(near, lagrange(distance[near]).tolist(), strict=True))
@@ -176,8 +176,8 @@ def _closed(points: Array, masses: Array, order: int, inner: slice) -> ClosedPoi
     first = np.clip(np.arange(count) - order // 2, 0, count - order - 1)
     neighbours: NDArray[np.int64] = first[:, None] + np.arange(order + 1)
     rates = [
-        np.array(_coefficients([mp.mpf(k - at) for k in range(order + 1)], 2)[1], float) / (points[1] - points[0])
-        for at in range(order + 1)
+        np.array(_coefficients([mp.mpf(k - place) for k in range(order + 1)], 2)[1], float) / (points[1] - points[0])
+        for place in range(order + 1)
     ]
     return ClosedPoints(
         points=points,

@@ -67,12 +67,12 @@ class SpectralElements(Axis):
         half = np.diff(breaks) / 2
         elements = len(half)
         offsets = np.array([float(1 + each) for each in rule.points])
-        at = breaks[:-1, None] + half[:, None] * offsets
+        local = breaks[:-1, None] + half[:, None] * offsets
         places = np.arange(elements)[:, None] * p + np.arange(p + 1)
         count = elements * p + (fixed is not None)
         places %= count
         points, masses = np.zeros(count), np.zeros(count)
-        points[places[:, ::-1]] = at[:, ::-1]
+        points[places[:, ::-1]] = local[:, ::-1]
         points[places[0, 0]] = breaks[0]  # not the end of a periodic axis
         np.add.at(masses, places.ravel(), np.outer(half, np.array([float(each) for each in rule.weights])).ravel())
         left, right = fixed or (False, False)
@@ -105,13 +105,13 @@ class SpectralElements(Axis):
             quadrature=rule.weights,
             operators=(identity_matrix(p + 1), derivative, matrix_product(derivative, derivative)),
             stiffness=(largest, largest**2),
-            edges=_edges(name, places, at, (rule.weights, derivative), fixed, clamped),
+            edges=_edges(name, places, local, (rule.weights, derivative), fixed, clamped),
             cells=tuple(kinds),
             jacobians=half,
-            cell_points=at,
+            cell_points=local,
             table=table,
             closed=ClosedPoints(
-                points=at.ravel(),
+                points=local.ravel(),
                 weights=np.outer(half, [float(each) for each in rule.weights]).ravel(),
                 positions=table.ravel(),
                 inside=((places >= int(left)) & (places < count - int(right))).ravel(),
@@ -121,10 +121,10 @@ class SpectralElements(Axis):
             reference=rule.points,
         )
 
-    def between(self, at: float, distance: Array) -> dict[int, float]:
+    def between(self, place: float, distance: Array) -> dict[int, float]:
         """See :meth:`Axis.between`: none within elements, which end at the places of point Lagrangians."""
         raise SystemDefinitionError(
-            f"the point Lagrangian at {self.name} = {at:g} is not at an unknown value of the mesh, but inside of "
+            f"the point Lagrangian at {self.name} = {place:g} is not at an unknown value of the mesh, but inside of "
             'an element or at an end with a prescribed value: use "spectral-elements", and a place off that end'
         )
 
@@ -141,8 +141,8 @@ class SpectralElements(Axis):
 def _breaks(axis: str, start: float, end: float, elements: Any, places: Sequence[float]) -> Any:
     """Return the ends of the elements, including the places, at which equal elements are divided."""
     if np.ndim(elements) == 0:
-        what = f"elements= of '{axis}' (a number of elements or their ends)"
-        count = checked_count(elements, what, least=1, error=SystemDefinitionError)
+        argument = f"elements= of '{axis}' (a number of elements or their ends)"
+        count = checked_count(elements, argument, least=1, error=SystemDefinitionError)
         ends = np.unique([start, *places, end])
         numbers = np.ceil(np.diff(ends) / (end - start) * count - 1e-9).astype(int)
         parts = [np.linspace(a, b, n + 1) for a, b, n in zip(ends[:-1], ends[1:], numbers, strict=True)]
@@ -162,15 +162,15 @@ def _breaks(axis: str, start: float, end: float, elements: Any, places: Sequence
 def _edges(
     name: str,
     places: NDArray[np.int64],
-    at: Array,
+    local: Array,
     rule: tuple[Vector, Matrix],
     fixed: tuple[bool, bool] | None,
     clamped: tuple[bool, bool],
 ) -> Edges:
-    """Return the ends of elements whose points have the positions ``places`` and the coordinates ``at``, (E, p + 1)."""
+    """Return the ends of elements whose points have the positions ``places`` and the coordinates ``local``, (E, p + 1)."""
     weights = np.array([float(each) for each in rule[0]])
     derivative = np.array([[float(x) for x in row] for row in rule[1]])
-    elements, size, half = len(places), places.shape[1], np.ptp(at, axis=1) / 2
+    elements, size, half = len(places), places.shape[1], np.ptp(local, axis=1) / 2
     last, (left, right) = int(places.max()), fixed or (False, False)
     ends = np.arange(1 - clamped[0], elements + (fixed is None or clamped[1]))
     sides = np.stack([ends - 1, ends], axis=1)
@@ -196,7 +196,7 @@ def _edges(
         cells=tuple(kinds),
         table=np.clip(table - left, 0, last - left - right),
         weights=whole[:, 0],
-        points=np.where(present[:, 1], at[sides[:, 1], 0], at[sides[:, 0], -1]),
+        points=np.where(present[:, 1], local[sides[:, 1], 0], local[sides[:, 0], -1]),
         rows={order: matrix[[-1, 0]] for order, matrix in ((1, derivative), (2, stiffness))},
         scales={1: shares / half[sides] / whole, 2: np.where(present, -1, 0) / half[sides] / whole},
     )

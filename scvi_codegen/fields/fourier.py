@@ -61,7 +61,7 @@ class Fourier(Axis):
             stiffness=tuple(float(np.abs(k).max()) ** (2 * power) for power in (1, 2)),
         )
 
-    def between(self, at: float, distance: Array) -> dict[int, float]:
+    def between(self, place: float, distance: Array) -> dict[int, float]:
         """See :meth:`Axis.between`: trigonometric interpolation."""
         angle, n = np.pi * distance / self.length, len(self.points)
         values = np.sin(n * angle) / (n * (np.sin(angle) if n % 2 else np.tan(angle)))

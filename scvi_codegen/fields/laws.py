@@ -94,8 +94,8 @@ class Variations:
         system, forces = self.system, {}
         for each in system.variables:
             terms = [self.partial(each)]
-            for name, (of, orders) in self.used.items():
-                if of == each and TIME not in orders:
+            for name, (field, orders) in self.used.items():
+                if field == each and TIME not in orders:
                     sign = (-1) ** sum(orders.values())
                     terms.append(sign * derivative(self.partial(name), orders))
             forces[each] = Add(*terms).doit()
@@ -108,11 +108,11 @@ class Variations:
 
     def laws(self) -> tuple[ConservationLaw, ...]:
         """Return the conservation laws of the candidates that are symmetries."""
-        found = {}
+        laws = {}
         for name, symmetry, variation, divergence in self._candidates():
-            if name not in found and self._is_symmetry(variation, divergence):
-                found[name] = self._law(name, symmetry, variation, divergence)
-        return tuple(found.values())
+            if name not in laws and self._is_symmetry(variation, divergence):
+                laws[name] = self._law(name, symmetry, variation, divergence)
+        return tuple(laws.values())
 
     def _is_symmetry(self, variation: Variation, divergence: Mapping[str, Expr]) -> bool:
         terms = [self.partial(each) * change for each, change in variation.items()]
@@ -217,16 +217,16 @@ def vanishes(formula: Expr) -> bool:
 
 def names_of(formula: Expr) -> dict[Expr, Symbol]:
     """Return the symbols ``u``, ``u_x``, ``u_tx`` of the functions and derivatives in a formula."""
-    found: dict[Expr, Symbol] = {}
+    symbols: dict[Expr, Symbol] = {}
     for each in formula.atoms(Derivative, AppliedUndef):
         if isinstance(each, Derivative):
             orders = "".join(
                 str(axis) * order for axis, order in sorted(each.variable_count, key=lambda v: str(v[0]) != TIME)
             )
-            found[each] = symbol(f"{each.expr.func}_{orders}")
+            symbols[each] = symbol(f"{each.expr.func}_{orders}")
         else:
-            found[each] = symbol(str(each.func))
-    return found
+            symbols[each] = symbol(str(each.func))
+    return symbols
 
 
 Array = NDArray[np.float64]
@@ -304,12 +304,12 @@ def time_derivative(t: Array, values: Array, most: int = WINDOW) -> Array:
     width = min(most, count)
     firsts = [min(max(k - width // 2, 0), count - width) for k in range(count)]
     windows = [slice(first, first + width) for first in firsts]
-    return np.array([_derivative(t[each], values[each], at) for each, at in zip(windows, t, strict=True)])
+    return np.array([_derivative(t[each], values[each], time) for each, time in zip(windows, t, strict=True)])
 
 
-def _derivative(t: Array, values: Array, at: float) -> Array:
+def _derivative(t: Array, values: Array, time: float) -> Array:
     """Return the derivative at a time of the polynomial through values (k, ..) at times (k,)."""
-    distance = t - at
+    distance = t - time
     scaled = distance / np.abs(distance).max()
     moments = np.zeros(len(t))
     moments[1] = 1 / np.abs(distance).max()
@@ -433,8 +433,8 @@ class FieldDerivation:
             yield f"\n{name}"
             yield from (f"  {line}" for line in text.split("\n"))
         divergence = " + ".join(f"d/d{axis} J{axis}" for axis in self.field_system.space)
-        found = f", d/d{TIME} J{TIME} + {divergence} = 0" if self.laws else ": none found"
-        yield f"\nconservation laws{found}{', the density is damped' * (self.field_system.dissipation != 0)}"
+        heading = f", d/d{TIME} J{TIME} + {divergence} = 0" if self.laws else ": none found"
+        yield f"\nconservation laws{heading}{', the density is damped' * (self.field_system.dissipation != 0)}"
         for law in self.laws:
             yield f"  {law.name}: {law.symmetry}"
             yield f"    J{TIME} = {_written(law.density)}"

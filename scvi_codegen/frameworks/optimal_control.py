@@ -300,19 +300,21 @@ def interval(name: str, value: Any) -> tuple[float, float]:
     return least, largest
 
 
-def check_known(values: Mapping[str, Any], known: Sequence[str], what: str) -> None:
+def check_known(values: Mapping[str, Any], known: Sequence[str], kind: str) -> None:
     """Raise :class:`StateError` for a name that is not known."""
     for name in values:
         if name not in known:
-            raise StateError(f"there is no {what} '{name}'{closest(name, known)} There are: {', '.join(known)}")
+            raise StateError(f"there is no {kind} '{name}'{closest(name, known)} There are: {', '.join(known)}")
 
 
-def _resampled(name: str, values: Any, at: Array) -> Array:
-    """Return values at equidistant points of [0, 1], or one number, interpolated linearly at ``at``."""
+def _resampled(name: str, values: Any, times: Array) -> Array:
+    """Return values at equidistant points of [0, 1], or one number, interpolated linearly at ``times``."""
     array = np.atleast_1d(real_array(values, f"the guess of {name}"))
     if array.ndim != 1 or not np.isfinite(array).all():
         raise StateError(f"the guess of {name} must be a finite number, or a list of them from start to end")
-    return np.interp(at, np.linspace(0.0, 1.0, len(array)), array) if len(array) > 1 else np.full(len(at), array[0])
+    return (
+        np.interp(times, np.linspace(0.0, 1.0, len(array)), array) if len(array) > 1 else np.full(len(times), array[0])
+    )
 
 
 @checks_arguments(StateError, system=SYSTEM, start=MAPPING, end=MAPPING, bounds=MAPPING)

@@ -273,12 +273,13 @@ def _multiplier_group(system: MechanicalSystem, tableau: Tableau, *, rounded: bo
 
 def _curve(tableau: Tableau, rule: Quadrature) -> tuple[Matrix, tuple[Matrix, ...], Vector]:
     """Return rows of q/h, of v and h^k d^k v/dt^k of the rule, and of q1/h, for V_i = v0 + sum a_ij z_j."""
-    curves, at = Polynomials(), rule.abscissae
+    curves, abscissae = Polynomials(), rule.abscissae
     moved = tuple((mp.one, *line) for line in tableau.A)
     velocities = tuple(
-        matrix_product(curves.velocities(tableau.c, at, k), moved) for k in range(len(rule.derivative_weights) + 1)
+        matrix_product(curves.velocities(tableau.c, abscissae, k), moved)
+        for k in range(len(rule.derivative_weights) + 1)
     )
-    position = matrix_product(curves.positions(tableau.c, at), moved)
+    position = matrix_product(curves.positions(tableau.c, abscissae), moved)
     return position, velocities, matrix_product((tableau.b,), moved)[0]
 
 

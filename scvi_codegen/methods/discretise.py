@@ -141,16 +141,16 @@ def _framed(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn]
     q, u, (group,) = system.coordinates, _symbols("turn", system), stages.stage_groups
     W = potential.xreplace(_into_frame(turns, q, u))
     velocity, push = (tuple(-x for x in gradient_tuple(W, variables)) for variables in (u, q))
-    *others, at, (force, momentum, rate) = *group.gathers, group.scatters
+    *others, momenta, (force, momentum, rate) = *group.gathers, group.scatters
     tau = [c - mp.mpf(1) / 2 for c in group.abscissae]
     timed, back = (
         Table.named("tau", [[t * x for x in line] for t, line in zip(tau, each.table.entries, strict=True)])
-        for each in (at, rate)
+        for each in (momenta, rate)
     )
     rates = replace(rate, results=system.velocities), Scatter(results=velocity, table=back, power=1)
     framed = replace(
         group,
-        gathers=(*others, at, Gather(arguments=u, table=timed, power=at.power + 1)),
+        gathers=(*others, momenta, Gather(arguments=u, table=timed, power=momenta.power + 1)),
         scatters=(replace(force, results=push), momentum, *rates),
         scalar=None,
         in_action=False,

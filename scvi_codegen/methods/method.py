@@ -189,11 +189,11 @@ class NodalMethod(Method):
         return self.nodes
 
 
-def _resolved(value: object, kind: type[Kind], by_name: Callable[[str], Kind], what: str, example: str) -> Kind:
-    found = by_name(value) if isinstance(value, str) else value
-    if not isinstance(found, kind):
-        raise MethodError(f"{what} {kind.__name__}, or a name such as '{example}', not {found!r}")
-    return found
+def _resolved(value: object, kind: type[Kind], by_name: Callable[[str], Kind], requirement: str, example: str) -> Kind:
+    item = by_name(value) if isinstance(value, str) else value
+    if not isinstance(item, kind):
+        raise MethodError(f"{requirement} {kind.__name__}, or a name such as '{example}', not {item!r}")
+    return item
 
 
 def resolve_quadrature(quadrature: Quadrature | str | None, degree: int) -> Quadrature:

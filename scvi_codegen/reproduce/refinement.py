@@ -162,18 +162,18 @@ class Study:
         """Return all curves, those of SVI and SC in turn."""
         return [
             each
-            for what in self.quantities
+            for quantity in self.quantities
             for case in self.cases
             for n in (LEGEND if not self.degrees else (0,))
-            for each in (self._curve(case, what, scheme, n) for scheme in SCHEMES)
+            for each in (self._curve(case, quantity, scheme, n) for scheme in SCHEMES)
         ]
 
-    def _curve(self, case: StepCase, what: str, scheme: str, n: int) -> ErrorCurve:
+    def _curve(self, case: StepCase, quantity: str, scheme: str, n: int) -> ErrorCurve:
         counts = [n] if n else [degree + case.beyond for degree in self.degrees[scheme]]
-        errors = np.array([step_errors(case, scheme, k, h)[what] for k in counts for h in self.steps])
+        errors = np.array([step_errors(case, scheme, k, h)[quantity] for k in counts for h in self.steps])
         x = np.array(self.steps if n else counts, dtype=float)
-        law = fitted_power(case, scheme, n, what) if n else fitted_line(x, errors)
-        return ErrorCurve(case, what, scheme, n, x, errors, law)
+        law = fitted_power(case, scheme, n, quantity) if n else fitted_line(x, errors)
+        return ErrorCurve(case, quantity, scheme, n, x, errors, law)
 
     def printed(self, curve: ErrorCurve) -> Law | None:
         """Return the paper's line of a curve; over h that of the same power."""
@@ -199,10 +199,10 @@ def fitted_line(n: Array, errors: Array) -> Law | None:
 
 
 @lru_cache(maxsize=512)
-def fitted_power(case: StepCase, scheme: str, n: int, what: str) -> Law | None:
+def fitted_power(case: StepCase, scheme: str, n: int, quantity: str) -> Law | None:
     """Return the line through the errors of small steps in 60 digits; ``None`` if there is no error."""
     steps = case.problem.fitted
-    errors = np.array([step_errors(case, scheme, n, h, precise=True)[what] for h in steps])
+    errors = np.array([step_errors(case, scheme, n, h, precise=True)[quantity] for h in steps])
     if errors.max() < NO_ERROR:
         return None
     power, offset = np.polyfit(np.log([float(h) for h in steps]), np.log(errors), 1)
@@ -290,8 +290,8 @@ def _point_checks(study: Study, curves: Sequence[ErrorCurve]) -> Iterator[Compar
 
 def _step_checks(study: Study, curves: Sequence[ErrorCurve]) -> Iterator[Comparison]:
     """Yield the checks over h: powers and constants of the legend, or that SVI falls faster if there is none."""
-    for what in study.quantities:
-        mine, printed = [c for c in curves if c.what == what], study.powers.get(what)
+    for quantity in study.quantities:
+        mine, printed = [c for c in curves if c.what == quantity], study.powers.get(quantity)
         powers = [f"{c.law.base:.1f}" if c.law else "none" for c in mine]
         measured = ", ".join(
             f"{power} ({c.scheme}, N = {c.n}, {c.case.title})" for power, c in zip(powers, mine, strict=True)
@@ -299,20 +299,20 @@ def _step_checks(study: Study, curves: Sequence[ErrorCurve]) -> Iterator[Compari
         if printed is None:
             pairs = zip(mine[::2], mine[1::2], strict=True)
             faster = [not svi.law or bool(sc.law and svi.law.base > sc.law.base) for svi, sc in pairs]
-            claim = f"The error of the {what} falls faster with h for SVI than for SC."
+            claim = f"The error of the {quantity} falls faster with h for SVI than for SC."
             yield comparison(claim, f"Powers: {measured}.", all(faster), bears_on="accuracy")
             continue
         laws = [c.law for c in mine if c.case.judged and c.law]
         missing = [power for power in printed if power not in {round(law.base) for law in laws}]
         yield comparison(
-            f"The errors of {what} follow the lines {', '.join(f'h^{power}' for power in printed)}.",
+            f"The errors of {quantity} follow the lines {', '.join(f'h^{power}' for power in printed)}.",
             f"Powers: {measured}. Missing: {', '.join(f'h^{power}' for power in missing) or 'none'}.",
             *(power not in missing for power in printed),
         )
         both = [(law.constant, printed[round(law.base)]) for law in laws if round(law.base) in printed]
         off = [max(a / b, b / a) for a, b in both]
         yield comparison(
-            f"The lines run along the errors of {what}.",
+            f"The lines run along the errors of {quantity}.",
             f"The constants of {len(off)} curves whose power is printed are off by factors of {min(off):.1f} to "
             f"{max(off):.1f} with {study.judged[0].title}. Below {ALONG:g} counts as along.",
             max(off) < ALONG,
@@ -322,20 +322,20 @@ def _step_checks(study: Study, curves: Sequence[ErrorCurve]) -> Iterator[Compari
 def _panels(study: Study, curves: Sequence[ErrorCurve]) -> Iterator[Panel]:
     """Yield a panel for each quantity and case; the paper's lines are dotted."""
     looks = {0: ("o", "-"), **dict(zip(LEGEND, (("o", "-"), ("s", "--"), ("D", "-.")), strict=True))}
-    for what, case in product(study.quantities, study.cases):
+    for quantity, case in product(study.quantities, study.cases):
         series = []
-        for c in (c for c in curves if c.what == what and c.case is case):
+        for c in (c for c in curves if c.what == quantity and c.case is case):
             marker, line = looks[c.n]
             label = f"{c.scheme}, N = {c.n}" if c.n else c.scheme
             series.append(Series(x=c.x, y=c.errors, scheme=c.scheme, label=label, marker=marker, line=line))
             if not c.n and (law := study.printed(c)):
                 label, y = f"paper: {law.constant:.0e} {law.base:g}$^N$", law.constant * law.base**c.x
                 series.append(Series(x=c.x, y=y, scheme=c.scheme, label=label, line=":"))
-        for power, constant in study.powers.get(what, {}).items() if case.judged else ():
+        for power, constant in study.powers.get(quantity, {}).items() if case.judged else ():
             y = constant * np.array(study.steps) ** power
             series.append(Series(x=study.steps, y=y, scheme="exact", end=f"$h^{{{power}}}$", line=":"))
         yield Panel(
-            title=f"{what}, {case.title}",
+            title=f"{quantity}, {case.title}",
             series=tuple(series),
             xlabel="Chebyshev points N" if study.degrees else "step h",
             ylabel="error",

@@ -89,15 +89,15 @@ def to_number(value: Any) -> Number:
     return number
 
 
-def ascending_points(values: Iterable[Any], what: str) -> Vector:
-    """Return ``values`` as numbers, checked to be strictly ascending and in [-1, 1]; ``what`` names one of them."""
+def ascending_points(values: Iterable[Any], name: str) -> Vector:
+    """Return ``values`` as numbers, checked to be strictly ascending and in [-1, 1]; ``name`` is that of one."""
     points = tuple(map(to_number, values))
     for index, point in enumerate(points):
         if abs(point) > 1:
-            raise MethodError(f"{what} {index} is {mp.nstr(point, 8)}, outside [-1, 1]; map the interval to [-1, 1]")
+            raise MethodError(f"{name} {index} is {mp.nstr(point, 8)}, outside [-1, 1]; map the interval to [-1, 1]")
         if index and point <= points[index - 1]:
             raise MethodError(
-                f"{what} {index} is {mp.nstr(point, 8)}, not greater than the one before it; give "
+                f"{name} {index} is {mp.nstr(point, 8)}, not greater than the one before it; give "
                 "distinct points in ascending order"
             )
     return points
@@ -109,11 +109,11 @@ def is_antisymmetric(points: Vector) -> bool:
     return all(abs(left + right) <= tolerance for left, right in zip(points, reversed(points), strict=True))
 
 
-def family_named(name: str, families: Mapping[str, Item], what: str) -> Item:
+def family_named(name: str, families: Mapping[str, Item], kind: str) -> Item:
     """Return ``families[name]``, or raise ``MethodError`` with the known names and the closest match."""
     if name in families:
         return families[name]
-    raise MethodError(f"unknown {what} {name!r}{closest(str(name), families)} Known: {', '.join(families)}")
+    raise MethodError(f"unknown {kind} {name!r}{closest(str(name), families)} Known: {', '.join(families)}")
 
 
 def jacobi_value_and_derivative(count: int, alpha: int, beta: int, x: Number) -> tuple[Number, Number]:

@@ -284,12 +284,12 @@ QUADRATURE_FAMILIES: Mapping[str, Callable[[int], Quadrature]] = {
 }
 
 
-def split_name(name: str, families: Mapping[str, Item], what: str) -> tuple[Item, int]:
+def split_name(name: str, families: Mapping[str, Item], kind: str) -> tuple[Item, int]:
     """Read ``"family:count"`` and return the family and the count; ``MethodError`` says what is wrong with either."""
     family, _, count = str(name).partition(":")
-    resolved = family_named(family, families, what)
+    resolved = family_named(family, families, kind)
     if not (count.isascii() and count.isdigit() and len(count) <= MOST_DIGITS):
-        raise MethodError(f"{what} {name!r} lacks its number of points; write '{family}:3', for example")
+        raise MethodError(f"{kind} {name!r} lacks its number of points; write '{family}:3', for example")
     return resolved, int(count)
 
 

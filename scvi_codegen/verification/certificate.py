@@ -99,9 +99,9 @@ def checked(name: str, statement: str, measure: Callable[[], Finding | None]) ->
     )
 
 
-def information(name: str, what: str, measured: float | None, remark: str = "") -> Check:
+def information(name: str, statement: str, measured: float | None, remark: str = "") -> Check:
     """Return a measured number without a bound."""
-    return Check(name=name, statement=what, outcome=Outcome.INFORMATION, measured=measured, remark=remark)
+    return Check(name=name, statement=statement, outcome=Outcome.INFORMATION, measured=measured, remark=remark)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

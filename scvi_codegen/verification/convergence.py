@@ -102,14 +102,14 @@ def _known_properties(method: Method) -> Finding | None:
 
 
 def _expected(method: Method) -> tuple[int | None, bool, bool] | None:
-    what = method.specification()
-    kind = str(what["method"])
+    specification = method.specification()
+    kind = str(specification["method"])
     if kind in EXPECTED:
-        order, symplectic, symmetric = EXPECTED[kind](int(str(what["stages"])))
-        return order, symplectic and what["form"] == "phase-space", symmetric
-    family, _, count = str(what.get("quadrature", "")).partition(":")
-    if kind == "svi" and family in RULES and "space" not in what:
-        degree, points = int(str(what["degree"])), int(count)
+        order, symplectic, symmetric = EXPECTED[kind](int(str(specification["stages"])))
+        return order, symplectic and specification["form"] == "phase-space", symmetric
+    family, _, count = str(specification.get("quadrature", "")).partition(":")
+    if kind == "svi" and family in RULES and "space" not in specification:
+        degree, points = int(str(specification["degree"])), int(count)
         order = min(2 * degree, RULES[family](points))
         return order if points >= degree else None, True, "radau" not in family
     return {"stoermer-verlet": (2, True, True), "explicit-euler": (1, False, False)}.get(kind)
@@ -164,12 +164,12 @@ def _error(tested: SystemUnderTest, method: Method, state: State, h: Number) -> 
 
 
 def _rate_in_degree(tested: SystemUnderTest) -> Finding | None:
-    what = tested.method.specification()
-    key = "degree" if "degree" in what else "stages" if "stages" in what else None
-    if key is None or "abscissae" in what or tested.method.order is None:
+    specification = tested.method.specification()
+    key = "degree" if "degree" in specification else "stages" if "stages" in specification else None
+    if key is None or "abscissae" in specification or tested.method.order is None:
         return None
-    size = int(str(what[key]))
-    less, more = (_of_size(what, key, size + change) for change in (-2, 2))
+    size = int(str(specification[key]))
+    less, more = (_of_size(specification, key, size + change) for change in (-2, 2))
     pair = (less, tested.method) if less else (tested.method, more) if more else None
     if pair is None:
         raise StateError("no method of a neighbouring degree exists with this quadrature")
@@ -192,14 +192,14 @@ def _errors_of(tested: SystemUnderTest, pair: tuple[Method, Method]) -> tuple[Nu
     return h, [_error(tested, method, state, h) for method in pair]
 
 
-def _of_size(what: Mapping[str, Any], key: str, size: int) -> Method | None:
+def _of_size(specification: Mapping[str, Any], key: str, size: int) -> Method | None:
     """Return the method of another degree, with the same number of additional quadrature points."""
     if size < 1:
         return None
-    changed = {**what, key: size}
-    family, colon, count = str(what.get("quadrature", "")).partition(":")
+    changed = {**specification, key: size}
+    family, colon, count = str(specification.get("quadrature", "")).partition(":")
     if colon and count.isdigit():
-        changed["quadrature"] = f"{family}:{int(count) + size - int(what[key])}"
+        changed["quadrature"] = f"{family}:{int(count) + size - int(specification[key])}"
     try:
         return method_from_specification(changed)
     except MethodError:
@@ -349,13 +349,13 @@ def _oscillator(method: Method) -> Finding | None:
 
 def _euler(tested: SystemUnderTest) -> Finding | None:
     """Compare explicit Euler with its formula; order 1 alone would also hold for implicit Euler."""
-    what = tested.method.specification()
-    if what["method"] != "explicit-euler" or forms_of(tested.system).one_form:
+    specification = tested.method.specification()
+    if specification["method"] != "explicit-euler" or forms_of(tested.system).one_form:
         return None
     state, motion = tested.states[0], tested.motion
     q, p, h, t = numbers(state.q), numbers(state.p), mp.mpf(state.h), mp.mpf(state.t)
     v, force = motion.rates(q, p, t)
-    if what["form"] == "phase-space":
+    if specification["form"] == "phase-space":
         end = [*(q + v * h), *(p + force * h)]
     elif motion.hamiltonian:
         raise StateError("no formula for the position form of a Hamiltonian")

@@ -225,8 +225,8 @@ def _energy_derivative(runs: VariableSteps) -> Finding:
     energies = []
     for sign in (1, -1):
         moved = step.arguments + direction * (sign * WIDTH)
-        at = motion.with_parameters(moved[2 * m : 2 * m + count].tolist())
-        energies.append(at.energy(moved[:m], moved[m : 2 * m], mp.zero))
+        shifted = motion.with_parameters(moved[2 * m : 2 * m + count].tolist())
+        energies.append(shifted.energy(moved[:m], moved[m : 2 * m], mp.zero))
     exact = float((energies[0] - energies[1]) / (2 * WIDTH))
     return Finding(abs(float(terms.sum()) - exact) / float(np.abs(terms).max()), BOUND, "relative, along one direction")
 

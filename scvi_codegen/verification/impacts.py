@@ -46,31 +46,31 @@ class Change(NamedTuple):
 
 def impact_checks(tested: SystemUnderTest, stepper: Stepper, parameters: Any = None) -> Iterator[Check]:
     """Yield the checks of the events of a stepper that change the state; ``parameters`` of its runs."""
-    found = list[Any]()
+    crossings = list[Any]()
     if stepper.changes_states:
         statement = "g = 0 up to round-off where the state changes"
-        yield from checked("event surfaces", statement, partial(_surfaces, tested, stepper, parameters, found))
-    if not found:
+        yield from checked("event surfaces", statement, partial(_surfaces, tested, stepper, parameters, crossings))
+    if not crossings:
         return
     statement = "the derivative of a step across an event (saltation matrix) is that of finite differences"
-    yield from checked("saltation", statement, partial(_saltation, tested.scales(tested.initial), *found))
+    yield from checked("saltation", statement, partial(_saltation, tested.scales(tested.initial), *crossings))
     if not tested.system.constraints:
         if tested.method.symmetric:
             statement = "a step with -h undoes a step with an elastic impact"
-            yield from checked("reversal, impacts", statement, partial(_reversal, *found))
+            yield from checked("reversal, impacts", statement, partial(_reversal, *crossings))
         statement = "p + (1 + e)/2 lambda n, H(p + lambda n) - H(p) = -lambda g_t, symmetries of walls, to round-off"
-        yield from checked("impacts", statement, partial(_impacts, *found))
+        yield from checked("impacts", statement, partial(_impacts, *crossings))
         if is_symplectic(tested.method, tested.system):
             statement = "J^T Omega J = Omega of a step with an elastic impact, up to the error of the method"
-            yield from checked("symplecticity, impacts", statement, partial(_symplecticity, *found))
+            yield from checked("symplecticity, impacts", statement, partial(_symplecticity, *crossings))
 
 
-def _surfaces(tested: SystemUnderTest, stepper: Stepper, parameters: Any, found: list[Any]) -> Finding:
-    """Return the largest value of an event function; add the run and its changes to ``found``."""
+def _surfaces(tested: SystemUnderTest, stepper: Stepper, parameters: Any, crossings: list[Any]) -> Finding:
+    """Return the largest value of an event function; add the run and its changes to ``crossings``."""
     start = tested.initial
     run = stepper.integrate(start.q, start.p, h=start.h, steps=STEPS, t=start.t, parameters=parameters)
-    found.extend((run, _changes(run)))
-    return Finding(max(each.residual for each in found[1]), ROUND_OFF, f"{len(found[1])} changes")
+    crossings.extend((run, _changes(run)))
+    return Finding(max(each.residual for each in crossings[1]), ROUND_OFF, f"{len(crossings[1])} changes")
 
 
 def _changes(run: Trajectory) -> list[Change]:

@@ -196,7 +196,7 @@ def momentum_error(run: Trajectory, k: int, such: str = "") -> Finding:
 
 def largest_step(tested: SystemUnderTest) -> Check:
     """Return the largest step size at which the stage equations are solved three times in a row, by bisection."""
-    name, what = "largest step", f"largest h at which {CONSECUTIVE_STEPS} steps in a row are solved"
+    name, statement = "largest step", f"largest h at which {CONSECUTIVE_STEPS} steps in a row are solved"
     state = tested.states[0]
 
     def usable(h: float) -> bool:
@@ -217,8 +217,8 @@ def largest_step(tested: SystemUnderTest) -> Check:
                 break
             good = bad
         else:
-            return information(name, what, good, "no failing step size was found")
+            return information(name, statement, good, "no failing step size was found")
     for _ in range(BISECTIONS):
         middle = (good + bad) / 2
         good, bad = (middle, bad) if usable(middle) else (good, middle)
-    return information(name, what, good)
+    return information(name, statement, good)

@@ -55,11 +55,11 @@ from scvi_codegen.version import __version__
 def system_section(system: MechanicalSystem) -> Section:
     """Return the section on the Lagrangian or the Hamiltonian, coordinates and parameters."""
     names = ", ".join(q.name for q in system.coordinates)
-    letter, what = ("H", "Hamiltonian") if system.auxiliaries else ("L", "Lagrangian")
+    letter, title = ("H", "Hamiltonian") if system.auxiliaries else ("L", "Lagrangian")
     count = f"{system.dimension} coordinate{'s' * (system.dimension > 1)}"
     time = " and time" if system.depends_on_time else ""
     contents: list[Content] = [
-        Paragraph(f"The {what} of {count}, {names}{time}:"),
+        Paragraph(f"The {title} of {count}, {names}{time}:"),
         *formulas([Formula(system.formula, Symbol(letter))], "formula"),
     ]
     if system.forces:

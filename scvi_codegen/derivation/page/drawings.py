@@ -82,8 +82,8 @@ def _words(part: Part) -> str:
     count = len(positions(part))
     if isinstance(part, Quadrature):
         return f"{count} quadrature point{'s' * (count > 1)} ({part.name})"
-    what = "stage" if hasattr(part, "b") else "node"
-    return f"{count} {what}{'s' * (count > 1)} ({part.name})"
+    kind = "stage" if hasattr(part, "b") else "node"
+    return f"{count} {kind}{'s' * (count > 1)} ({part.name})"
 
 
 def _text(x: float, y: float, text: str, anchor: str) -> str:
@@ -250,8 +250,8 @@ def kronecker_form(method: SpectralCollocation) -> Iterator[Paragraph | Formula]
 
 def _action(number: str) -> Iterator[Content]:
     n, g, h = Symbol("n", integer=True), Symbol("g"), Symbol("h")
-    at = Symbol("tau_n")
-    L = Function("L")(Function("q")(at), Function("q_dot")(at), Symbol("t_n"))
+    tau = Symbol("tau_n")
+    L = Function("L")(Function("q")(tau), Function("q_dot")(tau), Symbol("t_n"))
     yield Paragraph("The discrete Lagrangian is the quadrature of L along it:")
     yield Formula(h / 2 * sympy.Sum(Symbol("w_n") * L, (n, 1, g)), Symbol("L_d"), number)
 

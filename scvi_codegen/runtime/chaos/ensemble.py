@@ -107,8 +107,8 @@ class ChaosIndicatorsEnsemble:
         steps, runs = len(self.t) - 1, {}
         for j in range(0, len(self.q), CHECKED_STRIDE):
             start = self.q[j], self.p[j]
-            given: dict[str, Any] = {"t": self.t[0], "parameters": self.parameters[j], "options": self.options}
-            memory = Memory.started(self.stepper, *start, plan=StepPlan(h=self.h), **given)
+            arguments: dict[str, Any] = {"t": self.t[0], "parameters": self.parameters[j], "options": self.options}
+            memory = Memory.started(self.stepper, *start, plan=StepPlan(h=self.h), **arguments)
             with suppress(StepFailedError):
                 runs[j] = record(memory, steps, save_every=steps)
         worst = max(runs, key=lambda j: np.nan_to_num(runs[j].step_error), default=None)
@@ -196,8 +196,8 @@ class ChaosIndicatorsEnsemble:
             for first in range(0, steps, LARGEST_CHUNK):
                 last = min(first + LARGEST_CHUNK, steps)
                 starts = Starts.chain(*now, self.t[first:last], np.full(last - first, self.h))
-                at = np.arange(first, last + 1)
-                yield starts, np.where(at % self.save_every, -1, at // self.save_every)
+                reached = np.arange(first, last + 1)
+                yield starts, np.where(reached % self.save_every, -1, reached // self.save_every)
                 now = starts.q[-1], starts.p[-1]
 
         propagation = None

@@ -46,9 +46,9 @@ class ChaosIndicators:
     __repr__ = summary("t", "log_norms")
 
     @classmethod
-    def of(cls, t: Array, found: Array, status: NDArray[np.str_] | None = None) -> ChaosIndicators:
+    def of(cls, t: Array, series: Array, status: NDArray[np.str_] | None = None) -> ChaosIndicators:
         """Construct from (n,) times and (5, n, .., k) values of :data:`~scvi_codegen.runtime.chaos.growth.SERIES`."""
-        return cls(t=t, status=status, **dict(zip(SERIES, found, strict=True)))
+        return cls(t=t, status=status, **dict(zip(SERIES, series, strict=True)))
 
     def lyapunov_exponents(self) -> Array:
         """Return (n, k) the k largest Lyapunov exponents up to each state, descending; NaN at the first state.

@@ -194,11 +194,11 @@ class Ensemble:
             for j, each in zip(range(part.start, part.stop), trajectories.each(), strict=True):
                 self.saved[j] = SavedLane(*each)
             return
-        found = self.common
-        found.q[:, part], found.p[:, part] = trajectories.q, trajectories.p
-        found.status[part], found.done[part] = trajectories.status, trajectories.steps
-        if found.times is not None:
-            found.times[:, part] = trajectories.times
+        common = self.common
+        common.q[:, part], common.p[:, part] = trajectories.q, trajectories.p
+        common.status[part], common.done[part] = trajectories.status, trajectories.steps
+        if common.times is not None:
+            common.times[:, part] = trajectories.times
 
     def run(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> None:
         """Integrate all trajectories with ``threads`` threads; an exception raised by ``progress`` stops them promptly.

@@ -37,14 +37,14 @@ def momenta_of_each(
     name, argument = stepper.momentum_or_velocity(p, velocity)
     if name == "p":
         return argument
-    at = checked_number(t, "the time t")
+    time = checked_number(t, "the time t")
     positions = _states(stepper, q, "q")
     velocities = _states(stepper, argument, name)
     if positions.shape != velocities.shape:
         raise StateError(f"q and velocity must have equal shapes, not {positions.shape} and {velocities.shape}")
     values = parameters_of_each(stepper, parameters, len(positions))
     states = zip(positions, velocities, values, strict=True)
-    return np.array([stepper.initial_momentum(position, v, at, value) for position, v, value in states])
+    return np.array([stepper.initial_momentum(position, v, time, value) for position, v, value in states])
 
 
 def start_of_ensemble(

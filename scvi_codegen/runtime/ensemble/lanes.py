@@ -209,8 +209,8 @@ class SingleRun:
         segment, time = work.steps.at(step)
         values = work.values_at(segment.middle, slice(j, j + 1))[0]
         try:
-            given: dict[str, Any] = {"t": work.steps.t0, "parameters": values, "options": work.options}
-            run = Memory.started(work.stepper, q, p, plan=StepPlan(h=segment.h), **given)
+            arguments: dict[str, Any] = {"t": work.steps.t0, "parameters": values, "options": work.options}
+            run = Memory.started(work.stepper, q, p, plan=StepPlan(h=segment.h), **arguments)
         except StateError:  # a sum of finite terms has overflowed
             work.status[j] = "not finite"
         else:

@@ -165,11 +165,11 @@ def state_names(stepper: Stepper) -> tuple[str, ...]:
     return (*stepper.coordinates, *stepper.interface.momenta)
 
 
-def distinct(names: Sequence[str], what: str) -> tuple[str, ...]:
+def distinct(names: Sequence[str], kind: str) -> tuple[str, ...]:
     """Return the names; raise ``StateError`` if one occurs twice."""
     for k, name in enumerate(names):
         if name in names[:k]:
-            raise StateError(f"{what} names '{name}' twice")
+            raise StateError(f"{kind} names '{name}' twice")
     return tuple(names)
 
 

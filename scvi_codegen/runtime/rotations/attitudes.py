@@ -89,7 +89,7 @@ def _of_angles(value: Mapping[str, Any], name: str) -> Array:
     return np.roll(np.asarray(rotation.as_quat(), dtype=float), 1, axis=-1)
 
 
-def scaled_vectors(value: Any, what: str) -> tuple[Array, Array, Array]:
+def scaled_vectors(value: Any, name: str) -> tuple[Array, Array, Array]:
     """Return (.., 3) vectors divided by powers of two near their largest components, their lengths, and the exponents.
 
     Squares then neither overflow nor underflow.
@@ -97,14 +97,14 @@ def scaled_vectors(value: Any, what: str) -> tuple[Array, Array, Array]:
     Raises:
         StateError: unless there are three components, finite and not all zero.
     """
-    vector = real_array(value, what)
+    vector = real_array(value, name)
     if not vector.ndim or vector.shape[-1] != 3:
-        raise StateError(f"{what} must have three components, not {value!r}")
+        raise StateError(f"{name} must have three components, not {value!r}")
     if not np.isfinite(vector).all():
-        raise StateError(f"{what} must be finite, not {value!r}")
+        raise StateError(f"{name} must be finite, not {value!r}")
     largest = np.abs(vector).max(axis=-1, keepdims=True)
     if not (largest > 0).all():
-        raise StateError(f"{what} must not be zero, but is {value!r}: give three components, not all zero")
+        raise StateError(f"{name} must not be zero, but is {value!r}: give three components, not all zero")
     exponent = np.frexp(largest)[1]
     scaled = np.ldexp(vector, -exponent)
     return scaled, np.linalg.norm(scaled, axis=-1, keepdims=True), exponent

@@ -150,24 +150,24 @@ def _first_order_state(interface: Interface, z: Any, p: Any, velocity: Any) -> t
 
 def _entries(names: Sequence[str], name: str, value: Any) -> list[tuple[str, Any]]:
     """Return the names and values of the entries ``x_0``, ``x_1`` of an array ``x`` of variables."""
-    own = [each for each in names if name not in names and re.fullmatch(rf"{re.escape(name)}(_\d+)+", each)]
-    if not own:
+    entries = [each for each in names if name not in names and re.fullmatch(rf"{re.escape(name)}(_\d+)+", each)]
+    if not entries:
         return [(name, value)]
-    array, axes = real_array(value, name), own[0].removeprefix(name).count("_")
+    array, axes = real_array(value, name), entries[0].removeprefix(name).count("_")
     outer = array.shape[: max(0, array.ndim - axes)]
-    if array.size != len(own) * int(np.prod(outer, dtype=int)):
-        raise StateError(f"'{name}' must have {len(own)} values, not the shape {array.shape}")
-    return list(zip(own, np.moveaxis(array.reshape(*outer, len(own)), -1, 0), strict=True))
+    if array.size != len(entries) * int(np.prod(outer, dtype=int)):
+        raise StateError(f"'{name}' must have {len(entries)} values, not the shape {array.shape}")
+    return list(zip(entries, np.moveaxis(array.reshape(*outer, len(entries)), -1, 0), strict=True))
 
 
 def _by_entry(shapes: Shapes, members: Sequence[Member], values: Any) -> Any:
     """Return a state by name with its arrays replaced by their entries, ``R_0``, ``R_1`` of ``R``."""
     if not isinstance(values, Mapping):
         return values
-    own, axes, kinds = {member.name: member for member in members}, dict[str, tuple[int, ...]](), dict[str, str]()
+    by_name, axes, kinds = {member.name: member for member in members}, dict[str, tuple[int, ...]](), dict[str, str]()
     for name, shape in shapes:
         first = "_0" * (len(shape) - 1)
-        member = own.get(name + first)
+        member = by_name.get(name + first)
         axes[name] = shape if member is None else shape[:-1]
         if member is not None:
             rate = member.rate.removesuffix(first)
@@ -213,8 +213,8 @@ def state_of(
     if isinstance(q, Mapping):
         _check(q, [*ordinary, *(member.name for member in members)], "q")
         parts = [_column(q, name, "q") for name in ordinary]
-        own = {member.name: _coordinates(member, q) for member in members}
-        state = _joined([*parts, *(own[member.name][0] for member in members)])
+        attitudes = {member.name: _coordinates(member, q) for member in members}
+        state = _joined([*parts, *(attitudes[member.name][0] for member in members)])
     else:
         state = real_array(q, "q")
         if not state.ndim or state.shape[-1] != len(coordinates) or any(member.kind == "spin" for member in members):
@@ -222,15 +222,17 @@ def state_of(
                 f"momenta and velocities by name require q by name, or numbers of the shape (.., {len(coordinates)}) "
                 "and no spins"
             )
-        own = {member.name: (state[..., member.columns], np.zeros(0)) for member in members}
+        attitudes = {member.name: (state[..., member.columns], np.zeros(0)) for member in members}
     if velocity is not None and any(member.kind == "spin" for member in members):
         raise StateError("spins have no velocities: give p, the momenta of coordinates and rotations by name")
     if p is None and velocity is None and not ordinary and all(member.kind == "spin" for member in members):
         p = {}
     if isinstance(velocity, Mapping):
-        state, velocity = np.broadcast_arrays(state, _joined(_moving(ordinary, members, velocity, own, "velocity")))
+        state, velocity = np.broadcast_arrays(
+            state, _joined(_moving(ordinary, members, velocity, attitudes, "velocity"))
+        )
     if isinstance(p, Mapping):
-        state, p = np.broadcast_arrays(state, _joined(_moving(ordinary, members, p, own, "p")))
+        state, p = np.broadcast_arrays(state, _joined(_moving(ordinary, members, p, attitudes, "p")))
     return state, p, velocity
 
 
@@ -273,55 +275,55 @@ def _moving(
     ordinary: Sequence[str],
     members: Sequence[Member],
     values: Mapping[str, Any],
-    own: Mapping[str, tuple[Array, Array]],
-    what: str,
+    attitudes: Mapping[str, tuple[Array, Array]],
+    argument: str,
 ) -> list[Array]:
     """Return the parts of momenta or velocities."""
-    named = {m.name for m in members if m.kind == "rotation" and (m.momentum or what == "velocity")}
+    named = {m.name for m in members if m.kind == "rotation" and (m.momentum or argument == "velocity")}
     names = {m.name: m.rate if m.name in named else m.name for m in members}
     known = [*ordinary, *(names[m.name] for m in members if m.kind != "spin")]
-    _check(values, known, what, also=[f"{names[m.name]}_space" for m in members if m.kind == "rotation"])
-    parts = [_column(values, name, what) for name in ordinary]
+    _check(values, known, argument, also=[f"{names[m.name]}_space" for m in members if m.kind == "rotation"])
+    parts = [_column(values, name, argument) for name in ordinary]
     for member in members:
-        q, p = own[member.name]
+        q, p = attitudes[member.name]
         name = names[member.name]
         if member.kind == "spin":
             parts.append(p)
             continue
         in_space = member.kind == "rotation" and f"{name}_space" in values
-        vector = real_array(values[f"{name}_space" if in_space else name], f"{what}: '{name}'")
+        vector = real_array(values[f"{name}_space" if in_space else name], f"{argument}: '{name}'")
         if not vector.ndim or vector.shape[-1] != 3 or not np.isfinite(vector).all():
-            raise StateError(f"{what}: '{name}' must have three finite components, not {vector.tolist()}")
+            raise StateError(f"{argument}: '{name}' must have three finite components, not {vector.tolist()}")
         if member.kind == "direction":
             radial = (q * vector).sum(axis=-1, keepdims=True)
             if not (np.abs(radial) <= TANGENT * np.abs(vector).max(axis=-1, keepdims=True)).all():
                 raise StateError(
-                    f"{what}: '{name}' = {vector.tolist()} is not tangent to the unit sphere: its component along the "
-                    f"direction is {np.abs(radial).max():.3g}. The length is constant: give an orthogonal vector"
+                    f"{argument}: '{name}' = {vector.tolist()} is not tangent to the unit sphere: its component "
+                    f"along it is {np.abs(radial).max():.3g}. The length is constant: give an orthogonal vector"
                 )
             parts.append(np.asarray(vector - q * radial))
             continue
         body = np.einsum("...ji,...j->...i", matrices(q), vector) if in_space else vector
         q, body = np.broadcast_arrays(q, np.concatenate([body, body[..., :1]], axis=-1))
-        parts.append((velocities_of_body if what == "velocity" else momenta_of_body)(q, body[..., :3]))
+        parts.append((velocities_of_body if argument == "velocity" else momenta_of_body)(q, body[..., :3]))
     return parts
 
 
-def _check(values: Mapping[str, Any], known: Sequence[str], what: str, also: Sequence[str] = ()) -> None:
+def _check(values: Mapping[str, Any], known: Sequence[str], argument: str, also: Sequence[str] = ()) -> None:
     for name in values:
         if name not in known and name not in also:
             raise StateError(
-                f"there is no '{name}' in {what}{closest(str(name), [*known, *also])} Known: {', '.join(known)}"
+                f"there is no '{name}' in {argument}{closest(str(name), [*known, *also])} Known: {', '.join(known)}"
             )
     for name in known:
         count = (name in values) + (f"{name}_space" in set(also) & set(values))
         if count != 1:
-            both = f"both '{name}' and '{name}_space' are in {what}: give one of them"
-            raise StateError(both if count else f"'{name}' is missing in {what}")
+            both = f"both '{name}' and '{name}_space' are in {argument}: give one of them"
+            raise StateError(both if count else f"'{name}' is missing in {argument}")
 
 
-def _column(values: Mapping[str, Any], name: str, what: str) -> Array:
-    return real_array(values[name], f"{what}: '{name}'")[..., None]
+def _column(values: Mapping[str, Any], name: str, argument: str) -> Array:
+    return real_array(values[name], f"{argument}: '{name}'")[..., None]
 
 
 def _joined(parts: Sequence[Array]) -> Array:

@@ -194,8 +194,8 @@ def starts_of(states: SavedStates, first: int, last: int) -> tuple[Starts, NDArr
     count = 1 if taken else steps_between(length, span)
     if count == 1:
         h = steps_after(states, first, last)
-        of = slice(first, last + 1)
-        starts = Starts(states.t[first:last].copy(), h, states.q[of].copy(), states.p[of].copy())
+        piece = slice(first, last + 1)
+        starts = Starts(states.t[first:last].copy(), h, states.q[piece].copy(), states.p[piece].copy())
         return starts, np.arange(first, last + 1)
     t, h = states.t[first] + length * np.arange(count), np.full(count, length)
     starts = Starts.chain(states.q[first], states.p[first], t, h)

@@ -175,11 +175,11 @@ class TrajectoryDerivatives(SavedStates):
         for name in stepper.interface.inputs:
             first = stepper.parameters.index(f"{name}_0")
             began = np.array([run.parameters[first + COEFFICIENTS] for run in self._runs])
-            starts, of = (
+            starts, piece = (
                 np.flatnonzero(np.diff(began, prepend=np.nan)),
                 slice(2 * m + first, 2 * m + first + COEFFICIENTS),
             )
-            rows = np.stack([derivatives[:, of].T for derivatives in by_runs])
+            rows = np.stack([derivatives[:, piece].T for derivatives in by_runs])
             inputs[name] = np.add.reduceat(rows, starts).reshape(len(starts), COEFFICIENTS, *shape)
         return replace(gradient, h=None, inputs=inputs)
 

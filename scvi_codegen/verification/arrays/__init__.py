@@ -74,12 +74,12 @@ def verify_arrays(
     parameters = dict(zip(stepper.interface.parameters, arrays.numbers, strict=True))
     if stepper.source is None or system.coupled_terms or tolerance is not None or system.constraints:
         known = unroll_sums(system, arrays.sizes, tables=arrays.places, parameters={**parameters, **arrays.fields})
-        of: dict[str, Any] = {"h": run.h, "t": run.t, "tolerance": tolerance, "flags": flags}
+        options: dict[str, Any] = {"h": run.h, "t": run.t, "tolerance": tolerance, "flags": flags}
         if watched.events:
-            of["stepper"] = compile_stepper(known, chosen, flags=watched.flags, events=watched.events)
+            options["stepper"] = compile_stepper(known, chosen, flags=watched.flags, events=watched.events)
         if system.constraints and isinstance(chosen, StoermerVerlet):
             chosen = SVI(1, "gauss-lobatto:2")  # RATTLE under its name for known sizes
-        certificate = of_known_sizes(known, chosen, run.q, run.p, **of)
+        certificate = of_known_sizes(known, chosen, run.q, run.p, **options)
         if stepper.source is None:
             return certificate
         loops = SystemUnderTest(known, chosen, _bound(stepper, arrays), None, State(run.q, run.p, run.t, run.h))
@@ -182,8 +182,8 @@ def small_start(start: WholeStart) -> WholeStart:
                 continue
             used = [
                 arrays.places[table][chosen[row], column]
-                for table, row, column, of in _columns(interface)
-                if of == name
+                for table, row, column, size in _columns(interface)
+                if size == name
             ]
             known = np.unique(np.concatenate([*used, np.empty(0, dtype=np.int64)]))
             others = np.setdiff1d(_around(start, name, window), known)

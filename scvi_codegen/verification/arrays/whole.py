@@ -164,10 +164,10 @@ def _energies(start: WholeStart) -> Finding:
     return Finding(wrong / (size or 1.0), ROUNDINGS * EPSILON * float(np.log2(count) + 1), "relative to its terms")
 
 
-def _values(start: WholeStart, at: Elements, formula: Expr, slots: Sequence[tuple[Any, Access]]) -> Any:
+def _values(start: WholeStart, elements: Elements, formula: Expr, slots: Sequence[tuple[Any, Access]]) -> Any:
     arrays = {access.array.name: start.array(access.array.name) for _, access in slots} | {**start.arrays.fields}
     numbers: dict[Expr, float] = dict(zip(start.system.parameters, start.arrays.numbers, strict=True))
-    return at.values(formula, slots, arrays, {**numbers, start.system.time: start.t})
+    return elements.values(formula, slots, arrays, {**numbers, start.system.time: start.t})
 
 
 def _reversal(start: WholeStart) -> Finding:
