@@ -1,11 +1,4 @@
-"""Equations and table entries as data, as plain text, LaTeX and HTML.
-
-Named numbers of a method's tables, with their short exact forms.
-
-Numbers of 60 digits are recognised as short combinations of radicals by PSLQ.
-
-Changes of the state by events: maps, impulses of impacts, and their derivatives.
-"""
+"""Equations and table entries as data, as plain text, LaTeX and HTML; numbers as short radicals (PSLQ)."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress

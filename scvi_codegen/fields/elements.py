@@ -167,7 +167,7 @@ def _edges(
     fixed: tuple[bool, bool] | None,
     clamped: tuple[bool, bool],
 ) -> Edges:
-    """Return the ends of elements whose points have the positions ``places`` and the coordinates ``local``, (E, p + 1)."""
+    """Return the ends of elements; ``places`` and ``local``, (E, p + 1), are positions and coordinates of points."""
     weights = np.array([float(each) for each in rule[0]])
     derivative = np.array([[float(x) for x in row] for row in rule[1]])
     elements, size, half = len(places), places.shape[1], np.ptp(local, axis=1) / 2

@@ -9,12 +9,8 @@ conservation law ``D_t J^t + sum_i D_i J^i = 0`` of every solution, with
 (P. J. Olver, Applications of Lie Groups to Differential Equations, Springer 1993, section 4.4). A Hamiltonian density H
 has L = sum p u_t - H. Candidates for Q and K are tested: ``dL - D_t K^t - sum D_i K^i`` must be zero identically.
 
-Conserved densities, their fluxes and the residuals of local conservation laws along a run.
-
-Derivatives in space are those of the interpolant, on elements element by element with the prescribed values at ends.
-Values at end points that elements share are means weighted by length.
-
-Derivation of a density: equations, semi-discrete system and conservation laws, as text.
+Along a run derivatives in space are those of the interpolant, on elements element by element with the prescribed values
+at ends. Values at end points that elements share are means weighted by length.
 """
 
 from __future__ import annotations

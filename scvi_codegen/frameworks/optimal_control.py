@@ -1,17 +1,8 @@
 """Optimal control by discrete mechanics (DMOC): the step equations are the constraints of a nonlinear program.
 
-Unknowns are the states (q, p) between steps, the stages and inputs of each step and, if free, the duration. The
-solution is a trajectory of the variational integrator, step for step: momentum maps on which no input acts are
-conserved.
-
-Nonlinear program for IPOPT: named unknowns, their bounds, constraints and cost.
-
-Result of optimal control: a trajectory of the integrator, its inputs and their cost.
-
-Optimal control problem as a nonlinear program: unknowns, constraints, cost and initial guess.
-
 Unknowns are the states (q, p) between steps, the stages and inputs of each step, the velocities at both ends, and the
-duration. The program is a map of one step, so that CasADi differentiates a step and not the trajectory.
+duration if it is free. The program is a map of one step, so that CasADi differentiates a step and not the trajectory.
+Its solution is a trajectory of the variational integrator: momentum maps on which no input acts are conserved.
 """
 
 from __future__ import annotations

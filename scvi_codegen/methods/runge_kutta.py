@@ -1,7 +1,7 @@
 """Runge-Kutta methods, (22)-(23), in phase space (q, p) and in position-velocity form (q, v).
 
-Spectral collocation at the nodes x_1 .. x_s is the collocation Runge-Kutta method (22)-(23) on the abscissae
-c_i = (x_i + 1)/2, so the compiled form of both is a tableau (A, b, c). On Hamilton's equations, with stage
+Spectral collocation (SC), (10)-(21), at the nodes x_1 .. x_s is the collocation Runge-Kutta method (22)-(23) on the
+abscissae c_i = (x_i + 1)/2, so the compiled form of both is a tableau (A, b, c). On Hamilton's equations, with stage
 velocities V_i as unknowns,
 
     q_i = q0 + h sum_j a_ij V_j,     L_v(q_i, V_i) = p0 + h sum_j a_ij L_q(q_j, V_j),                   (22), (21)
@@ -11,11 +11,6 @@ and on (q, v), with v0 and z_i = h (acceleration at c_i) as unknowns,
     V_i = v0 + sum_j a_ij z_j,       q_i = q0 + h sum_j a_ij V_j,       E(q_i, V_i, z_i / h, t_i) = 0,    (18)
 
 where E is the Euler-Lagrange residual. If the mass is not constant these are two different maps.
-
-Spectral collocation (SC), (10)-(21), in position form (q, v) and in phase space (q, p).
-
-At the nodes x_1 .. x_s it is the collocation Runge-Kutta method (22)-(23) on the abscissae c_i = (x_i + 1)/2, and is
-compiled as such (:mod:`scvi_codegen.methods.runge_kutta`).
 """
 
 from __future__ import annotations

@@ -1,19 +1,8 @@
-"""Results of experiments: setting, claims of the paper, measurements, numbers and a picture.
+"""Experiments, results and pictures as plain data, and their report: setting, claims, measurements, verdicts.
 
-Everything is plain data that can be sent between processes; a formula is SymPy.
-
-Claims of the paper, each with all measurements that concern it and one verdict.
-
-Files of a result, and the report of all results: one self-contained HTML page with MathML, no script, no network.
-
-It adapts to light and dark mode (pictures keep a light background), to narrow screens and to paper. The page is
-``templates/report.html.jinja`` with ``templates/report.css`` on the base of all pages; this module converts results
-into text for it.
-
-Pictures of experiments as plain data, panels of curves, and their drawing: one colour per scheme.
-
-A picture is drawn on a Matplotlib figure under :data:`STYLE`; text remains text in SVG. Curves are thinned to what a
-page can show, so that a file has tens of kilobytes whatever the run's length.
+The report is one HTML page with MathML, without script or network, which adapts to dark mode, narrow screens and
+paper. Pictures are drawn by Matplotlib under :data:`STYLE`: one colour per scheme, and curves thinned to what a page
+shows.
 """
 
 from __future__ import annotations

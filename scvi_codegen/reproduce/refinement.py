@@ -1,12 +1,8 @@
-"""Errors of one step of SVI and SC over the number of points and over the step size, and the paper's lines.
+"""Errors of one step of SVI and SC over the number of points (figures 6, 16, 17) and over the step size (7, 8, 18-20).
 
 The captions state neither the eccentricity nor, unambiguously, what "N" counts: the number of points, as they say, or
 the degree, as in other figures. Verdicts are based on the cases that are judged; the others show how the result depends
-on what a caption leaves open.
-
-Figures of errors of one step: over the number of points (6, 16, 17) and over the step size (7, 8, 18-20).
-
-Their studies are those of ``refinement.toml``.
+on what a caption leaves open. The studies are those of ``refinement.toml``.
 """
 
 import math
@@ -219,8 +215,7 @@ def is_straight(n: Array, errors: Array) -> bool:
 def factors(n: Array, errors: Array, line: Law) -> Array:
     """Return the factor, at least 1, between each error that counts and a line."""
     used = within(errors)
-    result: Array = np.exp(np.abs(np.log(errors[used]) - np.log(line.constant) - n[used] * np.log(line.base)))
-    return result
+    return np.asarray(np.exp(np.abs(np.log(errors[used]) - np.log(line.constant) - n[used] * np.log(line.base))))
 
 
 def refinement(name: str, title: str, study: Study) -> Experiment:

@@ -1,12 +1,8 @@
-"""Runs of several methods on one system with the settings of the paper's captions, and quantities measured on them.
+"""Figures of runs (1, 3-5, 9-15, 21-30): several methods on one system, views as panels, and conditions of a verdict.
 
 The paper ends the nonlinear iteration when max(|Q^{i+1} - Q^i|, |P^{i+1} - P^i|) < TOL with TOL = 1e-14 in section 3
 and 1e-12 in section 4, after at most 1000 iterations: :data:`SECTION_3` and :data:`SECTION_4`. Code is compiled with
-flags that give the same bits on every machine.
-
-Figures of runs (1, 3-5, 9-15, 21-30): views turn runs into panels, checks into numbers and conditions of a verdict.
-
-Their settings, views and checks are those of ``figures.toml``.
+flags that give the same bits on every machine. Settings, views and checks are those of ``figures.toml``.
 """
 
 from __future__ import annotations
@@ -237,8 +233,7 @@ def _revolutions(r: MeasuredRun) -> list[float]:
 
 def angular_momentum(q: Array, p: Array) -> Array:
     """Return M = q1 p2 - q2 p1, along the last axis."""
-    result: Array = q[..., 0] * p[..., 1] - q[..., 1] * p[..., 0]
-    return result
+    return np.asarray(q[..., 0] * p[..., 1] - q[..., 1] * p[..., 0])
 
 
 def exact_oscillator(q: Sequence[float], p: Sequence[float], t: Array) -> tuple[Array, Array]:

@@ -5,9 +5,7 @@ integrators". Order, symplecticity, symmetry and A-stability are computed from A
 *Geometric Numerical Integration*, 2nd ed. 2006, here GNI; Hairer & Wanner, *Solving Ordinary Differential Equations
 II*, 2nd ed. 1996, here HW).
 
-A-stability tests on polynomials with 60-digit coefficients: Routh's criterion and Sturm's theorem.
-
-Coefficients below 1e-30 of their scale count as zero, so that exact zeros are recognised as such.
+A-stability is tested by Routh's criterion and Sturm's theorem; coefficients below 1e-30 of their scale count as zero.
 """
 
 from __future__ import annotations

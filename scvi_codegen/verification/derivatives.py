@@ -50,16 +50,14 @@ class _Map:
         values, m = self.parameters, len(self.state.q)
         h = self.state.h
         sizes = np.concatenate([self.scales[: 2 * m], np.where(values, values, 1.0), [h, h]])
-        direction: Array = sizes * (1.5 + np.sin(phase + 1.7 * np.arange(len(sizes))))
-        return direction
+        return np.asarray(sizes * (1.5 + np.sin(phase + 1.7 * np.arange(len(sizes)))))
 
     def propagated(self, vector: Array, *, back: bool) -> Array:
         """Return J v of the compiled Jacobian J, or J^T v."""
         vectors = np.zeros((2, 1, len(vector)))
         vectors[int(back)] = vector
         self.stepper._propagate(_starts(self.state), vectors, self.parameters, None, transpose=back)
-        carried: Array = vectors[int(not back), 0]
-        return carried
+        return np.asarray(vectors[int(not back), 0])
 
     def moved_end(self, change: Array) -> Array:
         """Return the results for perturbed arguments, in 60 digits."""
@@ -184,8 +182,7 @@ def _has_second_derivatives(tested: SystemUnderTest) -> bool:
 
 def _weights(step: _Map) -> Array:
     """Return (2m,) weights of a scalar function of the end state, to which all components contribute alike."""
-    weights: Array = (1.3 + np.cos(2.0 + np.arange(len(step.scales)))) / step.scales
-    return weights
+    return np.asarray((1.3 + np.cos(2.0 + np.arange(len(step.scales)))) / step.scales)
 
 
 def _hessian(step: _Map) -> Array:
@@ -195,8 +192,7 @@ def _hessian(step: _Map) -> Array:
     changes[0], vectors[1, 0, :, : len(step.scales)] = np.eye(size), _weights(step)
     step.stepper._propagate(starts, changes, step.parameters, None)
     step.stepper._second_order_adjoint(starts, changes, vectors, step.parameters, None)
-    hessian: Array = vectors[0, 1]
-    return hessian
+    return np.asarray(vectors[0, 1])
 
 
 def time_transformation_derivative_checks(runs: VariableSteps) -> Iterator[Check]:

@@ -112,8 +112,7 @@ def _sums(tested: SystemUnderTest) -> Finding:
 
 
 def _large_compensation(state: State, scales: Array) -> Array:
-    carry: Array = LARGE_COMPENSATION * scales * np.cos(1.0 + 2.0 * np.arange(len(state.z)))
-    return carry
+    return np.asarray(LARGE_COMPENSATION * scales * np.cos(1.0 + 2.0 * np.arange(len(state.z))))
 
 
 def _low_words(tested: SystemUnderTest) -> Finding | None:

@@ -1,11 +1,7 @@
 """Checks of the compiled step against the stage equations of the method, in 60 digits and by finite differences.
 
-Check of the predictor: the initial guess of the stages, extrapolated from previous steps.
-
-One iteration is made from the straight line and one from the predictor; the errors that remain are compared. The stages
-of one step predict the curve to a higher order in h than a straight line, those of two steps to a higher order still,
-so that at a small step size the predictor is far better. An error in its tables does not change the solution, only the
-number of iterations, so that no state would show it.
+The predictor is checked by one iteration from it and one from the straight line: at a small step size it leaves a far
+smaller error. An error in its tables changes only the number of iterations, so that no state would show it.
 """
 
 import itertools

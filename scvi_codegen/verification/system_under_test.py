@@ -1,7 +1,4 @@
-"""Jacobian of a step by finite differences, and the propagation of round-off through it.
-
-System under test: the stepper, a stepper with Newton's method alone, and generic states.
-"""
+"""System under test: the stepper, a stepper with Newton's method alone, generic states, and rounding of a step."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -44,8 +41,7 @@ class Jacobian:
 
     def propagated(self, change: Array) -> Array:
         """Return (2m,) bounds on the change of the end for changes of the arguments of any sign."""
-        spread: Array = self.scales * (np.abs(self.matrix) @ (np.abs(change) / self.scales))
-        return spread
+        return np.asarray(self.scales * (np.abs(self.matrix) @ (np.abs(change) / self.scales)))
 
 
 def linearised(step: Map, state: Array, scales: Array) -> Jacobian | None:
@@ -70,8 +66,7 @@ def _differences(step: Map, state: Array, scales: Array, width: float) -> Array:
     for unit in np.diag(width * scales):
         derivatives = sum(w * (step(state + k * unit) - step(state - k * unit)) for k, w in WEIGHTS.items())
         columns.append(derivatives / (width * scales))
-    matrix: Array = np.array(columns).T
-    return matrix
+    return np.asarray(np.array(columns).T)
 
 
 EPSILON = 2.0**-52
@@ -219,8 +214,7 @@ class SystemUnderTest:
     def tangents(self, state: State) -> Array:
         """Return (2m, 2(m - c)) directions, in units of :meth:`scales`, tangent to the constrained phase space."""
         left = 2 * (len(state.q) - len(self.system.constraints))
-        result: Array = np.linalg.svd(self.constraint_derivatives(state, self.scales(state)))[2][-left:].T
-        return result
+        return np.asarray(np.linalg.svd(self.constraint_derivatives(state, self.scales(state)))[2][-left:].T)
 
     def constraint_derivatives(self, state: State, units: Array) -> Array:
         """Return (2c, 2m) derivatives of constraints and their rates with respect to the state, in ``units``."""
@@ -313,15 +307,9 @@ class SystemUnderTest:
         longer = self.ends(State(state.q, state.p, state.t, state.h + time_change))
         step_change = np.abs(longer - end) / abs(time_change) * abs(state.h)
         total = propagated + np.abs(end) + np.abs(end - state.z) + drift + step_change
-        result: Array = EPSILON * np.maximum(total, self._least_sizes(state, end)) + np.finfo(float).tiny
-        return result
-
-    def _least_sizes(self, state: State, end: Array) -> Array:
-        """Return (2m,) :meth:`scales`, increased to the largest change relative to them."""
         sizes = self.scales(state)
-        relative = (np.abs(end - state.z) / sizes).reshape(2, -1).max(axis=1, initial=1.0)
-        least: Array = sizes * np.repeat(relative, len(state.q))
-        return least
+        changes = (np.abs(end - state.z) / sizes).reshape(2, -1).max(axis=1, initial=1.0)
+        return np.asarray(EPSILON * np.maximum(total, sizes * np.repeat(changes, len(state.q))) + np.finfo(float).tiny)
 
     def derived(self, method: Method | None = None, system: MechanicalSystem | None = None) -> DerivedStep:
         """Return the equations of the step in 60 digits, optionally of another method or system.

@@ -1,13 +1,4 @@
-"""Sections of the page, in order, and the page.
-
-Definition of the system, its parameters, and the equations of motion.
-
-Equations of a step: in compact form with sums, and component by component if they are short.
-
-Formulas of each kernel next to its C, and the operations saved by common subexpressions.
-
-Functions around the kernels, in the order of their calls: their purpose, and their C.
-"""
+"""Sections of the page: system and equations of motion, equations of a step, kernels and functions with their C."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence

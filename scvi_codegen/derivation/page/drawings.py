@@ -1,9 +1,4 @@
-"""Drawing of a step as a line, with the nodes, stages and quadrature points of a method.
-
-Trial curve of a method, in words and formulas, and its tables.
-
-Sparsity pattern of the Jacobian of the stage equations, from the tables and the derivatives of kernels.
-"""
+"""Drawings of a page: points of a method, its trial curve with tables, and the pattern of the Jacobian."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass

@@ -1,14 +1,9 @@
 """Chaos indicators of many initial states: tangent vectors propagated along each trajectory, in parallel threads.
 
-If the ensemble source supports variational equations they run in SIMD lanes. Otherwise, and where a SIMD step fails,
-states and derivatives are computed trajectory by trajectory in C, chunk by chunk. Only the indicator series are stored,
-so memory does not limit the number of initial states.
-
-Tangent vectors of many trajectories in SIMD lanes: each lane integrates a trajectory and its variational equations.
-
-The variations are additional coordinates (:mod:`scvi_codegen.mechanics.derived_systems`) of an ensemble. After each
-block of steps the tangent frame of every lane is replaced by Q of its QR factorisation. A block is repeated with half
-as many steps if its R shows that the tangent vectors became nearly parallel.
+In SIMD lanes the variations are additional coordinates (:mod:`scvi_codegen.mechanics.derived_systems`) of an ensemble.
+After each block of steps the tangent frame of every lane is replaced by Q of its QR factorisation; a block is repeated
+with half as many steps if its R shows that the tangent vectors became nearly parallel. Systems without variational
+equations in lanes, and lanes whose step fails, are computed trajectory by trajectory. Only the indicators are stored.
 """
 
 from collections.abc import Callable, Iterator
