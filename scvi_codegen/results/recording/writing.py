@@ -38,6 +38,7 @@ from scvi_codegen.results.recording.reading import RecordedRun, load_run
 from scvi_codegen.runtime.run.accuracy import warn_of_energy_error, warn_of_large_steps, warn_of_unresolved_fields
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.observation import Observation
+from scvi_codegen.runtime.run.observers import Saver
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.run_loop import record
 from scvi_codegen.runtime.run.step_plan import StepPlan
@@ -263,7 +264,7 @@ class _Recorder:
         run, save_every = self.run, self.manifest.save_every
         try:
             if run.stepper.events:
-                trajectory = Observation(run, save_every=save_every, within_steps=False).advance(steps)
+                trajectory = Observation(run, Saver(save_every, within_steps=False)).advance(steps)
             else:
                 trajectory = record(run, steps, save_every=save_every)
         except (StepFailedError, EventError) as error:

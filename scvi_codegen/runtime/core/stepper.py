@@ -46,6 +46,7 @@ from scvi_codegen.runtime.run.accuracy import (
 )
 from scvi_codegen.runtime.run.global_error import checked_error, confirmed_run, warn_of_unconfirmed
 from scvi_codegen.runtime.run.largest_step import largest_step
+from scvi_codegen.runtime.run.observers import Observe
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.saving import read_checkpoint
 from scvi_codegen.runtime.run.step_plan import StepPlan, checked_plan, planned_steps
@@ -87,7 +88,7 @@ class Stepper(Integrator):
         options: SolverOptions | None = None,
         progress: Callable[[int], None] | None = None,
         t_eval: ArrayLike | None = None,
-        observe: Callable[[Run], ArrayLike] | None = None,
+        observe: Observe = None,
         events: EventLike | Sequence[EventLike] | None = None,
         error: float | None = None,
         check_growth: bool | None = None,
@@ -117,7 +118,9 @@ class Stepper(Integrator):
             t_eval: (n,) output times, sorted in the direction of the run, instead of ``save_every``; see
                 :meth:`Trajectory.at`. Not with inputs.
             observe: function of the run that returns the data to save instead of the states, a number or an array of
-                constant shape, in ``observed`` of the trajectory. Not with inputs.
+                constant shape, in ``observed`` of the trajectory; or an observer of all states
+                (:class:`~scvi_codegen.runtime.run.observer.Observer`) or its name, whose result is saved there:
+                ``"extremes"``, the smallest and largest positions and momenta. Not with inputs.
             events: zero crossings to record in ``events`` of the trajectory; a terminal one ends the run, others may
                 change the state (:func:`~scvi_codegen.impact`), which is saved as a further state. One or several
                 :class:`~scvi_codegen.runtime.events.event.Event` or functions of (q, v, p, t) as text or SymPy

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.constraints.projection import constraint_values, multipliers
@@ -18,6 +17,7 @@ from scvi_codegen.runtime.run.accuracy import warn_of_inaccuracy
 from scvi_codegen.runtime.run.descriptions import describe_run
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.observation import Observation
+from scvi_codegen.runtime.run.observers import Observe, Saver, saver_of
 from scvi_codegen.runtime.run.one_thread import alone
 from scvi_codegen.runtime.run.run_loop import FIRST_STEPS, ShortRuns, integrate_short, record
 from scvi_codegen.runtime.run.step_plan import StepPlan
@@ -87,7 +87,7 @@ class Run(Memory, AttitudeHistory):
         if not self.stepper.changes_states:
             super()._advance_timed(steps, progress, stop)
         else:
-            Observation(self, save_every=LARGEST_COUNT).advance(steps, progress, stop)
+            Observation(self, Saver(LARGEST_COUNT)).advance(steps, progress, stop)
 
     def _recorded(
         self,
@@ -95,14 +95,15 @@ class Run(Memory, AttitudeHistory):
         save_every: int = 1,
         times: Array | None = None,
         progress: Callable[[int], None] | None = None,
-        observe: Callable[[Run], ArrayLike] | None = None,
+        observe: Observe = None,
         stop: Callable[[], bool] | None = None,
     ) -> Trajectory:
         """Return the states as :meth:`record` does, or those at ``times``, without its warnings and its lock."""
         plan = self._plan
         if self.stepper.events or times is not None or observe is not None or (plan.h and plan.t_end != math.inf):
-            recorder = Observation(self, save_every=save_every, times=times, observe=observe)
-            return recorder.advance(steps, progress, stop or (lambda: False))
+            return Observation(self, saver_of(observe, times, save_every)).advance(
+                steps, progress, stop or (lambda: False)
+            )
         return record(self, steps, save_every=save_every, progress=progress, stop=stop)
 
     def _integrated(
@@ -115,7 +116,7 @@ class Run(Memory, AttitudeHistory):
         save_every: int,
         times: Array | None,
         progress: Callable[[int], None] | None,
-        observe: Callable[[Run], ArrayLike] | None,
+        observe: Observe,
     ) -> Trajectory:
         """Start a run that is set up at (q, p) and record it as :meth:`_recorded`, a short one by one C call."""
         plan, stores_all = self._plan, times is None and observe is None and progress is None

@@ -1,0 +1,74 @@
+"""Observers receive every state of a run once, in any situation."""
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.runtime.run.observer import Observer
+
+STATE = {"q": [1.0, 0.0], "p": [0.0, 1.1], "h": 0.1}
+SITUATIONS = {
+    "steps": {"steps": 500},
+    "to a time between steps": {"t_end": 33.33},
+    "adaptive": {"h": None, "t_end": 33.33},
+    "to a terminal event": {"steps": 500, "events": sc.Event("q2 - 0.3", terminal=3)},
+    "with impacts": {"steps": 200, "events": sc.impact("q1 - 0.2")},
+}
+
+
+class Everything(Observer):
+    """Observer that keeps all states and limits its chunks."""
+
+    def __init__(self) -> None:
+        self.states, self.sizes = [], []
+
+    def most_steps(self, run):
+        """Return the number of steps of a chunk."""
+        return 17
+
+    def receive(self, chunk):
+        """Keep the states that are new."""
+        states = np.concatenate([chunk.states.q, chunk.states.p], axis=1)
+        if not chunk.is_first:
+            assert np.array_equal(states[0], self.states[-1])
+            self.sizes.append(len(states) - 1)
+        self.states.extend(states[0 if chunk.is_first else 1 :])
+
+    def result(self):
+        """Return all states."""
+        return self.states
+
+
+@pytest.fixture(scope="module")
+def stepper():
+    return sc.compile_stepper(sc.problem("kepler").system, "svi:2")
+
+
+@pytest.mark.parametrize("situation", SITUATIONS)
+def test_observers_receive_the_states_that_a_run_saves(stepper, situation):
+    arguments = STATE | SITUATIONS[situation]
+    saved, everything = stepper.integrate(**arguments), Everything()
+    states = np.concatenate([saved.q, saved.p], axis=1)
+    observed = stepper.integrate(**arguments, observe=everything)
+    assert np.array_equal(observed.observed, states)
+    assert np.array_equal(observed.t, saved.t)
+    assert np.array_equal(observed.q, saved.q[[0, -1]])
+    assert len(everything.sizes) > 5
+    extremes = stepper.integrate(**arguments, observe="extremes").observed
+    assert np.array_equal(extremes, [states.min(axis=0), states.max(axis=0)])
+
+
+def test_observers_and_functions_save_the_same_times(stepper):
+    energies, extremes = (
+        stepper.integrate(**STATE, steps=50, save_every=7, observe=observe)
+        for observe in (lambda run: run.energy, "extremes")
+    )
+    assert np.array_equal(energies.t, extremes.t)
+    assert np.array_equal(energies.observed, energies.conserved[:, 2])
+    assert np.array_equal(energies.conserved, extremes.conserved, equal_nan=True)
+
+
+@pytest.mark.parametrize(("observe", "message"), [("extreme", "did you mean 'extremes'"), (3, "function of the run")])
+def test_unknown_observers_are_rejected(stepper, observe, message):
+    with pytest.raises(sc.StateError, match=message):
+        stepper.integrate(**STATE, steps=3, observe=observe)
