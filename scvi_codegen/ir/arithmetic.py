@@ -177,11 +177,9 @@ class _Graph:
         root = self.node(("sqrt", (x,))) if half else None
         if whole == 0 and root is not None:
             return root
-        power = self._whole(x, whole) if whole > 0 else self._whole(self._inverse(x), -whole)
+        base = x if whole > 0 else self.node(("/", (self.node(Constant(Fraction(1))), x)))
+        power = self._whole(base, abs(whole))
         return power if root is None else self.node(("*", (power, root)))
-
-    def _inverse(self, x: int) -> int:
-        return self.node(("/", (self.node(Constant(Fraction(1))), x)))
 
     def _whole(self, x: int, n: int) -> int:
         """Return the node of x^n by repeated squaring, n >= 1."""

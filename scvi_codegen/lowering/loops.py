@@ -251,15 +251,11 @@ def reach_of(arrays: Iterable[Array], term_groups: Iterable[RolledKernel]) -> in
         for slot in rolled.reads
         if target != slot
     ]
-    if not all(_same_loops(*pair) for pair in pairs):
+    axes = [axis for target, slot in pairs for axis in zip(target.places, slot.places, strict=False)]
+    if any(a.table or b.table or a.index != b.index for a, b in axes):
         return 0
     distant = any(_distance(*pair) for pair in pairs if pair[0].array == pair[1].array)
     return max(_distance(*pair) for pair in pairs) if distant else 0
-
-
-def _same_loops(one: Access, other: Access) -> bool:
-    """Return whether two entries have the same index on every axis that both have."""
-    return not any(a.table or b.table or a.index != b.index for a, b in zip(one.places, other.places, strict=False))
 
 
 def _distance(one: Access, other: Access) -> int:

@@ -299,8 +299,10 @@ def _stage_curve(stages: StageSystem) -> StageCurve | None:
         differences = [(0, last), (0, (last + 1) // 2)]
         rows = [tuple(mp.mpf((b == last) - (b == first)) for b in range(count)) for first, last in differences]
         power = 2 * degree
-    elif isinstance(shape, Accelerations | ShotCurve | PrintedCurve) and _distinct(shape.tableau.c):
+    elif isinstance(shape, Accelerations | ShotCurve | PrintedCurve):
         c, size = shape.tableau.c, len(shape.tableau.c)
+        if len({*c}) < size:
+            return None
         first, tops = 1, [legendre_functional(c, k) for k in (size - 1, size - 2)]
         rows = [tuple(mp.mpf(b == only) for b in range(count)) for only in (1, size)]
         power = 2 * size
@@ -326,10 +328,6 @@ def _moves(stages: StageSystem, shape: Velocities) -> bool:
     """Return whether the velocities, the first blocks, are the only unknowns that displace positions."""
     degree = len(shape.blocks)
     return degree == len({*shape.blocks}) and all(block.moves == (b < degree) for b, block in enumerate(stages.blocks))
-
-
-def _distinct(points: Vector) -> bool:
-    return len(set(points)) == len(points)
 
 
 def _integrals(system: MechanicalSystem, method: Method, stages: StageSystem) -> Integrals | None:

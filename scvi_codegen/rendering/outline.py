@@ -53,17 +53,16 @@ def _function(match: re.Match[str], known: Mapping[str, re.Match[str]]) -> Funct
     called = dict.fromkeys(re.findall(r"\b(\w+)\(", match["body"]))
     return Function(
         name=match["name"],
-        arguments=tuple(_last_word(argument) for argument in match["arguments"].split(",") if argument != "void"),
+        arguments=tuple(
+            re.findall(r"\w+", re.sub(r"\[.*?\]|\)", "", argument))[-1]
+            for argument in match["arguments"].split(",")
+            if argument != "void"
+        ),
         comment=" ".join((match["comment"] or "").replace("\n *", " ").split()),
         body=match["body"],
         text=match["text"],
         calls=tuple(name for name in called if name in known and name != match["name"]),
     )
-
-
-def _last_word(argument: str) -> str:
-    words: list[str] = re.findall(r"\w+", re.sub(r"\[.*?\]|\)", "", argument))
-    return words[-1]
 
 
 def reached(functions: Mapping[str, Function], start: str) -> tuple[Function, ...]:

@@ -7,7 +7,7 @@ Terms are in the order in which the loops of ``support/newton/stages.h`` add the
 with 0 are omitted, products with 1 simplified.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import accumulate
@@ -267,16 +267,23 @@ def _text(kernel: Kernel, target: Target, lanes: Lanes | None, printed: Printed,
     time, parameter = (lanes.type_of(name) if lanes else real for name in ("t", "parameters"))
     declared = {name: f"{real} *{name}" for name in ARRAYS} | {"u": f"const {real} *u", "t": f"{time} t"}
     declared |= {"parameters": f"const {parameter} *parameters", "kept": f"{real} *restrict kept"}
+    cut = parts(kernel)
     texts = [
         _function(PART, part, [declared[name] for name in ARRAYS if part.uses(name)], printed(part))
-        for part in _parts(kernel)
+        for part in (cut if len(cut) > 1 else ())
     ]
     texts += [
         text for each in kernel.sums for text in (_text(each.kernel, target, lanes, printed), *_tables(each, target))
     ]
     statements = [*printed(kernel), *(line for each in kernel.sums for line in _Rows(each, real, parameter).lines())]
-    storage = "static inline" if lanes else "static"
-    return "\n\n".join([*texts, _whole(storage, kernel, _arguments(kernel, declared, partials=partials), statements)])
+    last = ["derivative"] if len(kernel.results) > kernel.values or partials else []
+    names = ["u", "t", "parameters", "value", *last]
+    unused = ", ".join(f"(void){name}" for name in names if name != "value" and not kernel.uses(name))
+    counts = ", ".join(f"{count} {operator}" for operator, count in kernel.operation_counts().items()) or "constants"
+    comment = wrapped_comment(f"{kernel.purpose} Operations: {counts}.".strip())
+    body = [*([f"{unused};"] if unused else []), *statements]
+    whole = _function("static inline" if lanes else "static", kernel, [declared[name] for name in names], body)
+    return "\n\n".join([*texts, f"{comment}\n{whole}"])
 
 
 def lane_mass_text(kernel: Kernel, fixed_point: FixedPointIteration, lanes: Lanes, target: Target) -> str:
@@ -331,27 +338,6 @@ class _Rows(Nest):
 
     def table_entry(self, place: Place) -> str:
         return f"{_named(self.rolled, place.table)}[index_{place.index}][{place.column}]"
-
-
-def _parts(kernel: Kernel) -> tuple[Part, ...]:
-    """Return the functions that a kernel calls if it is divided into several."""
-    cut = parts(kernel)
-    return cut if len(cut) > 1 else ()
-
-
-def _arguments(kernel: Kernel, declared: Mapping[str, str], *, partials: bool = False) -> list[str]:
-    last = ["derivative"] if len(kernel.results) > kernel.values or partials else []
-    return [declared[name] for name in ("u", "t", "parameters", "value", *last)]
-
-
-def _whole(storage: str, kernel: Kernel, arguments: Sequence[str], statements: Sequence[str]) -> str:
-    """Return a kernel with its comment; unused arguments are cast to void first."""
-    counts = ", ".join(f"{count} {operator}" for operator, count in kernel.operation_counts().items()) or "constants"
-    names = [argument.split()[-1].lstrip("*") for argument in arguments]
-    unused = ", ".join(f"(void){name}" for name in names if name != "value" and not kernel.uses(name))
-    body = [*([f"{unused};"] if unused else []), *statements]
-    comment = wrapped_comment(f"{kernel.purpose} Operations: {counts}.".strip())
-    return f"{comment}\n{_function(storage, kernel, arguments, body)}"
 
 
 def _function(storage: str, code: Kernel | Part, arguments: Sequence[str], statements: Sequence[str]) -> str:

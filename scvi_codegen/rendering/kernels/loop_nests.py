@@ -331,27 +331,20 @@ class Nest:
 
     def function(self, head: str, arguments: Sequence[str], lines: Sequence[str], *, values: str = "") -> str:
         """Return the loops as a function; without values no kernel is evaluated."""
-        known = [*self._arrays("\n".join(lines)), *self._unknowns(), *self._parameters(values)]
+        known = [*self._arrays("\n".join(lines))]
+        if self.source and self.rolled.reads:
+            known.append(f"{self.scalar} u[{len(self.rolled.reads)}];")
+        elif self.source:
+            known += [f"const {self.scalar} u[1] = {{0}};", f"(void){self.source};"]
+        if values:
+            count = max(1, self.scalars + len(self.rolled.given))
+            known += [f"{values};", f"double parameters[{count}] = {{0}};"]
+            known += [f"parameters[{k}] = given->parameters[{k}];" for k in range(self.scalars)]
         body = [*sizes_text(self.layout, "\n".join([*known, *lines])), *known, *lines]
         text = "\n".join(wrapped(line.strip(), indent=2 + len(line) - len(line.lstrip())) for line in body)
         whole = (argument.replace(" ", "\0") for argument in arguments)
         signature = wrapped(f"{head}({', '.join(whole)})", indent=0)
         return f"{wrapped_comment(self.rolled.text)}\n{signature}\n{{\n{text}\n}}"
-
-    def _unknowns(self) -> Iterator[str]:
-        """Yield the declaration of the arguments of the kernel, if it has any."""
-        if self.source and self.rolled.reads:
-            yield f"{self.scalar} u[{len(self.rolled.reads)}];"
-        elif self.source:
-            yield f"const {self.scalar} u[1] = {{0}};"
-            yield f"(void){self.source};"
-
-    def _parameters(self, values: str) -> Iterator[str]:
-        """Yield the declarations of the parameters and values of the kernel."""
-        if values:
-            yield f"{values};"
-            yield f"double parameters[{max(1, self.scalars + len(self.rolled.given))}] = {{0}};"
-            yield from (f"parameters[{k}] = given->parameters[{k}];" for k in range(self.scalars))
 
     def _arrays(self, text: str) -> Iterator[str]:
         yield from starts_text(self.layout, text)

@@ -47,7 +47,7 @@ def loop_context(program: Program) -> dict[str, Any]:
     """Return the template's context for the program of a system of arrays."""
     loops, constrained, pairs = program.loops, program.loops.constrained, _circulants(program)
     sums, fixed_point = _convolutions(program), program.fixed_point
-    starts = [*starts_text(program.layout, " ".join(sums))]
+    starts, lengths = [*starts_text(program.layout, " ".join(sums))], [*map(product_text, program.layout.fields)]
     terms = [(each, each.scalar) for each in loops.forces if each.scalar]
     terms += [(each, each.kernel) for each in loops.constants]
     scalars = [each.kernel for each in loops.masses] + [scalar for _, scalar in terms]
@@ -82,19 +82,14 @@ def loop_context(program: Program) -> dict[str, Any]:
         "work": _step_work(program) + _transform_work(program),
         "continued": loops.continued,
         "site_functions": [_site_text(program, each) for each in (*loops.velocities, *loops.momenta)],
-        **_field_lengths(program),
+        "field_lengths": lengths,
+        "field_sizes": [*sizes_text(program.layout, " ".join(lengths))],
         **_map_context(program),
         "hot": "static",
         "waves": _lattice_context(program) if _on_lattices(program) else None,
         "arrays": [(product_text(each), int(_is_field(each, loops.applied))) for each in program.layout.coordinates],
         **_constraint_context(program, constrained),
     }
-
-
-def _field_lengths(program: Program) -> dict[str, Any]:
-    """Return the numbers of entries of the fields in C."""
-    lengths = [product_text(array) for array in program.layout.fields]
-    return {"field_lengths": lengths, "field_sizes": list(sizes_text(program.layout, " ".join(lengths)))}
 
 
 def _map_context(program: Program) -> dict[str, Any]:
