@@ -171,7 +171,7 @@ def parse_force(
         rows = [{**row, name: value} for row in rows for value in values]
     forces = []
     for row in rows:
-        targets, formula = (ArrayParser(given, symbols, arrays, tables) for given in (target, text))
+        targets, formula = (ArrayParser(part, symbols, arrays, tables) for part in (target, text))
         targets.in_scope, formula.in_scope = dict(row), dict(row)
         slot, expression = parsed(targets), parsed(formula)
         loops = tuple(bound for bound in row.values() if isinstance(bound, Loop))
@@ -428,10 +428,10 @@ class EntryRules:
     tables: Tables
     names: Mapping[str, NDArray[np.str_]]
 
-    def rules(self, of: ArrayTerm | ArrayForce) -> Iterator[tuple[Elements, dict[Symbol, Expr]]]:
+    def rules(self, term: ArrayTerm | ArrayForce) -> Iterator[tuple[Elements, dict[Symbol, Expr]]]:
         """Yield the values of the indices with the symbol that replaces each access."""
-        for at in _elements(of.loops, self.sizes):
-            yield at, {slot: self.entry(access, at, of.loops) for slot, access in of.slots}
+        for at in _elements(term.loops, self.sizes):
+            yield at, {slot: self.entry(access, at, term.loops) for slot, access in term.slots}
 
     def forces(self, forces: Sequence[ArrayForce]) -> dict[Symbol, list[Expr]]:
         """Return the contributions to the force on each coordinate."""

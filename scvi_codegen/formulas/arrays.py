@@ -138,10 +138,10 @@ class _Indices(Parser):
         self.position += 1
         return token
 
-    def take_name(self, what: str) -> Token:
+    def take_name(self, role: str) -> Token:
         token = self.peek()
         if token.kind != "name":
-            self.refuse(f"{what} is expected here, not '{token.text}'", token.column)
+            self.refuse(f"{role} is expected here, not '{token.text}'", token.column)
         self.position += 1
         return token
 
@@ -229,9 +229,9 @@ class ArrayParser(_Indices):
             known = ", ".join(map(str, self.arrays.values())) or "none"
             self.refuse(f"'{name}' is not an array{closest(name, self.arrays)} Arrays: {known}", column)
         if name in self.in_scope or name in self.sizes:
-            what = "an index" if name in self.in_scope else "a size"
+            kind = "an index" if name in self.in_scope else "a size"
             self.refuse(
-                f"'{name}' is {what}, which may occur only in brackets and bounds: declare a parameter for its value",
+                f"'{name}' is {kind}, which may occur only in brackets and bounds: declare a parameter for its value",
                 column,
             )
         return super().name(name, column)
@@ -279,9 +279,9 @@ class ArrayParser(_Indices):
         terms, formula = [], self.sum().expand()
         self.end_of_sum([loop])
         for term in Add.make_args(formula):
-            if (found := convolution_of(term, loop, self.accesses, self.in_scope)) is None:
+            if (product := convolution_of(term, loop, self.accesses, self.in_scope)) is None:
                 self.refuse(NESTED, column)
-            terms.append(found[0] * self.slot(found[1]))
+            terms.append(product[0] * self.slot(product[1]))
         return Add(*terms)
 
     def written_out(self, loops: Sequence[Loop], column: int) -> Expr:

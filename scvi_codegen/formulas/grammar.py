@@ -186,8 +186,8 @@ class Parser:
             self.refuse(f"unexpected '{text}': there is nothing for it to close or separate", column)
         if kind == "end":
             self.refuse("the formula ends inside brackets: a ')' is missing", column)
-        what = "only the functions of the grammar can be called" if text == "(" else "write * for a product"
-        self.refuse(f"an operator is missing before '{text}': {what}", column)
+        remedy = "only the functions of the grammar can be called" if text == "(" else "write * for a product"
+        self.refuse(f"an operator is missing before '{text}': {remedy}", column)
 
     def accept(self, *operators: str) -> Token | None:
         """Return and consume the next token if it is one of these operators, else ``None``."""

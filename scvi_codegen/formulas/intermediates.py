@@ -174,16 +174,16 @@ def written_size(expression: Expr) -> int:
 
 def inner_of(expression: Expr) -> tuple[Intermediate, ...]:
     """Return the quantities in an expression, without those in their definitions."""
-    seen, found, pending = {expression}, [], [expression]
+    seen, quantities, pending = {expression}, [], [expression]
     while pending:
         node = pending.pop()
         if isinstance(node, Intermediate):
-            found.append(node)
+            quantities.append(node)
             continue
         new = [argument for argument in node.args if argument.args and argument not in seen]
         seen.update(new)
         pending += new
-    return tuple(found)
+    return tuple(quantities)
 
 
 def intermediates(*expressions: Expr) -> list[Intermediate]:

@@ -92,8 +92,8 @@ def parse_neighbours(
             raise SystemDefinitionError(
                 f"the box of the neighbours '{name}' must be one length, or one per component of {array} (at most 3)"
             )
-        given = (*box, entry["cutoff"], entry.get("skin", f"({entry['cutoff']})/8"))
-        lengths = [parse_expression(str(value), symbols) for value in given]
+        formulas = (*box, entry["cutoff"], entry.get("skin", f"({entry['cutoff']})/8"))
+        lengths = [parse_expression(str(value), symbols) for value in formulas]
         if wrong := [str(length) for length in lengths if length.is_number and not length > 0]:
             raise SystemDefinitionError(f"the lengths of the neighbours '{name}' must be positive, not {wrong[0]}")
         *periods, cutoff, skin = lengths
@@ -120,20 +120,20 @@ def convolution_of(
         bounds: loops of the enclosing sums by index.
     """
     entries = {slot: access for slot, access in accesses.items() if loop.index in access.indices}
-    found = sorted(
+    slots = sorted(
         (slot for slot in term.free_symbols if slot in entries),
         key=lambda slot: not any(place.minus for place in entries[slot].places),
     )
-    if len(found) != 2 or term.diff(*found) * found[0] * found[1] != term:
+    if len(slots) != 2 or term.diff(*slots) * slots[0] * slots[1] != term:
         return None
-    by, of = (entries[slot] for slot in found)
-    at = bounds.get(by.places[0].minus)
-    axes = [k for k, place in enumerate(of.places) if place.index == loop.index]
-    plain = of.places[axes[0]] == Place(index=loop.index) and of.array.axes[axes[0]] == loop.end
+    coefficients, convolved = (entries[slot] for slot in slots)
+    at = bounds.get(coefficients.places[0].minus)
+    axes = [k for k, place in enumerate(convolved.places) if place.index == loop.index]
+    plain = convolved.places[axes[0]] == Place(index=loop.index) and convolved.array.axes[axes[0]] == loop.end
     whole = isinstance(at, Loop) and at.is_whole and at.end == loop.end and loop.is_whole
-    if not (plain and whole) or len(axes) != 1 or by.array.axes != (loop.end,):
+    if not (plain and whole) or len(axes) != 1 or coefficients.array.axes != (loop.end,):
         return None
-    places = [*of.places]
-    places[axes[0]] = Place(index=by.places[0].minus)
-    added = Convolution(axes[0], by.array, loop.index)
-    return term.diff(*found), replace(of, places=tuple(places), sums=(*of.sums, added))
+    places = [*convolved.places]
+    places[axes[0]] = Place(index=coefficients.places[0].minus)
+    added = Convolution(axes[0], coefficients.array, loop.index)
+    return term.diff(*slots), replace(convolved, places=tuple(places), sums=(*convolved.sums, added))

@@ -44,7 +44,7 @@ from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.arrays import ROTATING, parse_coordinate
 from scvi_codegen.formulas.expressions import gradient, hessian
 from scvi_codegen.formulas.grammar import Parser, parsed
-from scvi_codegen.formulas.symbols import DOT, check_name, symbol
+from scvi_codegen.formulas.symbols import DOT, check_name, name_of_key, symbol
 from scvi_codegen.indices import Array, Size
 
 AXES = (1, 2, 3)
@@ -365,54 +365,71 @@ class RotationNames:
         self,
         coordinates: Sequence[str],
         read: Callable[[Any], Expr],
-        forces: Mapping[str, Any] | None,
+        forces: Mapping[Any, Any] | None,
         torques: Mapping[str, Sequence[Any]] | None,
         torques_space: Mapping[str, Sequence[Any]] | None,
         dissipation: Any,
-        others: Iterable[tuple[str, Matrix]] = (),
+        others: Iterable[tuple[str, Iterable[Expr]]] = (),
     ) -> Forces:
-        """Return the forces by name of a coordinate (one), rotation or direction (three components), and ``others``."""
+        """Return the forces by name of a coordinate (one), rotation or direction (three components), and ``others``.
+
+        Raises:
+            SystemDefinitionError: for forces and torques on other names, of other numbers of components, and a
+                dissipation without velocities.
+        """
+        if not isinstance(forces or {}, Mapping):
+            raise SystemDefinitionError(f"forces must be a mapping from coordinates to formulas, not {forces!r}")
         rotating = {member.name: member for member in self.rotations}
-        pointing = [member.name for member in self.members if isinstance(member, Direction)]
-        total: dict[str, Matrix] = {}
+        moved = [*coordinates, *(member.name for member in self.members if isinstance(member, Direction))]
+        total: dict[str, tuple[Expr, ...]] = {}
 
-        def add(name: str, force: Matrix) -> None:
-            total[name] = total[name] + force if name in total else force
+        def add(name: str, force: Iterable[Expr]) -> None:
+            total[name] = tuple(map(Add, total[name], force)) if name in total else tuple(force)
 
-        for what, by_name, known in (
-            ("force", forces, [*coordinates, *pointing]),
-            ("torque", torques, [*rotating]),
-            ("torque", torques_space, [*rotating]),
+        for kind, where, by_name, known in (
+            ("force", "coordinate", forces, moved),
+            ("torque", "rotation", torques, [*rotating]),
+            ("torque", "rotation", torques_space, [*rotating]),
         ):
-            for name, formulas in (by_name or {}).items():
+            for name, formulas in ((name_of_key(key), value) for key, value in (by_name or {}).items()):
                 if name not in known:
                     hint = f": write torques={{'{name}': [..]}}." if name in rotating else closest(name, known)
                     raise SystemDefinitionError(
-                        f"there is a {what} on '{name}'{hint} Possible: {', '.join(known) or 'none'}"
+                        f"there is a {kind} on '{name}', which is not a {where}{hint} "
+                        f"{where.capitalize()}s: {', '.join(known) or 'none'}"
                     )
-                texts = [formulas] if isinstance(formulas, str | Expr) else list(formulas)
-                if len(texts) != (1 if name in coordinates else len(AXES)):
-                    raise SystemDefinitionError(f"the {what} on '{name}' must have three components, not {formulas!r}")
-                force = Matrix([read(text) for text in texts])
-                if by_name is torques_space:
-                    force = Matrix(3, 3, rotating[name].entries).T * force
-                add(name, force)
-        friction = () if dissipation is None else self._friction(read(dissipation), coordinates)
-        for name, force in (*others, *friction):
-            add(name, force)
-        return tuple((name, tuple(force)) for name, force in total.items())
+                single = isinstance(formulas, str) or not isinstance(formulas, Sequence)
+                force = [*map(read, [formulas] if single else formulas)]
+                if len(force) != (1 if name in coordinates else len(AXES)):
+                    raise SystemDefinitionError(f"the {kind} on '{name}' must have three components, not {formulas!r}")
+                in_space = by_name is torques_space
+                add(name, Matrix(3, 3, rotating[name].entries).T * Matrix(force) if in_space else force)
+        friction = [] if dissipation is None else self._friction(read(dissipation), coordinates)
+        for name, components in (*others, *friction):
+            add(name, components)
+        return tuple(total.items())
 
-    def _friction(self, dissipation: Expr, coordinates: Sequence[str]) -> Iterator[tuple[str, Matrix]]:
-        """Yield the forces of Rayleigh's function."""
-        for name, rates in self._rates(coordinates).items():
-            if friction := gradient(dissipation, rates):
-                yield name, -Matrix([friction.get(i, S.Zero) for i in range(len(rates))])
+    def _friction(self, dissipation: Expr, coordinates: Sequence[str]) -> list[tuple[str, tuple[Expr, ...]]]:
+        """Return the forces -dD/dv of Rayleigh's function."""
+        rates = {name: (symbol(name + DOT),) for name in coordinates}
+        rates |= {member.name: member.rates for member in self.members}
+        derivatives = {name: gradient(dissipation, velocities) for name, velocities in rates.items()}
+        if not any(derivatives.values()):
+            raise SystemDefinitionError(
+                f"the dissipation {dissipation} contains no velocity: Rayleigh's function D(q, v) defines "
+                "the forces -dD/dv. Add velocities, or remove it"
+            )
+        return [
+            (name, tuple(-entries.get(i, S.Zero) for i in range(len(rates[name]))))
+            for name, entries in derivatives.items()
+            if entries
+        ]
 
     def fields(
         self,
         function: str,
         formula: Expr,
-        forces: Any,
+        forces: Forces,
         constraints: Sequence[Expr],
         variables: Sequence[str],
         parameters: Sequence[Symbol],
@@ -421,12 +438,9 @@ class RotationNames:
 
         Args:
             function: ``"lagrangian"`` or ``"hamiltonian"``.
-            formula, constraints: in the names of formulas.
-            forces: on all coordinates; with rotations by name (:meth:`forces_by_name`).
+            formula, forces, constraints: in the names of formulas.
             variables, parameters: names of all coordinates, symbols of the parameters.
         """
-        if not self.members:
-            return {function: formula, "forces": forces, "constraints": tuple(constraints)}
         fields = {
             "forces": self.forces(forces, variables),
             "constraints": tuple(map(self.in_coordinates, constraints)),
@@ -434,12 +448,8 @@ class RotationNames:
         }
         if function == "hamiltonian":
             return {function: self.in_coordinates(formula), "gauge": self.gauge(), **fields}
-        reduced = Reduced(formula, forces, tuple(constraints))
+        reduced = Reduced(formula, forces, tuple(constraints)) if self.members else None
         return {function: self.lagrangian(formula, parameters), "reduced": reduced, **fields}
-
-    def _rates(self, coordinates: Sequence[str]) -> dict[str, tuple[Symbol, ...]]:
-        ordinary = {name: (symbol(name + DOT),) for name in coordinates}
-        return ordinary | {member.name: member.rates for member in self.members}
 
     def forces(self, by_name: Forces, variables: Sequence[str]) -> tuple[Expr, ...]:
         """Return the generalised forces on all coordinates, in order; an empty tuple if there are none."""
@@ -534,10 +544,10 @@ class MemberArray:
         """Return the names of the entries of :attr:`formulas` and of both kinds of torques."""
         names: dict[str, dict[tuple[int, ...], str]] = {}
         for index, each in self.entries(sizes):
-            for of, name in zip(_all_names(self.member), _all_names(each), strict=True):
-                names.setdefault(of, {})[index] = name
+            for array, name in zip(_all_names(self.member), _all_names(each), strict=True):
+                names.setdefault(array, {})[index] = name
         shape = tuple(axis.at(sizes) for axis in self.axes)
-        return {of: np.array(list(each.values()), dtype=np.str_).reshape(shape) for of, each in names.items()}
+        return {array: np.array(list(each.values()), dtype=np.str_).reshape(shape) for array, each in names.items()}
 
 
 def member_arrays(
@@ -567,7 +577,7 @@ def entries_in_formulas(
 
     The values are the names of their entries, ``R_0_11``, ...
     """
-    by_name, found = {member.name: member for member in members}, dict[Array, NDArray[np.str_]]()
+    by_name, entries = {member.name: member for member in members}, dict[Array, NDArray[np.str_]]()
     for array in arrays:
         first = "_0" * (len(array.axes) - 1)
         member = by_name.get(array.name + first)
@@ -576,8 +586,8 @@ def entries_in_formulas(
                 member = replace(member, rate=member.rate.removesuffix(first))
             turning = MemberArray(replace(member, name=array.name), array.axes[:-1])
             names = turning.names(sizes)
-            found |= {each: names[each.name] for each in turning.formulas}
-    return found
+            entries |= {each: names[each.name] for each in turning.formulas}
+    return entries
 
 
 def torque_components(

@@ -16,7 +16,7 @@ from scvi_codegen.formulas.expressions import NAME_OF, evaluated, parts_of_type,
 from scvi_codegen.formulas.symbols import DOT, TIME, identifier, symbol
 
 
-def sympy_expression(value: Any, what: str) -> Expr:
+def sympy_expression(value: Any, role: str) -> Expr:
     """Return a SymPy expression; numbers are converted.
 
     Raises:
@@ -28,7 +28,7 @@ def sympy_expression(value: Any, what: str) -> Expr:
         expression = value
     if not isinstance(expression, Expr) or expression.is_Matrix:
         raise SystemDefinitionError(
-            f"the {what} is a {type(value).__name__}, not a SymPy expression (text goes to from_text)"
+            f"the {role} is a {type(value).__name__}, not a SymPy expression (text goes to from_text)"
         )
     return expression
 
@@ -85,14 +85,14 @@ class Translation:
             if free not in self.rules:
                 self._add(free, identifier(free.name))
 
-    def apply(self, expression: Expr, what: str = "Lagrangian") -> Expr:
+    def apply(self, expression: Expr, role: str = "Lagrangian") -> Expr:
         """Return the expression in canonical symbols, with exact numbers."""
         unfolded = {derivative: derivative.doit() for derivative in parts_of_type(sympy.Derivative, expression)}
         result = evaluated(expression.xreplace(unfolded), self.rules)
         leftover = sorted(parts_of_type(sympy.Derivative, result) or parts_of_type(AppliedUndef, result), key=str)
         if leftover:
             raise SystemDefinitionError(
-                f"'{leftover[0]}' in the {what} is neither a coordinate nor the velocity of one: list it among the "
+                f"'{leftover[0]}' in the {role} is neither a coordinate nor the velocity of one: list it among the "
                 "coordinates, or among the inputs if it is data, or write it with the functions of the grammar "
                 "(accelerations and other higher derivatives are not supported)"
             )

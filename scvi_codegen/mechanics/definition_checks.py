@@ -67,7 +67,7 @@ def warn_of_negative(name: str, coefficients: Mapping[str, Expr], constants: Map
     No warning is given where a coefficient was negative for all positive values tried: the sign is then in the formula.
     """
     warned = False
-    for what, formula in coefficients.items():
+    for coefficient, formula in coefficients.items():
         occurring = sorted(formula.free_symbols & constants.keys(), key=str)
         if not occurring or len(occurring) < len(formula.free_symbols):
             continue
@@ -76,7 +76,7 @@ def warn_of_negative(name: str, coefficients: Mapping[str, Expr], constants: Map
         if value is not None and value < 0 and any(sample >= 0 for sample in _positive_samples(tape, len(occurring))):
             defaults = ", ".join(f"{each} = {constants[each]:g}" for each in occurring)
             text = str(formula)
-            shown = f"{what} = {text}" if len(text) <= 60 else what
+            shown = f"{coefficient} = {text}" if len(text) <= 60 else coefficient
             warn(
                 f"{shown} of '{name}' is {float(value):g} with the default parameters ({defaults}): a negative mass. "
                 "Check the signs of these parameters.",
@@ -102,7 +102,7 @@ def _value(tape: Tape, numbers: Iterable[float]) -> Number | None:
         return None
 
 
-def check_definition(system: MechanicalSystem, what: str, arguments: Sequence[Symbol], kinds: str) -> None:
+def check_definition(system: MechanicalSystem, role: str, arguments: Sequence[Symbol], kinds: str) -> None:
     """Raise :class:`SystemDefinitionError` for invalid names, default values or symbols of the formulas."""
     if not isinstance(system.name, str) or not system.name.strip():
         raise SystemDefinitionError(f"the name of a system must be non-empty text, not {system.name!r}")
@@ -126,10 +126,10 @@ def check_definition(system: MechanicalSystem, what: str, arguments: Sequence[Sy
         )
     for parameter, value in system.constants.items():
         number(parameter.name, value)
-    _check_symbols(system, what, arguments, kinds)
+    _check_symbols(system, role, arguments, kinds)
 
 
-def _check_symbols(system: MechanicalSystem, what: str, arguments: Sequence[Symbol], kinds: str) -> None:
+def _check_symbols(system: MechanicalSystem, role: str, arguments: Sequence[Symbol], kinds: str) -> None:
     if system.forces and len(system.forces) != system.dimension:
         raise SystemDefinitionError(
             f"there are {system.dimension} coordinates, but {len(system.forces)} forces: give one force per coordinate"
@@ -137,7 +137,7 @@ def _check_symbols(system: MechanicalSystem, what: str, arguments: Sequence[Symb
     check_damping(system.name, system.damping, system.parameters)
     known = [*system.coordinates, *arguments, system.time, *system.parameters]
     named = zip(system.coordinates, system.forces, strict=False)
-    formulas = {what: system.formula, **{f"force on {q.name}": force for q, force in named}}
+    formulas = {role: system.formula, **{f"force on {q.name}": force for q, force in named}}
     formulas |= {"damping": system.damping}
     formulas |= {f"constraint {k}": g for k, g in enumerate(system.constraints, 1)}
     for where, formula in formulas.items():

@@ -94,13 +94,13 @@ class FirstOrderSystem(HamiltonianSystem):
             SystemDefinitionError: if a variable is missing or unknown.
         """
         names = [each.name for each in self.variables]
-        given = dict(values) if isinstance(values, Mapping) else dict(enumerate(values))
-        if set(given) != set(names) and list(given) != list(range(len(names))):
+        by_key = dict(values) if isinstance(values, Mapping) else dict(enumerate(values))
+        if set(by_key) != set(names) and list(by_key) != list(range(len(names))):
             raise SystemDefinitionError(
                 f"the state of '{self.name}' must have the values of {', '.join(names)}, by name or in this order, not "
-                f"{given}"
+                f"{by_key}"
             )
-        known = given if isinstance(values, Mapping) else dict(zip(names, given.values(), strict=True))
+        known = by_key if isinstance(values, Mapping) else dict(zip(names, by_key.values(), strict=True))
         q, y = ([known[each.name] for each in half] for half in (self.coordinates, self.momenta))
         return tuple(q), tuple(y)
 
@@ -165,7 +165,7 @@ class OneForm:
 
     def values(self, expressions: Sequence[Expr]) -> Iterator[list[Number]]:
         """Yield the values of expressions at up to ``SAMPLES`` points where they are defined."""
-        tape, found = None, 0
+        tape, defined = None, 0
         for point in self.points():
             tape = tape or Tape(expressions, list(point))
             try:
@@ -173,8 +173,8 @@ class OneForm:
             except ArithmeticError:
                 continue
             yield values
-            found += 1
-            if found == SAMPLES:
+            defined += 1
+            if defined == SAMPLES:
                 return
 
     def is_zero(self, expression: Expr) -> bool:
@@ -269,7 +269,7 @@ def first_order_form(form: OneForm) -> dict[str, Any]:
             no integral in closed form.
     """
     form.check()
-    found: list[tuple[int, tuple[int, ...], Expr, tuple[Expr, ...]]] = []
+    candidates: list[tuple[int, tuple[int, ...], Expr, tuple[Expr, ...]]] = []
     refused: list[tuple[int, ...]] = []
     z, n = form.coordinates, len(form.coordinates)
     for chosen, _ in zip(form.choices(), range(MOST_CHOICES), strict=False):
@@ -279,12 +279,12 @@ def first_order_form(form: OneForm) -> dict[str, Any]:
             continue
         rest = [i for i in range(n) if i not in chosen]
         theta = tuple(sympy.expand(form.theta[i] - integral.diff(z[i])) if integral else form.theta[i] for i in rest)
-        found.append((int(sympy.count_ops(theta)), chosen, integral, theta))
+        candidates.append((int(sympy.count_ops(theta)), chosen, integral, theta))
         if integral == 0:
             break
-    if not found:
+    if not candidates:
         raise SystemDefinitionError(_refusal(form, refused))
-    _, chosen, integral, theta = min(found, key=lambda each: each[:2])
+    _, chosen, integral, theta = min(candidates, key=lambda each: each[:2])
     rest = [i for i in range(n) if i not in chosen]
     y = tuple(z[i] for i in chosen)
     order = sorted(range(len(y)), key=lambda k: theta.index(y[k])) if set(theta) == set(y) else range(len(y))
@@ -340,10 +340,10 @@ def _refusal(form: OneForm, refused: Sequence[Sequence[int]]) -> str:
     shown = [
         f"omega{pair} = {format_expression(each)}" for pair, each in entries.items() if each.count_ops() < MOST_SHOWN
     ]
-    found = shear(form)
+    sheared = shear(form)
     remedy = "Use other coordinates, such as flux coordinates of a magnetic field, or canonical ones"
-    if found:
-        s, g, chosen, pivot = found
+    if sheared:
+        s, g, chosen, pivot = sheared
         remedy = (
             f"Put {format_expression(s - g)} in the place of {s}, and its time derivative in that of {s}_dot: then "
             f"omega vanishes between {' and '.join(chosen)}"

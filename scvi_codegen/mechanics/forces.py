@@ -16,51 +16,13 @@ Phys. 39 (2001).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import sympy
 from sympy import Expr, Symbol
 
-from scvi_codegen.errors import SystemDefinitionError, closest
-from scvi_codegen.formulas.expressions import gradient
-from scvi_codegen.formulas.symbols import name_of_key
-
-
-def forces_by_coordinate(
-    coordinates: Sequence[Symbol], by_name: Mapping[Any, Any], read: Callable[[Any], Expr]
-) -> tuple[Expr, ...]:
-    """Return the m forces, 0 for coordinates without one; an empty tuple if all are 0.
-
-    Args:
-        coordinates: of the system.
-        by_name: force by coordinate, which is a symbol or its name.
-        read: converts a value to an expression in canonical symbols.
-
-    Raises:
-        SystemDefinitionError: for keys that are not coordinates.
-    """
-    if not isinstance(by_name, Mapping):
-        raise SystemDefinitionError(f"forces must be a mapping from coordinates to formulas, not {by_name!r}")
-    names = [q.name for q in coordinates]
-    forces = {name_of_key(key): value for key, value in by_name.items()}
-    for name in forces:
-        if name not in names:
-            hint = f"{closest(name, names)} Coordinates: {', '.join(names)}"
-            raise SystemDefinitionError(f"there is a force on '{name}', which is not a coordinate{hint}")
-    ordered = tuple(read(forces[name]) if name in forces else sympy.S.Zero for name in names)
-    return ordered if any(f != 0 for f in ordered) else ()
-
-
-def dissipative_forces(dissipation: Expr, velocities: Sequence[Symbol]) -> tuple[Expr, ...]:
-    """Return the forces -dD/dv of Rayleigh's dissipation function D(q, v, t)."""
-    derivatives = gradient(dissipation, velocities)
-    if not derivatives:
-        raise SystemDefinitionError(
-            f"the dissipation {dissipation} contains no velocity: Rayleigh's function D(q, v) defines "
-            "the forces -dD/dv. Add velocities, or remove it"
-        )
-    return tuple(-derivatives.get(i, sympy.S.Zero) for i in range(len(velocities)))
+from scvi_codegen.errors import SystemDefinitionError
 
 
 def damping_rate(damping: Any, read: Callable[[Any], Expr]) -> Expr:

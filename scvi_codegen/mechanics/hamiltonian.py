@@ -108,10 +108,8 @@ class HamiltonianSystem(MechanicalSystem):
         ... ).lagrangian
         -p**2/2 + p*q_dot + cos(q)
         """
-        arguments = {"name": name, "coordinates": coordinates, "hamiltonian": hamiltonian, "momenta": momenta}
-        acting = {"parameters": parameters, "forces": forces, "damping": damping, "constraints": constraints}
-        turning = {"rotations": rotations, "spins": spins, "neighbours": neighbours}
-        return cls._of_text(arguments | acting | {"inputs": inputs, "tables": tables} | turning)
+        arguments = {key: value for key, value in locals().items() if key != "cls"}
+        return cls._of_text(arguments)
 
     @classmethod
     @checks_arguments(SystemDefinitionError, inputs=FORMULAS)
@@ -146,23 +144,10 @@ class HamiltonianSystem(MechanicalSystem):
             damping: damping rate of all momenta, an expression in parameters.
             inputs: functions of time, symbols or names whose values are passed to each run.
         """
+        arguments = {key: value for key, value in locals().items() if key not in ("cls", "hamiltonian")}
         from scvi_codegen.mechanics.reading import system_from_sympy
 
-        system: HamiltonianSystem = system_from_sympy(
-            cls,
-            "Hamiltonian",
-            hamiltonian,
-            name=name,
-            coordinates=coordinates,
-            momenta=momenta,
-            rotations=rotations,
-            spins=spins,
-            time=time,
-            parameters=parameters,
-            forces=forces,
-            damping=damping,
-            inputs=inputs,
-        )
+        system: HamiltonianSystem = system_from_sympy(cls, "Hamiltonian", hamiltonian, **arguments)
         return system
 
     @property

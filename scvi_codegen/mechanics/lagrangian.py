@@ -139,12 +139,8 @@ class LagrangianSystem(MechanicalSystem):
         >>> print(chain)
         chain: L(q[N]) = sum(i in N, q_dot[i]**2/2) + sum(i in N periodic, -k*(q[i+1] - q[i])**2/2)
         """
-        arguments = {"name": name, "coordinates": coordinates, "lagrangian": lagrangian, "parameters": parameters}
-        acting = {"forces": forces, "dissipation": dissipation, "damping": damping, "constraints": constraints}
-        acting |= {"torques": torques, "torques_space": torques_space}
-        turning: dict[str, Any] = {"rotations": rotations, "directions": directions, "point_forces": point_forces}
-        acting |= {"inputs": inputs, "tables": tables, "neighbours": neighbours}
-        return cls._of_text(arguments | acting | turning)
+        arguments = {key: value for key, value in locals().items() if key != "cls"}
+        return cls._of_text(arguments)
 
     @classmethod
     @checks_arguments(SystemDefinitionError, inputs=FORMULAS, torques=MAPPED, torques_space=MAPPED)
@@ -204,15 +200,11 @@ class LagrangianSystem(MechanicalSystem):
         >>> LagrangianSystem.from_sympy(name="chain", coordinates=["q[N]"], lagrangian=kinetic - springs)
         LagrangianSystem(name='chain', coordinates=(q[N]))
         """
+        arguments = {key: value for key, value in locals().items() if key not in ("cls", "lagrangian")}
         from scvi_codegen.mechanics.first_order import system_of
         from scvi_codegen.mechanics.reading import system_from_sympy
 
-        known: dict[str, Any] = {"name": name, "coordinates": coordinates, "velocities": velocities, "time": time}
-        known |= {"parameters": parameters, "inputs": inputs, "tables": tables, "neighbours": neighbours}
-        known |= {"forces": forces, "dissipation": dissipation, "damping": damping, "constraints": constraints}
-        known |= {"rotations": rotations, "directions": directions, "point_forces": point_forces}
-        known |= {"torques": torques, "torques_space": torques_space}
-        system: LagrangianSystem = system_from_sympy(partial(system_of, cls), "Lagrangian", lagrangian, **known)
+        system: LagrangianSystem = system_from_sympy(partial(system_of, cls), "Lagrangian", lagrangian, **arguments)
         return system
 
     @classmethod

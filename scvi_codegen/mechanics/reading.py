@@ -7,7 +7,7 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.rotations import RotationNames
+from scvi_codegen.formulas.rotations import Forces, RotationNames
 from scvi_codegen.formulas.symbols import (
     DOT,
     TIME,
@@ -24,7 +24,7 @@ from scvi_codegen.mechanics.arrays.reading import arrays_from_sympy, arrays_from
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.constraints import constraint_sides, constraints_of, rate_of_positions
 from scvi_codegen.mechanics.definition_checks import warn_of_mistakes
-from scvi_codegen.mechanics.forces import damping_rate, dissipative_forces, forces_by_coordinate
+from scvi_codegen.mechanics.forces import damping_rate
 from scvi_codegen.mechanics.rotations.points import forces_at_points, rotations_of_frames
 from scvi_codegen.mechanics.system import are_arrays
 
@@ -63,8 +63,10 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
     def read(text: str) -> Expr:
         return names.read(text, symbols).xreplace(driven)
 
-    torques, points = (arguments.get("torques"), arguments.get("torques_space")), arguments.get("point_forces") or ()
-    forces = _acting(names, ordinary, read, arguments["forces"], torques, arguments.get("dissipation"), points)
+    points = forces_at_points(arguments.get("point_forces") or (), ordinary, names.members, read)
+    applied, torques, torques_space = (arguments.get(each) for each in ("forces", *TORQUES))
+    friction = arguments.get("dissipation")
+    forces = names.forces_by_name(ordinary, read, applied, torques, torques_space, friction, points)
     constraints = constraints_of(arguments["constraints"], read, _rates(names, coordinates))
     function = "hamiltonian" if of_momenta else "lagrangian"
     return _system(
@@ -90,7 +92,7 @@ def _rates(names: RotationNames, coordinates: Sequence[str]) -> Callable[[Expr],
 def _system(
     cls: Any,
     names: RotationNames,
-    formulas: tuple[str, Expr, Any, Sequence[Expr]],
+    formulas: tuple[str, Expr, Forces, Sequence[Expr]],
     *,
     coordinates: Sequence[str],
     momenta: Sequence[str],
@@ -109,28 +111,6 @@ def _system(
         **others,
     )
     return system, warn_of_mistakes(system, getattr(system, "one_form", ()))
-
-
-def _acting(
-    names: RotationNames,
-    ordinary: Sequence[str],
-    read: Read,
-    applied: Mapping[str, Any] | None,
-    torques: tuple[Any, Any],
-    dissipation: Any,
-    points: Sequence[Mapping[str, Any]] = (),
-) -> Any:
-    """Return the forces of a system and of its dissipation: by name with rotations, else on all coordinates."""
-    coordinates = (*ordinary, *names.coordinates)
-    if names.members or points:
-        others = forces_at_points(points, ordinary, names.members, read)
-        by_name = names.forces_by_name(ordinary, read, applied, *torques, dissipation, others)
-        return by_name if names.members else names.forces(by_name, coordinates)
-    forces = forces_by_coordinate(tuple(map(symbol, coordinates)), applied or {}, read)
-    if dissipation is None:
-        return forces
-    friction = dissipative_forces(read(dissipation), tuple(symbol(name + DOT) for name in coordinates))
-    return tuple(map(sympy.Add, forces, friction)) if forces else friction
 
 
 def system_from_sympy(
@@ -161,16 +141,21 @@ def system_from_sympy(
     names = RotationNames.declared(*(turning.get(each) for each in TURNING), momentum=momenta is not None)
     if function == "Lagrangian" and are_arrays(each for each in coordinates if isinstance(each, str)):
         others = (velocities, forces, dissipation, damping, constraints, inputs, *turning.values())
-        given = {"coordinates": list(coordinates), "parameters": parameters, "tables": tables, "neighbours": neighbours}
+        arrays = {
+            "coordinates": list(coordinates),
+            "parameters": parameters,
+            "tables": tables,
+            "neighbours": neighbours,
+        }
         if any(others):
             raise SystemDefinitionError(
                 "from_sympy reads Lagrangian, parameters, tables and neighbours of a system with arrays: give the rest "
                 "as text to from_text"
             )
-        return _of_arrays(cls, arrays_from_sympy(formula, name=name, **given))
+        return _of_arrays(cls, arrays_from_sympy(formula, name=name, **arrays))
 
-    def expression_of(value: Any, what: str) -> Expr:
-        return sympy_expression(value, what).xreplace(of_frames)
+    def expression_of(value: Any, role: str) -> Expr:
+        return sympy_expression(value, role).xreplace(of_frames)
 
     formula = expression_of(formula, function)
     applied = {q: _components(f, f"force on {q}", expression_of) for q, f in (forces or {}).items()}
@@ -203,14 +188,16 @@ def system_from_sympy(
     )
     driven = input_formulas(input_names, symbol(TIME))
 
-    def reader(what: str) -> Read:
-        return lambda each: translation.apply(each, what).xreplace(driven)
+    def reader(role: str) -> Read:
+        return lambda each: translation.apply(each, role).xreplace(driven)
 
     by_name = {name_of_key(translation.rules.get(q, q)): f for q, f in applied.items()}
     ordinary = [q.name for q in translation.coordinates]
     if names.members:
         check_names(ordinary, tuple(constants), (), (*names.coordinates, *names.symbols))
-    acting = _acting(names, ordinary, reader("forces"), by_name, (torques, torques_space), friction, points)
+    read = reader("forces")
+    at_points = forces_at_points(points, ordinary, names.members, read)
+    acting = names.forces_by_name(ordinary, read, by_name, torques, torques_space, friction, at_points)
     all_coordinates, read_side = (*ordinary, *names.coordinates), reader("constraints")
     equations = constraints_of(
         constraints, lambda g: read_side(expression_of(g, "constraint")), _rates(names, all_coordinates)
@@ -228,8 +215,8 @@ def system_from_sympy(
     )[0]
 
 
-def _components(force: Any, what: str, read: Callable[[Any, str], Expr]) -> Any:
-    return tuple(read(f, what) for f in force) if isinstance(force, tuple | list) else read(force, what)
+def _components(force: Any, role: str, read: Callable[[Any, str], Expr]) -> Any:
+    return tuple(read(f, role) for f in force) if isinstance(force, tuple | list) else read(force, role)
 
 
 def default_momenta(coordinates: Sequence[str]) -> tuple[str, ...]:

@@ -65,8 +65,8 @@ class KineticSplitting:
         moved = [v.xreplace(dict(zip(p, u, strict=True))) for v in self.velocity]
         turned: list[Expr] = [S.Zero] * len(u)
         for (first, _, j, k), (common, outer, inner), axes in zip(self.bodies, self.rates, self.axes, strict=True):
-            own = slice(first, first + 4)
-            pair = [Quaternion(*q[own]), Quaternion(*u[own])]
+            quaternion = slice(first, first + 4)
+            pair = [Quaternion(*q[quaternion]), Quaternion(*u[quaternion])]
             momentum = [intermediate(x / 2) for x in axes.T * Matrix((pair[0].conjugate() * pair[1]).args[1:])]
             if outer == 0:
                 around = [inner * x / 2 if n == k else S.Zero for n, x in enumerate(momentum)]
@@ -77,7 +77,7 @@ class KineticSplitting:
             vector = [intermediate(each) for each in axes * Matrix(g.args[1:])]
             real, size = intermediate(g.a), intermediate(sqrt(SMALLEST + g.a**2))
             less = intermediate(real - size - Add(*(x**2 for x in vector)) / (1 + size))
-            moved[own], turned[own] = (list((x * Quaternion(less, *vector)).args) for x in pair)
+            moved[quaternion], turned[quaternion] = (list((x * Quaternion(less, *vector)).args) for x in pair)
         return moved, turned
 
 

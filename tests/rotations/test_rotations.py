@@ -108,7 +108,7 @@ def test_initial_velocities_and_momenta_are_those_of_either_frame():
         ),
         (
             {"rotations": {"R": "omega"}, "lagrangian": "omega_1**2", "forces": {"R": "1"}},
-            r"force on 'R': write torques=\{'R': \[..\]\}",
+            r"force on 'R', which is not a coordinate: write torques=\{'R': \[..\]\}",
         ),
         ({"rotations": {"R": "omega"}, "lagrangian": "omega_1**2", "torques": {"Q": ["1", "0", "0"]}}, "torque on 'Q'"),
         ({"rotations": {"R": "omega"}, "lagrangian": "omega_1**2", "torques": {"R": ["1"]}}, "three components"),

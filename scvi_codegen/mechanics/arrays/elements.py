@@ -69,13 +69,13 @@ def _rules(system: ArraySystem, sizes: Mapping[str, int], tables: Mapping[str, A
     columns = {name: _columns(table) for name, table in {**in_tables, **(tables or {})}.items()}
     rows = {table.axes[0].name: len(columns[table.name]) for table in system.tables if table.name in columns}
     sizes = {**rows, **sizes}
-    for known, named, what in (
+    for known, named, kind in (
         (system.sizes, sizes, "size"),
         ([table.name for table in system.tables], columns, "table"),
     ):
         if set(known) != set(named):
             raise SystemDefinitionError(
-                f"the {what}s of '{system.name}' are {', '.join(known) or 'none'}: give exactly these"
+                f"the {kind}s of '{system.name}' are {', '.join(known) or 'none'}: give exactly these"
             )
     names = {array.name: entry_names(array, sizes) for array in (*system.state, *system.fields)}
     for turning in system.rotations:
@@ -96,9 +96,7 @@ def _formulas(system: ArraySystem, written: EntryRules, constants: Sequence[Symb
         for terms in (system.terms, system.constraints)
     )
     total = {q: Add(*formulas) for q, formulas in written.forces(system.forces).items()}
-    forces: Any = _forces_by_name(turning, total)
-    if not turning.members:
-        forces = tuple(total.get(q, S.Zero) for q in coordinates) if total else ()
+    forces = _forces_by_name(turning, total)
     fields = turning.fields(
         system.function.lower(), Add(*summands), forces, constraints, [each.name for each in coordinates], constants
     )

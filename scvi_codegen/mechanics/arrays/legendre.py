@@ -59,14 +59,14 @@ def site_hamiltonian(system: ArraySystem) -> SiteHamiltonian | None:
     accessed = [access for group in groups.values() for _, access in group.slots if access.array.name in moving]
     if None in of_groups or not _each_once(accessed, system.coordinates):
         return None
-    found = [each for each in of_groups if each is not None]
+    mapped = [each for each in of_groups if each is not None]
     hamiltonian = ArrayHamiltonian(
         **{name: getattr(system, name) for name in COMMON},
         momenta=tuple(moving.values()),
-        terms=(*(each[0] for each in found), *(replace(term, formula=-term.formula) for term in still)),
+        terms=(*(each[0] for each in mapped), *(replace(term, formula=-term.formula) for term in still)),
     )
     return SiteHamiltonian(
-        system=hamiltonian, momenta=tuple(each[1] for each in found), velocities=tuple(each[2] for each in found)
+        system=hamiltonian, momenta=tuple(each[1] for each in mapped), velocities=tuple(each[2] for each in mapped)
     )
 
 

@@ -38,8 +38,8 @@ DEFINING = (
 
 def definition_of(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of ``from_text`` that model files contain as they are, without empty ones."""
-    given = {key: value for key in DEFINING if (value := arguments.get(key))}
-    return {key: list(value) if key in LISTED else value for key, value in given.items()}
+    defining = {key: value for key in DEFINING if (value := arguments.get(key))}
+    return {key: list(value) if key in LISTED else value for key, value in defining.items()}
 
 
 def arrays_from_text(arguments: Mapping[str, Any]) -> ArraySystem:
@@ -135,6 +135,6 @@ def arrays_from_sympy(lagrangian: Any, **arguments: Any) -> ArraySystem:
     sum(i in N, q_dot[i]**2/2)
     """
     if not isinstance(lagrangian, Expr):
-        what = type(lagrangian).__name__
-        raise SystemDefinitionError(f"the Lagrangian is a {what}, not a SymPy expression (text goes to from_text)")
+        kind = type(lagrangian).__name__
+        raise SystemDefinitionError(f"the Lagrangian is a {kind}, not a SymPy expression (text goes to from_text)")
     return arrays_from_text({**arguments, "lagrangian": array_text(lagrangian)})

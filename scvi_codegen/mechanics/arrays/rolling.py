@@ -124,13 +124,13 @@ def _mark(names: set[str]) -> str:
 
 
 def _check_supported(system: MechanicalSystem) -> None:
-    for what, value in (
+    for part, value in (
         ("constraints", system.constraints),
         ("damping", system.damping != 0),
         ("transformed time", system.clock),
     ):
         if value:
-            raise SystemDefinitionError(f"'{system.name}' has {what}, which systems rolled into sums do not support")
+            raise SystemDefinitionError(f"'{system.name}' has {part}, which systems rolled into sums do not support")
 
 
 def _defaults(system: MechanicalSystem, formulas: Sequence[Expr]) -> dict[Symbol, float]:

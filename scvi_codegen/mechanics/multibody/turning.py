@@ -76,10 +76,10 @@ def _freed(system: Any) -> Iterator[Rotation]:
 
 def _connected(first: Iterable[Any], relation: str) -> list[Any]:
     """Return frames or points and all that are oriented or located relative to them."""
-    found = list(first)
-    for each in found:
-        found += [other for other in getattr(each, relation) if other not in found]
-    return found
+    connected = list(first)
+    for each in connected:
+        connected += [other for other in getattr(each, relation) if other not in connected]
+    return connected
 
 
 def _points(system: Any) -> list[Any]:
@@ -103,7 +103,7 @@ def _built_in(system: Any, functions: Mapping[Expr, str]) -> set[Expr]:
     """Return the functions that occur in velocities of points that are not the rates of their positions."""
     if not functions:
         return set()
-    time, found = dynamicsymbols._t, set()
+    time, occurring = dynamicsymbols._t, set()
     speeds = {q.diff(time): u for each in system.joints for q, u in zip(each.coordinates, each.speeds, strict=True)}
     variables = Variables(tuple(system.q), time, tuple(system.u))
     for point, frame, velocity in _forget(system, functions):
@@ -112,8 +112,8 @@ def _built_in(system: Any, functions: Mapping[Expr, str]) -> set[Expr]:
         except ValueError:
             excess = Matrix([1])
         if not are_zero(map(variables.read, excess)):
-            found |= {f for f in functions if any(each.has(f) for each in _components(velocity))}
-    return found
+            occurring |= {f for f in functions if any(each.has(f) for each in _components(velocity))}
+    return occurring
 
 
 def _components(vector: Any) -> Iterator[Expr]:

@@ -130,11 +130,13 @@ def solved_for_speeds(equations: Sequence[Expr], variables: Variables) -> dict[S
     matrix, right = rows.jacobian(u), -rows.xreplace(dict.fromkeys(u, sympy.S.Zero))
     solution: dict[Symbol, Expr] = {}
     for block in coupled_blocks({(i, len(u) + j): entry for (i, j), entry in matrix.todok().items()}, 2 * len(u)):
-        of, by = [i for i in block if i < len(u)], [j - len(u) for j in block if j >= len(u)]
-        if matrix.has(*u) or len(of) != len(by) or (len(of) > MOST_COUPLED and matrix.free_symbols):
+        lines, unknowns = [i for i in block if i < len(u)], [j - len(u) for j in block if j >= len(u)]
+        if matrix.has(*u) or len(lines) != len(unknowns) or (len(lines) > MOST_COUPLED and matrix.free_symbols):
             break
-        part = inverse_by_minors(matrix.extract(of, by)) * right.extract(of, [0])
-        solution |= {u[j]: value for j, value in zip(by, part, strict=True) if not value.has(sympy.nan, sympy.zoo)}
+        part = inverse_by_minors(matrix.extract(lines, unknowns)) * right.extract(lines, [0])
+        solution |= {
+            u[j]: value for j, value in zip(unknowns, part, strict=True) if not value.has(sympy.nan, sympy.zoo)
+        }
     if len(solution) == len(u):
         return {each: solution[each] for each in u}
     names = ", ".join(str(variables.write(u)) for u in variables.u)

@@ -58,13 +58,13 @@ class Turn:
 
     def change(self, x: Sequence[Expr], rotation: Sequence[Expr]) -> tuple[Expr, ...]:
         """Return x (g - 1) for the quaternion in x and the four components of g - 1; 0 for the other entries."""
-        own = (Quaternion(*x[self.first : self.first + 4]) * Quaternion(*rotation)).args
-        return (*(S.Zero,) * self.first, *own, *(S.Zero,) * (len(x) - self.first - 4))
+        turned = (Quaternion(*x[self.first : self.first + 4]) * Quaternion(*rotation)).args
+        return (*(S.Zero,) * self.first, *turned, *(S.Zero,) * (len(x) - self.first - 4))
 
     def momentum(self, q: Sequence[Expr], p: Sequence[Expr]) -> tuple[Expr, ...]:
         """Return Pi = Im(conj(q) p)/2."""
-        own = slice(self.first, self.first + 4)
-        return tuple(x / 2 for x in (Quaternion(*q[own]).conjugate() * Quaternion(*p[own])).args[1:])
+        quaternion = slice(self.first, self.first + 4)
+        return tuple(x / 2 for x in (Quaternion(*q[quaternion]).conjugate() * Quaternion(*p[quaternion])).args[1:])
 
     def rotation(self, q: Sequence[Expr], u: Sequence[Expr]) -> tuple[Expr, ...]:
         """Return exp(a e_k) - 1, a = kappa h Pi_k/2, where u = h p."""

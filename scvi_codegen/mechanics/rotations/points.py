@@ -48,8 +48,8 @@ def forces_at_points(
     for k, entry in enumerate(entries):
         point, force = _vectors(entry, rotations, f"point_forces[{k}]", read)
         moving = {symbol(f"{name}_dot") for name in coordinates}.union(*(each.rates for each in members))
-        if found := sorted(each.name for each in point.free_symbols & moving):
-            raise SystemDefinitionError(f"the point of point_forces[{k}] depends on the velocity '{found[0]}'")
+        if velocities := sorted(each.name for each in point.free_symbols & moving):
+            raise SystemDefinitionError(f"the point of point_forces[{k}] depends on the velocity '{velocities[0]}'")
         for name in coordinates:
             yield name, Matrix([force.dot(point.diff(symbol(name)))])
         for each in members:
@@ -61,23 +61,23 @@ def forces_at_points(
 
 
 def _vectors(
-    entry: Mapping[str, Any], rotations: Mapping[str, Rotation], what: str, read: Callable[[Any], Expr]
+    entry: Mapping[str, Any], rotations: Mapping[str, Rotation], where: str, read: Callable[[Any], Expr]
 ) -> tuple[Matrix, Matrix]:
     """Return the point and the force in space."""
     unknown = sorted(set(entry) - set(KEYS))
     if unknown or not {"point", "force"} <= set(entry):
         named = f"the unknown key '{unknown[0]}'" if unknown else "no point or no force"
-        raise SystemDefinitionError(f"{what} has {named}. Required: point, force; optional: body, origin, frame")
+        raise SystemDefinitionError(f"{where} has {named}. Required: point, force; optional: body, origin, frame")
     body, frame = entry.get("body"), entry.get("frame", "space")
     if frame not in FRAMES or (body is None and (frame != "space" or "origin" in entry)):
         raise SystemDefinitionError(
-            f"{what} has the frame {frame!r}{' and an origin' * ('origin' in entry)} of the body {body!r}: frames are "
+            f"{where} has the frame {frame!r}{' and an origin' * ('origin' in entry)} of the body {body!r}: frames are "
             "'space' and 'body'; origin and the frame 'body' require a body"
         )
     if body is not None and body not in rotations:
-        raise SystemDefinitionError(f"{what} has the body '{body}'. Rotations: {', '.join(rotations) or 'none'}")
+        raise SystemDefinitionError(f"{where} has the body '{body}'. Rotations: {', '.join(rotations) or 'none'}")
     point, origin, force = (
-        _three(entry.get(key), f"the {key} of {what}", read) for key in ("point", "origin", "force")
+        _three(entry.get(key), f"the {key} of {where}", read) for key in ("point", "origin", "force")
     )
     if body is None:
         return point, force
@@ -85,11 +85,11 @@ def _vectors(
     return origin + matrix * point, matrix * force if frame == "body" else force
 
 
-def _three(formulas: Any, what: str, read: Callable[[Any], Expr]) -> Matrix:
+def _three(formulas: Any, role: str, read: Callable[[Any], Expr]) -> Matrix:
     if formulas is None:
         return zeros(3, 1)
     if not isinstance(formulas, Sequence) or isinstance(formulas, str) or len(formulas) != len(AXES):
-        raise SystemDefinitionError(f"{what} must have three components, not {formulas!r}")
+        raise SystemDefinitionError(f"{role} must have three components, not {formulas!r}")
     return Matrix([read(each if isinstance(each, Expr) else str(each)) for each in formulas])
 
 

@@ -168,16 +168,16 @@ def _integrated_gauge(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
     )
 
 
-def _expression(system: MechanicalSystem, value: Expr | str, what: str = "component of a direction") -> Expr:
+def _expression(system: MechanicalSystem, value: Expr | str, role: str = "component of a direction") -> Expr:
     """Return a function of coordinates, time and parameters (generators: also momenta) from text or SymPy."""
-    generates = what == "generator"
+    generates = role == "generator"
     momenta = system.momentum_symbols if generates else ()
     known = {x.name: x for x in (*system.coordinates, *momenta, system.time, *system.parameters)}
     if isinstance(value, str):
         return parse_expression(value, known)
     expression = sympy.sympify(value) if isinstance(value, int | float) else value
     if not isinstance(expression, Expr):
-        raise SystemDefinitionError(f"a {what} must be text or a SymPy expression, not {value!r}")
+        raise SystemDefinitionError(f"a {role} must be text or a SymPy expression, not {value!r}")
     unknown = sorted(free.name for free in expression.free_symbols if free.name not in known)
     if unknown:
         kinds = "coordinate, momentum, time or parameter" if generates else "coordinate, time or parameter"
@@ -188,20 +188,23 @@ def _expression(system: MechanicalSystem, value: Expr | str, what: str = "compon
     expression = evaluated(expression, {free: known[free.name] for free in expression.free_symbols})
     problem = unsupported_part(expression)
     if problem:
-        raise SystemDefinitionError(f"in a {what}: {problem}")
+        raise SystemDefinitionError(f"in a {role}: {problem}")
     return expression
 
 
 def _defect(system: MechanicalSystem, xi: Sequence[Expr], f: Expr | None) -> str:
     """Return the message with the change of L along a direction that is no symmetry."""
-    change, what = _change(system, xi), "along it L changes by"
+    change, phrase = _change(system, xi), "along it L changes by"
     if f is None:
         searched = "a polynomial f quadratic in q; any other f can be given as gauge"
         reason = f"not the time derivative of {searched if system.auxiliaries else 'any f(q, t)'}"
     else:
-        change, what = change - _rate(system, f), "the change of L is not the derivative of the gauge but differs by"
+        change, phrase = (
+            change - _rate(system, f),
+            "the change of L is not the derivative of the gauge but differs by",
+        )
         reason = "not 0"
-    return f"({', '.join(map(str, xi))}) is not a symmetry of '{system.name}': {what} {_cut(change)}, {reason}"
+    return f"({', '.join(map(str, xi))}) is not a symmetry of '{system.name}': {phrase} {_cut(change)}, {reason}"
 
 
 def _cut(change: Expr) -> str:

@@ -345,14 +345,14 @@ def rotation_columns(system: MechanicalSystem) -> dict[str, dict[Monomial, Expr]
     m, position = system.dimension, {q.name: i for i, q in enumerate(system.coordinates)}
     columns: dict[str, dict[Monomial, Expr]] = {}
     for member in system.rotations:
-        own = [position[name] for name in member.coordinates]
-        if len(own) == len(AXES):
-            body = Body(name=member.name, columns=tuple(own))
+        indices = [position[name] for name in member.coordinates]
+        if len(indices) == len(AXES):
+            body = Body(name=member.name, columns=tuple(indices))
             for axis, plane in zip(AXES, planes_of([body]), strict=True):
                 columns[f"angular momentum {axis} of {member.name}"] = dict(turn(m, [body], plane))
             continue
         if isinstance(member, Spin):
-            x, y, p, q = *own, *(m + i for i in own)
+            x, y, p, q = *indices, *(m + i for i in indices)
             half, quarter = sympy.Rational(1, 2), sympy.Rational(1, 4)
             parts = (
                 {Monomial(0, (x, y)): half, Monomial(0, (p, q)): half},
@@ -364,16 +364,16 @@ def rotation_columns(system: MechanicalSystem) -> dict[str, dict[Monomial, Expr]
             }
             continue
         for k, axis in enumerate(AXES, 1):
-            columns[f"angular momentum {axis} of {member.name}"] = _quaternion_column(m, own, k, -1)
-            columns[f"body momentum {k} of {member.name}"] = _quaternion_column(m, own, k, 1)
+            columns[f"angular momentum {axis} of {member.name}"] = _quaternion_column(m, indices, k, -1)
+            columns[f"body momentum {k} of {member.name}"] = _quaternion_column(m, indices, k, 1)
     return columns
 
 
-def _quaternion_column(m: int, own: Sequence[int], axis: int, sign: int) -> dict[Monomial, Expr]:
+def _quaternion_column(m: int, indices: Sequence[int], axis: int, sign: int) -> dict[Monomial, Expr]:
     """Return component ``axis`` of E(q)^T p/2 (sign 1) or F(q)^T p/2 (sign -1)."""
     after, before = axis % 3 + 1, (axis + 1) % 3 + 1
     pairs = ((axis, 0, -1), (0, axis, 1), (before, after, sign), (after, before, -sign))
-    return {Monomial(0, (own[i], m + own[j])): sympy.Rational(factor, 2) for i, j, factor in pairs}
+    return {Monomial(0, (indices[i], m + indices[j])): sympy.Rational(factor, 2) for i, j, factor in pairs}
 
 
 def total_angular_momentum(system: MechanicalSystem) -> dict[str, Terms]:
@@ -534,8 +534,8 @@ def _turning_name(system: MechanicalSystem, turning: Terms) -> tuple[str, int]:
     q = [coordinate.name for coordinate in system.coordinates]
     touched = sorted({i % m for a in turning for i in a.factors})
     scaled = [a.factors[0] == a.factors[1] - m for a in turning]
-    what = "scaling" if all(scaled) else "linear symmetry" if any(scaled) else "angular momentum"
-    return f"{what} of {_listed([q[i] for i in touched])}", 1
+    kind = "scaling" if all(scaled) else "linear symmetry" if any(scaled) else "angular momentum"
+    return f"{kind} of {', '.join(_shown([q[i] for i in touched]))}", 1
 
 
 def _shifting_name(system: MechanicalSystem, kind: str, shifts: Mapping[int, Expr]) -> str:
@@ -548,14 +548,8 @@ def _shifting_name(system: MechanicalSystem, kind: str, shifts: Mapping[int, Exp
     if equal and len(shifts) == system.dimension > 1:
         return f"{kind} of all coordinates"
     terms = [x * system.coordinates[i] for i, x in sorted(shifts.items())]
-    return f"{kind} of {_joined([str(term) for term in terms])}"
+    return f"{kind} of {' + '.join(_shown([str(term) for term in terms])).replace('+ -', '- ')}"
 
 
-def _listed(names: Sequence[str]) -> str:
-    shown = names if len(names) <= NAMED_TERMS else [*names[: NAMED_TERMS - 1], "...", names[-1]]
-    return ", ".join(shown)
-
-
-def _joined(terms: Sequence[str]) -> str:
-    shown = terms if len(terms) <= NAMED_TERMS else [*terms[: NAMED_TERMS - 1], "...", terms[-1]]
-    return " + ".join(shown).replace("+ -", "- ")
+def _shown(names: Sequence[str]) -> Sequence[str]:
+    return names if len(names) <= NAMED_TERMS else [*names[: NAMED_TERMS - 1], "...", names[-1]]

@@ -107,9 +107,9 @@ class Element:
             self.refuse(f"has {key}='{self.text(key)}', which must not be zero")
         return vector / length
 
-    def refuse(self, what: str) -> NoReturn:
+    def refuse(self, problem: str) -> NoReturn:
         """Raise an error that names the file and the element."""
-        raise SystemDefinitionError(f"{self.file}: <{self.tag}> '{self.name}' {what}")
+        raise SystemDefinitionError(f"{self.file}: <{self.tag}> '{self.name}' {problem}")
 
     def walk(self, kinds: Mapping[str, Kind]) -> Iterator[tuple[Element, Kind]]:
         """Yield this element and those inside it whose attributes are known, parents first, with their kinds.

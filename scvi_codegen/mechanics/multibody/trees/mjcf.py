@@ -248,8 +248,8 @@ class _MujocoModel:
         if joint == other:
             equality.refuse(f"is between joint '{joint}' and itself")
         first = equality.vector("polycoef", (0,), range(1, 6))
-        given = (*first, *(0, 1, 0, 0, 0)[len(first) :])  # those that are not written keep their defaults
-        coefficients = tuple(map(float, given if other else given[:1]))
+        polynomial = (*first, *(0, 1, 0, 0, 0)[len(first) :])  # those that are not written keep their defaults
+        coefficients = tuple(map(float, polynomial if other else polynomial[:1]))
         return Coupling(joint, other, coefficients, zeros.get(joint, 0.0), zeros.get(other or "", 0.0))
 
     def joint(self, joint: Element, name: str, pose: Pose, frame: Pose, parent: int) -> Joint:
@@ -459,12 +459,12 @@ def _classes(root: Element) -> dict[str, Defaults]:
     return classes
 
 
-def _over(defaults: dict[str, str], own: dict[str, str]) -> dict[str, str]:
+def _over(defaults: dict[str, str], attributes: dict[str, str]) -> dict[str, str]:
     """Return attributes over their defaults: one orientation replaces another, and numbers of a size the first ones."""
-    turned = any(key in own for key in ORIENTATIONS)
-    merged = {key: value for key, value in defaults.items() if not (turned and key in ORIENTATIONS)} | own
-    if "size" in defaults and "size" in own:
-        sizes = own["size"].split()
+    turned = any(key in attributes for key in ORIENTATIONS)
+    merged = {key: value for key, value in defaults.items() if not (turned and key in ORIENTATIONS)} | attributes
+    if "size" in defaults and "size" in attributes:
+        sizes = attributes["size"].split()
         merged["size"] = " ".join(sizes + defaults["size"].split()[len(sizes) :])
     return merged
 
