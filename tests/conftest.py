@@ -36,8 +36,11 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup() -> None:
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Forget what other tests declared; skip a test with a compiler that is not installed before it does anything."""
     programs.forget()
+    if (callspec := getattr(item, "callspec", None)) and (compiler := callspec.params.get("compiler")):
+        programs.needs(compiler)
 
 
 @pytest.hookimpl(wrapper=True)

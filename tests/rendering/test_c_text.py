@@ -164,7 +164,6 @@ def test_clang_reports_no_warnings(method, share, tmp_path):
 @pytest.mark.parametrize("name", ["kepler", "double-pendulum", "driven Hamiltonian"])
 def test_sources_for_this_machine_compile_without_warnings(name, solver, compiler, tmp_path):
     """Sources with a fallback library and with a step density."""
-    needs(compiler)
     system = systems()[name]
     q = system.coordinates[0].name
     time_transformation = f"1/(1 + {q}**2)"
@@ -220,7 +219,6 @@ def test_headers_compile_as_c_plus_plus(tmp_path):
 @pytest.mark.parametrize("solver", ["newton", "fixed-point"])
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_either_solver_alone_compiles_without_warnings(compiler, solver, tmp_path):
-    needs(compiler)
     methods = (SVI(2), Gauss(3), StoermerVerlet(), SpectralCollocation(2), SCVI(3, variational=False))
     names = ("kepler", "driven-duffing", "pumped-cart-pole")
     sources = [generate_source(systems()[name], method, solver=solver)[0] for method in methods for name in names]
@@ -236,7 +234,6 @@ def test_either_solver_alone_compiles_without_warnings(compiler, solver, tmp_pat
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_tuned_builds_compile_without_warnings(compiler, method, name, tmp_path):
     """Flags are the vector instructions of this processor, and glibc's vector functions where available."""
-    needs(compiler)
     files = write([generate_source(systems()[name], method)[0]], tmp_path)
     for define, _ in _mathematics(TUNED_FLAGS):
         run([needs(compiler), *C99, *TUNED_FLAGS, *define, "-c", *files], tmp_path)

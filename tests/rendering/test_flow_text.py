@@ -7,7 +7,8 @@ from programs import needs
 from samples import linkage, pumped_cart_pole, two_rods
 from style import check_style
 
-from scvi_codegen import SCVI, SVI, Gauss, SpectralCollocation, StoermerVerlet, compile_stepper, problem
+from scvi_codegen import SCVI, SVI, Gauss, SpectralCollocation, StoermerVerlet, problem
+from scvi_codegen.pipeline import Sources
 from scvi_codegen.rendering.program_source import with_casadi_flow, with_flow_of_rows, with_xla_flow
 
 STRICT = ["-std=c99", "-O0", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
@@ -24,6 +25,10 @@ CASES = {
 }
 
 
+def source_of(name, kind="derivatives"):
+    return Sources(*CASES[name]).variant(kind)
+
+
 def compile_with(compiler, flags, source, folder):
     (folder / f"{source.prefix}.h").write_text(source.header)
     (folder / "all.c").write_text(source.code)
@@ -37,37 +42,37 @@ def compile_with(compiler, flags, source, folder):
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 @pytest.mark.parametrize("name", CASES)
 def test_flows_compile_without_warnings(name, compiler, tmp_path):
-    source = with_casadi_flow(compile_stepper(*CASES[name]).derivatives, 10, 5).amalgamated()
+    source = with_casadi_flow(source_of(name), 10, 5).amalgamated()
     check_style(source.code)
     compile_with(compiler, ["-Wno-missing-prototypes"], source, tmp_path)
 
 
 def test_flows_of_batches_compile_without_warnings(tmp_path):
-    stepper = compile_stepper(*CASES["kepler"])
-    for source in (with_flow_of_rows(stepper.derivatives), with_flow_of_rows(stepper.second_derivatives, second=True)):
+    first, second = source_of("kepler"), source_of("kepler", "second_derivatives")
+    for source in (with_flow_of_rows(first), with_flow_of_rows(second, second=True)):
         check_style(source.amalgamated().code)
         compile_with("gcc", ["-Wno-missing-prototypes"], source.amalgamated(), tmp_path)
 
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_second_derivatives_compile_without_warnings(compiler, tmp_path):
-    source = with_casadi_flow(compile_stepper(*CASES["kepler"]).second_derivatives, 10, 5, second=True).amalgamated()
+    source = with_casadi_flow(source_of("kepler", "second_derivatives"), 10, 5, second=True).amalgamated()
     check_style(source.code)
     compile_with(compiler, ["-Wno-missing-prototypes"], source, tmp_path)
 
 
 def test_headers_of_libraries_remain_includes():
-    source = with_xla_flow(compile_stepper(*CASES["kepler"]).derivatives, "0")
+    source = with_xla_flow(source_of("kepler"), "0")
     assert source.amalgamated().code.count('#include "xla/ffi/api/c_api.h"') == 1
     assert [name for name in source.files if "xla/" in name] == []
 
 
 def test_flows_compile_with_the_interface_of_xla(tmp_path):
     jax = pytest.importorskip("jax", reason="needs the extra 'jax'")
-    stepper, flags = compile_stepper(*CASES["kepler"]), ["-isystem", jax.ffi.include_dir()]
-    source = with_xla_flow(stepper.derivatives, "0").amalgamated()
+    flags = ["-isystem", jax.ffi.include_dir()]
+    source = with_xla_flow(source_of("kepler"), "0").amalgamated()
     check_style(source.code)
     compile_with("gcc", flags, source, tmp_path)
-    second = with_xla_flow(stepper.second_derivatives, "0", second=True).amalgamated()
+    second = with_xla_flow(source_of("kepler", "second_derivatives"), "0", second=True).amalgamated()
     check_style(second.code)
     compile_with("gcc", flags, second, tmp_path)

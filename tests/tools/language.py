@@ -11,6 +11,7 @@ import re
 import sys
 import tokenize
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -144,12 +145,23 @@ def _flat(value: ast.expr) -> str:
     return ""
 
 
+@cache
+def _tokens(path: Path) -> tuple[list[tuple[int, str]], dict[str, int]]:
+    """Return the strings and comments of a file with their lines, and its names with the first line of each."""
+    strings, names = [], dict[str, int]()
+    for token in tokenize.generate_tokens(io.StringIO(path.read_text(encoding="utf-8")).readline):
+        if token.type in (tokenize.STRING, tokenize.COMMENT):
+            strings.append((token.start[0], token.string))
+        elif token.type == tokenize.NAME:
+            names.setdefault(token.string, token.start[0])
+    return strings, names
+
+
 def prose() -> Iterator[Text]:
     """Everything that people read: docstrings and strings of the package, comments, pages without their code."""
     for path in package():
-        for token in tokenize.generate_tokens(io.StringIO(path.read_text(encoding="utf-8")).readline):
-            if token.type in (tokenize.STRING, tokenize.COMMENT):
-                yield Text(path, token.start[0], re.sub(r"\{[^{}]*\}|``[^`]*``|`[^`]*`", " ", token.string))
+        for line, string in _tokens(path)[0]:
+            yield Text(path, line, re.sub(r"\{[^{}]*\}|``[^`]*``|`[^`]*`", " ", string))
     for path in templates():
         text = path.read_text(encoding="utf-8")
         for found in re.finditer(r"/\*.*?\*/|\{#.*?#\}|//[^\n]*", text, re.DOTALL):
@@ -170,9 +182,8 @@ def identifiers() -> Iterator[Text]:
     for path in (*package(), *templates()):
         yield Text(path, 0, path.name.partition(".")[0])
     for path in package():
-        for token in tokenize.generate_tokens(io.StringIO(path.read_text(encoding="utf-8")).readline):
-            if token.type == tokenize.NAME:
-                yield Text(path, token.start[0], token.string)
+        for name, line in _tokens(path)[1].items():
+            yield Text(path, line, name)
     for path in templates():
         text = path.read_text(encoding="utf-8")
         code = re.sub(r'/\*.*?\*/|\{#.*?#\}|//[^\n]*|"[^"\n]*"', _blank, text, flags=re.DOTALL)
@@ -191,6 +202,7 @@ def names_in_tests() -> Iterator[Text]:
                     yield Text(path, node.lineno, name)
 
 
+@cache
 def words_of(identifier: str) -> set[str]:
     """Words of a name in snake case or camel case, in lower case, and the whole of it."""
     spaced = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", identifier)

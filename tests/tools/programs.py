@@ -35,7 +35,7 @@ class UndeclaredProgramError(AssertionError):
 def needs(*names: str) -> str:
     """Skip the running test unless these programs are installed; otherwise allow it to call them.
 
-    Returns the path of the first.
+    Returns the path of the first. The value of an argument ``compiler`` of a test is declared before its fixtures.
     """
     for name in names:
         if shutil.which(name) is None:
