@@ -135,7 +135,7 @@ def test_generated_programs_warn_of_options_that_they_do_not_use(key, tmp_path):
 
 
 @pytest.mark.parametrize("generate", ["generate_package", "generate_fmu"])
-def test_generated_programs_refuse_a_controller_beside_a_step_size(generate, tmp_path):
+def test_generated_programs_refuse_a_controller_with_a_step_size(generate, tmp_path):
     import scvi_codegen as sc
     from scvi_codegen.models.packages.fmu import generate_fmu
 
