@@ -16,10 +16,12 @@ from samples import QUICK_FLAGS
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.exact.step import derived_step
+from scvi_codegen.files.cache import template_folder
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI, SpectralCollocation
 from scvi_codegen.models.problems import problem
+from scvi_codegen.rendering.environment import support_text
 
 ROUNDING = 5e-16
 Q, P, STEPS = [1.2], [0.7], 5
@@ -351,9 +353,12 @@ int decide(const double *changes, int count, double *active, double *rows)
 def test_lanes_decide_as_single_trajectories(tmp_path):
     """About changes that converge, stagnate at any level, grow or are undefined, also beside inactive lanes."""
     compiler, decide = needs("cc"), {}
-    headers = Path(__file__).parents[2] / "templates/support"
+    for path in (template_folder() / "support").glob("*/*.h"):
+        written = tmp_path / "support" / path.parent.name / path.name
+        written.parent.mkdir(parents=True, exist_ok=True)
+        written.write_text(support_text(f"support/{path.parent.name}/{path.name}"))
     for lanes, header in ((1, "core/progress"), (4, "iteration/many_trajectories")):
-        (tmp_path / f"{lanes}.c").write_text(DECISIONS.format(folder=headers, header=header))
+        (tmp_path / f"{lanes}.c").write_text(DECISIONS.format(folder="support", header=header))
         command = [
             compiler,
             f"-DLANES={lanes}",
