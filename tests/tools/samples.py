@@ -232,8 +232,11 @@ def sample_named(name: str) -> Sample:
 
 UNOPTIMISED = ("-O0", "-Dalways_inline=unused")
 """For most tests. Inlining takes a third of the time of gcc where it does not optimise."""
-QUICK_FLAGS = ("-O1", *(flag for flag in TUNED_FLAGS if flag != "-O3"))
-"""What users get, but for the optimisation of which most of the compilation time is made."""
+QUICK_FLAGS = TUNED_FLAGS if FLAGS_VARIABLE in os.environ else ("-O1", *TUNED_FLAGS[1:])
+"""What users get, but for the optimisation of which most of the compilation time is made.
+
+The flags of the environment come last: with them these are the default flags, so that tests share libraries.
+"""
 
 
 def stepper_for(name: str, method: Method, *, solver: str = "auto", flags: tuple[str, ...] = QUICK_FLAGS) -> Stepper:
