@@ -161,16 +161,17 @@ class Tape:
             self._steps.append((len(self._start), operation, operands))
             self._start.append(mp.zero)
         else:
-            self._start.append(_constant(expression))
+            known = CONSTANT_VALUES.get(expression)
+            self._start.append(mp.mpf(int(expression.p)) / int(expression.q) if known is None else known)
         self._places[expression] = len(self._start) - 1
         return self._places[expression]
 
 
 def _operation(expression: sympy.Expr, operands: tuple[int, ...]) -> tuple[Callable[..., Number], tuple[int, ...]]:
     if expression.is_Add:
-        return (operator.add if len(operands) == 2 else _sum), operands
+        return (operator.add if len(operands) == 2 else lambda *terms: mp.fsum(terms)), operands
     if expression.is_Mul:
-        return (operator.mul if len(operands) == 2 else _product), operands
+        return (operator.mul if len(operands) == 2 else lambda *factors: mp.fprod(factors)), operands
     if isinstance(expression, Intermediate):
         return operator.pos, operands
     if not expression.is_Pow:
@@ -181,20 +182,6 @@ def _operation(expression: sympy.Expr, operands: tuple[int, ...]) -> tuple[Calla
         power = int(exponent)
         return (lambda x: x**power), operands[:1]
     return mp.power, operands
-
-
-def _sum(*terms: Number) -> Number:
-    return mp.fsum(terms)
-
-
-def _product(*factors: Number) -> Number:
-    return mp.fprod(factors)
-
-
-def _constant(expression: Any) -> Number:
-    if expression.is_Rational:
-        return mp.mpf(int(expression.p)) / int(expression.q)
-    return CONSTANT_VALUES[expression]
 
 
 def evaluate(expression: sympy.Expr, values: Mapping[sympy.Symbol, Number]) -> Number:

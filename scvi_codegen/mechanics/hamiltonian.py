@@ -85,23 +85,16 @@ class HamiltonianSystem(MechanicalSystem):
         Arrays are declared and treated as in :meth:`LagrangianSystem.from_text`.
 
         Args:
-            name: name of the system.
-            coordinates: names of the coordinates, and declarations of arrays, ``["x", "q[N]"]``.
+            name, coordinates, parameters, damping, inputs, tables, neighbours: as of
+                :meth:`LagrangianSystem.from_text`.
             hamiltonian: the formula; it may span several lines.
             rotations: as of :meth:`LagrangianSystem.from_text`, but with the name of the angular momentum in the body
                 frame, ``{"R": "Pi"}``.
             spins: names of vectors of constant length with the brackets {s_1, s_2} = s_3 and cyclic.
             momenta: names of the momenta, declared as the coordinates are; by default ``p_`` before the name of the
                 coordinate.
-            parameters: default value by name, or of all entries by declaration of an array.
             forces: formula by coordinate, in coordinates, momenta and time, added to the rate of its momentum.
-            damping: damping rate of all momenta, a number or a formula of parameters
-                (:mod:`scvi_codegen.mechanics.forces`).
             constraints: must be empty; :func:`lagrangian_of` accepts constraints.
-            inputs: names of functions of time whose values are passed to each run
-                (:mod:`scvi_codegen.formulas.symbols`).
-            tables: declarations of index tables.
-            neighbours: lists of neighbours.
 
         >>> HamiltonianSystem.from_text(
         ...     name="pendulum", coordinates=["q"], momenta=["p"], hamiltonian="p**2/2 - cos(q)"
@@ -134,15 +127,11 @@ class HamiltonianSystem(MechanicalSystem):
         described in :mod:`scvi_codegen.formulas.symbols`.
 
         Args:
-            name: name of the system.
+            name, time, parameters, damping, inputs: as of :meth:`LagrangianSystem.from_sympy`.
             hamiltonian: H.
             coordinates, momenta: symbols or functions of time, parallel to each other.
             rotations, spins: as of :meth:`from_text`; the names in formulas are symbols, ``Symbol("s_1")``.
-            time: the symbol for time; by default the argument of the coordinates, or the symbol called ``t``.
-            parameters: default value by symbol or by name.
             forces: expression by coordinate, in coordinates, momenta and time.
-            damping: damping rate of all momenta, an expression in parameters.
-            inputs: functions of time, symbols or names whose values are passed to each run.
         """
         arguments = {key: value for key, value in locals().items() if key not in ("cls", "hamiltonian")}
         from scvi_codegen.mechanics.reading import system_from_sympy

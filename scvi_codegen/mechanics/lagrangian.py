@@ -172,11 +172,11 @@ class LagrangianSystem(MechanicalSystem):
         canonical as described in :mod:`scvi_codegen.formulas.symbols`.
 
         Args:
-            name: name of the system.
+            name, torques, torques_space, point_forces, directions, tables, neighbours: as of :meth:`from_text`; names
+                of components are symbols, ``Symbol("R_33")``, ``Symbol("omega_1")``.
             lagrangian: L.
             coordinates: symbols, or functions of time such as ``dynamicsymbols`` returns.
-            rotations, directions, torques, torques_space, point_forces: as of :meth:`from_text`; names are symbols,
-                ``Symbol("R_33")``, ``Symbol("omega_1")``. A frame ``B.orient_quaternion(N, ..)`` is declared by
+            rotations: as of :meth:`from_text`. A frame ``B.orient_quaternion(N, ..)`` is declared by
                 ``{B: N}``: its rotation is called as the frame, and its angular velocity ``omega``, or ``omega_B`` if
                 there are several frames.
             velocities: parallel to ``coordinates``; by default ``Derivative(q(t), t)`` for a function of time, the
@@ -184,11 +184,9 @@ class LagrangianSystem(MechanicalSystem):
             time: the symbol for time; by default the argument of the coordinates, or the symbol called ``t``.
             parameters: default value by symbol, by name, or by a function of time that is constant.
             forces: expression by coordinate, which is a symbol, a function of time or a name.
-            dissipation: Rayleigh's function, whose forces -dD/dv are added to them.
-            damping: damping rate of all momenta, an expression in parameters.
+            dissipation, damping: as of :meth:`from_text`, expressions.
             constraints: expressions in coordinates, time and, linearly, velocities that are 0, or equations ``Eq``.
             inputs: functions of time, symbols or names whose values are passed to each run.
-            tables, neighbours: declarations of index tables and lists of neighbours, as of :meth:`from_text`.
 
         With arrays, ``coordinates`` and ``parameters`` are as of :meth:`from_text`, and the Lagrangian consists of
         ``Sum`` and ``Indexed``: a periodic index is ``Mod(i + 1, N)``, pairs are ``(j, i + 1, N - 1), (i, 0, N - 2)``,
@@ -261,7 +259,7 @@ class LagrangianSystem(MechanicalSystem):
 
         Args:
             method: with bodies and kinematic equations; its equations need not have been formed.
-            name: name of the system.
+            name: of the system.
             parameters: default value by symbol, by function of time that is constant, or by name.
             inputs: functions of time, such as ``dynamicsymbols("F")``, whose values are passed to each run.
 

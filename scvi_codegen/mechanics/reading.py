@@ -7,7 +7,7 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.rotations import Forces, RotationNames
+from scvi_codegen.formulas.rotations import RotationNames
 from scvi_codegen.formulas.symbols import (
     DOT,
     TIME,
@@ -49,8 +49,7 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
             raise SystemDefinitionError("point_forces of arrays are not supported: give torques and forces by index")
         return _of_arrays(cls, arrays_from_text(arguments)), True
     names = RotationNames.declared(*turning, momentum=of_momenta)
-    coordinates = (*ordinary, *names.coordinates)
-    momenta = arguments.get("momenta", ())
+    coordinates, momenta = (*ordinary, *names.coordinates), arguments.get("momenta", ())
     momenta = default_momenta(ordinary) if momenta is None else tuple(momenta)
     momenta = (*momenta, *default_momenta(names.coordinates)) if of_momenta else momenta
     values = with_inputs(parameters or {}, inputs)
@@ -63,49 +62,67 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
     def read(text: str) -> Expr:
         return names.read(text, symbols).xreplace(driven)
 
-    points = forces_at_points(arguments.get("point_forces") or (), ordinary, names.members, read)
-    applied, torques, torques_space = (arguments.get(each) for each in ("forces", *TORQUES))
-    friction = arguments.get("dissipation")
-    forces = names.forces_by_name(ordinary, read, applied, torques, torques_space, friction, points)
-    constraints = constraints_of(arguments["constraints"], read, _rates(names, coordinates))
-    function = "hamiltonian" if of_momenta else "lagrangian"
+    damping = arguments["damping"]
     return _system(
         cls,
         names,
-        (function, read(arguments[function]), forces, constraints),
+        "hamiltonian" if of_momenta else "lagrangian",
+        lambda _: read,
+        {**arguments, "damping": None if damping is None else str(damping)},
         name=arguments["name"],
-        coordinates=coordinates,
+        coordinates=ordinary,
         momenta=momenta,
         values=values,
         definition=definition_of(arguments) if names.members else {},
-        damping=damping_rate(arguments["damping"], lambda formula: read(str(formula))),
         inputs=tuple(inputs),
     )
-
-
-def _rates(names: RotationNames, coordinates: Sequence[str]) -> Callable[[Expr], Expr]:
-    """Return the function that computes time derivatives of formulas, in all coordinates and their velocities."""
-    variables = tuple(map(symbol, coordinates))
-    return lambda formula: rate_of_positions(names.in_coordinates(formula), variables, symbol(TIME))
 
 
 def _system(
     cls: Any,
     names: RotationNames,
-    formulas: tuple[str, Expr, Forces, Sequence[Expr]],
+    function: str,
+    reader: Callable[[str], Read],
+    formulas: Mapping[str, Any],
     *,
     coordinates: Sequence[str],
     momenta: Sequence[str],
     values: Mapping[str, Any],
     **others: Any,
 ) -> tuple[Any, bool]:
-    """Return a system of ``(function, formula, forces, constraints)``, and whether warnings were issued."""
-    parameters = tuple(map(symbol, values))
+    """Return a system, and whether warnings were issued.
+
+    Args:
+        cls: makes the system of its fields.
+        names: of rotations, directions and spins.
+        function: ``"lagrangian"`` or ``"hamiltonian"``.
+        reader: returns the function that reads formulas of a role, which messages contain.
+        formulas: of ``function``, forces, torques, dissipation, point_forces, constraints and damping.
+        coordinates: names of the ordinary coordinates.
+        momenta: names of all momenta of a Hamiltonian.
+        values: default value by name of a parameter.
+        others: further fields.
+    """
+    read, members, time = reader("forces"), names.members, symbol(TIME)
+    at_points = forces_at_points(formulas.get("point_forces") or (), coordinates, members, read)
+    applied, torques, torques_space = (formulas.get(each) for each in ("forces", *TORQUES))
+    forces = names.forces_by_name(
+        coordinates, read, applied, torques, torques_space, formulas.get("dissipation"), at_points
+    )
+    variables, parameters = (*coordinates, *names.coordinates), tuple(map(symbol, values))
+    q = tuple(map(symbol, variables))
+    constraints = constraints_of(
+        formulas.get("constraints"),
+        reader("constraints"),
+        lambda g: rate_of_positions(names.in_coordinates(g), q, time),
+    )
+    formula = reader(function.capitalize())(formulas[function])
     system = cls(
-        coordinates=tuple(map(symbol, coordinates)),
-        **({"momenta": tuple(map(symbol, momenta))} if formulas[0] == "hamiltonian" else {}),
-        **names.fields(*formulas, coordinates, parameters),
-        time=symbol(TIME),
+        coordinates=q,
+        **({"momenta": tuple(map(symbol, momenta))} if function == "hamiltonian" else {}),
+        **names.fields(function, formula, forces, constraints, variables, parameters),
+        damping=damping_rate(formulas.get("damping"), reader("damping")),
+        time=time,
         parameters=parameters,
         defaults=tuple(number(each, value) for each, value in values.items()),
         **others,
@@ -141,18 +158,13 @@ def system_from_sympy(
     names = RotationNames.declared(*(turning.get(each) for each in TURNING), momentum=momenta is not None)
     if function == "Lagrangian" and are_arrays(each for each in coordinates if isinstance(each, str)):
         others = (velocities, forces, dissipation, damping, constraints, inputs, *turning.values())
-        arrays = {
-            "coordinates": list(coordinates),
-            "parameters": parameters,
-            "tables": tables,
-            "neighbours": neighbours,
-        }
         if any(others):
             raise SystemDefinitionError(
                 "from_sympy reads Lagrangian, parameters, tables and neighbours of a system with arrays: give the rest "
                 "as text to from_text"
             )
-        return _of_arrays(cls, arrays_from_sympy(formula, name=name, **arrays))
+        declared = {"coordinates": list(coordinates), "parameters": parameters, "tables": tables}
+        return _of_arrays(cls, arrays_from_sympy(formula, name=name, neighbours=neighbours, **declared))
 
     def expression_of(value: Any, role: str) -> Expr:
         return sympy_expression(value, role).xreplace(of_frames)
@@ -189,28 +201,31 @@ def system_from_sympy(
     driven = input_formulas(input_names, symbol(TIME))
 
     def reader(role: str) -> Read:
-        return lambda each: translation.apply(each, role).xreplace(driven)
+        return lambda each: translation.apply(expression_of(each, role), role).xreplace(driven)
 
-    by_name = {name_of_key(translation.rules.get(q, q)): f for q, f in applied.items()}
     ordinary = [q.name for q in translation.coordinates]
     if names.members:
         check_names(ordinary, tuple(constants), (), (*names.coordinates, *names.symbols))
-    read = reader("forces")
-    at_points = forces_at_points(points, ordinary, names.members, read)
-    acting = names.forces_by_name(ordinary, read, by_name, torques, torques_space, friction, at_points)
-    all_coordinates, read_side = (*ordinary, *names.coordinates), reader("constraints")
-    equations = constraints_of(
-        constraints, lambda g: read_side(expression_of(g, "constraint")), _rates(names, all_coordinates)
-    )
+    formulas = {
+        function.lower(): formula,
+        "forces": {name_of_key(translation.rules.get(q, q)): f for q, f in applied.items()},
+        "torques": torques,
+        "torques_space": torques_space,
+        "dissipation": friction,
+        "point_forces": points,
+        "constraints": constraints,
+        "damping": rate,
+    }
     return _system(
         cls,
         names,
-        (function.lower(), reader(function)(formula), acting, equations),
+        function.lower(),
+        reader,
+        formulas,
         name=name,
-        coordinates=all_coordinates,
+        coordinates=ordinary,
         momenta=(*(p.name for p in translation.momenta), *default_momenta(names.coordinates)),
         values=dict(zip((each.name for each in translation.parameters), constants.values(), strict=True)),
-        damping=reader("damping")(rate),
         inputs=input_names,
     )[0]
 

@@ -242,11 +242,6 @@ def _distance(system: MechanicalSystem) -> Expr:
     return sympy.Add(*(square ** sympy.Rational(-3, 2) for square in squares)) ** sympy.Rational(-1, 2)
 
 
-def _potential(system: MechanicalSystem) -> Expr:
-    potential, _ = _potential_and_masses(system, "potential")
-    return 1 / (-potential)
-
-
 def _arclength(system: MechanicalSystem) -> Expr:
     if not system.auxiliaries:
         raise SystemDefinitionError(
@@ -258,6 +253,11 @@ def _arclength(system: MechanicalSystem) -> Expr:
 
 
 TIME_RESCALINGS: Mapping[str, Callable[[MechanicalSystem], Expr]] = MappingProxyType(
-    {"frequency": _frequency, "distance": _distance, "potential": _potential, "arclength": _arclength}
+    {
+        "frequency": _frequency,
+        "distance": _distance,
+        "potential": lambda system: -1 / _potential_and_masses(system, "potential")[0],
+        "arclength": _arclength,
+    }
 )
 """Built-in time-rescaling functions by name."""

@@ -66,7 +66,8 @@ def formula_at_sizes(
 def _rules(system: ArraySystem, sizes: Mapping[str, int], tables: Mapping[str, ArrayLike] | None) -> EntryRules:
     """Return the sizes, index tables and names of entries; raise as :func:`unroll_sums`."""
     in_tables = {table.name: system.data[table.name] for table in system.tables if table.name in system.data}
-    columns = {name: _columns(table) for name, table in {**in_tables, **(tables or {})}.items()}
+    arrays = {name: np.asarray(table) for name, table in {**in_tables, **(tables or {})}.items()}
+    columns = {name: array[:, None] if array.ndim == 1 else array for name, array in arrays.items()}
     rows = {table.axes[0].name: len(columns[table.name]) for table in system.tables if table.name in columns}
     sizes = {**rows, **sizes}
     for known, named, kind in (
@@ -118,12 +119,6 @@ def _forces_by_name(turning: RotationNames, total: dict[Symbol, Expr]) -> Forces
         if body != body * 0:
             by_name.append((member.name, tuple(body)))
     return (*((q.name, (force,)) for q, force in total.items()), *by_name)
-
-
-def _columns(table: ArrayLike) -> NDArray[np.int64]:
-    """Return an index table as a two-dimensional array; one axis becomes one column."""
-    array = np.asarray(table)
-    return array[:, None] if array.ndim == 1 else array
 
 
 def _filled(array: Array, value: ArrayLike, sizes: Mapping[str, int]) -> NDArray[np.float64]:

@@ -54,7 +54,9 @@ def site_hamiltonian(system: ArraySystem) -> SiteHamiltonian | None:
         if site is None:
             return None
         known = groups.get(site.loops)
-        groups[site.loops] = site if known is None else _sum(known, site)
+        if known is not None:
+            site = term_of(site.loops, known.formula + site.formula, dict((*known.slots, *site.slots)))
+        groups[site.loops] = site
     of_groups = [_transformed(group, moving) for group in groups.values()]
     accessed = [access for group in groups.values() for _, access in group.slots if access.array.name in moving]
     if None in of_groups or not _each_once(accessed, system.coordinates):
@@ -92,19 +94,14 @@ def _of_site(term: ArrayTerm, moving: dict[str, Array]) -> ArrayTerm | None:
     if set(order) != set(ends) or len(set(order)) < len(order):
         return None
     names = {index: f"site{k}" for k, index in enumerate(order)}
-    renamed = {slot: _renamed(access, names) for slot, access in term.slots}
+    renamed = {
+        slot: replace(access, places=tuple(replace(p, index=names[p.index]) if p.index else p for p in access.places))
+        for slot, access in term.slots
+    }
     rule = {slot: symbol(str(access)) for slot, access in renamed.items()}
     loops = {loop.index: replace(loop, index=names[loop.index]) for loop in term.loops}
     accesses = {rule[slot]: access for slot, access in renamed.items()}
     return term_of(tuple(loops[index] for index in order), term.formula.xreplace(rule), accesses)
-
-
-def _renamed(access: Access, names: dict[str, str]) -> Access:
-    return replace(access, places=tuple(replace(p, index=names[p.index]) if p.index else p for p in access.places))
-
-
-def _sum(one: ArrayTerm, other: ArrayTerm) -> ArrayTerm:
-    return term_of(one.loops, one.formula + other.formula, dict((*one.slots, *other.slots)))
 
 
 def _each_once(accesses: Sequence[Access], coordinates: Sequence[Array]) -> bool:

@@ -23,7 +23,7 @@ so G M^-1 G^T is sparse; its pattern is that of the net and is known when a run 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import chain
@@ -143,12 +143,9 @@ def terms_at_rest(
 
 def constraint_text(term: ArrayTerm) -> str:
     """Return the constraint as text."""
-    return f"{term.formula} = 0" + (f" for {', '.join(map(str, _named(term)))}" if term.loops else "")
-
-
-def _named(term: ArrayTerm) -> Iterator[object]:
     behind = {loop.behind for loop in term.loops}
-    return (loop for loop in term.loops if loop.index not in behind)
+    named = ", ".join(str(loop) for loop in term.loops if loop.index not in behind)
+    return f"{term.formula} = 0" + f" for {named}" * bool(term.loops)
 
 
 def check_constraint(term: ArrayTerm, coordinates: Sequence[Array], fields: Sequence[Array], inputs: str) -> None:
@@ -241,11 +238,10 @@ class ArraySystem:
     """Lagrangian or Hamiltonian in index notation; ``LagrangianSystem.from_text(coordinates=["q[N]"])`` returns it.
 
     Attributes:
-        name: name of the system.
+        name, time, inputs, damping: see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
         coordinates: arrays of coordinates, single ones without axes; the array of the velocities of ``q`` is called
             ``q_dot``.
         momenta: of a Hamiltonian, arrays parallel to ``coordinates``; empty for a Lagrangian.
-        time: the symbol ``t``.
         parameters, defaults: adjustable numbers and their default values.
         fields: arrays of parameters, whose values, one per element, are passed to each run.
         field_defaults: default value of all elements of each field.
@@ -253,9 +249,7 @@ class ArraySystem:
         neighbours: lists of the pairs closer than a cutoff.
         terms: of the Lagrangian or the Hamiltonian.
         forces: generalised forces of coordinates, velocities (momenta of a Hamiltonian) and time.
-        inputs: names of functions of time passed to each run, each represented by five of the parameters.
         constraints: g = 0 at every element of loops (:mod:`scvi_codegen.mechanics.arrays.system`).
-        damping: damping rate of all momenta, see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
         rotations: rotations, directions and spins, which require known sizes.
         definition: the arguments of ``from_text`` other than name and parameters, for model files.
         data: values of fields and tables by name for runs that pass none.
