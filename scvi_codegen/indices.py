@@ -219,8 +219,8 @@ class Access:
     def __str__(self) -> str:
         places, before = [*map(str, self.places)], ""
         for each in reversed(self.sums):
-            (size,), at = each.coefficients.axes, places[each.axis]
-            before += f"sum({each.index} in {size}, {each.coefficients.name}[{each.index}-{at}]*"
+            (size,), place = each.coefficients.axes, places[each.axis]
+            before += f"sum({each.index} in {size}, {each.coefficients.name}[{each.index}-{place}]*"
             places[each.axis] = each.index
         entry = f"{self.array.name}[{', '.join(places)}]" if places else self.array.name
         return before + entry + ")" * len(self.sums)

@@ -52,3 +52,8 @@ def _short(value: Any) -> str:
 
 def _size(shape: tuple[int, ...]) -> str:
     return f"<{' x '.join(map(str, shape))}>"
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun, in the plural unless the number is 1."""
+    return f"{count} {noun}{'s' * (count != 1)}"

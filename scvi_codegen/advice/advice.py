@@ -217,7 +217,9 @@ def _advised(
         most=most,
     )
     choice = _choose(pilot, tolerance)
-    return _cost(pilot, choice.n, points), _advice(pilot, choice, method)
+    nearest = min(pilot.good, key=lambda k: abs(math.log(k / choice.n)))
+    evaluations = (pilot.runs[nearest].iterations + OVERHEAD) * math.ceil(points / LANES) * LANES  # in full registers
+    return evaluations / pilot.step(choice.n), _advice(pilot, choice, method)
 
 
 def _steppers(system: MechanicalSystem, method: Method, solver: str) -> Iterator[Stepper]:
@@ -242,12 +244,6 @@ def _points(method: Method) -> int:
     """Return the number of evaluation points of the Lagrangian per step, which is the same for every system."""
     simplest = LagrangianSystem.from_text(name="free particle", coordinates=["q"], lagrangian="q_dot**2/2")
     return sum(len(group.abscissae) for group in method.stage_system(simplest).stage_groups)
-
-
-def _cost(pilot: Pilot, n: float, points: int) -> float:
-    """Return the number of evaluations, in full vector registers, per unit of time."""
-    nearest = min(pilot.good, key=lambda k: abs(math.log(k / n)))
-    return (pilot.runs[nearest].iterations + OVERHEAD) * math.ceil(points / LANES) * LANES / pilot.step(n)
 
 
 class _Choice(NamedTuple):

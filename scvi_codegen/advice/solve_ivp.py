@@ -154,11 +154,15 @@ def solve_ivp(
         raise StateError("y0 contains positions by name: give velocity, too, or numbers for positions and momenta")
     p: Any = stepper._initial_momenta(q, p0, velocity, start, parameters)
     along: dict[str, Any] = {"t": start, "parameters": parameters, "options": options}
-    plan = _plan(stepper, uncompiled, request, (q, p, end - start), along)
-    settings = {**_steps(stepper, start, end, plan), **along, "events": events}
+    steps, missed = _plan(stepper, uncompiled, request, (q, p, start, end), along)
+    settings = {**steps, **along, "events": events}
     try:
         trajectory = stepper.integrate(q, p, **settings, t_eval=None if dense_output else requested_times)
-        status, message = _outcome(trajectory, plan)
+        status, message = REACHED, "The end of the span was reached."
+        if shortfall := missed(trajectory):
+            status, message = MISSED, shortfall
+        elif trajectory.ended_by is not None:
+            status, message = EVENT, f"The terminal event '{trajectory.ended_by.function}' occurred."
     except StepFailedError as error:
         trajectory, status, message = Trajectory.before(error), FAILED, str(error)
     return _motion(trajectory, requested_times if dense_output else None, dense_output, status, message)
@@ -171,15 +175,6 @@ class _StepRequest(NamedTuple):
     rtol: float | None
     tolerance: float | None
     error: float | None
-
-
-class _StepChoice(NamedTuple):
-    """Step-size selection, and a check of the completed run that returns a message if the tolerance is missed."""
-
-    h: float | None
-    rtol: float | None
-    missed: Callable[[Trajectory], str] = lambda trajectory: ""
-    error: float | None = None
 
 
 def _stepper(
@@ -213,25 +208,37 @@ def _plan(
     stepper: Stepper,
     uncompiled: tuple[MechanicalSystem, Method] | None,
     request: _StepRequest,
-    motion: tuple[States, States, float],
+    motion: tuple[States, States, float, float],
     along: dict[str, Any],
-) -> _StepChoice:
-    """Return the step-size selection for a request and an initial state (q, p) over a span."""
+) -> tuple[dict[str, Any], Callable[[Trajectory], str]]:
+    """Return the step-size arguments of :meth:`Stepper.integrate`, and a check of the run by a message if it misses.
+
+    ``motion``: initial state (q, p), first and last time. Fixed steps fill the span.
+    """
+    q, p, start, end = motion
+    met: Callable[[Trajectory], str] = lambda run: ""  # noqa: E731
     if request.error is not None:
-        return _StepChoice(None, None, _unconfirmed, request.error)
-    if request.h is not None:
-        return _StepChoice(request.h, request.rtol)
+        return {"t_end": end, "error": request.error}, _unconfirmed
+    if request.rtol is not None and (request.h is not None or not stepper._has_tau):
+        return {"h": request.h, "t_end": end, "tolerance": request.rtol}, met
+    h, missed = request.h, met
     if stepper._has_tau:
-        error = request.rtol or 0.0
-        tau = largest_step(stepper, *motion, error, **along)
-        return _StepChoice(tau, None, lambda run: accuracy_message(run.step_error, run.worst_step_time, error) or "")
-    adaptive = request.tolerance is not None or stepper.binding.has("advance_to")
-    advised = request.tolerance if adaptive else DEFAULT_TOLERANCE
-    if request.rtol is not None or uncompiled is None or advised is None:
-        return _StepChoice(None, request.rtol)
-    (system, method), (q, p, span) = uncompiled, motion
-    h = advise(system, method, q, p, span, advised, **along).h
-    return _StepChoice(h, None, lambda run: missed_tolerance(system, run, advised))
+        if h is None:
+            error = request.rtol or 0.0
+            h = largest_step(stepper, q, p, end - start, error, **along)
+            missed = lambda run: accuracy_message(run.step_error, run.worst_step_time, error) or ""  # noqa: E731
+        sign = 1.0 if stepper.interface.time_transformation else end - start
+        return {"h": math.copysign(checked_step(h), sign), "t_end": end}, missed
+    if h is None:
+        adaptive = request.tolerance is not None or stepper.binding.has("advance_to")
+        advised = request.tolerance if adaptive else DEFAULT_TOLERANCE
+        if uncompiled is None or advised is None:
+            return {"t_end": end}, met
+        system, method = uncompiled
+        h = advise(system, method, q, p, end - start, advised, **along).h
+        missed = lambda run: missed_tolerance(system, run, advised)  # noqa: E731
+    steps = max(1, math.ceil(abs((end - start) / checked_step(h)) * (1.0 - 1e-12)))
+    return {"h": (end - start) / steps, "steps": steps}, missed
 
 
 def _unconfirmed(trajectory: Trajectory) -> str:
@@ -256,28 +263,6 @@ def _refuse(arguments: Mapping[str, float | None]) -> None:
     for name, value in arguments.items():
         if value is not None:
             raise StateError(f"solve_ivp has no {name}={value!r}: {ALTERNATIVES[name]}")
-
-
-def _steps(stepper: Stepper, start: float, end: float, plan: _StepChoice) -> dict[str, Any]:
-    """Return the arguments of :meth:`Stepper.integrate`: whole fixed steps that fill the span, or adaptive steps."""
-    if plan.error is not None:
-        return {"t_end": end, "error": plan.error}
-    if plan.rtol is not None or plan.h is None:
-        return {"h": plan.h, "t_end": end, "tolerance": plan.rtol}
-    if stepper._has_tau:
-        sign = 1.0 if stepper.interface.time_transformation else end - start
-        return {"h": math.copysign(checked_step(plan.h), sign), "t_end": end}
-    steps = max(1, math.ceil(abs((end - start) / checked_step(plan.h)) * (1.0 - 1e-12)))
-    return {"h": (end - start) / steps, "steps": steps}
-
-
-def _outcome(trajectory: Trajectory, plan: _StepChoice) -> tuple[int, str]:
-    """Return status and message of a run without failed steps."""
-    if missed := plan.missed(trajectory):
-        return MISSED, missed
-    if trajectory.ended_by is not None:
-        return EVENT, f"The terminal event '{trajectory.ended_by.function}' occurred."
-    return REACHED, "The end of the span was reached."
 
 
 def _motion(

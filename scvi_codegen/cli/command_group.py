@@ -213,9 +213,6 @@ def check_writable(path: Path, hint: str) -> None:
     """Raise an error of usage unless a file can be written; ``hint`` names the option that requires it.
 
     Called before long computations.
-
-    Raises:
-        click.BadParameter: if the path is a folder, or its folder is missing or not writable.
     """
     if path.is_dir() and path.suffix.lower() != ".zarr":
         raise click.BadParameter(f"'{path}' is a folder", param_hint=hint)

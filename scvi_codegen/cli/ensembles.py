@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scvi_codegen.cli.reports import counted, duration, momentum_report
+from scvi_codegen.cli.reports import duration, momentum_report
 from scvi_codegen.cli.supervision import check_memory, interruptions, progress_bar
 from scvi_codegen.files.energy import MOST_BALANCED_STEPS, energy_account, energy_reason
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.ensemble_file import EnsembleStates
 from scvi_codegen.native.options import FAILURES
+from scvi_codegen.representation import counted
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
@@ -43,15 +44,9 @@ class _Stop(Exception):  # noqa: N818  (no error)
 
 
 def integrate_states(states: EnsembleStates) -> EnsembleOutcome:
-    """Integrate the model from each initial state, with a progress bar, until all end or a signal arrives.
-
-    Raises:
-        BuildError: without a C compiler.
-        MethodError: for a solver that the method does not have.
-        StateError: if a state is not finite or violates the constraints, or memory does not suffice.
-    """
+    """Integrate the model from each initial state, with a progress bar, until all end or a signal arrives."""
     model, began = states.model, time.perf_counter()
-    check_memory(model, len(states))
+    check_memory(model, trajectories=len(states))
     stepper = model.stepper()
     work = _work(model, stepper, states)
     started, interrupted = time.perf_counter(), False

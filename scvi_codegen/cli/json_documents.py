@@ -24,9 +24,11 @@ def run_numbers(
     """Return the numbers of a run in memory."""
     run, trajectory = outcome.run, outcome.trajectory
     t, q, p = outcome.end
+    iterations = int(np.sum(trajectory.iterations)) + run.iterations
+    arrays = {"sizes": model.sizes, "tolerance": model.allowed_error, "iterations": iterations}
     return {
         **_about(model),
-        **(_array_numbers(model, outcome) if model.array_system else {}),
+        **(arrays if model.array_system else {}),
         "steps": trajectory.steps,
         "rejected_steps": run.rejected_steps,
         "h": model.h or run.h if run.plan.fixed else run.plan.tau or None,
@@ -89,13 +91,7 @@ def ensemble_numbers(model: Model, outcome: EnsembleOutcome, balance: float | No
 
 def _about(model: Model) -> dict[str, Any]:
     method = {"method": model.method.name, "order": model.method.order}
-    return {"system": model.system.name, **method, "run": model.run_section()}
-
-
-def _array_numbers(model: Model, outcome: RunOutcome) -> dict[str, Any]:
-    """Return further numbers of a run over arrays whose sizes are known at run time."""
-    iterations = int(np.sum(outcome.trajectory.iterations)) + outcome.run.iterations
-    return {"sizes": model.sizes, "tolerance": model.allowed_error, "iterations": iterations}
+    return {"system": model.system.name, **method, "run": model._run_section()}
 
 
 def _named(model: Model, vector: Any) -> dict[str, Any]:

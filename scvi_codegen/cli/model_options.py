@@ -171,8 +171,8 @@ def model_arguments(*further: str, required: bool = True) -> Callable[[Command],
 
 def check_exclusive(choices: Choices) -> None:
     """Reject options that exclude each other."""
-    given = [name for name, value in choices.items() if value is not None]
-    if pair := next(excluded(given, "initial", "run"), None):
+    names = [name for name, value in choices.items() if value is not None]
+    if pair := next(excluded(names, "initial", "run"), None):
         raise click.UsageError(f"{pair[0].flag} and {pair[1].flag} exclude each other")
 
 
@@ -201,12 +201,7 @@ def _check_method(choices: Choices) -> None:
 
 
 def read_model(name: str, choices: Choices) -> Model:
-    """Return the model of a file or of the catalogue, overridden by the options of the command line.
-
-    Raises:
-        click.UsageError: if options exclude or contradict each other, or are not options of the chosen method.
-        ScviCodegenError: as reading and building the model do.
-    """
+    """Return the model of a file or of the catalogue, overridden by the options of the command line."""
     check_exclusive(choices)
     _check_method(choices)
     path = Path(name)
@@ -221,11 +216,7 @@ def read_model(name: str, choices: Choices) -> Model:
 
 
 def with_known_sizes(model: Model, option: str) -> Model:
-    """Return the model of named coordinates that an option requires.
-
-    Raises:
-        click.UsageError: if there are too many of them.
-    """
+    """Return the model of named coordinates that an option requires."""
     if model.array_system is not None and model.dimension > MOST_COORDINATES:
         raise click.UsageError(
             f"{option} compiles an array model with its sizes, which is limited to {MOST_COORDINATES} coordinates: "

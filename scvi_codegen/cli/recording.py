@@ -13,21 +13,28 @@ import click
 import numpy as np
 
 from scvi_codegen.cli.model_options import check_exclusive
-from scvi_codegen.cli.reports import counted, duration
+from scvi_codegen.cli.reports import duration
 from scvi_codegen.cli.running import conserved, event_counts, final_state
 from scvi_codegen.cli.supervision import interruptions, progress_bar
 from scvi_codegen.errors import ModelFileError, StepFailedError
 from scvi_codegen.files import export
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
+from scvi_codegen.models.options import DURATION, OPTIONS
 from scvi_codegen.models.time_span import whole_steps_in
+from scvi_codegen.representation import counted
 from scvi_codegen.results.recording import RecordedRun, load_run, record_run, resume_run
 from scvi_codegen.runtime.run.run import Run
 
 SUFFIX = ".run"
 MAX_STATES = 10_000
 """Largest number of states used to summarise what was conserved."""
-WITH_RESUME = {"resume", "steps", "span", "checkpoint", "checkpoint_steps"}
+WITH_RESUME = {
+    "resume",
+    "checkpoint",
+    "checkpoint_steps",
+    *(each.name for each in OPTIONS if each.determines == DURATION),
+}
 """Options that are allowed with ``--resume``."""
 
 
@@ -37,16 +44,12 @@ def is_run_folder(output: str) -> bool:
 
 
 def check_format(output: str, *, ensemble: bool) -> None:
-    """Check that a file format exists and that its library is installed.
-
-    Raises:
-        click.BadParameter: for an unknown format.
-    """
+    """Check that a file format exists and that its library is installed."""
     if Path(output).suffix.lower() not in export.WRITERS:
-        what = f"an ensemble is written as {export.FORMATS}"
+        formats = f"an ensemble is written as {export.FORMATS}"
         if not ensemble:
-            what = f"a trajectory is written as {export.FORMATS} or into a folder {SUFFIX}"
-        raise click.BadParameter(f"{what}, not as '{output}'", param_hint="'-o'")
+            formats = f"a trajectory is written as {export.FORMATS} or into a folder {SUFFIX}"
+        raise click.BadParameter(f"{formats}, not as '{output}'", param_hint="'-o'")
     export.check_format(output)
 
 

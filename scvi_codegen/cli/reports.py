@@ -17,11 +17,6 @@ if TYPE_CHECKING:
     from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 
-def counted(count: int, what: str) -> str:
-    """Return a number with its noun, in the plural unless the number is 1."""
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"
-
-
 def duration(seconds: float) -> str:
     """Return a duration with a suitable unit."""
     for unit, scale in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):

@@ -9,13 +9,14 @@ from functools import partial
 import numpy as np
 
 from scvi_codegen.advice.tolerance_check import SECOND_RUN, Known, known_digits
-from scvi_codegen.cli.reports import counted, duration, energy_report, in_known_digits, momentum_report
-from scvi_codegen.cli.supervision import BAR_LENGTH, check_memory, check_run_memory, interruptions, progress_bar
+from scvi_codegen.cli.reports import duration, energy_report, in_known_digits, momentum_report
+from scvi_codegen.cli.supervision import BAR_LENGTH, check_memory, interruptions, progress_bar
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
 from scvi_codegen.files.energy import EnergyAccount
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.models.model import Model
 from scvi_codegen.rendering.source import Interface
+from scvi_codegen.representation import counted
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.events.event import Crossings
 from scvi_codegen.runtime.inputs.segments import record_segments
@@ -63,13 +64,7 @@ class RunOutcome:
 
 @without_accuracy_warnings()
 def integrate_model(model: Model) -> RunOutcome:
-    """Integrate a model with a progress bar until its end, a failed step or a signal.
-
-    Raises:
-        BuildError: without a C compiler.
-        MethodError: for a solver that the method does not have.
-        StateError: if the initial state is invalid, or memory does not suffice for all states.
-    """
+    """Integrate a model with a progress bar until its end, a failed step or a signal."""
     check_memory(model)
     began = time.perf_counter()
     run = model.start()
@@ -84,7 +79,7 @@ def integrate_model(model: Model) -> RunOutcome:
         def look(_: int) -> None:
             reached = int(BAR_LENGTH * (run.t - model.t) / model.covered) if by_time else run.steps
             show_progress(min(length, reached))
-            check_run_memory(model, run.steps)
+            check_memory(model, run.steps)
 
         def stop() -> bool:
             nonlocal stopped
@@ -100,6 +95,9 @@ def integrate_model(model: Model) -> RunOutcome:
                 trajectory = recorded(next(segments))
         except StepFailedError as error:
             failure, trajectory = error, Trajectory.before(error)
+    missed = None
+    if (allowed := model.allowed_error) is not None and model.has_time_transformation:  # the step of tau fits the start
+        missed = accuracy_message(trajectory.step_error, trajectory.worst_step_time, allowed)
     return RunOutcome(
         trajectory=trajectory,
         run=run,
@@ -107,16 +105,8 @@ def integrate_model(model: Model) -> RunOutcome:
         seconds=time.perf_counter() - began,
         failure=failure,
         interrupted=stopped,
-        missed=_missed(model, trajectory),
+        missed=missed,
     )
-
-
-def _missed(model: Model, trajectory: Trajectory) -> str | None:
-    """Return a message if later steps exceed the error for which the step of tau was chosen at the start."""
-    allowed = model.allowed_error
-    if allowed is None or not model.has_time_transformation:
-        return None
-    return accuracy_message(trajectory.step_error, trajectory.worst_step_time, allowed)
 
 
 def summary(model: Model, outcome: RunOutcome, known: Known | None, account: EnergyAccount | None = None) -> str:

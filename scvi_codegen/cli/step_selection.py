@@ -22,16 +22,12 @@ MAX_STEPS = 10**9
 
 
 def model_with_adaptive_steps(model: Model, tolerance: float) -> Model:
-    """Return the model with adaptive steps whose local error is bounded by the tolerance, or by round-off.
-
-    Raises:
-        StateError: unless the tolerance is positive and below 1.
-    """
+    """Return the model with adaptive steps whose local error is bounded by the tolerance, or by round-off."""
     check_tolerance(tolerance)
     if tolerance < ROUND_OFF:
         click.echo(f"Warning: tolerance {tolerance:g} is below double precision: round-off is used instead", err=True)
     allowed = tolerance if tolerance >= ROUND_OFF else None
-    return model.with_step_size(tolerance=allowed)
+    return model._with_step_size(tolerance=allowed)
 
 
 def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalError]:
@@ -39,11 +35,8 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
 
     The estimate compares runs with different steps and is printed. Steps of one tolerance are reproducible to the last
     bit, so that the run that follows is the one whose error was estimated.
-
-    Raises:
-        StateError: unless the error is positive and below 1.
     """
-    wanted = model.with_step_size(error=error)
+    wanted = model._with_step_size(error=error)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AccuracyWarning)  # reported in the line printed below
         result = wanted.confirmed(wanted.stepper())
@@ -74,11 +67,6 @@ def model_with_advised_step(model: Model, tolerance: float) -> Model:
     """Return the model with the fixed step size that pilot runs recommend for an error at the end of the span.
 
     Prints the recommendation and its pilot runs to stdout, warnings to stderr.
-
-    Raises:
-        MethodError: with a time transformation, or events that change the state.
-        StateError: if the tolerance is not positive, if every pilot run fails, or if more
-            than ``MAX_STEPS`` steps are needed.
     """
     if model.has_time_transformation:
         raise refusal("advice", "with a time transformation")
@@ -104,7 +92,7 @@ def model_with_advised_step(model: Model, tolerance: float) -> Model:
             f"the recommended run has {advice.steps} steps, more than {MAX_STEPS:g}: use a method of higher order, a "
             f"larger --advise or a shorter --span, or pass --step {advice.h:.6g} to run it"
         )
-    return model.with_step_size(h=advice.h, steps=advice.steps)
+    return model._with_step_size(h=advice.h, steps=advice.steps)
 
 
 def _text(advice: Advice) -> str:

@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType
@@ -26,42 +26,22 @@ CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 """File with the memory limit of a Linux control group (container)."""
 
 
-def check_memory(model: Model, trajectories: int = 1) -> None:
-    """Reject a run whose saved states do not fit into memory.
-
-    Raises:
-        StateError: with the size needed and a ``--save-every`` at which the states fit.
-    """
-    check_run_memory(model, 0 if model.ends_at_time else model.step_count, trajectories)
-
-
-def check_run_memory(model: Model, steps: int, trajectories: int = 1) -> None:
-    """Reject a run of ``steps`` steps whose states do not fit; adaptive runs call it as they proceed.
-
-    Raises:
-        StateError: as :func:`check_memory`.
-    """
-    folder = "record the run in a folder (-o NAME.run)"
-    check_state_memory(
-        model.dimension, steps, model.save_every, trajectories, remedies=[folder] if trajectories == 1 else []
-    )
-
-
-def check_state_memory(
-    m: int, steps: int, save_every: int, trajectories: int = 1, *, remedies: Sequence[str] = ()
-) -> None:
-    """Reject a run whose states, of ``m`` coordinates each, do not fit; ``remedies`` are remedies to propose.
-
-    Raises:
-        StateError: as :func:`check_memory`.
-    """
-    saved = steps // save_every + 1
-    each = 16 * m * trajectories + 12  # q and p of each; time and iterations
+def check_memory(model: Model, steps: int | None = None, trajectories: int = 1) -> None:
+    """Reject a run whose saved states do not fit into memory; adaptive runs call it with the ``steps`` done so far."""
+    if steps is None:
+        steps = 0 if model.ends_at_time else model.step_count
+    saved = steps // model.save_every + 1
+    each = 16 * model.dimension * trajectories + 12  # q and p of each; time and iterations
     room = usable_memory() / (COPIES * each)
     if saved <= room:
         return
-    states = f"{saved} states" if trajectories == 1 else f"{saved} states of each of {trajectories} trajectories"
-    remedies = [*([f"save fewer (--save-every {-(-steps // int(room - 1))})"] if room >= 2 else []), *remedies]
+    states, remedies = f"{saved} states", list[str]()
+    if room >= 2:
+        remedies.append(f"save fewer (--save-every {-(-steps // int(room - 1))})")
+    if trajectories == 1:
+        remedies.append("record the run in a folder (-o NAME.run)")
+    else:
+        states += f" of each of {trajectories} trajectories"
     needed = f"{COPIES * each * saved / 1e9:.3g} GB of memory"
     raise StateError(f"{states} need {needed}: {' or '.join(remedies or ['reduce the number of steps'])}")
 

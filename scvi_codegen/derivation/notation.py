@@ -9,8 +9,7 @@ from itertools import combinations
 import sympy
 
 from scvi_codegen.display.cards import Html, plain
-from scvi_codegen.display.mathml import mathml_terms
-from scvi_codegen.display.mathml.names import latex_name
+from scvi_codegen.display.mathml import latex_name, mathml_terms
 from scvi_codegen.errors import ExpressionError
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import TIME, symbol

@@ -1,15 +1,8 @@
 """Self-contained pages of HTML: formulas as MathML, pictures inline, without scripts or network.
 
-Modules: contents of a page (:mod:`~scvi_codegen.display.page`), typesetting of its text
-(:mod:`~scvi_codegen.display.page`), and its templates (:mod:`~scvi_codegen.display.page`).
-
-Blocks of a page: prose, formulas, tables, fixed-width text, drawings, and blocks side by side.
-
-Long formulas and functions are replaced by their size.
-
-Typesetting of ASCII prose and table cells as HTML: 1e-9, h^2, q_(k+1), -3, <=, ``..``.
-
-Jinja environment of pages, ``templates/page.html.jinja`` and those that extend it, with their filters.
+Blocks of a page: prose, formulas, tables, fixed-width text, drawings, and blocks side by side. Long formulas and
+functions are replaced by their size. ASCII prose and table cells are typeset: 1e-9, h^2, q_(k+1), -3, <=, ``..``.
+Templates are ``templates/page.html.jinja`` and those that extend it.
 """
 
 from __future__ import annotations
@@ -27,6 +20,7 @@ from sympy.printing.pretty.pretty_symbology import greek_unicode
 
 from scvi_codegen.display.mathml import mathml, mathml_terms
 from scvi_codegen.files.cache import template_folder
+from scvi_codegen.representation import counted
 
 Cell: TypeAlias = float | int | str | sympy.Basic | None
 
@@ -150,12 +144,12 @@ def operations(expression: sympy.Basic) -> int:
     return int(sympy.count_ops(expression))
 
 
-def formulas(all_formulas: Sequence[Formula], what: str, *, together: int = MOST_TOGETHER) -> Iterator[Content]:
+def formulas(all_formulas: Sequence[Formula], noun: str, *, together: int = MOST_TOGETHER) -> Iterator[Content]:
     """Yield the first formulas, and the number of the others.
 
     Args:
         all_formulas: all of them.
-        what: the word for one of them.
+        noun: the word for one of them.
         together: operations of those shown.
     """
     shown, large, total = 0, [], 0
@@ -170,10 +164,10 @@ def formulas(all_formulas: Sequence[Formula], what: str, *, together: int = MOST
         else:
             large.append(size)
     if large:
-        count = _counted(len(large), what)
+        count = counted(len(large), noun)
         yield Paragraph(f"{count} of more than {MOST_OPERATIONS} operations left out, the longest of {max(large)}.")
     if shown < len(all_formulas):
-        yield Paragraph(f"The first {shown} of {_counted(len(all_formulas), what)}.")
+        yield Paragraph(f"The first {shown} of {counted(len(all_formulas), noun)}.")
 
 
 def lines(text: str) -> Code:
@@ -183,10 +177,6 @@ def lines(text: str) -> Code:
         return Code(text)
     shown = "\n".join(all_formulas[:MOST_LINES])
     return Code(f"{shown}\n/* .. {len(all_formulas) - MOST_LINES} more lines */")
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'s' * (count != 1)}"
 
 
 FORMAT = ".3g"

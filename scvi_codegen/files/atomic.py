@@ -45,13 +45,13 @@ def replaced(path: str | os.PathLike[str]) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(
         prefix=f".{target.name}.", dir=target.parent, ignore_cleanup_errors=True
     ) as temporary_folder:
-        made, aside = Path(temporary_folder) / target.name, Path(temporary_folder) / "replaced"
-        yield made
-        _sync(made)
+        new, aside = Path(temporary_folder) / target.name, Path(temporary_folder) / "replaced"
+        yield new
+        _sync(new)
         if target.is_dir():
             target.replace(aside)
         try:
-            made.replace(target)
+            new.replace(target)
         except OSError:
             if aside.exists():
                 aside.replace(target)

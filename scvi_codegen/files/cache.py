@@ -265,11 +265,11 @@ def cached_source(key: Sequence[str], make: Callable[[], str]) -> str:
     """Return the result of ``make`` for this key, from the cache if it was made before."""
     if trusted_folder() is None:
         return make()
-    found = stored_text(key)
-    if found is None:
-        found = make()
-        store_text(key, found)
-    return found
+    text = stored_text(key)
+    if text is None:
+        text = make()
+        store_text(key, text)
+    return text
 
 
 def stored_text(key: Sequence[str]) -> str | None:

@@ -161,10 +161,10 @@ def write_hdf5(labelled: Labelled, path: Path) -> None:
         for name, dimensions in labelled.dimensions.items():
             whole = labelled.whole.get(name)
             kind = _kind(name) if whole is None else texts if whole.dtype.kind == "U" else whole.dtype
-            made = file.create_variable(name, dimensions, kind)
-            made.attrs.update(labelled.about(name))
+            variable = file.create_variable(name, dimensions, kind)
+            variable.attrs.update(labelled.about(name))
             if whole is not None:
-                made[...] = whole.astype(object) if whole.dtype.kind == "U" else whole
+                variable[...] = whole.astype(object) if whole.dtype.kind == "U" else whole
         _fill(labelled, file)
 
 
@@ -179,10 +179,10 @@ def write_zarr(labelled: Labelled, path: Path) -> None:
         row = int(np.prod(shape[1:])) * kind.itemsize
         rows = max(1, min(labelled.count, CHUNK_BYTES // max(row, 1))) if whole is None else shape[0]
         options = {"chunks": (max(1, rows), *shape[1:]), "fill_value": None}
-        made = group.create_array(name, shape=shape, dtype=kind, **options)
-        made.attrs.update({"_ARRAY_DIMENSIONS": list(dimensions), **labelled.about(name)})
+        array = group.create_array(name, shape=shape, dtype=kind, **options)
+        array.attrs.update({"_ARRAY_DIMENSIONS": list(dimensions), **labelled.about(name)})
         if whole is not None:
-            made[...] = whole
+            array[...] = whole
     _fill(labelled, group)
     zarr.consolidate_metadata(str(path), zarr_format=2)
 

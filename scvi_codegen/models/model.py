@@ -247,7 +247,7 @@ class Model(TimeSpan):
         """Compile a stepper for runs of this model; raises as :func:`~scvi_codegen.compile_stepper`."""
         from scvi_codegen.compiler import compile_stepper  # imported here: not needed for reading a model
 
-        self.check_controller()
+        self._check_controller()
         stepper = compile_stepper(
             self.system,
             self.method,
@@ -317,11 +317,11 @@ class Model(TimeSpan):
                 raise ModelFileError(f"the input {name} is not set: give {way}")
         return self.inputs
 
-    def _inputs_and_parameters(self, of: Stepper | Run) -> tuple[dict[str, Input], Callable[[float], Array]]:
+    def _inputs_and_parameters(self, integrator: Stepper | Run) -> tuple[dict[str, Input], Callable[[float], Array]]:
         """Return the inputs, and the scalar parameters as a function of time."""
         from scvi_codegen.runtime.inputs.segments import checked_inputs, parameters_at
 
-        stepper: Any = getattr(of, "stepper", of)
+        stepper: Any = getattr(integrator, "stepper", integrator)
         inputs = checked_inputs(stepper.interface, self.all_inputs())
         return inputs, partial(parameters_at, stepper.parameters, stepper._parameters(self.parameters), inputs)
 

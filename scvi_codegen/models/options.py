@@ -272,9 +272,9 @@ def alternatives(*sections: str) -> Iterator[tuple[Option, Option]]:
             yield one, other
 
 
-def excluded(given: Collection[str], *sections: str) -> Iterator[tuple[Option, Option]]:
+def excluded(names: Collection[str], *sections: str) -> Iterator[tuple[Option, Option]]:
     """Yield the pairs of :func:`alternatives` whose names are both given."""
-    return (pair for pair in alternatives(*sections) if all(option.name in given for option in pair))
+    return (pair for pair in alternatives(*sections) if all(option.name in names for option in pair))
 
 
 def check_alternatives(values: Any, *groups: Alternatives) -> None:

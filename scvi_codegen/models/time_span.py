@@ -62,21 +62,21 @@ class TimeSpan(RunOptions):
                 "backward in time, and less than 2^53 steps"
             )
 
-    def check_controller(self) -> None:
+    def _check_controller(self) -> None:
         """Raise an error if a controller of adaptive steps is given beside a step size."""
         if self.controller is not None and self.time_transformation is None and self.h is not None:
             raise ModelFileError(
                 f"the controller {self.controller} determines adaptive steps: leave out the step size or the controller"
             )
 
-    def run_section(self) -> dict[str, Any]:
+    def _run_section(self) -> dict[str, Any]:
         """Return the section ``[run]`` of the model file."""
         section = {option.key: getattr(self, option.field) for option in options_of("run")}
         if self.time_transformation is not None and self.controller is None:
             section["controller"] = default_controller(in_tau=True)
         return {key: value for key, value in section.items() if value is not None}
 
-    def with_step_size(self, *, steps: int | None = None, **chosen: Any) -> Self:
+    def _with_step_size(self, *, steps: int | None = None, **chosen: Any) -> Self:
         """Return the model whose step size another option determines, over the same time span or ``steps`` steps."""
         others = {option.field: None for option in OPTIONS if option.determines == STEP_SIZE and option.section}
         return replace(self, **{**others, **chosen, "steps": steps, "span": None if steps else self.covered})

@@ -332,11 +332,11 @@ class Film:
         kind = Path(path).suffix.lower()
         if kind == ".mp4" and not writers.is_available("ffmpeg"):
             raise PlotError(".mp4 animations need ffmpeg, which is not installed; use .gif or .html")
-        with style(), replaced(path) as made:
+        with style(), replaced(path) as new:
             if kind == ".html":
-                made.write_text(self.animation.to_jshtml(), encoding="utf-8")
+                new.write_text(self.animation.to_jshtml(), encoding="utf-8")
             else:
-                self.animation.save(made, writer="pillow" if kind == ".gif" else "ffmpeg")
+                self.animation.save(new, writer="pillow" if kind == ".gif" else "ffmpeg")
 
     def _repr_html_(self) -> str:
         with style():
@@ -379,6 +379,8 @@ class _Scene:
             self.axes.set(**{f"{letter}lim": (middle - size, middle + size), f"{letter}label": label})
         if self.shape.equal:
             self.axes.set_aspect("equal")
+        if dimension == 3:
+            self.axes.locator_params(nbins=5)  # more labels overlap
         nothing: list[list[float]] = [[]] * dimension
         single = [slice(0, count)] if shape.joined else [slice(k, k + 1) for k in range(count)]
         marks = list(shape.solids) or single

@@ -11,8 +11,7 @@ from printed_formulas import mp, names, trees_of_mathml, value
 from sympy import Float, Function, Matrix, Mul, Pow, Rational, Symbol, cos, exp, pi, sin, sqrt, symbols
 
 from scvi_codegen import SCVI, SVI, Gauss, SpectralCollocation, derive, problem
-from scvi_codegen.display.mathml import mathml, mathml_terms
-from scvi_codegen.display.mathml.names import latex_name
+from scvi_codegen.display.mathml import latex_name, mathml, mathml_terms
 
 x, y, h = symbols("x y h")
 

@@ -15,7 +15,7 @@ from scvi_codegen import Model, ModelFileError
 from scvi_codegen.cli.commands.derive import derive
 from scvi_codegen.cli.commands.run import run
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
-from scvi_codegen.models.options import FIELDS, OPTIONS, RUN_FIELDS, alternatives
+from scvi_codegen.models.options import FIELDS, OPTIONS, RUN_FIELDS, alternatives, options_of
 
 PAGE = (Path(scvi_codegen.__file__).parents[1] / "docs" / "model_files.md").read_text(encoding="utf-8")
 RUNS = {
@@ -91,6 +91,12 @@ def test_flags_of_commands_are_those_of_the_table():
 def test_page_of_model_files_names_every_key_of_runs():
     written = [option.key for option in FIELDS if re.search(rf"\b{option.key} = ", PAGE)]
     assert written == [option.key for option in FIELDS]
+
+
+def test_page_of_model_files_has_the_table_of_options():
+    rows = [f"| `{each.key}` | `{each.flag}` | {each.help} |" for each in options_of("run")]
+    table = "\n".join(["| key of `[run]` | flag | meaning |", "| --- | --- | --- |", *rows])
+    assert f"\n\n{table}\n\n" in PAGE
 
 
 OCCURRENCES = {

@@ -60,16 +60,16 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
     emit(text, output, **about, **formulas, text=text)
 
 
-def _formulas(of: StepEquations) -> dict[str, Any]:
+def _formulas(equations: StepEquations) -> dict[str, Any]:
     """Return the document of ``--json``: formulas as text, equations as residuals, the new state in order."""
     return {
-        "unknowns": [symbol.name for symbol in of.unknowns],
-        "equations": [{"number": each.number, "residual": str(each.residual)} for each in of.equations],
+        "unknowns": [symbol.name for symbol in equations.unknowns],
+        "equations": [{"number": each.number, "residual": str(each.residual)} for each in equations.equations],
         "end": {
-            "q": [str(each.residual) for each in of.end_position],
-            "p": [str(each.residual) for each in of.end_momentum],
+            "q": [str(each.residual) for each in equations.end_position],
+            "p": [str(each.residual) for each in equations.end_momentum],
         },
-        "initial_guess": {symbol.name: str(value) for symbol, value in of.initial_guess.items()},
-        "entries": {entry.symbol.name: float(entry.value) for entry in of.entries},
-        "conserved": [str(symmetry) for symmetry in of.symmetries],
+        "initial_guess": {symbol.name: str(value) for symbol, value in equations.initial_guess.items()},
+        "entries": {entry.symbol.name: float(entry.value) for entry in equations.entries},
+        "conserved": [str(symmetry) for symmetry in equations.symmetries],
     }

@@ -10,9 +10,9 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
+from typing import NamedTuple
 
 import click
 
@@ -47,8 +47,7 @@ print(abs(energy / energy[0] - 1).max())
 """Source of the trial run, which has a process of its own: an instruction unknown to the processor would kill it."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CheckResult:
+class CheckResult(NamedTuple):
     """Result of one check.
 
     Attributes:
@@ -66,8 +65,8 @@ class CheckResult:
 
 def run_checks() -> Iterator[CheckResult]:
     """Yield the results of all checks one by one; the trial run, which compiles a stepper, takes some seconds."""
-    yield CheckResult(name="python", status=OK, result=f"{platform.python_version()}, {platform.platform()}")
-    yield CheckResult(name="cores", status=OK, result=_cores())
+    yield CheckResult("python", OK, f"{platform.python_version()}, {platform.platform()}")
+    yield CheckResult("cores", OK, _cores())
     yield _packages("", "libraries")
     yield from _compilation()
     yield _cache()
@@ -114,13 +113,9 @@ def _packages(extra: str, name: str) -> CheckResult:
         if _numbers(installed) < _numbers(wanted["least"]):
             absent.append(f"{wanted['name']} >= {wanted['least']}")
     if not absent:
-        return CheckResult(name=name, status=OK, result=", ".join(present))
-    return CheckResult(
-        name=name,
-        status=MISSING if extra else FAILED,
-        result=", ".join(present) or "none installed",
-        remedy=f"missing {', '.join(absent)}: pip install '{PACKAGE}{f'[{extra}]' if extra else ''}'",
-    )
+        return CheckResult(name, OK, ", ".join(present))
+    remedy = f"missing {', '.join(absent)}: pip install '{PACKAGE}{f'[{extra}]' if extra else ''}'"
+    return CheckResult(name, MISSING if extra else FAILED, ", ".join(present) or "none installed", remedy)
 
 
 def _numbers(text: str) -> tuple[int, ...]:
@@ -134,18 +129,13 @@ def _compilation() -> Iterator[CheckResult]:
         command = find_compiler()
         title = compiler_title()
     except (BuildError, OSError, subprocess.TimeoutExpired) as error:
-        yield CheckResult(name="compiler", status=FAILED, result="none", remedy=str(error))
+        yield CheckResult("compiler", FAILED, "none", str(error))
         return
-    why = (
-        "" if not from_wheel(command) or os.environ.get("CC") else " (extra compiler: the PATH has no cc, gcc or clang)"
-    )
-    yield CheckResult(name="compiler", status=OK, result=f"{' '.join(command)}: {title}{why}")
-    own_flags = os.environ.get(FLAGS_VARIABLE, "")
-    yield CheckResult(
-        name="flags",
-        status=OK,
-        result=" ".join([*TUNED_FLAGS, *([own_flags, f"({FLAGS_VARIABLE})"] if own_flags else [])]),
-    )
+    bundled = from_wheel(command) and not os.environ.get("CC")
+    reason = " (extra compiler: the PATH has no cc, gcc or clang)" if bundled else ""
+    yield CheckResult("compiler", OK, f"{' '.join(command)}: {title}{reason}")
+    chosen = [flags, f"({FLAGS_VARIABLE})"] if (flags := os.environ.get(FLAGS_VARIABLE, "")) else []
+    yield CheckResult("flags", OK, " ".join([*TUNED_FLAGS, *chosen]))
     with tempfile.TemporaryDirectory(prefix="scvi-codegen-doctor-", ignore_cleanup_errors=True) as folder:
         trial = _trial(Path(folder))
         yield trial
@@ -165,21 +155,14 @@ def _trial(folder: Path) -> CheckResult:
         return _trial_failure(errors.strip() or _exit_reason(process.returncode))
     error = float(message)
     if not error < ENERGY_BOUND:
-        return _trial_failure(
-            f"its relative energy error is {error:.0e}: compiler or flags violate IEEE 754 arithmetic"
-        )
+        return _trial_failure(f"relative energy error {error:.0e}: compiler or flags violate IEEE 754 arithmetic")
     took = f"compiled and run in {time.perf_counter() - began:.1f} s"
-    return CheckResult(name="trial", status=OK, result=f"a pendulum, {took}, relative energy error {error:.0e}")
+    return CheckResult("trial", OK, f"a pendulum, {took}, relative energy error {error:.0e}")
 
 
-def _trial_failure(why: str) -> CheckResult:
-    last = why.splitlines()[-12:]
-    return CheckResult(
-        name="trial",
-        status=FAILED,
-        result="a pendulum could not be compiled and run",
-        remedy="\n".join([*last, f"use another compiler (CC=gcc, CC=clang), or check {FLAGS_VARIABLE}"]),
-    )
+def _trial_failure(reason: str) -> CheckResult:
+    remedy = [*reason.splitlines()[-12:], f"use another compiler (CC=gcc, CC=clang), or check {FLAGS_VARIABLE}"]
+    return CheckResult("trial", FAILED, "a pendulum could not be compiled and run", "\n".join(remedy))
 
 
 def _exit_reason(status: int) -> str:
@@ -193,14 +176,9 @@ def _exit_reason(status: int) -> str:
 def _vectors(folder: Path) -> CheckResult:
     """Check if the compiled library calls glibc's vector functions."""
     if any(VECTOR_CALL in library.read_bytes() for library in folder.glob("_scvi_*/*.so")):
-        return CheckResult(name="vectors", status=OK, result="libmvec: vectorised sines and exponentials")
-    return CheckResult(
-        name="vectors",
-        status=MISSING,
-        result="no libmvec: scalar sines and exponentials",
-        remedy="it requires glibc 2.22 or later on x86-64 and -march=native among the flags "
-        "(Debian, Ubuntu: apt install libc6-dev)",
-    )
+        return CheckResult("vectors", OK, "libmvec: vectorised sines and exponentials")
+    remedy = "it requires glibc 2.22 or later on x86-64 and -march=native among the flags (Debian, Ubuntu: apt install "
+    return CheckResult("vectors", MISSING, "no libmvec: scalar sines and exponentials", f"{remedy}libc6-dev)")
 
 
 def _cache() -> CheckResult:
@@ -210,14 +188,13 @@ def _cache() -> CheckResult:
     try:
         cache_text = str(cache_info()).replace("\n", ": ")
     except BuildError as error:
-        return CheckResult(name="cache", status=MISSING, result=str(folder), remedy=str(error))
+        return CheckResult("cache", MISSING, str(folder), str(error))
+    remedy = ""
     if exposed(folder):
         remedy = f"the cache is not used, because {remedy_of(folder)}"
-        return CheckResult(name="cache", status=MISSING, result=cache_text, remedy=remedy)
-    if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
+    elif not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
         remedy = f"the folder is not writable, nothing is cached: set {CACHE_VARIABLE} to another one"
-        return CheckResult(name="cache", status=MISSING, result=cache_text, remedy=remedy)
-    return CheckResult(name="cache", status=OK, result=cache_text)
+    return CheckResult("cache", MISSING if remedy else OK, cache_text, remedy)
 
 
 STATUS_WIDTH, NAME_WIDTH = 5, 17
@@ -239,15 +216,10 @@ def doctor() -> None:
     findings = []
     for finding in run_checks():
         findings.append(finding)
-        tell(_lines(finding))
+        tell(f"{finding.status:{STATUS_WIDTH}} {finding.name:{NAME_WIDTH}} {finding.result}")
+        for line in finding.remedy.splitlines():
+            tell(" " * (STATUS_WIDTH + NAME_WIDTH + 2) + line)
     failing = [finding.name for finding in findings if finding.status == FAILED]
-    tell(ok=not failing, findings=[asdict(finding) for finding in findings])
+    tell(ok=not failing, findings=[finding._asdict() for finding in findings])
     if failing:
         raise CommandFailure(f"integrators cannot be compiled and run on this machine: {', '.join(failing)}", FAILURE)
-
-
-def _lines(finding: CheckResult) -> str:
-    """Return a line with status, name and description of a check, and indented lines with the remedy."""
-    indent = " " * (STATUS_WIDTH + NAME_WIDTH + 2)
-    first = f"{finding.status:{STATUS_WIDTH}} {finding.name:{NAME_WIDTH}} {finding.result}"
-    return "\n".join([first, *(f"{indent}{line}" for line in finding.remedy.splitlines())])

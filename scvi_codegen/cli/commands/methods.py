@@ -70,7 +70,7 @@ def methods_table(entries: Iterable[Mapping[str, Any]]) -> str:
         name = f"{entry['name']}[:{entry['number']}]" if entry["number"] else entry["name"]
         first = (name, ", ".join(entry["arguments"]) or "none") if entry["name"] != last else ("", "")
         order = "none claimed" if entry["order"] is None else str(entry["order"])
-        holds = ("yes" if entry[what] else "no" for what in ("symplectic", "symmetric"))
+        holds = ("yes" if entry[claim] else "no" for claim in ("symplectic", "symmetric"))
         rows.append((*first, " ".join([entry["example"], *entry["options"]]), order, *holds))
         last = entry["name"]
     return table(rows)
@@ -80,9 +80,6 @@ def tableau_text(name: str) -> str:
     """Return the Butcher tableau of a name such as ``gauss:3``, in radicals if known and short, else in 17 digits.
 
     Long radicals are listed below the decimal tableau, one entry a line.
-
-    Raises:
-        MethodError: if there is no such tableau.
     """
     tableau = tableau_by_name(name)
     rows = [[_decimal(c), *map(_decimal, line)] for c, line in zip(tableau.c, tableau.A, strict=True)]

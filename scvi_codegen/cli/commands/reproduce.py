@@ -18,9 +18,9 @@ from scvi_codegen.cli.command_group import (
     reporting,
     tell,
 )
-from scvi_codegen.cli.reports import counted
 from scvi_codegen.files.atomic import write_text
 from scvi_codegen.pictures.canvas import check_plot_path
+from scvi_codegen.representation import counted
 from scvi_codegen.reproduce.experiment import Experiment, Result, report_html, tally, write_result
 from scvi_codegen.reproduce.runner import CATALOGUE, Failure, Watch, catalogue, run_experiments, with_needs
 
@@ -139,11 +139,6 @@ def reproduce_experiments(
     """Run experiments and those they depend on; write the files of each result, and the page at the end.
 
     Each result is a line passed to ``report``. Ctrl-C ends the run; files written before remain.
-
-    Raises:
-        StateError: for an unknown name.
-        PlotError: without Matplotlib.
-        OSError: if a file cannot be written.
     """
     experiments = catalogue(module)
     chosen = _chosen(names, experiments)

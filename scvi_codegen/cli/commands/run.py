@@ -140,8 +140,10 @@ def run(
         (f"-o {output}", recorded),
     ):
         model = with_known_sizes(model, option) if needed else model
-    if model.system.inputs:
-        _check_driven(wanted["advise"], recorded=recorded)
+    if model.system.inputs and wanted["advise"] is not None:
+        check_flag(ERRORS["advise"], WITH_INPUTS)
+    if model.system.inputs and recorded:
+        raise click.UsageError("a run with inputs cannot be recorded in a folder: write it to a file (-o NAME.npz)")
     model, confirmation = _with_steps(model, wanted)
     if ensemble is not None:
         _run_ensemble(model, ensemble, (output, plot))
@@ -204,13 +206,6 @@ def _check_combination(
             raise click.UsageError(f"--{arguments[0]} determines the step size: omit --{name} (--span is the duration)")
     if ensemble is not None and arguments:
         check_flag(ERRORS[arguments[0]], IN_ENSEMBLE)
-
-
-def _check_driven(advise: float | None, *, recorded: bool) -> None:
-    if advise is not None:
-        check_flag(ERRORS["advise"], WITH_INPUTS)
-    if recorded:
-        raise click.UsageError("a run with inputs cannot be recorded in a folder: write it to a file (-o NAME.npz)")
 
 
 def _run_one(model: Model, output: str | None, plot: str | None, *, advised: float | None) -> None:

@@ -15,7 +15,7 @@ from itertools import groupby
 import sympy
 from sympy import Symbol
 
-from scvi_codegen.display.mathml.names import RAISED
+from scvi_codegen.display.mathml import RAISED
 from scvi_codegen.display.page import Formula
 from scvi_codegen.lowering.stage_groups import argument_name
 from scvi_codegen.mechanics.constraints import constraint_rates, position_conditions, velocity_conditions

@@ -162,7 +162,7 @@ def motion_of(model: Model, names: Sequence[str]) -> dict[str, Any]:
     specification = model.method.specification().items()
     method = {key: list(value) if isinstance(value, tuple) else value for key, value in specification}
     solver = {} if model.solver == "auto" else {"solver": model.solver}
-    return {"initial": {"t": model.t, **initial}, "method": {**method, **solver}, "run": model.run_section()}
+    return {"initial": {"t": model.t, **initial}, "method": {**method, **solver}, "run": model._run_section()}
 
 
 def _wrapped(formula: str) -> str:

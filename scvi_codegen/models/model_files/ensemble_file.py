@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scvi_codegen.errors import ModelFileError, closest
-from scvi_codegen.files.atomic import read_text
 from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.input_tables import parse_table
+from scvi_codegen.models.model_files.sections import text_in
 from scvi_codegen.models.options import real
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.validation import checked_count
@@ -105,14 +105,11 @@ def load_ensemble(path: str | os.PathLike[str], model: Model) -> EnsembleStates:
     readers: dict[str, Callable[[str, Check], dict[str, Array]]]
     readers = {".toml": _read_grid, ".csv": lambda text, check: parse_table(text, check).columns}
     suffix = Path(path).suffix.lower()
+    if suffix not in readers:
+        raise ModelFileError(f"{path}: an ensemble must be a grid in a .toml file or a table in a .csv file")
+    text = text_in(path, "utf-8-sig")
     try:
-        if suffix not in readers:
-            raise ModelFileError("an ensemble must be a grid in a .toml file or a table in a .csv file")
-        columns = readers[suffix](read_text(path, "utf-8-sig"), partial(_check_names, model))
-    except OSError as error:
-        raise ModelFileError(f"{path} cannot be read: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise ModelFileError(f"{path} is not a text file in UTF-8: {error.reason} at byte {error.start}") from error
+        columns = readers[suffix](text, partial(_check_names, model))
     except ModelFileError as error:
         raise ModelFileError(f"{path}: {error}") from error
     return EnsembleStates(columns=columns, model=model)

@@ -126,9 +126,10 @@ def tables_of_example(
 ) -> tuple[tuple[ExampleInput, ...], tuple[float, ...]]:
     """Return the tables of all inputs (or none) for C, and all parameters at the start of a run over that time span."""
     whole = min(span), max(span) + 1.0  # of the only piece of a constant
-    given = {name: inputs[name] for name in system.inputs if inputs}
+    chosen = {name: inputs[name] for name in system.inputs if inputs}
     data = {
-        name: input_of(name, each if isinstance(each, tuple) else (whole, (each, each))) for name, each in given.items()
+        name: input_of(name, each if isinstance(each, tuple) else (whole, (each, each)))
+        for name, each in chosen.items()
     }
     tables = tuple(
         ExampleInput(name, tuple(each.breakpoints.tolist()), tuple(map(tuple, each.pieces[:, :POWERS].tolist())))

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from scvi_codegen.controllers import SYMPLECTIC, default_controller, with_time_transformation
 from scvi_codegen.errors import ModelFileError, SystemDefinitionWarning
-from scvi_codegen.files.atomic import read_text, write_text
+from scvi_codegen.files.atomic import write_text
 from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.lowering.arrays import one_coordinate
@@ -42,6 +42,7 @@ from scvi_codegen.models.model_files.sections import (
     read_method,
     read_run,
     read_system,
+    text_in,
     words_of,
 )
 from scvi_codegen.models.model_files.values import read_values
@@ -75,12 +76,7 @@ def load_model(path: str | os.PathLike[str], changes: Document | None = None) ->
     Raises:
         ModelFileError: beginning with the path and naming the key at fault.
     """
-    try:
-        text = read_text(path, "utf-8")
-    except OSError as error:
-        raise ModelFileError(f"{path} cannot be read: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise ModelFileError(f"{path} is not a text file in UTF-8: {error.reason} at byte {error.start}") from error
+    text = text_in(path, "utf-8")
     try:
         return parse_model(text, changes, folder=Path(path).parent)
     except ModelFileError as error:

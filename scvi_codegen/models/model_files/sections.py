@@ -1,11 +1,13 @@
 """Sections of model files: merging, validation of keys, methods, systems with their forces, hints for unknown keys."""
 
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import chain
 from typing import Any, Final, TypeVar
 
 from scvi_codegen.errors import ModelFileError, ScviCodegenError, closest
+from scvi_codegen.files.atomic import read_text
 from scvi_codegen.mechanics.first_order import FirstOrderSystem
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -108,6 +110,17 @@ def _changed_method(base: Section, changes: Section) -> Section:
     return sized({**base_section, **changes}) if "method" in changes else {**base_section, **changes}
 
 
+def text_in(path: str | os.PathLike[str], encoding: str, name: object = None) -> str:
+    """Return the text of a file; :class:`ModelFileError` begins with its ``name``, by default the path."""
+    try:
+        return read_text(path, encoding)
+    except OSError as error:
+        raise ModelFileError(f"{name or path} cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        problem = f"is not a text file in UTF-8: {error.reason} at byte {error.start}"
+        raise ModelFileError(f"{name or path} {problem}") from error
+
+
 def read_method(section: Section) -> Method:
     """Return the method of the section ``[method]``."""
     name = text_of(section, "method", "[method]")
@@ -156,13 +169,13 @@ def formula_of(section: Section, key: str, where: str) -> str:
     return str(section[key])
 
 
-def check_keys(section: Section, known: Iterable[str], what: str, where: str = "the file") -> None:
+def check_keys(section: Section, known: Iterable[str], kind: str, where: str = "the file") -> None:
     """Raise an error for unknown keys."""
     names = list(known)
-    hint = key_hint if what in ("key", "section") else closest
+    hint = key_hint if kind in ("key", "section") else closest
     for key in section:
         if key not in names:
-            raise ModelFileError(f"unknown {what} '{key}' in {where}{hint(key, names)} Known: {', '.join(names)}")
+            raise ModelFileError(f"unknown {kind} '{key}' in {where}{hint(key, names)} Known: {', '.join(names)}")
 
 
 def in_section(where: str, build: Callable[[], Built]) -> Built:

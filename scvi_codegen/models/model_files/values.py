@@ -96,7 +96,9 @@ def read_values(
     }
     changed = {name: x for (group, _), values in elements.items() if group == "fields" for name, x in values.items()}
     vectors = {
-        name: _read_vector(section[key], names, key, {of: x for (group, of), x in elements.items() if group == key})
+        name: _read_vector(
+            section[key], names, key, {array: x for (group, array), x in elements.items() if group == key}
+        )
         for key, name in STATE.items()
         if key in section
     }
@@ -113,8 +115,8 @@ def _by_coordinate(section: Section, system: MechanicalSystem) -> Section:
         return {**section, **{key: list(half) for key, half in zip(("q", "p"), halves, strict=True)}}
     if not system.rotations:
         return section
-    given = [section.get(key) for key in STATE]
-    state = in_section("[initial]", lambda: state_by_name(system, *given))
+    entries = [section.get(key) for key in STATE]
+    state = in_section("[initial]", lambda: state_by_name(system, *entries))
     vectors = {key: value for key, value in zip(STATE, state, strict=True) if value is not None}
     return {
         **section,
@@ -126,9 +128,16 @@ def _values_of_arrays(
     document: Document, system: ArraySystem, entries: dict[Key, Entry], folder: str | os.PathLike[str]
 ) -> dict[str, Any]:
     """Return the fields of a model with arrays whose sizes are names; ``entries`` are those of parameters."""
-    entries |= _table_entries(document.get("tables", {})) | _state_entries(document["initial"], system)
+    for key, value in document.get("tables", {}).items():
+        table = in_section("[tables]", partial(parse_array, key))
+        entries["tables", table.name] = Entry(table, value, f"[tables] {table.name}")
+    entries |= _state_entries(document["initial"], system)
+    sizes = document.get("sizes", {})
+    check_keys(sizes, system.sizes, "size", "[sizes]")
+    for name, value in sizes.items():
+        checked_count(value, f"[sizes] {name}", least=1, error=ModelFileError)
     numbers = {each.name: value for each, value in zip(system.parameters, system.defaults, strict=True)}
-    read = _read_arrays(entries, _read_sizes(document.get("sizes", {}), system), folder, numbers)
+    read = _read_arrays(entries, sizes, folder, numbers)
     groups: dict[str, dict[str, Any]] = {}
     for (group, name), values in read.items():
         groups.setdefault(group, {})[name] = _whole(values, f"[tables] {name}") if group == "tables" else values
@@ -141,13 +150,6 @@ def _parameter_entries(section: Section, system: MechanicalSystem) -> dict[Key, 
     names = {key: key.partition("[")[0] for key, value in section.items() if "[" in key and not is_number(value)}
     return {
         ("fields", name): Entry(declared[name], section[key], f"[parameters] {name}") for key, name in names.items()
-    }
-
-
-def _table_entries(section: Section) -> dict[Key, Entry]:
-    tables = {key: in_section("[tables]", partial(parse_array, key)) for key in section}
-    return {
-        ("tables", table.name): Entry(table, section[key], f"[tables] {table.name}") for key, table in tables.items()
     }
 
 
@@ -170,13 +172,6 @@ def _state_entries(section: Section, system: ArraySystem) -> dict[Key, Entry]:
         for array in system.coordinates:
             entries[field, array.name] = Entry(array, required(value, array.name, where), f"{where}, {array.name}")
     return entries
-
-
-def _read_sizes(section: Section, system: ArraySystem) -> dict[str, int]:
-    check_keys(section, system.sizes, "size", "[sizes]")
-    return {
-        name: checked_count(value, f"[sizes] {name}", least=1, error=ModelFileError) for name, value in section.items()
-    }
 
 
 def _read_arrays(

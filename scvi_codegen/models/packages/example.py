@@ -70,6 +70,9 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
     else:
         count = OUTPUTS if model.h is None or model.time_transformation is not None else None
         steps = count or max(1, model.step_count if model.system.inputs else model.whole_step_count())
+    tolerance = COMPARED if model.h is not None else model.tolerance or 0.0
+    if model.time_transformation is not None and model.h is not None:
+        tolerance = abs(model.h)  # the step size in tau
     save_every = math.ceil(steps / OUTPUTS)
     outputs = math.ceil(steps / save_every)
     return ExampleRun(
@@ -79,7 +82,7 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
         t=model.t,
         h=model.h if model.time_transformation is None else None,
         span=model.covered,
-        tolerance=_chosen_by(model),
+        tolerance=tolerance,
         controlled=controlled,
         save_every=save_every,
         outputs=outputs,
@@ -93,7 +96,7 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
 
 def _check_options(model: Model) -> None:
     """Reject a controller beside a fixed step size; warn of options that generated programs do not use."""
-    model.check_controller()
+    model._check_controller()
     names = [option.key for option in RUN_FIELDS if option.solver_option and getattr(model, option.field) is not None]
     if names:
         warn(
@@ -101,13 +104,6 @@ def _check_options(model: Model) -> None:
             "pass them to the C functions as options",
             MethodWarning,
         )
-
-
-def _chosen_by(model: Model) -> float:
-    """Return the tolerance of adaptive steps, or the step size in tau."""
-    if model.time_transformation is not None and model.h is not None:
-        return abs(model.h)
-    return COMPARED if model.h is not None else model.tolerance or 0.0
 
 
 def _momenta(model: Model, parameters: Sequence[float]) -> tuple[float, ...]:

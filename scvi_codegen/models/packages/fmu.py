@@ -84,8 +84,8 @@ def model_description(
     able = ABLE | {"hasEventMode": "true"} if has_events else ABLE
     SubElement(root, "CoSimulation", able, modelIdentifier=interface.prefix, fixedInternalStepSize=repr(start.h))
     categories = SubElement(root, "LogCategories")
-    for name, what in LOGGED.items():
-        SubElement(categories, "Category", name=name, description=what)
+    for name, description in LOGGED.items():
+        SubElement(categories, "Category", name=name, description=description)
     end = start.t + start.span
     SubElement(root, "DefaultExperiment", startTime=repr(start.t), stopTime=repr(end), stepSize=repr(start.h))
     variables = list(enumerate(_variables(interface, start, by_velocity=by_velocity)))

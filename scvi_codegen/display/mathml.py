@@ -1,8 +1,19 @@
-"""SymPy's presentation MathML printer with names, numbers, sums and functions of the package."""
+"""SymPy expressions as presentation MathML, which browsers typeset.
+
+    >>> from sympy import Symbol
+    >>> mathml(Symbol("theta_1_dot") / 2)  # doctest: +ELLIPSIS
+    '<math><mrow><mfrac><msub><mover accent="true"><mi mathvariant="normal" ...>θ</mi><mo ...>˙</mo></mover>...</math>'
+
+Browsers do not break lines within ``<math>``, so :func:`mathml_terms` returns an equation as terms, between which a
+line may end.
+
+Names of symbols are parsed: ``theta_1_dot`` is a letter with an accent and an index, ``l_1_0`` is l_0(tau_1).
+"""
 
 import html
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 from xml.dom.minidom import Element, Node
 
@@ -10,8 +21,91 @@ import sympy
 from sympy.core.function import AppliedUndef
 from sympy.printing.mathml import MathMLPresentationPrinter
 from sympy.printing.precedence import PRECEDENCE
+from sympy.printing.pretty.pretty_symbology import greek_unicode
 
-from scvi_codegen.display.mathml.names import ACCENTS, TOKEN, Name, parsed, table_name
+ACCENTS = {"dot": "˙", "ddot": "¨", "hat": "^", "tilde": "~", "bar": "¯"}
+LATEX_ACCENT = re.compile(r"\\(dot|ddot|hat|tilde|bar)\{?(\w+?)\}?(?=[_^]|$)")
+RAISED = ("Q", "V", "P")
+"""Letters whose first index counts nodes: Q_1_x is component x of Q at node 1, as the paper has it."""
+CARDINAL = {"l": "", "dl": "dot"}
+"""Tables of cardinal functions at points, with their accent: l_1_0 is l_0(tau_1)."""
+PRODUCTS = {"DD": ("D_hat", "D_tilde"), "aa": ("A__2",), "bA": ("b", "A")}
+"""Tables that are products of matrices: DD_1_0 is entry (1, 0) of the product, DD_n_j any."""
+RUNNING = ("i", "j", "n")
+"""Indices of sums."""
+TOKEN = re.compile(r"[^\W\d]+\d*|\d+|\S")
+"""Pieces of an index: letters with their digits, a number, or a sign."""
+GREEK_NAMES = {letter: name for name, letter in greek_unicode.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Name:
+    """Parts of a symbol's name: ``theta_1_dot`` is θ with an accent and one index."""
+
+    letter: str
+    accent: str = ""
+    below: tuple[str, ...] = field(default=())
+    above: tuple[str, ...] = field(default=())
+
+
+def parsed(name: str) -> Name:
+    """Return the parts of names as the package makes them (q_dot, p_q1_k, Q_2_x) and as SymPy does (Q__2_x, theta1)."""
+    plain = LATEX_ACCENT.sub(r"\2_\1", name.strip("_") or name)
+    head, *raised = re.split(r"__|\^", plain)
+    above: list[str] = []
+    letter, *below = head.split("_")
+    for part in raised:
+        first, *rest = part.split("_")
+        above.append(first)
+        below += rest
+    accent = next((part for part in below if part in ACCENTS), "")
+    if accent:
+        below.remove(accent)
+    if letter in RAISED and not above and below and below[0].isdigit():
+        above.append(below.pop(0))
+    if match := re.fullmatch(r"([^\W\d]+)(\d+)", letter):
+        letter, below = match[1], [match[2], *below]
+    return Name(str(greek_unicode.get(letter, letter)), accent, tuple(filter(None, below)), tuple(above))
+
+
+@dataclass(frozen=True, slots=True)
+class TableName:
+    """An entry of a derived table: a cardinal function at a point, or matrices with the indices of their product."""
+
+    factors: tuple[Name, ...]
+    point: Name | None
+    indices: tuple[str, ...]
+
+
+def table_name(name: str) -> TableName | None:
+    """Return the entry of a table that a symbol denotes if its name is that of one."""
+    prefix, *indices = name.lstrip("_").split("_")
+    if prefix in CARDINAL and len(indices) == 2 and all(map(str.isdigit, indices)):
+        return TableName((Name("l", CARDINAL[prefix], below=(indices[1],)),), Name("τ", below=(indices[0],)), ())
+    if prefix in PRODUCTS and indices and all(index.isdigit() or index in RUNNING for index in indices):
+        return TableName(tuple(map(parsed, PRODUCTS[prefix])), None, tuple(indices))
+    return None
+
+
+def latex_name(name: str) -> str:
+    """Return the name in LaTeX: ``l_1_0`` as l_0(tau_1), ``Q_2_x`` with 2 above and x below."""
+    entry = table_name(name)
+    if entry is None:
+        return _latex(parsed(name))
+    factors = "".join(map(_latex, entry.factors))
+    return f"{factors}({_latex(entry.point)})" if entry.point else f"({factors}){_script('_', entry.indices)}"
+
+
+def _latex(name: Name) -> str:
+    letter = str(sympy.latex(sympy.Symbol(GREEK_NAMES.get(name.letter, name.letter))))
+    accented = rf"\{name.accent}{{{letter}}}" if name.accent else letter
+    return f"{accented}{_script('_', name.below)}{_script('^', name.above)}"
+
+
+def _script(sign: str, parts: tuple[str, ...]) -> str:
+    written = ",".join("".join(_latex(parsed(t)) if t[0].isalpha() else t for t in TOKEN.findall(p)) for p in parts)
+    return f"{sign}{{{written}}}" if parts else ""
+
 
 DIGITS = 6
 """Significant digits of floating-point numbers."""
@@ -147,3 +241,26 @@ def _finish(node: Any) -> None:
         if node.nodeName == "mi" and GREEK.fullmatch(child.data):
             for name, value in UPRIGHT.items():
                 node.setAttribute(name, value)
+
+
+def mathml(expression: sympy.Basic) -> str:
+    """Return an expression, a matrix or a relation as one ``<math>`` element; well-formed XML and HTML."""
+    printer = Printer()
+    return printer.text(printer._print(expression))
+
+
+def mathml_terms(right: sympy.Basic, left: sympy.Basic | None = None) -> tuple[str, ...]:
+    """Return the terms of an expression or an equation as ``<math>`` elements of full size; each begins with its sign.
+
+    Args:
+        right: an expression, or an equation if ``left`` is ``None``.
+        left: the left side; the first term of the right side begins with the equals sign.
+    """
+    if left is None and isinstance(right, sympy.Eq):
+        left, right = right.lhs, right.rhs
+    printer = Printer()
+    terms = list(printer.terms(right))
+    if left is not None:
+        terms[0].insert(0, printer.element("mo", "=", form="infix"))
+        terms = [*printer.terms(left), *terms]
+    return tuple(printer.text(*term, displaystyle="true") for term in terms)
