@@ -11,6 +11,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 import scvi_codegen as sc
+from scvi_codegen import verification
 from scvi_codegen.cli import command_group, main
 from scvi_codegen.methods import specification_of
 from scvi_codegen.models.model_files.model_file import parse_model
@@ -142,6 +143,25 @@ def test_json_of_lists_and_model_files():
 def test_certificate_equals_the_saved_one():
     found = document("verify", "planar-pendulum", "--method", "svi:1", "-o", "certificate.json")
     assert found == json.loads(Path("certificate.json").read_text())
+    assert any(check["name"].startswith("identity") for check in found["checks"])
+
+
+@pytest.mark.parametrize(
+    ("run", "tolerance"),
+    [("span = 3.0\nerror = 1e-6", 0.0), ("span = 3.0\ntolerance = 1e-6", 1e-6), ("step = 0.1\nsteps = 9", None)],
+)
+def test_adaptive_steps_are_verified_at_the_tolerance_of_the_model(run, tolerance, monkeypatch):
+    """0 stands for round-off; None for a fixed step size."""
+    seen = []
+
+    def verify(*_, **arguments):
+        seen.append(arguments["tolerance"])
+        raise sc.StateError("seen")
+
+    monkeypatch.setattr(verification, "verify", verify)
+    Path("model.toml").write_text(f"[system]\ncatalogue = 'kepler'\n[method]\nmethod = 'svi:4'\n[run]\n{run}\n")
+    invoke("verify", "model.toml", status=2)
+    assert seen == [tolerance]
 
 
 def test_undefined_numbers_are_null():

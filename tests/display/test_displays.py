@@ -13,6 +13,7 @@ from samples import compile_quickly
 
 import scvi_codegen as sc
 from scvi_codegen.display.cards import card, listed, plain, sparkline
+from scvi_codegen.display.number_tables import number_table
 from scvi_codegen.verification.certificate import Check, Outcome
 
 METHODS = [
@@ -163,6 +164,13 @@ class TestEquations:
         assert re.search(r"\(27a\) \d+ operations", shown)
         small = DISPLAYED["equations"]()
         assert small._repr_latex_() == small.to_latex()
+
+
+def test_rows_of_numbers_are_numbered_as_in_the_formulas():
+    """Nodes from 0, points of a quadrature and stages from 1."""
+    tables = [number_table(part) for part in (sc.chebyshev_lobatto(2), sc.gauss_legendre(3), sc.RadauIIA(2).tableau)]
+    assert [[row[0] for row in table.rows] for table in tables] == [list("012"), list("123"), ["1", "2", "b"]]
+    assert "of order 3" in tables[2].name
 
 
 class TestTrajectory:

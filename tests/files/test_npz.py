@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.files.export import States
+from scvi_codegen.files.export import States, loaded
 
 PARAMETERS = {"m": 1.0, "k": 1.0}
 GIVEN: dict[str, Any] = {"h": 0.05, "steps": 12, "t": 0.7, "save_every": 3}
@@ -107,3 +107,10 @@ def test_many_parameters_are_a_labelled_array(count):
         assert labelled.attributes == {"h": 0.1}
         assert dict(zip(labelled.whole["parameter"], labelled.whole["parameters"], strict=True)) == parameters
         assert labelled.dimensions["parameters"] == ("parameter",)
+
+
+def test_pickled_objects_are_refused(tmp_path: Path) -> None:
+    """They could run any code when they are loaded."""
+    np.savez(tmp_path / "a.npz", t=np.array([{"not": "numbers"}], dtype=object))
+    with loaded(tmp_path / "a.npz") as content, pytest.raises(ValueError, match="allow_pickle=False"):
+        content["t"]

@@ -160,3 +160,11 @@ def test_iterations_of_a_model_are_limited():
     with pytest.raises(StepFailedError, match="did not converge"):
         parse_model(text).integrate()
     assert parse_model(text.replace("max_iterations = 1", "max_iterations = 200")).integrate().steps == 2
+
+
+def test_options_of_commands_have_the_order_of_the_table():
+    for command in (run, derive):
+        names = [each.name for each in command.params]
+        assert [name for name in names if name in {each.name for each in OPTIONS}] == [
+            each.name for each in OPTIONS if each.name in names
+        ]

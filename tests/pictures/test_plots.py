@@ -251,6 +251,10 @@ class TestOnePicture:
         for line, orbit in zip(drawn, orbits, strict=True):
             assert np.array_equal(line.get_xydata(), np.stack([orbit.q[:, 1], orbit.p[:, 1]], axis=1))
 
+    def test_phase_portrait_is_that_of_the_first_coordinate_by_default(self, orbits):
+        axes = plot_phase(orbits[0])
+        assert (axes.get_xlabel(), axes.get_ylabel()) == ("x", "p_x")
+
     def test_energies_of_several_runs_share_axes_that_contain_them(self, orbits):
         axes = plot_energy(orbits)
         low, high = axes.get_ylim()

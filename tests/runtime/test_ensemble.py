@@ -566,6 +566,7 @@ class TestFiles:
                 assert np.array_equal(file[name], getattr(result, name), equal_nan=name in "qp")
             assert file["coordinates"].tolist() == ["q1", "q2"]
             assert file["parameter_names"].tolist() == ["mu"]
+        assert [result[j].steps for j in range(3)] == result.steps.tolist()
 
     def test_csv_has_long_format_and_omits_failures(self, result: sc.EnsembleTrajectory, tmp_path):
         result.save(tmp_path / "runs.csv")

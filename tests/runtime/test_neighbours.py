@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import scvi_codegen as sc
 from scvi_codegen.models.model_files.model_file import dump_model
 from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.native.compilers import find_compiler
+from scvi_codegen.rendering.source import _check_lengths
 
 SQUARE = "sum(a in 3, wrap(r[i, a] - r[j, a], box)**2)"
 WELL = f"4*(1/{SQUARE}**6 - 1/{SQUARE}**3)*positive_part(1 - {SQUARE}**2/cut**4)**4"
@@ -368,3 +370,20 @@ def test_lengths_may_be_formulas_and_defaults_are_checked() -> None:
     each.integrate({"q": [0.0, 1.0]}, {"q": [0.0, 0.0]}, h=0.1, steps=1, parameters={"s": 0.9})
     with pytest.raises(sc.StateError, match="must be a positive number"):
         each.integrate({"q": [0.0, 1.0]}, {"q": [0.0, 0.0]}, h=0.1, steps=1, parameters={"s": -1})
+
+
+@pytest.mark.parametrize(
+    "lengths",
+    [
+        [("near", "skin", "0.5"), ("near", "cutoff", "1")],
+        [("near", "cutoff", "1"), ("far", "box", "9")],
+        [("near", "cutoff", "1"), ("near", "radius", "1")],
+        [("near", "cutoff", "r")],
+    ],
+    ids=["a skin before the cutoff", "no cutoff", "an unknown length", "an unknown parameter"],
+)
+def test_lengths_of_an_interface_are_those_of_lists_with_a_cutoff(lengths: list[tuple[str, str, str]]) -> None:
+    interface = stepper().interface
+    _check_lengths(replace(interface, lengths=(("near", "cutoff", "1"), ("near", "skin", "0.5"))))
+    with pytest.raises(ValueError, match="lengths"):
+        _check_lengths(replace(interface, lengths=tuple(lengths)))

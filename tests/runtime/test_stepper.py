@@ -333,6 +333,11 @@ def test_looser_tolerance_needs_fewer_iterations_and_loses_digits(kepler):
     q, _ = kepler.step(*STATE, 0.2, options=sc.SolverOptions(tolerance=1e-4))
     assert np.array_equal(q, loose.q[1])
     assert not np.array_equal(q, tight.q[1])
+    exact, rough = (
+        kepler.discrete_legendre_minus(STATE[0], q, 0.2, options=options)[1]
+        for options in (None, sc.SolverOptions(tolerance=0.1))
+    )
+    assert 1e-13 < np.abs(exact - rough).max() < 0.1
 
 
 def test_absolute_tolerance_bounds_the_update(kepler):
