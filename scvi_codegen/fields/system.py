@@ -93,10 +93,38 @@ class FieldSystem(Density):
         if text is None or (density is not None and hamiltonian is not None):
             raise SystemDefinitionError("give exactly one of density and hamiltonian")
         first_order = hamiltonian is not None
-        variables, axes = ("|".join(map(re.escape, each)) for each in ((*fields, *momenta), (*space, TIME)))
-        for match in re.finditer(rf"\b({variables})_((?:{axes})+)\b", text):
+        names, axes = ("|".join(map(re.escape, each)) for each in ((*fields, *momenta), (*space, TIME)))
+        for match in re.finditer(rf"\b({names})_((?:{axes})+)\b", text):
             _check_derivative(match[0], match[1], [*space], parameters or {})
-        system = cls._of(name, fields, momenta, space, boundary, parameters, first_order, text)
+        values = {key: number(key, value) for key, value in (parameters or {}).items()}
+        if not 1 <= len(space) <= MOST_AXES:
+            raise SystemDefinitionError(f"space has {len(space)} axes; one to three are supported")
+        if len(momenta) != len(fields) * first_order:
+            raise SystemDefinitionError(
+                f"there are {len(fields)} fields and {len(momenta)} momenta: a Hamiltonian density needs one momentum "
+                "by field, a Lagrangian density none"
+            )
+        variables = (*fields, *momenta)
+        rates = [] if first_order else [f"{each}_{TIME}" for each in fields]
+        derivatives = [*rates, *derivatives_of(variables, [*space])]
+        check_names(variables, (*values, *space, *derivatives), ())
+        known = {each: symbol(each) for each in (*variables, *derivatives, *space, TIME, *values)}
+        kinds = dict(boundary or {})
+        for axis in kinds:
+            if axis not in space:
+                raise SystemDefinitionError(f"there is no axis '{axis}', as in boundary. Axes: {', '.join(space)}")
+        prescribed = {each: known[each] for each in (TIME, *values)}
+        natural = (NATURAL, NATURAL)
+        system = cls(
+            name=name,
+            fields=tuple(fields),
+            momenta=tuple(momenta),
+            space={axis: _bounds(axis, ends) for axis, ends in space.items()},
+            boundary={axis: _boundary(axis, kinds.get(axis, natural), variables, prescribed) for axis in space},
+            parameters=tuple(known[key] for key in values),
+            defaults=tuple(values.values()),
+            density=parse_expression(text, known),
+        )
         for key, value in (("dissipation", dissipation), ("point_lagrangians", point_lagrangians)):
             if first_order and value:
                 raise SystemDefinitionError(f"'{name}' has a Hamiltonian density, which has no {key}=: omit it")
@@ -168,48 +196,6 @@ class FieldSystem(Density):
                 {key: text(entry) if key == "lagrangian" else entry for key, entry in place.items()}
                 for place in point_lagrangians
             ],
-        )
-
-    @classmethod
-    def _of(
-        cls,
-        name: str,
-        fields: Sequence[str],
-        momenta: Sequence[str],
-        space: Mapping[str, Sequence[Any]],
-        boundary: Mapping[str, Any] | None,
-        parameters: Mapping[str, float] | None,
-        first_order: bool,
-        text: str,
-    ) -> FieldSystem:
-        values = {key: number(key, value) for key, value in (parameters or {}).items()}
-        if not 1 <= len(space) <= MOST_AXES:
-            raise SystemDefinitionError(f"space has {len(space)} axes; one to three are supported")
-        if len(momenta) != len(fields) * first_order:
-            raise SystemDefinitionError(
-                f"there are {len(fields)} fields and {len(momenta)} momenta: a Hamiltonian density needs one momentum "
-                "by field, a Lagrangian density none"
-            )
-        variables = (*fields, *momenta)
-        rates = [] if first_order else [f"{each}_{TIME}" for each in fields]
-        derivatives = [*rates, *derivatives_of(variables, [*space])]
-        check_names(variables, (*values, *space, *derivatives), ())
-        known = {each: symbol(each) for each in (*variables, *derivatives, *space, TIME, *values)}
-        kinds = dict(boundary or {})
-        for axis in kinds:
-            if axis not in space:
-                raise SystemDefinitionError(f"there is no axis '{axis}', as in boundary. Axes: {', '.join(space)}")
-        prescribed = {each: known[each] for each in (TIME, *values)}
-        natural = (NATURAL, NATURAL)
-        return cls(
-            name=name,
-            fields=tuple(fields),
-            momenta=tuple(momenta),
-            space={axis: _bounds(axis, ends) for axis, ends in space.items()},
-            boundary={axis: _boundary(axis, kinds.get(axis, natural), variables, prescribed) for axis in space},
-            parameters=tuple(known[key] for key in values),
-            defaults=tuple(values.values()),
-            density=parse_expression(text, known),
         )
 
     def euler_lagrange(self) -> dict[str, Expr]:
