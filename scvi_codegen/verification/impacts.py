@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import sympy
@@ -141,7 +141,7 @@ def _impacts(run: Trajectory, changes: list[Change]) -> Finding | None:
 def _across(run: Trajectory, change: Change, h: float) -> tuple[Array, Any]:
     """Return the state h/2 before a change, and the step of size h from a state there."""
     t, m = change.t - 0.5 * h, run.stepper.dimension
-    step = partial(run.stepper.integrate, h=h, steps=1, t=t, parameters=run.parameters)
+    step = partial(cast(Stepper, run.stepper).integrate, h=h, steps=1, t=t, parameters=run.parameters)
     return np.concatenate(run.at(t)), lambda z: step(z[:m], z[m:])
 
 
@@ -159,9 +159,9 @@ def _reversal(run: Trajectory, changes: list[Change]) -> Finding | None:
     worst = list[float]()
     for change in [each for each in changes if each.restitution == 1.0][:REVERSED]:
         start, step = _across(run, change, run.h)
-        there = step(start)
+        there, stepper = step(start), cast(Stepper, run.stepper)
         end, t = np.hstack([there.q[-1], there.p[-1]]), there.t[-1]
-        back = run.stepper.integrate(there.q[-1], there.p[-1], h=-run.h, steps=1, t=t, parameters=run.parameters)
+        back = stepper.integrate(there.q[-1], there.p[-1], h=-run.h, steps=1, t=t, parameters=run.parameters)
         moved = np.abs(end - start) * (1.0 + abs(t / run.h))
         forward = there.tangent()[-1]
         reached = np.abs(end) + moved + np.abs(forward) @ (np.abs(start) + moved)

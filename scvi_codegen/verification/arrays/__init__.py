@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from scvi_codegen.methods import SVI, StoermerVerlet, as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.interface import RunArrays, check_accesses, read_arrays
-from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper, StepperOfRunTimeSizes
 from scvi_codegen.verification.arrays.whole import WholeStart, whole_checks
 from scvi_codegen.verification.certificate import Certificate, Check, Finding, checked, information, issued
 from scvi_codegen.verification.convergence import convergence_checks
@@ -139,7 +139,7 @@ def _subject(start: WholeStart) -> SystemUnderTest:
 
 def _bound(stepper: Stepper, arrays: RunArrays) -> Stepper:
     """Return a stepper of arrays at these sizes, as one of named coordinates."""
-    result = stepper._bound_to(arrays)._copy(())
+    result = cast(StepperOfRunTimeSizes, stepper)._bound_to(arrays)._copy(())
     result.interface = replace(result.interface, map_names=())  # whole_checks examines momentum maps
     return result
 
