@@ -107,7 +107,11 @@ def _worst(stepper: Integrator, q: Array, p: Array, t: float, parameters: Parame
     worst = np.abs(values).argmax(axis=1)
     largest = values[np.arange(2), worst]
     names = [stepper.constraints[k] for k in worst]
-    if not any(f"{q}_dot" in names[1] for q in stepper.coordinates):  # a velocity constraint is a rate itself
+    from scvi_codegen.formulas.rotations import RotationNames  # imports SymPy
+
+    members = RotationNames.members_of(stepper.interface.rotations)
+    velocities = {f"{x}_dot" for x in stepper.coordinates} | {x.name for member in members for x in member.rates}
+    if velocities.isdisjoint(re.findall(r"\w+", names[1])):  # a velocity constraint is a rate itself
         names[1] = f"the rate of {names[1]}"
     descriptions = [
         f"{name} is {value:.3g}"
