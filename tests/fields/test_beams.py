@@ -34,7 +34,7 @@ def integrated(field, options, start, *, method="svi:4", h=0.01, steps=10):
     return mesh, stepper.integrate({"u": start(*places)}, h=h, steps=steps)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.filterwarnings("ignore::scvi_codegen.AccuracyWarning")
 @pytest.mark.parametrize("ends", ENDS)
 def test_errors_of_beams_fall_exponentially_with_the_degree(ends):

@@ -91,7 +91,7 @@ def check(sample, compiled, name, method, *, h=H, t=T, **how):
     assert relative(compiled(name, method, **how).step(q, p, h, t), case.oracle(method, q, p, h, t)) < TOLERANCE
 
 
-@pytest.mark.sampled(5)
+@pytest.mark.sampled(3)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", SYSTEMS)
 @pytest.mark.parametrize("method", FEW, ids=lambda method: method.name)
@@ -119,7 +119,7 @@ SOLVED_BOTH_WAYS = (
 )
 
 
-@pytest.mark.sampled(12)
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("solver", ["newton", "fixed-point"])
 @pytest.mark.parametrize(("name", "method"), SOLVED_BOTH_WAYS, ids=lambda value: getattr(value, "name", value))
 def test_both_solvers_agree_with_the_oracle(sample, compiled, name, method, solver):
@@ -140,6 +140,7 @@ def test_every_method_on_every_system_agrees_with_the_oracle(sample, compiled, n
     check(sample, compiled, name, method)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("degree", [20, *(pytest.param(s, marks=pytest.mark.full) for s in (17, 24, 28, 32))])
 @pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole"])
 def test_steps_of_more_than_16_points_agree_with_the_oracle(sample, compiled, name, degree):

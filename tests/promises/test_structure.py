@@ -86,7 +86,7 @@ ON_SYSTEMS = (
 )
 
 
-@pytest.mark.sampled(10)
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize(("name", "method"), ON_SYSTEMS, ids=lambda value: getattr(value, "name", value))
 def test_symplectic_methods_preserve_the_two_form(sample, compiled, name, method):
     q, p = sample(name).state
@@ -152,7 +152,7 @@ METHODS = (
 )
 
 
-@pytest.mark.sampled(20)
+@pytest.mark.sampled(12)
 @pytest.mark.parametrize("name", ["pumped-cart-pole", pytest.param("double-pendulum", marks=pytest.mark.full)])
 @pytest.mark.parametrize("method", first_of_each(METHODS, family), ids=lambda method: method.name)
 def test_claims_of_symmetry_and_symplecticity_agree_with_measurement(sample, compiled, method, name):

@@ -136,7 +136,7 @@ def share_of(method: str, share: int) -> list[Source]:
     return [source for source, _ in generated(method).values()][share::SHARES]
 
 
-@pytest.mark.sampled(8)
+@pytest.mark.sampled(6)
 @pytest.mark.covering
 @pytest.mark.parametrize("share", range(SHARES))
 @pytest.mark.parametrize("method", METHODS)
@@ -227,7 +227,7 @@ def test_either_solver_alone_compiles_without_warnings(compiler, solver, tmp_pat
     run([needs(compiler), *C99, "-c", *files], tmp_path)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", ["double-pendulum", "driven-duffing", "driven Hamiltonian"])
 @pytest.mark.parametrize("method", TUNED, ids=lambda method: method.name)
@@ -451,7 +451,7 @@ SANITIZERS = pytest.mark.parametrize(
 )
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(2)
 @pytest.mark.covering
 @SANITIZERS
 @pytest.mark.parametrize("method", BRIEFLY)

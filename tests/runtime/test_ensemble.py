@@ -904,6 +904,7 @@ def test_command_line_runs_a_grid(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         assert (np.nanmax(file["times"], axis=0) == 9.0).all()
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.usefixtures("as_users_compile")
 @pytest.mark.parametrize("h", [6e-2, 1e-2, 1e-4, 2e-14])
 def test_lanes_converge_as_single_runs(h: float) -> None:

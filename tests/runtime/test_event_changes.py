@@ -119,6 +119,7 @@ def test_accumulation_of_a_relativistic_ball():
     assert np.abs(np.diff(run.t) - run.step_sizes[:-1]).max() < 1e-12
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("t0", [0.0, 7e4])
 @pytest.mark.parametrize("h", [50.0, 5.0, 0.5])
 def test_corners_of_a_square_are_met_exactly(point, h, t0):
@@ -484,7 +485,7 @@ def chart(x, t):
     return np.array(columns).T
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("b", "e"), [(0.0, 1.0), (0.0, 0.8), (0.2, 1.0), (0.2, 0.7)])
 def test_impacts_of_constrained_systems_equal_those_of_free_coordinates(b, e):
     """A pendulum as a point on a rod, also with a moving pivot, hits a moving wall and is kicked."""

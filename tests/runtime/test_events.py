@@ -451,6 +451,7 @@ def test_bouncing_ball_runs_until_its_bounces_accumulate(thrown, floor, error, h
     assert abs(abs(float(str(raised.value).split("t = ")[1].split(":")[0])) - end) < error
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("t0", [0.0, 7e4])
 @pytest.mark.parametrize(("h", "start", "velocity"), CORNERS)
 def test_walls_hit_in_a_corner_are_both_found(thrown, t0, h, start, velocity):

@@ -52,7 +52,7 @@ def outcome(stepper, start, h, **more):
     return [*(x.tolist() for x in (run.t, run.q, run.p, run.iterations)), status, events]
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(2)
 @pytest.mark.filterwarnings("ignore::scvi_codegen.AccuracyWarning")
 @each_method
 @pytest.mark.parametrize("h", [0.02, LONG, 0.3])

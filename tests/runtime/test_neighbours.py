@@ -97,6 +97,7 @@ def test_no_bit_depends_on_skin_and_interruptions(method: str) -> None:
     assert run.q["r"] == pytest.approx(all_pairs.q["r"], abs=1e-10)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", ["stoermer-verlet", "svi:2"])
 def test_threads_evaluate_the_same_pairs(method: str) -> None:
     """With 3 x 3 x 3 cells, and enough coordinates for several threads."""
@@ -123,6 +124,7 @@ def test_adaptive_steps_and_ensembles_have_the_pairs_of_all() -> None:
 SOFT = f"positive_part(1 - {SQUARE}/cut**2)**4"
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", ["stoermer-verlet", "svi:2"])
 def test_steps_longer_than_the_skin_miss_no_pair(method: str) -> None:
     r, v = start(6.0)
@@ -214,14 +216,14 @@ def test_boxes_of_other_shapes_and_none(box: Any) -> None:
 
 def test_known_sizes_model_files_and_sympy_have_the_same_sum(tmp_path: Path) -> None:
     r, v = start()
-    few = {"r": r[:5]}
-    expected = stepper("svi:2").integrate(few, velocity=v[:5], h=0.01, steps=20)
-    known = sc.compile_stepper(liquid(), "svi:2", sizes={"N": 5})
-    run = known.integrate(r[:5].reshape(-1), velocity=v[:5].reshape(-1), h=0.01, steps=20)
+    few = {"r": r[:4]}
+    expected = stepper("svi:2").integrate(few, velocity=v[:4], h=0.01, steps=20)
+    known = sc.compile_stepper(liquid(), "svi:2", sizes={"N": 4})
+    run = known.integrate(r[:4].reshape(-1), velocity=v[:4].reshape(-1), h=0.01, steps=20)
     assert run.q == pytest.approx(expected.q["r"].reshape(21, -1), abs=1e-12)
-    moved = stepper("svi:2").jacobian(few, {"r": v[:5]}, h=0.01)
-    assert moved == pytest.approx(known.jacobian(r[:5].reshape(-1), v[:5].reshape(-1), h=0.01), abs=1e-9)
-    model = sc.Model(system=liquid(), q=few, velocity={"r": v[:5]}, h=0.01, method=sc.SVI(2), span=0.2)
+    moved = stepper("svi:2").jacobian(few, {"r": v[:4]}, h=0.01)
+    assert moved == pytest.approx(known.jacobian(r[:4].reshape(-1), v[:4].reshape(-1), h=0.01), abs=1e-9)
+    model = sc.Model(system=liquid(), q=few, velocity={"r": v[:4]}, h=0.01, method=sc.SVI(2), span=0.2)
     path = tmp_path / "liquid.toml"
     path.write_text(dump_model(model))
     again = sc.load_model(path)
@@ -229,7 +231,7 @@ def test_known_sizes_model_files_and_sympy_have_the_same_sum(tmp_path: Path) -> 
     assert again.integrate().q["r"][-1] == pytest.approx(expected.q["r"][-1], abs=1e-12)
 
 
-@pytest.mark.parametrize("sanitizer", ["address,undefined", "thread"])
+@pytest.mark.parametrize("sanitizer", ["address,undefined", pytest.param("thread", marks=pytest.mark.full)])
 def test_programs_of_packages_make_their_lists(sanitizer: str, tmp_path: Path) -> None:
     """With three threads and the compiler's sanitizers, from the same start to the same bits."""
     needs("setarch")

@@ -76,7 +76,7 @@ def by_differences(case, q, p, h, t, directions):
     return np.array(columns).T
 
 
-@pytest.mark.sampled(5)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", NAMES)
 def test_derivatives_of_a_step_by_all_arguments(name):
     """Along a random direction of the state and one of the parameters, and by time and step size."""
@@ -118,7 +118,7 @@ def second_difference(case, start, direction, weights):
     return float((ends[0] - 2 * ends[1] + ends[2]) / width**2)
 
 
-@pytest.mark.sampled(5)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", NAMES)
 def test_second_derivatives_of_a_step_by_all_arguments(name):
     """Directions weight all entries equally; symmetry determines all of them."""
