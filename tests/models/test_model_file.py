@@ -363,3 +363,13 @@ def test_the_example_of_the_outer_solar_system_is_the_catalogue_entry():
     path = Path(__file__).parents[2] / "examples" / "outer_solar_system.toml"
     assert load_model(path) == Model.from_problem(problem("outer-solar-system"))
     assert "catalogue" not in path.read_text()
+
+
+def test_initial_states_of_first_order_systems_are_whole_or_in_halves():
+    text = (
+        "[system]\nname = 'vortex'\ncoordinates = ['x', 'y']\nlagrangian = 'x*y_dot - x**2/2 - y**2/2'\n"
+        "[method]\nmethod = 'svi:2'\n[run]\nstep = 0.1\nsteps = 3\n[initial]\n"
+    )
+    whole = parse_model(text + "q = [0.3, 0.2]\n")
+    assert sorted((*whole.q, *whole.p)) == [0.2, 0.3]
+    assert parse_model(text + f"q = {list(whole.q)}\np = {list(whole.p)}\n") == whole

@@ -284,16 +284,28 @@ def test_more_trajectories_than_one_batch_are_distinguished(galaxy):
     """A row of a map equals its single trajectories for any number of threads."""
     y = np.linspace(-0.2, 0.3, TRAJECTORIES_TOGETHER + 5)
     start = np.column_stack([0 * y, y]), np.column_stack([0.3 + 0 * y, 0 * y])
-    done, common = [], {"h": 0.2, "steps": 40, "count": 1, "t": 3.0}
+    done, common = [], {"h": 0.2, "steps": 40, "count": 1}
     both = [
         galaxy.chaos_indicators_ensemble(*start, **common, threads=threads, progress=done.append) for threads in (1, 3)
     ]
     assert_array_equal(both[0].log_norms, both[1].log_norms)
-    assert both[0].t[0] == 3.0
     assert max(done) == done[-1] == len(y)
     for j in (0, TRAJECTORIES_TOGETHER - 1, TRAJECTORIES_TOGETHER, TRAJECTORIES_TOGETHER + 4):
         alone = galaxy.integrate(start[0][j], start[1][j], h=0.2, steps=40).chaos_indicators(1)
         assert_allclose(both[0].log_norms[-1, j], alone.log_norms[-1], rtol=0, atol=1e-13)
+
+
+def test_ensembles_have_the_time_and_the_parameters_of_their_trajectories():
+    pumped = sc.LagrangianSystem.from_text(
+        "pumped", ["x"], "x_dot**2/2 - k*(1 + cos(t)/2)*x**2/2 - x**4/8", parameters={"k": 1.0}
+    )
+    stepper, k, common = sc.compile_stepper(pumped, "svi:2"), [0.5, 2.0], {"h": 0.1, "steps": 20, "t": 0.7}
+    q, p = np.array([[1.0], [0.5]]), np.array([[0.0], [0.3]])
+    found = stepper.chaos_indicators_ensemble(q, p, count=1, save_every=1, parameters={"k": k}, **common)
+    for j in range(2):
+        alone = stepper.integrate(q[j], p[j], parameters={"k": k[j]}, **common).chaos_indicators(1)
+        assert_array_equal(found.t, alone.t)
+        assert_allclose(found.log_norms[:, j], alone.log_norms, rtol=0, atol=1e-13)
 
 
 def test_last_step_of_an_event_run_is_not_changed(galaxy):
