@@ -14,33 +14,33 @@ PATIENCE_SECONDS = 1.0
 LOGGER = logging.getLogger("scvi_codegen")
 
 
-def _print(what: str) -> None:
+def _print(message: str) -> None:
     """Print a line on stderr, also if it is a file."""
     if sys.stderr is not None:
-        print(f"scvi-codegen: {what} ...", file=sys.stderr, flush=True)
+        print(f"scvi-codegen: {message} ...", file=sys.stderr, flush=True)
 
 
-def _print_on_terminal(what: str) -> None:
+def _print_on_terminal(message: str) -> None:
     if sys.stderr is not None and sys.stderr.isatty():
-        _print(what)
+        _print(message)
 
 
 _listener: ContextVar[Callable[[str], None] | None] = ContextVar("listener", default=None)
 
 
-def tell(what: str) -> None:
+def tell(message: str) -> None:
     """Announce a message now, e.g. the expected duration of a computation."""
-    (_listener.get() or _print)(what)
+    (_listener.get() or _print)(message)
 
 
 @contextmanager
-def announced(what: str) -> Iterator[None]:
+def announced(message: str) -> Iterator[None]:
     """Announce a computation if it takes longer than a second."""
     listener = _listener.get() or _print_on_terminal
 
     def announce() -> None:
-        LOGGER.info(what)
-        listener(what)
+        LOGGER.info(message)
+        listener(message)
 
     timer = threading.Timer(PATIENCE_SECONDS, announce)
     timer.daemon = True

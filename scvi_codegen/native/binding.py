@@ -148,13 +148,13 @@ class Binding:
         """Return the enumeration constant ``<PREFIX>_<NAME>``."""
         return int(getattr(self._lib, f"{self._prefix.upper()}_{name}"))
 
-    def new(self, what: str) -> Any:
-        """Return a zeroed ``<prefix>_<what>``, as in ``"run *"``."""
-        return self._ffi.new(f"{self._prefix}_{what}")
+    def new(self, type_name: str) -> Any:
+        """Return a zeroed ``<prefix>_<type_name>``, as in ``"run *"``."""
+        return self._ffi.new(f"{self._prefix}_{type_name}")
 
-    def numbers(self, what: str) -> Any:
+    def numbers(self, type_name: str) -> Any:
         """Return zeroed numbers of C, as in ``"long long *"`` and ``"double[3]"``."""
-        return self._ffi.new(what)
+        return self._ffi.new(type_name)
 
     def vector(self, part: Any) -> NDArray[np.float64]:
         """Return an array of doubles of a struct, in the same memory."""

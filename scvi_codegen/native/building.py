@@ -162,8 +162,8 @@ def _load_from(folder: Path, source: Source, compiler: tuple[str, ...], flags: t
             return _open(entry)
         except ImportError as error:
             if _is_intact(entry):
-                made = f"the library made by the compiler {' '.join(compiler)!r} cannot be loaded on this machine"
-                raise BuildError(f"{made}: {error}") from error
+                problem = f"the library made by the compiler {' '.join(compiler)!r} cannot be loaded on this machine"
+                raise BuildError(f"{problem}: {error}") from error
     raise OSError(f"{entry} was removed by another process {ATTEMPTS} times while it was loaded")
 
 
@@ -361,10 +361,10 @@ def library_for(platform: str, source: Source, *, flags: tuple[str, ...]) -> byt
             f"compiling for {platform} requires a cross compiler: pip install 'scvi-codegen[compiler]' (ziglang)"
         )
     with tempfile.TemporaryDirectory(prefix="scvi-codegen-") as name:
-        folder, made = Path(name), "library"
+        folder, library = Path(name), "library"
         source.write(folder)
         texts = [f"{each.prefix}.c" for each in source.sources]
         command = [sys.executable, "-m", "ziglang", "cc", "-target", TARGETS[platform], "-shared", "-fPIC", "-s"]
         with announced(f"compiling for {platform}, slowest the first time"):
-            run_compiler([*command, "-std=c99", "-I.", *flags, *texts, "-lm", "-o", made], folder)
-        return (folder / made).read_bytes()
+            run_compiler([*command, "-std=c99", "-I.", *flags, *texts, "-lm", "-o", library], folder)
+        return (folder / library).read_bytes()

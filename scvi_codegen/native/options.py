@@ -102,8 +102,8 @@ def step_failure(
     """
     word = STATUS[status]
     length = f" with h = {h:g}" if h else ""
-    what, remedy = failures[word]
+    cause, remedy = failures[word]
     if word == NOT_CONVERGED:
-        what += f" (last update {report.change:.3g}; {report.iterations} iterations in this call)"
-    message = f"step {step} at t = {report.t:.17g}{length} failed: {what}. {remedy}{remark}"
+        cause += f" (last update {report.change:.3g}; {report.iterations} iterations in this call)"
+    message = f"step {step} at t = {report.t:.17g}{length} failed: {cause}. {remedy}{remark}"
     return StepFailedError(message, status=word, step=step, t=report.t, residual=report.change)

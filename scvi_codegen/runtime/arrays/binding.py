@@ -78,7 +78,7 @@ class ArrayBinding(Binding):
             )
         if names := self.interface.layout.neighbours:
             hint = f". No particle may move by a cutoff of {', '.join(map(repr, names))} in one step"
-        return {word: (what, remedy + hint) for word, (what, remedy) in failures.items()}
+        return {word: (cause, remedy + hint) for word, (cause, remedy) in failures.items()}
 
     @cached_property
     def _bound(self) -> tuple[Any, Any, tuple[NDArray[Any], ...]]:
@@ -91,10 +91,10 @@ class ArrayBinding(Binding):
         sizes = self._ffi.new("long long[]", [*(self.sizes.sizes[name] for name in layout.sizes), 0])
         return sizes, self._ffi.new("int *[]", [*map(self.pointer, tables), self.null]), tuple(tables)
 
-    def new(self, what: str) -> Any:
+    def new(self, type_name: str) -> Any:
         """Return a run in memory of its own, bound to the sizes and tables; else what :meth:`Binding.new` returns."""
-        if what != "run *":
-            return super().new(what)
+        if type_name != "run *":
+            return super().new(type_name)
         sizes, tables, arrays = self._bound
         if (length := self._call("memory", sizes, tables)) < 0:
             raise StateError("the constraints are invalid, or too many for the memory: check the bounds of their loops")

@@ -41,26 +41,26 @@ def envelope_of(layout: ArrayLayout, arrays: RunSizes) -> Envelope | None:
     """
     if not layout.couplings or (layout.momenta and _has_modes(layout)):
         return None
-    found = _envelope(layout, arrays)
-    if found is None and not layout.symmetric:
+    envelope = _envelope(layout, arrays)
+    if envelope is None and not layout.symmetric:
         raise StateError(
             "solver='newton' factorises the linear part of a Hamiltonian or with forces of velocities, with at most "
             f"{MOST_PER_ROW} entries per row and {MOST_ENTRIES} in all, which this system exceeds: use "
             "solver='fixed-point', finite differences or spectral elements, or fewer points across"
         )
-    return found
+    return envelope
 
 
 def _has_modes(layout: ArrayLayout) -> bool:
     """Return whether circulant matrices couple no array of the state to another: the linear part has Fourier modes."""
-    names, found = {array.name for array in (*layout.coordinates, *layout.momenta)}, False
+    names, has_terms = {array.name for array in (*layout.coordinates, *layout.momenta)}, False
     for term in layout.couplings:
         if any(access.sums or any(place.minus for place in access.places) for _, access in term.slots):
-            found, moving = True, [(slot, x.array.name) for slot, x in term.slots if x.array.name in names]
+            has_terms, moving = True, [(slot, x.array.name) for slot, x in term.slots if x.array.name in names]
             pairs = ((a, b) for a, one in moving for b, other in moving if one < other)
             if any(term.formula.diff(a, b) != 0 for a, b in pairs):
                 return False
-    return found and not layout.tables
+    return has_terms and not layout.tables
 
 
 def _envelope(layout: ArrayLayout, arrays: RunSizes) -> Envelope | None:
@@ -112,7 +112,7 @@ def _coupled_pairs(layout: ArrayLayout, arrays: RunSizes, most: int) -> NDArray[
     firsts = dict(zip(shapes, starts, strict=False))
     firsts |= {name + DOT: first for name, first in firsts.items()}
     shapes |= {name + DOT: shape for name, shape in shapes.items()}
-    found: list[NDArray[np.int64]] = []
+    groups: list[NDArray[np.int64]] = []
     count = 0
     for term in layout.couplings:
         targets = () if isinstance(term, ArrayTerm) else term.targets
@@ -124,7 +124,7 @@ def _coupled_pairs(layout: ArrayLayout, arrays: RunSizes, most: int) -> NDArray[
             count += len(entries) ** 2
             if count > MOST_COUPLINGS or len(entries) * (len(entries) - 1) > 2 * most:
                 return None
-            found.append(entries[np.stack(np.triu_indices(len(entries), 1))])
+            groups.append(entries[np.stack(np.triu_indices(len(entries), 1))])
             continue
         size = np.prod([float(loop.end.at(arrays.sizes) - loop.first.at(arrays.sizes)) for loop in term.loops])
         count += int(size) * len(accesses) ** 2
@@ -135,8 +135,8 @@ def _coupled_pairs(layout: ArrayLayout, arrays: RunSizes, most: int) -> NDArray[
         rows = next((len(index) for index in elements.index.values()), 1)
         places = [_flat(elements.of(access), shapes[access.array.name], rows) for access in accesses]
         indices = [place + firsts[access.array.name] for place, access in zip(places, accesses, strict=True)]
-        found += [np.stack([a, b]) for k, a in enumerate(indices) for b in indices[k + 1 :]]
-    pairs = np.concatenate([np.zeros((2, 0), np.int64), *found], axis=1)
+        groups += [np.stack([a, b]) for k, a in enumerate(indices) for b in indices[k + 1 :]]
+    pairs = np.concatenate([np.zeros((2, 0), np.int64), *groups], axis=1)
     if layout.momenta:  # the rate of an unknown is a derivative with respect to its conjugate
         n = int(starts[-1]) // 2
         pairs = np.concatenate([pairs, [range(n), range(n, 2 * n)]], axis=1) % n

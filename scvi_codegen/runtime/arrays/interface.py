@@ -88,7 +88,7 @@ def first_state(interface: Interface, argument: Any) -> Any:
     return real_array(argument, "q")[0]
 
 
-def read_state(interface: Interface, argument: ArrayLike | Mapping[str, ArrayLike], what: str) -> dict[str, Numbers]:
+def read_state(interface: Interface, argument: ArrayLike | Mapping[str, ArrayLike], label: str) -> dict[str, Numbers]:
     """Return the coordinate arrays (or velocities, momenta) by name, from a mapping or a single array.
 
     Raises:
@@ -99,11 +99,11 @@ def read_state(interface: Interface, argument: ArrayLike | Mapping[str, ArrayLik
         argument = dict(argument.items())
     if not isinstance(argument, Mapping):
         if len(names) > 1:
-            raise StateError(f"{what} must be given by name, as {{'{names[0]}': .., '{names[1]}': ..}}")
+            raise StateError(f"{label} must be given by name, as {{'{names[0]}': .., '{names[1]}': ..}}")
         argument = {names[0]: argument}
-    check_named(argument, names, what, whole=True)
+    check_named(argument, names, label, whole=True)
     return {
-        array.name: _of_axes(array, real_array(argument[array.name], what), what)
+        array.name: _of_axes(array, real_array(argument[array.name], label), label)
         for array in interface.layout.coordinates
     }
 
@@ -133,12 +133,12 @@ def field_values(
 def read_tables(interface: Interface, argument: Mapping[str, ArrayLike] | None) -> dict[str, IndexTable]:
     """Return read-only copies of the tables by name, so that indices cannot change after validation."""
     names = [table.name for table in interface.layout.tables]
-    given = {name: value for name, value in interface.layout.data.items() if name in names} | dict(argument or {})
-    check_named(given, names, "tables", whole=True)
+    tables = {name: value for name, value in interface.layout.data.items() if name in names} | dict(argument or {})
+    check_named(tables, names, "tables", whole=True)
     result = {}
     for table in interface.layout.tables:
         try:
-            values = np.asarray(given[table.name])
+            values = np.asarray(tables[table.name])
         except (TypeError, ValueError, OverflowError) as error:
             raise StateError(
                 f"the table '{table.name}' must be an array of whole numbers with {table.axes[1].number} columns: "
@@ -231,26 +231,26 @@ def _span(loop: Loop, sizes: Mapping[str, int]) -> tuple[int, int]:
     return loop.first.at(sizes), loop.end.at(sizes) - 1
 
 
-def _check_span(what: str, span: tuple[int, int], array: Array, axis: int, sizes: Mapping[str, int]) -> None:
+def _check_span(label: str, span: tuple[int, int], array: Array, axis: int, sizes: Mapping[str, int]) -> None:
     (low, high), length = span, array.axes[axis].at(sizes)
     if low < 0 or high >= length:
         raise StateError(
-            f"the index of {what} runs from {low} to {high}, but {array} has {array.axes[axis]} = {length} entries"
+            f"the index of {label} runs from {low} to {high}, but {array} has {array.axes[axis]} = {length} entries"
         )
 
 
-def _of_axes(array: Array, values: Numbers, what: str) -> Numbers:
+def _of_axes(array: Array, values: Numbers, label: str) -> Numbers:
     literal = [(k, axis.number) for k, axis in enumerate(array.axes) if not axis.name]
     if values.ndim != len(array.axes) or any(values.shape[k] != number for k, number in literal):
-        raise StateError(f"{what}: '{array.name}' must have the shape of {array}, not {values.shape}")
-    _check_finite(values, f"{what}: '{array.name}'")
+        raise StateError(f"{label}: '{array.name}' must have the shape of {array}, not {values.shape}")
+    _check_finite(values, f"{label}: '{array.name}'")
     return values
 
 
-def _check_finite(values: Numbers, what: str) -> None:
+def _check_finite(values: Numbers, label: str) -> None:
     if not np.all(np.isfinite(values)):
         index = np.argwhere(~np.isfinite(np.atleast_1d(values)))[0]
-        raise StateError(f"{what} must be finite, but is not at the index {[int(k) for k in index]}")
+        raise StateError(f"{label} must be finite, but is not at the index {[int(k) for k in index]}")
 
 
 def _text(shape: Sequence[int]) -> str:

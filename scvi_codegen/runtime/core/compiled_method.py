@@ -39,18 +39,18 @@ class Variants:
     steps, and ``"changes K"`` (ensembles with K tangent vectors).
 
     Args:
-        made: sources by name; ``None`` for a variant that the method lacks. Those with events by the tuple of these.
+        sources: sources by name; ``None`` for a variant that the method lacks. Those with events by the tuple of these.
         make: derives a source that is not among them.
         lacking: returns whether the name is that of a variant that the method lacks, without deriving it.
     """
 
     def __init__(
         self,
-        made: Mapping[Any, Source | None] | None = None,
+        sources: Mapping[Any, Source | None] | None = None,
         make: Callable[[str], Source | None] = lambda _: None,
         lacking: Callable[[str], bool] = lambda _: True,
     ) -> None:
-        self._made: dict[Any, Source | None] = dict(made or {})
+        self._made: dict[Any, Source | None] = dict(sources or {})
         self._make, self._lacking = make, lacking
 
     def __getitem__(self, name: str) -> Source | None:

@@ -178,10 +178,10 @@ def refusal(operation: str, property_: str, title: str = "") -> ScviCodegenError
 
 
 def check_together(**arguments: Any) -> None:
-    """Raise the refusal of an argument of a run that another one excludes; ``None``: not given."""
-    given = [name for name, value in arguments.items() if value is not None]
+    """Raise the refusal of an argument of a run that another one excludes; ``None``: not passed."""
+    passed = [name for name, value in arguments.items() if value is not None]
     for operation, property_ in FEATURES:
-        if operation in given and property_.removeprefix("with ") in given:
+        if operation in passed and property_.removeprefix("with ") in passed:
             raise refusal(operation, property_)
 
 
@@ -191,8 +191,8 @@ def require(stepper: Any, operation: str, *together: str) -> None:
         if each != operation:
             continue
         if property_ in PROPERTIES_OF_SIZES:
-            found = not stepper.run_time_sizes and PROPERTIES_OF_SIZES[property_](stepper.known)
+            applies = not stepper.run_time_sizes and PROPERTIES_OF_SIZES[property_](stepper.known)
         else:
-            found = PROPERTIES[property_](stepper) if property_ in PROPERTIES else property_[5:] in together
-        if found:
+            applies = PROPERTIES[property_](stepper) if property_ in PROPERTIES else property_[5:] in together
+        if applies:
             raise refusal(operation, property_, stepper.title)

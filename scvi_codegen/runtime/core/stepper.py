@@ -155,8 +155,8 @@ class Stepper(Integrator):
             save_every = checked_count(save_every, "save_every", least=1)
         stepper, interface, segments = self if events is None else self.with_events(events), self.interface, None
         if inputs is not None or t_eval is not None or observe is not None:
-            given = None if save_every == 1 else save_every
-            check_together(inputs=inputs, t_eval=t_eval, observe=observe, save_every=given, error=error)
+            stride = None if save_every == 1 else save_every
+            check_together(inputs=inputs, t_eval=t_eval, observe=observe, save_every=stride, error=error)
             inputs = None if inputs is None else checked_inputs(interface, inputs)
         if interface.rotations or interface.variables:
             q, p, velocity = homogeneous_state(interface, q, p, velocity)
@@ -434,8 +434,8 @@ class Stepper(Integrator):
             progress: called with the number of completed trajectories.
 
         Returns:
-            :class:`ChaosIndicators` of shape (n, K, k): ``found.megno()[-1]`` has K values. A trajectory that fails has
-            NaN from at most a thousand steps before the failure on, and the reason in ``status``. An
+            :class:`ChaosIndicators` of shape (n, K, k): ``megno()[-1]`` has K values. A trajectory that fails has NaN
+            from at most a thousand steps before the failure on, and the reason in ``status``. An
             :class:`~scvi_codegen.AccuracyWarning` is issued for too large steps, checked on every 64th trajectory.
 
         Raises:

@@ -137,29 +137,29 @@ def shapes_of(interface: Interface) -> Shapes | None:
     return coordinate_shapes(interface) if interface.arrays else None
 
 
-def _joined(arrays: Sequence[tuple[str, tuple[int, ...]]], by_name: Mapping[str, Any], what: str) -> Array:
-    check_named(by_name, [name for name, _ in arrays], what)
+def _joined(arrays: Sequence[tuple[str, tuple[int, ...]]], by_name: Mapping[str, Any], label: str) -> Array:
+    check_named(by_name, [name for name, _ in arrays], label)
     parts = []
     for name, shape in arrays:
-        part = real_array(by_name[name], f"{what}: '{name}'")
+        part = real_array(by_name[name], f"{label}: '{name}'")
         if part.shape[max(0, part.ndim - len(shape)) :] != shape:
-            raise StateError(f"{what}: '{name}' must have the shape {shape}, not {part.shape}")
+            raise StateError(f"{label}: '{name}' must have the shape {shape}, not {part.shape}")
         parts.append(part.reshape(*part.shape[: part.ndim - len(shape)], math.prod(shape)))
     if len({part.shape[:-1] for part in parts}) > 1:
-        raise StateError(f"{what}: the arrays have different numbers of states")
+        raise StateError(f"{label}: the arrays have different numbers of states")
     return np.concatenate(parts, axis=-1)
 
 
-def check_named(values: Mapping[str, object], names: Sequence[str], what: str, *, whole: bool = True) -> None:
+def check_named(values: Mapping[str, object], names: Sequence[str], label: str, *, whole: bool = True) -> None:
     """Raise :class:`StateError` for a name that is unknown, or with ``whole`` missing."""
     for name in values:
         if name not in names:
             raise StateError(
-                f"there is no '{name}' in {what}{closest(str(name), names)} Known: {', '.join(names) or 'none'}"
+                f"there is no '{name}' in {label}{closest(str(name), names)} Known: {', '.join(names) or 'none'}"
             )
     for name in names:
         if whole and name not in values:
-            raise StateError(f"'{name}' is missing in {what}")
+            raise StateError(f"'{name}' is missing in {label}")
 
 
 def coordinate_shapes(interface: Interface) -> list[tuple[str, tuple[int, ...]]]:
@@ -253,15 +253,15 @@ def check_lengths(interface: Interface, values: Array, where: str = "") -> None:
     cutoffs: dict[str, tuple[str, float]] = {}
     for near, kind, formula in interface.lengths:
         length = _length(formula, interface.parameters, values)
-        what = f"the {kind} of the neighbours '{near}'{where} is {formula}"
-        what += "" if NUMBER.fullmatch(formula) else f" = {length:.15g}"
+        label = f"the {kind} of the neighbours '{near}'{where} is {formula}"
+        label += "" if NUMBER.fullmatch(formula) else f" = {length:.15g}"
         if not 0 < length < math.inf:
-            raise StateError(f"{what}: it must be a positive number")
+            raise StateError(f"{label}: it must be a positive number")
         if kind == "cutoff":
             cutoffs[near] = formula, length
         elif kind == "box" and length < 2 * (cutoff := cutoffs[near])[1]:
             raise StateError(
-                f"{what}: it must be at least two cutoffs, 2*({cutoff[0]}) = {2 * cutoff[1]:.15g}, since only the "
+                f"{label}: it must be at least two cutoffs, 2*({cutoff[0]}) = {2 * cutoff[1]:.15g}, since only the "
                 "nearest image of a point counts. Enlarge the box or reduce the cutoff"
             )
 

@@ -52,11 +52,11 @@ class EventBinding(ArrayBinding):
             raise EventError(f"the events have {self._first[-1]} functions, more than {LARGEST_NUMBER}: use fewer")
         self._rows: WeakKeyDictionary[Any, Numbers] = WeakKeyDictionary()
 
-    def new(self, what: str) -> Any:
+    def new(self, type_name: str) -> Any:
         """Return memory of a run, a search or crossings."""
-        if what == "watch *" and self.acts:
+        if type_name == "watch *" and self.acts:
             return self._ffi.new(f"{self._prefix}_watch *", {"history": int(self._first[-1])})
-        return super().new(what)
+        return super().new(type_name)
 
     def records(self, structs: Any, count: int | None = None) -> NDArray[np.void]:
         """Return a copy of the first of several crossings, by the names of their fields."""
@@ -76,14 +76,14 @@ class EventBinding(ArrayBinding):
         return partial(self._search, function, memory is not None) if name in SEARCHES else function
 
     def _search(self, function: Callable[..., Any], advances: bool, watch: Any, *arguments: Any) -> int:
-        room, found, n, functions = arguments[-5], arguments[-4], self.count or 0, int(self._first[-1])
+        room, crossings, n, functions = arguments[-5], arguments[-4], self.count or 0, int(self._first[-1])
         size = self.constant("EVENT_STATES") * n + self.constant("EVENT_VALUES") * functions
         work, values, places = np.empty(size), np.empty(self._changes + n), np.zeros(self._changes, np.int32)
-        if found not in self._rows:
-            self._rows[found] = np.empty((room, 2 * n))
+        if crossings not in self._rows:
+            self._rows[crossings] = np.empty((room, 2 * n))
         host = self.new("event_host *")
         host.count, host.functions, host.changes, host.first = n, functions, self._changes, self._first.tolist()
-        host.memory, host.states = self.pointer(work), self.pointer(self._rows[found])
+        host.memory, host.states = self.pointer(work), self.pointer(self._rows[crossings])
         host.values, host.places = self.pointer(values), self.pointer(places)
         watch.host = host
         status = function(watch, *arguments[:-1], self.workspace() if advances else arguments[-1])

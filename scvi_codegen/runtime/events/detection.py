@@ -40,7 +40,7 @@ class CrossingSearch:
         terminal: whether terminal events end the search.
 
     Attributes:
-        ended: whether a terminal event occurred; ``found[-1]`` then contains its crossing.
+        ended: whether a terminal event occurred; ``last`` then contains its crossing.
         recorded: structured arrays (t, function, q, p), in the order of the run.
         changes: whether crossings change the state, so that the run must be advanced by :meth:`advance`.
     """

@@ -130,8 +130,8 @@ class Event:
     @property
     def loops(self) -> str:
         """Loops of an event with a function for each of their elements, ``" for i in N"``; else empty."""
-        found = LOOPS.search(self.function) if isinstance(self.function, str) else None
-        return found[0] if found else ""
+        loops = LOOPS.search(self.function) if isinstance(self.function, str) else None
+        return loops[0] if loops else ""
 
     @property
     def changes_state(self) -> bool:

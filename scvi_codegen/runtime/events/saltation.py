@@ -79,8 +79,8 @@ def _changes(states: SavedStates, numbers: NDArray[np.intp]) -> dict[int, tuple[
             raise StateError("derivatives through events that change the state require a run forward in time")
         here = (numbers[0] < rows) & (rows <= numbers[-1])
         each = states.stepper._events_of_entries(crossings.event) if here.any() else ()
-        found = (crossings.element[here], crossings.q[here], crossings.p[here])
-        for row, element, q, p in zip(rows[here].tolist(), *found, strict=True):
+        entries = (crossings.element[here], crossings.q[here], crossings.p[here])
+        for row, element, q, p in zip(rows[here].tolist(), *entries, strict=True):
             if row in result:
                 raise StateError(
                     f"the run meets the events '{result[row][0].function}' and '{crossings.event.function}' at once at "

@@ -100,8 +100,8 @@ def input_of(name: str, argument: Any, trajectories: int | None = None) -> Input
     if not isinstance(argument, tuple) or len(argument) not in (2, 3):
         raise StateError(f"the input '{name}' must be {KINDS_OF_INPUTS}, not {argument!r:.60}")
     t, values = (
-        checked_times(part, f"{what} of the input {name}")
-        for part, what in zip(argument, ("t", "values"), strict=False)
+        checked_times(part, f"{label} of the input {name}")
+        for part, label in zip(argument, ("t", "values"), strict=False)
     )
     kind = argument[2] if len(argument) == 3 else "linear"
     if kind not in list(KINDS):

@@ -76,5 +76,5 @@ class SavedStates:
 
     def _restarted(self, k: int, h: float) -> Memory:
         """Return a run from saved state k with fixed steps h."""
-        given: dict[str, Any] = {"parameters": self.parameters, "options": self.options}
-        return Memory.started(self.stepper, self.q[k], self.p[k], plan=StepPlan(h=h), t=float(self.t[k]), **given)
+        settings: dict[str, Any] = {"parameters": self.parameters, "options": self.options}
+        return Memory.started(self.stepper, self.q[k], self.p[k], plan=StepPlan(h=h), t=float(self.t[k]), **settings)
