@@ -149,12 +149,11 @@ class Stepper(Integrator):
             EventError: if an event function has an unknown symbol or is not finite.
             StepFailedError: if a step fails; its ``trajectory`` contains the states before.
         """
-        if tables is not None or threads is not None:
-            self._check_not_of_run(tables, threads)
         if type(save_every) is not int or save_every != 1:
             save_every = checked_count(save_every, "save_every", least=1)
         stepper, interface, segments = self if events is None else self.with_events(events), self.interface, None
-        if inputs is not None or t_eval is not None or observe is not None:
+        if not (inputs is None and t_eval is None and observe is None and tables is None and threads is None):
+            self._check_not_of_run(tables, threads)
             stride = None if save_every == 1 else save_every
             check_together(inputs=inputs, t_eval=t_eval, observe=observe, save_every=stride, error=error)
             inputs = None if inputs is None else checked_inputs(interface, inputs)
@@ -165,8 +164,11 @@ class Stepper(Integrator):
             start = {"velocity": velocity, "inputs": inputs, "t": t, "parameters": parameters, "options": options}
             return stepper._confirmed(wanted, q, p, t_end, save_every, t_eval, progress, start)
         begin = 0.0 if h is None or t_end is None else t  # one plan for all initial times where they do not matter
-        controller, in_tau = interface.time_transformation, stepper.in_tau
-        plan, count = planned_steps(h, steps, t_end, tolerance, save_every, begin, controller, in_tau)
+        schedule = h, steps, t_end, tolerance, save_every, begin, interface.time_transformation, stepper.in_tau
+        try:
+            plan, count = planned_steps(*schedule)
+        except TypeError:  # of an argument that is not hashable, as an array
+            plan, count = planned_steps.__wrapped__(*schedule)
         if inputs is not None:
             plan = StepPlan(h=plan.h) if plan.h else plan  # each segment ends where the next begins
             segments = InputSegments(stepper, inputs, parameters, t, final_time(t, plan.h, steps, t_end))

@@ -113,7 +113,7 @@ class ShortRuns(StateRows):
     def __init__(self, memory: Memory) -> None:
         super().__init__(memory, FIRST_STEPS + 3)
         stepper, m = memory.stepper, len(memory._q)
-        self.interface, self._count = stepper.interface, 0
+        self.interface, self._kind = stepper.interface, (0, 0.0)
         self.shape = (m,) if m <= FEW else None  # of vectors that are checked as lists, faster than as arrays
         self._start, self._sizes = np.empty(1 + 2 * m), np.full(FIRST_STEPS + 3, math.nan)
         self._pack = partial(struct.Struct(f"{1 + 2 * m}d").pack_into, cast(Any, self._start), 0)
@@ -138,21 +138,17 @@ class ShortRuns(StateRows):
                 return
         except (OverflowError, struct.error):  # of an integer above all floats
             pass
-        self._start[:] = t, *np.concatenate(checked_pair(self.interface, q, p))
+        self._start[0], self._start[1:] = t, np.concatenate(checked_pair(self.interface, q, p))
 
     def recorded(self, count: int, h: float, save_every: int) -> tuple[States, Array]:
         """Return copies of the first states and of the steps that follow them."""
-        if count != self._count:
-            self._count, self._views = count, (*self.first(count), self._sizes[:count])
-            self._undefined = np.full(count, math.nan)
-        t, q, p, iterations, sizes = self._views
-        if h:
-            sizes = _repeated(h, count)
-        elif save_every == 1:
+        if (count, h) != self._kind:
+            self._kind, self._views = (count, h), self.first(count)
+            self._sizes_of_kind = _repeated(h, count) if h else self._sizes[:count]
+        (t, q, p, iterations), sizes = self._views, self._sizes_of_kind
+        if not h:
             sizes[-1] = math.nan
-            sizes = sizes.copy()
-        else:
-            sizes = self._undefined.copy()
+            sizes = sizes.copy() if save_every == 1 else np.full(count, math.nan)
         return (t.copy(), q.copy(), p.copy(), iterations.copy()), sizes
 
 

@@ -96,7 +96,7 @@ def checked_plan(
     return StepPlan(t_end=checked_number(t_end, "t_end"), tolerance=allowed)
 
 
-@evaluated_once
+@lru_cache(maxsize=256, typed=True)
 def planned_steps(
     h: float | None,
     steps: int | None,
