@@ -1,8 +1,14 @@
-"""Memory of a run: one plain C struct that is started, advanced, saved and restored bitwise."""
+"""Memory of a run: one plain C struct that is started, advanced, saved and restored bitwise.
 
+C functions modify the struct, so a second thread that enters raises an error.
+"""
+
+import functools
 import math
-from collections.abc import Callable
-from typing import Any, Self
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 
@@ -23,7 +29,6 @@ from scvi_codegen.runtime.core.validation import (
 )
 from scvi_codegen.runtime.rotations.states import checked_pair
 from scvi_codegen.runtime.run.chunks import drive
-from scvi_codegen.runtime.run.one_thread import OneThread, alone, in_use
 from scvi_codegen.runtime.run.saving import checkpoint
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.validation import LARGEST_COUNT, checked_count
@@ -48,8 +53,34 @@ EVENT_NUMBERS = ("undefined", "accumulated", "through", "jammed")
 NO_OUTPUT, NO_PLAN = LARGEST_COUNT, StepPlan()
 """Output stride that saves no state; plan of a run that was not started."""
 
+Called = TypeVar("Called", bound=Callable[..., Any])
 
-class Memory(OneThread):
+
+def in_use() -> StateError:
+    """Return the error for a second thread."""
+    return StateError(
+        "this run is in use by another thread: only one thread may use a run at a time. Start a run for each thread "
+        "(stepper.start(...), copy.copy(run)); the stepper may be shared"
+    )
+
+
+def alone(method: Called) -> Called:
+    """Decorate a method to lock its run; the method raises as :meth:`Memory.alone`."""
+
+    @functools.wraps(method)
+    def locked(self: Any, *arguments: Any, **keywords: Any) -> Any:
+        lock = self._lock
+        if not lock.acquire(False):
+            raise in_use()
+        try:
+            return method(self, *arguments, **keywords)
+        finally:
+            lock.release()
+
+    return cast(Called, locked)
+
+
+class Memory:
     """State of a run: positions, momenta, compensation terms and the predictor for the next step.
 
     Attributes:
@@ -61,7 +92,7 @@ class Memory(OneThread):
     """
 
     def __init__(self, stepper: Integrator) -> None:
-        super().__init__()
+        self._lock = threading.RLock()  # re-entrant: callbacks in the owning thread may call methods
         self.stepper, binding = stepper, stepper.binding
         self._memory = memory = binding.new("run *")
         self._q, self._p = map(binding.vector, (memory.q, memory.p))
@@ -464,6 +495,20 @@ class Memory(OneThread):
     def _leaving(self) -> bool:
         """Return whether the run started at the origin and is still near it, where relative errors are undefined."""
         return int(getattr(self._memory, "steps_from_rest", 0)) > STEPS_FROM_REST - STEPS_NEAR_REST
+
+    @contextmanager  # the last method, because it hides the decorator of its name
+    def alone(self) -> Iterator[None]:
+        """Lock the run for several calls.
+
+        Raises:
+            StateError: if another thread has locked it.
+        """
+        if not self._lock.acquire(blocking=False):
+            raise in_use()
+        try:
+            yield
+        finally:
+            self._lock.release()
 
 
 def _time(memory: Any) -> float:

@@ -15,7 +15,7 @@ from scvi_codegen.errors import EventError, StepFailedError
 from scvi_codegen.runtime.events.detection import CrossingSearch
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.memory import Memory
-from scvi_codegen.runtime.run.observer import Chunk
+from scvi_codegen.runtime.run.observer import StateChunk
 from scvi_codegen.runtime.run.observers import AtTimes, Saver
 from scvi_codegen.runtime.run.run_loop import record, trajectory_of
 from scvi_codegen.runtime.run.singular_time import ProgressWatch
@@ -189,7 +189,7 @@ class Observation:
         iterations = self.iterations + np.cumsum(part.iterations, dtype=np.int64)
         self.iterations = int(iterations[-1])
         is_last = self.ended or self.run.arrived
-        self.saver.receive(Chunk(self.run, part, numbers, iterations, is_first, is_last, self.ended))
+        self.saver.receive(StateChunk(self.run, part, numbers, iterations, is_first, is_last, self.ended))
 
     def trajectory(self) -> Trajectory:
         """Return all states saved so far."""

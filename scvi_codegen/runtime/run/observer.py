@@ -15,7 +15,7 @@ from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 
 @dataclass(frozen=True, slots=True)
-class Chunk:
+class StateChunk:
     """Consecutive states of a run.
 
     Attributes:
@@ -44,7 +44,7 @@ class Observer:
         """Return the largest number of steps of the next chunk."""
         return math.inf
 
-    def receive(self, chunk: Chunk) -> None:
+    def receive(self, chunk: StateChunk) -> None:
         """Receive the next states; those of the first chunk are the initial state alone."""
         raise NotImplementedError
 

@@ -10,7 +10,7 @@ from scvi_codegen.errors import StateError, closest
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.run.memory import Memory
-from scvi_codegen.runtime.run.observer import Chunk, Observer
+from scvi_codegen.runtime.run.observer import Observer, StateChunk
 from scvi_codegen.runtime.trajectory.dense_output import states_and_steps_at, step_sizes_at
 from scvi_codegen.validation import checked_count
 
@@ -21,7 +21,7 @@ class Extremes(Observer):
     def __init__(self) -> None:
         self.values = np.empty((0, 0))
 
-    def receive(self, chunk: Chunk) -> None:
+    def receive(self, chunk: StateChunk) -> None:
         """Include the states."""
         states = np.concatenate([chunk.states.q, chunk.states.p], axis=1)
         rows = states if chunk.is_first else np.concatenate([self.values, states])
@@ -55,7 +55,7 @@ class Saver(Observer):
         self.save_every, self.within_steps = checked_count(save_every, "save_every", least=1), within_steps
         self.rows: list[tuple[Array, Array, Array, Array, Array, NDArray[np.int64]]] = []
 
-    def wanted(self, chunk: Chunk) -> NDArray[np.bool_]:
+    def wanted(self, chunk: StateChunk) -> NDArray[np.bool_]:
         """Return which states of a chunk to save."""
         wanted: NDArray[np.bool_] = chunk.numbers % self.save_every == 0  # states within a step only if all are saved
         wanted &= self.within_steps | (chunk.numbers >= 0)
@@ -63,12 +63,12 @@ class Saver(Observer):
         wanted[-1] |= chunk.is_last
         return wanted
 
-    def receive(self, chunk: Chunk) -> None:
+    def receive(self, chunk: StateChunk) -> None:
         """Save the states that are wanted."""
         if (wanted := self.wanted(chunk)).any():
             self.save(chunk, wanted)
 
-    def save(self, chunk: Chunk, wanted: NDArray[np.bool_]) -> None:
+    def save(self, chunk: StateChunk, wanted: NDArray[np.bool_]) -> None:
         """Save some states of a chunk."""
         part = chunk.states
         t, q, p, sizes, stepped = (each[wanted] for each in (part.t, part.q, part.p, part.step_sizes, part.stepped))
@@ -91,7 +91,7 @@ class AtTimes(Saver):
         super().__init__()
         self.times = times
 
-    def receive(self, chunk: Chunk) -> None:
+    def receive(self, chunk: StateChunk) -> None:
         """Save the states at the times within the chunk, by partial steps."""
         part, forward = chunk.states, chunk.states.forward
         left, right = forward * part.t[0], forward * part.t[-1]
@@ -124,7 +124,7 @@ class Observed(Saver):
             return self.observer.most_steps(run)
         return self.save_every - run.steps % self.save_every
 
-    def receive(self, chunk: Chunk) -> None:
+    def receive(self, chunk: StateChunk) -> None:
         """Pass the states to the observer."""
         wanted = self.wanted(chunk)
         if isinstance(self.observer, Observer):
@@ -142,7 +142,7 @@ class Observed(Saver):
         maps = stepper.momentum_maps(q, p, t, parameters) if stepper.momentum_map_names else np.empty((len(t), 0))
         self.conserved.extend(np.concatenate([energies, maps], axis=1))
 
-    def _call(self, chunk: Chunk) -> None:
+    def _call(self, chunk: StateChunk) -> None:
         run, part = chunk.run, chunk.states
         if chunk.within_step:
             here = {"t": part.t[-1], "parameters": run.parameters, "options": run.options}
