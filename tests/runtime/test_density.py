@@ -61,39 +61,32 @@ def test_steps_are_those_of_the_density_controller(method, solver):
     assert 0.0 < run.t[-1] - run.t[-2] <= run.step_sizes[-3] * 1.5
 
 
-def test_step_density_may_depend_on_time_for_nonautonomous_systems():
-    stepper = sc.compile_stepper(DRIVEN, sc.SVI(3), time_transformation="1/(1 + x**2 + cos(t)/2)", flags=QUICK_FLAGS)
-    run = stepper.integrate([1.0], [0.7], h=0.2, t_end=8.0)
-
-    def control(t, q, p):
-        return (2.0 * q[0] * p[0] - np.sin(t) / 2.0) / (1.0 + q[0] ** 2 + np.cos(t) / 2.0)
-
-    expected = by_hand(
-        sc.compile_stepper(DRIVEN, sc.SVI(3), flags=QUICK_FLAGS),
-        np.array([1.0]),
-        np.array([0.7]),
-        0.2,
-        len(run.t) - 2,
+DENSITIES = {
+    "of time": (
+        lambda: DRIVEN,
+        "1/(1 + x**2 + cos(t)/2)",
         lambda t, q, _: 1.0 / (1.0 + q[0] ** 2 + np.cos(t) / 2.0),
-        control,
-    )
-    assert np.abs(np.column_stack([run.t, run.q, run.p])[1:-1] - expected).max() < 1e-12
-
-
-def test_forces_enter_the_step_density_of_momenta():
-    system = sc.hamiltonian_of(DRIVEN, momenta=["p"])
-    run = sc.compile_stepper(system, sc.SVI(3), time_transformation="1/(1 + p**2)", flags=QUICK_FLAGS).integrate(
-        [1.0], [0.7], h=0.2, t_end=8.0
-    )
-    expected = by_hand(
-        sc.compile_stepper(system, sc.SVI(3), flags=QUICK_FLAGS),
-        np.array([1.0]),
-        np.array([0.7]),
-        0.2,
-        len(run.t) - 2,
+        lambda t, q, p: (2.0 * q[0] * p[0] - np.sin(t) / 2.0) / (1.0 + q[0] ** 2 + np.cos(t) / 2.0),
+    ),
+    "of momenta": (
+        lambda: sc.hamiltonian_of(DRIVEN, momenta=["p"]),
+        "1/(1 + p**2)",
         lambda _, __, p: 1.0 / (1.0 + p[0] ** 2),
         lambda t, q, p: 2.0 * p[0] * (-(q[0] ** 3) + np.cos(2.0 * t) / 2.0 - p[0] / 10.0) / (1.0 + p[0] ** 2),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DENSITIES)
+def test_step_density_may_depend_on_time_or_momenta(name):
+    """Time occurs in the system, too; forces enter the rates of momenta."""
+    system, time_transformation, rate, control = DENSITIES[name]
+    plain, own = (
+        sc.compile_stepper(system(), sc.SVI(3), time_transformation=each, flags=QUICK_FLAGS)
+        for each in (None, time_transformation)
     )
+    run = own.integrate([1.0], [0.7], h=0.2, t_end=8.0)
+    expected = by_hand(plain, np.array([1.0]), np.array([0.7]), 0.2, len(run.t) - 2, rate, control)
     assert np.abs(np.column_stack([run.t, run.q, run.p])[1:-1] - expected).max() < 1e-12
 
 
