@@ -167,6 +167,12 @@ class TestFilm:
         assert drawn[-1] == (25, 25)
         assert capsys.readouterr().err == ""  # no terminal
 
+    def test_drawing_of_an_ensemble_reports_its_progress(self):
+        stepper = run_of("kepler", 1).stepper
+        runs, drawn = stepper.integrate_ensemble([[1.0, 0.0]] * 2, [[0.0, 1.0], [0.0, 1.1]], h=0.1, steps=9), []
+        runs.animate(seconds=0.2, progress=lambda *numbers: drawn.append(numbers))._repr_html_()
+        assert drawn[-1] == (5, 5)
+
     def test_animation_of_a_backward_run_is_backward(self):
         run = run_of("kepler", 10)
         back = run.stepper.integrate(run.q[-1], run.p[-1], h=-run.h, steps=10)

@@ -11,6 +11,7 @@ from samples import QUICK_FLAGS
 from scipy.special import ellipk
 
 import scvi_codegen as sc
+from scvi_codegen.pipeline import Sources
 from scvi_codegen.runtime.rotations.reduction import Reduction
 from scvi_codegen.verification.structure import structure_checks
 from scvi_codegen.verification.system_under_test import State, SystemUnderTest
@@ -198,3 +199,13 @@ def test_certificates_contain_gauge_invariance_and_reduced_symplecticity(system,
 def test_violations_of_the_reduced_map_are_found():
     checks = checks_of(BODY, ({"R": [1, 0, 0, 0]}, {"omega": [0.7, -0.4, 2.5]}), step=Contracting)
     assert [checks[name].outcome.name for name in REDUCED] == ["VIOLATED"] * 2
+
+
+@pytest.mark.parametrize("system", [MIXED, SPINS], ids=lambda system: system.name)
+def test_derivatives_of_the_gauge_are_those_of_differences(system):
+    reduction = Reduction(Sources(system, sc.as_method("svi:1")).integrator()[1])
+    state, like = np.random.default_rng(3).normal(size=(2, 2 * system.dimension))
+    _, rows = reduction.gauge(state, like)
+    for k, unit in enumerate(np.eye(len(state))):
+        ahead, behind = (reduction.gauge(state + sign * unit, like)[0] for sign in (1, -1))
+        np.testing.assert_allclose(rows[:, k], (ahead - behind) / 2, rtol=0, atol=1e-14)
