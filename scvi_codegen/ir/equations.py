@@ -371,29 +371,52 @@ class Control:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ErrorGrowth:
-    """Explicit Runge-Kutta-Nystroem scheme for a tangent vector (:mod:`scvi_codegen.lowering.control`).
+class TangentScheme:
+    """Explicit Runge-Kutta-Nystroem scheme of n stages for a tangent vector (:mod:`scvi_codegen.lowering.control`).
 
     Attributes:
-        partials: distinct derivatives F_q at the points, on lanes.
-        product: at u = (x, these) the product F_q x, on lanes.
         which: (n,) indices of the nodes among the points of a step; ``nodes``: their abscissae.
-        position: (n, n + 1) from a_0 and the stages to the displacements at the nodes.
+        position, velocity: (n, 5) from a_0 and the stages to the displacements and velocities at the nodes.
+        expected: (n,) from a_0 and the stages before the last to its extrapolation.
         end_position, end_velocity, end_acceleration: (n,) from the stages to the end of the step.
-        from_nodes: (n, lanes) from the stages to the displacements at all points.
+        at_points: (n, lanes) from the stages to the accelerations at all points.
+    """
+
+    which: tuple[int, ...]
+    nodes: tuple[Number, ...]
+    position: NumberTable
+    velocity: NumberTable
+    expected: tuple[Number, ...]
+    end_position: tuple[Number, ...]
+    end_velocity: tuple[Number, ...]
+    end_acceleration: tuple[Number, ...]
+    at_points: NumberTable
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ErrorGrowth:
+    """Propagation of a tangent vector along adaptive runs (:mod:`scvi_codegen.lowering.control`).
+
+    Attributes:
+        partials: distinct derivatives at the points, on lanes: F_q, or -E_q and -E_v with the terms of the mass matrix.
+        product: at u = (x, these) their product with x = dq, or (dq, dq'), on lanes.
+        energy: gradient of the energy at (q, v), on lanes; ``None`` of separable systems.
+        schemes: for tolerances at round-off level, and for larger ones.
         at_end: (lanes,) extrapolation from all points to the end.
+        tables: those of corrections at the points, unless they are the iteration's own.
     """
 
     partials: Kernel
     product: Kernel
-    which: tuple[int, ...]
-    nodes: tuple[Number, ...]
-    position: NumberTable
-    end_position: tuple[Number, ...]
-    end_velocity: tuple[Number, ...]
-    end_acceleration: tuple[Number, ...]
-    from_nodes: NumberTable
+    energy: Kernel | None
+    schemes: tuple[TangentScheme, TangentScheme]
     at_end: tuple[Number, ...]
+    tables: tuple[IterationTable, ...] = ()
+
+    @property
+    def kernels(self) -> tuple[Kernel, ...]:
+        """Its kernels, all on lanes."""
+        return (self.partials, self.product, *((self.energy,) if self.energy else ()))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,11 +7,12 @@ predictors they need only double precision, by Stieltjes' procedure (Gautschi, *
 
 Growth of errors along adaptive runs: a tangent vector by an explicit Runge-Kutta-Nystroem scheme.
 
-The variational equation dq'' = F_q dq / m of a separable system is integrated over each accepted step. Its nodes c_s
-are a few of the points of the step, at which F_q is evaluated in SIMD lanes; the acceleration a_0 at the start of the
-step is extrapolated from the step before. The stages
+The variational equation dq'' = F_q dq / m of a separable system, or L_vv dq'' = -E_q dq - E_v dq' with the residual
+E(q, v, a) of the Euler-Lagrange equations, is integrated over each accepted step. Its nodes c_s are a few of the points
+of the step, at which the derivatives are evaluated in SIMD lanes; the acceleration a_0 at the start of the step is
+extrapolated from the step before. The stages
 
-    x_s = dq + c_s h dv + h^2 sum_{j < s} position[s][j] a_j,      a_s = F_q(X_s) x_s / m
+    x_s = dq + c_s h dv + h^2 sum_{j < s} position[s][j] a_j,      a_s = F_q(X_s) x_s / m,
 
 are explicit, with the integrals of the polynomial through a_0, .., a_{s-1}; the polynomial through a_1, .., a_n gives
 the end. (Nystroem methods: Hairer, Norsett & Wanner, Solving ODEs I, sec. II.14.)
@@ -19,24 +20,40 @@ the end. (Nystroem methods: Hairer, Norsett & Wanner, Solving ODEs I, sec. II.14
 
 import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from sympy import Expr
 
 from scvi_codegen.controllers import Controller
 from scvi_codegen.controllers.predictive import PREDICTIVE
+from scvi_codegen.formulas.expressions import gradient_tuple, jacobian
 from scvi_codegen.ir.arithmetic import INVERSE_ROOTS
-from scvi_codegen.ir.equations import AdaptivePredictor, Control, ErrorGrowth, FixedPointIteration, StoredValues
+from scvi_codegen.ir.equations import (
+    AdaptivePredictor,
+    Control,
+    ErrorGrowth,
+    FixedPointIteration,
+    IterationTable,
+    StoredValues,
+    TangentScheme,
+)
 from scvi_codegen.ir.kernel import Expression, Kernel, Load, Number, NumberTable, Operation, lower_matrix, lower_vector
 from scvi_codegen.ir.program import Program
-from scvi_codegen.lowering.derivatives import force_derivatives
-from scvi_codegen.lowering.solvers.tables import DEGREE_OF_ONE, DEGREE_OF_TWO, INTERPOLATED, pad_vector
+from scvi_codegen.lowering.derivatives import NOTHING, force_derivatives, vector_product
+from scvi_codegen.lowering.solvers.tables import DEGREE_OF_ONE, DEGREE_OF_TWO, INTERPOLATED, pad_matrix, pad_vector
 from scvi_codegen.lowering.stage_groups import system_kernel
-from scvi_codegen.mechanics.derived_expressions import forms_of
+from scvi_codegen.mechanics.derived_expressions import accelerations, forms_of
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.tables.basis import cardinal_integrals, cardinal_values, least_squares, matrix_product, transpose
+from scvi_codegen.tables.basis import (
+    cardinal_integrals,
+    cardinal_values,
+    differentiation_matrix,
+    least_squares,
+    transpose,
+)
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 from scvi_codegen.tables.quadrature import gauss_legendre
 
@@ -151,47 +168,110 @@ def _padded(rows: list[list[float]], through: NumberTable, lanes: int) -> Number
     return (*wide, *(wide[-1],) * (lanes - count))
 
 
-MOST_NODES = 4
-"""Largest number of nodes; those nearest to the Gauss points of as many are chosen."""
-MOST_COORDINATES, MOST_DERIVATIVES = 12, 48
+MOST_NODES = 3, 4
+"""Largest numbers of nodes at round-off level and above; those nearest to the Gauss points of as many are chosen."""
+MOST_COORDINATES, MOST_DERIVATIVES = 20, 180
 """Largest numbers of coordinates and of distinct derivatives F_q, to limit the time of compilation."""
 
 
 def error_growth_of(system: MechanicalSystem, program: Program) -> ErrorGrowth | None:
-    """Return kernels and tables; ``None`` unless the system is separable, autonomous and conservative, and small."""
+    """Return kernels and tables; ``None`` unless the system is autonomous, conservative and small enough."""
     fixed_point = program.fixed_point
-    if fixed_point is None or fixed_point.derivatives_part != "separable_derivatives" or program.newton:
+    if fixed_point is None or program.newton or program.damping or system.inputs or system.changes_energy:
         return None
-    twin = equivalent_lagrangian(system) if system.dimension <= MOST_COORDINATES else None
-    if twin is None or system.changes_energy or system.inputs or program.damping:
+    make = GROWTH_KERNELS.get(fixed_point.derivatives_part)
+    twin = equivalent_lagrangian(system) if make and system.dimension <= MOST_COORDINATES else None
+    points = fixed_point.guess.abscissae
+    which = [_nodes(points, most) for most in MOST_NODES]
+    if make is None or twin is None or len(set(points)) < len(points) or len(which[0]) < 2:
         return None
-    points, (partials, products) = fixed_point.guess.abscissae, force_derivatives(twin)
-    which = _nodes(points)
-    if partials.values > MOST_DERIVATIVES or len(set(points)) < len(points) or len(which) < 2:
+    partials, product, energy = make(twin)
+    if partials.values > MOST_DERIVATIVES:
         return None
-    nodes, lanes = tuple(points[n] for n in which), fixed_point.lanes
-    position = tuple(_twice_integrated((mp.zero, *nodes[:s]), (c,))[0] for s, c in enumerate(nodes))
-    at_points = matrix_product(_twice_integrated(points, points), cardinal_values(nodes, points))
+    lanes = fixed_point.lanes
+    tables = (
+        IterationTable("TANGENT_INTEGRALS", pad_matrix(cardinal_integrals(points, points, mp.zero), lanes)),
+        IterationTable("TANGENT_END", pad_vector(cardinal_integrals(points, (mp.one,), mp.zero)[0], lanes)),
+        IterationTable("VELOCITY_RATE", pad_matrix(differentiation_matrix(points), lanes)),
+    )
+    of_roundoff, of_tolerance = (_tangent_scheme(points, each, lanes) for each in which)
     return ErrorGrowth(
         partials=_with_common_roots(partials),
-        product=products[0],
-        which=which,
-        nodes=lower_vector(nodes),
-        position=lower_matrix(tuple((*row, *(mp.zero,) * (len(nodes) - len(row) + 1)) for row in position)),
-        end_position=lower_vector(_twice_integrated(nodes, (mp.one,))[0]),
-        end_velocity=lower_vector(cardinal_integrals(nodes, (mp.one,), mp.zero)[0]),
-        end_acceleration=lower_vector(cardinal_values(nodes, (mp.one,))[0]),
-        from_nodes=tuple(pad_vector(column, lanes) for column in transpose(at_points)),
+        product=product,
+        energy=energy,
+        schemes=(of_roundoff, of_tolerance),
         at_end=pad_vector(cardinal_values(points, (mp.one,))[0], lanes),
+        tables=tables if energy else (),
     )
 
 
-def _nodes(points: Vector) -> tuple[int, ...]:
+def _tangent_scheme(points: Vector, which: tuple[int, ...], lanes: int) -> TangentScheme:
+    nodes = tuple(points[n] for n in which)
+    return TangentScheme(
+        which=which,
+        nodes=lower_vector(nodes),
+        position=_explicit(nodes, _twice_integrated),
+        velocity=_explicit(nodes, lambda known, at: cardinal_integrals(known, at, mp.zero)),
+        expected=lower_vector(cardinal_values((mp.zero, *nodes[:-1]), nodes[-1:])[0]),
+        end_position=lower_vector(_twice_integrated(nodes, (mp.one,))[0]),
+        end_velocity=lower_vector(cardinal_integrals(nodes, (mp.one,), mp.zero)[0]),
+        end_acceleration=lower_vector(cardinal_values(nodes, (mp.one,))[0]),
+        at_points=tuple(pad_vector(column, lanes) for column in transpose(cardinal_values(nodes, points))),
+    )
+
+
+def _separable_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, None]:
+    partials, products = force_derivatives(system)
+    return partials, products[0], None
+
+
+def _coupled_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, Kernel]:
+    """Return kernels of L_vv dq'' = -E_q dq - E_v dq', with E(q, v, a) the Euler-Lagrange residual."""
+    forms, of = forms_of(system), (*system.coordinates, *system.velocities)
+    residual = [-each for each in forms.euler_lagrange]
+    entries = jacobian(residual, of) or NOTHING
+    different = tuple(dict.fromkeys(entries.values()))
+    partials = system_kernel(
+        system,
+        "point_derivatives",
+        different,
+        u=(*of, *accelerations(system)),
+        partials=forms.mass_terms,
+        purpose="The distinct entries of -E_q and -E_v, and terms of L_vv at all points.",
+    )
+    product = vector_product(
+        system,
+        "derivative_product",
+        entries,
+        different,
+        shape=(system.dimension, len(of)),
+        purpose="The matrix of derivatives times x, u = (x, its entries).",
+    )
+    energy = system_kernel(
+        system, "energy_gradient", gradient_tuple(forms.energy, of), u=of, purpose="E_q and E_v of the energy E."
+    )
+    return partials, product, energy
+
+
+GROWTH_KERNELS: Mapping[str, Callable[[LagrangianSystem], tuple[Kernel, Kernel, Kernel | None]]] = {
+    "separable_derivatives": _separable_growth,
+    "coupled_derivatives": _coupled_growth,
+}
+
+
+def _explicit(nodes: Vector, integrated: Callable[[Vector, Vector], Matrix]) -> NumberTable:
+    """Return integrals up to each node of the polynomial through the start and the nodes before, padded by zeros."""
+    width = max(MOST_NODES)
+    rows = ((*integrated((mp.zero, *nodes[:s]), (c,))[0], *(mp.zero,) * (width - s)) for s, c in enumerate(nodes))
+    return lower_matrix(tuple(rows))
+
+
+def _nodes(points: Vector, most: int) -> tuple[int, ...]:
     """Return the indices of the nodes among the points; the start of the step is not one."""
     inner = [n for n, c in enumerate(points) if c > 0]
-    if len(inner) <= MOST_NODES:
+    if len(inner) <= most:
         return tuple(inner)
-    gauss = [(1 + x) / 2 for x in gauss_legendre(MOST_NODES).points]
+    gauss = [(1 + x) / 2 for x in gauss_legendre(most).points]
     distances = ([abs(points[n] - c) for n in inner] for c in gauss)
     return tuple(dict.fromkeys(inner[each.index(min(each))] for each in distances))
 

@@ -208,17 +208,29 @@ def _products(
     system: LagrangianSystem, partials: Entries, different: tuple[Expr, ...], *, size: int
 ) -> tuple[Kernel, Kernel]:
     """Return kernels of the matrix of derivatives times x, and of its transpose; the same kernel if they are equal."""
-    number = {value: k for k, value in enumerate(different)}
-    x = [Symbol(f"x[{i}]", real=True) for i in range(size)]
-    values = [Symbol(f"derivative[{k}]", real=True) for k in range(len(different))]
     back = {(j, i): value for (i, j), value in partials.items()}
+    purpose = "The matrix of derivatives times x, u = (x, its entries)."
+    forward = vector_product(system, "derivative_product", partials, different, shape=(size, size), purpose=purpose)
+    if back == partials:
+        return forward, forward
+    name, purpose = "transposed_product", "Its transpose times x."
+    return forward, vector_product(system, name, back, different, shape=(size, size), purpose=purpose)
 
-    def product(name: str, matrix: Entries, purpose: str) -> Kernel:
-        rows: list[list[Expr]] = [[] for _ in x]
-        for (i, j), value in matrix.items():
-            rows[i].append(Mul(values[number[value]], x[j]))
-        return system_kernel(system, name, [Add(*row) for row in rows], u=(*x, *values), purpose=purpose)
 
-    forward = product("derivative_product", partials, "The matrix of derivatives times x, u = (x, its entries).")
-    turned = product("transposed_product", back, "Its transpose times x.") if back != partials else forward
-    return forward, turned
+def vector_product(
+    system: LagrangianSystem,
+    name: str,
+    matrix: Entries,
+    different: tuple[Expr, ...],
+    *,
+    shape: tuple[int, int],
+    purpose: str,
+) -> Kernel:
+    """Return the kernel of a matrix times x at u = (x, ``different``), the distinct entries of the matrix."""
+    number = {value: k for k, value in enumerate(different)}
+    x = [Symbol(f"x[{i}]", real=True) for i in range(shape[1])]
+    values = [Symbol(f"derivative[{k}]", real=True) for k in range(len(different))]
+    rows: list[list[Expr]] = [[] for _ in range(shape[0])]
+    for (i, j), value in matrix.items():
+        rows[i].append(Mul(values[number[value]], x[j]))
+    return system_kernel(system, name, [Add(*row) for row in rows], u=(*x, *values), purpose=purpose)

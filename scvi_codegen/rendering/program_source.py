@@ -23,7 +23,14 @@ from scvi_codegen.rendering.environment import support_text, template_environmen
 from scvi_codegen.rendering.kernels.functions import unrolled_equations
 from scvi_codegen.rendering.kernels.loops import loop_context
 from scvi_codegen.rendering.kernels.printer import DOUBLE, SINGLE, Target, constants, inverse_roots
-from scvi_codegen.rendering.kernels.simd import POINTS, TRAJECTORIES, Fallback, iteration_source, predictor_text
+from scvi_codegen.rendering.kernels.simd import (
+    POINTS,
+    TRAJECTORIES,
+    Fallback,
+    iteration_source,
+    lane_table,
+    predictor_text,
+)
 from scvi_codegen.rendering.source import ExampleInput, Interface, Source
 from scvi_codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, MAX_ITERATIONS, ROUNDING_UNITS, included
 
@@ -208,8 +215,9 @@ def _control_context(program: Program, control: Control | None) -> dict[str, obj
     name = f"support/{program.prefix}_predictor.h"
     if not (control and control.predictor and program.fixed_point):
         return {"control": control, "own_headers": {}}
-    text = predictor_text(control.predictor)
-    return {"control": control, "own_headers": {name: text}}
+    text, tables = predictor_text(control.predictor), control.growth.tables if control.growth else ()
+    growth_tables = [lane_table(each.name, each.numbers) for each in tables]
+    return {"control": control, "own_headers": {name: text}, "growth_tables": growth_tables}
 
 
 def render_ensemble(program: Program) -> Source | None:
@@ -297,7 +305,7 @@ def _context(
     kernels = program.kernels if kernels is None else kernels
     fallback, scalars = fallback or ("own" if program.newton else "none"), _scalar_kernels(program, control, kernels)
     growth = control.growth if control else None
-    lanes = beside.lane_kernels if beside else (growth.partials, growth.product) if growth else ()
+    lanes = beside.lane_kernels if beside else growth.kernels if growth else ()
     return {
         "program": program,
         "target": target,

@@ -27,6 +27,15 @@ ELASTIC = PLANE, "(x_dot**2 + y_dot**2)/2 - y - 15*(sqrt(x**2 + y**2) - 1)**2"
 OSCILLATORS = PLANE, "(x_dot**2 + y_dot**2)/2 - x**2/2 - 9*y**2"
 HILL = PLANE, "(x_dot**2 + y_dot**2)/2 + x*y_dot - y*x_dot + 3*x**2/2 + 1/sqrt(x**2 + y**2)"
 PENDULUM = ("a", "b"), "a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)"
+TOP = (
+    ("a", "b", "c"),
+    (
+        "((a_dot*sin(b)*sin(c) + b_dot*cos(c))**2 + 2*(a_dot*sin(b)*cos(c) - b_dot*sin(c))**2"
+        " + 3*(a_dot*cos(b) + c_dot)**2)/2"
+    ),
+)
+SPHERICAL = ("u", "w"), "(u_dot**2 + sin(u)**2*w_dot**2)/2 + cos(u)"
+POLAR = ("r", "f"), "(r_dot**2 + r**2*f_dot**2)/2 + 1/r"
 STEPPERS = {}
 
 
@@ -41,6 +50,10 @@ def stepper_of(system, method="svi:8"):
 
 def ellipse(e):
     return [1.0 - e, 0.0], [0.0, math.sqrt((1.0 + e) / (1.0 - e))]
+
+
+def polar(e):
+    return [1.0 - e, 0.0], [0.0, math.sqrt((1.0 - e) * (1.0 + e))]
 
 
 def burrau_states(random):
@@ -84,9 +97,14 @@ REGULAR = {
     "elastic pendulum": (ELASTIC, [0.2, -1.0], [0.0, 0.0], 100.0),
     "Hill": (HILL, [0.1, 0.0], [0.0, math.sqrt(10.0)], 40.0),
     "oscillators": (OSCILLATORS, [1.0, 0.5], [0.0, 0.7], 300.0),
+    "double pendulum, small": (PENDULUM, [0.3, -0.2], [0.0, 0.0], 60.0),
+    "free top in Euler angles": (TOP, [0.3, 1.2, 0.5], [0.4, -0.7, 0.9], 60.0),
+    "spherical pendulum": (SPHERICAL, [2.0, 0.0], [0.0, 0.5], 100.0),
+    "Kepler 0.5, polar": (POLAR, [0.5, 0.0], [0.0, math.sqrt(0.75)], 100.0),
     "Henon-Heiles, E = 1/12": (HENON_HEILES, [0.0, 0.1], [math.sqrt(1 / 6 - 0.01 + 0.002 / 3 - 0.01), 0.1], 300.0),
 }
 CHAOTIC = {
+    "double pendulum": (PENDULUM, [2.5, -2.0], [0.0, 0.0], 60.0),
     "Burrau": (BURRAU, [1.0, 3.0, -2.0, -1.0, 1.0, -1.0], [0.0] * 6, 65.0),
     "early ejection": (BURRAU, [1.0, 3.05, -2.02, -1.01, 0.95, -1.01], [0.0] * 6, 65.0),
     "Henon-Heiles, E = 1/6.2": (HENON_HEILES, *henon_heiles_states(np.random.default_rng(7), 1 / 6.2), 300.0),
@@ -101,7 +119,7 @@ def test_chaotic_motions_are_reported_and_regular_ones_are_not(name, tolerance):
     assert reports(stepper_of(system), q, p, t_end, tolerance=tolerance) == (name in CHAOTIC)
 
 
-@pytest.mark.parametrize("method", ["svi:3", "svi:16"])
+@pytest.mark.parametrize("method", ["svi:3", "svi:12", "svi:16"])
 @pytest.mark.parametrize("name", ["Kepler 0.9", "Henon-Heiles, E = 1/6.2"])
 def test_other_methods_report_the_same(name, method):
     system, q, p, t_end = (REGULAR | CHAOTIC)[name]
@@ -109,19 +127,42 @@ def test_other_methods_report_the_same(name, method):
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1e-9])
-def test_growth_is_that_of_nearby_runs(tolerance):
+@pytest.mark.parametrize("name", ["Henon-Heiles, E = 1/6.2", "double pendulum"])
+def test_growth_is_that_of_nearby_runs(name, tolerance):
     """The tangent vector starts as cos(i) q_i, cos(i + 1) v_i; its part off the energy surface does not grow."""
-    system, q, p, _ = CHAOTIC["Henon-Heiles, E = 1/6.2"]
-    stepper, t_end, size = stepper_of(system), 120.0, 1e-9
+    system, q, p, _ = CHAOTIC[name]
+    stepper, t_end, size = stepper_of(system), 120.0 if name != "double pendulum" else 30.0, 1e-9
     run = stepper.start(q, p, t_end=t_end, tolerance=tolerance or None)
-    run._memory.measures_growth = 1
+    run._memory.measures_growth = 2 if tolerance else 1
     run._run_to_target()
-    states = np.array([[*q, *p]]) * (1.0 + size * np.array([[0.0] * 4, np.cos([0, 1, 1, 2])]))
-    one, other = (stepper.integrate(x[:2], x[2:], t_end=t_end, check_growth=False) for x in states)
+    states = np.array([[*q, *stepper.velocity(q, p)]]) * (1.0 + size * np.array([[0.0] * 4, np.cos([0, 1, 1, 2])]))
+    one, other = (stepper.integrate(x[:2], velocity=x[2:], t_end=t_end, check_growth=False) for x in states)
     pairs = (one.q, other.q), (one.p, other.p)
     apart = max(np.linalg.norm(b[-1] - a[-1]) / np.linalg.norm(a, axis=1).max() for a, b in pairs)
     assert run._growth[0] > 5.0
     assert run._growth[0] == pytest.approx(math.log(apart / size), abs=1.5)
+
+
+@pytest.mark.parametrize(
+    ("system", "method", "measured"),
+    [
+        (PENDULUM, "svi:8", True),
+        (TOP, "svi:4", True),
+        ((("x",), "x_dot**2/2 - x**2/2 + x*sin(t)"), "svi:4", False),  # the energy is not conserved
+        (
+            (tuple(f"x{i}" for i in range(24)), " + ".join(f"x{i}_dot**2/2 - x{i}**4" for i in range(24))),
+            "svi:2",
+            False,
+        ),
+    ],
+    ids=["double pendulum", "top", "driven", "24 coordinates"],
+)
+def test_which_systems_have_a_tangent_vector(system, method, measured):
+    stepper = stepper_of(system, method)
+    assert (
+        hasattr(stepper.start([0.1] * len(system[0]), [0.1] * len(system[0]), t_end=1.0)._memory, "measures_growth")
+        == measured
+    )
 
 
 @pytest.mark.parametrize(
@@ -168,7 +209,11 @@ def test_states_of_extreme_size_are_checked_by_repetition(scale):
     [
         (BURRAU, burrau_states, 65.0, 26, 30),
         (BURRAU, ejecting_states, 65.0, 26, 30),
-        (PENDULUM, pendulum_states, 60.0, 24, 30),  # some are regular
+        (PENDULUM, pendulum_states, 60.0, 27, 30),
+        (PENDULUM, lambda random: (random.uniform(-0.3, 0.3, 2), np.zeros(2)), 60.0, 0, 0),
+        (POLAR, lambda random: polar(random.uniform(0.0, 0.9)), 100.0, 0, 0),
+        (SPHERICAL, lambda random: ([random.uniform(0.5, 2.5), 0.0], [0.0, random.uniform(0.2, 0.9)]), 100.0, 0, 0),
+        (TOP, lambda random: ([0.3, 1.2, 0.5], random.uniform(-1.0, 1.0, 3)), 60.0, 0, 0),
         (HILL, hill_states, 40.0, 0, 0),
         (HENON_HEILES, lambda random: henon_heiles_states(random, 1 / 6.2), 300.0, 24, 26),  # the others are regular
         (HENON_HEILES, lambda random: henon_heiles_states(random, 1 / 12), 300.0, 0, 0),
@@ -179,6 +224,10 @@ def test_states_of_extreme_size_are_checked_by_repetition(scale):
         "Burrau",
         "early ejection",
         "double pendulum",
+        "small double pendulum",
+        "polar Kepler",
+        "spherical pendulum",
+        "free top",
         "Hill",
         "Henon-Heiles 1/6.2",
         "Henon-Heiles 1/12",

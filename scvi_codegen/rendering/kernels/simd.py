@@ -133,8 +133,8 @@ def iteration_source(
         damping=damping,
         support=("iteration/convergence", *meaning.memory, *parts, *solver),
         error_defines=_kept(fixed_point),
-        highest=_table("HIGHEST", fixed_point.guess.highest),
-        next=_table("NEXT", fixed_point.guess.next),
+        highest=lane_table("HIGHEST", fixed_point.guess.highest),
+        next=lane_table("NEXT", fixed_point.guess.next),
     )
 
 
@@ -164,13 +164,13 @@ def _tables(fixed_point: FixedPointIteration, meaning: Lanes, *, changes: bool) 
     one_each = fixed_point.in_groups and not meaning.are_points
     points = len(fixed_point.guess.abscissae) if one_each else 0
     for each in (*fixed_point.tables, *(fixed_point.derivatives_tables if changes else ())):
-        yield _table(each.name, each.numbers, points, groups=fixed_point.in_groups)
+        yield lane_table(each.name, each.numbers, points, groups=fixed_point.in_groups)
         if each.in_two_parts:
             low = tuple(tuple(map(DOUBLE.rest, x)) if each.is_matrix else DOUBLE.rest(x) for x in each.numbers)
-            yield _table(f"{each.name}_LOW", low, points, groups=fixed_point.in_groups)
+            yield lane_table(f"{each.name}_LOW", low, points, groups=fixed_point.in_groups)
 
 
-def _table(name: str, numbers: tuple[Number, ...] | NumberTable, points: int = 0, *, groups: bool = True) -> str:
+def lane_table(name: str, numbers: tuple[Number, ...] | NumberTable, points: int = 0, *, groups: bool = True) -> str:
     """Return a table over points: one number for each of ``points``; if 0, vectors, those of a matrix by columns."""
     kind, is_matrix = "double" if points else "lanes", isinstance(numbers[0], tuple)
     if not is_matrix:

@@ -130,10 +130,11 @@ class Stepper(Integrator):
                 the bound: ``global_error``, ``confirmed_digits`` and ``confirmed_until`` of the trajectory. If double
                 precision does not suffice (chaotic motion), an :class:`~scvi_codegen.AccuracyWarning` reports the
                 time until which the bound is confirmed.
-            check_growth: by default adaptive runs warn of exponential growth of errors: of separable conservative
-                systems by a tangent vector along the run, of others by repeating up to 2048 steps from an initial state
-                perturbed in its last place, unless a coarse run shows that errors grow slowly. ``True``: repeat all
-                steps, and warn if the states differ by more than 1e-7 (relative); ``False``: no check.
+            check_growth: by default adaptive runs warn of exponential growth of errors: of most conservative
+                Lagrangian systems by a tangent vector along the run, of others by repeating up to 2048 steps from an
+                initial state perturbed in its last place, unless a coarse run shows that errors grow slowly.
+                ``True``: repeat all steps, and warn if the states differ by more than 1e-7 (relative); ``False``: no
+                check.
             tables, threads: of arrays of run-time sizes: (rows, columns) whole numbers by name, (rows,) for a single
                 column; and the number of threads per step, by default one, with bitwise equal results. Threads pay off
                 if a step takes longer than some tens of microseconds; they are started by each call of C. The shapes

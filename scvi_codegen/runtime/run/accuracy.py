@@ -1,6 +1,6 @@
 """Accuracy warnings: steps too large for the motion, energy errors at the end of a run, exponential error growth.
 
-The growth of errors along an adaptive run of a separable conservative system is that of a tangent vector, which C
+The growth of errors along an adaptive run of a conservative Lagrangian system is that of a tangent vector, which C
 propagates beside the run (``error_growth.h``). Along other runs it is checked afterwards, by repeating the run from a
 perturbed initial state: the difference of two runs shows how the motion amplifies an initial error. A coarse run with a
 larger tolerance shows in the first half of the steps whether errors grow exponentially; only then is the run repeated
@@ -261,8 +261,8 @@ LEAST_GROWTH, EXPONENT = math.log(2e4), 8.0
 
 Bodies that are ejected move regularly from then on, which brings the mean closer to g.
 """
-LOOSE_TOLERANCE = 1e-6
-"""Tolerance above which the propagation of the tangent vector needs more corrections."""
+ROUNDOFF, LOOSE_TOLERANCE = 1e-14, 1e-6
+"""Tolerances above which the propagation of the tangent vector needs four stages, and more corrections."""
 
 
 def warn_of_error_growth(
@@ -294,7 +294,7 @@ def warn_of_error_growth(
 
 
 def measured_growth(stepper: Integrator, plan: StepPlan, requested: bool | None) -> int:
-    """Return how C measures the growth of errors along a run: 0 no, 1 or 2 by a tangent vector (``measures_growth``).
+    """Return how C measures the growth of errors along a run: 0 no, 1 to 3 by a tangent vector (``measures_growth``).
 
     Raises:
         MethodError: for a requested check, if events change the state.
@@ -309,7 +309,7 @@ def measured_growth(stepper: Integrator, plan: StepPlan, requested: bool | None)
             )
     if requested is not None or not plan.adaptive or stepper.changes_states or not _warnings_enabled.get():
         return 0
-    return 1 + (plan.tolerance > LOOSE_TOLERANCE)
+    return 1 + (plan.tolerance > ROUNDOFF) + (plan.tolerance > LOOSE_TOLERANCE)
 
 
 def _warn_of_amplification(what: str) -> None:

@@ -1,132 +1,278 @@
-#include "../iteration/separable_iteration.h"
 #include "../run/run.h"
 
-/* Growth of errors along an adaptive run: the relative size of one tangent vector (dq, dv), dq'' = F_q dq / m, which an
- * explicit Runge-Kutta-Nystroem scheme advances by each accepted step. Its nodes are points of the step, at which
- * F_q is evaluated in SIMD lanes; a_0 is extrapolated from the step before. Where h^2 F_q / m is large, the scheme is
- * corrected by fixed-point iterations x = x0 + h^2 P (F_q x) / m of the equations of the step itself. Every second step
- * the vector is projected on the energy surface (in the metric of the sizes of q and v): its part along the gradient of
- * the energy, which is conserved, grows by the error of the scheme only. Requires: the tables of the scheme,
- * point_derivatives and derivative_product. */
+/* Growth of errors along an adaptive run: the relative size of one tangent vector (dq, dv), which an explicit
+ * Runge-Kutta-Nystroem scheme advances by each accepted step. Its accelerations are those of the variational equations,
+ *   dq'' = F_q dq / m,      or      L_vv dq'' = -E_q dq - E_v dv   (VARIABLE_ACCELERATIONS),
+ * with E(q, v, a) the Euler-Lagrange residual at the points of the step, whose derivatives are evaluated in SIMD lanes.
+ * The nodes of the scheme are some of the points; a_0 is extrapolated from the step before. Where h^2 dq'' is large,
+ * the scheme is corrected by fixed-point iterations of the collocation equations at all points. Every second or fourth
+ * step the vector is projected on the energy surface (in the metric of the sizes of q and v): its part along the
+ * gradient of the energy, which is conserved, grows by the error of the scheme only. Requires: the iteration, the tables
+ * of the scheme, point_derivatives and derivative_product; with VARIABLE_ACCELERATIONS energy_gradient. */
 
-#define LOOSE_TOLERANCE 2 /* value of measures_growth for tolerances above 1e-6 */
-#define SAMPLED_STEPS 2 /* one of so many steps is projected and measured */
+#define AT_ROUNDOFF 1 /* values of measures_growth: no tolerance is given */
+#define LOOSE_TOLERANCE 3 /* a tolerance above 1e-6 */
+#define SAMPLED_AT_ROUNDOFF 4 /* one of so many steps is projected and measured */
+#define SAMPLED 2 /* with a tolerance */
 #define LEAST_GROWTH 9.9 /* logarithm: of less, the difference to the mean is not measured */
 #define LARGEST_GROWTH 100.0 /* logarithm: beyond it the growth is known; below the reciprocal numbers underflow */
 #define LARGEST_SQUARE 1e140 /* of sizes: the products of two are numbers */
 #define UNRESOLVED_SQUARE 1e4 /* of h^2 F_q x / m relative to x */
+#define MANY_POINTS (POINTS > 8) /* steps are longer */
+#define MOST_CORRECTIONS 40
 #define LOG_2 0.6931471805599453
 
-typedef lanes vector_at_points[M + FORCE_DERIVATIVES]; /* x, then the derivatives F_q */
+#ifdef VARIABLE_ACCELERATIONS
+enum { TANGENT = 2 * M }; /* numbers of a tangent vector on which accelerations depend */
+#define VECTOR_SQUARE(x, v) ((x) * (x) + (v) * (v))
+/* Squared change of h^2 dq'' by a correction, relative to the vector, after which another one is necessary. */
+#define UNSETTLED(change) ((change) > (MANY_POINTS ? 0.01 : 1.0))
+#define SMALL_REST (MANY_POINTS ? 0.01 : 0.1) /* squared residual of the last stage relative to the vector */
+#else
+enum { TANGENT = M };
+#define VECTOR_SQUARE(x, v) ((x) * (x))
+#define UNSETTLED(change) 0 /* corrections converge like those of a sine */
+#define SMALL_REST (MANY_POINTS ? 0.01 : 1.0)
+#endif
 
-/* Number of corrections, by the square of the size of a = h^2 F_q x / m relative to x: the fewest by which regular
- * motions of eleven systems show no exponential growth at tolerances up to 1e-6, and at larger ones (LOOSE_TOLERANCE).
- * The error of k of them is about |a / x|^k / (2 k)!; the measurement ends where 16 do not suffice. */
-static inline int corrections_of(run_memory *run, const lanes *x, const double *a)
+/* Explicit scheme: nodes among the points, and weights of the stages (NODES at most). */
+typedef struct {
+  int nodes;
+  const int *point;
+  const double *node, (*position)[NODES + 1], (*velocity)[NODES + 1], *expected;
+  const double *end_position, *end_velocity, *end_acceleration, (*at_points)[POINTS];
+} tangent_scheme;
+
+#ifdef VARIABLE_ACCELERATIONS
+#define VELOCITY_TABLE(name) VELOCITY_##name
+#else
+#define VELOCITY_TABLE(name) NULL
+#endif
+#define SCHEME(name)                                                                                \
+  {NODES_##name, POINT_##name, NODE_##name, POSITION_##name, VELOCITY_TABLE(name), EXPECTED_##name, \
+      END_POSITION_##name, END_VELOCITY_##name, END_ACCELERATION_##name, AT_POINTS_##name}
+
+/* Tangent vectors at the points of a group, and the derivatives by which they are multiplied. */
+typedef lanes tangent_at_points[TANGENT + GROWTH_DERIVATIVES];
+
+#ifdef VARIABLE_ACCELERATIONS
+typedef struct {
+  tangent_at_points u[GROUPS];
+  lanes mass[GROUPS][MASS];
+  double square, inverse; /* h^2, 1 / h */
+} tangent_points;
+
+/* Computes the derivatives of the accelerations at the points of a step from their velocities in the run's memory. */
+static inline void linearise_accelerations(const run_memory *run, const step_data *step, const iteration_data *data,
+    coordinates *X, tangent_points *at)
 {
-  static const double most[2][4] = {{3.0, 12.0, 60.0, 250.0}, {0.3, 0.3, 3.0, 30.0}};
-  const double *limit = most[run->measures_growth == LOOSE_TOLERANCE];
-  double of_x = 0.0, of_a = 0.0;
-  for (int i = 0; i < M; i++) {
-    of_x += x[i][0] * x[i][0];
-    of_a += a[i] * a[i];
+  lanes V[GROUPS][M], scaled[GROUPS][M], u[3 * M];
+  (void)X;
+  lanes_load(run->memory, V);
+  scale(data->position_weight, V, scaled);
+  for (int n = 0; n < GROUPS; n++) {
+    place(step, n, scaled, V, u);
+    for (int i = 0; i < M; i++)
+      u[2 * M + i] = at->inverse * apply(VELOCITY_RATE, n, V, i);
+    memset(at->mass[n], 0, sizeof at->mass[n]);
+    point_derivatives(u, step->t + step->h * ABSCISSA[n], step->parameters, at->u[n] + TANGENT, at->mass[n]);
+    factor_mass(at->mass[n]);
   }
-  if (of_a < limit[0] * of_x)
+}
+
+/* Accelerations times h^2 of the tangent vectors at the points of a group. */
+static inline void tangent_accelerations(const step_data *step, const tangent_points *at, int n, lanes *a)
+{
+  derivative_product(at->u[n], lanes_of(step->t), step->parameters, a);
+  solve_mass(at->mass[n], a);
+  for (int i = 0; i < M; i++)
+    a[i] *= at->square;
+}
+#else
+typedef struct {
+  tangent_at_points u[GROUPS];
+  double unit[M]; /* h^2 / m */
+} tangent_points;
+
+static inline void linearise_accelerations(const run_memory *run, const step_data *step, const iteration_data *data,
+    coordinates *X, tangent_points *at)
+{
+  (void)run;
+  for (int n = 0; n < GROUPS; n++)
+    point_derivatives(X[n], step->t + step->h * ABSCISSA[n], step->parameters, at->u[n] + TANGENT);
+  for (int i = 0; i < M; i++)
+    at->unit[i] = data->square * data->inverse_mass[i];
+}
+
+static inline void tangent_accelerations(const step_data *step, const tangent_points *at, int n, lanes *a)
+{
+  derivative_product(at->u[n], lanes_of(step->t), step->parameters, a);
+  for (int i = 0; i < M; i++)
+    a[i] *= at->unit[i];
+}
+#endif
+
+/* Number of corrections: none if the last stage differs little from the extrapolation of those before; else by the
+ * square of the size of a = h^2 dq'' relative to that of the vector, the fewest by which regular motions of nineteen
+ * systems show no exponential growth. The error of k of them is about |a / x|^k / (2 k)!, or |a / x|^k / k! if forces
+ * depend on velocities; the measurement ends where 16 do not suffice. */
+static inline int corrections_of(run_memory *run, double of_x, double of_a, double of_rest)
+{
+#ifdef VARIABLE_ACCELERATIONS
+  static const double most[2][3] = {{0.1, 1.0, 10.0}, {0.1, 1.0, 10.0}};
+#else
+  static const double most[2][3] = {{12.0, 60.0, 250.0}, {0.3, 3.0, 30.0}};
+#endif
+  const double *limit = most[run->measures_growth >= (MANY_POINTS ? LOOSE_TOLERANCE - 1 : LOOSE_TOLERANCE)];
+  if (of_rest < SMALL_REST * of_x)
     return 0;
   if (of_a > UNRESOLVED_SQUARE * of_x)
     run->measures_growth = run->growth_samples = 0;
   if (of_a > 500.0 * of_x)
-    return 16;
-  return of_a < limit[1] * of_x ? 1 : of_a < limit[2] * of_x ? 2
-      : of_a < limit[3] * of_x                               ? 4
-                                                             : 8;
+    return of_a > 2500.0 * of_x ? 16 : 10;
+  if (of_a > limit[2] * of_x)
+    return of_a > 130.0 * of_x ? 8 : 6;
+  return of_a < limit[0] * of_x ? 1 : of_a < limit[1] * of_x ? 2
+                                                             : 4;
 }
 
-/* Accelerations F_q x / m times h^2 at all points. */
-static inline void accelerations(const step_data *step, const double *unit, vector_at_points *x, coordinates *a)
+/* Tangent vectors at the points, from the vector (q, h v) at the start and the accelerations a. */
+static inline void place_tangents(const double *q, const double *v, coordinates *a, tangent_points *at)
 {
-  for (int n = 0; n < GROUPS; n++) {
-    derivative_product(x[n], lanes_of(step->t), step->parameters, a[n]);
-    for (int i = 0; i < M; i++)
-      a[n][i] *= unit[i];
+  for (int i = 0; i < M; i++) {
+#ifdef VARIABLE_ACCELERATIONS
+    coordinates V[GROUPS];
+    for (int n = 0; n < GROUPS; n++) {
+      V[n][0] = v[i] + apply(TANGENT_INTEGRALS, n, a, i);
+      at->u[n][M + i] = at->inverse * V[n][0];
+    }
+    for (int n = 0; n < GROUPS; n++)
+      at->u[n][i] = q[i] + apply(TANGENT_INTEGRALS, n, V, 0);
+#else
+    for (int n = 0; n < GROUPS; n++)
+      at->u[n][i] = q[i] + DRIFT[n] * v[i] + apply(PRODUCT, n, a, i);
+#endif
   }
 }
 
-/* Improves the end of the step, by iterations from the stages of the explicit scheme. */
-static __attribute__((noinline)) void correct_tangent(run_memory *run, const step_data *step, const double *unit,
-    vector_at_points *x, const double *q, const double *v, double (*stages)[M], int corrections)
+/* Mean over the points of the squared change of accelerations. */
+static inline double change_between(coordinates *one, coordinates *other)
+{
+  lanes sum = lanes_of(0.0);
+  for (int i = 0; i < M; i++)
+    for (int n = 0; n < GROUPS; n++)
+      sum += (other[n][i] - one[n][i]) * (other[n][i] - one[n][i]);
+  return lanes_total(sum) / POINTS;
+}
+
+/* Improves the end of the step, by iterations from the stages of the explicit scheme; ends the measurement if they
+ * diverge, as those of forces of velocities may. */
+static __attribute__((noinline)) void correct_tangent(run_memory *run, const step_data *step, tangent_points *at,
+    const tangent_scheme *of, const double *q, const double *v, double (*stages)[M], double of_x,
+    int corrections)
 {
   const double inverse = 1.0 / step->h;
-  lanes end[GROUPS], column[NODES][GROUPS];
-  coordinates a[GROUPS];
+  double change = INFINITY;
+  lanes end[GROUPS];
+  coordinates a[GROUPS], before[GROUPS];
   memcpy(end, AT_END, sizeof end);
-  memcpy(column, FROM_NODES, sizeof column);
-  for (int i = 0; i < M; i++)
-    for (int n = 0; n < GROUPS; n++) {
-      x[n][i] = q[i] + DRIFT[n] * v[i];
-#pragma GCC unroll 4
-      for (int s = 0; s < NODES; s++)
-        x[n][i] += column[s][n] * stages[s][i];
-    }
-  accelerations(step, unit, x, a);
-  for (int k = 1; k < corrections; k++) {
+  memset(a, 0, sizeof a);
+  for (int s = 0; s < of->nodes; s++) {
+    lanes column[GROUPS];
+    memcpy(column, of->at_points[s], sizeof column);
     for (int i = 0; i < M; i++)
       for (int n = 0; n < GROUPS; n++)
-        x[n][i] = q[i] + DRIFT[n] * v[i] + apply(PRODUCT, n, a, i);
-    accelerations(step, unit, x, a);
+        a[n][i] += column[n] * stages[s][i];
   }
+  for (int k = 0; k < corrections || (UNSETTLED(change) && k < MOST_CORRECTIONS); k++) {
+    place_tangents(q, v, a, at);
+    memcpy(before, a, sizeof before);
+    for (int n = 0; n < GROUPS; n++)
+      tangent_accelerations(step, at, n, a[n]);
+    if (UNSETTLED(change))
+      change = change_between(before, a) / of_x;
+  }
+  if (UNSETTLED(change))
+    run->measures_growth = run->growth_samples = 0;
   for (int i = 0; i < M; i++) {
+#ifdef VARIABLE_ACCELERATIONS
+    coordinates V[GROUPS];
+    for (int n = 0; n < GROUPS; n++)
+      V[n][0] = v[i] + apply(TANGENT_INTEGRALS, n, a, i);
+    run->tangent_q[i] = q[i] + weigh(TANGENT_END, V, 0);
+    run->tangent_v[i] = inverse * (v[i] + weigh(TANGENT_END, a, i));
+#else
     run->tangent_q[i] = q[i] + v[i] + weigh(POINT_END_POSITION, a, i);
     run->tangent_v[i] = inverse * (v[i] + weigh(POINT_END_MOMENTUM, a, i));
+#endif
     run->tangent_a[i] = inverse * inverse * weigh(end, a, i);
   }
 }
 
 /* Advances the tangent vector by a step. The stages are the same in all lanes, of which each uses the derivatives at
  * one point: reading single lanes of all derivatives would take longer. */
-static inline void advance_tangent(run_memory *run, const step_data *step, const iteration_data *data,
-    coordinates *X)
+static inline __attribute__((always_inline)) void advance_tangent(run_memory *run, const step_data *step,
+    const iteration_data *data, coordinates *X, const tangent_scheme *of)
 {
-  const double h = step->h, inverse = 1.0 / h;
-  double unit[M], q[M], v[M], stages[NODES][M];
+  const double h = step->h, inverse = 1.0 / h, square = h * h;
+  double q[M], v[M], stages[NODES][M], of_x = 0.0, of_a = 0.0, of_rest = 0.0;
   lanes F[M];
-  vector_at_points x[GROUPS];
+  tangent_points at;
   int corrections;
-  for (int n = 0; n < GROUPS; n++)
-    point_derivatives(X[n], step->t + h * ABSCISSA[n], step->parameters, x[n] + M);
+#ifdef VARIABLE_ACCELERATIONS
+  at.square = square;
+  at.inverse = inverse;
+#endif
+  linearise_accelerations(run, step, data, X, &at);
   for (int i = 0; i < M; i++) {
-    unit[i] = data->square * data->inverse_mass[i];
     q[i] = run->tangent_q[i];
     v[i] = h * run->tangent_v[i];
   }
 #pragma GCC unroll 4
-  for (int s = 0; s < NODES; s++) {
-    lanes *u = x[NODE_POINT[s] / LANES];
+  for (int s = 0; s < of->nodes; s++) {
+    lanes *u = at.u[of->point[s] / LANES];
 #pragma GCC unroll 8
     for (int i = 0; i < M; i++) {
-      double at_node = q[i] + NODE[s] * v[i] + NODE_POSITION[s][0] * (data->square * run->tangent_a[i]);
+      double at_node = q[i] + of->node[s] * v[i] + of->position[s][0] * (square * run->tangent_a[i]);
 #pragma GCC unroll 4
       for (int j = 0; j < s; j++)
-        at_node += NODE_POSITION[s][j + 1] * stages[j][i];
+        at_node += of->position[s][j + 1] * stages[j][i];
       u[i] = lanes_of(at_node);
+#ifdef VARIABLE_ACCELERATIONS
+      at_node = v[i] + of->velocity[s][0] * (square * run->tangent_a[i]);
+#pragma GCC unroll 4
+      for (int j = 0; j < s; j++)
+        at_node += of->velocity[s][j + 1] * stages[j][i];
+      u[M + i] = lanes_of(inverse * at_node);
+#endif
     }
-    derivative_product(u, lanes_of(step->t), step->parameters, F);
+    tangent_accelerations(step, &at, of->point[s] / LANES, F);
 #pragma GCC unroll 8
     for (int i = 0; i < M; i++)
-      stages[s][i] = unit[i] * F[i][NODE_POINT[s] % LANES];
+      stages[s][i] = F[i][of->point[s] % LANES];
   }
-  corrections = corrections_of(run, x[NODE_POINT[NODES - 1] / LANES], stages[NODES - 1]);
+  for (int i = 0; i < M; i++) {
+    const double x = at.u[of->point[of->nodes - 1] / LANES][i][0], a = stages[of->nodes - 1][i];
+    double rest = a - of->expected[0] * (square * run->tangent_a[i]);
+#pragma GCC unroll 4
+    for (int s = 1; s < of->nodes; s++)
+      rest -= of->expected[s] * stages[s - 1][i];
+    of_x += VECTOR_SQUARE(x, v[i]);
+    of_a += a * a;
+    of_rest += rest * rest;
+  }
+  corrections = corrections_of(run, of_x, of_a, of_rest);
   if (corrections > 0) {
-    correct_tangent(run, step, unit, x, q, v, stages, corrections);
+    correct_tangent(run, step, &at, of, q, v, stages, of_x, corrections);
     return;
   }
   for (int i = 0; i < M; i++) {
     double end_q = q[i] + v[i], end_v = v[i], end_a = 0.0;
 #pragma GCC unroll 4
-    for (int s = 0; s < NODES; s++) {
-      end_q += NODES_END_POSITION[s] * stages[s][i];
-      end_v += NODES_END_VELOCITY[s] * stages[s][i];
-      end_a += NODES_END_ACCELERATION[s] * stages[s][i];
+    for (int s = 0; s < of->nodes; s++) {
+      end_q += of->end_position[s] * stages[s][i];
+      end_v += of->end_velocity[s] * stages[s][i];
+      end_a += of->end_acceleration[s] * stages[s][i];
     }
     run->tangent_q[i] = end_q;
     run->tangent_v[i] = inverse * end_v;
@@ -142,32 +288,57 @@ static inline double logarithm(double x)
   return (double)bits * 0x1p-52 - 1023.0;
 }
 
+/* Velocities v and the gradient of the energy with respect to (q, v) at the end q of the step. */
+static inline void end_gradient(const run_memory *run, const step_data *step, const iteration_data *data,
+    const double *q, const double *dp, double *v, double *by_q, double *by_v)
+{
+  lanes end[GROUPS], F[GROUPS][M]; /* forces, or velocities */
+  memcpy(end, AT_END, sizeof end);
+  lanes_load(run->memory, F);
+#ifdef VARIABLE_ACCELERATIONS
+  lanes u[2 * M], value[2 * M];
+  (void)data, (void)dp;
+  for (int i = 0; i < M; i++) {
+    v[i] = weigh(end, F, i);
+    u[i] = lanes_of(q[i]);
+    u[M + i] = lanes_of(v[i]);
+  }
+  energy_gradient(u, lanes_of(step->t), step->parameters, value);
+  for (int i = 0; i < M; i++) {
+    by_q[i] = value[i][0];
+    by_v[i] = value[M + i][0];
+  }
+#else
+  (void)q;
+  for (int i = 0; i < M; i++) {
+    by_q[i] = -weigh(end, F, i);
+    by_v[i] = step->p0[i] + dp[i];
+    v[i] = data->inverse_mass[i] * by_v[i];
+  }
+#endif
+}
+
 /* Projects the tangent vector on the energy surface at the end of the step and measures it. */
 static inline void sample_growth(run_memory *run, const step_data *step, const iteration_data *data, const double *dq,
     const double *dp)
 {
-  double f[M], p[M], q2 = 0.0, v2 = 0.0, along = 0.0, size = 0.0, dq2 = 0.0, dv2 = 0.0, growth;
-  lanes end[GROUPS], F[GROUPS][M];
-  memcpy(end, AT_END, sizeof end);
-  lanes_load(run->memory, F);
+  double q[M], v[M], by_q[M], by_v[M], q2 = 0.0, v2 = 0.0, along = 0.0, size = 0.0, dq2 = 0.0, dv2 = 0.0, growth;
+  for (int i = 0; i < M; i++)
+    q[i] = step->q0[i] + dq[i];
+  end_gradient(run, step, data, q, dp, v, by_q, by_v);
   for (int i = 0; i < M; i++) {
-    const double q = step->q0[i] + dq[i];
-    double v;
-    p[i] = step->p0[i] + dp[i];
-    v = data->inverse_mass[i] * p[i];
-    f[i] = weigh(end, F, i);
-    q2 += q * q;
-    v2 += v * v;
-    along += p[i] * run->tangent_v[i] - f[i] * run->tangent_q[i];
+    q2 += q[i] * q[i];
+    v2 += v[i] * v[i];
+    along += by_v[i] * run->tangent_v[i] + by_q[i] * run->tangent_q[i];
   }
   for (int i = 0; i < M; i++)
-    size += f[i] * f[i] * q2 + p[i] * p[i] * v2;
+    size += by_q[i] * by_q[i] * q2 + by_v[i] * by_v[i] * v2;
   run->largest_q2 = larger(run->largest_q2, q2);
   run->largest_v2 = larger(run->largest_v2, v2);
   along /= size;
   for (int i = 0; i < M; i++) {
-    run->tangent_q[i] += along * q2 * f[i];
-    run->tangent_v[i] -= along * v2 * p[i];
+    run->tangent_q[i] -= along * q2 * by_q[i];
+    run->tangent_v[i] -= along * v2 * by_v[i];
     dq2 += run->tangent_q[i] * run->tangent_q[i];
     dv2 += run->tangent_v[i] * run->tangent_v[i];
   }
@@ -188,12 +359,27 @@ static inline void sample_growth(run_memory *run, const step_data *step, const i
 static __attribute__((noinline)) void measure_growth(run_memory *run, const step_data *step,
     const iteration_data *data, coordinates *X, const double *dq, const double *dp)
 {
-  if (run->tangent_steps == 0)
+  static const tangent_scheme of_roundoff = SCHEME(OF_ROUNDOFF), of_tolerance = SCHEME(OF_TOLERANCE);
+  int sampled = SAMPLED;
+  if (run->tangent_steps == 0) {
+#ifdef VARIABLE_ACCELERATIONS
+    lanes V[GROUPS][M];
+    lanes_load(run->memory, V);
+#endif
     for (int i = 0; i < M; i++) {
       run->tangent_q[i] = step->q0[i] * cos(i);
+#ifdef VARIABLE_ACCELERATIONS
+      run->tangent_v[i] = at_start(V, i) * cos(i + 1);
+#else
       run->tangent_v[i] = data->inverse_mass[i] * step->p0[i] * cos(i + 1);
+#endif
     }
-  advance_tangent(run, step, data, X);
-  if (run->tangent_steps++ % SAMPLED_STEPS == 0 && run->measures_growth)
+  }
+  if (run->measures_growth == AT_ROUNDOFF) {
+    sampled = SAMPLED_AT_ROUNDOFF;
+    advance_tangent(run, step, data, X, &of_roundoff);
+  } else
+    advance_tangent(run, step, data, X, &of_tolerance);
+  if (run->tangent_steps++ % sampled == 0 && run->measures_growth)
     sample_growth(run, step, data, dq, dp);
 }
