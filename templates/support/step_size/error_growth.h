@@ -7,8 +7,8 @@
  * The nodes of the scheme are some of the points; a_0 is extrapolated from the step before. Where h^2 dq'' is large,
  * the scheme is corrected by fixed-point iterations of the collocation equations at all points. Every second or fourth
  * step the vector is projected on the energy surface (in the metric of the sizes of q and v): its part along the
- * gradient of the energy, which is conserved, grows by the error of the scheme only. Requires: the iteration, the tables
- * of the scheme, point_derivatives and derivative_product; with VARIABLE_ACCELERATIONS energy_gradient. */
+ * gradient of the energy, which is conserved, grows by the error of the scheme only. Requires: the iteration, the
+ * tables of the scheme, point_derivatives and derivative_product; with VARIABLE_ACCELERATIONS energy_gradient. */
 
 #define AT_ROUNDOFF 1 /* values of measures_growth: no tolerance is given */
 #define LOOSE_TOLERANCE 3 /* a tolerance above 1e-6 */
