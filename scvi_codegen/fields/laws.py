@@ -30,9 +30,9 @@ from sympy.core.function import AppliedUndef
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, closest, warn
 from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis
 from scvi_codegen.fields.density import Density, place_text
+from scvi_codegen.formulas.expressions import sums_to_zero
 from scvi_codegen.formulas.symbols import TIME, symbol
 from scvi_codegen.formulas.translation import format_expression
-from scvi_codegen.mechanics.arrays.symmetry import sums_to_zero
 from scvi_codegen.representation import summary
 
 Variation = dict[str, Expr]
@@ -208,7 +208,7 @@ def shorter(formula: Expr) -> Expr:
 def vanishes(formula: Expr) -> bool:
     """Return whether an expression in functions and their derivatives is zero identically, by evaluation."""
     plain = sympy.expand(formula).xreplace(names_of(formula))
-    return sums_to_zero(Add.make_args(plain), sorted(plain.free_symbols, key=str))
+    return sums_to_zero(Add.make_args(plain))
 
 
 def names_of(formula: Expr) -> dict[Expr, Symbol]:

@@ -11,8 +11,11 @@ Values are computed by straight-line programs that evaluate each subexpression o
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Mapping, Sequence
+import random
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import lru_cache
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -198,6 +201,28 @@ def evaluate(expression: sympy.Expr, values: Mapping[sympy.Symbol, Number]) -> N
         return Tape(list(parts(expression)), list(values))(list(map(mp.mpf, values.values())))[0]
     except ArithmeticError as error:
         raise ArithmeticError(f"'{shortened(expression)}' is not a finite real number") from error
+
+
+ATTEMPTS, SAMPLES = 24, 4
+"""Numbers of random points at which formulas are evaluated at most, and at which an identity must hold."""
+NEGLIGIBLE = mp.mpf(10) ** -40
+"""Largest sum that counts as 0, relative to the sum of the absolute values of its terms."""
+
+
+def samples(expressions: Sequence[Expr]) -> Iterator[list[Number]]:
+    """Yield values in 60 digits at reproducible random points of order 1, without those where one is undefined."""
+    symbols = sorted(set().union(*(expression.free_symbols for expression in expressions)), key=str)
+    tape, generator = Tape(expressions, symbols), random.Random(20250101)
+    for _ in range(ATTEMPTS):
+        with suppress(ArithmeticError):
+            yield tape([mp.mpf(generator.uniform(0.3, 1.3)) for _ in symbols])
+
+
+def sums_to_zero(terms: Sequence[Expr]) -> bool:
+    """Return whether the sum of terms is zero at ``SAMPLES`` random points; false where it is undefined."""
+    values = list(islice(samples(terms), SAMPLES)) if Add(*terms) != 0 else [[mp.zero]] * SAMPLES
+    zeros = (abs(mp.fsum(parts)) <= NEGLIGIBLE * mp.fsum(map(abs, parts)) for parts in values)
+    return len(values) == SAMPLES and all(zeros)
 
 
 MAX_EXPONENT = 64

@@ -18,11 +18,10 @@ values at random points in 60 digits.
 
 from __future__ import annotations
 
-import random
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import combinations, permutations
+from itertools import combinations, islice, permutations
 from typing import Any
 
 import numpy as np
@@ -30,17 +29,13 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.expressions import Tape, hessian
+from scvi_codegen.formulas.expressions import SAMPLES, hessian, samples, sums_to_zero
 from scvi_codegen.formulas.intermediates import written_out
 from scvi_codegen.formulas.symbols import DOT, inputs_by_name, symbol
 from scvi_codegen.formulas.translation import format_expression
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.representation import summary
-from scvi_codegen.tables.precision import Number, mp
 
-SAMPLES = 4
-NEGLIGIBLE = mp.mpf(10) ** -30
-"""Largest value of an expression that is zero, relative to the largest of its terms."""
 MOST_SHEARED = 6
 """Largest number of coordinates of which shears are tried."""
 MOST_SHOWN = 12
@@ -156,33 +151,9 @@ class OneForm:
         """Return the entry d theta_j / d z_i - d theta_i / d z_j of the two-form d theta."""
         return self.theta[j].diff(self.coordinates[i]) - self.theta[i].diff(self.coordinates[j])
 
-    def points(self) -> Iterator[dict[Symbol, Number]]:
-        """Yield reproducible random points with positive values of order 1, where logarithms and roots are defined."""
-        symbols = sorted(self.lagrangian.free_symbols - set(self.velocities) | {*self.coordinates, self.time}, key=str)
-        generator = random.Random(20250101)
-        for _ in range(4 * SAMPLES):
-            yield {each: mp.mpf(generator.uniform(0.3, 1.3)) for each in symbols}
-
-    def values(self, expressions: Sequence[Expr]) -> Iterator[list[Number]]:
-        """Yield the values of expressions at up to ``SAMPLES`` points where they are defined."""
-        tape, defined = None, 0
-        for point in self.points():
-            tape = tape or Tape(expressions, list(point))
-            try:
-                values = tape(list(point.values()))
-            except ArithmeticError:
-                continue
-            yield values
-            defined += 1
-            if defined == SAMPLES:
-                return
-
     def is_zero(self, expression: Expr) -> bool:
-        """Return whether an expression is zero at all points, up to the rounding of its terms."""
-        terms = sympy.Add.make_args(expression)
-        return expression == 0 or all(
-            abs(mp.fsum(values)) <= NEGLIGIBLE * max(map(abs, values)) for values in self.values(list(terms))
-        )
+        """Return whether an expression is zero identically."""
+        return sums_to_zero(sympy.Add.make_args(expression))
 
     @cached_property
     def vanishing(self) -> frozenset[tuple[int, int]]:
@@ -194,7 +165,7 @@ class OneForm:
         """Return the largest rank of omega at the points."""
         n = len(self.coordinates)
         entries = [self.omega(i, j) for i in range(n) for j in range(n)]
-        matrices = [np.array(values, dtype=float).reshape(n, n) for values in self.values(entries)]
+        matrices = [np.array(values, dtype=float).reshape(n, n) for values in islice(samples(entries), SAMPLES)]
         return max((int(np.linalg.matrix_rank(m, tol=RANK_TOLERANCE * np.abs(m).max())) for m in matrices), default=0)
 
     def choices(self, chosen: tuple[int, ...] = (), first: int = 0) -> Iterator[tuple[int, ...]]:

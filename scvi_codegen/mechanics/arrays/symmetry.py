@@ -5,25 +5,19 @@ entries of ``q`` add up to 0 identically (Noether); so the cost of the proof doe
 coordinates.
 """
 
-import random
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import TypeAlias
 
-from sympy import Add, Expr, S, Symbol
+from sympy import Expr, S
 
 from scvi_codegen.formulas.array_statements import ArrayForce
-from scvi_codegen.formulas.expressions import Tape
+from scvi_codegen.formulas.expressions import sums_to_zero
 from scvi_codegen.formulas.symbols import DOT, symbol
 from scvi_codegen.indices import Access, Array, ArrayMap, Place, Size
 from scvi_codegen.mechanics.arrays.system import ArraySystem, force_of
-from scvi_codegen.tables.precision import mp
 
-SAMPLES = 4
-"""Number of random points at which an identity is tested in 60 digits."""
-RELATIVE_TOLERANCE = 1e-40
-"""Largest sum that counts as 0, relative to the sum of the absolute values of its terms."""
 MAX_ROTATED_COMPONENTS = 3
 """Largest number of components for which rotations are tested (points in space)."""
 
@@ -50,13 +44,13 @@ def _maps(system: ArraySystem, array: Array) -> Iterator[ArrayMap]:
     last, forces = array.axes[-1] if array.axes else Size("", 0), list(_forces(system))
     components: Sequence[int | None] = range(last.number) if array.axes and not last.name else [None]
     for component in components:
-        if all(sums_to_zero(*_shift(system, each, array, component)) for each in forces):
+        if all(sums_to_zero(_shift(each, array, component)) for each in forces):
             yield ArrayMap(array.name, component)
-    if system.momenta and all(sums_to_zero(*_phase(system, each, array)) for each in forces):
+    if system.momenta and all(sums_to_zero(_phase(system, each, array)) for each in forces):
         yield ArrayMap(array.name, None, phase=True)
     if not last.name and last.number <= MAX_ROTATED_COMPONENTS:
         for a, b in combinations(range(last.number), 2):
-            turned = all(sums_to_zero(*_turn(system, each, array, (a, b))) for each in forces)
+            turned = all(sums_to_zero(_turn(system, each, array, (a, b))) for each in forces)
             if turned and _same_masses(system, array, a, b):
                 yield ArrayMap(array.name, a, b)
 
@@ -67,28 +61,24 @@ def _component(access: Access, array: Array, component: int | None) -> bool:
     return component is None or access.places[-1] == Place(base=Size("", component))
 
 
-def _shift(
-    system: ArraySystem, force: ArrayForce, array: Array, component: int | None
-) -> tuple[list[Expr], list[Symbol]]:
+def _shift(force: ArrayForce, array: Array, component: int | None) -> list[Expr]:
     moved = [pair for pair in force.targets if _component(pair[0], array, component)]
     by = {slot: symbol(f"{slot} shift") for slot, _ in moved if slot.sums}  # the sums of any coefficients
-    return [derivative * by.get(slot, S.One) for slot, derivative in moved], [*_symbols(system, force), *by.values()]
+    return [derivative * by.get(slot, S.One) for slot, derivative in moved]
 
 
-def _turn(
-    system: ArraySystem, force: ArrayForce, array: Array, plane: tuple[int, int]
-) -> tuple[list[Expr], list[Symbol]]:
+def _turn(system: ArraySystem, force: ArrayForce, array: Array, plane: tuple[int, int]) -> list[Expr]:
     """Return the terms of sum x_a dl/dx_b - x_b dl/dx_a, for the array and its momenta."""
     (a, b), arrays = plane, [array, *_conjugate(system, array)]
     one, two = Place(base=Size("", a)), Place(base=Size("", b))
     pairs = [((x, to), (x, by), sign) for x in arrays for to, by, sign in ((two, one, 1), (one, two, -1))]
-    return _rotated_terms(system, force, pairs)
+    return _rotated_terms(force, pairs)
 
 
-def _phase(system: ArraySystem, force: ArrayForce, array: Array) -> tuple[list[Expr], list[Symbol]]:
+def _phase(system: ArraySystem, force: ArrayForce, array: Array) -> list[Expr]:
     """Return the terms of sum p dl/dq - q dl/dp."""
     (momenta,) = _conjugate(system, array)
-    return _rotated_terms(system, force, [((array, None), (momenta, None), 1), ((momenta, None), (array, None), -1)])
+    return _rotated_terms(force, [((array, None), (momenta, None), 1), ((momenta, None), (array, None), -1)])
 
 
 def _conjugate(system: ArraySystem, array: Array) -> tuple[Array, ...]:
@@ -103,41 +93,16 @@ Entry: TypeAlias = tuple[Array, Place | None]
 """Array with a last index, or without one for all of its entries."""
 
 
-def _rotated_terms(
-    system: ArraySystem, force: ArrayForce, pairs: Sequence[tuple[Entry, Entry, int]]
-) -> tuple[list[Expr], list[Symbol]]:
+def _rotated_terms(force: ArrayForce, pairs: Sequence[tuple[Entry, Entry, int]]) -> list[Expr]:
     """Return the terms of the derivative along the motion of entries of the first kind by those of the second."""
     parts: list[Expr] = []
-    known = _symbols(system, force)
     for (array, last), (other, by), sign in pairs:
         for access, derivative in force.targets:
             if access.array != array or (last is not None and access.places[-1] != last):
                 continue
             indices = access.places if by is None else (*access.places[:-1], by)
-            partner = symbol(str(replace(access, array=other, places=indices)))
-            known += [] if partner in known else [partner]
-            parts.append(sign * partner * derivative)
-    return parts, known
-
-
-def _symbols(system: ArraySystem, force: ArrayForce) -> list[Symbol]:
-    return [*(slot for slot, _ in force.slots), *system.parameters, system.time]
-
-
-def sums_to_zero(parts: Sequence[Expr], symbols: Sequence[Symbol]) -> bool:
-    """Return whether the sum of the parts is 0 at all sampled points, of which at least ``SAMPLES`` are required."""
-    if Add(*parts) == 0:
-        return True
-    tape, chosen, tried = Tape(parts, symbols), random.Random(1), 0
-    for _ in range(4 * SAMPLES):
-        try:
-            values = tape([mp.mpf(chosen.randint(1, 10**6)) / 10**6 + mp.mpf(1) / 3 for _ in symbols])
-        except ArithmeticError:
-            continue
-        if abs(mp.fsum(values)) > RELATIVE_TOLERANCE * mp.fsum(map(abs, values)):
-            return False
-        tried += 1
-    return tried >= SAMPLES
+            parts.append(sign * symbol(str(replace(access, array=other, places=indices))) * derivative)
+    return parts
 
 
 def _same_masses(system: ArraySystem, array: Array, a: int, b: int) -> bool:

@@ -34,15 +34,13 @@ from sympy import Add, Dummy, Expr, Matrix, Pow, Symbol
 from sympy.integrals.manualintegrate import manualintegrate
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.expressions import jacobian, unsupported_part
+from scvi_codegen.formulas.expressions import NEGLIGIBLE, jacobian, samples, unsupported_part
 from scvi_codegen.formulas.rotations import RotationNames
-from scvi_codegen.mechanics.multibody.variables import Variables, samples
-from scvi_codegen.tables.precision import mp
+from scvi_codegen.mechanics.multibody.variables import Variables
 
 if TYPE_CHECKING:
     from sympy.physics.mechanics import Particle, ReferenceFrame, RigidBody
 
-NEGLIGIBLE = mp.mpf(10) ** -40
 POINTS = 2
 
 

@@ -3,9 +3,7 @@
 SymPy's functions of time and speeds are converted to plain symbols, and back.
 """
 
-import random
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,11 +13,10 @@ from sympy import Dummy, Expr, Matrix, Symbol
 from sympy.core.function import AppliedUndef
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.expressions import Tape, evaluated, gradient, jacobian, unsupported_part
+from scvi_codegen.formulas.expressions import evaluated, gradient, jacobian, samples, unsupported_part
 from scvi_codegen.formulas.rotations import Rotation
 from scvi_codegen.mechanics.derived_expressions import coupled_blocks, inverse_by_minors, row_rank
 from scvi_codegen.mechanics.rotations.points import torque_of
-from scvi_codegen.tables.precision import mp
 
 MOST_COUPLED = 6
 """Largest number of generalised speeds that equations with variable coefficients couple."""
@@ -144,19 +141,6 @@ def solved_for_speeds(equations: Sequence[Expr], variables: Variables) -> dict[S
         f"the kinematic equations cannot be solved for the generalised speeds {names}: they must be an invertible "
         f"combination of the rates of the coordinates, at most {MOST_COUPLED} of which are coupled"
     )
-
-
-ATTEMPTS = 24
-SEED = 20250101
-
-
-def samples(expressions: Sequence[Expr]) -> Iterator[list[Any]]:
-    """Yield the values of expressions in 60 digits at random points, without points at which one is undefined."""
-    symbols = sorted(set().union(*(expression.free_symbols for expression in expressions)), key=str)
-    tape, generator = Tape(expressions, symbols), random.Random(SEED)
-    for _ in range(ATTEMPTS):
-        with suppress(ArithmeticError):
-            yield tape([mp.mpf(generator.uniform(0.1, 1.0)) for _ in symbols])
 
 
 def independent_of(known: Sequence[Expr], asked: Sequence[Expr], rates: Sequence[Symbol]) -> tuple[int, ...]:

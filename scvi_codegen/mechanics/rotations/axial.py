@@ -31,10 +31,10 @@ from itertools import product
 from sympy import Add, Expr, Quaternion, S, cos, expand, sin
 from sympy.core.function import AppliedUndef
 
+from scvi_codegen.formulas.expressions import sums_to_zero
 from scvi_codegen.formulas.intermediates import intermediate
 from scvi_codegen.formulas.rotations import Rotation
 from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.mechanics.arrays.symmetry import sums_to_zero
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.splitting import exponential
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -83,7 +83,7 @@ class Turn:
         axis = [S(int(k == self.axis + 1)) for k in range(4)]
         along = (*self.change(system.coordinates, axis), *self.change(system.momenta, axis))
         rates = [system.hamiltonian.diff(x) * y for x, y in zip(variables, along, strict=True)]
-        return sums_to_zero(rates, (*variables, *system.parameters, system.time))
+        return sums_to_zero(rates)
 
 
 @lru_cache(maxsize=64)
@@ -105,7 +105,7 @@ def frame_potential(system: MechanicalSystem) -> Expr | None:
     q, p = core.coordinates, core.momenta
     potential: Expr = core.hamiltonian.xreplace(dict.fromkeys(p, S.Zero))
     energies = (-turn.rate * x**2 / 2 for turn in turns for x in turn.momentum(q, p))
-    alone = sums_to_zero([core.hamiltonian, -potential, *energies], (*q, *p, *core.parameters, core.time))
+    alone = sums_to_zero([core.hamiltonian, -potential, *energies])
     return potential if alone else None
 
 
