@@ -1,12 +1,13 @@
 """Relative error of the conserved energy after a run to a tolerance, compared with its definition."""
 
+import math
 import re
 
 import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.advice.tolerance_check import _lost_energy
+from scvi_codegen.advice.tolerance_check import _lost_energy, _tenfold
 
 
 @pytest.mark.sampled(2)
@@ -27,3 +28,11 @@ def test_energy_error_is_relative_to_energy_and_twice_the_kinetic_energy(mass, o
     assert found is not None
     assert float(found[1]) == pytest.approx(expected, rel=0.05)
     assert _lost_energy(system, run, expected) == ""
+
+
+@pytest.mark.parametrize("rate", [0.5, 2.0])
+def test_time_of_tenfold_growth_is_that_of_an_exponential(rate):
+    """Of distances from a start without one; growth by a power of time has no such time."""
+    t = np.linspace(0.0, 4.0, 129)
+    assert _tenfold(1e-12 * 10.0 ** (rate * t) * (t > 0.0), 4.0) == pytest.approx(1 / rate, rel=1e-12)
+    assert _tenfold(1e-12 * t**2, 4.0) == math.inf

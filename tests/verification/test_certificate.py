@@ -24,6 +24,7 @@ from scvi_codegen.native import announcements
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification import system_under_test
 from scvi_codegen.verification.certificate import Check, Finding, Outcome, ViolationError, checked
+from scvi_codegen.verification.convergence import _expected
 from scvi_codegen.verification.stepping import step_checks
 from scvi_codegen.verification.structure import structure_checks
 
@@ -277,3 +278,21 @@ def test_certificate_reports_slow_checks_and_their_duration(quickly_compiled, mo
     assert "which takes about" in capsys.readouterr().err  # which is no terminal
     assert "measuring stage equations" in message
     assert any("unknowns per step are solved in 60 digits, which takes about" in line for line in message)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        *(sc.SpectralCollocation(4, form=form) for form in ("position", "phase-space")),
+        *(kind(3) for kind in (sc.Gauss, sc.RadauIIA, sc.RadauIA, sc.LobattoIIIA)),
+        *(
+            sc.SVI(3, rule)
+            for rule in ("gauss-legendre:3", "gauss-lobatto:4", "gauss-radau-left:3", "clenshaw-curtis:4")
+        ),
+        sc.StoermerVerlet(),
+        sc.ExplicitEuler(),
+    ],
+    ids=lambda method: method.name,
+)
+def test_properties_in_the_literature_are_those_of_the_method(method):
+    assert _expected(method) in (None, (method.order, method.symplectic, method.symmetric))
