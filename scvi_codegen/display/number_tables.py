@@ -8,7 +8,7 @@ import sympy
 
 from scvi_codegen.display.cards import Html, grid, plain
 from scvi_codegen.display.mathml import mathml
-from scvi_codegen.display.page import Cell, TableBlock
+from scvi_codegen.display.page import TableBlock
 from scvi_codegen.tables.closed_forms import exact_points, exact_rule, exact_tableau
 from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import Number, Vector, mp
@@ -59,14 +59,11 @@ def _listed(title: str, series: range, columns: Sequence[_Column]) -> TableBlock
 
 def numbers_html(table: TableBlock) -> Html:
     """Return the first rows of a table for a notebook."""
-    rows = [[_cell(cell) for cell in row] for row in table.rows[:MOST_ROWS]]
+    shown = table.rows[:MOST_ROWS]
+    rows = [[plain(cell) if isinstance(cell, str) else Html(mathml(cell)) for cell in row] for row in shown]
     left_out = len(table.rows) - len(rows)
     title = f"{table.name} (the first {MOST_ROWS} of {len(table.rows)} rows)" if left_out else table.name
     return grid(rows, head=table.columns, caption=title)
-
-
-def _cell(cell: Cell) -> Html:
-    return plain(cell) if isinstance(cell, str) else Html(mathml(cell))
 
 
 def positions(part: Part) -> Vector:

@@ -301,12 +301,8 @@ def _environment() -> Environment:
         "column_heading": column_heading,
         "column": column_class,
         "equation": lambda formula: Markup(" ".join(mathml_terms(formula.right, formula.left))),
-        "c_text": _c_text,
+        "c_text": lambda text: Markup(COMMENT.sub(r'<span class="comment">\g<0></span>', str(escape(text)))),
         "markup": Markup,
     }
     environment.tests |= {name: lambda block, kind=kind: isinstance(block, kind) for name, kind in KINDS.items()}
     return environment
-
-
-def _c_text(text: str) -> Markup:
-    return Markup(COMMENT.sub(lambda match: f'<span class="comment">{match[0]}</span>', str(escape(text))))
