@@ -163,7 +163,8 @@ class Stepper(Integrator):
         if error is not None:
             wanted = checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance})
             start = {"velocity": velocity, "inputs": inputs, "t": t, "parameters": parameters, "options": options}
-            return stepper._confirmed(wanted, q, p, t_end, save_every, t_eval, progress, start)
+            saved = {"t_end": t_end, "save_every": save_every, "t_eval": t_eval}
+            return stepper._confirmed(wanted, q, p, {**start, "progress": progress}, saved)
         begin = 0.0 if h is None or t_end is None else t  # one plan for all initial times where they do not matter
         schedule = h, steps, t_end, tolerance, save_every, begin, interface.time_transformation, stepper.in_tau
         try:
@@ -194,39 +195,28 @@ class Stepper(Integrator):
         return trajectory
 
     def _confirmed(
-        self,
-        error: float,
-        q: States,
-        p: States | None,
-        t_end: float | None,
-        save_every: int,
-        t_eval: ArrayLike | None,
-        progress: Callable[[int], None] | None,
-        start: dict[str, Any],
+        self, error: float, q: States, p: States | None, start: dict[str, Any], saved: dict[str, Any]
     ) -> Trajectory:
-        """Return the run to t_end whose relative global error is confirmed; ``start``: further arguments of all runs.
+        """Return the run to t_end whose relative global error is confirmed; runs for comparison have no events.
 
-        Runs for comparison have neither events nor output times.
+        ``start``, ``saved``: arguments of all runs, and further ones of the run that is returned.
         """
         require(self, "error")
-        run = partial(
-            self.integrate, q, p, t_end=t_end, save_every=save_every, t_eval=t_eval, progress=progress, **start
-        )
+        t, velocity, parameters = start["t"], start["velocity"], start["parameters"]
         again: Callable[..., Trajectory] | None = None
-        if self.events or save_every != 1 or t_eval is not None:
-            again = partial(self.with_events(()).integrate, q, p, progress=progress, **start)
-        along = {name: start[name] for name in ("t", "parameters", "options")}
-        of_tau = partial(self._largest_step, (q, p, start["velocity"]), t_end, along) if self._has_tau else None
-        return confirmed_run(error, run, again, checked_number(start["t"], "the time t"), of_tau)
+        if self.events or saved["save_every"] != 1 or saved["t_eval"] is not None:
+            again = partial(self.with_events(()).integrate, q, p, **start)
 
-    def _largest_step(
-        self, state: tuple[Any, Any, Any], t_end: Any, along: Mapping[str, Any], tolerance: float
-    ) -> float:
-        """Return the largest step of tau of a tolerance for a run to t_end; ``along``: t, parameters and options."""
-        q, p, velocity = state
-        if p is None or velocity is not None:
-            p = self._initial_momenta(q, p, velocity, along["t"], along["parameters"])
-        return largest_step(self, q, p, checked_number(t_end, "the time t_end") - along["t"], tolerance, **along)
+        def step_of_tau(tolerance: float) -> float:
+            momenta = self._initial_momenta(q, p, velocity, t, parameters) if p is None or velocity is not None else p
+            span = checked_number(saved["t_end"], "the time t_end") - t
+            return largest_step(self, q, momenta, span, tolerance, t=t, parameters=parameters, options=start["options"])
+
+        run, has_tau = (
+            partial(self.integrate, q, p, **start, **saved),
+            self.in_tau or self.interface.time_transformation,
+        )
+        return confirmed_run(error, run, again, checked_number(t, "the time t"), step_of_tau if has_tau else None)
 
     @property
     def _has_tau(self) -> bool:

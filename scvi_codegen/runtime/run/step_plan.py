@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache, wraps
-from typing import Any, TypeVar, cast
+from functools import lru_cache
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.runtime.core.features import FEATURES, refusal
 from scvi_codegen.runtime.run.times import steps_to
 from scvi_codegen.validation import check_tolerance, checked_count
-
-Evaluated = TypeVar("Evaluated", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,21 +40,6 @@ class StepPlan:
         return not (self.h or self.tau)
 
 
-def evaluated_once(function: Evaluated) -> Evaluated:
-    """Decorate a function of numbers: equal arguments of equal types are evaluated once."""
-    known = lru_cache(maxsize=256, typed=True)(function)
-
-    @wraps(function)
-    def evaluated(*arguments: Any) -> Any:
-        try:
-            return known(*arguments)
-        except TypeError:  # of an argument that is not hashable, as an array
-            return function(*arguments)
-
-    return cast(Evaluated, evaluated)
-
-
-@evaluated_once
 def checked_plan(
     h: float | None, t_end: float | None, tolerance: float | None, controller: str = "", in_tau: bool = False, /
 ) -> StepPlan:
