@@ -56,13 +56,17 @@ def record(
     recorder = _StateRecorder(memory, save_every, count, filled)
     try:
         recorder.check(status)
-        drive(
-            recorder.advance,
-            math.inf if count is None else count,
-            first=1 if stop else recorder.first_size,
-            ended=lambda: memory.arrived or bool(stop and stop()),
-            progress=progress,
-        )
+        if progress is None and stop is None and count is not None and count <= recorder.first_size:
+            if count and not memory.arrived:  # one chunk
+                recorder.advance(count)
+        else:
+            drive(
+                recorder.advance,
+                math.inf if count is None else count,
+                first=1 if stop else recorder.first_size,
+                ended=lambda: memory.arrived or bool(stop and stop()),
+                progress=progress,
+            )
     except StepFailedError as failure:
         failure.trajectory = recorder.trajectory()
         raise
