@@ -180,6 +180,8 @@ def refusal(operation: str, property_: str, title: str = "") -> ScviCodegenError
 def check_together(**arguments: Any) -> None:
     """Raise the refusal of an argument of a run that another one excludes; ``None``: not passed."""
     passed = [name for name, value in arguments.items() if value is not None]
+    if len(passed) < 2:
+        return
     for operation, property_ in FEATURES:
         if operation in passed and property_.removeprefix("with ") in passed:
             raise refusal(operation, property_)
