@@ -76,8 +76,8 @@ def main(names: list[str]) -> None:
         stepper, q, p, t_end = RUNS[name]()
         measured = [cost(stepper, q, p, t_end, tolerance) for tolerance in TOLERANCES]
         by = "tangent vector" if hasattr(stepper.start(q, p, t_end=t_end)._memory, "measures_growth") else "repetition"
-        told = " (reported)" if reports(stepper, q, p, t_end) else ""
-        print(f"| {name}{told} | {by} | {measured[0][1]:,} |", *(f"{100 * each:.0f} % |" for each, _ in measured))
+        note = " (reported)" if reports(stepper, q, p, t_end) else ""
+        print(f"| {name}{note} | {by} | {measured[0][1]:,} |", *(f"{100 * each:.0f} % |" for each, _ in measured))
 
 
 if __name__ == "__main__":
