@@ -334,17 +334,25 @@ class _Repetition:
         self.run, self.states, self.advance_until = run, states, advance_until or self._to
         self.steps, self.tolerance = run.steps, run.plan.tolerance
         self.nudge, self.tolerable, self.decades = _thresholds(self.tolerance)
+        self.reached, self.quarter = 0, 0.0
 
     def warn(self, *, requested: bool) -> None:
         """Repeat the run; without a request only up to ``MOST_STEPS`` steps, and if errors grow exponentially."""
         states, last = self.states, self._last(requested=requested)
-        if last == 0 or (not requested and self._grows_slowly(last, max(self.nudge, COARSE))):
+        coarse, loose, before = max(self.nudge, COARSE), self.tolerable == LARGEST, 0.0
+        if last == 0 or (not requested and self._grows_slowly(last, coarse)):
             return
         try:
-            self._begin(self.nudge, self.tolerance)
-            loose, before = self.tolerable == LARGEST, 0.0
+            if coarse == self.nudge == self.tolerance and 0.0 < self.quarter <= self.tolerable:
+                before = self.quarter  # the coarse run is this one, and goes on from where it ended
+            else:
+                self.reached = 0
+                self._begin(self.nudge, self.tolerance)
             for k in sorted({last >> i for i in range(8 if loose else 2)} - {0}):
-                self.advance_until(float(states.t[k]))
+                if k < self.reached:
+                    continue
+                if k > self.reached:
+                    self.advance_until(float(states.t[k]))
                 apart = self._relative_difference(k)
                 if not apart <= self.tolerable:
                     if not (loose and apart < ALGEBRAIC * before):
@@ -368,13 +376,15 @@ class _Repetition:
             for k in sorted((first | {int(last * DECISIVE)}) - {0}):
                 self.advance_until(float(self.states.t[k]))
                 little = 0.0 if k in first else needed * k / last
-                grown = math.log10(max(self._relative_difference(k, tolerance * 10.0**little) / tolerance, 1.0))
+                apart = self._relative_difference(k, tolerance * 10.0**little)
+                grown = math.log10(max(apart / tolerance, 1.0))
                 rate = max(grown - grown_before, 0.0) / (k - before)
                 if k not in first and (grown < little or grown + rate * (last - k) < needed):
                     return True
-                before, grown_before = k, grown
+                self.quarter = apart if k in first else self.quarter
+                self.reached, before, grown_before = k, k, grown
         except StepFailedError:
-            pass
+            self.quarter = 0.0
         return False
 
     def _last(self, *, requested: bool) -> int:
