@@ -16,26 +16,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sympy import Symbol
 
-from scvi_codegen.errors import (
-    ExpressionError,
-    MethodError,
-    ModelFileError,
-    PackageError,
-    ScviCodegenError,
-    SystemDefinitionError,
-)
+import scvi_codegen as sc
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import IDENTIFIER
 from scvi_codegen.formulas.translation import format_expression
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import ARGUMENTS, METHODS, SCVI, SVI, Gauss, method_from_specification
-from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.ensemble_file import load_ensemble
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
-from scvi_codegen.models.packages.package import generate_package
-from scvi_codegen.models.problems import problem
-from scvi_codegen.pipeline import generate_source
 from scvi_codegen.tables.nodes import nodes_by_name
 from scvi_codegen.tables.quadrature import quadrature_by_name
 from scvi_codegen.tables.spaces import space_by_name
@@ -50,12 +37,12 @@ def warmed() -> None:
     for text in seeds("models"):
         try:
             parse_model(text)
-        except ModelFileError:
+        except sc.ModelFileError:
             continue
     for text in seeds("formulas.txt"):
         try:
             parse_expression(text, SYMBOLS)
-        except ExpressionError:
+        except sc.ExpressionError:
             continue
 
 
@@ -67,7 +54,7 @@ def try_formula(number: int) -> bool:
     random = Random(number)
     known = seeds("formulas.txt")
     text = formula(random) if number % 2 else mutated(random, random.choice(known), known)
-    found = quietly(parse_expression, text, SYMBOLS, expected=ExpressionError)
+    found = quietly(parse_expression, text, SYMBOLS, expected=sc.ExpressionError)
     if found is None:
         return False
     with guarded():
@@ -89,7 +76,7 @@ def test_seven_hundred_thousand_random_formulas():
 )
 @settings(max_examples=150, deadline=None)
 def test_any_text_is_a_formula_or_an_error(text):
-    with guarded(), suppress(ExpressionError):
+    with guarded(), suppress(sc.ExpressionError):
         parse_expression(text, SYMBOLS)
 
 
@@ -104,14 +91,14 @@ def try_system(number: int) -> bool:
     if number % 2:
         kinetic, common["parameters"]["p"] = "q_dot**2/2 + x_dot**2/2", 1.0
         common["lagrangian"] = f"{kinetic} + {text}" if number % 3 else text
-        build = LagrangianSystem.from_text
+        build = sc.LagrangianSystem.from_text
     else:
         common |= {"momenta": ["p", "px"], "hamiltonian": f"p**2/2 + px**2/2 + {text}" if number % 3 else text}
-        build = HamiltonianSystem.from_text
+        build = sc.HamiltonianSystem.from_text
 
     def compiled() -> None:
         method = random.choice((SVI(2), SCVI(2), Gauss(2), SVI(3, "gauss-lobatto:4")))
-        source, _ = generate_source(build(**common), method)
+        source, _ = sc.generate_source(build(**common), method)
         assert not re.search(
             r"[^\w](?:nan|inf|zoo|oo|I)[^\w(]", re.sub(r"/\*.*?\*/", "", source.amalgamated().code, flags=re.DOTALL)
         )
@@ -120,7 +107,7 @@ def try_system(number: int) -> bool:
         with guarded(may_compile=True), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             compiled()
-    except ScviCodegenError:
+    except sc.ScviCodegenError:
         return False
     return True
 
@@ -157,10 +144,10 @@ def try_model(number: int) -> bool:
     text = with_a_value_changed(random, text) if number % 2 else mutated(random, text, known)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        model = quietly(parse_model, text, expected=ModelFileError)
+        model = quietly(parse_model, text, expected=sc.ModelFileError)
         if model is None:
             return False
-        written = quietly(dump_model, model, expected=ModelFileError)
+        written = quietly(dump_model, model, expected=sc.ModelFileError)
         assert written is None or parse_model(written) == model
     return True
 
@@ -175,13 +162,13 @@ def test_two_hundred_thousand_random_model_files():
 
 
 def test_grids_are_read_or_rejected(tmp_path):
-    model, random = Model.from_problem(problem("kepler")), Random(1)
+    model, random = sc.Model.from_problem(sc.problem("kepler")), Random(1)
     grid = next(text for text in seeds("models") if "[grid]" in text)
     path = tmp_path / "grid.toml"
     for _ in range(300):
         text = with_a_value_changed(random, grid) if random.random() < 0.5 else mutated(random, grid, seeds("models"))
         path.write_bytes(text.encode("utf-8", "replace") + random.choice((b"", b"\xff")))
-        quietly(load_ensemble, path, model, expected=ModelFileError)
+        quietly(load_ensemble, path, model, expected=sc.ModelFileError)
 
 
 @pytest.mark.parametrize(
@@ -203,7 +190,7 @@ def test_grids_are_read_or_rejected(tmp_path):
     ids=range(12),
 )
 def test_files_that_attack_the_parser_are_rejected_fast(text, message):
-    with guarded(), pytest.raises(ModelFileError, match=message):
+    with guarded(), pytest.raises(sc.ModelFileError, match=message):
         parse_model(text)
 
 
@@ -234,11 +221,11 @@ def try_name(number: int) -> bool:
         warnings.simplefilter("ignore")
         if number % 2:
             read = random.choice((quadrature_by_name, space_by_name, tableau_by_name))
-            found = quietly(read, name, expected=MethodError)
+            found = quietly(read, name, expected=sc.MethodError)
             if found is not None and read is not tableau_by_name:
                 assert read(found.name) == found
             return found is not None
-        return quietly(method_from_specification, specification(random, name), expected=MethodError) is not None
+        return quietly(method_from_specification, specification(random, name), expected=sc.MethodError) is not None
 
 
 def specification(random: Random, name: str) -> dict[str, Any]:
@@ -266,10 +253,10 @@ def test_ninety_thousand_random_names():
 @pytest.mark.parametrize("count", [10**5, 10**9, 10**30, int("9" * 4000)])
 def test_absurd_counts_are_rejected_immediately(count):
     for family in ("gauss-legendre", "gauss-lobatto", "gauss-radau-left", "clenshaw-curtis", "fejer", "hermite-3"):
-        with guarded(1000), pytest.raises(MethodError):
+        with guarded(1000), pytest.raises(sc.MethodError):
             quadrature_by_name(f"{family}:{count}")
     for nodes in ("chebyshev-lobatto", "legendre-lobatto", "equispaced"):
-        with guarded(1000), pytest.raises(MethodError):
+        with guarded(1000), pytest.raises(sc.MethodError):
             nodes_by_name(nodes, count)
     for data in (
         *({"method": name, "degree": count} for name in ("svi", "scvi", "sc")),
@@ -281,12 +268,12 @@ def test_absurd_counts_are_rejected_immediately(count):
         {"method": "svi", "degree": 4, "space": f"trigonometric:0.5:{count}"},
         {"method": "svi", "degree": 4, "space": "trigonometric:1e300"},
     ):
-        with guarded(1000), pytest.raises(MethodError):
+        with guarded(1000), pytest.raises(sc.MethodError):
             method_from_specification(data)
 
 
 def test_splines_of_too_many_velocities_are_rejected():
-    with guarded(3_000_000), pytest.raises(MethodError):
+    with guarded(3_000_000), pytest.raises(sc.MethodError):
         method_from_specification({"method": "svi", "degree": 64, "space": "splines:64"})
 
 
@@ -300,8 +287,8 @@ TITLES = [
 PLAIN = ("Makefile", "__init__.py", "main.c")
 
 
-def hostile_model(title: str) -> Model:
-    model = Model.from_problem(problem("planar-pendulum"))
+def hostile_model(title: str) -> sc.Model:
+    model = sc.Model.from_problem(sc.problem("planar-pendulum"))
     return replace(model, method=SVI(1), system=replace(model.system, name=title))
 
 
@@ -312,10 +299,10 @@ def code_of(text: str) -> str:
 
 @pytest.mark.parametrize("title", TITLES, ids=lambda title: repr(title)[:20])
 def test_system_name_occurs_only_in_comments_and_prose(title, tmp_path):
-    plain = generate_package(hostile_model("plain"), tmp_path / "a" / "pendulum")
+    plain = sc.generate_package(hostile_model("plain"), tmp_path / "a" / "pendulum")
     try:
-        folder = generate_package(hostile_model(title), tmp_path / "b" / "pendulum")
-    except ScviCodegenError:
+        folder = sc.generate_package(hostile_model(title), tmp_path / "b" / "pendulum")
+    except sc.ScviCodegenError:
         assert not (tmp_path / "b").exists() or not list((tmp_path / "b").iterdir())
         return
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
@@ -336,8 +323,8 @@ def test_folder_names_are_valid_or_rejected(name, tmp_path):
     inside = tmp_path / "inside"
     inside.mkdir()
     try:
-        folder = generate_package(model, f"{inside}/{name}")
-    except PackageError:
+        folder = sc.generate_package(model, f"{inside}/{name}")
+    except sc.PackageError:
         return
     assert IDENTIFIER.fullmatch(folder.resolve().name)
 
@@ -349,11 +336,11 @@ def try_identifier(random: Random) -> None:
     role = random.choice(("coordinates", "momenta", "parameters"))
     data: dict[str, Any] = {"coordinates": ["x"], "momenta": ["y"], "parameters": {}, "name": "s"}
     data[role] = {name: 1.0} if role == "parameters" else [name]
-    system = quietly(lambda: HamiltonianSystem.from_text(hamiltonian="1", **data), expected=SystemDefinitionError)
+    system = quietly(lambda: sc.HamiltonianSystem.from_text(hamiltonian="1", **data), expected=sc.SystemDefinitionError)
     if system is not None:
         names = (*system.coordinates, *system.momenta, *system.parameters)
         assert all(IDENTIFIER.fullmatch(symbol.name) for symbol in names)
-        code = code_of(generate_source(system, SVI(1, "gauss-legendre:1"), solver="newton")[0].amalgamated().code)
+        code = code_of(sc.generate_source(system, SVI(1, "gauss-legendre:1"), solver="newton")[0].amalgamated().code)
         assert name not in re.findall(r"\w+", code) or len(name) < 9
 
 

@@ -12,18 +12,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from samples import QUICK_FLAGS
 
-from scvi_codegen import (
-    SVI,
-    ArgumentError,
-    LagrangianSystem,
-    MethodError,
-    StateError,
-    StoermerVerlet,
-    compile_stepper,
-    jax_flow,
-    problem,
-    reparametrise,
-)
+import scvi_codegen as sc
 
 jax = pytest.importorskip("jax", reason="needs the extra 'jax'")
 jnp = jax.numpy
@@ -42,15 +31,15 @@ def binary64():
 
 @cache
 def driven(method):
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="driven", coordinates=["x"], lagrangian="m*x_dot**2/2 - k*x**4/4 + a*x*cos(w*t)", parameters=SPECIAL
     )
-    return compile_stepper(system, method, flags=QUICK_FLAGS)
+    return sc.compile_stepper(system, method, flags=QUICK_FLAGS)
 
 
 @cache
 def kepler():
-    return compile_stepper(problem("kepler").system, SVI(4), flags=QUICK_FLAGS)
+    return sc.compile_stepper(sc.problem("kepler").system, sc.SVI(4), flags=QUICK_FLAGS)
 
 
 def leapfrog(x):
@@ -72,13 +61,13 @@ def leapfrog(x):
 
 
 def by_c(x, save_every=1):
-    flow = jax_flow(driven(StoermerVerlet()), steps=STEPS, save_every=save_every)
+    flow = sc.jax_flow(driven(sc.StoermerVerlet()), steps=STEPS, save_every=save_every)
     q, p = flow(x[:1], x[1:2], parameters=x[2:6], t=x[6], h=x[7])
     return jnp.concatenate([q, p], axis=-1).T
 
 
 def given():
-    assert driven(StoermerVerlet()).parameters == tuple(sorted(SPECIAL))
+    assert driven(sc.StoermerVerlet()).parameters == tuple(sorted(SPECIAL))
     return jnp.array([Q, P, *SPECIAL.values(), 0.2, H])
 
 
@@ -86,10 +75,10 @@ def test_values_are_those_of_leapfrog_and_of_integrate():
     assert_allclose(by_c(given()), leapfrog(given()), atol=1e-12)
     run = kepler().integrate([0.5, 0.0], [0.0, 1.7], h=H, steps=40, save_every=8, parameters={"mu": 1.1})
     start = jnp.array([0.5, 0.0]), jnp.array([0.0, 1.7])
-    q, p = jax_flow(kepler(), steps=40, save_every=8)(*start, h=H, parameters={"mu": 1.1})
+    q, p = sc.jax_flow(kepler(), steps=40, save_every=8)(*start, h=H, parameters={"mu": 1.1})
     assert_allclose(q, run.q, rtol=0, atol=1e-13)
     assert_allclose(p, run.p, rtol=0, atol=1e-13)
-    q, p = jax_flow(kepler(), steps=40)(*start, h=H, parameters=jnp.array([1.1]))
+    q, p = sc.jax_flow(kepler(), steps=40)(*start, h=H, parameters=jnp.array([1.1]))
     assert_allclose(q, run.q[-1], rtol=0, atol=1e-13)
 
 
@@ -102,10 +91,10 @@ def test_derivatives_by_all_arguments_are_those_of_leapfrog(derivative, save_eve
 
 
 def test_derivatives_of_a_harmonic_oscillator_are_closed_form():
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="oscillator", coordinates=["x"], lagrangian="x_dot**2/2 - w**2*x**2/2", parameters={"w": 1.3}
     )
-    flow = jax_flow(compile_stepper(system, SVI(6), flags=QUICK_FLAGS), steps=70)
+    flow = sc.jax_flow(sc.compile_stepper(system, sc.SVI(6), flags=QUICK_FLAGS), steps=70)
     end = jax.value_and_grad(lambda w, h: flow(jnp.ones(1), jnp.zeros(1), parameters={"w": w}, h=h)[0][0], (0, 1))
     value, partials = end(1.3, H)
     time = 70 * H
@@ -114,7 +103,7 @@ def test_derivatives_of_a_harmonic_oscillator_are_closed_form():
 
 
 def test_transformations_apply_in_any_order():
-    flow = jax_flow(kepler(), steps=30)
+    flow = sc.jax_flow(kepler(), steps=30)
     q, p = jnp.array([[0.5, 0.0], [0.6, 0.1], [0.9, -0.2]]), jnp.array([0.0, 1.6])
 
     def x_of_end(q, p, mu, h):
@@ -141,7 +130,7 @@ def test_transformations_apply_in_any_order():
 @pytest.mark.parametrize("save_every", [None, 50])
 def test_second_derivatives_are_those_of_leapfrog(save_every):
     """JAX differentiates leapfrog twice: forward and reverse over a gradient, compiled, batched, times vectors."""
-    flow = jax_flow(driven(StoermerVerlet()), steps=STEPS, save_every=save_every)
+    flow = sc.jax_flow(driven(sc.StoermerVerlet()), steps=STEPS, save_every=save_every)
 
     def along(x):
         q, p = flow(x[:1], x[1:2], parameters=x[2:6], t=x[6], h=x[7])
@@ -164,7 +153,7 @@ def test_second_derivatives_are_those_of_leapfrog(save_every):
 
 
 def test_a_jacobian_linearises_a_trajectory_once():
-    flow = jax_flow(kepler(), steps=30)
+    flow = sc.jax_flow(kepler(), steps=30)
     q, p = jnp.array([0.5, 0.0]), jnp.array([0.0, 1.6])
     for derivative, part in ((jax.jacfwd, "jvp"), (jax.jacrev, "vjp")):
         text = jax.jit(derivative(lambda q: flow(q, p, h=H)[0])).lower(q).as_text()
@@ -183,7 +172,7 @@ print(float(flow(jax.numpy.array([0.5, 0.0]), jax.numpy.array([0.0, 1.6]), h=0.1
 
 
 def test_result_is_equal_in_another_process(tmp_path):
-    flow = jax_flow(kepler(), steps=5)
+    flow = sc.jax_flow(kepler(), steps=5)
     here = flow(jnp.array([0.5, 0.0]), jnp.array([0.0, 1.6]), h=H)[0][0]
     (tmp_path / "flow").write_bytes(pickle.dumps(flow))
     command = [sys.executable, "-c", COPIED, str(tmp_path / "flow")]
@@ -192,59 +181,61 @@ def test_result_is_equal_in_another_process(tmp_path):
 
 
 def test_inputs_with_zero_order_hold_are_parameters():
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="pushed", coordinates=["x"], lagrangian="x_dot**2/2", forces={"x": "u"}, inputs=["u"]
     )
-    flow = jax_flow(compile_stepper(system, SVI(1), flags=QUICK_FLAGS), steps=10)
+    flow = sc.jax_flow(sc.compile_stepper(system, sc.SVI(1), flags=QUICK_FLAGS), steps=10)
     start = {"q": jnp.zeros(1), "p": jnp.zeros(1)}
     derivative = jax.grad(lambda u: flow(**start, parameters={"u_0": u}, h=0.2)[0][0])(3.0)
     assert_allclose(derivative, 2.0, rtol=1e-13)  # t^2 / 2
-    with pytest.raises(StateError, match="input 'u' is not set"):
+    with pytest.raises(sc.StateError, match="input 'u' is not set"):
         flow(**start, h=0.2)
 
 
 def test_constrained_trajectories_have_the_derivatives_of_their_runs():
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="rod",
         coordinates=["x", "y"],
         lagrangian="(x_dot**2 + y_dot**2)/2 - g*y",
         parameters={"g": 9.0},
         constraints=["x**2 + y**2 = 1"],
     )
-    stepper = compile_stepper(system, SVI(2, "gauss-lobatto:3"), flags=QUICK_FLAGS)
-    flow, run = jax_flow(stepper, steps=20), stepper.integrate([1.0, 0.0], [0.0, 0.5], h=0.02, steps=20)
+    stepper = sc.compile_stepper(system, sc.SVI(2, "gauss-lobatto:3"), flags=QUICK_FLAGS)
+    flow, run = sc.jax_flow(stepper, steps=20), stepper.integrate([1.0, 0.0], [0.0, 0.5], h=0.02, steps=20)
     found = jax.jacrev(lambda q, p: flow(q, p, h=0.02)[0], (0, 1))(jnp.array([1.0, 0.0]), jnp.array([0.0, 0.5]))
     assert_allclose(np.concatenate(found, axis=1), run.sensitivity().state[-1, :2], rtol=0, atol=1e-12)
 
 
 def test_failed_step_reports_its_time():
-    flow = jax_flow(kepler(), steps=5)
+    flow = sc.jax_flow(kepler(), steps=5)
     with pytest.raises((RuntimeError, ValueError), match=r"step 0 at t = 0 failed: a value is infinite or NaN"):
         jax.block_until_ready(flow(jnp.zeros(2), jnp.zeros(2), h=H))
 
 
 def test_unsupported_functions_are_rejected():
     q, p = jnp.array([0.5, 0.0]), jnp.array([0.0, 1.6])
-    flow = jax_flow(kepler(), steps=5)
-    with pytest.raises(MethodError, match=r"no forward-over-forward second derivatives.* use jax\.hessian"):
+    flow = sc.jax_flow(kepler(), steps=5)
+    with pytest.raises(sc.MethodError, match=r"no forward-over-forward second derivatives.* use jax\.hessian"):
         jax.jacfwd(jax.jacfwd(lambda q: flow(q, p, h=H)[0].sum()))(q)
-    with pytest.raises(MethodError, match="no third derivatives"):
+    with pytest.raises(sc.MethodError, match="no third derivatives"):
         jax.jacrev(jax.hessian(lambda q: flow(q, p, h=H)[0].sum()))(q)
-    with pytest.raises(StateError, match="q is float32, but a flow is computed in binary64"):
+    with pytest.raises(sc.StateError, match="q is float32, but a flow is computed in binary64"):
         flow(q.astype(jnp.float32), p, h=H)
-    with pytest.raises(StateError, match=r"p must have shape \(.., 2\), not \(3,\)"):
+    with pytest.raises(sc.StateError, match=r"p must have shape \(.., 2\), not \(3,\)"):
         flow(q, jnp.zeros(3), h=H)
-    with pytest.raises(StateError, match="leading axes"):
+    with pytest.raises(sc.StateError, match="leading axes"):
         flow(jnp.zeros((3, 2)), jnp.zeros((4, 2)), h=H)
-    with pytest.raises(StateError, match="did you mean 'mu'"):
+    with pytest.raises(sc.StateError, match="did you mean 'mu'"):
         flow(q, p, h=H, parameters={"Mu": 1.0})
-    with pytest.raises(StateError, match="must be a multiple of save_every = 3"):
-        jax_flow(kepler(), steps=10, save_every=3)
-    with pytest.raises(MethodError, match="time_transformation"):
-        jax_flow(compile_stepper(problem("kepler").system, SVI(2), time_transformation="q1**2 + q2**2"), steps=3)
-    clocked = compile_stepper(reparametrise(problem("kepler").system, "q1**2 + q2**2"), SVI(2))
-    with pytest.raises(MethodError, match="flow of JAX, PyTorch or CasADi is not available in transformed time"):
-        jax_flow(clocked, steps=3)(q, p, h=H)
+    with pytest.raises(sc.StateError, match="must be a multiple of save_every = 3"):
+        sc.jax_flow(kepler(), steps=10, save_every=3)
+    with pytest.raises(sc.MethodError, match="time_transformation"):
+        sc.jax_flow(
+            sc.compile_stepper(sc.problem("kepler").system, sc.SVI(2), time_transformation="q1**2 + q2**2"), steps=3
+        )
+    clocked = sc.compile_stepper(sc.reparametrise(sc.problem("kepler").system, "q1**2 + q2**2"), sc.SVI(2))
+    with pytest.raises(sc.MethodError, match="flow of JAX, PyTorch or CasADi is not available in transformed time"):
+        sc.jax_flow(clocked, steps=3)(q, p, h=H)
 
 
 ALONE = """
@@ -263,7 +254,7 @@ def test_missing_binary64_is_reported_with_the_remedy():
 
 
 def test_derivatives_by_time_and_parameters_of_a_segmented_flow():
-    flow = jax_flow(pumped.stepper(), steps=pumped.STEPS, save_every=pumped.EVERY)
+    flow = sc.jax_flow(pumped.stepper(), steps=pumped.STEPS, save_every=pumped.EVERY)
 
     def along(x):
         q, p = flow(x[:2], x[2:4], h=x[9], t=x[8], parameters=x[4:8])
@@ -273,9 +264,9 @@ def test_derivatives_by_time_and_parameters_of_a_segmented_flow():
         assert_allclose(along(jnp.array(row)), pumped.states(row), rtol=0, atol=2e-12)
         for derivative in (jax.jacfwd, jax.jacrev):
             assert_allclose(derivative(along)(jnp.array(row)), pumped.partials(row), rtol=1e-11, atol=1e-11)
-    with pytest.raises(ArgumentError, match=r"no 't_end'.*fixed number of steps give h = \(t_end - t\) / steps"):
+    with pytest.raises(sc.ArgumentError, match=r"no 't_end'.*fixed number of steps give h = \(t_end - t\) / steps"):
         flow(pumped.ROWS[0][:2], pumped.ROWS[0][2:4], t_end=3.0)
-    with pytest.raises(ArgumentError, match=r"no 'velocity': use momenta, p = stepper.momentum"):
+    with pytest.raises(sc.ArgumentError, match=r"no 'velocity': use momenta, p = stepper.momentum"):
         flow(pumped.ROWS[0][:2], velocity=pumped.ROWS[0][2:4], h=0.1)
-    with pytest.raises(ArgumentError, match=r"no 't_end'.*fixed number of steps"):
-        jax_flow(pumped.stepper(), t_end=3.0)
+    with pytest.raises(sc.ArgumentError, match=r"no 't_end'.*fixed number of steps"):
+        sc.jax_flow(pumped.stepper(), t_end=3.0)

@@ -4,29 +4,23 @@ import numpy as np
 import pytest
 from samples import fixed_point
 
-from scvi_codegen.methods import (
-    SCVI,
-    SVI,
-    CollocationRK,
-    ExplicitEuler,
-    Gauss,
-    LobattoIIIA,
-    RadauIA,
-    RadauIIA,
-    SpectralCollocation,
-)
+import scvi_codegen as sc
 
 POSITION = (
-    SpectralCollocation(1),
-    SpectralCollocation(8),
-    Gauss(4, form="position"),
-    RadauIIA(2, form="position"),
-    RadauIA(3, form="position"),
-    LobattoIIIA(3, form="position"),
-    CollocationRK([0.0, 0.5], form="position"),
-    ExplicitEuler(form="position"),
+    sc.SpectralCollocation(1),
+    sc.SpectralCollocation(8),
+    sc.Gauss(4, form="position"),
+    sc.RadauIIA(2, form="position"),
+    sc.RadauIA(3, form="position"),
+    sc.LobattoIIIA(3, form="position"),
+    sc.CollocationRK([0.0, 0.5], form="position"),
+    sc.ExplicitEuler(form="position"),
 )
-PRINTED = (SCVI(2, variational=False), SCVI(8, variational=False), SCVI(3, "gauss-lobatto:6", variational=False))
+PRINTED = (
+    sc.SCVI(2, variational=False),
+    sc.SCVI(8, variational=False),
+    sc.SCVI(3, "gauss-lobatto:6", variational=False),
+)
 COUPLED = ("double-pendulum", "pumped-cart-pole", "charged-particle", "relativistic-particle", "spherical-pendulum")
 named = {"ids": lambda value: getattr(value, "name", value)}
 
@@ -41,18 +35,18 @@ def test_separable_systems_iterate_on_positions_but_for_the_printed_form(sample)
     system = sample("kepler").system
     assert {fixed_point(system, method).name for method in POSITION} == {"separable"}
     assert {fixed_point(system, method).name for method in PRINTED} == {"collocation"}
-    assert fixed_point(system, SCVI(1, variational=False)).name == "separable"
+    assert fixed_point(system, sc.SCVI(1, variational=False)).name == "separable"
 
 
 def test_more_points_than_lanes_use_newton(sample):
     system = sample("double-pendulum").system
-    assert fixed_point(system, SpectralCollocation(32)) is not None
-    assert fixed_point(system, SpectralCollocation(33)) is None
-    assert fixed_point(system, SCVI(2, "gauss-legendre:33", variational=False)) is None
+    assert fixed_point(system, sc.SpectralCollocation(32)) is not None
+    assert fixed_point(system, sc.SpectralCollocation(33)) is None
+    assert fixed_point(system, sc.SCVI(2, "gauss-legendre:33", variational=False)) is None
 
 
 @pytest.mark.sampled(2)
-@pytest.mark.parametrize("method", [SVI(3), SCVI(2), SpectralCollocation(3), PRINTED[0]], **named)
+@pytest.mark.parametrize("method", [sc.SVI(3), sc.SCVI(2), sc.SpectralCollocation(3), PRINTED[0]], **named)
 def test_start_from_rest_does_not_need_newton(sample, compiled, method):
     """Velocities that vanish are no measure of what is small."""
     q, p = sample("double-pendulum").state
@@ -62,7 +56,7 @@ def test_start_from_rest_does_not_need_newton(sample, compiled, method):
     assert np.abs(np.subtract(*steps)).max() < 1e-14
 
 
-@pytest.mark.parametrize("method", [SpectralCollocation(3), PRINTED[0]], **named)
+@pytest.mark.parametrize("method", [sc.SpectralCollocation(3), PRINTED[0]], **named)
 def test_stored_velocity_is_recomputed_for_new_parameters(sample, compiled, method):
     stepper = compiled("pumped-cart-pole", method, solver="fixed-point")
     run = stepper.start(*sample("pumped-cart-pole").state, h=0.05)

@@ -8,34 +8,26 @@ import numpy as np
 import pytest
 from samples import lowered, pumped_chain
 
-from scvi_codegen import (
-    SCVI,
-    SVI,
-    LagrangianSystem,
-    SolverOptions,
-    SpectralCollocation,
-    compile_stepper,
-    generate_source,
-)
-from scvi_codegen.errors import MethodError, StepFailedError
+import scvi_codegen as sc
 from scvi_codegen.ir.program import LEAST_REUSED_UNKNOWNS
 from scvi_codegen.lowering.stage_groups import layout_of, lowered_stage_group
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.models.systems import fput_chain
 from scvi_codegen.rendering.program_source import workspace_size
-from scvi_codegen.runtime.core.stepper import Stepper
 
 SIZE = 12
 
 
 @cache
-def ring(seed: int | None = None) -> Stepper:
+def ring(seed: int | None = None) -> sc.Stepper:
     """Masses on a ring of hardening springs, coordinates in order or shuffled."""
     order = list(range(SIZE)) if seed is None else random.Random(seed).sample(range(SIZE), SIZE)
     kinetic = " + ".join(f"x{i}_dot**2/2" for i in range(SIZE))
     springs = "".join(f" - cosh(x{i} - x{(i + 1) % SIZE}) + x{i}*x{(i + 5) % SIZE}_dot/50" for i in range(SIZE))
-    system = LagrangianSystem.from_text(name="ring", coordinates=[f"x{i}" for i in order], lagrangian=kinetic + springs)
-    return compile_stepper(system, SVI(3), solver="newton")
+    system = sc.LagrangianSystem.from_text(
+        name="ring", coordinates=[f"x{i}" for i in order], lagrangian=kinetic + springs
+    )
+    return sc.compile_stepper(system, sc.SVI(3), solver="newton")
 
 
 def state(size: int = SIZE) -> tuple[np.ndarray, np.ndarray]:
@@ -43,8 +35,8 @@ def state(size: int = SIZE) -> tuple[np.ndarray, np.ndarray]:
 
 
 @cache
-def chain(method: object, *, pumped: bool = False) -> Stepper:
-    return compile_stepper(pumped_chain(SIZE) if pumped else fput_chain(SIZE), method, solver="newton")
+def chain(method: object, *, pumped: bool = False) -> sc.Stepper:
+    return sc.compile_stepper(pumped_chain(SIZE) if pumped else fput_chain(SIZE), method, solver="newton")
 
 
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.full)])
@@ -59,21 +51,21 @@ def test_the_order_of_the_coordinates_does_not_matter(seed):
     np.testing.assert_allclose(found.energy(), expected.energy(), rtol=1e-14)
 
 
-@pytest.mark.parametrize("method", [SVI(2), SCVI(2), SpectralCollocation(2)], ids=lambda method: method.name)
+@pytest.mark.parametrize("method", [sc.SVI(2), sc.SCVI(2), sc.SpectralCollocation(2)], ids=lambda method: method.name)
 def test_rows_are_pivoted_within_the_band(method):
     """Masses x_dot y_dot have no diagonal: every diagonal pivot is zero. In u = x + y, w = x - y they have."""
     pairs = range(8)
     kinetic = " + ".join(f"x{i}_dot*y{i}_dot" for i in pairs)
     springs = "".join(f" - x{i}*y{i} - (x{i} - y{i + 1})**2/3" for i in list(pairs)[:-1])
     names = [f"{letter}{i}" for i in pairs for letter in "xy"]
-    tilted = LagrangianSystem.from_text(name="tilted", coordinates=names, lagrangian=kinetic + springs)
+    tilted = sc.LagrangianSystem.from_text(name="tilted", coordinates=names, lagrangian=kinetic + springs)
     change = {f"x{i}": f"(u{i} + w{i})" for i in pairs} | {f"y{i}": f"(u{i} - w{i})" for i in pairs}
     text = kinetic + springs
     for name, value in change.items():
         text = text.replace(f"{name}_dot", value.replace(" ", "_dot ", 1).replace(")", "_dot)")).replace(name, value)
     names = [f"{letter}{i}" for i in pairs for letter in "uw"]
-    straight = LagrangianSystem.from_text(name="straight", coordinates=names, lagrangian=text)
-    one, other = (compile_stepper(system, method, solver="newton") for system in (tilted, straight))
+    straight = sc.LagrangianSystem.from_text(name="straight", coordinates=names, lagrangian=text)
+    one, other = (sc.compile_stepper(system, method, solver="newton") for system in (tilted, straight))
     turn = np.kron(np.eye(8), [[1.0, 1.0], [1.0, -1.0]])
     q, v = state(16)
     first, second = one.step(turn @ q, one.momentum(turn @ q, turn @ v), 0.3), other.step(q, other.momentum(q, v), 0.3)
@@ -82,17 +74,17 @@ def test_rows_are_pivoted_within_the_band(method):
 
 
 def test_memory_grows_linearly_with_the_length_of_a_chain():
-    sizes = [workspace_size(lowered(fput_chain(n), SVI(8))) for n in (32, 64, 128)]
+    sizes = [workspace_size(lowered(fput_chain(n), sc.SVI(8))) for n in (32, 64, 128)]
     assert sizes[2] - sizes[1] == pytest.approx(2 * (sizes[1] - sizes[0]), rel=1e-3)
     assert sizes[2] < 10**5
 
 
 def test_newton_matrix_has_minimal_size():
-    source, _ = generate_source(fput_chain(16), SVI(2), solver="fixed-point")
+    source, _ = sc.generate_source(fput_chain(16), sc.SVI(2), solver="fixed-point")
     assert "BAND = 0," in source.code
 
 
-@pytest.mark.parametrize("method", [SVI(3), SCVI(3)], ids=lambda method: method.name)
+@pytest.mark.parametrize("method", [sc.SVI(3), sc.SCVI(3)], ids=lambda method: method.name)
 class TestReusedFactors:
     """Runs of a chain with enough unknowns that factors go from step to step."""
 
@@ -127,19 +119,19 @@ class TestReusedFactors:
         run = chain(method).start(q, p, h=0.15)
         run.record(10)
         before = run.checkpoint()
-        strict = chain(method).from_checkpoint(before, options=SolverOptions(max_iterations=1))
-        with pytest.raises(StepFailedError):
+        strict = chain(method).from_checkpoint(before, options=sc.SolverOptions(max_iterations=1))
+        with pytest.raises(sc.StepFailedError):
             strict.record(1)
         assert strict.checkpoint() == before
 
 
 def test_wrong_sign_in_a_scatter_is_reported_before_compilation():
     """Newton's matrix is the Jacobian of a gradient: by one of other results the iteration would never converge."""
-    system = LagrangianSystem.from_text(name="mixed", coordinates=["x"], lagrangian="(1 + x**2)*x_dot**2/2 - x**4")
-    stages = discretise(system, SVI(2))
+    system = sc.LagrangianSystem.from_text(name="mixed", coordinates=["x"], lagrangian="(1 + x**2)*x_dot**2/2 - x**4")
+    stages = discretise(system, sc.SVI(2))
     (group,), sites = stages.stage_groups, layout_of(stages, 1)
     lowered_stage_group(system, group, sites)
     first, *others = group.scatters
     wrong = replace(first, results=tuple(-each for each in first.results))
-    with pytest.raises(MethodError, match=r"(?s)'quadrature' are not the gradient of its scalar.*check the signs"):
+    with pytest.raises(sc.MethodError, match=r"(?s)'quadrature' are not the gradient of its scalar.*check the signs"):
         lowered_stage_group(system, replace(group, scatters=(wrong, *others)), sites)

@@ -4,22 +4,14 @@ import pytest
 import sympy
 from sympy.physics.mechanics import LagrangesMethod, Point, ReferenceFrame, dynamicsymbols
 
-from scvi_codegen.errors import MethodError, StateError, SystemDefinitionError
-from scvi_codegen.exact.discrete_lagrangian import exact_discrete_lagrangian
-from scvi_codegen.mechanics.derived_systems import change_coordinates
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.legendre import hamiltonian_of, lagrangian_of
-from scvi_codegen.mechanics.symmetry.symmetry import symmetries
-from scvi_codegen.mechanics.time_transformation import reparametrise
-from scvi_codegen.methods import SCVI, SVI
+import scvi_codegen as sc
 from scvi_codegen.methods.discretise import discretise
 
 PARAMETERS = {"m": 1.2, "c": 0.1, "F": 0.5, "w": 2.0}
 
 
 def driven(**given):
-    return LagrangianSystem.from_text(
+    return sc.LagrangianSystem.from_text(
         name="driven",
         coordinates=["x", "y"],
         lagrangian="m*(x_dot**2 + y_dot**2)/2 - x**2*y**2",
@@ -40,7 +32,7 @@ def test_sympy_input_equals_text_input():
     t, c = sympy.symbols("t c")
     x, y = dynamicsymbols("x y")
     L = sympy.Symbol("m") * (x.diff(t) ** 2 + y.diff(t) ** 2) / 2 - x**2 * y**2
-    own = LagrangianSystem.from_sympy(
+    own = sc.LagrangianSystem.from_sympy(
         name="driven",
         lagrangian=L,
         coordinates=[x, y],
@@ -61,16 +53,16 @@ def test_sympy_input_equals_text_input():
     ],
 )
 def test_unsuitable_forces_are_named(given, message):
-    with pytest.raises(SystemDefinitionError, match=message):
+    with pytest.raises(sc.SystemDefinitionError, match=message):
         driven(**given)
 
 
 def test_legendre_transform_and_its_inverse():
     system = driven(forces={"x": "-c*x_dot", "y": "F*cos(w*t)"})
-    other = hamiltonian_of(system)
+    other = sc.hamiltonian_of(system)
     assert str(other.forces[0]) == "-c*p_x/m"
-    assert lagrangian_of(other).forces == system.forces
-    text = HamiltonianSystem.from_text(
+    assert sc.lagrangian_of(other).forces == system.forces
+    text = sc.HamiltonianSystem.from_text(
         name="h", coordinates=["x"], hamiltonian="p_x**2/2", parameters={"c": 1}, forces={"x": "-c*p_x"}
     )
     assert [str(f) for f in text.forces] == ["-c*p_x"]
@@ -78,10 +70,10 @@ def test_legendre_transform_and_its_inverse():
 
 def test_work_is_the_same_in_other_coordinates():
     """A constant force along x, in polar coordinates."""
-    plane = LagrangianSystem.from_text(
+    plane = sc.LagrangianSystem.from_text(
         name="plane", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2", forces={"x": "1"}
     )
-    polar = change_coordinates(plane, {"x": "r*cos(a)", "y": "r*sin(a)"}, coordinates=["r", "a"])
+    polar = sc.change_coordinates(plane, {"x": "r*cos(a)", "y": "r*sin(a)"}, coordinates=["r", "a"])
     assert [str(f) for f in polar.forces] == ["cos(a)", "-r*sin(a)"]
 
 
@@ -98,8 +90,8 @@ def test_forces_of_sympys_mechanics_act_through_velocities():
     acting = [(bob, 3 * ground.x - bob.vel(ground)), (rod, 5 * ground.z)]
     method = LagrangesMethod(length**2 * theta.diff(t) ** 2 / 2, [theta], forcelist=acting, frame=ground)
     method.form_lagranges_equations()
-    system = LagrangianSystem.from_lagranges_method(method, name="pulled", parameters={"l": 2})
-    expected = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_lagranges_method(method, name="pulled", parameters={"l": 2})
+    expected = sc.LagrangianSystem.from_text(
         name="pulled",
         coordinates=["theta"],
         lagrangian="l**2*theta_dot**2/2",
@@ -110,21 +102,23 @@ def test_forces_of_sympys_mechanics_act_through_velocities():
 
 
 def test_symmetries_are_those_of_the_forced_motion():
-    still = LagrangianSystem.from_text(name="free", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y**4")
-    dragged = LagrangianSystem.from_text(
+    still = sc.LagrangianSystem.from_text(
+        name="free", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y**4"
+    )
+    dragged = sc.LagrangianSystem.from_text(
         name="free", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y**4", forces={"x": "-x_dot/2"}
     )
-    assert "p_x" in {str(each.momentum_map) for each in symmetries(still)}
-    assert [str(each.momentum_map) for each in symmetries(dragged)] == ["p_x + x/2"]
+    assert "p_x" in {str(each.momentum_map) for each in sc.symmetries(still)}
+    assert [str(each.momentum_map) for each in sc.symmetries(dragged)] == ["p_x + x/2"]
 
 
 def test_functions_that_need_an_action_reject_forces():
     system = driven(forces={"x": "-c*x_dot"})
-    with pytest.raises(SystemDefinitionError, match="forces act on 'driven'"):
-        reparametrise(system, "1 + x**2")
-    with pytest.raises(StateError, match="not derivatives of an action"):
-        exact_discrete_lagrangian(system, [0, 0], [1, 1], 0.1)
-    with pytest.raises(MethodError, match="without derivatives"):
-        discretise(system, SVI(2, "hermite:2"))
-    with pytest.raises(MethodError, match="lagrangian_of"):
-        discretise(hamiltonian_of(system), SCVI(2))
+    with pytest.raises(sc.SystemDefinitionError, match="forces act on 'driven'"):
+        sc.reparametrise(system, "1 + x**2")
+    with pytest.raises(sc.StateError, match="not derivatives of an action"):
+        sc.exact_discrete_lagrangian(system, [0, 0], [1, 1], 0.1)
+    with pytest.raises(sc.MethodError, match="without derivatives"):
+        discretise(system, sc.SVI(2, "hermite:2"))
+    with pytest.raises(sc.MethodError, match="lagrangian_of"):
+        discretise(sc.hamiltonian_of(system), sc.SCVI(2))

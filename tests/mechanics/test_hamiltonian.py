@@ -8,59 +8,42 @@ import numpy as np
 import pytest
 import sympy
 
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.derivation.equations import derive
-from scvi_codegen.errors import MethodError, StateError, SystemDefinitionError
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+import scvi_codegen as sc
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian, hamiltonian_of, lagrangian_of, positive_parameters
-from scvi_codegen.methods import (
-    SCVI,
-    SVI,
-    ExplicitEuler,
-    Gauss,
-    LobattoIIIA,
-    RadauIA,
-    RadauIIA,
-    SpectralCollocation,
-    StoermerVerlet,
-)
-from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
-from scvi_codegen.models.problems import problem
 
 QUICK = ("-O1", "-ffp-contract=off")
 ROUND_OFF = 2e-14
 METHODS = (
-    SVI(2, "gauss-legendre:4"),
-    SCVI(3),
-    SCVI(3, variational=False),
-    SCVI(3, abscissae="radau-iia"),
-    SpectralCollocation(3),
-    SpectralCollocation(3, form="phase-space"),
-    RadauIA(2),
-    LobattoIIIA(3, form="position"),
-    StoermerVerlet(),
+    sc.SVI(2, "gauss-legendre:4"),
+    sc.SCVI(3),
+    sc.SCVI(3, variational=False),
+    sc.SCVI(3, abscissae="radau-iia"),
+    sc.SpectralCollocation(3),
+    sc.SpectralCollocation(3, form="phase-space"),
+    sc.RadauIA(2),
+    sc.LobattoIIIA(3, form="position"),
+    sc.StoermerVerlet(),
     *(
         pytest.param(method, marks=pytest.mark.full)
         for method in (
-            *(SVI(3), SVI(3, "clenshaw-curtis:4"), SCVI(1), SCVI(2, "gauss-lobatto:4"), Gauss(2)),
-            *(Gauss(2, form="position"), RadauIIA(3), ExplicitEuler()),
+            *(sc.SVI(3), sc.SVI(3, "clenshaw-curtis:4"), sc.SCVI(1), sc.SCVI(2, "gauss-lobatto:4"), sc.Gauss(2)),
+            *(sc.Gauss(2, form="position"), sc.RadauIIA(3), sc.ExplicitEuler()),
         )
     ),
 )
 
 
-def hyperbolic() -> HamiltonianSystem:
+def hyperbolic() -> sc.HamiltonianSystem:
     """Return H = q p: q' = q, p' = -p; velocities do not determine momenta."""
-    return HamiltonianSystem.from_text(name="hyperbolic", coordinates=["q"], momenta=["p"], hamiltonian="q*p")
+    return sc.HamiltonianSystem.from_text(name="hyperbolic", coordinates=["q"], momenta=["p"], hamiltonian="q*p")
 
 
 # Reading.
 
 
 def test_text_and_sympy_define_equal_systems() -> None:
-    text = HamiltonianSystem.from_text(
+    text = sc.HamiltonianSystem.from_text(
         name="pendulum",
         coordinates=["q"],
         momenta=["p"],
@@ -68,7 +51,7 @@ def test_text_and_sympy_define_equal_systems() -> None:
         parameters={"m": 2},
     )
     q, p, m, t = sympy.symbols("q p m t")
-    own = HamiltonianSystem.from_sympy(
+    own = sc.HamiltonianSystem.from_sympy(
         name="pendulum",
         coordinates=[q],
         momenta=[p],
@@ -77,7 +60,7 @@ def test_text_and_sympy_define_equal_systems() -> None:
     )
     T = sympy.Symbol("T")
     Q, P = sympy.Function("q")(T), sympy.Function("p")(T)
-    functions = HamiltonianSystem.from_sympy(
+    functions = sc.HamiltonianSystem.from_sympy(
         name="pendulum",
         coordinates=[Q],
         momenta=[P],
@@ -104,8 +87,8 @@ def test_text_and_sympy_define_equal_systems() -> None:
 )
 def test_invalid_systems_are_rejected(changes: dict[str, object], message: str) -> None:
     given = {"name": "x", "coordinates": ["q"], "momenta": ["p"], "hamiltonian": "p**2/2"} | changes
-    with pytest.raises(SystemDefinitionError, match=message):
-        HamiltonianSystem.from_text(**given)  # type: ignore[arg-type]  # wrong on purpose
+    with pytest.raises(sc.SystemDefinitionError, match=message):
+        sc.HamiltonianSystem.from_text(**given)  # type: ignore[arg-type]  # wrong on purpose
 
 
 @pytest.mark.parametrize(
@@ -118,7 +101,7 @@ def test_invalid_systems_are_rejected(changes: dict[str, object], message: str) 
     ],
 )
 def test_invalid_model_files_are_rejected(old: str, new: str, message: str) -> None:
-    text = dump_model(Model(system=hyperbolic(), method=SVI(4), q=(1.0,), p=(2.0,), h=0.1, steps=5))
+    text = dump_model(sc.Model(system=hyperbolic(), method=sc.SVI(4), q=(1.0,), p=(2.0,), h=0.1, steps=5))
     assert old in text
     with pytest.raises(Exception, match=message):
         parse_model(text.replace(old, new))
@@ -132,8 +115,8 @@ def test_invalid_model_files_are_rejected(old: str, new: str, message: str) -> N
 )
 def test_legendre_transform_and_its_inverse(name: str) -> None:
     """At a random point: v = H_p and H = p . v - L; and the Lagrangian of the Hamiltonian is the first one again."""
-    system = problem(name).system
-    assert isinstance(system, LagrangianSystem)
+    system = sc.problem(name).system
+    assert isinstance(system, sc.LagrangianSystem)
     hamiltonian = hamiltonian_of(system)
     assert hamiltonian.is_regular
     again = lagrangian_of(hamiltonian)
@@ -154,11 +137,13 @@ def test_legendre_transform_and_its_inverse(name: str) -> None:
 
 
 def test_missing_legendre_transform_is_named() -> None:
-    with pytest.raises(SystemDefinitionError, match="velocities do not determine momenta"):
+    with pytest.raises(sc.SystemDefinitionError, match="velocities do not determine momenta"):
         lagrangian_of(hyperbolic())
     assert equivalent_lagrangian(hyperbolic()) is None
-    quintic = LagrangianSystem.from_text(name="quintic", coordinates=["q"], lagrangian="q_dot**2/2 + q_dot**6/6 - q**2")
-    with pytest.raises(SystemDefinitionError, match="define the other function yourself"):
+    quintic = sc.LagrangianSystem.from_text(
+        name="quintic", coordinates=["q"], lagrangian="q_dot**2/2 + q_dot**6/6 - q**2"
+    )
+    with pytest.raises(sc.SystemDefinitionError, match="define the other function yourself"):
         hamiltonian_of(quintic)
 
 
@@ -173,16 +158,18 @@ def test_a_regular_hamiltonian_gives_the_steps_of_its_lagrangian(sample, name, m
     """Identity 10, for every method: with Newton's iteration on (35), and with the fixed point."""
     system, h, t = sample(name).system, 0.13, 0.4
     q, p = sample(name).state
-    expected = np.array(compile_stepper(system, method, solver="newton", flags=QUICK).step(q, p, h, t))
+    expected = np.array(sc.compile_stepper(system, method, solver="newton", flags=QUICK).step(q, p, h, t))
     hamiltonian = hamiltonian_of(system)
     for solver in ("newton", "auto"):
-        stepper = compile_stepper(hamiltonian, method, solver=solver, flags=QUICK)
+        stepper = sc.compile_stepper(hamiltonian, method, solver=solver, flags=QUICK)
         assert np.abs(np.array(stepper.step(q, p, h, t)) - expected).max() < ROUND_OFF
 
 
 def test_transforms_and_energy_are_those_of_the_lagrangian(sample) -> None:
     system = sample("double-pendulum").system
-    one, two = (compile_stepper(s, SVI(2), solver="newton", flags=QUICK) for s in (system, hamiltonian_of(system)))
+    one, two = (
+        sc.compile_stepper(s, sc.SVI(2), solver="newton", flags=QUICK) for s in (system, hamiltonian_of(system))
+    )
     q, p = sample("double-pendulum").state
     v = one.velocity(q, p)
     assert np.abs(two.velocity(q, p) - v).max() < ROUND_OFF
@@ -200,18 +187,18 @@ def test_transforms_and_energy_are_those_of_the_lagrangian(sample) -> None:
 @pytest.mark.parametrize(
     ("method", "error"),
     [
-        (SVI(4), 1e-14),
-        (Gauss(3), 1e-10),
-        (RadauIIA(3), 1e-8),
-        (SVI(3, "gauss-lobatto:3"), 1e-4),
-        (SpectralCollocation(5, form="phase-space"), 1e-9),
-        (StoermerVerlet(), 1e-2),
+        (sc.SVI(4), 1e-14),
+        (sc.Gauss(3), 1e-10),
+        (sc.RadauIIA(3), 1e-8),
+        (sc.SVI(3, "gauss-lobatto:3"), 1e-4),
+        (sc.SpectralCollocation(5, form="phase-space"), 1e-9),
+        (sc.StoermerVerlet(), 1e-2),
     ],
     ids=lambda value: getattr(value, "name", ""),
 )
 def test_hamiltonian_without_a_lagrangian(method, error) -> None:
     """q' = q, p' = -p; q p is a quadratic invariant, conserved by the symplectic methods to round-off."""
-    stepper = compile_stepper(hyperbolic(), method, flags=QUICK)
+    stepper = sc.compile_stepper(hyperbolic(), method, flags=QUICK)
     run = stepper.integrate([1.0], [1.0], h=0.1, steps=10)
     assert abs(run.q[-1, 0] - np.e) < error
     assert abs(run.p[-1, 0] - 1 / np.e) < error
@@ -221,27 +208,27 @@ def test_hamiltonian_without_a_lagrangian(method, error) -> None:
 
 @pytest.mark.parametrize(
     "method",
-    [SVI(3, "gauss-legendre:4"), SCVI(2), SpectralCollocation(2), Gauss(2, form="position")],
+    [sc.SVI(3, "gauss-legendre:4"), sc.SCVI(2), sc.SpectralCollocation(2), sc.Gauss(2, form="position")],
     ids=lambda method: method.name,
 )
 def test_methods_that_need_a_lagrangian_are_reported(method) -> None:
-    for make in (compile_stepper, derive):
-        with pytest.raises(MethodError, match="as many quadrature points as its degree"):
+    for make in (sc.compile_stepper, sc.derive):
+        with pytest.raises(sc.MethodError, match="as many quadrature points as its degree"):
             make(hyperbolic(), method)
 
 
 def test_a_singular_hamiltonian_has_no_momenta_of_velocities_and_no_discrete_lagrangian() -> None:
-    stepper = compile_stepper(hyperbolic(), SVI(2), flags=QUICK)
+    stepper = sc.compile_stepper(hyperbolic(), sc.SVI(2), flags=QUICK)
     assert stepper.velocity([2.0], [5.0]) == 2.0
-    with pytest.raises(StateError, match="give p instead of velocity"):
+    with pytest.raises(sc.StateError, match="give p instead of velocity"):
         stepper.momentum([1.0], [1.0])
-    with pytest.raises(MethodError, match="discrete_lagrangian is not available without an action"):
+    with pytest.raises(sc.MethodError, match="discrete_lagrangian is not available without an action"):
         stepper.discrete_lagrangian([1.0], [1.1], 0.1)
 
 
 def test_quadratures_with_derivatives_need_a_lagrangian() -> None:
-    with pytest.raises(MethodError, match="lagrangian_of"):
-        compile_stepper(hamiltonian_of(problem("planar-pendulum").system), SVI(2, "hermite:2"))
+    with pytest.raises(sc.MethodError, match="lagrangian_of"):
+        sc.compile_stepper(hamiltonian_of(sc.problem("planar-pendulum").system), sc.SVI(2, "hermite:2"))
 
 
 def vortex_rates(state: np.ndarray, strength: np.ndarray) -> np.ndarray:
@@ -256,9 +243,9 @@ def vortex_rates(state: np.ndarray, strength: np.ndarray) -> np.ndarray:
 
 
 def test_point_vortices_agree_with_gauss_by_hand() -> None:
-    entry = problem("point-vortices")
+    entry = sc.problem("point-vortices")
     strength = np.array(entry.system.defaults)
-    stepper = compile_stepper(entry.system, SVI(2), flags=QUICK)
+    stepper = sc.compile_stepper(entry.system, sc.SVI(2), flags=QUICK)
     root = np.sqrt(3.0) / 6.0
     A = np.array([[0.25, 0.25 - root], [0.25 + root, 0.25]])
     state, h = np.concatenate([entry.q, entry.p]), 0.1
@@ -270,12 +257,14 @@ def test_point_vortices_agree_with_gauss_by_hand() -> None:
 
 
 @pytest.mark.sampled(4)
-@pytest.mark.parametrize("method", [SVI(6), Gauss(3), RadauIIA(3), StoermerVerlet()], ids=lambda method: method.name)
+@pytest.mark.parametrize(
+    "method", [sc.SVI(6), sc.Gauss(3), sc.RadauIIA(3), sc.StoermerVerlet()], ids=lambda method: method.name
+)
 @pytest.mark.parametrize("h", [0.1, -0.1])
 def test_both_solvers_give_the_same_step_without_a_lagrangian(method, h) -> None:
-    entry = problem("point-vortices")
+    entry = sc.problem("point-vortices")
     one, two = (
-        compile_stepper(entry.system, method, solver=solver, flags=QUICK) for solver in ("fixed-point", "newton")
+        sc.compile_stepper(entry.system, method, solver=solver, flags=QUICK) for solver in ("fixed-point", "newton")
     )
     steps = [np.array(stepper.step(entry.q, entry.p, h)) for stepper in (one, two)]
     assert np.abs(steps[0] - steps[1]).max() < ROUND_OFF
@@ -285,7 +274,7 @@ def test_both_solvers_give_the_same_step_without_a_lagrangian(method, h) -> None
 
 def test_parameters_are_assumed_positive_if_their_values_are():
     """Roots of squares of other parameters have signs; a value of 0 does not determine the sign of others."""
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="signs",
         coordinates=["q"],
         lagrangian="a*q_dot**2/2 - b*q - c*q**2",
@@ -295,14 +284,14 @@ def test_parameters_are_assumed_positive_if_their_values_are():
 
 
 def test_energy_error_is_relative_to_the_action_if_the_energy_starts_at_0():
-    pair = HamiltonianSystem.from_text("two spins", spins=["a", "b"], hamiltonian="a_1*b_1 + a_2*b_2")
-    run = compile_stepper(pair, SVI(2)).integrate({"a": [1, 0, 0], "b": [0, 0.6, 0.8]}, h=0.1, steps=50)
+    pair = sc.HamiltonianSystem.from_text("two spins", spins=["a", "b"], hamiltonian="a_1*b_1 + a_2*b_2")
+    run = sc.compile_stepper(pair, sc.SVI(2)).integrate({"a": [1, 0, 0], "b": [0, 0.6, 0.8]}, h=0.1, steps=50)
     assert abs(run.energy()[0]) < 1e-15
     assert run.energy_error() < 1e-13
 
 
 def test_the_hamiltonian_of_a_direction_has_its_energy():
-    pendulum = LagrangianSystem.from_text(
+    pendulum = sc.LagrangianSystem.from_text(
         "spherical pendulum", directions=["n"], lagrangian="(n_1_dot**2 + n_2_dot**2 + n_3_dot**2)/2 - n_3"
     )
     hamiltonian = hamiltonian_of(pendulum).hamiltonian  # expanded determinants took minutes

@@ -6,23 +6,14 @@ import sympy
 from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS
 
-from scvi_codegen import (
-    SVI,
-    Gauss,
-    LagrangianSystem,
-    SystemDefinitionError,
-    compile_stepper,
-    hamiltonian_of,
-    problem,
-    variational_system,
-)
+import scvi_codegen as sc
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.derived_systems import with_tangent_vectors
 
 
 def test_tangent_vectors_satisfy_the_variational_equations():
     """x'' = -sin x - k x y^2 + cos t, and so on: forces of changes are the Hessian times these, masses the same."""
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="two",
         coordinates=["x", "y"],
         lagrangian="(m*x_dot**2 + y_dot**2)/2 + cos(x) - k*x**2*y**2/2",
@@ -47,28 +38,30 @@ def test_tangent_vectors_satisfy_the_variational_equations():
 
 
 def test_reserved_names_are_avoided():
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="taken", coordinates=["x", "x_change_1"], lagrangian="(x_dot**2 + x_change_1_dot**2)/2 - x**2*x_change_1"
     )
     assert len({q.name for q in with_tangent_vectors(system, 2).coordinates}) == 6
 
 
 def test_variable_masses_have_no_variational_equations():
-    assert with_tangent_vectors(problem("double-pendulum").system, 1) is None
-    magnetic = LagrangianSystem.from_text(
+    assert with_tangent_vectors(sc.problem("double-pendulum").system, 1) is None
+    magnetic = sc.LagrangianSystem.from_text(
         name="magnetic", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 + x*y_dot - y**2"
     )
     assert with_tangent_vectors(magnetic, 1) is None
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize("method", [SVI(5), SVI(3, "gauss-lobatto:5"), Gauss(3)], ids=["svi", "other points", "gauss"])
+@pytest.mark.parametrize(
+    "method", [sc.SVI(5), sc.SVI(3, "gauss-lobatto:5"), sc.Gauss(3)], ids=["svi", "other points", "gauss"]
+)
 def test_tangents_by_iteration_are_the_derivative_of_the_computed_flow(method):
     """Steps commute with differentiation: the tangent map of the run, also of a Hamiltonian, and symplectic."""
-    kepler, (q, p) = problem("kepler").system, ([0.5, 0.0], [0.0, 3**0.5])
-    tangent = compile_stepper(kepler, method, flags=QUICK_FLAGS).integrate(q, p, h=0.1, steps=63).tangent()[-1]
+    kepler, (q, p) = sc.problem("kepler").system, ([0.5, 0.0], [0.0, 3**0.5])
+    tangent = sc.compile_stepper(kepler, method, flags=QUICK_FLAGS).integrate(q, p, h=0.1, steps=63).tangent()[-1]
     made, directions = (
-        compile_stepper(variational_system(hamiltonian_of(kepler), 4), method, flags=QUICK_FLAGS),
+        sc.compile_stepper(sc.variational_system(sc.hamiltonian_of(kepler), 4), method, flags=QUICK_FLAGS),
         np.eye(4),
     )
     starts = (np.concatenate([own, of.T.ravel()]) for own, of in ((q, directions[:2]), (p, directions[2:])))
@@ -80,5 +73,7 @@ def test_tangents_by_iteration_are_the_derivative_of_the_computed_flow(method):
 
 
 def test_systems_without_variational_equations_are_rejected():
-    with pytest.raises(SystemDefinitionError, match=r"variational equations of 'double pendulum' cannot.*run.tangent"):
-        variational_system(problem("double-pendulum").system, 2)
+    with pytest.raises(
+        sc.SystemDefinitionError, match=r"variational equations of 'double pendulum' cannot.*run.tangent"
+    ):
+        sc.variational_system(sc.problem("double-pendulum").system, 2)

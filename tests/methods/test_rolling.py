@@ -8,23 +8,14 @@ from samples import sleigh
 from scipy.integrate import solve_ivp
 from sympy.physics.mechanics import LagrangesMethod, dynamicsymbols
 
-from scvi_codegen import (
-    SVI,
-    LagrangianSystem,
-    MethodError,
-    StateError,
-    SystemDefinitionError,
-    compile_stepper,
-    derive,
-    symmetries,
-)
+import scvi_codegen as sc
 from scvi_codegen.methods.discretise import is_symplectic
 
 START = np.array([0.3, -0.4, 0.5]), np.array([1.1 * np.cos(0.5), 1.1 * np.sin(0.5), 0.8])
 
 
 def lobatto(s):
-    return SVI(s, f"gauss-lobatto:{s + 1}")
+    return sc.SVI(s, f"gauss-lobatto:{s + 1}")
 
 
 def by_accelerations(t, state):
@@ -45,7 +36,7 @@ def by_accelerations(t, state):
 @pytest.mark.parametrize(("s", "steps"), [(1, 20), (2, 10), (3, 10), (4, 5)])
 def test_the_order_is_2s_and_the_step_is_symmetric(s, steps):
     end = solve_ivp(by_accelerations, (0.0, 2.0), np.concatenate(START), method="DOP853", rtol=1e-13, atol=1e-14)
-    stepper, errors = compile_stepper(sleigh(), lobatto(s)), []
+    stepper, errors = sc.compile_stepper(sleigh(), lobatto(s)), []
     for n in (steps, 2 * steps):
         run = stepper.integrate(START[0], velocity=START[1], h=2.0 / n, steps=n)
         errors.append(np.abs(np.concatenate([run.q[-1], run.velocity[-1]]) - end.y[:, -1]).max())
@@ -63,7 +54,7 @@ def test_chaplygin_sleigh_agrees_with_its_closed_form():
     m, j, d, turning = 1.3, 0.7, 0.2, 0.9
     speed = np.sqrt(j / m) * turning
     k = m * d * speed / j
-    stepper = compile_stepper(sleigh().with_parameters(k=0.0), lobatto(4))
+    stepper = sc.compile_stepper(sleigh().with_parameters(k=0.0), lobatto(4))
     run = stepper.integrate([0.0, 0.0, 0.0], velocity=[0.0, 0.0, turning], h=0.25, steps=80)
     heading = 2 * turning / k * np.arctan(np.tanh(k * run.t / 2))
     assert_allclose(run.q[:, 2], heading, rtol=0, atol=1e-10)
@@ -72,17 +63,17 @@ def test_chaplygin_sleigh_agrees_with_its_closed_form():
 
 
 def test_rolling_disk_moves_in_circles_and_conserves_free_momenta():
-    disk = LagrangianSystem.from_text(
+    disk = sc.LagrangianSystem.from_text(
         name="rolling disk",
         coordinates=["x", "y", "a", "b"],
         lagrangian="m*(x_dot**2 + y_dot**2)/2 + J*a_dot**2/2 + K*b_dot**2/2",
         parameters={"m": 1, "J": 0.25, "K": 0.5, "r": 1},
         constraints=["x_dot = r*b_dot*cos(a)", "y_dot = r*b_dot*sin(a)"],
     )
-    names = [symmetry.name for symmetry in symmetries(disk)]
+    names = [symmetry.name for symmetry in sc.symmetries(disk)]
     assert "momentum of a" in names
     assert "momentum of b" not in names
-    stepper = compile_stepper(disk, lobatto(3))
+    stepper = sc.compile_stepper(disk, lobatto(3))
     run = stepper.integrate(
         [0.0, 0.0, 0.3, 0.0], velocity=[2 * np.cos(0.3), 2 * np.sin(0.3), 0.7, 2.0], h=0.1, steps=200
     )
@@ -97,7 +88,9 @@ def test_energy_does_not_drift():
     """Area is not preserved; the steps are symmetric and the system is reversible."""
     system = sleigh()
     assert not is_symplectic(lobatto(2), system)
-    run = compile_stepper(system, lobatto(3)).integrate(START[0], velocity=START[1], h=0.2, steps=50_000, save_every=10)
+    run = sc.compile_stepper(system, lobatto(3)).integrate(
+        START[0], velocity=START[1], h=0.2, steps=50_000, save_every=10
+    )
     energy = run.energy() - run.energy()[0]
     assert np.abs(energy).max() < 5e-8
     assert abs(energy[-500:].mean() - energy[:500].mean()) < 1e-8
@@ -107,52 +100,52 @@ def test_holonomic_and_moving_nonholonomic_constraints_combine():
     """A slope x = 4 z equals the system with z eliminated; and a moving constraint x_dot = cos(t)."""
     common = {"parameters": {"m": 1.0, "J": 0.3, "g": 9.81}, "name": "sleigh on a slope"}
     skate = "x_dot*sin(a) - y_dot*cos(a)"
-    space = LagrangianSystem.from_text(
+    space = sc.LagrangianSystem.from_text(
         coordinates=["x", "y", "z", "a"],
         lagrangian="m*(x_dot**2 + y_dot**2 + z_dot**2)/2 + J*a_dot**2/2 - m*g*z",
         constraints=[skate, "z = x**2/4"],
         **common,
     )
-    plane = LagrangianSystem.from_text(
+    plane = sc.LagrangianSystem.from_text(
         coordinates=["x", "y", "a"],
         lagrangian="m*(x_dot**2*(1 + x**2/4) + y_dot**2)/2 + J*a_dot**2/2 - m*g*x**2/4",
         constraints=[skate],
         **common,
     )
     x, v = 0.8, 0.5
-    one = compile_stepper(space, lobatto(4)).integrate(
+    one = sc.compile_stepper(space, lobatto(4)).integrate(
         [x, 0.0, x * x / 4, 0.6],
         velocity=[v * np.cos(0.6), v * np.sin(0.6), x / 2 * v * np.cos(0.6), 0.4],
         h=0.02,
         steps=100,
     )
-    other = compile_stepper(plane, lobatto(4)).integrate(
+    other = sc.compile_stepper(plane, lobatto(4)).integrate(
         [x, 0.0, 0.6], velocity=[v * np.cos(0.6), v * np.sin(0.6), 0.4], h=0.02, steps=100
     )
     assert_allclose(one.q[:, [0, 1, 3]], other.q, rtol=0, atol=1e-12)
     assert np.abs(one.constraint_values()).max() < 2e-15
-    dragged = LagrangianSystem.from_text(
+    dragged = sc.LagrangianSystem.from_text(
         coordinates=["x", "y", "a"],
         lagrangian="m*(x_dot**2 + y_dot**2)/2 + J*a_dot**2/2 - m*g*y",
         constraints=["x_dot = cos(t)"],
         **common,
     )
     assert dragged.changes_energy == "constraints do work"
-    run = compile_stepper(dragged, lobatto(3)).integrate([0, 0, 0], velocity=[1, 0, 0], h=0.1, steps=30)
+    run = sc.compile_stepper(dragged, lobatto(3)).integrate([0, 0, 0], velocity=[1, 0, 0], h=0.1, steps=30)
     assert_allclose(run.q[:, 0], np.sin(run.t), rtol=0, atol=1e-9)
     assert_allclose(run.multipliers()[:, 0], -np.sin(run.t), rtol=0, atol=1e-13)
 
 
 def test_a_blade_of_prescribed_direction_does_no_work():
     """Constraint forces do work only if the rates of constraints at rest are not 0, also where they contain time."""
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="blade",
         coordinates=["x", "y"],
         lagrangian="(x_dot**2 + y_dot**2)/2 - y",
         constraints=["x_dot*sin(t) = y_dot*cos(t)"],
     )
     assert not system.changes_energy
-    run = compile_stepper(system, lobatto(4)).integrate([0.0, 0.0], velocity=[1.0, 0.0], h=0.05, steps=60)
+    run = sc.compile_stepper(system, lobatto(4)).integrate([0.0, 0.0], velocity=[1.0, 0.0], h=0.05, steps=60)
     assert np.abs(run.energy() - 0.5).max() < 1e-12 < 0.1 < np.ptp(run.velocity[:, 0])
 
 
@@ -165,29 +158,29 @@ def test_nonholonomic_constraints_from_sympy_mechanics():
         lagrangian - k * (x**2 / 2 + y**2), [x, y, a], nonhol_coneqs=[vx * sympy.sin(a) - vy * sympy.cos(a)]
     )
     values = {m: 1.3, j: 0.7, d: 0.2, k: 0.5}
-    found = LagrangianSystem.from_lagranges_method(method, name="sleigh", parameters=values)
-    one, other = (compile_stepper(system, lobatto(2)) for system in (found, sleigh()))
+    found = sc.LagrangianSystem.from_lagranges_method(method, name="sleigh", parameters=values)
+    one, other = (sc.compile_stepper(system, lobatto(2)) for system in (found, sleigh()))
     p = other.momentum(*START)
     assert_allclose(one.step(START[0], p, 0.1), other.step(START[0], p, 0.1), rtol=1e-14)
 
 
 def test_invalid_nonholonomic_constraints_are_rejected():
     skate = {"name": "skate", "coordinates": ["x", "y"], "lagrangian": "x_dot**2 + y_dot**2"}
-    with pytest.raises(SystemDefinitionError, match="not linear in the velocity x_dot"):
-        LagrangianSystem.from_text(**skate, constraints=["x_dot**2 = y"])
-    with pytest.raises(SystemDefinitionError, match="is redundant"):
-        LagrangianSystem.from_text(
+    with pytest.raises(sc.SystemDefinitionError, match="not linear in the velocity x_dot"):
+        sc.LagrangianSystem.from_text(**skate, constraints=["x_dot**2 = y"])
+    with pytest.raises(sc.SystemDefinitionError, match="is redundant"):
+        sc.LagrangianSystem.from_text(
             name="s",
             coordinates=["x", "y", "z"],
             lagrangian="x_dot**2 + y_dot**2 + z_dot**2",
             constraints=["x_dot = y*z_dot", "2*x_dot = 2*y*z_dot"],
         )
-    with pytest.raises(MethodError, match="does not support the constraints"):
-        compile_stepper(sleigh(), SVI(3))
-    with pytest.raises(MethodError, match="not polynomials"):
-        compile_stepper(sleigh(), SVI(3, "gauss-lobatto:4", space="trigonometric:0.5"))
-    stepper = compile_stepper(sleigh(), lobatto(2))
-    with pytest.raises(StateError, match=r"x_dot\*sin\(a\) - y_dot\*cos\(a\) is [-\d.]+, not 0"):
+    with pytest.raises(sc.MethodError, match="does not support the constraints"):
+        sc.compile_stepper(sleigh(), sc.SVI(3))
+    with pytest.raises(sc.MethodError, match="not polynomials"):
+        sc.compile_stepper(sleigh(), sc.SVI(3, "gauss-lobatto:4", space="trigonometric:0.5"))
+    stepper = sc.compile_stepper(sleigh(), lobatto(2))
+    with pytest.raises(sc.StateError, match=r"x_dot\*sin\(a\) - y_dot\*cos\(a\) is [-\d.]+, not 0"):
         stepper.integrate([0.0, 0.0, 0.5], velocity=[1.0, 1.0, 0.0], h=0.1, steps=1)
     q, p = stepper.project([0.0, 0.0, 0.5], velocity=[1.0, 1.0, 0.0])
     assert np.abs(stepper.constraint_values(q, p)[1]).max() < 1e-15
@@ -196,12 +189,12 @@ def test_invalid_nonholonomic_constraints_are_rejected():
 
 def test_violated_velocity_constraints_of_rotations_are_named_without_a_rate():
     text, constraints = "omega_1**2 + omega_2**2 + 2*omega_3**2 - R_33", ["omega_3 = 0.2"]
-    system = LagrangianSystem.from_text("top", lagrangian=text, rotations={"R": "omega"}, constraints=constraints)
-    with pytest.raises(StateError, match=r"\(relative\): omega_3 - 1/5 is 0.8, not 0"):
-        compile_stepper(system, "svi:2").start({"R": [1, 0, 0, 0]}, velocity={"omega": [0, 0.3, 1]}, h=0.1)
+    system = sc.LagrangianSystem.from_text("top", lagrangian=text, rotations={"R": "omega"}, constraints=constraints)
+    with pytest.raises(sc.StateError, match=r"\(relative\): omega_3 - 1/5 is 0.8, not 0"):
+        sc.compile_stepper(system, "svi:2").start({"R": [1, 0, 0, 0]}, velocity={"omega": [0, 0.3, 1]}, h=0.1)
 
 
 def test_derivation_shows_nonholonomic_constraints():
-    text = derive(sleigh(), lobatto(1)).to_text()
+    text = sc.derive(sleigh(), lobatto(1)).to_text()
     assert "0 = x_dot*sin(a) - y_dot*cos(a)" in text
     assert "lambda_1" in text

@@ -16,24 +16,10 @@ from fmu import DISCARD, ERROR, OK, Fmu, Slave
 from numpy.testing import assert_allclose
 from style import check_style
 
-from scvi_codegen import (
-    SVI,
-    BuildError,
-    Gauss,
-    LagrangianSystem,
-    Model,
-    ModelFileError,
-    PackageError,
-    StoermerVerlet,
-    compile_stepper,
-    generate_fmu,
-    problem,
-    reparametrise,
-)
+import scvi_codegen as sc
 from scvi_codegen.cli import main
 from scvi_codegen.models.packages import fmu as fmu_module
 from scvi_codegen.native.building import PORTABLE_FLAGS, TARGETS
-from scvi_codegen.runtime.events.event import Event, impact
 
 H = 0.1
 STRICT = "-std=c99 -O1 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Wno-psabi -Werror -c".split()  # noqa: SIM905
@@ -48,7 +34,7 @@ NEVER_CALLED = (
 
 def pushed(**given):
     """A pushed pendulum with friction, some of whose mass is data, too."""
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name='pushed pendulum <&> "friends"',
         coordinates=["q"],
         lagrangian="(m + w)*q_dot**2/2 + cos(q)",
@@ -56,31 +42,33 @@ def pushed(**given):
         forces={"q": "u - c*q_dot"},
         inputs=["w", "u"],
     )
-    return Model(system=system, method=SVI(4), q=(0.3,), h=H, t=0.5, span=2.3, **(given or {"velocity": (0.5,)}))
+    return sc.Model(system=system, method=sc.SVI(4), q=(0.3,), h=H, t=0.5, span=2.3, **(given or {"velocity": (0.5,)}))
 
 
 def rod():
     """A mass on a rod, in Cartesian coordinates."""
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="rod", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"]
     )
-    return Model(system=system, method=SVI(2, "gauss-lobatto:3"), q=(1.0, 0.0), velocity=(0.0, 0.2), h=H, steps=10)
+    return sc.Model(
+        system=system, method=sc.SVI(2, "gauss-lobatto:3"), q=(1.0, 0.0), velocity=(0.0, 0.2), h=H, steps=10
+    )
 
 
 @pytest.fixture(scope="module")
 def fmu(tmp_path_factory):
     folder = tmp_path_factory.mktemp("fmu")
-    return Fmu(generate_fmu(pushed(), folder / "pushed.fmu"), folder / "unpacked")
+    return Fmu(sc.generate_fmu(pushed(), folder / "pushed.fmu"), folder / "unpacked")
 
 
 def stepper_of(model):
-    return compile_stepper(model.system, model.method, flags=PORTABLE_FLAGS)
+    return sc.compile_stepper(model.system, model.method, flags=PORTABLE_FLAGS)
 
 
 MODELS = {
-    "velocities": lambda: replace(Model.from_problem(problem("kepler"), SVI(4)), t=-3.0),
-    "momenta": lambda: Model.from_problem(problem("point-vortices"), Gauss(2)),
-    "explicit": lambda: Model.from_problem(problem("henon-heiles"), StoermerVerlet()),
+    "velocities": lambda: replace(sc.Model.from_problem(sc.problem("kepler"), sc.SVI(4)), t=-3.0),
+    "momenta": lambda: sc.Model.from_problem(sc.problem("point-vortices"), sc.Gauss(2)),
+    "explicit": lambda: sc.Model.from_problem(sc.problem("henon-heiles"), sc.StoermerVerlet()),
     "constraints": rod,
 }
 
@@ -89,7 +77,7 @@ MODELS = {
 @pytest.mark.parametrize("name", MODELS)
 def test_states_equal_those_of_the_stepper_bitwise(name, tmp_path):
     model = MODELS[name]()
-    one, h = Slave(Fmu(generate_fmu(model, tmp_path / "one.fmu"), tmp_path / "unpacked")), model.h
+    one, h = Slave(Fmu(sc.generate_fmu(model, tmp_path / "one.fmu"), tmp_path / "unpacked")), model.h
     assert one.start(model.t) == OK, one.log
     stepper = stepper_of(model)
     run = stepper.integrate(model.q, model.momenta(stepper), h=h, steps=30, t=model.t)
@@ -147,12 +135,12 @@ def check_event_mode(fmu, model, run):
 
 def test_impacts_within_communication_steps(tmp_path):
     """States equal those of the stepper, also from a saved state; the crossing of x = -2 ends the simulation."""
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="ball", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - g*y - y**4/40", parameters={"g": 1.0}
     )
-    walls = (impact("y", 0.8), Event("x - 3", then={"p_x": "-p_x"}), Event("x + 2", -1, terminal=1))
-    model = Model(system=system, method=SVI(2), q=(0.0, 1.0), velocity=(1.0, 0.0), h=H, steps=60, events=walls)
-    one = Slave(Fmu(generate_fmu(model, tmp_path / "ball.fmu"), tmp_path / "unpacked"))
+    walls = (sc.impact("y", 0.8), sc.Event("x - 3", then={"p_x": "-p_x"}), sc.Event("x + 2", -1, terminal=1))
+    model = sc.Model(system=system, method=sc.SVI(2), q=(0.0, 1.0), velocity=(1.0, 0.0), h=H, steps=60, events=walls)
+    one = Slave(Fmu(sc.generate_fmu(model, tmp_path / "ball.fmu"), tmp_path / "unpacked"))
     assert one.start() == OK
     run = model.stepper().integrate(model.q, velocity=model.velocity, h=H, steps=70)
     for k in range(70):
@@ -168,8 +156,8 @@ def test_impacts_within_communication_steps(tmp_path):
     assert one.do_step(70 * H, 15 * H) == (OK, False, True, False)
     assert_allclose([one.last, *one.get("x")], [8.0, -2.0], rtol=0, atol=1e-13)
     check_event_mode(one.fmu, model, run)
-    with pytest.raises(ModelFileError, match="must change the state"):
-        generate_fmu(replace(model, events=walls[2:]), tmp_path / "ended.fmu")
+    with pytest.raises(sc.ModelFileError, match="must change the state"):
+        sc.generate_fmu(replace(model, events=walls[2:]), tmp_path / "ended.fmu")
 
 
 def test_inputs_are_zero_order_hold_and_parameters_may_change(fmu):
@@ -343,7 +331,7 @@ def test_the_instantiation_token_identifies_the_model():
         replace(model, velocity=(0.6,)),
         replace(model, h=0.05),
         replace(model, t=0.0),
-        replace(model, method=SVI(3)),
+        replace(model, method=sc.SVI(3)),
         replace(model, system=model.system.with_parameters(m=1.6)),
         pushed(p=(0.4,)),
     ]
@@ -366,7 +354,7 @@ def test_discards_are_logged_if_requested(fmu):
 
 
 def test_initial_states_far_off_their_constraints_are_rejected(tmp_path):
-    fmu = Fmu(generate_fmu(rod(), tmp_path / "rod.fmu"), tmp_path / "unpacked")
+    fmu = Fmu(sc.generate_fmu(rod(), tmp_path / "rod.fmu"), tmp_path / "unpacked")
     near, far = Slave(fmu), Slave(fmu)
     assert near.start(0.0, x=1.001) == OK
     assert_allclose(np.hypot(*near.get("x", "y")), 1.0, rtol=1e-15)
@@ -399,7 +387,7 @@ def test_description_has_the_elements_required_by_the_standard(fmu):
 
 
 def test_model_with_initial_momenta_starts_with_them(tmp_path):
-    fmu = Fmu(generate_fmu(pushed(p=(0.4,)), tmp_path / "by_momenta.fmu"), tmp_path / "unpacked")
+    fmu = Fmu(sc.generate_fmu(pushed(p=(0.4,)), tmp_path / "by_momenta.fmu"), tmp_path / "unpacked")
     assert (fmu.variables["p_q"]["start"], fmu.variables["q_dot"]["initial"]) == ("0.4", "calculated")
     one = Slave(fmu)
     assert one.set(q_dot=1.0) == ERROR
@@ -408,19 +396,19 @@ def test_model_with_initial_momenta_starts_with_them(tmp_path):
 
 
 def test_names_are_made_unique(tmp_path):
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="names",
         coordinates=["q"],
         lagrangian="energy*q_dot**2/2 - p_q*q**2/2",
         parameters={"energy": 1.0, "p_q": 2.0, "energy_": 0.0},
     )
-    model = Model(system=system, method="svi:2", q=(1.0,), velocity=(0.0,), h=0.1, steps=1)
-    names = list(Fmu(generate_fmu(model, tmp_path / "names.fmu"), tmp_path / "unpacked").variables)
+    model = sc.Model(system=system, method="svi:2", q=(1.0,), velocity=(0.0,), h=0.1, steps=1)
+    names = list(Fmu(sc.generate_fmu(model, tmp_path / "names.fmu"), tmp_path / "unpacked").variables)
     assert len(set(names)) == len(names) == 8
 
 
 def test_archive_is_reproducible_and_contains_all_sources(tmp_path):
-    first, second = (generate_fmu(pushed(), part / "push.fmu") for part in _folders(tmp_path, "a", "b"))
+    first, second = (sc.generate_fmu(pushed(), part / "push.fmu") for part in _folders(tmp_path, "a", "b"))
     assert first.read_bytes() == second.read_bytes()
     folder = tmp_path / "unpacked"
     zipfile.ZipFile(first).extractall(folder)
@@ -461,27 +449,29 @@ def test_unsuitable_models_and_names_are_rejected(tmp_path):
         (replace(model, h=None, tolerance=1e-6), "fixed step size"),
         (replace(model, h=-0.1), "must be positive"),
         (
-            replace(Model.from_problem(problem("kepler"), SVI(4)), time_transformation="distance"),
+            replace(sc.Model.from_problem(sc.problem("kepler"), sc.SVI(4)), time_transformation="distance"),
             "without a time transformation",
         ),
     ):
-        with pytest.raises(ModelFileError, match=words):
-            generate_fmu(wrong, tmp_path / "push.fmu")
-    clocked = reparametrise(problem("kepler").system, "distance")
-    entry = problem("kepler")
-    with pytest.raises(ModelFileError, match="time transformation"):
-        generate_fmu(replace(model, system=clocked, q=entry.q, velocity=entry.velocity, t=0.0), tmp_path / "push.fmu")
+        with pytest.raises(sc.ModelFileError, match=words):
+            sc.generate_fmu(wrong, tmp_path / "push.fmu")
+    clocked = sc.reparametrise(sc.problem("kepler").system, "distance")
+    entry = sc.problem("kepler")
+    with pytest.raises(sc.ModelFileError, match="time transformation"):
+        sc.generate_fmu(
+            replace(model, system=clocked, q=entry.q, velocity=entry.velocity, t=0.0), tmp_path / "push.fmu"
+        )
     for name in ("pendulum", "Pendulum.fmu", "while.fmu"):
-        with pytest.raises(PackageError):
-            generate_fmu(model, tmp_path / name)
+        with pytest.raises(sc.PackageError):
+            sc.generate_fmu(model, tmp_path / name)
     (tmp_path / "mine.fmu").write_text("mine")
-    with pytest.raises(PackageError, match="is not an FMU"):
-        generate_fmu(model, tmp_path / "mine.fmu")
+    with pytest.raises(sc.PackageError, match="is not an FMU"):
+        sc.generate_fmu(model, tmp_path / "mine.fmu")
     assert (tmp_path / "mine.fmu").read_text() == "mine"
     for _ in range(2):
-        assert zipfile.is_zipfile(generate_fmu(model, tmp_path / "mine.fmu", force=True))
-    with pytest.raises(PackageError, match="cannot be written"):
-        generate_fmu(model, tmp_path / "missing" / "push.fmu")
+        assert zipfile.is_zipfile(sc.generate_fmu(model, tmp_path / "mine.fmu", force=True))
+    with pytest.raises(sc.PackageError, match="cannot be written"):
+        sc.generate_fmu(model, tmp_path / "missing" / "push.fmu")
 
 
 def test_command_line_writes_an_fmu(tmp_path):
@@ -503,7 +493,7 @@ class TestPlatforms:
     def test_each_platform_has_its_folder(self, tmp_path, monkeypatch):
         monkeypatch.setattr(fmu_module, "library_for", lambda name, source, *, flags: f"{name} {flags}".encode())
         here = fmu_module._this_platform()
-        path = generate_fmu(pushed(), tmp_path / "push.fmu", platforms=tuple(TARGETS), flags=("-O1",))
+        path = sc.generate_fmu(pushed(), tmp_path / "push.fmu", platforms=tuple(TARGETS), flags=("-O1",))
         archive = zipfile.ZipFile(path)
         found = {name for name in archive.namelist() if name.startswith("binaries")}
         ends = {"windows": ".dll", "darwin": ".dylib", "linux": ".so"}
@@ -512,11 +502,11 @@ class TestPlatforms:
         assert archive.read("binaries/aarch64-windows/push.dll") == b"aarch64-windows ('-O1',)"
 
     def test_unknown_or_unbuildable_platforms_are_reported_without_files(self, tmp_path, monkeypatch):
-        with pytest.raises(PackageError, match=r"'windows' is not a platform .* x86_64-windows"):
-            generate_fmu(pushed(), tmp_path / "push.fmu", platforms=("windows",))
+        with pytest.raises(sc.PackageError, match=r"'windows' is not a platform .* x86_64-windows"):
+            sc.generate_fmu(pushed(), tmp_path / "push.fmu", platforms=("windows",))
         monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
-        with pytest.raises(BuildError, match=r"for aarch64-windows .* pip install 'scvi-codegen\[compiler\]'"):
-            generate_fmu(pushed(), tmp_path / "push.fmu", platforms=("aarch64-windows",))
+        with pytest.raises(sc.BuildError, match=r"for aarch64-windows .* pip install 'scvi-codegen\[compiler\]'"):
+            sc.generate_fmu(pushed(), tmp_path / "push.fmu", platforms=("aarch64-windows",))
         words = ["generate", "kepler", "--platform", "x86_64-windows", "-o", str(tmp_path / "kepler")]
         refused = CliRunner().invoke(main, words)
         assert (refused.exit_code, "--platform requires --fmu" in refused.output) == (2, True)
@@ -526,7 +516,7 @@ class TestPlatforms:
     def test_platform_binaries_export_all_functions(self, tmp_path):
         pytest.importorskip("ziglang", reason="pip install 'scvi-codegen[compiler]'")
         first, second = (
-            zipfile.ZipFile(generate_fmu(rod(), part / "rod.fmu", platforms=tuple(MAGIC)))
+            zipfile.ZipFile(sc.generate_fmu(rod(), part / "rod.fmu", platforms=tuple(MAGIC)))
             for part in _folders(tmp_path, "a", "b")
         )
         for name, begin in MAGIC.items():
@@ -542,13 +532,13 @@ class TestByFMPy:
 
     def test_fmpy_validates_the_model_and_the_schema(self, fmu, tmp_path):
         validation = pytest.importorskip("fmpy.validation", reason="FMPy is not installed")
-        path = generate_fmu(pushed(), tmp_path / "pushed.fmu")
+        path = sc.generate_fmu(pushed(), tmp_path / "pushed.fmu")
         assert validation.validate_fmu(str(path)) == []
 
     def test_fmpy_simulates_as_the_stepper(self, tmp_path):
         fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed")
         model = pushed()
-        path = generate_fmu(model, tmp_path / "pushed.fmu")
+        path = sc.generate_fmu(model, tmp_path / "pushed.fmu")
         signals = np.array([(0.5, 0.25), (9.9, 0.25)], dtype=[("time", float), ("u", float)])
         found = fmpy.simulate_fmu(str(path), start_values={"c": 0.3}, input=signals, output=["q", "p_q"])
         stepper = stepper_of(model)

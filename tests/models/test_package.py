@@ -11,17 +11,8 @@ import pytest
 from click.testing import CliRunner
 from programs import needs
 
+import scvi_codegen as sc
 from scvi_codegen.cli import main
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import BuildError, PackageError, StateError, StepFailedError
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.methods import SVI, Gauss
-from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_files.model_file import load_model
-from scvi_codegen.models.packages.package import generate_package, load_package
-from scvi_codegen.models.problems import problem
-from scvi_codegen.runtime.events.event import Event
-from scvi_codegen.tables.quadrature import Quadrature
 
 STRICT = "-O1 -std=c99 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror"
 
@@ -35,28 +26,28 @@ print(*map(float.hex, [*q, *p]))
 """
 
 
-def model_of(name: str, **changes: object) -> Model:
-    return replace(Model.from_problem(problem(name)), **changes)
+def model_of(name: str, **changes: object) -> sc.Model:
+    return replace(sc.Model.from_problem(sc.problem(name)), **changes)
 
 
 @pytest.fixture
-def pendulum() -> Model:
-    return model_of("planar-pendulum", method=SVI(3))
+def pendulum() -> sc.Model:
+    return model_of("planar-pendulum", method=sc.SVI(3))
 
 
 def test_folder_contains_a_complete_integrator(pendulum, tmp_path):
-    folder = generate_package(pendulum, tmp_path / "made" / "pendulum_svi")
+    folder = sc.generate_package(pendulum, tmp_path / "made" / "pendulum_svi")
     assert folder == tmp_path / "made" / "pendulum_svi"
     names = "Makefile README.md __init__.py interface.json main.c model.toml pendulum_svi.c pendulum_svi.h support"
     assert sorted(path.name for path in folder.iterdir()) == names.split()
-    assert load_model(folder / "model.toml") == pendulum
+    assert sc.load_model(folder / "model.toml") == pendulum
     assert "pendulum_svi_step" in (folder / "README.md").read_text()
 
 
 def test_a_single_file_computes_the_same_bits(tmp_path):
-    pendulum = model_of("planar-pendulum", method=SVI(3), steps=200, span=None)
-    many = generate_package(pendulum, tmp_path / "many" / "pendulum_svi")
-    single = generate_package(pendulum, tmp_path / "single" / "pendulum_svi", single_file=True)
+    pendulum = model_of("planar-pendulum", method=sc.SVI(3), steps=200, span=None)
+    many = sc.generate_package(pendulum, tmp_path / "many" / "pendulum_svi")
+    single = sc.generate_package(pendulum, tmp_path / "single" / "pendulum_svi", single_file=True)
     assert sorted(path.name for path in single.glob("*.[ch]")) == ["main.c", "pendulum_svi.c", "pendulum_svi.h"]
     assert not (single / "support").exists()
     strict = "CFLAGS=-O1 -ffp-contract=off -std=c11 -Wall -Wextra -Wpedantic -Werror"
@@ -66,17 +57,17 @@ def test_a_single_file_computes_the_same_bits(tmp_path):
     ]
     assert len(printed[0].splitlines()) > 20
     assert printed[0] == printed[1]
-    assert load_package(single).step([0.5], [0.0], 0.1) == load_package(many).step([0.5], [0.0], 0.1)
+    assert sc.load_package(single).step([0.5], [0.0], 0.1) == sc.load_package(many).step([0.5], [0.0], 0.1)
 
 
 def test_single_file_replaces_the_files_of_a_folder(pendulum, tmp_path):
-    folder = generate_package(pendulum, tmp_path / "pendulum_svi")
-    generate_package(pendulum, folder, single_file=True)
+    folder = sc.generate_package(pendulum, tmp_path / "pendulum_svi")
+    sc.generate_package(pendulum, folder, single_file=True)
     assert list(folder.glob("support/*/*")) == []
 
 
 def test_equal_models_give_equal_bytes(pendulum, tmp_path):
-    one, two = (generate_package(pendulum, tmp_path / parent / "same") for parent in ("a", "b"))
+    one, two = (sc.generate_package(pendulum, tmp_path / parent / "same") for parent in ("a", "b"))
     for path in filter(Path.is_file, one.rglob("*")):
         assert path.read_bytes() == (two / path.relative_to(one)).read_bytes()
 
@@ -84,10 +75,10 @@ def test_equal_models_give_equal_bytes(pendulum, tmp_path):
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["planar-pendulum", "kepler", "spherical-pendulum"])
 def test_package_steps_as_the_compiled_system_without_sympy(name, tmp_path):
-    model = model_of(name, method=Gauss(2))
-    stepper = compile_stepper(model.system, model.method)
+    model = model_of(name, method=sc.Gauss(2))
+    stepper = sc.compile_stepper(model.system, model.method)
     p = model.momenta(stepper)
-    folder = generate_package(model, tmp_path / "generated_stepper")
+    folder = sc.generate_package(model, tmp_path / "generated_stepper")
     script = WITHOUT_SYMPY.format(name=folder.name, q=list(model.q), p=list(map(float, p)), h=model.h)
     result = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=True)
     expected = np.concatenate(stepper.step(model.q, p, model.h))
@@ -95,10 +86,10 @@ def test_package_steps_as_the_compiled_system_without_sympy(name, tmp_path):
 
 
 def test_generated_c_is_compiled_unchanged(pendulum, tmp_path):
-    folder = generate_package(pendulum, tmp_path / "pendulum_svi")
+    folder = sc.generate_package(pendulum, tmp_path / "pendulum_svi")
     (folder / "pendulum_svi.c").write_text("#error edited\n")
-    with pytest.raises(BuildError, match="edited"):
-        load_package(folder)
+    with pytest.raises(sc.BuildError, match="edited"):
+        sc.load_package(folder)
 
 
 @pytest.mark.parametrize(
@@ -116,14 +107,14 @@ def test_generated_c_is_compiled_unchanged(pendulum, tmp_path):
 def test_c_program_falls_back_to_newton_where_the_fixed_point_fails(h, solver, reported, tmp_path):
     """Two stiff springs with forces: omega h = 5 and more, where the fixed-point iteration diverges."""
     needs("make", "cc")
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="springs",
         coordinates=["x", "y"],
         lagrangian="(x_dot**2 + y_dot**2)/2 - 50*(x**2 + y**2) - x**2*y**2",
         forces={"x": "-0.1*x_dot", "y": "cos(t) - 0.1*y_dot"},
     )
-    model = Model(system=system, method="svi:2", q=(1.0, 0.5), velocity=(0.0, 0.0), h=h, steps=20)
-    folder = generate_package(model, tmp_path / "springs_svi", solver=solver)
+    model = sc.Model(system=system, method="svi:2", q=(1.0, 0.5), velocity=(0.0, 0.0), h=h, steps=20)
+    folder = sc.generate_package(model, tmp_path / "springs_svi", solver=solver)
     command = ["make", "-s", "-C", str(folder), "run", f"CFLAGS={STRICT}"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if reported:
@@ -132,10 +123,12 @@ def test_c_program_falls_back_to_newton_where_the_fixed_point_fails(h, solver, r
         return
     assert result.returncode == 0
     table = np.array([line.split() for line in result.stdout.splitlines() if line[0] != "#"], dtype=float)
-    run = compile_stepper(system, "svi:2", solver="newton").integrate(model.q, velocity=model.velocity, h=h, steps=20)
+    run = sc.compile_stepper(system, "svi:2", solver="newton").integrate(
+        model.q, velocity=model.velocity, h=h, steps=20
+    )
     assert np.abs(table[:, 1:-1] - np.hstack([run.q, run.p])).max() < 1e-9
-    with pytest.raises(StepFailedError):
-        compile_stepper(system, "svi:2", solver="fixed-point").step(model.q, run.p[0], h)
+    with pytest.raises(sc.StepFailedError):
+        sc.compile_stepper(system, "svi:2", solver="fixed-point").step(model.q, run.p[0], h)
 
 
 KINDS = """
@@ -173,9 +166,9 @@ def test_every_kind_of_folder_is_built_without_a_warning(words, tmp_path):
 def test_examples_print_at_most_twenty_states_up_to_the_end(steps, lines, tmp_path):
     """41 steps: 13 states of 3 steps each, and one of 2."""
     needs("make", "cc")
-    events = (Event("q1"),) if steps == 41 else ()
-    model = replace(model_of("kepler", h=0.01, span=None, steps=steps, method=SVI(2)), events=events)
-    folder = generate_package(model, tmp_path / "orbit")
+    events = (sc.Event("q1"),) if steps == 41 else ()
+    model = replace(model_of("kepler", h=0.01, span=None, steps=steps, method=sc.SVI(2)), events=events)
+    folder = sc.generate_package(model, tmp_path / "orbit")
     command = ["make", "-s", "-C", str(folder), "run", f"CFLAGS={STRICT} -O0"]
     printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
     times = [float(line.split()[0]) for line in printed if line[0] != "#"]
@@ -186,15 +179,15 @@ def test_examples_print_at_most_twenty_states_up_to_the_end(steps, lines, tmp_pa
 
 
 def test_large_workspaces_are_not_on_the_stack(tmp_path):
-    text = (generate_package(model_of("kepler"), tmp_path / "kepler_svi") / "main.c").read_text()
+    text = (sc.generate_package(model_of("kepler"), tmp_path / "kepler_svi") / "main.c").read_text()
     assert "static double workspace[" in text
     assert "static kepler_svi_run run;" in text
 
 
 def test_user_names_do_not_occur_in_the_program(tmp_path):
-    base = model_of("planar-pendulum", method=SVI(1))
+    base = model_of("planar-pendulum", method=sc.SVI(1))
     model = replace(base, system=replace(base.system, name='*/ #error " ? \\\n """ evil'))
-    folder = generate_package(model, tmp_path / "pendulum_svi")
+    folder = sc.generate_package(model, tmp_path / "pendulum_svi")
     command = ["make", "-s", "-C", str(folder), "run", f"CFLAGS={STRICT}"]
     assert subprocess.run(command, capture_output=True, text=True, check=False).returncode == 0
     subprocess.run([sys.executable, "-c", "import pendulum_svi"], cwd=tmp_path, check=True)
@@ -206,16 +199,16 @@ def test_foreign_and_edited_files_require_force(pendulum, tmp_path, name):
     folder = tmp_path / "pendulum_svi"
     folder.mkdir()
     (folder / name).write_text("mine")
-    with pytest.raises(PackageError, match="force"):
-        generate_package(pendulum, folder)
+    with pytest.raises(sc.PackageError, match="force"):
+        sc.generate_package(pendulum, folder)
     assert [(path.name, path.read_text()) for path in folder.iterdir()] == [(name, "mine")]
-    generate_package(pendulum, folder, force=True)
-    generate_package(replace(pendulum, h=0.125), folder)  # they are ours now
+    sc.generate_package(pendulum, folder, force=True)
+    sc.generate_package(replace(pendulum, h=0.125), folder)  # they are ours now
     if name != "interface.json":
         with (folder / name).open("a") as file:
             file.write("\n")
-        with pytest.raises(PackageError, match="edited"):
-            generate_package(pendulum, folder)
+        with pytest.raises(sc.PackageError, match="edited"):
+            sc.generate_package(pendulum, folder)
 
 
 @pytest.mark.parametrize(
@@ -233,66 +226,66 @@ def test_foreign_and_edited_files_require_force(pendulum, tmp_path, name):
     ],
 )
 def test_unsuitable_folder_names_are_rejected_with_a_suggestion(pendulum, tmp_path, name, hint):
-    with pytest.raises(PackageError, match=f"'{hint}'"):
-        generate_package(pendulum, tmp_path / name)
+    with pytest.raises(sc.PackageError, match=f"'{hint}'"):
+        sc.generate_package(pendulum, tmp_path / name)
     assert not (tmp_path / name).exists()
 
 
 def test_dot_is_the_current_folder(pendulum, tmp_path, monkeypatch):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    generate_package(pendulum, ".")
+    sc.generate_package(pendulum, ".")
     assert (tmp_path / "here" / "here.c").is_file()
 
 
 def test_unwritable_folders_are_named(pendulum, tmp_path):
     (tmp_path / "taken").write_text("a file")
-    with pytest.raises(PackageError, match="taken"):
-        generate_package(pendulum, tmp_path / "taken")
+    with pytest.raises(sc.PackageError, match="taken"):
+        sc.generate_package(pendulum, tmp_path / "taken")
 
 
 def test_methods_without_text_form_are_generated_without_a_model_file(pendulum, tmp_path):
-    own = Quadrature(name="mine", points=(-0.5, 0.5), weights=(1, 1))
-    folder = generate_package(replace(pendulum, method=SVI(1, own)), tmp_path / "own")
+    own = sc.Quadrature(name="mine", points=(-0.5, 0.5), weights=(1, 1))
+    folder = sc.generate_package(replace(pendulum, method=sc.SVI(1, own)), tmp_path / "own")
     assert not (folder / "model.toml").exists()
-    assert load_package(folder).dimension == 1
+    assert sc.load_package(folder).dimension == 1
 
 
 def test_files_of_an_older_integrator_are_removed(pendulum, tmp_path):
-    folder = generate_package(pendulum, tmp_path / "pendulum_svi")
+    folder = sc.generate_package(pendulum, tmp_path / "pendulum_svi")
     (folder / "certificate.json").write_text("{}")
     (folder / "notes.txt").write_text("mine")
-    generate_package(pendulum, folder)  # the same code: what was measured of it holds
+    sc.generate_package(pendulum, folder)  # the same code: what was measured of it holds
     assert (folder / "certificate.json").exists()
-    generate_package(replace(pendulum, method=SVI(2)), folder, embedded="double")
+    sc.generate_package(replace(pendulum, method=sc.SVI(2)), folder, embedded="double")
     assert not (folder / "certificate.json").exists()
     assert not (folder / "__init__.py").exists()
     assert (folder / "notes.txt").read_text() == "mine"
 
 
 def test_outdated_edited_file_is_preserved(pendulum, tmp_path):
-    folder = generate_package(pendulum, tmp_path / "pendulum_svi")
+    folder = sc.generate_package(pendulum, tmp_path / "pendulum_svi")
     (folder / "__init__.py").write_text("# mine\n")
-    with pytest.raises(PackageError, match=r"__init__\.py was edited"):
-        generate_package(pendulum, folder, embedded="double")
+    with pytest.raises(sc.PackageError, match=r"__init__\.py was edited"):
+        sc.generate_package(pendulum, folder, embedded="double")
     record = json.loads((folder / "interface.json").read_text())
     record["files"] = {"../outside": "0"}
     (tmp_path / "outside").write_text("not ours")
     (folder / "interface.json").write_text(json.dumps(record))
-    generate_package(pendulum, folder, force=True)
+    sc.generate_package(pendulum, folder, force=True)
     assert (tmp_path / "outside").exists()
 
 
 def test_velocities_without_momenta_are_rejected(tmp_path):
     model = model_of("relativistic-particle", velocity=(2.0,))
-    with pytest.raises(StateError, match="no momenta"):
-        generate_package(model, tmp_path / "too_fast")
+    with pytest.raises(sc.StateError, match="no momenta"):
+        sc.generate_package(model, tmp_path / "too_fast")
 
 
 def test_foreign_folders_are_named(pendulum, tmp_path):
-    with pytest.raises(PackageError, match="not a generated package"):
-        load_package(tmp_path)
-    folder = generate_package(pendulum, tmp_path / "pendulum_svi")
+    with pytest.raises(sc.PackageError, match="not a generated package"):
+        sc.load_package(tmp_path)
+    folder = sc.generate_package(pendulum, tmp_path / "pendulum_svi")
     path = folder / "interface.json"
     record = json.loads(path.read_text())
     for text, message in (
@@ -304,9 +297,9 @@ def test_foreign_folders_are_named(pendulum, tmp_path):
         (json.dumps(record | {"interface": record["interface"] | {"unknowns": 7}}), "damaged"),
     ):
         path.write_text(text)
-        with pytest.raises(PackageError, match=message):
-            load_package(folder)
+        with pytest.raises(sc.PackageError, match=message):
+            sc.load_package(folder)
     path.write_text(json.dumps(record))
     Path(folder / "pendulum_svi.h").unlink()
-    with pytest.raises(PackageError, match=r"pendulum_svi\.h"):
-        load_package(folder)
+    with pytest.raises(sc.PackageError, match=r"pendulum_svi\.h"):
+        sc.load_package(folder)

@@ -9,23 +9,16 @@ import numpy as np
 import pytest
 from matplotlib import pyplot
 
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import PlotError, StateError
+import scvi_codegen as sc
 from scvi_codegen.mechanics.symmetry.sampling import bodies
-from scvi_codegen.methods import SVI, StoermerVerlet
-from scvi_codegen.models.model import Model
-from scvi_codegen.models.problems import problem
 from scvi_codegen.pictures.canvas import check_plot_path
 from scvi_codegen.pictures.conserved import largest_in_bins, plot_energy, plot_momentum_maps
-from scvi_codegen.pictures.overview import plot_motion, plot_phase, plot_section, plot_trajectory
-from scvi_codegen.runtime.events.event import Event
-from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 
-def trajectory_of(name: str, steps: int = 300, h: float | None = None) -> Trajectory:
-    model = replace(Model.from_problem(problem(name)), method=StoermerVerlet())
+def trajectory_of(name: str, steps: int = 300, h: float | None = None) -> sc.Trajectory:
+    model = replace(sc.Model.from_problem(sc.problem(name)), method=sc.StoermerVerlet())
     model = replace(model, h=(model.h if h is None else h) / 4)
-    return model.start(compile_stepper(model.system, model.method)).record(steps)
+    return model.start(sc.compile_stepper(model.system, model.method)).record(steps)
 
 
 @pytest.fixture(autouse=True)
@@ -35,15 +28,15 @@ def _closed() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def kepler() -> Trajectory:
+def kepler() -> sc.Trajectory:
     return trajectory_of("kepler")
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
 def test_equal_trajectories_give_equal_bytes(kepler, tmp_path, suffix):
     one, two = tmp_path / f"one{suffix}", tmp_path / f"two{suffix}"
-    plot_trajectory(kepler, one)
-    plot_trajectory(kepler, two)
+    sc.plot_trajectory(kepler, one)
+    sc.plot_trajectory(kepler, two)
     assert one.read_bytes() == two.read_bytes()
     assert one.read_bytes().startswith({".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF"}[suffix])
 
@@ -60,14 +53,14 @@ def test_equal_trajectories_give_equal_bytes(kepler, tmp_path, suffix):
     ],
 )
 def test_each_kind_of_system_has_its_panels(name, titles):
-    figure = plot_trajectory(trajectory_of(name))[0].figure
+    figure = sc.plot_trajectory(trajectory_of(name))[0].figure
     assert [axes.get_title() for axes in figure.axes if axes.get_title()] == titles
     assert figure.axes[len(titles) - 1].get_yscale() == "log"
 
 
 def test_bodies_are_named_in_the_legend_and_drawn_where_they_are():
     trajectory = trajectory_of("outer-solar-system")
-    figure = plot_trajectory(trajectory)[0].figure
+    figure = sc.plot_trajectory(trajectory)[0].figure
     for axes, columns in zip(figure.axes[:2], ((3, 4), (3, 5)), strict=True):  # Jupiter in the planes x y and x z
         first, last = trajectory.q[[0, -1]][:, columns]
         drawn = [line.get_xydata()[0] for line in axes.get_lines() if len(line.get_xydata()) == 1]  # ends of curves
@@ -80,15 +73,15 @@ def test_bodies_are_named_in_the_legend_and_drawn_where_they_are():
 @pytest.mark.parametrize("name", ["kepler", "planar-pendulum", "fput-chain:12"])
 @pytest.mark.parametrize("steps", [0, 1])
 def test_a_single_state_can_be_drawn(name, steps, tmp_path):
-    plot_trajectory(trajectory_of(name, steps), tmp_path / "short.png")
+    sc.plot_trajectory(trajectory_of(name, steps), tmp_path / "short.png")
 
 
 def test_a_run_backward_can_be_drawn(tmp_path):
-    plot_trajectory(trajectory_of("fput-chain:12", h=-0.1), tmp_path / "back.svg")
+    sc.plot_trajectory(trajectory_of("fput-chain:12", h=-0.1), tmp_path / "back.svg")
 
 
 def test_an_exactly_conserved_energy_can_be_drawn(tmp_path):
-    plot_trajectory(trajectory_of("charged-particle", 2), tmp_path / "exact.png")
+    sc.plot_trajectory(trajectory_of("charged-particle", 2), tmp_path / "exact.png")
 
 
 def test_energy_error_is_the_largest_of_each_bin():
@@ -122,48 +115,48 @@ def test_coordinates_are_grouped_into_bodies(names, expected):
 
 
 def test_unknown_suffix_and_missing_matplotlib_fail_before_the_run(monkeypatch):
-    with pytest.raises(StateError, match=r"\.png, \.svg or \.pdf"):
+    with pytest.raises(sc.StateError, match=r"\.png, \.svg or \.pdf"):
         check_plot_path("orbit.gif")
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "matplotlib" else find(name))
-    with pytest.raises(PlotError, match=r"pip install 'scvi-codegen\[plot\]'"):
+    with pytest.raises(sc.PlotError, match=r"pip install 'scvi-codegen\[plot\]'"):
         check_plot_path("orbit.png")
 
 
 def test_failed_picture_leaves_no_file(kepler, tmp_path, monkeypatch):
-    def fail(trajectory: Trajectory, ax: object) -> None:
+    def fail(trajectory: sc.Trajectory, ax: object) -> None:
         raise RuntimeError("no picture")
 
     monkeypatch.setattr("scvi_codegen.pictures.overview.plot_energy", fail)
     with pytest.raises(RuntimeError, match="no picture"):
-        plot_trajectory(kepler, tmp_path / "orbit.png")
+        sc.plot_trajectory(kepler, tmp_path / "orbit.png")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_dollar_signs_in_names_are_escaped(tmp_path):
-    model = Model.from_problem(problem("planar-pendulum"))
+    model = sc.Model.from_problem(sc.problem("planar-pendulum"))
     system = replace(model.system, name="a $ b $ {")
-    stepper = compile_stepper(system, SVI(1))
-    plot_trajectory(stepper.integrate([0.5], [0.0], h=0.1, steps=10), tmp_path / "dollar.png")
+    stepper = sc.compile_stepper(system, sc.SVI(1))
+    sc.plot_trajectory(stepper.integrate([0.5], [0.0], h=0.1, steps=10), tmp_path / "dollar.png")
 
 
 @pytest.fixture(scope="module")
-def orbits() -> list[Trajectory]:
-    system = problem("henon-heiles").system
-    stepper = compile_stepper(system, StoermerVerlet(), flags=("-O0",), events=["y", Event("x", 1)])
+def orbits() -> list[sc.Trajectory]:
+    system = sc.problem("henon-heiles").system
+    stepper = sc.compile_stepper(system, sc.StoermerVerlet(), flags=("-O0",), events=["y", sc.Event("x", 1)])
     return [stepper.integrate([0.0, y], [0.3, 0.0], h=0.1, steps=3000) for y in (-0.1, 0.2)]
 
 
 def test_section_contains_the_states_at_the_crossings(orbits, tmp_path):
-    axes = plot_section(orbits, axes=("y", "p_y"), event=1)
+    axes = sc.plot_section(orbits, axes=("y", "p_y"), event=1)
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("y", "p_y")
     assert axes.get_title() == "Henon-Heiles system: x = 0, rising"
     for line, orbit in zip(axes.get_lines(), orbits, strict=True):
         assert len(line.get_xdata()) > 40
         assert np.array_equal(line.get_xydata(), np.stack([orbit.events[1].q[:, 1], orbit.events[1].p[:, 1]], axis=1))
     one, two = tmp_path / "one.png", tmp_path / "two.png"
-    plot_section(orbits, one, axes=("y", "p_y"), event=1)
-    plot_section(orbits, two, axes=("y", "p_y"), event=1)
+    sc.plot_section(orbits, one, axes=("y", "p_y"), event=1)
+    sc.plot_section(orbits, two, axes=("y", "p_y"), event=1)
     assert one.read_bytes() == two.read_bytes()
 
 
@@ -172,13 +165,13 @@ def test_section_contains_the_states_at_the_crossings(orbits, tmp_path):
     [({"axes": ("y", "z")}, "'z' is neither"), ({"axes": ("y", "p_y"), "event": 2}, "no event 2")],
 )
 def test_section_reports_missing_arguments(orbits, arguments, words, tmp_path):
-    with pytest.raises(StateError, match=words):
-        plot_section(orbits[0], tmp_path / "section.png", **arguments)
+    with pytest.raises(sc.StateError, match=words):
+        sc.plot_section(orbits[0], tmp_path / "section.png", **arguments)
 
 
 @pytest.fixture(scope="module")
-def ellipse() -> Trajectory:
-    stepper = compile_stepper(problem("kepler").system, SVI(4), flags=("-O0",))
+def ellipse() -> sc.Trajectory:
+    stepper = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(4), flags=("-O0",))
     run = stepper.integrate([0.5, 0.0], [0.0, 3**0.5], t_end=6.0, tolerance=1e-4)
     assert len(run) < 200
     return run
@@ -195,7 +188,7 @@ class TestAdaptiveSteps:
     def test_images_have_cells_of_the_lengths_of_the_steps(self):
         chain = trajectory_of("fput-chain:12", 3)
         run = replace(chain, t=chain.t**2)
-        (image,) = plot_motion(run).collections
+        (image,) = sc.plot_motion(run).collections
         edges = np.asarray(image.get_coordinates())[0, :, 0]
         assert edges[1:-1] == pytest.approx((run.t[1:] + run.t[:-1]) / 2)
 
@@ -205,7 +198,7 @@ class TestAdaptiveSteps:
         assert (ellipse["q2_dot"] == ellipse.velocity[:, 1]).all()
         assert (ellipse["t"] == ellipse.t).all()
         assert (ellipse["energy"] == ellipse.energy()).all()
-        with pytest.raises(StateError, match=r"there is no quantity 'q3'.*Known: q1, q2, p_q1"):
+        with pytest.raises(sc.StateError, match=r"there is no quantity 'q3'.*Known: q1, q2, p_q1"):
             ellipse["q3"]
 
     def test_ensembles_are_drawn_together(self, ellipse, tmp_path):
@@ -228,10 +221,10 @@ class TestAdaptiveSteps:
 class TestOnePicture:
     def test_picture_is_drawn_on_the_supplied_axes(self, kepler, orbits):
         _, given = pyplot.subplots(2, 2)
-        assert plot_motion(kepler, ax=given[0, 0]) is given[0, 0]
+        assert sc.plot_motion(kepler, ax=given[0, 0]) is given[0, 0]
         assert plot_energy(kepler, ax=given[0, 1]) is given[0, 1]
-        assert plot_phase(kepler, axes=("q2", "p_q1"), ax=given[1, 0]) is given[1, 0]
-        assert plot_section(orbits, axes=("y", "p_y"), ax=given[1, 1]) is given[1, 1]
+        assert sc.plot_phase(kepler, axes=("q2", "p_q1"), ax=given[1, 0]) is given[1, 0]
+        assert sc.plot_section(orbits, axes=("y", "p_y"), ax=given[1, 1]) is given[1, 1]
         assert all(axes.lines for axes in given.flat)
 
     def test_without_axes_a_figure_is_returned(self, kepler):
@@ -245,14 +238,14 @@ class TestOnePicture:
         assert pyplot.get_fignums() == []
 
     def test_phase_portrait_has_one_curve_per_orbit(self, orbits):
-        axes = plot_phase(orbits, axes=("y", "p_y"))
+        axes = sc.plot_phase(orbits, axes=("y", "p_y"))
         assert (axes.get_xlabel(), axes.get_ylabel()) == ("y", "p_y")
         drawn = [line for line in axes.lines if len(line.get_xdata()) > 2]
         for line, orbit in zip(drawn, orbits, strict=True):
             assert np.array_equal(line.get_xydata(), np.stack([orbit.q[:, 1], orbit.p[:, 1]], axis=1))
 
     def test_phase_portrait_is_that_of_the_first_coordinate_by_default(self, orbits):
-        axes = plot_phase(orbits[0])
+        axes = sc.plot_phase(orbits[0])
         assert (axes.get_xlabel(), axes.get_ylabel()) == ("x", "p_x")
 
     def test_energies_of_several_runs_share_axes_that_contain_them(self, orbits):
@@ -270,9 +263,9 @@ class TestOnePicture:
         assert [np.nanmax(line.get_ydata()) for line in axes.lines] == list(largest)
 
     def test_unsupported_pictures_are_reported(self, kepler, orbits):
-        with pytest.raises(StateError, match="'Henon-Heiles system' has no known symmetry"):
+        with pytest.raises(sc.StateError, match="'Henon-Heiles system' has no known symmetry"):
             plot_momentum_maps(orbits[0])
-        with pytest.raises(StateError, match="'z' is neither a coordinate nor a momentum"):
-            plot_phase(kepler, axes=("q1", "z"))
-        with pytest.raises(StateError, match="no trajectory"):
-            plot_phase([])
+        with pytest.raises(sc.StateError, match="'z' is neither a coordinate nor a momentum"):
+            sc.plot_phase(kepler, axes=("q1", "z"))
+        with pytest.raises(sc.StateError, match="no trajectory"):
+            sc.plot_phase([])

@@ -10,19 +10,7 @@ import pytest
 import sympy
 from scipy.integrate import solve_ivp
 
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.legendre import hamiltonian_of
-from scvi_codegen.methods import (
-    SCVI,
-    SVI,
-    ChebyshevGauss,
-    Composition,
-    Gauss,
-    LobattoIIIA,
-    RadauIIA,
-    SpectralCollocation,
-    StoermerVerlet,
-)
+import scvi_codegen as sc
 
 SPAN = 2.0
 
@@ -30,7 +18,7 @@ SPAN = 2.0
 @cache
 def cart_pole():
     """A motor on the cart, friction in the joint, drag by the square of the cart's speed."""
-    return LagrangianSystem.from_text(
+    return sc.LagrangianSystem.from_text(
         name="cart and pole with a motor",
         coordinates=["x", "theta"],
         lagrangian="(M + m)*x_dot**2/2 + m*l*x_dot*theta_dot*cos(theta) + m*l**2*theta_dot**2/2 + m*g*l*cos(theta)",
@@ -44,7 +32,7 @@ def cart_pole():
 def radial():
     """Friction along the radius, a mass that depends on place: no torque."""
     drag = "-c*{0}*(x*x_dot + y*y_dot)*(1 + x_dot**2 + y_dot**2)/(x**2 + y**2)"
-    return LagrangianSystem.from_text(
+    return sc.LagrangianSystem.from_text(
         name="radial friction",
         coordinates=["x", "y"],
         lagrangian="(x_dot**2 + y_dot**2)*(1 + x**2 + y**2)/2 + 1/sqrt(x**2 + y**2)",
@@ -84,27 +72,27 @@ def derivative(stepper, build, counts):
 
 
 QUICK = [
-    (SVI(3), 6, (20, 40)),
-    (SVI(2, "gauss-lobatto:3"), 4, (40, 80)),
-    (SCVI(3), 6, (20, 40)),
-    (SpectralCollocation(4), 4, (40, 80)),
+    (sc.SVI(3), 6, (20, 40)),
+    (sc.SVI(2, "gauss-lobatto:3"), 4, (40, 80)),
+    (sc.SCVI(3), 6, (20, 40)),
+    (sc.SpectralCollocation(4), 4, (40, 80)),
 ]
 FULL = [
-    (SVI(1), 2, (80, 160)),
-    (SVI(4), 8, (10, 20)),
-    (SVI(4, "gauss-legendre:6"), 8, (7, 14)),
-    (SCVI(1), 2, (80, 160)),
-    (SCVI(2), 4, (40, 80)),
-    (SCVI(4), 8, (10, 20)),
-    (SCVI(3, abscissae="gauss"), 6, (20, 40)),
-    (SCVI(3, nodes="legendre-lobatto"), 6, (20, 40)),
-    (SpectralCollocation(3, form="phase-space"), 3, (80, 160)),
-    (Gauss(2), 4, (40, 80)),
-    (Gauss(3, form="position"), 6, (20, 40)),
-    (RadauIIA(3), 5, (40, 80)),
-    (LobattoIIIA(3), 4, (40, 80)),
-    (ChebyshevGauss(3), 4, (40, 80)),
-    (StoermerVerlet(), 2, (160, 320)),
+    (sc.SVI(1), 2, (80, 160)),
+    (sc.SVI(4), 8, (10, 20)),
+    (sc.SVI(4, "gauss-legendre:6"), 8, (7, 14)),
+    (sc.SCVI(1), 2, (80, 160)),
+    (sc.SCVI(2), 4, (40, 80)),
+    (sc.SCVI(4), 8, (10, 20)),
+    (sc.SCVI(3, abscissae="gauss"), 6, (20, 40)),
+    (sc.SCVI(3, nodes="legendre-lobatto"), 6, (20, 40)),
+    (sc.SpectralCollocation(3, form="phase-space"), 3, (80, 160)),
+    (sc.Gauss(2), 4, (40, 80)),
+    (sc.Gauss(3, form="position"), 6, (20, 40)),
+    (sc.RadauIIA(3), 5, (40, 80)),
+    (sc.LobattoIIIA(3), 4, (40, 80)),
+    (sc.ChebyshevGauss(3), 4, (40, 80)),
+    (sc.StoermerVerlet(), 2, (160, 320)),
 ]
 
 
@@ -132,10 +120,12 @@ def test_order_of_every_method_is_that_without_forces(quickly_compiled, case):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("method", [SVI(3), Gauss(3), SpectralCollocation(4, form="phase-space")], ids=lambda m: m.name)
+@pytest.mark.parametrize(
+    "method", [sc.SVI(3), sc.Gauss(3), sc.SpectralCollocation(4, form="phase-space")], ids=lambda m: m.name
+)
 def test_hamiltonian_with_forces_has_the_same_step(quickly_compiled, method):
     system = radial()
-    own, other = (quickly_compiled(each, method) for each in (system, hamiltonian_of(system)))
+    own, other = (quickly_compiled(each, method) for each in (system, sc.hamiltonian_of(system)))
     q, v = STATES[radial]
     p = own.momentum(q, v)
     for one, two in zip(own.step(q, p, 0.1), other.step(q, p, 0.1), strict=True):
@@ -144,11 +134,11 @@ def test_hamiltonian_with_forces_has_the_same_step(quickly_compiled, method):
 
 def test_compositions_accept_forces_of_position_and_time(quickly_compiled):
     """x'' = -x + sin(2 t): the solution from rest is (2 sin t - sin 2t) / 3."""
-    system = LagrangianSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="pushed", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2", forces={"x": "sin(2*t)"}
     )
     errors = []
     for count in (4, 8):
-        run = quickly_compiled(system, Composition(8)).integrate([0.0], [0.0], h=SPAN / count, steps=count)
+        run = quickly_compiled(system, sc.Composition(8)).integrate([0.0], [0.0], h=SPAN / count, steps=count)
         errors.append(abs(run.q[-1, 0] - (2 * np.sin(SPAN) - np.sin(2 * SPAN)) / 3))
     assert np.log2(errors[0] / errors[1]) == pytest.approx(8, abs=0.4), errors

@@ -12,28 +12,22 @@ from fuzzing import guarded
 from mpmath import mp, mpc
 from samples import QUICK_FLAGS, stepper_for
 
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation, StoermerVerlet
-from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.core.stepper import Stepper
+import scvi_codegen as sc
 from scvi_codegen.runtime.run.saving import sealed, unsealed
 
 Q, P = np.array([1.0, 0.25]), np.array([0.0, 1.0])
-REFUSED = (StateError, StepFailedError)
+REFUSED = (sc.StateError, sc.StepFailedError)
 
 
-def prepared(stepper: Stepper) -> Stepper:
+def prepared(stepper: sc.Stepper) -> sc.Stepper:
     """Compile in advance all code that is compiled on demand."""
     stepper.prepare()
     return stepper
 
 
 @pytest.fixture(scope="module")
-def kepler() -> Stepper:
-    return prepared(stepper_for("kepler", SVI(3)))
+def kepler() -> sc.Stepper:
+    return prepared(stepper_for("kepler", sc.SVI(3)))
 
 
 # Layouts, types and shapes.
@@ -93,7 +87,7 @@ WRONG: dict[str, Callable[[np.ndarray], Any]] = {
 }
 
 
-def calls(stepper: Stepper) -> dict[str, Callable[[Any, Any], Any]]:
+def calls(stepper: sc.Stepper) -> dict[str, Callable[[Any, Any], Any]]:
     """Everything that takes a state, as a function of the two vectors; the result as one array."""
     return {
         "step": lambda q, p: np.hstack(stepper.step(q, p, 0.125)),
@@ -132,7 +126,7 @@ def test_ensembles_in_any_container_are_accepted_and_others_rejected(kepler):
         with pytest.raises(REFUSED):
             pytest.fail(f"{what} gave {final([WRONG[what](row) for row in q], p)}")
     masked = np.ma.array(q, mask=q > 2)
-    with pytest.raises(StateError, match="masked"):
+    with pytest.raises(sc.StateError, match="masked"):
         final(masked, p)
 
 
@@ -164,11 +158,11 @@ def test_real_numbers_are_required(what, kepler):
         lambda: kepler.integrate(Q, P, h=0.1, steps=value),
         lambda: kepler.integrate(Q, P, h=0.1, steps=4, save_every=value),
         lambda: kepler.integrate_ensemble([Q], [P], h=value, steps=1),
-        lambda: SolverOptions(tolerance=value),
-        lambda: SolverOptions(max_iterations=value),
-        lambda: SolverOptions(absolute=value),
+        lambda: sc.SolverOptions(tolerance=value),
+        lambda: sc.SolverOptions(max_iterations=value),
+        lambda: sc.SolverOptions(absolute=value),
     ):
-        with pytest.raises(StateError), guarded():
+        with pytest.raises(sc.StateError), guarded():
             call()
 
 
@@ -197,11 +191,11 @@ def test_real_numbers_are_required(what, kepler):
     ],
 )
 def test_wrong_types_are_rejected_by_name(call, kepler):
-    with pytest.raises(StateError), guarded():
+    with pytest.raises(sc.StateError), guarded():
         call(kepler)
 
 
-@pytest.mark.parametrize("method", [SVI(3), StoermerVerlet()], ids=lambda method: method.name)
+@pytest.mark.parametrize("method", [sc.SVI(3), sc.StoermerVerlet()], ids=lambda method: method.name)
 def test_damaged_bytes_of_a_run_are_rejected_or_bounded(method):
     """Behind a right checksum."""
     stepper = prepared(stepper_for("kepler", method))
@@ -210,7 +204,7 @@ def test_damaged_bytes_of_a_run_are_rejected_or_bounded(method):
     memory, random = len(run.snapshot), Random(5)
     before, saved = (whole := unsealed(run.checkpoint()))[:-memory], whole[-memory:]
     for byte in (b"\0", b"\xff", b"\x7f"):
-        with pytest.raises(StateError, match=r"invalid saved run|the saved run has adaptive steps"):
+        with pytest.raises(sc.StateError, match=r"invalid saved run|the saved run has adaptive steps"):
             stepper.from_checkpoint(sealed(before + byte * len(saved)))
     for _ in range(300):
         damaged = bytearray(saved)
@@ -247,10 +241,10 @@ SIZES = [
 ]
 
 
-def oscillator(kind: str) -> LagrangianSystem | HamiltonianSystem:
+def oscillator(kind: str) -> sc.LagrangianSystem | sc.HamiltonianSystem:
     if kind == "hamiltonian":
-        return HamiltonianSystem.from_text(name="o", coordinates=["q"], hamiltonian="p_q**2/2 + q**2/2")
-    return LagrangianSystem.from_text(name="o", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2")
+        return sc.HamiltonianSystem.from_text(name="o", coordinates=["q"], hamiltonian="p_q**2/2 + q**2/2")
+    return sc.LagrangianSystem.from_text(name="o", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2")
 
 
 def exact_step(q: float, p: float, h: float, steps: int) -> complex:
@@ -266,7 +260,7 @@ def rounding(q: float, p: float, h: float) -> float:
     return 5e-13 * ((float(abs(q)) + float(abs(p))) * (1.0 + abs(h))) + 1e-319 * (1.0 + abs(h)) ** 2
 
 
-def check_oscillator(stepper: Stepper, random: Random) -> bool:
+def check_oscillator(stepper: sc.Stepper, random: Random) -> bool:
     """Return whether a run from a random state was completed; check its end."""
     q, p = (
         random.choice((-1, 1)) * random.choice(SIZES) * random.choice((1.0, random.uniform(0.5, 1.0))) for _ in "qp"
@@ -277,7 +271,7 @@ def check_oscillator(stepper: Stepper, random: Random) -> bool:
     steps = random.choice((1, 1, 5))
     with guarded(), warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.simplefilter("ignore", AccuracyWarning)
+        warnings.simplefilter("ignore", sc.AccuracyWarning)
         try:
             if steps == 1:
                 found = complex(*(x[0] for x in stepper.step([q], [p], h)))
@@ -297,14 +291,14 @@ def check_oscillator(stepper: Stepper, random: Random) -> bool:
 @pytest.mark.parametrize("kind", ["lagrangian", "hamiltonian"])
 def test_oscillator_of_any_size_with_any_step_is_correct_or_rejected(kind, solver, request):
     """SVI(2) with two Gauss points is the two-stage Gauss method, and on the oscillator a rational function of h."""
-    stepper = prepared(compile_stepper(oscillator(kind), SVI(2), solver=solver, flags=QUICK_FLAGS))
+    stepper = prepared(sc.compile_stepper(oscillator(kind), sc.SVI(2), solver=solver, flags=QUICK_FLAGS))
     random = Random(11)
     done = sum(check_oscillator(stepper, random) for _ in range(400))
     assert done > 100
 
 
 def test_ensemble_with_any_sizes_is_correct_or_reports_failures():
-    stepper = prepared(compile_stepper(oscillator("lagrangian"), SVI(2), flags=QUICK_FLAGS))
+    stepper = prepared(sc.compile_stepper(oscillator("lagrangian"), sc.SVI(2), flags=QUICK_FLAGS))
     random = Random(3)
     q, p = (np.array([[random.choice((-1, 1)) * random.choice(SIZES)] for _ in range(200)]) for _ in "qp")
     for h in (1e-310, 1e-3, 0.7, -1.0, 40.0, 1e8):
@@ -318,12 +312,12 @@ def test_ensemble_with_any_sizes_is_correct_or_reports_failures():
 
 
 NONLINEAR = [
-    ("kepler", SVI(3)),
-    ("double-pendulum", SCVI(2)),
-    ("planar-pendulum", Gauss(2)),
-    ("charged-particle", SpectralCollocation(2, form="position")),
-    ("cart-pole", SVI(2)),
-    ("kepler", StoermerVerlet()),
+    ("kepler", sc.SVI(3)),
+    ("double-pendulum", sc.SCVI(2)),
+    ("planar-pendulum", sc.Gauss(2)),
+    ("charged-particle", sc.SpectralCollocation(2, form="position")),
+    ("cart-pole", sc.SVI(2)),
+    ("kepler", sc.StoermerVerlet()),
 ]
 
 
@@ -339,7 +333,7 @@ def check_nonlinear(name: str, method: Any, random: Random) -> bool:
     for stepper in steppers:
         with guarded(), warnings.catch_warnings():
             warnings.simplefilter("error")
-            warnings.simplefilter("ignore", AccuracyWarning)
+            warnings.simplefilter("ignore", sc.AccuracyWarning)
             try:
                 found.append(np.hstack(stepper.step(q, p, h)))
             except REFUSED:
@@ -362,7 +356,7 @@ def test_any_state_gives_a_finite_step_or_is_rejected(name, method):
 def test_any_state_full_sample():
     for kind in ("lagrangian", "hamiltonian"):
         for solver in ("auto", "newton", "fixed-point"):
-            stepper = prepared(compile_stepper(oscillator(kind), SVI(2), solver=solver, flags=QUICK_FLAGS))
+            stepper = prepared(sc.compile_stepper(oscillator(kind), sc.SVI(2), solver=solver, flags=QUICK_FLAGS))
             random = Random(1)
             assert sum(check_oscillator(stepper, random) for _ in range(20_000)) > 5_000
     for name, method in NONLINEAR:

@@ -9,19 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.methods import (
-    SCVI,
-    SVI,
-    ChebyshevGauss,
-    ExplicitEuler,
-    Gauss,
-    LobattoIIIA,
-    RadauIA,
-    RadauIIA,
-    SpectralCollocation,
-    StoermerVerlet,
-)
+import scvi_codegen as sc
 from scvi_codegen.methods.method import Method
 
 TENTHS = st.integers(-9, 9).map(lambda k: k / 10)
@@ -56,7 +44,7 @@ POTENTIAL_TERMS = (
 class Case:
     """A Lagrangian, a method, a state and where to step from."""
 
-    system: LagrangianSystem
+    system: sc.LagrangianSystem
     method: Method
     q: tuple[float, ...]
     v: tuple[float, ...]
@@ -84,7 +72,7 @@ def systems(draw):
     choices = st.tuples(st.sampled_from((*VELOCITY_TERMS, *POTENTIAL_TERMS)), pairs)
     chosen = st.lists(choices, min_size=1, max_size=5, unique_by=lambda choice: choice[0])
     terms = [term.format(x=x, y=y) for term, (x, y) in draw(chosen)]
-    return LagrangianSystem.from_text(
+    return sc.LagrangianSystem.from_text(
         name="random", coordinates=names, lagrangian=lagrangian(names, mass, terms), parameters={"a": 0.7, "b": -0.4}
     )
 
@@ -103,18 +91,18 @@ def methods(draw):
     return draw(
         st.sampled_from(
             [
-                SVI(degree, quadrature),
-                SVI(degree + 1),
-                SCVI(degree, quadrature, nodes),
-                SCVI(degree, quadrature, nodes, variational=False),
-                SpectralCollocation(degree, nodes, form),
-                Gauss(degree, form=form),
-                RadauIIA(degree, form=form),
-                RadauIA(degree, form=form),
-                LobattoIIIA(degree + 1, form=form),
-                ChebyshevGauss(degree, form=form),
-                StoermerVerlet(),
-                ExplicitEuler(form=form),
+                sc.SVI(degree, quadrature),
+                sc.SVI(degree + 1),
+                sc.SCVI(degree, quadrature, nodes),
+                sc.SCVI(degree, quadrature, nodes, variational=False),
+                sc.SpectralCollocation(degree, nodes, form),
+                sc.Gauss(degree, form=form),
+                sc.RadauIIA(degree, form=form),
+                sc.RadauIA(degree, form=form),
+                sc.LobattoIIIA(degree + 1, form=form),
+                sc.ChebyshevGauss(degree, form=form),
+                sc.StoermerVerlet(),
+                sc.ExplicitEuler(form=form),
             ]
         )
     )

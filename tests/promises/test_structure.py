@@ -4,21 +4,7 @@ import numpy as np
 import pytest
 from tiers import family, first_of_each
 
-from scvi_codegen.methods import (
-    SCVI,
-    SVI,
-    ChebyshevGauss,
-    ChebyshevLobatto,
-    CollocationRK,
-    ExplicitEuler,
-    Gauss,
-    LobattoIIIA,
-    RadauIA,
-    RadauIIA,
-    SpectralCollocation,
-    StoermerVerlet,
-)
-from scvi_codegen.models.problems import problem
+import scvi_codegen as sc
 
 DERIVATIVE_WEIGHTS = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
 """Central differences of order six."""
@@ -56,28 +42,28 @@ def angular_momentum(q, p):
 # Symplecticity.
 
 SYMPLECTIC = (
-    SVI(1),
-    SVI(2, "gauss-legendre:3"),
-    SVI(4, "gauss-lobatto:5"),
-    SVI(3, "clenshaw-curtis:5"),
-    SVI(2, "gauss-radau-left:2"),
-    *(SCVI(s) for s in (1, 2, 3, 4, 5, 6)),
-    SCVI(3, "gauss-legendre:2"),
-    SCVI(3, abscissae="lobatto-iiia"),
-    SCVI(2, abscissae="radau-iia"),
-    SCVI(3, "gauss-lobatto:5"),
-    Gauss(3),
-    StoermerVerlet(),
+    sc.SVI(1),
+    sc.SVI(2, "gauss-legendre:3"),
+    sc.SVI(4, "gauss-lobatto:5"),
+    sc.SVI(3, "clenshaw-curtis:5"),
+    sc.SVI(2, "gauss-radau-left:2"),
+    *(sc.SCVI(s) for s in (1, 2, 3, 4, 5, 6)),
+    sc.SCVI(3, "gauss-legendre:2"),
+    sc.SCVI(3, abscissae="lobatto-iiia"),
+    sc.SCVI(2, abscissae="radau-iia"),
+    sc.SCVI(3, "gauss-lobatto:5"),
+    sc.Gauss(3),
+    sc.StoermerVerlet(),
 )
 FINITE_DIFFERENCES = 2e-12
 """Five times the noise of the differences (4e-13 measured); the smallest real defect below is 1e-7."""
 
 
-SHOOTING = tuple(SCVI(s) for s in (2, 3, 4, 5, 6))
+SHOOTING = tuple(sc.SCVI(s) for s in (2, 3, 4, 5, 6))
 ON_SYSTEMS = (
     *(("double-pendulum", method) for method in SYMPLECTIC),
-    *(("kepler", method) for method in (SVI(2, "gauss-legendre:3"), SVI(3, "clenshaw-curtis:5"), *SHOOTING[:2])),
-    *(("charged-particle", method) for method in (SVI(4, "gauss-lobatto:5"), Gauss(3), *SHOOTING[:2])),
+    *(("kepler", method) for method in (sc.SVI(2, "gauss-legendre:3"), sc.SVI(3, "clenshaw-curtis:5"), *SHOOTING[:2])),
+    *(("charged-particle", method) for method in (sc.SVI(4, "gauss-lobatto:5"), sc.Gauss(3), *SHOOTING[:2])),
     *(
         pytest.param(name, method, marks=pytest.mark.full)
         for name in ("kepler", "charged-particle")
@@ -94,7 +80,7 @@ def test_symplectic_methods_preserve_the_two_form(sample, compiled, name, method
     assert symplecticity_defect(compiled(name, method), q, p, 0.15, 0.4) < FINITE_DIFFERENCES
 
 
-@pytest.mark.parametrize("method", [SVI(3), SCVI(3)], ids=lambda method: method.name)
+@pytest.mark.parametrize("method", [sc.SVI(3), sc.SCVI(3)], ids=lambda method: method.name)
 def test_forced_time_dependent_systems_preserve_the_two_form(sample, compiled, method):
     q, p = sample("pumped-cart-pole").state
     assert symplecticity_defect(compiled("pumped-cart-pole", method), q, p, 0.15, 0.4) < FINITE_DIFFERENCES
@@ -109,8 +95,8 @@ KEPLER = np.array([0.3, 0.8]), np.array([-1.1, 0.4])
 @pytest.mark.parametrize(("size", "expected"), PRINTED.items())
 def test_printed_shooting_equations_are_not_symplectic_but_variational_ones_are(compiled, size, expected):
     points, count = size
-    printed = compiled("kepler", SCVI(points - 1, f"gauss-legendre:{count}", variational=False))
-    variational = compiled("kepler", SCVI(points - 1, f"gauss-legendre:{count}"))
+    printed = compiled("kepler", sc.SCVI(points - 1, f"gauss-legendre:{count}", variational=False))
+    variational = compiled("kepler", sc.SCVI(points - 1, f"gauss-legendre:{count}"))
     before = angular_momentum(*KEPLER)
     assert angular_momentum(*printed.step(*KEPLER, 0.3)) - before == pytest.approx(expected[1], rel=0.05, abs=1e-15)
     assert abs(angular_momentum(*variational.step(*KEPLER, 0.3)) - before) < 1e-14
@@ -121,34 +107,34 @@ def test_printed_shooting_equations_are_not_symplectic_but_variational_ones_are(
 # The properties that methods claim.
 
 METHODS = (
-    *(SVI(s) for s in (1, 2, 3)),
-    SVI(2, "gauss-lobatto:3"),
-    SVI(2, "gauss-radau-right:2"),
-    SVI(2, "gauss-radau-left:3"),
-    *(SCVI(s) for s in (1, 2, 3)),
-    SCVI(1, "gauss-radau-left:2"),
-    SCVI(2, nodes="equispaced"),
-    *(SCVI(s, variational=False) for s in (1, 2, 3)),
-    *(SVI(3, rule) for rule in ("gauss-lobatto:3", "clenshaw-curtis:4", "fejer:5")),
-    *(SCVI(2, abscissae=family) for family in ("gauss", "radau-iia", "lobatto-iiia", "chebyshev-gauss")),
-    *(SCVI(3, abscissae=family) for family in ("gauss", "lobatto-iiia", "chebyshev-gauss", "chebyshev-lobatto")),
-    SCVI(2, "gauss-radau-left:3", abscissae="gauss"),
-    *(SpectralCollocation(s, form=form) for s in (1, 2, 3) for form in ("position", "phase-space")),
-    *(family(2, form="position") for family in (Gauss, RadauIIA, LobattoIIIA, ChebyshevGauss)),
-    *(family(2) for family in (Gauss, RadauIIA, LobattoIIIA, ChebyshevGauss)),
-    Gauss(1),
-    Gauss(1, form="position"),
-    LobattoIIIA(3),
-    ChebyshevGauss(3),
-    ChebyshevLobatto(4),
-    RadauIA(1),
-    RadauIA(2),
-    CollocationRK([0.5]),
-    CollocationRK([0.2, 0.9]),
-    CollocationRK([0.25, 0.75]),
-    StoermerVerlet(),
-    ExplicitEuler(),
-    ExplicitEuler(form="position"),
+    *(sc.SVI(s) for s in (1, 2, 3)),
+    sc.SVI(2, "gauss-lobatto:3"),
+    sc.SVI(2, "gauss-radau-right:2"),
+    sc.SVI(2, "gauss-radau-left:3"),
+    *(sc.SCVI(s) for s in (1, 2, 3)),
+    sc.SCVI(1, "gauss-radau-left:2"),
+    sc.SCVI(2, nodes="equispaced"),
+    *(sc.SCVI(s, variational=False) for s in (1, 2, 3)),
+    *(sc.SVI(3, rule) for rule in ("gauss-lobatto:3", "clenshaw-curtis:4", "fejer:5")),
+    *(sc.SCVI(2, abscissae=family) for family in ("gauss", "radau-iia", "lobatto-iiia", "chebyshev-gauss")),
+    *(sc.SCVI(3, abscissae=family) for family in ("gauss", "lobatto-iiia", "chebyshev-gauss", "chebyshev-lobatto")),
+    sc.SCVI(2, "gauss-radau-left:3", abscissae="gauss"),
+    *(sc.SpectralCollocation(s, form=form) for s in (1, 2, 3) for form in ("position", "phase-space")),
+    *(family(2, form="position") for family in (sc.Gauss, sc.RadauIIA, sc.LobattoIIIA, sc.ChebyshevGauss)),
+    *(family(2) for family in (sc.Gauss, sc.RadauIIA, sc.LobattoIIIA, sc.ChebyshevGauss)),
+    sc.Gauss(1),
+    sc.Gauss(1, form="position"),
+    sc.LobattoIIIA(3),
+    sc.ChebyshevGauss(3),
+    sc.ChebyshevLobatto(4),
+    sc.RadauIA(1),
+    sc.RadauIA(2),
+    sc.CollocationRK([0.5]),
+    sc.CollocationRK([0.2, 0.9]),
+    sc.CollocationRK([0.25, 0.75]),
+    sc.StoermerVerlet(),
+    sc.ExplicitEuler(),
+    sc.ExplicitEuler(form="position"),
 )
 
 
@@ -163,32 +149,32 @@ def test_claims_of_symmetry_and_symplecticity_agree_with_measurement(sample, com
     assert defect < FINITE_DIFFERENCES if method.symplectic else defect > 1e-7
 
 
-@pytest.mark.parametrize("family", [SCVI, SpectralCollocation])
+@pytest.mark.parametrize("family", [sc.SCVI, sc.SpectralCollocation])
 def test_asymmetry_on_chebyshev_lobatto_nodes_decreases_with_the_degree(sample, compiled, family):
     q, p = sample("planar-pendulum").state
     defects = [reversal_defect(compiled("planar-pendulum", family(s)), q, p, 0.6) for s in (2, 3, 5)]
     # 2e-5, 2e-7, 2e-12 for SCVI; 4e-3, 2e-4, 6e-7 for SC.
     assert defects[0] > 10 * defects[1] > 100 * defects[2] > 1e-10
-    assert reversal_defect(compiled("planar-pendulum", SVI(2)), q, p, 0.6) < 1e-15
+    assert reversal_defect(compiled("planar-pendulum", sc.SVI(2)), q, p, 0.6) < 1e-15
 
 
 # Momentum maps over long runs.
 
-VARIATIONAL = (SVI(4), SVI(2, "gauss-legendre:3"), SCVI(4), StoermerVerlet())
+VARIATIONAL = (sc.SVI(4), sc.SVI(2, "gauss-legendre:3"), sc.SCVI(4), sc.StoermerVerlet())
 STEPS = 10_000
 
 
 @pytest.mark.parametrize("method", VARIATIONAL, ids=lambda method: method.name)
 def test_kepler_conserves_angular_momentum_to_round_off(compiled, method):
-    entry = problem("kepler")
+    entry = sc.problem("kepler")
     run = compiled("kepler", method).integrate(entry.q, entry.velocity, h=0.05, steps=STEPS)
     L = angular_momentum(run.q, run.p)
     assert np.abs(L - L[0]).max() < 2e-14
 
 
 def test_newton_solver_conserves_angular_momentum_to_round_off(compiled):
-    entry = problem("kepler")
-    run = compiled("kepler", SVI(4), solver="newton").integrate(entry.q, entry.velocity, h=0.05, steps=STEPS)
+    entry = sc.problem("kepler")
+    run = compiled("kepler", sc.SVI(4), solver="newton").integrate(entry.q, entry.velocity, h=0.05, steps=STEPS)
     L = angular_momentum(run.q, run.p)
     assert np.abs(L - L[0]).max() < 2e-14
 
@@ -201,7 +187,7 @@ def test_spherical_pendulum_conserves_azimuthal_momentum_exactly(sample, compile
     assert np.abs(run.p[:, 1] - p[1]).max() == 0.0
 
 
-@pytest.mark.parametrize("method", [SVI(3), SCVI(3)], ids=lambda method: method.name)
+@pytest.mark.parametrize("method", [sc.SVI(3), sc.SCVI(3)], ids=lambda method: method.name)
 def test_free_bodies_conserve_linear_and_angular_momentum_to_round_off(sample, compiled, method):
     q, p = sample("three-bodies").state
     run = compiled("three-bodies", method).integrate(q, p, h=0.1, steps=STEPS)
@@ -212,7 +198,7 @@ def test_free_bodies_conserve_linear_and_angular_momentum_to_round_off(sample, c
 
 
 def check_solar_system(compiled, method, steps):
-    entry = problem("outer-solar-system")
+    entry = sc.problem("outer-solar-system")
     stepper = compiled("outer-solar-system", method)
     run = stepper.integrate(
         entry.q, stepper.momentum(entry.q, entry.velocity), h=entry.step, steps=steps, save_every=10
@@ -225,19 +211,19 @@ def check_solar_system(compiled, method, steps):
 
 
 def test_outer_solar_system_conserves_momenta_to_round_off(compiled):
-    check_solar_system(compiled, SVI(3), 1000)
+    check_solar_system(compiled, sc.SVI(3), 1000)
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("method", [SVI(3), SVI(6), SCVI(4)], ids=lambda method: method.name)
+@pytest.mark.parametrize("method", [sc.SVI(3), sc.SVI(6), sc.SCVI(4)], ids=lambda method: method.name)
 def test_outer_solar_system_conserves_momenta_over_long_times(compiled, method):
     check_solar_system(compiled, method, STEPS)
 
 
 def test_methods_without_a_discrete_lagrangian_do_not_conserve_angular_momentum(compiled):
     """Counterexample to the tests above: these methods do not conserve the quantity."""
-    entry = problem("kepler")
-    for method in (SpectralCollocation(4), SCVI(4, variational=False), RadauIIA(3)):
+    entry = sc.problem("kepler")
+    for method in (sc.SpectralCollocation(4), sc.SCVI(4, variational=False), sc.RadauIIA(3)):
         run = compiled("kepler", method).integrate(entry.q, entry.velocity, h=0.05, steps=1000)
         assert abs(angular_momentum(run.q, run.p)[-1] - angular_momentum(run.q, run.p)[0]) > 1e-9
 
@@ -252,8 +238,8 @@ def energy_errors(compiled, name, method, q, p, h):
     return error[: STEPS // 10].max(), error[-STEPS // 10 :].max()
 
 
-DRIFTLESS = (SVI(3), SVI(3, "gauss-legendre:4"), SCVI(3), StoermerVerlet())
-DRIFTING = (SpectralCollocation(3), RadauIIA(3), SCVI(3, variational=False))
+DRIFTLESS = (sc.SVI(3), sc.SVI(3, "gauss-legendre:4"), sc.SCVI(3), sc.StoermerVerlet())
+DRIFTING = (sc.SpectralCollocation(3), sc.RadauIIA(3), sc.SCVI(3, variational=False))
 
 
 @pytest.mark.sampled(3)

@@ -16,28 +16,12 @@ from programs import needs
 from samples import QUICK_FLAGS, sample_named
 from style import check_style
 
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import MethodError
+import scvi_codegen as sc
 from scvi_codegen.ir.program import LEAST_REUSED_UNKNOWNS
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods import (
-    SCVI,
-    SVI,
-    ChebyshevLobatto,
-    ExplicitEuler,
-    Gauss,
-    LobattoIIIA,
-    RadauIA,
-    RadauIIA,
-    SpectralCollocation,
-    StoermerVerlet,
-)
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import fput_chain
 from scvi_codegen.native.building import TUNED_FLAGS, _mathematics
-from scvi_codegen.pipeline import generate_source
 from scvi_codegen.rendering.source import Interface, Source
 
 pytestmark = pytest.mark.long
@@ -48,40 +32,40 @@ CXX = "-std=c++11 -Wall -Wextra -Wpedantic -Werror".split()  # noqa: SIM905  (as
 METHODS = {
     method.name: method
     for method in (
-        SVI(1),
-        SVI(3, "gauss-lobatto:5"),
-        SVI(3, "hermite-2:3"),
-        SVI(2, space="trigonometric:0.3"),
-        SVI(3, space="splines:2"),
-        SCVI(2, abscissae="gauss"),
-        SCVI(1, "gauss-legendre:2"),
-        SCVI(2),
-        SCVI(2, variational=False),
-        SpectralCollocation(3, form="position"),
-        SpectralCollocation(2, form="phase-space"),
-        Gauss(2),
-        RadauIIA(2),
-        RadauIA(2),
-        LobattoIIIA(3),
-        ChebyshevLobatto(3, form="position"),
-        StoermerVerlet(),
-        ExplicitEuler(),
+        sc.SVI(1),
+        sc.SVI(3, "gauss-lobatto:5"),
+        sc.SVI(3, "hermite-2:3"),
+        sc.SVI(2, space="trigonometric:0.3"),
+        sc.SVI(3, space="splines:2"),
+        sc.SCVI(2, abscissae="gauss"),
+        sc.SCVI(1, "gauss-legendre:2"),
+        sc.SCVI(2),
+        sc.SCVI(2, variational=False),
+        sc.SpectralCollocation(3, form="position"),
+        sc.SpectralCollocation(2, form="phase-space"),
+        sc.Gauss(2),
+        sc.RadauIIA(2),
+        sc.RadauIA(2),
+        sc.LobattoIIIA(3),
+        sc.ChebyshevLobatto(3, form="position"),
+        sc.StoermerVerlet(),
+        sc.ExplicitEuler(),
     )
 }
 
 
 SHARES = 6
-TUNED = (SVI(3), Gauss(5), SpectralCollocation(4), SCVI(5, variational=False))
+TUNED = (sc.SVI(3), sc.Gauss(5), sc.SpectralCollocation(4), sc.SCVI(5, variational=False))
 
 
-def bare_oscillator() -> LagrangianSystem:
-    return LagrangianSystem.from_text(
+def bare_oscillator() -> sc.LagrangianSystem:
+    return sc.LagrangianSystem.from_text(
         name="bare oscillator", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2", parameters={}
     )
 
 
-def driven_hamiltonian() -> HamiltonianSystem:
-    return HamiltonianSystem.from_text(
+def driven_hamiltonian() -> sc.HamiltonianSystem:
+    return sc.HamiltonianSystem.from_text(
         name="driven Hamiltonian",
         coordinates=["x", "y"],
         hamiltonian="sqrt(1 + p_x**2 + k*p_x*p_y + p_y**2) + x*sin(t) + x**2*p_y",
@@ -89,8 +73,8 @@ def driven_hamiltonian() -> HamiltonianSystem:
     )
 
 
-def hyperbolic() -> HamiltonianSystem:
-    return HamiltonianSystem.from_text(name="hyperbolic", coordinates=["q"], momenta=["p"], hamiltonian="q*p")
+def hyperbolic() -> sc.HamiltonianSystem:
+    return sc.HamiltonianSystem.from_text(name="hyperbolic", coordinates=["q"], momenta=["p"], hamiltonian="q*p")
 
 
 @cache
@@ -106,8 +90,8 @@ def generated(method: str) -> Mapping[str, tuple[Source, Interface]]:
     """Text of one method for all systems that it takes."""
     found = {}
     for name, system in systems().items():
-        with suppress(MethodError):
-            found[name] = generate_source(system, METHODS[method])
+        with suppress(sc.MethodError):
+            found[name] = sc.generate_source(system, METHODS[method])
     assert len(found) >= len(systems()) - 2
     return found
 
@@ -167,8 +151,8 @@ def test_sources_for_this_machine_compile_without_warnings(name, solver, compile
     system = systems()[name]
     q = system.coordinates[0].name
     time_transformation = f"1/(1 + {q}**2)"
-    stepper = compile_stepper(
-        system, SVI(3), solver=solver, time_transformation=time_transformation, prefix="own", flags=QUICK_FLAGS
+    stepper = sc.compile_stepper(
+        system, sc.SVI(3), solver=solver, time_transformation=time_transformation, prefix="own", flags=QUICK_FLAGS
     )
     texts = [stepper.source, *([stepper.fallback] if stepper.fallback else [])]
     assert len(texts) == (2 if solver == "auto" else 1)
@@ -200,7 +184,7 @@ def test_code_allocates_nothing_writes_nothing_and_has_no_static_state(method):
 
 
 def test_headers_compile_as_c_plus_plus(tmp_path):
-    pairs = [generate_source(systems()["kepler"], method) for method in METHODS.values()]
+    pairs = [sc.generate_source(systems()["kepler"], method) for method in METHODS.values()]
     files = write([source for source, _ in pairs], tmp_path)
     uses = "".join(
         f"  total += {s.prefix}_default_options().tolerance + {s.prefix.upper()}_WORKSPACE;\n" for s, _ in pairs
@@ -219,10 +203,10 @@ def test_headers_compile_as_c_plus_plus(tmp_path):
 @pytest.mark.parametrize("solver", ["newton", "fixed-point"])
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_either_solver_alone_compiles_without_warnings(compiler, solver, tmp_path):
-    methods = (SVI(2), Gauss(3), StoermerVerlet(), SpectralCollocation(2), SCVI(3, variational=False))
+    methods = (sc.SVI(2), sc.Gauss(3), sc.StoermerVerlet(), sc.SpectralCollocation(2), sc.SCVI(3, variational=False))
     names = ("kepler", "driven-duffing", "pumped-cart-pole")
-    sources = [generate_source(systems()[name], method, solver=solver)[0] for method in methods for name in names]
-    sources += [generate_source(driven_hamiltonian(), method, solver=solver)[0] for method in methods[:3]]
+    sources = [sc.generate_source(systems()[name], method, solver=solver)[0] for method in methods for name in names]
+    sources += [sc.generate_source(driven_hamiltonian(), method, solver=solver)[0] for method in methods[:3]]
     files = write(sources, tmp_path)
     run([needs(compiler), *C99, "-c", *files], tmp_path)
 
@@ -234,7 +218,7 @@ def test_either_solver_alone_compiles_without_warnings(compiler, solver, tmp_pat
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_tuned_builds_compile_without_warnings(compiler, method, name, tmp_path):
     """Flags are the vector instructions of this processor, and glibc's vector functions where available."""
-    files = write([generate_source(systems()[name], method)[0]], tmp_path)
+    files = write([sc.generate_source(systems()[name], method)[0]], tmp_path)
     for define, _ in _mathematics(TUNED_FLAGS):
         run([needs(compiler), *C99, *TUNED_FLAGS, *define, "-c", *files], tmp_path)
 
@@ -287,7 +271,7 @@ C_NAMES = """
     parameters gather scatter evaluate factorise solve report options status workspace EOF FLT_EPSILON linux unix y0 y1
     j1 gamma HUGE_VAL M_PI size_t int8_t bool_ true false assert stdin Q P q p t0 _ i k n legendre lagrangian velocity
 """.split()  # noqa: SIM905  (a paragraph of words reads better)
-TESTED = [SVI(2), SCVI(2), StoermerVerlet()]
+TESTED = [sc.SVI(2), sc.SCVI(2), sc.StoermerVerlet()]
 
 
 def accepted(names: Sequence[str]) -> list[str]:
@@ -302,7 +286,7 @@ def accepted(names: Sequence[str]) -> list[str]:
     return saved
 
 
-def named_system(names: Sequence[str], name: str = "oscillators") -> LagrangianSystem:
+def named_system(names: Sequence[str], name: str = "oscillators") -> sc.LagrangianSystem:
     """Coupled oscillators whose coordinates are every third of the names, whose parameters are the others."""
     coordinates = names[::3]
     parameters = [name for name in names if name not in coordinates]
@@ -311,7 +295,7 @@ def named_system(names: Sequence[str], name: str = "oscillators") -> LagrangianS
     terms = "".join(f" - {c}*{coordinates[k % len(coordinates)]}**2/2" for k, c in enumerate(parameters))
     values = {c: 1.0 / (k + 2) for k, c in enumerate(parameters)}
     lagrangian = f"{kinetic}{coupling}{terms}".removeprefix(" + ")
-    return LagrangianSystem.from_text(name=name, coordinates=coordinates, lagrangian=lagrangian, parameters=values)
+    return sc.LagrangianSystem.from_text(name=name, coordinates=coordinates, lagrangian=lagrangian, parameters=values)
 
 
 @pytest.mark.parametrize("method", TESTED, ids=lambda method: method.name)
@@ -320,7 +304,7 @@ def test_reserved_names_of_c_are_valid_coordinates(method, tmp_path):
     plain = [f"name{k}" for k in range(len(hostile))]
     assert len(hostile) > 50
     steppers = [
-        compile_stepper(named_system(names), method, prefix="named", flags=QUICK_FLAGS) for names in (hostile, plain)
+        sc.compile_stepper(named_system(names), method, prefix="named", flags=QUICK_FLAGS) for names in (hostile, plain)
     ]
     m = steppers[0].dimension
     results = [stepper.step(np.linspace(-0.5, 0.5, m), np.linspace(0.3, -0.2, m), 0.1) for stepper in steppers]
@@ -344,7 +328,7 @@ TITLES = [
 @pytest.mark.parametrize("title", TITLES)
 def test_title_cannot_end_its_comment(title, tmp_path):
     system = named_system(["a", "b", "c"], name=title)
-    source, interface = generate_source(system, SVI(1))
+    source, interface = sc.generate_source(system, sc.SVI(1))
     assert interface.title.isprintable()
     (file,) = write([source], tmp_path)
     run([needs("gcc"), *C99, "-c", file], tmp_path)
@@ -353,7 +337,7 @@ def test_title_cannot_end_its_comment(title, tmp_path):
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("prefix", ["fabs", "errno", "NULL", "main", "newton", "step", "int", "m", "b"])
 def test_reserved_prefixes_of_c_are_valid(prefix, tmp_path):
-    source, _ = generate_source(bare_oscillator(), SVI(2), prefix=prefix)
+    source, _ = sc.generate_source(bare_oscillator(), sc.SVI(2), prefix=prefix)
     files = write([source], tmp_path)
     run([needs("gcc"), *C99, "-c", *files], tmp_path)
 
@@ -465,11 +449,17 @@ def test_method_families_pass_the_sanitizers(command, method, tmp_path):
 @SANITIZERS
 @pytest.mark.parametrize(
     ("masses", "method"),
-    [(5, SVI(8)), (12, SVI(3, "gauss-lobatto:4")), (12, SCVI(2)), (12, Gauss(3)), (9, SpectralCollocation(3))],
+    [
+        (5, sc.SVI(8)),
+        (12, sc.SVI(3, "gauss-lobatto:4")),
+        (12, sc.SCVI(2)),
+        (12, sc.Gauss(3)),
+        (9, sc.SpectralCollocation(3)),
+    ],
 )
 def test_band_solver_and_reused_factors_pass_the_sanitizers(command, masses, method, tmp_path):
     sanitizer(command, tmp_path)
-    source, interface = generate_source(fput_chain(masses), method, solver="newton")
+    source, interface = sc.generate_source(fput_chain(masses), method, solver="newton")
     assert interface.unknowns >= LEAST_REUSED_UNKNOWNS
     run([needs(command[0]), *C99, "-c", *write([source], tmp_path)], tmp_path)
     check_sanitized([(source, interface)], command, tmp_path)
@@ -478,7 +468,7 @@ def test_band_solver_and_reused_factors_pass_the_sanitizers(command, masses, met
 @SANITIZERS
 def test_phase_space_iterations_pass_the_sanitizers(command, tmp_path):
     sanitizer(command, tmp_path)
-    source, interface = generate_source(driven_hamiltonian(), Gauss(3), solver="fixed-point")
+    source, interface = sc.generate_source(driven_hamiltonian(), sc.Gauss(3), solver="fixed-point")
     check_sanitized([(source, interface)], command, tmp_path)
 
 

@@ -9,21 +9,13 @@ from programs import needs
 from samples import linkage
 from style import check_style
 
-from scvi_codegen import (
-    SVI,
-    AccuracyWarning,
-    LagrangianSystem,
-    Model,
-    compile_stepper,
-    generate_package,
-    generate_source,
-)
+import scvi_codegen as sc
 from scvi_codegen.exact.step import compiled_equations, derived_step
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 
 STRICT = ["-std=c99", "-O0", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
 LINKAGE = linkage()
-PENDULUM = LagrangianSystem.from_text(
+PENDULUM = sc.LagrangianSystem.from_text(
     name="double pendulum",
     coordinates=["x1", "y1", "x2", "y2"],
     lagrangian="(x1_dot**2 + y1_dot**2 + x2_dot**2 + y2_dot**2)/2 - 9.81*(y1 + y2)",
@@ -34,13 +26,13 @@ NEAR = [0.0, 1.0, 1.94, 1.5]
 
 
 def lobatto(s):
-    return SVI(s, f"gauss-lobatto:{s + 1}")
+    return sc.SVI(s, f"gauss-lobatto:{s + 1}")
 
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_constrained_code_compiles_without_warnings(compiler, tmp_path):
     for system, s, controlled in ((LINKAGE, 3, False), (LINKAGE, 3, True), (PENDULUM, 1, True), (PENDULUM, 4, False)):
-        source = generate_source(system, lobatto(s), controlled=controlled)[0]
+        source = sc.generate_source(system, lobatto(s), controlled=controlled)[0]
         (tmp_path / f"{source.prefix}.h").write_text(source.header)
         (tmp_path / "all.c").write_text(source.single_file().code)
         check_style(source.amalgamated().code)
@@ -50,7 +42,7 @@ def test_constrained_code_compiles_without_warnings(compiler, tmp_path):
 
 @pytest.mark.parametrize("s", [1, 2, 3])
 def test_steps_are_those_of_the_equations_in_60_digits(s):
-    stepper = compile_stepper(LINKAGE, lobatto(s))
+    stepper = sc.compile_stepper(LINKAGE, lobatto(s))
     q, p = stepper.project(NEAR)
     q, p = stepper.integrate(q, p, h=0.02, steps=7).q[-1], stepper.integrate(q, p, h=0.02, steps=7).p[-1]
     found = stepper.step(q, p, 0.05, 0.3)
@@ -61,9 +53,9 @@ def test_steps_are_those_of_the_equations_in_60_digits(s):
 
 
 def test_model_files_select_compatible_points():
-    stepper = compile_stepper(LINKAGE, "svi:3")
+    stepper = sc.compile_stepper(LINKAGE, "svi:3")
     q, _ = stepper.project(NEAR)
-    model = Model(system=LINKAGE, method="svi:3", q=tuple(q), velocity=(0.0,) * 4, h=0.01, span=1.0)
+    model = sc.Model(system=LINKAGE, method="svi:3", q=tuple(q), velocity=(0.0,) * 4, h=0.01, span=1.0)
     assert model.method == lobatto(3)
     assert parse_model(dump_model(model)) == model
     text = dump_model(model).partition("[method]")[0]
@@ -72,8 +64,8 @@ def test_model_files_select_compatible_points():
 
 def made_and_run(folder, q, *, precision=None, system=LINKAGE, exit_status=0):
     """Generate a folder, build it with ``make``, run it and return the example's states and output."""
-    model = Model(system=system, method="svi:3", q=tuple(q), velocity=(0.0,) * 4, h=0.05, steps=40)
-    generate_package(model, folder, embedded=precision)
+    model = sc.Model(system=system, method="svi:3", q=tuple(q), velocity=(0.0,) * 4, h=0.05, steps=40)
+    sc.generate_package(model, folder, embedded=precision)
     found = subprocess.run(["make", "-s", "-C", str(folder)], capture_output=True, text=True)
     assert (found.returncode != 0) == exit_status
     return np.array([line.split() for line in found.stdout.splitlines() if line[0] != "#"], dtype=float), found
@@ -84,8 +76,8 @@ def test_generated_folders_project_constraints_and_equal_python(precision, tmp_p
     """Slightly inconsistent states are projected with a message and integrated, also with adaptive steps."""
     near = [0.001, 1.0, 1.94, 1.5]
     states, found = made_and_run(tmp_path / "linkage", near, precision=precision)
-    stepper = compile_stepper(LINKAGE, "svi:3", solver="newton")
-    with pytest.warns(AccuracyWarning, match="projected onto the constraints"):
+    stepper = sc.compile_stepper(LINKAGE, "svi:3", solver="newton")
+    with pytest.warns(sc.AccuracyWarning, match="projected onto the constraints"):
         run = stepper.integrate(near, [0.0] * 4, h=0.05, steps=40, save_every=2)
     assert "violates the constraints" in found.stderr
     assert len(states) == len(run)

@@ -12,21 +12,13 @@ from click.testing import CliRunner
 from programs import needs
 from samples import sample_named, stepper_for
 
+import scvi_codegen as sc
 from scvi_codegen.cli import main
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import MethodError, PackageError
 from scvi_codegen.ir.arithmetic import FUNCTIONS
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.methods import SCVI, SVI, SpectralCollocation, StoermerVerlet
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.model import Model
-from scvi_codegen.models.packages.package import generate_package, load_package
-from scvi_codegen.models.problems import problem
-from scvi_codegen.pipeline import generate_source
 from scvi_codegen.rendering.kernels.printer import SINGLE
 from scvi_codegen.rendering.program_source import EMBEDDED, Embedded
 from scvi_codegen.rendering.source import Interface, Source
-from scvi_codegen.runtime.events.event import impact
 
 HERE = Path(__file__).parent / "embedded"
 CROSS, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"
@@ -53,11 +45,11 @@ BOARDS = {
 """Double precision in software, single precision in hardware, double precision in hardware."""
 
 CASES: dict[str, tuple[str, Method]] = {
-    "kepler": ("kepler", SVI(4)),
-    "verlet": ("kepler", StoermerVerlet()),
-    "pendulum": ("double-pendulum", SVI(3)),
-    "shooting": ("planar-pendulum", SCVI(3)),
-    "driven": ("driven-duffing", SVI(2)),
+    "kepler": ("kepler", sc.SVI(4)),
+    "verlet": ("kepler", sc.StoermerVerlet()),
+    "pendulum": ("double-pendulum", sc.SVI(3)),
+    "shooting": ("planar-pendulum", sc.SCVI(3)),
+    "driven": ("driven-duffing", sc.SVI(2)),
 }
 
 
@@ -70,7 +62,7 @@ def run(command: list[str], folder: Path) -> str:
 @cache
 def embedded(case: str, precision: Embedded) -> tuple[Source, Interface]:
     name, method = CASES[case]
-    return generate_source(sample_named(name).system, method, prefix="integrator", embedded=precision)
+    return sc.generate_source(sample_named(name).system, method, prefix="integrator", embedded=precision)
 
 
 @cache
@@ -209,7 +201,7 @@ def test_literals_read_back_as_the_nearest_double(value):
 def test_residual_zeros_in_tables_become_zero_and_model_numbers_are_rejected():
     assert SINGLE.number(1.7e-63) == "0.0f"
     for value in (1e-39, 1e39, -1e300):
-        with pytest.raises(MethodError, match="outside the range of single precision"):
+        with pytest.raises(sc.MethodError, match="outside the range of single precision"):
             SINGLE.check([1.0, value])
 
 
@@ -218,21 +210,23 @@ def test_models_with_numbers_beyond_single_precision_are_rejected(number):
     """Numbers are constants of the Lagrangian or values of parameters."""
     text = "q_dot**2/2 - {}*q**2/2"
     for system in (
-        LagrangianSystem.from_text(name="s", coordinates=["q"], lagrangian=text.format(number)),
-        LagrangianSystem.from_text(
+        sc.LagrangianSystem.from_text(name="s", coordinates=["q"], lagrangian=text.format(number)),
+        sc.LagrangianSystem.from_text(
             name="s", coordinates=["q"], lagrangian=text.format("k"), parameters={"k": float(number)}
         ),
     ):
-        generate_source(system, SVI(1), embedded="double")
-        with pytest.raises(MethodError, match="other units"):
-            generate_source(system, SVI(1), embedded="single")
+        sc.generate_source(system, sc.SVI(1), embedded="double")
+        with pytest.raises(sc.MethodError, match="other units"):
+            sc.generate_source(system, sc.SVI(1), embedded="single")
 
 
 def test_energy_does_not_drift_in_single_precision(tmp_path):
     """Twenty thousand steps of the pendulum: the error stays at that of a few, which for a sum without care grows."""
     needs("gcc")
-    folder = generate_package(
-        replace(Model.from_problem(problem("planar-pendulum")), method=SVI(3), h=0.125, span=None, steps=20_000),
+    folder = sc.generate_package(
+        replace(
+            sc.Model.from_problem(sc.problem("planar-pendulum")), method=sc.SVI(3), h=0.125, span=None, steps=20_000
+        ),
         tmp_path / "pendulum",
         embedded="single",
     )
@@ -262,26 +256,26 @@ def test_the_command_line_writes_a_folder_without_python(tmp_path):
         assert f"static {kind} workspace" in (folder / "README.md").read_text()
         lines = run(["make", "-s", "-C", str(folder), "run"], tmp_path).splitlines()[1:]
         outputs[precision] = np.array([line.split() for line in lines], dtype=float)
-        with pytest.raises(PackageError, match="without --embedded"):
-            load_package(folder)
+        with pytest.raises(sc.PackageError, match="without --embedded"):
+            sc.load_package(folder)
     assert 0.0 < np.abs(outputs["single"] - outputs["double"]).max() < 1e-2
 
 
 def test_lanes_are_rejected_by_name():
-    system = problem("kepler").system
-    with pytest.raises(MethodError, match="unavailable with embedded"):
-        generate_source(system, SVI(2), solver="fixed-point", embedded="double")
-    with pytest.raises(MethodError, match="double or single"):
-        generate_source(system, SVI(2), embedded="half")
-    assert "lanes" not in generate_source(system, SVI(2), embedded="double")[0].code
+    system = sc.problem("kepler").system
+    with pytest.raises(sc.MethodError, match="unavailable with embedded"):
+        sc.generate_source(system, sc.SVI(2), solver="fixed-point", embedded="double")
+    with pytest.raises(sc.MethodError, match="double or single"):
+        sc.generate_source(system, sc.SVI(2), embedded="half")
+    assert "lanes" not in sc.generate_source(system, sc.SVI(2), embedded="double")[0].code
 
 
 def test_all_methods_compile_in_either_precision(tmp_path):
     needs("gcc")
-    methods = {"collocation": SpectralCollocation(2, form="position"), "printed": SCVI(2, variational=False)}
+    methods = {"collocation": sc.SpectralCollocation(2, form="position"), "printed": sc.SCVI(2, variational=False)}
     for prefix, method in methods.items():
         for precision in EMBEDDED:
-            source, _ = generate_source(sample_named("cart-pole").system, method, prefix=prefix, embedded=precision)
+            source, _ = sc.generate_source(sample_named("cart-pole").system, method, prefix=prefix, embedded=precision)
             (tmp_path / f"{prefix}.h").write_text(source.header)
             (tmp_path / f"{prefix}.c").write_text(source.code)
             pure = PURE_SINGLE if precision == "single" else ()
@@ -318,10 +312,10 @@ int main(void)
 def test_impacts_without_allocation(tmp_path):
     """The bounces of a ball by C alone, which allocates no memory, equal those of Python."""
     needs("gcc")
-    ball = LagrangianSystem.from_text(
+    ball = sc.LagrangianSystem.from_text(
         name="ball", coordinates=["y"], lagrangian="y_dot**2/2 - g*y", parameters={"g": 1.0}
     )
-    source, _ = generate_source(ball, SVI(2), prefix="hit", events=impact("y", 0.8), embedded="double")
+    source, _ = sc.generate_source(ball, sc.SVI(2), prefix="hit", events=sc.impact("y", 0.8), embedded="double")
     assert set(source.files) == {"hit.h", "hit.c", "hit_events.h", "hit_events.c"}
     source.write(tmp_path)
     (tmp_path / "main.c").write_text(EVENTS_MAIN)
@@ -331,9 +325,9 @@ def test_impacts_without_allocation(tmp_path):
     assert not re.search(r"\b[mc]alloc\b|\balloca\b", code)
     printed = subprocess.run([tmp_path / "hit"], capture_output=True, text=True, check=True).stdout
     found = np.array([line.split() for line in printed.splitlines()], dtype=float)
-    run = compile_stepper(ball, SVI(2)).integrate([1.0], [0.0], h=0.1, t_end=8.0, events=impact("y", 0.8))
+    run = sc.compile_stepper(ball, sc.SVI(2)).integrate([1.0], [0.0], h=0.1, t_end=8.0, events=sc.impact("y", 0.8))
     assert len(found) == len(run.events[0]) == 4
     assert np.abs(found[:, 0] - run.events[0].t).max() < 1e-13
     assert np.abs(found[:, 1] - run.events[0].p[:, 0]).max() < 1e-13
-    with pytest.raises(MethodError, match="events require double precision"):
-        generate_source(ball, SVI(2), events=impact("y"), embedded="single")
+    with pytest.raises(sc.MethodError, match="events require double precision"):
+        sc.generate_source(ball, sc.SVI(2), events=sc.impact("y"), embedded="single")
