@@ -55,7 +55,8 @@ def record(
         save_every = checked_count(save_every, "save_every", least=1)
     recorder = _StateRecorder(memory, save_every, count, filled)
     try:
-        recorder.check(status)
+        if status:
+            raise memory._failure(status)
         if progress is None and stop is None and count is not None and count <= recorder.first_size:
             if count and not memory.arrived:  # one chunk
                 recorder.advance(count)
@@ -184,8 +185,6 @@ class _StateRecorder:
     The number of states is known for fixed steps; for adaptive steps each chunk has arrays of its own.
     """
 
-    __slots__ = ("earlier", "filled", "first", "first_size", "memory", "rows", "save_every", "watch")
-
     def __init__(self, memory: Memory, save_every: int, steps: int | None, filled: int) -> None:
         plan, first = memory._plan, 0 if filled else memory._memory.step
         self.memory, self.save_every, self.first, self.filled = memory, save_every, first, filled or 1
@@ -219,16 +218,12 @@ class _StateRecorder:
             self.filled += report.stored
         else:
             self.filled = 1 + memory._memory.step // save_every - self.first // save_every
-        self.check(status)
+        if status:
+            raise memory._failure(status)
         steps: int = report.steps
         if watch is not None and before is not None:
             watch.check_progress(before, memory.t, steps, memory.steps)
         return steps
-
-    def check(self, status: int) -> None:
-        """Raise :class:`StepFailedError` for the status of a failed step."""
-        if status:
-            raise self.memory._failure(status)
 
     def _states(self) -> States:
         """Return the rows in use; copies if most are not, or if the run uses the memory again."""
