@@ -67,7 +67,7 @@ def _rows(braced: Sequence[str]) -> list[str]:
 def wrapped(statement: str, indent: int = 2) -> str:
     """Return a statement, continued on further lines if it is too long, after an operator or comma."""
     first = " " * indent
-    joined = SHORT_SUM.sub(lambda found: found[0].replace(" ", "\0"), statement)
+    joined = SHORT_SUM.sub(lambda match: match[0].replace(" ", "\0"), statement)
     joined = OPERATOR.sub("\0\\1 ", joined)  # no break before an operator
     return "\n".join(_lines(joined, first, first + " " * CONTINUATION)).replace("\0", " ")
 
@@ -85,7 +85,7 @@ def wrapped_comment_lines(text: str) -> str:
 
 def wrapped_prototypes(text: str) -> str:
     """Return the source with every prototype that is too long broken between arguments."""
-    return PROTOTYPE.sub(lambda found: wrapped_prototype(" ".join(found[0].split())), text)
+    return PROTOTYPE.sub(lambda match: wrapped_prototype(" ".join(match[0].split())), text)
 
 
 def wrapped_prototype(prototype: str) -> str:
@@ -334,14 +334,14 @@ def with_own_names(code: str, prefix: str, header: str) -> str:
         header: included by the code; its names are retained.
     """
     prefixes = dict(PREFIXING.findall(code))
-    code = EXPORTED.sub(lambda found: prefixes[found[1]] + found[2], PREFIXING.sub("", code))
+    code = EXPORTED.sub(lambda match: prefixes[match[1]] + match[2], PREFIXING.sub("", code))
     taken = set(TOKEN.findall(header + code))
     names = {}
     for name in (*(match["name"] for match in MACRO.finditer(code)), *_names(code)):
         if not name.lower().startswith(f"{prefix.lower()}_"):
             upper, local = (prefix.upper(), "LOCAL") if name.isupper() else (prefix, "local")
             names[name] = f"{upper}_{name}" if f"{upper}_{name}" not in taken else f"{upper}_{local}_{name}"
-    renamed = TOKEN.sub(lambda found: names.get(found[0], found[0]), code)
+    renamed = TOKEN.sub(lambda match: names.get(match[0], match[0]), code)
     return "\n".join(_broken(renamed.split("\n")))
 
 
