@@ -102,6 +102,12 @@ SYSTEMS: dict[str, System] = {
         {**ARRAYS, "parameters": {"c": np.arange(8.0) / 9}},
         {},
     ),
+    "convolution of coordinates": (
+        lambda: lattice("sum(i in N, sum(j in N, c[j-i]*q[j])**2)", parameters={"c[N]": 1.0}),
+        "svi:2",
+        {**ARRAYS, "parameters": {"c": np.sin(np.arange(8.0)) / 3}},
+        {},
+    ),
     "neighbours": (lambda: lattice(PAIR, neighbours={"near": {"of": "q", "cutoff": 0.5}}), "svi:1", ARRAYS, {}),
     **{
         name: of_case(name)
