@@ -9,16 +9,9 @@ import pytest
 import sympy as sp
 from mpmath import MPContext
 
-from scvi_codegen.errors import MethodError
+import scvi_codegen as sc
 from scvi_codegen.tables.closed_forms import exact_points
-from scvi_codegen.tables.nodes import (
-    NODE_FAMILIES,
-    Nodes,
-    chebyshev_lobatto,
-    legendre_lobatto,
-    nodes_by_name,
-    to_number,
-)
+from scvi_codegen.tables.nodes import NODE_FAMILIES, nodes_by_name, to_number
 from scvi_codegen.tables.precision import mp
 
 chebyshev_gauss, legendre_gauss, radau_left, radau_right = (
@@ -50,7 +43,7 @@ def test_legendre_families_are_roots_to_fifty_digits_of_mpmath_polynomials(degre
 
     polynomials = [
         (legendre_gauss(degree), lambda x: other.legendre(count, x)),
-        (legendre_lobatto(degree), legendre_slope),
+        (sc.legendre_lobatto(degree), legendre_slope),
         (radau_left(degree), lambda x: other.legendre(count, x) + other.legendre(degree, x)),
         (radau_right(degree), lambda x: other.legendre(count, x) - other.legendre(degree, x)),
     ]
@@ -64,7 +57,7 @@ def test_legendre_families_are_roots_to_fifty_digits_of_mpmath_polynomials(degre
 def test_lobatto_and_gauss_points_have_published_digits() -> None:
     golden = legendre_gauss(9).points[-1]
     assert abs(golden - mp.mpf("0.97390652851717172007796401208445205342826994669238211923121")) < FIFTY_DIGITS
-    assert abs(legendre_lobatto(4).points[3] - mp.sqrt(mp.mpf(3) / 7)) < FIFTY_DIGITS
+    assert abs(sc.legendre_lobatto(4).points[3] - mp.sqrt(mp.mpf(3) / 7)) < FIFTY_DIGITS
 
 
 @pytest.mark.parametrize(
@@ -91,24 +84,24 @@ def test_closed_forms_are_radicals_of_the_same_value(name: str, degrees: list[in
 
 
 def test_nodes_of_higher_degree_and_rounded_nodes_have_no_closed_form() -> None:
-    assert exact_points(chebyshev_lobatto(7)) is None
-    assert exact_points(legendre_lobatto(7)) is None
+    assert exact_points(sc.chebyshev_lobatto(7)) is None
+    assert exact_points(sc.legendre_lobatto(7)) is None
     assert exact_points(legendre_gauss(5)) is None
     assert exact_points(radau_left(3)) is None
-    assert exact_points(Nodes(name="legendre-gauss", degree=1, points=(-(1 / 3**0.5), 1 / 3**0.5))) is None
-    assert exact_points(Nodes(name="mine", degree=1, points=(mp.mpf("1e-30"), mp.pi / 4))) is None
+    assert exact_points(sc.Nodes(name="legendre-gauss", degree=1, points=(-(1 / 3**0.5), 1 / 3**0.5))) is None
+    assert exact_points(sc.Nodes(name="mine", degree=1, points=(mp.mpf("1e-30"), mp.pi / 4))) is None
 
 
 def test_user_defined_nodes_are_recognised() -> None:
-    assert exact_points(Nodes(name="equispaced", degree=2, points=(-1, 0.25, 1))) == (-1, sp.Rational(1, 4), 1)
+    assert exact_points(sc.Nodes(name="equispaced", degree=2, points=(-1, 0.25, 1))) == (-1, sp.Rational(1, 4), 1)
     silver, half = sp.sqrt(2) - 1, sp.Rational(1, 2)
     for points in [(-silver, half), (-sp.sqrt(half - sp.sqrt(2) / 4), silver), (sp.Rational(-12345, 678901), silver)]:
-        assert exact_points(Nodes(name="mine", degree=1, points=points)) == points
+        assert exact_points(sc.Nodes(name="mine", degree=1, points=points)) == points
 
 
 def test_numbers_of_many_kinds_are_converted() -> None:
     third = Fraction(1, 3)
-    nodes = Nodes(name="mine", degree=4, points=(-1, "-0.1", np.float64(0.25), third, sp.sqrt(2) / 2))
+    nodes = sc.Nodes(name="mine", degree=4, points=(-1, "-0.1", np.float64(0.25), third, sp.sqrt(2) / 2))
     assert nodes.points[1] == -mp.mpf(1) / 10
     assert abs(nodes.points[3] - mp.mpf(1) / 3) < FIFTY_DIGITS
     assert abs(nodes.points[4] ** 2 - mp.mpf(1) / 2) < FIFTY_DIGITS
@@ -119,7 +112,7 @@ def test_numbers_of_many_kinds_are_converted() -> None:
 
 @pytest.mark.parametrize("value", ["x", 1j, None, [1], sp.Symbol("x"), sp.I, float("nan"), float("inf")])
 def test_non_finite_and_non_real_numbers_are_rejected(value: object) -> None:
-    with pytest.raises(MethodError, match="give a"):
+    with pytest.raises(sc.MethodError, match="give a"):
         to_number(value)
 
 
@@ -128,12 +121,12 @@ def test_non_finite_and_non_real_numbers_are_rejected(value: object) -> None:
 def test_nonpositive_and_noninteger_degrees_are_rejected(name: str, degree: object, message: str) -> None:
     nodes_by_name(name, 2)
     nodes_by_name(name, 1)
-    with pytest.raises(MethodError, match=message):
+    with pytest.raises(sc.MethodError, match=message):
         nodes_by_name(name, degree)  # type: ignore[arg-type]  # the wrong type is the point
 
 
 def test_unknown_family_suggests_the_closest_and_lists_all() -> None:
-    with pytest.raises(MethodError, match=r"did you mean 'chebyshev-lobatto'.*legendre-gauss"):
+    with pytest.raises(sc.MethodError, match=r"did you mean 'chebyshev-lobatto'.*legendre-gauss"):
         nodes_by_name("chebyshev_lobato", 3)
 
 
@@ -148,8 +141,8 @@ def test_unknown_family_suggests_the_closest_and_lists_all() -> None:
     ],
 )
 def test_invalid_points_are_rejected(degree: int, points: tuple[float, ...], message: str) -> None:
-    with pytest.raises(MethodError, match=message):
-        Nodes(name="mine", degree=degree, points=points)
+    with pytest.raises(sc.MethodError, match=message):
+        sc.Nodes(name="mine", degree=degree, points=points)
 
 
 def test_user_precision_has_no_effect_and_is_not_changed() -> None:
