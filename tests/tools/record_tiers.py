@@ -3,7 +3,7 @@
 ::
 
     $ SCVI_CODEGEN_CACHE=$(mktemp -d) SCVI_CODEGEN_TESTS_COSTS=costs.txt pytest -n auto -m 'not full'
-    $ python tests/tools/record_tiers.py costs.txt --seconds 280
+    $ python tests/tools/record_tiers.py costs.txt --seconds 260
 
 Costs are processor seconds, of the processes that a test starts, too. All cases of a test that together cost at most a
 threshold are quick, of others the first cases within the threshold. The threshold is the largest for which all quick
