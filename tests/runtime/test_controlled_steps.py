@@ -494,3 +494,16 @@ def test_looser_tolerance_needs_no_more_steps_under_the_iteration_limit():
     errors = [np.abs(run.q[-1] - exact.q[-1]).max() for run in (loose, middle, tight)]
     assert errors[0] > errors[2]
     assert errors[0] < 0.1
+
+
+def test_step_sizes_do_not_depend_on_the_origin_of_time():
+    """Also of steps that are compared with two of half their size."""
+    pumped = sc.LagrangianSystem.from_text(
+        "pumped", ["x"], "x_dot**2/2 - (1 + cos(3*(t - s))/2)*x**4/4", parameters={"s": 0.0}
+    )
+    stepper = sc.compile_stepper(pumped, "svi:4")
+    first, shifted = (
+        stepper.integrate([1.0], [0.0], t=s, t_end=s + 9.0, tolerance=1e-8, parameters={"s": s}) for s in (0.0, 64.0)
+    )
+    assert (shifted.steps, shifted.rejected_steps) == (first.steps, first.rejected_steps)
+    assert np.array_equal(shifted.step_sizes[:-2], first.step_sizes[:-2])
