@@ -359,6 +359,7 @@ class Control:
         stage_growth: factor of the error estimate per level for Newton's method; 0 if there is no estimate.
         density: values of a time transformation at (q, v), or (q, p) of a Hamiltonian; instead of the predictor.
         growth: of errors, measured along runs; ``None`` if it is not.
+        whole: whether the state is to be accurate as a whole, as those of arrays are, not each coordinate by itself.
     """
 
     code: str
@@ -368,6 +369,7 @@ class Control:
     stage_growth: float = 0.0
     density: Kernel | None = None
     growth: ErrorGrowth | None = None
+    whole: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

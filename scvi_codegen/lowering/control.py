@@ -101,7 +101,14 @@ def control_of(
         mantissas=MANTISSAS,
         predictor=predictor_of(program.fixed_point) if program.fixed_point else None,
         stage_growth=2.0 ** (stage_curve.power / LEVELS_PER_BINADE) if stage_curve else 0.0,
+        whole=system is not None and not program.of_arrays and _has_arrays(system),
     )
+
+
+def _has_arrays(system: MechanicalSystem) -> bool:
+    """Return whether some coordinates are the entries of an array of known size."""
+    names = {q.name for q in system.coordinates}
+    return any(each.axes and names.issuperset(each.elements) for each in system.arrays)
 
 
 def predictor_of(fixed_point: FixedPointIteration) -> AdaptivePredictor:

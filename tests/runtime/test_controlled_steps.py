@@ -507,3 +507,14 @@ def test_step_sizes_do_not_depend_on_the_origin_of_time():
     )
     assert (shifted.steps, shifted.rejected_steps) == (first.steps, first.rejected_steps)
     assert np.array_equal(shifted.step_sizes[:-2], first.step_sizes[:-2])
+
+
+@pytest.mark.parametrize("solver", ["fixed-point", "newton"])
+def test_known_sizes_take_the_adaptive_steps_of_arrays_at_the_nodes_of_a_wave(solver):
+    text = "sum(i in N, q_dot[i]**2/2 - q[i]**4/4) - sum(i in N periodic, (q[i+1] - q[i])**2/2)"
+    ring = sc.LagrangianSystem.from_text(name="ring", coordinates=["q[N]"], lagrangian=text)
+    q = np.sin(np.arange(8) * 2 * np.pi / 8)
+    of_any, known = (sc.compile_stepper(ring, "svi:4", solver=solver, **more) for more in ({}, {"sizes": {"N": 8}}))
+    run, other = (each.integrate(q, 0.0 * q, t_end=5.0, tolerance=1e-9) for each in (of_any, known))
+    assert run.steps <= other.steps < 2 * run.steps
+    np.testing.assert_allclose(run.q[-1], other.q[-1], atol=1e-8)

@@ -20,7 +20,11 @@ typedef struct {
 #else
 #include "../run/run.h"
 
+#ifdef ARRAYS_OF_KNOWN_SIZES
+#define SHARE_OF_TRIAL ALL
+#else
 #define SHARE_OF_TRIAL EACH
+#endif
 #endif
 
 #ifdef NEWTON_ALONE
@@ -41,7 +45,7 @@ static real attempt(run_memory *run, step_data *step, const solver_data *data, i
   if (solve(step, data, run->memory, guess, dq, dp, options, report, step->scratch + SCRATCH) != OK)
     return INFINITY;
   *guess = 1;
-  return stage_error(step, run->memory, dq, EACH, decay, least);
+  return stage_error(step, run->memory, dq, SHARE_OF_TRIAL, decay, least);
 }
 #else
 #define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
