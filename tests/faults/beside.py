@@ -244,13 +244,7 @@ C_TEXT = (
         r": -at->given",
         ": at->given",
     ),
-    (
-        "sweeps of changes that end early",
-        "kepler/svi-3",
-        "vectors_status",
-        r"<= LEFT_TO_COME \* before",
-        "<= 1e-14 * before",
-    ),
+    ("sweeps of changes that end early", "kepler/svi-3", "vectors_status", r": LEFT_TO_COME\)", ": 1e-14)"),
     ("a matrix not transposed", "double/svi", "solve_back", r"pivot, 1, at->x", "pivot, 0, at->x"),
     (
         "half of the last row",
@@ -312,7 +306,7 @@ SECOND = (
         "a second derivative off by 1e-6",
         case("double/svi"),
         lowered_derivatives,
-        "gradient",
+        "jacobian",
         changed_result(lambda found: found | {k: found[k] * sympy.Rational(1000001, 10**6) for k in list(found)[:1]}),
     ),
 )
