@@ -244,7 +244,13 @@ C_TEXT = (
         r": -at->given",
         ": at->given",
     ),
-    ("sweeps of changes that end early", "kepler/svi-3", "vectors_status", r": LEFT_TO_COME\)", ": 1e-14)"),
+    (
+        "sweeps of changes that end early",
+        "kepler/svi-3",
+        "vectors_status",
+        r"<= LEFT_TO_COME \* before",
+        "<= 1e-14 * before",
+    ),
     ("a matrix not transposed", "double/svi", "solve_back", r"pivot, 1, at->x", "pivot, 0, at->x"),
     (
         "half of the last row",
