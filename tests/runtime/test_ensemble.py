@@ -725,7 +725,7 @@ class TestCommandLine:
         ("words", "message"),
         [
             ("kepler --ensemble none.toml", "none.toml cannot be read"),
-            ("kepler --ensemble grid.toml --tolerance 1e-6", "--tolerance is not available with --ensemble"),
+            ("kepler --ensemble grid.toml --error 1e-6", "--error is not available with --ensemble"),
             ("kepler --ensemble grid.toml -o runs.txt", "written as .npz, .csv, .h5"),
             ("planar-pendulum --ensemble grid.toml", "'q1' is not a coordinate"),
             (
