@@ -14,6 +14,8 @@ from nbody_reference import integrate
 from outer_planets import GRAVITY, MASSES, POSITIONS, VELOCITIES
 
 from scvi_codegen import Advice, LagrangianSystem, MethodError, StateError, advise, compile_stepper, problem
+from scvi_codegen.advice.advice import _advice, _choose, _warnings
+from scvi_codegen.advice.pilot import run_pilot
 from scvi_codegen.cli import main
 from scvi_codegen.cli.step_selection import _text
 from scvi_codegen.methods import SVI, ExplicitEuler, Gauss, Method, RadauIIA, StoermerVerlet
@@ -62,6 +64,45 @@ def assert_achieved(advice: Advice, error: float, tolerance: float) -> None:
     assert advice.warnings == ()
     assert 0.02 * tolerance < advice.expected_error < 0.51 * tolerance
     assert advice.expected_error / 3.0 < error < 3.0 * advice.expected_error
+
+
+def turning(q: np.ndarray, h: float, steps: int, save_every: int) -> SimpleNamespace:
+    """Run on a circle at the angular velocity 1 + h^2/24, as of a method of order 2."""
+    angles = (1.0 + h * h / 24.0) * h * np.arange(0, steps + 1, save_every)
+    return SimpleNamespace(q=np.stack([np.cos(angles), np.sin(angles)], 1), iterations=np.full(steps, 5))
+
+
+@pytest.mark.parametrize("span", [100.0, -100.0, 4000.0])
+def test_numbers_of_advice_are_those_of_an_error_in_closed_form(span: float) -> None:
+    """The error after t is h^2 t/24; 5e-3 are half of the tolerance."""
+    bounds = {"symplectic": True, "target_error": 5e-3, "most": 2**18}
+    pilot = run_pilot(turning, StoermerVerlet(), np.array([1.0, 0.0]), span, **bounds)
+    advice = _advice(pilot, _choose(pilot, 1e-2), StoermerVerlet())
+    assert pilot.whole == (abs(span) == 100.0)
+    assert advice.h * advice.steps == pytest.approx(span)
+    assert advice.expected_error == pytest.approx(advice.h**2 * abs(span) / 24, rel=0.02)
+    assert 5e-3 / 1.6 < advice.expected_error <= 5e-3
+    fine = [each for each in advice.evidence if each.error < 0.1]
+    assert [each.error for each in fine] == pytest.approx([each.h**2 * abs(span) / 24 for each in fine], rel=0.02)
+    assert {each.iterations for each in fine} == {5.0}
+    words = f"{advice.steps} steps of {advice.h:.6g} by {StoermerVerlet().name}, for an expected error of "
+    assert advice.message.startswith(f"{words}{advice.expected_error:.1g}. The pilot runs covered ")
+    assert advice.message.endswith("The method is symplectic only at this fixed step size.")
+
+
+def test_warnings_name_their_numbers() -> None:
+    """From 100 units of time with an error of 1e-10, four decades take four times the time of tenfold growth."""
+    pilot = SimpleNamespace(length=100.0, whole=False, growth=3.0, final_quarter_error=lambda _: 1e-10)
+    chaos = "neighbouring trajectories diverge tenfold every 5 units of time (chaos), "
+    for tenfold, floor, words in (
+        (5.0, 1e-9, [f"{chaos}at an uncertain rate later"]),
+        (5.0, 1e-3, [f"the tolerance cannot be met: {chaos}so round-off alone exceeds it",
+                     "the recommended step meets it for about 120 units of time"]),
+        (math.inf, 6e-7, ["round-off alone causes an error of about 6e-07 at the end, for any step size"]),
+        (math.inf, 1e-9, ["errors grew like t^3.0 in the pilot runs, a rate that may not continue"]),
+    ):  # fmt: skip
+        pilot.rate, pilot.floor_at_end = math.log(10.0) / tenfold, floor
+        assert [*_warnings(pilot, 1e-6, 8)] == words
 
 
 class TestAchievedErrors:

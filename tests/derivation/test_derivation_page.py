@@ -28,7 +28,8 @@ from scvi_codegen.derivation import derivation_html
 from scvi_codegen.derivation.equations import derive
 from scvi_codegen.derivation.notation import table_entries
 from scvi_codegen.derivation.page.document import ITERATIONS, kernels_of
-from scvi_codegen.derivation.page.drawings import jacobian_pattern
+from scvi_codegen.derivation.page.drawings import curve_section, jacobian_pattern
+from scvi_codegen.display.number_tables import positions
 from scvi_codegen.display.page import MOST_LINES, SPACE, Formula, Paragraph, formulas, operations
 from scvi_codegen.ir.equations import IterationName
 from scvi_codegen.methods.discretise import paper_equations, with_auxiliaries
@@ -129,6 +130,27 @@ class TestEquations:
 
     def test_pattern_with_fewer_multipliers_than_coordinates(self):
         assert_pattern_is_of_jacobian(swing(constraints=["x**2 + y**2 - 1"]), sc.SVI(2, "gauss-lobatto:3"))
+
+
+NUMBERED = {
+    sc.SVI(3): ["25"],
+    sc.SCVI(2): ["33"],
+    sc.SpectralCollocation(2): ["18"],
+    sc.SpectralCollocation(2, form="phase-space"): ["21", "21"],
+    sc.Gauss(2): [],
+}
+
+
+@pytest.mark.parametrize("method", NUMBERED, ids=lambda method: method.name)
+def test_curves_are_drawn_to_scale_and_numbered_as_in_the_paper(method):
+    """Points are at MARGIN + c (WIDTH - 2 MARGIN), and as high as their weights."""
+    *contents, drawing = curve_section(method).contents
+    assert [each.number for each in contents if isinstance(each, Formula) and each.number] == NUMBERED[method]
+    circles = [float(x) for x in re.findall(r'<circle cx="([^"]*)"', drawing.svg)]
+    assert circles == pytest.approx([30 + 580 * float(c) for part in method.parts for c in positions(part)], abs=0.051)
+    stems = [float(y) - float(top) for y, top in re.findall(r"M[\d.]+ (\d+)V([\d.]+)", drawing.svg)]
+    weights = [float(w) for part in method.parts for w in getattr(part, "weights", ())]
+    assert stems == pytest.approx([30 * w / max(weights) for w in weights], abs=0.051)
 
 
 def assert_pattern_is_of_jacobian(system: sc.LagrangianSystem, method: Any) -> None:

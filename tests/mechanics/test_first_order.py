@@ -277,6 +277,14 @@ def test_malformed_states(start: object, message: str) -> None:
         sc.compile_stepper(system("guiding centre"), "svi:2").integrate(start, h=0.1, steps=1)
 
 
+def test_the_choice_with_the_shortest_one_form_is_used() -> None:
+    """The integral over x leaves -2*x*y for theta_y, that over y only y**2 for theta_x."""
+    short = sc.LagrangianSystem.from_text("short", ["x", "y"], "(y + y**2)*x_dot + x*y_dot - x**2 - y**2")
+    fields = short.coordinates, short.momenta, short.one_form, short.integrated, short.hamiltonian
+    x, y = short.variables
+    assert fields == ((x,), (y,), (y**2,), x * y, x**2 + y**2)
+
+
 def test_velocities_are_refused_and_available() -> None:
     stepper = sc.compile_stepper(system("coupled"), "svi:2")
     start = CASES["coupled"][3]

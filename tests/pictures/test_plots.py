@@ -41,23 +41,6 @@ def test_equal_trajectories_give_equal_bytes(kepler, tmp_path, suffix):
     assert one.read_bytes().startswith({".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF"}[suffix])
 
 
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize(
-    ("name", "titles"),
-    [
-        ("planar-pendulum", ["phase plane", "relative energy error"]),
-        ("kepler", ["configuration", "relative energy error"]),
-        ("charged-particle", ["orbit", "orbit", "relative energy error"]),
-        ("outer-solar-system", ["orbits", "orbits", "relative energy error"]),
-        ("fput-chain:12", ["q over time", "relative energy error"]),
-    ],
-)
-def test_each_kind_of_system_has_its_panels(name, titles):
-    figure = sc.plot_trajectory(trajectory_of(name))[0].figure
-    assert [axes.get_title() for axes in figure.axes if axes.get_title()] == titles
-    assert figure.axes[len(titles) - 1].get_yscale() == "log"
-
-
 def test_bodies_are_named_in_the_legend_and_drawn_where_they_are():
     trajectory = trajectory_of("outer-solar-system")
     figure = sc.plot_trajectory(trajectory)[0].figure

@@ -11,7 +11,10 @@ from scvi_codegen.reproduce.experiment import Verdict
 from scvi_codegen.reproduce.refinement import (
     CASES,
     STUDIES,
+    ErrorCurve,
     Law,
+    _kepler_errors,
+    _point_checks,
     factors,
     fitted_line,
     fitted_power,
@@ -105,6 +108,30 @@ def test_lines_are_fitted_to_resolved_errors():
     assert is_straight(n, errors)
     assert not is_straight(n, errors[::-1])
     assert fitted_line(n, np.full(6, 1e-16)) is None
+
+
+def test_verdicts_follow_from_the_lines_of_the_judged_cases():
+    """Errors along c b^N and 50 times above it, of the case that is judged and of one that is only shown."""
+    judged, shown = CASES["N points"], CASES["N the degree"]
+    law, n = Law(1e3, 0.1), np.arange(6.0, 12.0)
+    study = replace(STUDIES["oscillator-over-n"], cases=(judged, shown), lines={("SVI", "q"): law})
+    for far, verdict in (((50, 1), Verdict.FAILS), ((1, 50), Verdict.HOLDS)):
+        pairs = zip(study.cases, far, strict=True)
+        curves = [ErrorCurve(case, "q", "SVI", 0, n, factor * 1e3 * 0.1**n, law) for case, factor in pairs]
+        straight, lines = _point_checks(study, curves)
+        assert straight.measured.startswith("1 of 1 curves above round-off are straight")
+        assert f" is {far[0]} (N points), {far[1]} (N the degree). Below 30 counts" in lines.measured
+        assert (straight.verdict, lines.verdict) == (Verdict.HOLDS, verdict)
+
+
+def test_errors_of_a_step_are_differences_from_the_ellipse():
+    """At e = 1/2 a quarter of the period ends where x = -a e and y = b, for the mean anomaly pi/2 - 1/2."""
+    e, minor = mp.mpf("0.5"), mp.sqrt(mp.mpf(3) / 4)
+    q, p = (-e, minor), (-mp.one, mp.zero)
+    for moved, names in (((1e-3, 0), "q1 energy"), ((0, 1e-3), "q2 energy momentum")):
+        errors = _kepler_errors(e, [x + mp.mpf(d) for x, d in zip(q, moved, strict=True)], p, mp.pi / 2 - e)
+        assert {name for name, error in errors.items() if error > 1e-12} == {*names.split()}
+        assert errors[names[:2]] == pytest.approx(1e-3)
 
 
 COARSE = {

@@ -84,6 +84,17 @@ def test_accumulation_ends_the_run_and_is_named(ball, e):
     assert run.q.min() > -1e-14
 
 
+def test_time_is_one_double_where_impacts_accumulate(ball):
+    """The sum of steps of 0.1 has a low word, the time of the last impact has none."""
+    run = ball.with_events(sc.impact("y", 0.5)).start([1.0], [0.0], h=0.1)
+    run.advance(30)
+    assert run.left_to(run.t) != 0.0
+    with pytest.raises(sc.EventError, match="accumulate at t = "):
+        run.advance(30)
+    assert run.t < 3.0 * math.sqrt(2.0) < run.t + 1e-6
+    assert run.left_to(run.t) == 0.0
+
+
 def test_start_behind_a_wall(ball):
     """A start on the wall, up to rounding, and one behind a wall of finite size are inside the region."""
     for arguments in ({"t_end": 4.0}, {"h": 0.1, "steps": 3}):
