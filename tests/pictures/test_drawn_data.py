@@ -84,17 +84,17 @@ def test_other_drawings_have_the_values_of_their_arrays() -> None:
 
 
 def test_links_of_robots_are_drawn_in_space_with_the_path_of_the_tip() -> None:
-    """Two links of lengths 1 and 3 turn about z; the second one follows from the center of mass at half its length."""
+    """Two links of lengths 1 and 3 turn about z on a base; the second length is twice the distance of its center."""
     common = {"kind": "hinge", "follows": None, "zero": 0.0, "rotation": np.eye(3)}
-    first = SimpleNamespace(name="a", parent=-1, position=(0.0, 0.0, 0.0), center=(0.5, 0.0, 0.0), **common)
+    first = SimpleNamespace(name="a", parent=-1, position=(0.0, 0.0, 0.5), center=(0.5, 0.0, 0.0), **common)
     second = SimpleNamespace(name="b", parent=0, position=(1.0, 0.0, 0.0), center=(1.5, 0.0, 0.0), **common)
     run = motion("a b", links=(first, second))
     drawn, _ = sc.plot_trajectory(run)
     assert [drawn.get_xlabel(), drawn.get_ylabel(), drawn.get_zlabel(), drawn.get_title()] == [*"xyz", "links"]
     angle, both = run.q[:, 0], run.q.sum(axis=1)
-    tip = [np.cos(angle) + 3 * np.cos(both), np.sin(angle) + 3 * np.sin(both), 0 * both]
+    tip = [np.cos(angle) + 3 * np.cos(both), np.sin(angle) + 3 * np.sin(both), 0.5 + 0 * both]
     *poses, path = drawn.lines
     assert np.allclose(path.get_data_3d(), tip, rtol=0, atol=1e-14)
-    assert len(poses) == 6 * 3  # two links and their joints
+    assert len(poses) == 6 * 4  # base, two links and their joints
     assert np.allclose(np.array(poses[-2].get_data_3d())[:, 1], np.array(tip)[:, -1], rtol=0, atol=1e-14)
-    assert [line.get_alpha() for line in poses[::3]] == [0.25] * 5 + [1.0]
+    assert [line.get_alpha() for line in poses[::4]] == [0.25] * 5 + [1.0]

@@ -23,7 +23,7 @@ from scvi_codegen.verification.impacts import impact_checks
 from scvi_codegen.verification.roundoff import roundoff_checks
 from scvi_codegen.verification.stepping import _agree, _solves, predictor_checks, step_checks
 from scvi_codegen.verification.structure import _reversal, _symplecticity, structure_checks
-from scvi_codegen.verification.system_under_test import EPSILON, State, SystemUnderTest
+from scvi_codegen.verification.system_under_test import State, SystemUnderTest
 from scvi_codegen.verification.variable_steps import variable_step_checks
 
 
@@ -36,7 +36,7 @@ DAMPED = lagrangian("q_dot**2/2 - q**2/2", damping="g", parameters={"g": 0.25})
 PUSHED = lagrangian("q_dot**2/2", forces={"q": "-q_dot"})
 ROD = lagrangian("(x_dot**2 + y_dot**2)/2 - y", "xy", constraints=["x**2 + y**2 = 1"])
 MIDPOINT = sc.SVI(1)
-ERROR = 1e-4
+ERROR, EPSILON = 1e-4, float(np.finfo(float).eps)
 
 
 class Midpoint:
