@@ -151,6 +151,7 @@ def test_steps_without_a_potential_are_exact(top, h):
     turns = [Rotation.from_rotvec(2 * h * momentum), Rotation.from_rotvec([0, 0, 2 * h * momentum[2]])]
     expected = run.rotation()[0] @ (turns[0] * turns[1]).as_matrix()
     np.testing.assert_allclose(run.rotation()[-1], expected, rtol=0, atol=1e-15 * (10 + 10 * h))
+    assert run.iterations[1:].tolist() == [1, 1]  # none by Newton's method
 
 
 def test_a_top_at_rest_begins_to_fall(top):
