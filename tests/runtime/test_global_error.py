@@ -15,8 +15,8 @@ from motions import MOTIONS, recorded
 
 import scvi_codegen as sc
 from scvi_codegen.cli import main
-from scvi_codegen.runtime.run.global_error import _alternative
-from scvi_codegen.runtime.run.memory import Memory
+from scvi_codegen.runtime.run.global_error import SAFETY, SAFETY_OF_ROUNDING, SAFETY_OF_TWO, _alternative
+from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.trajectory import dense_output
 
 MASSES = np.array([3, 4, 5], dtype=Real)
@@ -89,24 +89,25 @@ class Work:
 
     def __init__(self, monkeypatch):
         self.iterations = 0
-        advance, partial_steps = Memory._advance, dense_output._take_partial_steps
+        integrate, partial_steps = Run._integrated, dense_output._take_partial_steps
 
-        def counted_advance(run, *arguments):
-            status = advance(run, *arguments)
-            self.iterations += run._report.iterations
-            return status
+        def counted_run(run, *arguments):
+            trajectory = integrate(run, *arguments)
+            self.iterations += int(trajectory.iterations.sum())
+            return trajectory
 
         def counted_partial_steps(*arguments):
             iterations = partial_steps(*arguments)
             self.iterations += iterations
             return iterations
 
-        monkeypatch.setattr(Memory, "_advance", counted_advance)
+        monkeypatch.setattr(Run, "_integrated", counted_run)
         monkeypatch.setattr(dense_output, "_take_partial_steps", counted_partial_steps)
 
     def of(self, run):
-        before = self.iterations
-        return run(), self.iterations - before
+        before, result = self.iterations, run()
+        assert self.iterations > before
+        return result, self.iterations - before
 
 
 def true_errors(name, run):
@@ -144,7 +145,7 @@ def check_claims(name, run, error):
 class TestMotions:
     """Regular and chaotic motions compared with records of 30 digits."""
 
-    @pytest.mark.parametrize("error", [1e-5, 1e-9])
+    @pytest.mark.parametrize("error", [1e-5, 1e-9, 1e-11])
     @pytest.mark.parametrize("name", ["oscillator", "driven", "kepler .999"])
     @pytest.mark.filterwarnings("ignore:the global error")
     def test_estimates_bound_errors_of_selected_motions(self, name, error, monkeypatch):
@@ -174,6 +175,19 @@ class TestMotions:
         assert np.mean(attained) >= 0.97
         assert np.median(ratios) < 30.0
         assert np.median(costs) < 6.0
+
+    @pytest.mark.parametrize(("comparisons", "safety"), [(2, SAFETY_OF_TWO), (3, SAFETY_OF_ROUNDING)])
+    def test_agreement_of_rounding_errors_by_chance_is_improbable(self, comparisons, safety):
+        first, *others = np.random.default_rng(0).standard_normal((1 + comparisons, 10**6))
+        assert np.mean(safety * np.max([abs(first - each) for each in others], axis=0) < abs(first)) < 1e-3
+
+    def test_a_third_comparison_is_made_where_two_do_not_suffice(self):
+        stepper, start = motion_stepper("kepler .6")
+        found = {error: stepper.integrate(**start, error=error).confirmation for error in (1e-9, 1e-11, 1e-12)}
+        assert {each.safety for each in found.values()} == {SAFETY, SAFETY_OF_TWO, SAFETY_OF_ROUNDING}
+        for each in found.values():
+            assert each.confirmed
+            assert each.estimate == pytest.approx(each.safety * each.differences.max())
 
     def test_runs_that_agree_by_chance_do_not_confirm_each_other(self):
         """Rounding errors grow a thousandfold: runs with tolerances 1e-14, 1e-17 agree to 3e-15, both off by 3e-13."""

@@ -46,21 +46,23 @@ def states_and_steps_at(states: SavedStates, times: Array) -> tuple[Array, Array
         _check_on_grid(states)
         return states_in_transformed_time(states, times)
     left = np.searchsorted(states.forward * states.t, states.forward * times, side="right") - 1
-    spans, lengths = np.diff(states.t), states.step_sizes[:-1]
-    several = not (np.abs(spans) < 1.5 * np.abs(lengths)).all()
-    if (several and states.stepper.changes_states) or (not states.plan.fixed and np.isnan(lengths).any()):
+    lengths, fixed, several = states.step_sizes[:-1], states.plan.fixed, False
+    if states.stepper.changes_states:
+        several = not (np.abs(np.diff(states.t)) < 1.5 * np.abs(lengths)).all()
+    if several or (not fixed and np.isnan(lengths).any()):
         return *_integrate_to_each(states, left, times, states.plan), times
-    _check_on_grid(states)
     t, q, p = states.t[left], states.q[left], states.p[left]
-    whole = whole_steps(times - t, np.nan_to_num(states.step_sizes[left], nan=np.inf))
-    between = np.flatnonzero(whole)
-    saved, run = -1, None
-    for k in between[np.lexsort((whole[between], left[between]))]:
-        if run is None or left[k] != saved:
-            saved = int(left[k])
-            run = states._restarted(saved, float(states.step_sizes[saved]))
-        run.advance(int(whole[k]) - run.steps)
-        t[k], q[k], p[k] = run.t, run.q, run.p
+    if fixed:  # adaptive steps are all saved here
+        _check_on_grid(states)
+        whole = whole_steps(times - t, np.nan_to_num(states.step_sizes[left], nan=np.inf))
+        between = np.flatnonzero(whole)
+        saved, run = -1, None
+        for k in between[np.lexsort((whole[between], left[between]))]:
+            if run is None or left[k] != saved:
+                saved = int(left[k])
+                run = states._restarted(saved, float(states.step_sizes[saved]))
+            run.advance(int(whole[k]) - run.steps)
+            t[k], q[k], p[k] = run.t, run.q, run.p
     _take_partial_steps(states, t, times - t, q, p)
     return q, p, times
 
