@@ -50,7 +50,7 @@ in 8 of 10,000 cases, and those of three within e / 4 in as many.
 """
 SMALLEST = 5.0 * float(np.finfo(float).eps)
 """Smallest estimate."""
-LEAST_SAMPLES, STEPS_PER_SAMPLE, MOST_SAMPLES, MOST_NUMBERS = 16, 8, 512, 2**22
+LEAST_SAMPLES, STEPS_PER_SAMPLE, MOST_SAMPLES, MOST_NUMBERS = 16, 16, 512, 2**22
 """Numbers of states that are compared: least, per steps, most, and most times the number of coordinates."""
 EARLY = 1.0 / 16.0
 """Part of the run whose largest state sets the least size that errors are relative to."""
@@ -283,7 +283,9 @@ class _Runs:
                 return trajectory, result
             if not result.estimate < 1.0:
                 break
-            powers = math.ceil(math.log(result.estimate / self.wanted, GAIN) * math.log(RATIO, ratio))
+            powers = 1
+            if self.again is not None or tolerance < rounded:  # else the next run was made for this comparison
+                powers = math.ceil(math.log(result.estimate / self.wanted, GAIN) * math.log(RATIO, ratio))
             tolerance = list(accumulate(repeat(ratio, max(1, powers)), mul, initial=tolerance))[-1]
         found: list[tuple[Any, GlobalError]] = []
         for tolerance in LAST:
