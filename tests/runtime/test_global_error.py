@@ -201,13 +201,13 @@ class TestMotions:
     def test_errors_of_growing_motions_are_relative_to_their_size_by_then(self):
         """Of q = p = exp(t); at first relative to the largest size of the first sixteenth."""
         saddle = sc.compile_stepper(made("saddle", ["q"], "q_dot**2/2 + q**2/2"), "svi:4")
-        run = saddle.integrate([1.0], [1.0], t_end=48.0, error=1e-6)
+        run = saddle.integrate([1.0], [1.0], t_end=192.0, error=1e-6)
         found, exact = run.confirmation, np.exp(run.t)
-        early = exact[run.t <= 3.0].max()
+        early = exact[run.t <= 12.0].max()
         off = np.maximum(abs(run.q[:, 0] - exact), abs(run.p[:, 0] - exact)) / np.maximum(exact, early)
         off = off[np.searchsorted(run.t, found.t)]
         assert found.differences == pytest.approx(off, rel=0.05, abs=1e-14)
-        assert (off[found.t <= 3.0] > 0).any()
+        assert (off[found.t <= 12.0] > 0).any()
 
     def test_a_short_last_step_is_no_close_encounter(self):
         oscillator = made("o", ["x"], "x_dot**2/2 - x**2/2")
