@@ -378,7 +378,8 @@ class Model(TimeSpan):
         """Integrate over the whole span; raises as :meth:`Stepper.integrate`."""
         stepper, arguments = self.stepper(), self._run_arguments()
         if self.h is None and self.has_time_transformation and self.error is None:
-            arguments |= {"h": self.start(stepper).h, "tolerance": None}
+            plan = self.start(stepper).plan
+            arguments |= {"h": plan.h or plan.tau, "tolerance": None}
         arguments |= {**self.initial_state(stepper), **self._common(None, threads), "parameters": self.parameters}
         trajectory: Trajectory = stepper.integrate(**arguments, progress=progress)
         return trajectory

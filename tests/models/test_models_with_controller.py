@@ -170,6 +170,14 @@ def test_unsupported_combinations_with_a_controller_are_reported(shaken: Path, w
     assert printed in " ".join(invoke(*words.replace("FILE", str(shaken)).split(), status=2).split())
 
 
+def test_python_and_the_command_line_choose_the_same_step_of_tau() -> None:
+    model = parse_model(SHAKEN.replace("step = 0.1", "tolerance = 1e-9"))
+    run = model.integrate()
+    assert run.plan == model.start().plan
+    assert run.t[-1] == 12.0
+    assert run.plan.tau > 0.0
+
+
 def test_unsupported_model_fields_are_reported(shaken: Path, tmp_path: Path) -> None:
     model = sc.load_model(shaken)
     with pytest.raises(ModelFileError, match="reversible controller"):
