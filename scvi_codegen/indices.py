@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import combinations, product
 from typing import Any
 
 from scvi_codegen.errors import SystemDefinitionError
@@ -71,11 +71,13 @@ class Array:
     Attributes:
         name, axes: name of the array, size of each axis.
         letters: names of the entries along the last axis, ``"wxyz"`` of quaternions; by default their indices.
+        is_field: of an array of known sizes, whether forces couple neighbouring elements (:func:`couples_elements`).
     """
 
     name: str
     axes: tuple[Size, ...]
     letters: str = ""
+    is_field: bool = field(default=False, compare=False)
 
     def shape(self, sizes: Mapping[str, int]) -> tuple[int, ...]:
         """Return the numerical shape for the sizes of a run."""
@@ -224,6 +226,22 @@ class Access:
             places[each.axis] = each.index
         entry = f"{self.array.name}[{', '.join(places)}]" if places else self.array.name
         return before + entry + ")" * len(self.sums)
+
+
+def couples_elements(array: Array, reads: Iterable[Access], coefficients: Iterable[Access]) -> bool:
+    """Return whether a term couples elements of an array: at offsets, by rows of a table, or by a matrix c[i, j]."""
+    coefficients = [*coefficients]
+    return any(
+        all(_are_coupled(a, b, coefficients) for a, b in zip(one.places, other.places, strict=True))
+        and any(a != b and a.index for a, b in zip(one.places, other.places, strict=True))
+        for one, other in combinations([read for read in reads if read.array == array], 2)
+    )
+
+
+def _are_coupled(a: Place, b: Place, coefficients: Iterable[Access]) -> bool:
+    if a.index == b.index:
+        return not (a.minus or b.minus)
+    return any({a.index, b.index} <= each.indices for each in coefficients)
 
 
 @dataclass(frozen=True, slots=True)

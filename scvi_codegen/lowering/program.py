@@ -5,7 +5,7 @@ matrix: on positions, on velocities, or on momenta and velocities (:mod:`~scvi_c
 accelerations, or on accelerations and multipliers (:mod:`~scvi_codegen.lowering.solvers.curves`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -198,8 +198,17 @@ def _layout(system: MechanicalSystem | ArraySystem) -> Layout:
     return Layout(
         coordinates=tuple(Array(q.name, ()) for q in system.coordinates),
         inputs=tuple((name, system.parameters.index(symbol(f"{name}_0"))) for name in system.inputs),
+        coupled=tuple(_coupled_coordinates(system)),
         **numbers,
     )
+
+
+def _coupled_coordinates(system: MechanicalSystem) -> Iterator[tuple[int, int]]:
+    names = [each.name for each in system.coordinates]
+    for elements in (array.elements for array in system.arrays if array.is_field):
+        first = names.index(elements[0]) if elements[0] in names else len(names)
+        if names[first : first + len(elements)] == [*elements]:
+            yield first, first + len(elements)
 
 
 def _equations(

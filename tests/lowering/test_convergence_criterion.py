@@ -22,6 +22,7 @@ from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI, SpectralCollocation
 from scvi_codegen.models.problems import problem
 from scvi_codegen.rendering.environment import support_text
+from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 
 ROUNDING = 5e-16
 Q, P, STEPS = [1.2], [0.7], 5
@@ -267,13 +268,37 @@ def test_standing_waves_converge_up_to_the_largest_step(name, method):
     """Sites at nodes are at rest, and their forces are rounding errors; named ones need a few more iterations."""
     phase = 4 * np.pi * np.arange(SITES) / SITES
     system = either_system(name="ring", **LATTICES[name])
-    stepper = compile_stepper(system, method, solver="fixed-point", flags=QUICK_FLAGS)
-    h, counts = (0.8 if name == "momenta" else 0.95) * (1.1 if method == "svi:4" else 1.75), []
+    h = (0.8 if name == "momenta" else 0.95) * (1.1 if method == "svi:4" else 1.75)
+    for sizes in ({"N": SITES}, None) if "array" in name else (None,):
+        stepper, counts = compile_stepper(system, method, solver="fixed-point", sizes=sizes, flags=QUICK_FLAGS), []
+        for shift in (0.0, 0.3):
+            run = stepper.start(np.cos(phase + shift), np.zeros(SITES), h=h)
+            run.advance(20)
+            counts.append(run.iterations / 20)
+        assert counts[0] <= (1.1 * counts[1] + 0.2 if "array" in name else counts[1] + 5)
+
+
+def test_standing_waves_of_an_ensemble_converge_at_known_sizes():
+    phase = 4 * np.pi * np.arange(SITES) / SITES
+    system = either_system(name="ring", **LATTICES["array"])
+    stepper, counts = compile_stepper(system, "svi:4", sizes={"N": SITES}, flags=QUICK_FLAGS), []
     for shift in (0.0, 0.3):
-        run = stepper.start(np.cos(phase + shift), np.zeros(SITES), h=h)
-        run.advance(20)
-        counts.append(run.iterations / 20)
-    assert counts[0] <= (1.1 * counts[1] + 0.2 if "array" in name else counts[1] + 5)
+        waves = np.cos(phase + shift) * np.arange(1, 9)[:, None]
+        runs = Ensemble(stepper, waves, 0 * waves, h=0.5, steps=20).common
+        block = runs.blocks()[0](0)
+        block.advance(20)
+        counts.append(block.memory.iterations / 20)
+    assert counts[0] <= 1.1 * counts[1] + 0.2
+
+
+def test_bodies_of_known_number_are_measured_one_by_one():
+    """Bodies that do not move do not make the criterion of others looser: only fields are measured as a whole."""
+    system = LagrangianSystem.from_text(
+        name="pairs",
+        coordinates=["x[4]"],
+        lagrangian="sum(i in 4, x_dot[i]**2/2) + sum(i < j in 4, 1/sqrt((x[i] - x[j])**2 + 1))",
+    )
+    assert not any(array.is_field for array in system.arrays)
 
 
 @pytest.mark.parametrize("form", ["", "*(1 + y**2/1000)"])

@@ -1,6 +1,7 @@
 """Elements of arrays of known sizes: fields of the equivalent system of named coordinates q_0, q_1, ..."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.array_statements import EntryRules, entry_names, formula_of_entries, known_array
 from scvi_codegen.formulas.rotations import AXES, Forces, RotationNames, momenta_of, torque_symbols
 from scvi_codegen.formulas.symbols import number, symbol
-from scvi_codegen.indices import Array
+from scvi_codegen.indices import Array, couples_elements
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 
 
@@ -46,12 +47,24 @@ def unrolled_fields(
         "defaults": (*numbers.values(), *values.values()),
         "inputs": system.inputs,
         "damping": system.damping,
-        "arrays": tuple(known_array(array, sizes) for array in (*system.positions, *system.fields)),
+        "arrays": tuple(
+            replace(known_array(array, sizes), is_field=_is_field(system, array))
+            for array in (*system.positions, *system.fields)
+        ),
         "indices": {**sizes, **{name: table.tolist() for name, table in written.tables.items()}},
         "lengths": tuple(length for near in system.neighbours for length in near.lengths),
         "definition": {} if system.sizes else system.definition,
         **_formulas(system, written, constants),
     }
+
+
+def _is_field(system: ArraySystem, array: Array) -> bool:
+    """Return whether a term couples neighbouring elements of an array."""
+    accesses = [[access for _, access in term.slots] for term in system.terms]
+    return any(
+        couples_elements(array, each, [access for access in each if access.array not in system.positions])
+        for each in accesses
+    )
 
 
 def formula_at_sizes(

@@ -1,15 +1,15 @@
 """Systems of arrays as C: functions of nested loops around kernels, lattices, and the template's context."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import accumulate, combinations, groupby
+from itertools import accumulate, groupby
 from math import prod
 from typing import Any
 
-from scvi_codegen.indices import MOST_THREADS, Access, Array, Convolution, Place
+from scvi_codegen.indices import MOST_THREADS, Array, Convolution, couples_elements
 from scvi_codegen.ir.equations import ConstrainedSteps
 from scvi_codegen.ir.kernel import Kernel, RolledKernel, is_divided
-from scvi_codegen.ir.program import Program
+from scvi_codegen.ir.program import Program, RolledTerms
 from scvi_codegen.rendering.kernels.functions import kernel_text
 from scvi_codegen.rendering.kernels.loop_nests import (
     DIRECTION,
@@ -87,7 +87,7 @@ def loop_context(program: Program) -> dict[str, Any]:
         **_map_context(program),
         "hot": "static",
         "waves": _lattice_context(program) if _on_lattices(program) else None,
-        "arrays": [(product_text(each), int(_is_field(each, loops.applied))) for each in program.layout.coordinates],
+        "arrays": [(product_text(each), _is_field(each, loops)) for each in program.layout.coordinates],
         **_constraint_context(program, constrained),
     }
 
@@ -355,20 +355,8 @@ def _constraint_texts(program: Program, condition: RolledKernel, curvature: Roll
     yield _function(program, bare, f"place_{name}", [now], lines, values=0, source="")
 
 
-def _is_field(array: Array, term_groups: Iterable[RolledKernel]) -> bool:
-    """Return whether forces couple elements of an array: at offsets, by rows of a table, or by a matrix c[i, j]."""
-    return any(
-        all(_are_coupled(a, b, each.given) for a, b in zip(one.places, other.places, strict=True))
-        and any(a != b and a.index for a, b in zip(one.places, other.places, strict=True))
-        for each in term_groups
-        for one, other in combinations([read for read in each.reads if read.array == array], 2)
-    )
-
-
-def _are_coupled(a: Place, b: Place, coefficients: Iterable[Access]) -> bool:
-    if a.index == b.index:
-        return not (a.minus or b.minus)
-    return any({a.index, b.index} <= each.indices for each in coefficients)
+def _is_field(array: Array, loops: RolledTerms) -> int:
+    return int(any(couples_elements(array, each.reads, each.given) for each in loops.applied))
 
 
 def _on_lattices(program: Program) -> bool:

@@ -44,16 +44,22 @@ static inline number exponential_less_1(number x)
   return view.all;
 }
 
-/* Maximum of M numbers. */
-static inline number largest_number(const number *x)
+/* Maximum of x_first .. x_(end - 1). */
+static inline number largest_between(const number *x, int first, int end)
 {
-  lane_view largest = {x[0]};
-  for (int i = 1; i < M; i++) {
+  lane_view largest = {x[first]};
+  for (int i = first + 1; i < end; i++) {
     const lane_view view = {x[i]};
     for (int j = 0; j < LANES; j++)
       largest.lane[j] = larger(largest.lane[j], view.lane[j]);
   }
   return largest.all;
+}
+
+/* Maximum of M numbers. */
+static inline number largest_number(const number *x)
+{
+  return largest_between(x, 0, M);
 }
 
 static inline number fused_numbers(number a, number b, number c)

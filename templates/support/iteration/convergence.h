@@ -102,11 +102,28 @@ static inline double relative_change(double change, double size)
 #else
 /* Inverse sizes, in units of which changes are measured. Requires: points.h or trajectories.h. */
 
+/* Adds the largest size of an array whose neighbouring elements forces couple to the size of each element: at a node of
+ * a standing wave forces are rounding errors of terms that cancel. */
+static inline void add_largest_of_arrays(number *size)
+{
+#ifdef COUPLED_ELEMENTS
+  static const int coupled[][2] = {COUPLED_ELEMENTS};
+  for (size_t k = 0; k < sizeof coupled / sizeof coupled[0]; k++) {
+    const number largest = largest_between(size, coupled[k][0], coupled[k][1]);
+    for (int i = coupled[k][0]; i < coupled[k][1]; i++)
+      size[i] += largest;
+  }
+#else
+  (void)size;
+#endif
+}
+
 /* 1 / (size + a little of the largest), so that a coordinate at 0 has a size, too; or `absolute`, which converts to
  * changes of q. An infinite size gives NaN. */
 static inline void invert_sizes(const solver_options *options, double absolute, number *size)
 {
   const number largest = largest_number(size);
+  add_largest_of_arrays(size);
   for (int i = 0; i < M; i++)
     size[i] =
         (options->absolute ? number_of(absolute) : 1.0 / (size[i] + (DBL_EPSILON * largest + DBL_MIN))) + 0.0 * largest;
