@@ -10,6 +10,7 @@ from benchmarks.cases.adaptive import ADAPTIVE_CASES, adaptive_case
 from benchmarks.cases.fields import FIELDS, FieldCase, our_fields
 from benchmarks.cases.forced import driven_pendulum
 from benchmarks.cases.large import atoms, bodies, field, ring
+from benchmarks.cases.published import PUBLISHED_CASES, published_case
 from benchmarks.cases.references import Reference, rms_error
 from benchmarks.cases.robots import ROBOTS
 from benchmarks.cases.rotations import BODIES, FEW_BODIES, ROTATIONS, tumbling
@@ -138,6 +139,7 @@ BUILDERS: dict[str, Callable[[Plan], Race]] = {
     **{name: partial(_single, make) for name, make in CASES.items()},
     **{f"ensemble:{name}": partial(_copies, name) for name in ENSEMBLES},
     "forced:double-pendulum": partial(_single, driven_pendulum),
+    **{f"published:{name}": partial(_single, partial(published_case, name)) for name in PUBLISHED_CASES},
     **{f"adaptive:{name}": partial(_adaptive, name) for name in ADAPTIVE_CASES},
     **{f"rotations:{name}": partial(_rotation, name) for name in ROTATIONS},
     "rotations:bodies": _tumbling,

@@ -69,6 +69,7 @@ class Case:
         loops: source of ``rates(out, t, x, unused)`` in Python with loops, for Numba, if faster than unrolled code.
         velocity_of: function from (k, m) momenta in extended precision to velocities if a rounding of momenta matters;
             ``None`` if p = dL/dv is exact at the initial states (unit masses, or rest).
+        momenta: initial momenta of formulations in momenta; ``None``: zero.
         mjcf: the same system as a model of MuJoCo, if there is one.
         arrays: of an array system of one array, which has one initial state, what peers of arrays need.
         field: of a partial differential equation, its density and exact solution.
@@ -85,6 +86,7 @@ class Case:
     bodies: Bodies | None = None
     loops: str | None = None
     velocity_of: Callable[[Any], Any] | None = None
+    momenta: Array | None = None
     mjcf: str | None = None
     arrays: Arrays | None = None
     field: Any = None

@@ -1,6 +1,7 @@
 """Integrators of other packages, each with the best options and the best formulation known to us.
 
 heyoka      adaptive Taylor series, compiled by LLVM: see :mod:`.taylor`.
+irkgl16     the Gauss method of 8 stages in SIMD lanes, ported to C from the paper: see :mod:`.irkgl16`.
 rebound     IAS15, for gravitating bodies, with its default step control.
 mujoco      its integrators, Pinocchio and Exudyn, for multibody systems: see :mod:`.engines`.
 cyrk        DOP853 in C++ (CyRK), right-hand side compiled by Numba.
@@ -21,6 +22,7 @@ from benchmarks.cases.unforced import Array, Case
 from benchmarks.contenders import arrays, pdes
 from benchmarks.contenders.dop853 import absolute_tolerance, by_tolerance, dop853, start_of
 from benchmarks.contenders.engines import exudyn_contenders, mujoco_contenders, pinocchio_contenders
+from benchmarks.contenders.irkgl16 import irkgl16_contenders
 from benchmarks.contenders.mechanisms import by_lambdify, by_pydy, kane_contenders
 from benchmarks.contenders.taylor import heyoka_contenders
 from benchmarks.contenders.tracing import rates_text
@@ -166,6 +168,7 @@ BY_LAMBDIFY, BY_PYDY = (
 )
 PEERS = {
     "heyoka": Peer(("heyoka",), heyoka_contenders, _has_formulations),
+    "irkgl16": Peer((), irkgl16_contenders, _has_formulations),
     "rebound": Peer(("rebound",), rebound_contenders, lambda case: case.bodies is not None),
     "mujoco": Peer(("mujoco",), mujoco_contenders, lambda case: case.mjcf is not None),
     "pinocchio": Peer(("pinocchio",), pinocchio_contenders, _is_tree),
@@ -180,5 +183,6 @@ PEERS = {
     "pydy": Peer(("pydy",), BY_PYDY, _is_mechanism),
     "openmm": Peer(("openmm",), arrays.openmm_contenders, lambda case: "atoms" in case.name),
 }
-"""Peers by the name on the command line, the fastest first; "hand", "fft" and "numba" are programs
-written by hand: C for lattices, split steps with FFT and loops in Numba for fields."""
+"""Peers by the name on the command line, the fastest first; "irkgl16", "hand", "fft" and "numba" are
+programs written by hand: a port of a Julia package to C, C for lattices, split steps with FFT and loops in Numba for
+fields."""

@@ -113,12 +113,15 @@ class _Taylor:
             options=f"{self.name}, {'compact' if self.compact else 'unrolled'}, order {integrator.order}",
             compile_seconds=seconds,
             prepare=(self._batches if batch else self._preparation)(integrator, case),
+            momenta=case.momenta if self.formulation.momenta else None,
             trajectories=len(case.q) if batch else 1,
         )
 
     def _second(self, case: Case) -> Array:
-        """Return the second half of the states; momenta are used only for cases that start from rest."""
-        return np.zeros_like(case.q) if self.formulation.momenta else case.velocity
+        """Return the second half of the states."""
+        if self.formulation.momenta:
+            return np.zeros_like(case.q) if case.momenta is None else case.momenta
+        return case.velocity
 
     def _preparation(self, integrator: Any, case: Case) -> Callable[[int], Callable[[], Array]]:
         second = self._second(case)
