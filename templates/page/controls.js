@@ -1,0 +1,259 @@
+// Sliders, buttons, keys, dragging, and the loop over frames.
+const BUDGET = 12; // milliseconds of a frame at most
+const CAUSES = about.causes;
+let running = true, pending = [], dragged, last, target = 0, stepCost = 0.01, drawCost = 2, frames = 0, dirty = true, notice = "", noticeEnds = 0;
+const motion = by("motion"), calm = matchMedia("(prefers-reduced-motion: reduce)");
+
+function tell(text) { notice = text; noticeEnds = performance.now() + 7000; dirty = true; }
+let writing;
+function writeAddress() {
+  clearTimeout(writing);
+  writing = setTimeout(() => { try { history.replaceState(null, "", address(false)); } catch { /* a frame without an address */ } }, 300);
+}
+
+/** Starts the motion again, and finds the frame of the drawing by running ahead for a moment. */
+function restart() {
+  start();
+  if (!fault && m <= WHOLE) {
+    const began = performance.now(), states = [pointsOf(memory_q, code.time())], span = 10 * settings.speed;
+    while (!fault && performance.now() - began < 4 && Math.abs(code.time() - about.t) < span && states.length < 4000) {
+      fault = code.advance(16, 4);
+      for (let k = 0; k < 4; k++) states.push(pointsOf(stored_q.subarray(k * m, (k + 1) * m), stored_t[k]));
+    }
+    const shown = states.filter((points) => points.flat().every(Number.isFinite));
+    start();
+    picture.ahead(shown);
+  } else picture.ahead([]);
+  target = code.time();
+  by("reverse").setAttribute("aria-pressed", "false");
+  dirty = true;
+}
+
+// ---- sliders
+const sliders = [];
+const groups = {};
+function group(title) {
+  if (groups[title]) return groups[title];
+  const box = document.createElement("details"), heading = box.appendChild(document.createElement("summary"));
+  heading.textContent = title; box.open = true;
+  by("controls").append(box);
+  return (groups[title] = box);
+}
+function addSlider(title, label, name, { low, high, log = false, hard = true, get, set: put }) {
+  const row = document.createElement("div"), id = "c" + sliders.length, text = document.createElement("label"), range = document.createElement("input"), number = document.createElement("input");
+  row.className = "row"; text.htmlFor = range.id = id; text.append(label); text.title = name;
+  Object.assign(range, { type: "range", min: 0, max: 1, step: 0.001 }); range.setAttribute("aria-label", name);
+  Object.assign(number, { type: "number", step: "any" }); number.setAttribute("aria-label", `${name}, value`);
+  row.append(text, range, number);
+  const share = (x) => clamped(log ? Math.log(x / low) / Math.log(high / low) : (x - low) / (high - low), 0, 1);
+  const show = () => {
+    const x = get(), at = share(x);
+    if (document.activeElement !== range) range.value = at;
+    range.style.setProperty("--at", `${100 * at}%`);
+    range.setAttribute("aria-valuetext", short(x));
+    if (document.activeElement !== number) number.value = Math.abs(x) < 1e-15 ? 0 : +x.toPrecision(5);
+  };
+  const changed = (x) => { put(x); showSliders(); writeAddress(); };
+  range.addEventListener("input", () => { const s = +range.value; changed(clamped(+(log ? low * (high / low) ** s : low + (high - low) * s).toPrecision(4), low, high)); });
+  number.addEventListener("change", () => {
+    const x = number.valueAsNumber;
+    if (!Number.isFinite(x)) tell(`${name} must be a number.`);
+    else if (hard && (x < low || x > high)) { tell(`${name} must be between ${short(low)} and ${short(high)}; ${short(x, 6)} was replaced.`); changed(clamped(x, low, high)); number.value = +get().toPrecision(5); }
+    else changed(x);
+  });
+  number.addEventListener("blur", show);
+  group(title).append(row);
+  sliders.push(show);
+}
+const showSliders = () => sliders.forEach((show) => show());
+addSlider("Time", "Speed", "Speed", { ...about.speed, log: true, get: () => settings.speed, set: (x) => { settings.speed = x; } });
+const adaptive = about.step.kind === "adaptive";
+addSlider("Time", adaptive ? "Tolerance" : "Step size", adaptive ? "Tolerance" : "Step size", { ...about.step, log: true, get: () => settings.step, set: (x) => { settings.step = x; restart(); } });
+for (const { name, low, high, log } of about.parameters) addSlider("Parameters", set(name), name, { low, high, log, get: () => settings.parameters[name], set: (x) => { settings.parameters[name] = x; restart(); } });
+const rotations = (source.solids || []).filter((each) => each.columns.length === 4);
+if (rotations.length) rotations.forEach(addRotation);
+if (!about.initial && about.ranges) {
+  for (const kind of ["q", "v"]) about.coordinates.forEach((name, k) => {
+    if (rotations.some(({ columns }) => columns.includes(k))) return;
+    const [low, high] = about.ranges[kind][k];
+    addSlider("Initial values", set(name, kind === "v"), kind === "q" ? name : `Velocity of ${name}`, { low, high, hard: false, get: () => settings[kind][k], set: (x) => { settings[kind] = settings[kind].with(k, x); restart(); } });
+  });
+}
+if (groups.Parameters && about.parameters.length > 10 && groups["Initial values"]) groups["Initial values"].open = false;
+
+/** Adds sliders of a rotation: tilt about the first axis, and the angular velocity in the body. */
+function addRotation({ name, columns, omega: names }) {
+  const product = ([a, b, c, d], [w, x, y, z]) => [a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y, a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w];
+  const attitude = () => columns.map((c) => settings.q[c]);
+  const omega = () => { const [w, x, y, z] = attitude(); return product([w, -x, -y, -z], columns.map((c) => settings.v[c])).slice(1).map((u) => 2 * u); };
+  const put = (q, rate) => {
+    const v = product(q, [0, ...rate]).map((u) => u / 2);
+    columns.forEach((c, k) => { settings.q = settings.q.with(c, q[k]); settings.v = settings.v.with(c, v[k]); });
+    restart();
+  };
+  addSlider("Initial values", "Tilt", `Tilt of ${name}`, { low: 0, high: Math.PI, get: () => { const [w, x, y] = attitude(); return 2 * Math.atan2(Math.hypot(x, y), w); }, set: (x) => put([Math.cos(x / 2), Math.sin(x / 2), 0, 0], omega()) });
+  const largest = Math.max(4, ...omega().map((u) => 2 * Math.abs(u)));
+  [0, 1, 2].forEach((axis) => addSlider("Initial values", set(names[axis]), names[axis], { low: -largest, high: largest, hard: false, get: () => omega()[axis], set: (x) => put(attitude(), omega().with(axis, x)) }));
+}
+
+// ---- buttons and keys
+function play(on = !running) {
+  running = on && !fault;
+  document.body.classList.toggle("playing", running);
+  by("play").querySelector("span").textContent = running ? "Pause" : "Play";
+  last = undefined; target = code.time(); dirty = true;
+}
+const actions = {
+  play: () => play(),
+  step: () => { play(false); advance(1); target = code.time(); dirty = true; },
+  reverse: () => { if (fault) return; turn(); by("reverse").setAttribute("aria-pressed", String(backward())); play(true); },
+  restart: () => { pending = []; restart(); writeAddress(); play(true); },
+  here: () => {
+    if (fault || code.velocities()) { tell("The velocities of the present state are undefined; restart first."); return; }
+    settings.q = Array.from(memory_q); settings.v = Array.from(memory_v);
+    if (source.rods) source.rods.lengths.forEach((_, k) => { settings.q[k] = wrapped(settings.q[k]); });
+    restart(); showSliders(); writeAddress();
+  },
+  share: async () => {
+    const here = location.protocol === "about:" ? "" : location.href.split("#")[0], link = here + address();
+    try {
+      await navigator.clipboard.writeText(link);
+      by("share").textContent = "Copied"; by("link").hidden = true;
+    } catch { // no clipboard: a text to select
+      by("link").hidden = false; by("link_text").value = link; by("link_text").focus(); by("link_text").select();
+    }
+    setTimeout(() => { by("share").textContent = "Copy link"; }, 1600);
+  },
+};
+for (const [id, act] of Object.entries(actions)) by(id).addEventListener("click", act);
+if (about.initial) by("here").remove();
+const keys = { " ": "play", ArrowRight: "step", b: "reverse", r: "restart", h: "here", c: "share" };
+document.addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input[type=number], select, #link_text, summary")) return;
+  if (event.target === motion && !flat && !source.mesh) {
+    const turned = { ArrowLeft: [-12, 0], ArrowRight: [12, 0], ArrowUp: [0, 12], ArrowDown: [0, -12] }[event.key];
+    if (turned) { view.orbit(...turned); event.preventDefault(); dirty = true; return; }
+  }
+  if (event.target === motion && !source.mesh && "+-0".includes(event.key)) { if (event.key === "0") view.reset(); else view.enlarge(event.key === "+" ? 1.15 : 1 / 1.15); dirty = true; return; }
+  if (event.key === "ArrowRight" && event.target.matches("input")) return;
+  if (event.key === " " && event.target.matches("button:not(#play)")) return;
+  const id = keys[event.key.toLowerCase?.() ?? event.key] || keys[event.key];
+  if (!id || !by(id)) return;
+  event.preventDefault(); actions[id]();
+});
+
+// ---- dragging: a body, or the camera
+const place = ({ clientX, clientY }) => { const box = motion.getBoundingClientRect(); return [clientX - box.left, clientY - box.top]; };
+const reachOf = (event) => (event.pointerType === "touch" || event.touches ? 44 : 26);
+motion.addEventListener("touchstart", (event) => { if (event.touches.length === 1 && picture.near(place(event.touches[0]), 44) !== undefined) event.preventDefault(); }, { passive: false });
+motion.addEventListener("pointerdown", (event) => {
+  if (source.mesh || pending.length) return;
+  by("hint").classList.add("gone");
+  const which = picture.near(place(event), reachOf(event));
+  if (which === undefined) { if (flat) return; dragged = { orbit: true, at: place(event) }; }
+  else {
+    const was = running;
+    actions.here(); play(false);
+    if (!source.columns) settings.v = settings.v.map(() => 0); // released at rest
+    dragged = { which, was, depth: picture.at[which][2] };
+  }
+  motion.classList.add("dragging");
+  motion.setPointerCapture(event.pointerId);
+});
+motion.addEventListener("pointermove", (event) => {
+  const at = place(event);
+  if (!dragged) { if (!source.mesh && picture.at) motion.classList.toggle("near", !flat || picture.near(at, reachOf(event)) !== undefined); return; }
+  if (dragged.orbit) { view.orbit(at[0] - dragged.at[0], at[1] - dragged.at[1]); dragged.at = at; dirty = true; return; }
+  settings.q = moved(dragged.which, view.from(at, dragged.depth), settings.q, about.t);
+  start(); target = code.time(); showSliders(); writeAddress(); dirty = true;
+});
+for (const name of ["pointerup", "pointercancel"]) motion.addEventListener(name, () => {
+  motion.classList.remove("dragging");
+  if (dragged && !dragged.orbit) { restart(); if (dragged.was) play(true); }
+  dragged = undefined;
+});
+motion.addEventListener("dblclick", () => { view.reset(); dirty = true; });
+
+// ---- frames
+/** Returns q between the last two states: a cubic with their positions and velocities. */
+function between(time) {
+  if (!before || m > WHOLE || code.velocities()) return memory_q;
+  const h = code.time() - before.t, s = (time - before.t) / h;
+  if (!(s >= 0 && s < 1)) return memory_q;
+  const [a, b, c, d] = [(1 + 2 * s) * (1 - s) ** 2, s * (1 - s) ** 2 * h, s * s * (3 - 2 * s), s * s * (s - 1) * h];
+  return Float64Array.from(memory_q, (q, k) => a * before.q[k] + b * before.v[k] + c * q + d * memory_v[k]);
+}
+const snapshot = () => { before = m <= WHOLE && !code.velocities() ? { t: code.time(), q: memory_q.slice(), v: memory_v.slice() } : undefined; };
+
+/** Performs the steps of a frame within the time that is left for them. */
+function go(elapsed, until) {
+  const sign = backward() ? -1 : 1, speed = settings.speed * sign;
+  target += elapsed * speed;
+  let performed = 0;
+  while (!fault && (target - code.time()) * sign > 0) {
+    const size = adaptive ? 1 : Math.ceil(((target - code.time()) * sign) / settings.step - 1e-9);
+    const now = Math.max(1, Math.min(size, Math.floor((until - performance.now()) / stepCost / 2))), began = performance.now(), every = Math.max(1, Math.ceil(size / 48));
+    if (now > 1) advance(now - 1, Math.min(every, now - 1));
+    if (!fault) { snapshot(); advance(1); }
+    performed += now;
+    stepCost = 0.8 * stepCost + (0.2 * Math.max(performance.now() - began, 1e-3)) / now;
+    if (performance.now() > until) { if ((target - code.time()) * sign > 0) target = code.time(); break; }
+  }
+  return performed;
+}
+
+/** Performs the steps of an address, as many as a frame allows. */
+function replay(until) {
+  const every = Math.max(1, Math.ceil(pending[0] / 2000));
+  while (pending.length && !fault && performance.now() < until) {
+    if (pending[0] > 0) { const now = Math.min(pending[0], 64 * every); advance(now, every); pending[0] -= now; }
+    if (pending[0] === 0 && pending.shift() === 0 && pending.length) turn();
+  }
+  if (fault) pending = [];
+  if (!pending.length) { by("reverse").setAttribute("aria-pressed", String(backward())); target = code.time(); }
+  dirty = true;
+}
+
+function frame(now) {
+  const began = performance.now(), until = began + Math.max(2, BUDGET - drawCost);
+  let performed = 0;
+  if (pending.length) replay(until);
+  else if (running && !fault) {
+    performed = go(Math.min(now - (last ?? now), 100) / 1000, until);
+    last = now; dirty = true;
+  }
+  if (fault && running) play(false);
+  const drawing = performance.now();
+  if (dirty || frames % 60 === 0) draw(performed);
+  if (dirty) drawCost = 0.9 * drawCost + 0.1 * (performance.now() - drawing);
+  dirty = dirty && panels.length > 1 && !running && stale-- > 0;
+  frames++;
+  requestAnimationFrame(frame);
+}
+let stale = 0;
+function draw(performed) {
+  const [pen, width, height] = fitted(motion), time = running && !pending.length ? target : code.time();
+  picture.draw(pen, between(time), time, width, height);
+  if (running) { panels[frames % panels.length].draw(); stale = panels.length; } else panels.forEach((panel) => panel.draw());
+  by("clock").textContent = pending.length ? `computing the state of the link: ${pending[0].toLocaleString("en")} steps to go` : `t = ${code.time().toFixed(2)}`;
+  const told = fault ? CAUSES[fault] || `The step failed (status ${fault}).` : performance.now() < noticeEnds ? notice : "";
+  by("fault").hidden = !told;
+  if (by("fault").textContent !== told) by("fault").textContent = told;
+  if (frames % 20 === 0 || !running) by("status").textContent = `${code.steps().toLocaleString("en")} steps${performed ? `, ${performed} a frame` : ""}; ${short(code.iterations(), 2)} iterations a step${code.error() >= 0 ? `; largest error of a step about ${short(code.error(), 1)}` : ""}`;
+}
+
+function open() {
+  const { error, steps } = readAddress(location.hash);
+  if (error) tell(error);
+  restart(); showSliders();
+  pending = steps && steps.some((n) => n) ? steps : [];
+  play(!error && !pending.length && !calm.matches);
+}
+if (window !== parent) document.body.classList.add("embedded");
+by("hint").textContent = source.mesh ? "" : shape.movable.length ? (flat ? "drag a body" : "drag a body, or turn the view") : flat ? "" : "drag to turn the view";
+readColors();
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { readColors(); dirty = true; });
+addEventListener("resize", () => { dirty = true; });
+addEventListener("hashchange", open);
+open();
+requestAnimationFrame(frame);

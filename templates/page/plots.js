@@ -1,0 +1,116 @@
+// Plots of the history: two variables over one another, the energy, and every conserved quantity.
+const GREEK = { alpha: "α", beta: "β", gamma: "γ", delta: "δ", epsilon: "ε", zeta: "ζ", eta: "η", theta: "θ", kappa: "κ", lambda: "λ", mu: "μ", nu: "ν", xi: "ξ", rho: "ρ", sigma: "σ", tau: "τ", phi: "φ", chi: "χ", psi: "ψ", omega: "ω", Gamma: "Γ", Delta: "Δ", Theta: "Θ", Lambda: "Λ", Phi: "Φ", Psi: "Ψ", Omega: "Ω" };
+const LOW_DIGITS = "₀₁₂₃₄₅₆₇₈₉";
+/** Returns a name in parts: a letter or word, and what is below it. */
+function parted(name) {
+  const [, stem, under] = name.match(/^([A-Za-z]+?)_?(\d+|(?<=_).+)?$/) || [0, name];
+  return [GREEK[stem] || stem, under];
+}
+/** Returns a span with a name set as in a formula. */
+function set(name, dotted = false) {
+  const [stem, under] = parted(name), span = document.createElement("span"), letter = span.appendChild(document.createElement("i"));
+  letter.textContent = stem;
+  if (dotted) letter.className = "dot";
+  if (stem.length > 2) letter.style.fontStyle = "normal";
+  if (under !== undefined) span.appendChild(document.createElement("sub")).append(/[A-Za-z]{2,}|_/.test(under) ? set(under) : under);
+  return span;
+}
+/** Returns a name as text, for where there is no markup. */
+const spelled = (name) => { const [stem, under] = parted(name); return under === undefined ? stem : /^\d+$/.test(under) ? stem + under.replace(/\d/g, (d) => LOW_DIGITS[d]) : `${stem} ${spelled(under)}`; };
+const wrapped = (angle) => angle - TAU * Math.round(angle / TAU);
+
+// ---- variables
+const variables = [{ name: "t", label: "t", of: (row) => row[0] }];
+if (m <= WHOLE && about.coordinates.length) {
+  const turning = source.rods ? source.rods.lengths.length : 0;
+  about.coordinates.forEach((name, k) => variables.push({ name, label: spelled(name), of: k < turning ? (row) => wrapped(row[ROW.q + k]) : (row) => row[ROW.q + k], period: k < turning ? TAU : 0 }));
+  about.momenta.forEach((name, k) => variables.push({ name, label: spelled(name), of: (row) => row[ROW.p + k] }));
+  (source.solids || []).forEach((solid, j) => "xyz".split("").forEach((letter, axis) => {
+    const columns = solid.columns.map((c) => ROW.q + c);
+    variables.push({ name: `${solid.name}.${letter}`, label: `${solid.name} axis ${letter}`, of: (row) => { const part = unit(columns.map((c) => row[c])); return part.length === 4 ? rotation(part)[axis][2] : part[axis]; } });
+  }));
+} else probes.forEach((at, k) => {
+  const name = source.mesh?.fields.find(({ columns: [begin, end] }) => at >= begin && at < end)?.name || "q";
+  variables.push({ name: `q.${k}`, label: `${name}, node ${at}`, of: (row) => row[ROW.q + k] }, { name: `p.${k}`, label: `p, node ${at}`, of: (row) => row[ROW.p + k] });
+});
+if (about.energy) variables.push({ name: "energy", label: "energy", of: (row) => row[1] });
+about.quantities.forEach((name, k) => variables.push({ name, label: name, of: (row) => row[2 + k] }));
+const named = (name, other) => { const at = variables.findIndex((each) => each.name === name); return at < 0 ? Math.min(other, variables.length - 1) : at; };
+
+// ---- panels
+const panels = [];
+function addPanel(title, draw) {
+  const box = document.createElement("div"), heading = box.appendChild(document.createElement("h2"));
+  box.className = "plot";
+  const span = heading.appendChild(document.createElement("span")), output = heading.appendChild(document.createElement("output")), canvas = box.appendChild(document.createElement("canvas"));
+  span.textContent = span.title = title;
+  canvas.setAttribute("role", "img"); canvas.setAttribute("aria-label", title); output.setAttribute("aria-live", "off");
+  by("plots").append(box);
+  const panel = { span, output, canvas, draw: () => draw(panel) };
+  panels.push(panel);
+  return panel;
+}
+const solid = (source.solids || [])[0];
+const defaults = about.plots.length ? about.plots : [solid ? [`${solid.name}.y`, `${solid.name}.x`] : m <= WHOLE && about.coordinates.length ? [about.momenta[0] || "t", about.coordinates[0]] : ["q.0", "t"]];
+for (const [y, x] of defaults) {
+  const shown = { y: named(y, 2), x: named(x, 0) };
+  const panel = addPanel("Plot of two variables", ({ canvas }) => {
+    const [across, up] = [variables[shown.x], variables[shown.y]], xs = rows.map(across.of), ys = rows.map(up.of);
+    const { px, py, pen } = plot(canvas, xs, ys, colors.c0, { periods: [across.period, up.period] });
+    pen.beginPath(); pen.arc(px(xs.at(-1)), py(ys.at(-1)), 3.5, 0, TAU); pen.fillStyle = colors.c1; pen.fill();
+  });
+  panel.span.textContent = ""; panel.span.className = "choices";
+  for (const which of ["y", "x"]) {
+    const choice = document.createElement("select");
+    choice.setAttribute("aria-label", which === "y" ? "Vertical axis" : "Horizontal axis");
+    variables.forEach(({ label }, k) => choice.add(new Option(label, k, false, k === shown[which])));
+    choice.addEventListener("change", () => { shown[which] = +choice.value; panel.draw(); });
+    if (which === "x") panel.span.append("over");
+    panel.span.append(choice);
+  }
+}
+if (about.energy) addPanel(about.energy.conserved ? "Relative energy error" : about.energy.label, ({ canvas, output }) => {
+  const scale = about.energy.conserved ? Math.abs(energy0) || 1 : 1, ys = rows.map((row) => (row[1] - (about.energy.conserved ? energy0 : 0)) / scale);
+  plot(canvas, rows.map((row) => row[0]), ys, colors.c2, { symmetric: about.energy.conserved });
+  output.textContent = short(ys.at(-1), 2);
+});
+about.quantities.forEach((name, k) => addPanel(`${name[0].toUpperCase()}${name.slice(1)}, change`, ({ canvas, output }) => {
+  plot(canvas, rows.map((row) => row[0]), rows.map((row) => row[2 + k] - quantities0[k]), colors.c3, { symmetric: true });
+  output.textContent = short(rows.at(-1)[2 + k], 4);
+}));
+
+/** Returns the context of a canvas, cleared, in CSS pixels. */
+function fitted(canvas) {
+  const ratio = devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight, [w, h] = [width, height].map((x) => Math.round(x * ratio));
+  if (canvas.width !== w || canvas.height !== h) { canvas.width = w; canvas.height = h; }
+  const pen = canvas.getContext("2d");
+  pen.setTransform(ratio, 0, 0, ratio, 0, 0); pen.clearRect(0, 0, width, height); pen.lineJoin = pen.lineCap = "round";
+  return [pen, width, height];
+}
+
+/** Draws ys over xs; where a periodic variable jumps, points are not joined. */
+function plot(canvas, xs, ys, color, { symmetric = false, periods = [0, 0] } = {}) {
+  const [pen, width, height] = fitted(canvas), left = 52, bottom = 17, top = 6, right = 8;
+  const range = (list) => {
+    let low = Infinity, high = -Infinity;
+    for (const x of list) { if (x < low) low = x; if (x > high) high = x; }
+    if (!(low <= high)) return [-1, 1];
+    const least = 1e-9 * Math.max(Math.abs(low), Math.abs(high)) || 1e-15;
+    return high - low > least ? [low, high] : [low - least, low + least];
+  };
+  let [x0, x1] = range(xs), [y0, y1] = range(ys);
+  if (symmetric) { y1 = Math.max(...ys.reduce(([a, b], y) => [Math.max(a, y), Math.max(b, -y)], [0, 0]), 2.3e-16); y0 = -y1; }
+  const pad = 0.08 * (y1 - y0); y0 -= pad; y1 += pad;
+  const px = (x) => left + ((width - left - right) * (x - x0)) / (x1 - x0), py = (y) => height - bottom - ((height - bottom - top) * (y - y0)) / (y1 - y0);
+  pen.font = `11px ${colors.sans}`; pen.fillStyle = colors.muted; pen.textBaseline = "middle"; pen.textAlign = "right";
+  for (const mark of ticks(y0, y1, 3)) { line(pen, [[left, py(mark)], [width - right, py(mark)]], colors.rule, 1); pen.fillText(short(mark), left - 6, py(mark)); }
+  pen.textBaseline = "top"; pen.textAlign = "center";
+  for (const mark of ticks(x0, x1, 4)) { const text = short(mark), half = pen.measureText(text).width / 2; if (px(mark) + half < width) pen.fillText(text, px(mark), height - bottom + 4); }
+  pen.beginPath();
+  for (let k = 0; k < xs.length; k++) {
+    const jump = k && periods.some((period, axis) => period && Math.abs((axis ? ys : xs)[k] - (axis ? ys : xs)[k - 1]) > period / 2);
+    if (!k || jump) pen.moveTo(px(xs[k]), py(ys[k])); else pen.lineTo(px(xs[k]), py(ys[k]));
+  }
+  pen.strokeStyle = color; pen.lineWidth = 1.2; pen.stroke();
+  return { px, py, pen };
+}
