@@ -1,16 +1,16 @@
 """Released archives: wheel and sdist are reproducible and work outside the checkout."""
 
-import hashlib
 import importlib.util
 import json
 import os
-import shutil
 import subprocess
 import sys
 import tarfile
 import tomllib
 import zipfile
+from datetime import date
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -18,16 +18,20 @@ import pytest
 import scvi_codegen
 
 ROOT = Path(__file__).parents[2]
-TOOLS = ("build", "hatchling", "twine", "check_wheel_contents")
-LEFT_BEHIND = shutil.ignore_patterns(".git", ".venv", "venv", ".*_cache", ".hypothesis", "__pycache__", "site", "dist")
-EPOCH = "1700000000"
+needs_tools = pytest.mark.skipif(
+    any(importlib.util.find_spec(tool) is None for tool in ("build", "hatchling", "twine", "check_wheel_contents")),
+    reason="pip install 'scvi-codegen[release]'",
+)
 
-pytestmark = [
-    pytest.mark.full,
-    pytest.mark.skipif(
-        any(importlib.util.find_spec(tool) is None for tool in TOOLS), reason="pip install 'scvi-codegen[release]'"
-    ),
-]
+
+def loaded_release() -> ModuleType:
+    specification = importlib.util.spec_from_file_location("release", ROOT / ".ci" / "release.py")
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    return module
+
+
+release = loaded_release()
 
 
 def output_of(*command: str, folder: Path, **variables: str) -> str:
@@ -39,59 +43,56 @@ def output_of(*command: str, folder: Path, **variables: str) -> str:
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Folders with an sdist and a wheel each, of two copies that are not equally old."""
-    folders = []
-    for name, age in (("first", 10**6), ("second", 10**8)):
-        copy = tmp_path_factory.mktemp(name) / "checkout"
-        shutil.copytree(ROOT, copy, ignore=LEFT_BEHIND)
-        for path in copy.rglob("*"):
-            os.utime(path, (age, age))
-        output_of(sys.executable, "-m", "build", "--no-isolation", folder=copy, SOURCE_DATE_EPOCH=EPOCH)
-        folders.append(copy / "dist")
-    return folders
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with sdist and wheel, which were built twice with equal bytes."""
+    folder = tmp_path_factory.mktemp("dist")
+    release.build(folder, date(2026, 11, 25))
+    return folder
 
 
-def digests(folder: Path) -> dict[str, str]:
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()}
-
-
-def test_two_builds_have_the_same_bytes(built):
-    first, second = map(digests, built)
-    assert first == second
+@needs_tools
+@pytest.mark.second
+def test_archives_are_complete(built):
     version = scvi_codegen.__version__
-    assert set(first) == {f"scvi_codegen-{version}.tar.gz", f"scvi_codegen-{version}-py3-none-any.whl"}
-
-
-def test_wheel_contents_are_complete(built):
-    files = sorted(map(str, built[0].iterdir()))
-    assert "PASSED" in output_of(sys.executable, "-m", "twine", "check", "--strict", *files, folder=built[0])
-    wheel = next(name for name in files if name.endswith(".whl"))
-    assert ": OK" in output_of(sys.executable, "-m", "check_wheel_contents", wheel, folder=built[0])
+    names = {f"scvi_codegen-{version}.tar.gz", f"scvi_codegen-{version}-py3-none-any.whl"}
+    assert {path.name for path in built.iterdir()} == names
+    release.check(sorted(built.iterdir()))
+    (wheel,) = built.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         packed = set(archive.namelist())
-    version = scvi_codegen.__version__
     assert {name.split("/")[0] for name in packed} == {"scvi_codegen", f"scvi_codegen-{version}.dist-info"}
     packed = {name.replace("scvi_codegen/templates/", "templates/") for name in packed if ".dist-info/" not in name}
     paths = [path for folder in ("scvi_codegen", "templates") for path in (ROOT / folder).rglob("*") if path.is_file()]
     assert packed == {str(path.relative_to(ROOT)) for path in paths if "__pycache__" not in path.parts}
 
 
+@needs_tools
+@pytest.mark.second
 def test_tests_documentation_and_benchmarks_run_from_the_source_archive(built):
-    (archive,) = built[0].glob("*.tar.gz")
+    (archive,) = built.glob("*.tar.gz")
     with tarfile.open(archive) as packed:
         entries = {name.split("/")[1] for name in packed.getnames()}
-    assert entries >= {"scvi_codegen", "templates", "tests", "docs", "examples", "benchmarks", "generated", ".ci"}
+    assert entries >= {
+        "scvi_codegen",
+        "templates",
+        "tests",
+        "docs",
+        "examples",
+        "benchmarks",
+        "generated",
+        ".ci",
+        ".github",
+    }
     assert entries >= {path.name for path in ROOT.iterdir() if path.suffix in (".md", ".toml", ".cff")}
     assert entries >= {"LICENSE", ".clang-format", ".gitattributes", ".gitignore"}
 
 
 @pytest.fixture(scope="module")
-def installed(built: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def installed(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The programs of a fresh environment with the wheel, which sees the libraries of this one."""
     folder = tmp_path_factory.mktemp("installed") / "venv"
     output_of(sys.executable, "-m", "venv", "--without-pip", str(folder), folder=folder.parent)
-    (wheel,) = built[0].glob("*.whl")
+    (wheel,) = built.glob("*.whl")
     python = str(folder / "bin" / "python")
     install = ("install", "--quiet", "--no-deps", "--no-index", str(wheel))
     output_of(sys.executable, "-m", "pip", "--python", python, *install, folder=folder.parent)
@@ -101,6 +102,8 @@ def installed(built: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Pa
     return folder / "bin"
 
 
+@needs_tools
+@pytest.mark.full
 def test_the_wheel_works_outside_the_checkout(installed, tmp_path):
     place = "import scvi_codegen; print(scvi_codegen.__file__)"
     assert Path(output_of(str(installed / "python"), "-c", place, folder=tmp_path)).is_relative_to(installed.parent)
@@ -114,12 +117,56 @@ def test_the_wheel_works_outside_the_checkout(installed, tmp_path):
     assert {each["name"]: each["status"] for each in found["findings"]}["trial"] == "ok"
 
 
-def test_citation_has_the_current_version():
-    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+@needs_tools
+@pytest.mark.full
+def test_the_wheel_needs_no_compiler_of_the_machine(built):
+    """Only the programs of a fresh environment are on the PATH; the extra ``compiler`` provides one."""
+    if importlib.util.find_spec("ziglang") is None:
+        pytest.skip("pip install 'scvi-codegen[compiler]'")
+    (wheel,) = built.glob("*.whl")
+    release.try_wheel(wheel, libraries=[path for path in sys.path if path.endswith("-packages")])
+
+
+def test_two_builds_that_differ_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(release, "LEFT_OUT", ("*",))
+    ages = iter("ab")
+
+    def made(*command: str, folder: Path, environment: dict[str, str]) -> str:
+        (folder.parent / "dist").mkdir()
+        (folder.parent / "dist" / "wheel").write_text(next(ages))
+        return ""
+
+    monkeypatch.setattr(release, "called", made)
+    with pytest.raises(release.ReleaseError, match="two builds differ"):
+        release.build(tmp_path, date(2026, 11, 25))
+
+
+def test_version_date_and_licence_are_stated_alike():
+    version, _ = release.version_and_date()
+    assert version == scvi_codegen.__version__
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    released = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split("\n## ")[1:]
-    unreleased = [entry.split()[0] for entry in released if "(unreleased)" in entry.splitlines()[0]]
-    cited = next(line for line in citation.splitlines() if line.startswith("version:")).split()[1]
-    version, developed, _ = scvi_codegen.__version__.partition(".dev")
-    assert version in unreleased if developed else cited == version
-    assert f"license: {project['license']}" in citation
+    assert f"license: {project['license']}" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["CITATION.cff", "CHANGELOG.md", "scvi_codegen/version.py"])
+def test_different_versions_are_refused(name, tmp_path, monkeypatch):
+    for other in ("CITATION.cff", "CHANGELOG.md", "scvi_codegen/version.py"):
+        text = (ROOT / other).read_text(encoding="utf-8")
+        path = tmp_path / other
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text.replace(scvi_codegen.__version__, "9.9.9") if other == name else text, encoding="utf-8")
+    monkeypatch.setattr(release, "ROOT", tmp_path)
+    with pytest.raises(release.ReleaseError, match=r"versions or dates differ.*9\.9\.9.*make them equal"):
+        release.version_and_date()
+
+
+def test_the_recipe_requires_what_the_package_requires(tmp_path):
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    sdist = tmp_path / "archive.tar.gz"
+    sdist.write_bytes(b"")
+    lines = release.recipe("1.2.3", sdist).splitlines()
+    run = lines[lines.index("  run:") + 1 : lines.index("tests:")]
+    required = {line.strip(" -").replace(" ", "") for line in run if line.strip()}
+    assert required == {*project["dependencies"], "python>=${{python_min}}", "c-compiler"}
+    assert '  version: "1.2.3"' in lines
+    assert '  sha256: "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"' in lines

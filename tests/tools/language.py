@@ -86,7 +86,7 @@ def templates() -> list[Path]:
 
 def pages() -> list[Path]:
     """Pages of the documentation."""
-    return [ROOT / "README.md", ROOT / "SECURITY.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    return [ROOT / "README.md", ROOT / "SECURITY.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def docstrings() -> Iterator[Text]:
