@@ -429,6 +429,7 @@ class AdaptivePredictor:
         reach: largest change of level between successive steps.
         alone: by the change into the next step, -reach .. reach: from the last step to the next.
         last, before: by the changes into the last step and into the next: from these two steps.
+        inside: by the number of levels, from 1 on: from a step to a shorter one that begins with it.
         growth: factor of the error estimate per level.
     """
 
@@ -436,4 +437,5 @@ class AdaptivePredictor:
     alone: tuple[NumberTable, ...]
     last: tuple[tuple[NumberTable, ...], ...]
     before: tuple[tuple[NumberTable, ...], ...]
+    inside: tuple[NumberTable, ...]
     growth: float

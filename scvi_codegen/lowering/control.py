@@ -57,8 +57,9 @@ from scvi_codegen.tables.basis import (
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 from scvi_codegen.tables.quadrature import gauss_legendre
 
-LEVELS_PER_BINADE, REACH = 4, 2
-"""Levels per factor of two, and the largest change of level for which the predictor is available."""
+LEVELS_PER_BINADE, REACH, REACH_INSIDE = 4, 2, 8
+"""Levels per factor of two; largest changes of level for which there are predictors from accepted steps and, downwards,
+from a rejected one."""
 MANTISSAS = tuple(round(2.0 ** (k / LEVELS_PER_BINADE + 32)) / 2.0**32 for k in range(LEVELS_PER_BINADE))
 """Step sizes in one octave, rounded to 32 bits.
 
@@ -115,7 +116,10 @@ def predictor_of(fixed_point: FixedPointIteration) -> AdaptivePredictor:
     """Return the predictor tables of a fixed-point iteration."""
     points = _doubles(fixed_point.guess.abscissae)
     ratios = [2.0 ** (change / LEVELS_PER_BINADE) for change in range(-REACH, REACH + 1)]
-    alone = _tables_by_ratio(fixed_point, ratios, points, min(len(points) - 1, DEGREE_OF_ONE), (1.0,))
+    degree = min(len(points) - 1, DEGREE_OF_ONE)
+    alone = _tables_by_ratio(fixed_point, ratios, points, degree, (1.0,))
+    shorter = [2.0 ** (-down / LEVELS_PER_BINADE) for down in range(1, REACH_INSIDE + 1)]
+    inside = _tables_by_ratio(fixed_point, shorter, points, len(points) - 1, (1.0,), begin=0.0)
     pairs = []
     for ratio in ratios:
         sources = (*points, *((x - 1.0) / ratio for x in points))
@@ -126,6 +130,7 @@ def predictor_of(fixed_point: FixedPointIteration) -> AdaptivePredictor:
         alone=tuple(table for (table,) in alone),
         last=tuple(tuple(last for last, _ in line) for line in pairs),
         before=tuple(tuple(before for _, before in line) for line in pairs),
+        inside=tuple(table for (table,) in inside),
         growth=2.0 ** (fixed_point.error_power / LEVELS_PER_BINADE),
     )
 
@@ -136,12 +141,22 @@ def _tables_by_ratio(
     sources: Sequence[float],
     degree: int,
     ages: Sequence[float],
+    begin: float = 1.0,
 ) -> list[list[NumberTable]]:
-    """Return tables by ratio of the next step size to the last, and by step; ``ages``: last step size by theirs."""
+    """Return tables by ratio of the next step size to the last, and by step.
+
+    Args:
+        fixed_point: the iteration.
+        ratios: ratios of the next step size to the last.
+        sources: times of the stored values, in units of the last step size.
+        degree: of the polynomial.
+        ages: last step size by those of the steps.
+        begin: of the next step, in units of the last step size.
+    """
     points = _doubles(fixed_point.guess.abscissae)
     through = tuple(map(_doubles, fixed_point.predictor_matrix))
     count = len(points)
-    targets = [1.0 + ratio * x for ratio in ratios for x in points]
+    targets = [begin + ratio * x for ratio in ratios for x in points]
     rows = least_squares(sources, targets, degree, lambda a, b: math.fsum(map(operator.mul, a, b)))
     tables = []
     for k, ratio in enumerate(ratios):

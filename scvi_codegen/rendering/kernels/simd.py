@@ -191,9 +191,10 @@ def predictor_text(predictor: AdaptivePredictor) -> str:
 
 
 def _predictor_tables(predictor: AdaptivePredictor) -> Iterator[str]:
-    """Yield the tables from stored values to predicted ones: of the last step, and of each of the last two."""
+    """Yield the tables from stored values to predicted ones: of a rejected step, the last one, each of the last two."""
     changes, size = len(predictor.alone), "[POINTS * GROUPS]"
-    yield table(f"static const lanes PREDICTOR_ALONE[{changes}]{size}", list(map(_columns, predictor.alone)))
+    for name, tables in (("INSIDE", predictor.inside), ("ALONE", predictor.alone)):
+        yield table(f"static const lanes PREDICTOR_{name}[{len(tables)}]{size}", list(map(_columns, tables)))
     for name, lines in (("LAST", predictor.last), ("BEFORE", predictor.before)):
         rows = [[f"{{{', '.join(_columns(each))}}}" for each in line] for line in lines]
         yield table(f"static const lanes PREDICTOR_{name}[{changes}][{changes}]{size}", rows)

@@ -38,9 +38,10 @@ static inline real smaller(real a, real b)
 
 /* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
  * failed. afresh: without the predictor, which requires the step size of the previous step. */
-static real attempt(run_memory *run, step_data *step, const solver_data *data, int afresh, long long *guess, real *dq,
-    real *dp, real decay, real least, const solver_options *options, solver_report *report)
+static real attempt(run_memory *run, step_data *step, const solver_data *data, int afresh, int inside, long long *guess,
+    real *dq, real *dp, real decay, real least, const solver_options *options, solver_report *report)
 {
+  (void)inside;
   *guess = !afresh && run->change == 0 && run->guess > 0;
   if (solve(step, data, run->memory, guess, dq, dp, options, report, step->scratch + SCRATCH) != OK)
     return INFINITY;
@@ -51,21 +52,28 @@ static real attempt(run_memory *run, step_data *step, const solver_data *data, i
 #define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
 
 /* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
- * failed. afresh: without the predictor. Out of line, one copy compiles faster than two. */
+ * failed. afresh: without the predictor; inside: levels above this one of a rejected step, whose curve is stored, or 0.
+ * Out of line, one copy compiles faster than two. */
 static __attribute__((noinline)) double attempt(run_memory *run, step_data *step, const solver_data *data, int afresh,
-    long long *guess, double *dq, double *dp, double decay, double least, const solver_options *options,
+    int inside, long long *guess, double *dq, double *dp, double decay, double least, const solver_options *options,
     solver_report *report)
 {
   struct predictor_tables_of tables = {NULL, NULL, NULL};
   int status;
   step->tables = &tables;
-  *guess = afresh || !choose_tables(run, &tables) ? 0 : run->guess;
+  if (inside > 0) {
+    tables.alone = PREDICTOR_INSIDE[inside - 1];
+    *guess = 1;
+  } else
+    *guess = afresh || !choose_tables(run, &tables) ? 0 : run->guess;
 #ifdef NEWTON_KRYLOV
   status = solve(step, data, STORED(run, step), guess, dq, dp, options, report, NULL);
 #else
   status = fixed_point(step, data, STORED(run, step), guess, dq, dp, options, report);
 #endif
   step->tables = NULL;
+  if (inside > 0) /* the step before is no longer stored */
+    *guess = 1;
   if (status != OK)
     return INFINITY;
   return curve_error(step, data, STORED(run, step), dq, SHARE_OF_TRIAL, decay, least);
@@ -95,6 +103,7 @@ typedef struct {
   long long change; /* of the level, from the previous step to this */
   real length; /* step size; 0 before the first trial */
   int last; /* 1 if the step ends at t_end */
+  int inside; /* levels above this one of a rejected step, whose curve is stored; 0: none */
 #ifdef ERROR_GROWTH
   coordinates points[GROUPS]; /* of the last trial */
 #endif
@@ -116,7 +125,7 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
     now->step.h = h;
     prepare(&now->step, &now->data);
   }
-  now->error = attempt(run, &now->step, &now->data, now->last, &now->guess, now->dq, now->dp, now->limits.decay, least,
+  now->error = attempt(run, &now->step, &now->data, now->last, now->last ? 0 : now->inside, &now->guess, now->dq, now->dp, now->limits.decay, least,
       options, report);
 }
 
@@ -181,12 +190,27 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
   }
 }
 
-/* Reduces the step size after a failed or rejected trial, by 2 to `most` levels; returns 0 on step size underflow. */
-static int shorten(run_memory *run, const trial *now, int most)
+/* Levels from the step whose curve is stored down to the next trial, 0 without a predictor. A solved trial stored its
+ * own; a failed one left that of the trial before. */
+static inline int down_from_stored(const trial *now, int solved, int down)
 {
+#if defined(NEWTON_ALONE) || defined(ARRAYS)
+  (void)now, (void)solved, (void)down;
+  return 0;
+#else
+  const int levels = solved ? down : now->inside > 0 ? now->inside + down : 0;
+  return levels <= INSIDE ? levels : 0;
+#endif
+}
+
+/* Reduces the step size after a failed or rejected trial, by 2 to `most` levels; returns 0 on step size underflow. */
+static int shorten(run_memory *run, trial *now, int most)
+{
+  const int solved = now->error < INFINITY && now->length > 0 && !now->last;
   int down = 2;
   while (down < most && !(error_at(now->error, -down) <= now->limits.most))
     down++;
+  now->inside = down_from_stored(now, solved, down);
   run->grid_level -= down;
   run->error_before = error_at(run->error_before, -down);
   run->guess = 0;
@@ -215,6 +239,7 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
     try_step(run, now, least, options, report);
   }
   now->error = larger(now->error, least);
+  now->inside = 0;
   now->change += run->grid_level;
   return OK;
 }
@@ -246,6 +271,7 @@ static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare
     }
     run->steps_to_compare = STEPS_COMPARED_AFTER_DOUBT;
     now->error = INFINITY;
+    now->inside = 0;
     if (!shorten(run, now, MOST_DOWN))
       return STATUS(STEP_SIZE_UNDERFLOW);
     run->error_before = now->limits.most;
