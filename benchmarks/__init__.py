@@ -27,7 +27,7 @@ from benchmarks.cases.unforced import CASES
 from benchmarks.comparison import run_race
 from benchmarks.contenders.peers import PEERS
 from benchmarks.machine import machine
-from benchmarks.report import LEGEND, CaseResult, ResultTable, header_lines
+from benchmarks.report import LEGEND, PRECISION, CaseResult, ResultTable, degree_table, header_lines
 from benchmarks.sections import BUILDERS
 from benchmarks.settings import Plan, ReportActivity
 from benchmarks.tables import run_drift, run_first_steps
@@ -144,5 +144,12 @@ def _reports(
         report = replace(report, results=(*report.results, result))
         show(f"\n{result.text()}")
         yield report
+    else:
+        precise = [result for result in report.cases if result.name.startswith(PRECISION)]
+        if precise:
+            table = degree_table(precise)
+            report = replace(report, results=(*report.results, table))
+            show(f"\n{table.text()}")
+            yield report
     if report.cases:
         show(f"\n{LEGEND}")

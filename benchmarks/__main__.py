@@ -38,6 +38,7 @@ def main(
       forced:double-pendulum                                                friction and driving forces
       ensemble:planar-pendulum, :kepler:0.2, :outer-solar-system            64 trajectories at once
       published:henon-heiles, :outer-solar-system, :black-hole              problems of IRKGL16's authors
+      precision:kepler:0.5, ..  all degrees and peers from 1e-3 to round-off; of all cases of this list until :dumbbell
       adaptive:kepler:0.9, ..   adaptive and fixed step size; heyoka and IAS15
       rotations:free-top, :heavy-top, :dumbbell, :bodies                    rigid bodies; heyoka, MuJoCo
       robots:chain:2, :5, :10, :30, :quadruped, :four-bar                   multibody systems; MuJoCo, Pinocchio, Exudyn

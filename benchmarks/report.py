@@ -274,6 +274,30 @@ def _line_at(result: CaseResult, error: float) -> str:
     return f"at {error:.0e}: {1e3 * times[ours]:.3g} ms by {ours}; others over it: {', '.join(others)}{never}"
 
 
+PRECISION, STANDARD = "precision:", "svi:8"
+"""Beginning of the names of cases with curves of all degrees, and the default method."""
+
+
+def degree_table(results: Iterable[CaseResult]) -> ResultTable:
+    """Return, by case and error, the fastest degree and how many times as long the default degree and peers take."""
+    lines = []
+    for result in results:
+        line: dict[str, Any] = {"problem": result.name.removeprefix(PRECISION)}
+        for error in ERRORS:
+            best, times = ratios_at(result, error)
+            peers = [seconds for name, seconds in times.items() if not name.startswith(OURS)]
+            others = [times.get(f"{OURS} {STANDARD}"), min(peers, default=None)]
+            ratios = ["-" if seconds is None else f"{seconds / times[best]:.2f}" for seconds in others if best]
+            line[f"{error:.0e}"] = " ".join([best.removeprefix(f"{OURS} svi:"), *ratios]) if best else None
+        lines.append(line)
+    return ResultTable(
+        name="precision",
+        title="fastest degree of SVI, time of SVI(8) and of the fastest peer divided by its time, at errors",
+        columns={"problem": ""} | {f"{error:.0e}": "" for error in ERRORS},
+        rows=tuple(lines),
+    )
+
+
 def _ratio(reference: Sequence[Point], points: Sequence[Point]) -> float | None:
     error = common_error(points, reference)
     if error is None:

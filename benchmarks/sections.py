@@ -21,12 +21,13 @@ from benchmarks.contenders.engines import mujoco_contenders
 from benchmarks.contenders.mechanisms import LINKS, links
 from benchmarks.contenders.ours import (
     adaptive_contenders,
+    degree_contenders,
     fixed_contenders,
     our_contenders,
     our_ensembles,
     run_contenders,
 )
-from benchmarks.contenders.peers import rebound_contenders
+from benchmarks.contenders.peers import PEERS, rebound_contenders
 from benchmarks.contenders.taylor import heyoka_contenders, heyoka_ensembles
 from benchmarks.report import Contender
 from benchmarks.settings import Plan
@@ -83,6 +84,21 @@ def _adaptive(name: str, plan: Plan) -> Race:
     return Race(case=chosen, ours=partial(adaptive_contenders, chosen, quick=plan.quick), peers=peers)
 
 
+def _precision(make: Callable[[], Case], name: str, plan: Plan) -> Race:
+    """Return all degrees with adaptive step size, and all peers, from errors of 1e-3 to round-off."""
+    chosen = replace(_shortened(make(), plan), name=f"precision:{name}")
+    peers = {peer: each.contenders for peer, each in PEERS.items()}
+    peers["heyoka"] = partial(heyoka_contenders, loose=True)
+    return Race(case=chosen, ours=partial(degree_contenders, chosen, quick=plan.quick), peers=peers)
+
+
+def _published(name: str, plan: Plan) -> Race:
+    """Return a problem of IRKGL16's authors, at advised and at adaptive step sizes."""
+    chosen = _shortened(published_case(name), plan)
+    both = (our_contenders, adaptive_contenders)
+    return Race(case=chosen, ours=lambda: [each for make in both for each in make(chosen, quick=plan.quick)])
+
+
 def _rotation(name: str, plan: Plan) -> Race:
     """Return a rigid body, at advised and at adaptive step sizes, and by explicit splitting, exact without forces."""
     chosen = _shortened(ROTATIONS[name](), plan)
@@ -135,11 +151,21 @@ ROBOT_METHODS: dict[str | Method, range] = {f"svi:{s}": range(most) for s, most 
 ROBOTS_EXACT: dict[str | Method, int] = {"svi:8": 3, "svi:6": 4}
 MECHANISM_METHODS: dict[str | Method, range] = {"svi:4": range(6)}
 
+ALL_CASES: Mapping[str, Callable[[], Case]] = {
+    **CASES,
+    "forced:double-pendulum": driven_pendulum,
+    **{f"published:{name}": partial(published_case, name) for name in PUBLISHED_CASES},
+    **{f"adaptive:{name}": partial(adaptive_case, name) for name in ADAPTIVE_CASES},
+    **{f"rotations:{name}": make for name, make in ROTATIONS.items()},
+}
+"""Cases whose degrees are compared."""
+
 BUILDERS: dict[str, Callable[[Plan], Race]] = {
     **{name: partial(_single, make) for name, make in CASES.items()},
     **{f"ensemble:{name}": partial(_copies, name) for name in ENSEMBLES},
     "forced:double-pendulum": partial(_single, driven_pendulum),
-    **{f"published:{name}": partial(_single, partial(published_case, name)) for name in PUBLISHED_CASES},
+    **{f"published:{name}": partial(_published, name) for name in PUBLISHED_CASES},
+    **{f"precision:{name}": partial(_precision, make, name) for name, make in ALL_CASES.items()},
     **{f"adaptive:{name}": partial(_adaptive, name) for name in ADAPTIVE_CASES},
     **{f"rotations:{name}": partial(_rotation, name) for name in ROTATIONS},
     "rotations:bodies": _tumbling,

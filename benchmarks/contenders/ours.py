@@ -30,6 +30,9 @@ TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-8, 1e-9, 1e-10, 3e-11, 1e-11, 3e-12, 1e-12, 5
 
 QUICK_TOLERANCES = (1e-8, 1e-10, 1e-12)
 ADAPTIVE_TOLERANCES = (None, 1e-15, 1e-14, 1e-13, 1e-12, 1e-10, 1e-8)
+LOOSE_TOLERANCES = (*ADAPTIVE_TOLERANCES, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
+DEGREES = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12)
+"""Degrees whose work-precision curves are compared."""
 FIXED = tuple(2.0 ** (k / 2) for k in range(-2, 9))
 """Fixed steps, as multiples of the number of adaptive steps."""
 LARGEST_NEWTON = 18
@@ -166,6 +169,26 @@ def adaptive_contenders(case: Case, *, quick: bool) -> list[Contender]:
     momenta = momenta_of(stepper, case)
     adaptive = stepper.integrate(case.q[0], momenta[0], t_end=case.span, check_growth=False).steps
     counts = [max(1, round(adaptive * factor)) for factor in FIXED[: 1 if quick else None]]
+    controlled = controlled_contenders(case, stepper, seconds, ADAPTIVE_TOLERANCES[: 2 if quick else None])
+    fixed = (replace(each, method=f"{OURS} fixed") for each in fixed_contenders(case, {SVI(8): counts}))
+    return [*controlled, *fixed]
+
+
+def degree_contenders(case: Case, *, quick: bool) -> list[Contender]:
+    """Return contenders by SVI of all degrees with adaptive step size, at tolerances from 1e-2 to round-off."""
+    tolerances, made = LOOSE_TOLERANCES[:: 4 if quick else 1], []
+    for degree in DEGREES[:: 6 if quick else 1]:
+        stepper, seconds = compiled(case.system, SVI(degree))
+        curve = controlled_contenders(case, stepper, seconds, tolerances)
+        made += [replace(each, method=f"{OURS} svi:{degree}") for each in curve]
+    return made
+
+
+def controlled_contenders(
+    case: Case, stepper: Stepper, seconds: float, tolerances: Iterable[float | None]
+) -> list[Contender]:
+    """Return contenders with adaptive step size at several tolerances."""
+    momenta = momenta_of(stepper, case)
 
     def prepare(tolerance: float | None, index: int) -> Callable[[], Array]:
         run = stepper.start(case.q[index], momenta[index], t_end=case.span, tolerance=tolerance)
@@ -178,7 +201,7 @@ def adaptive_contenders(case: Case, *, quick: bool) -> list[Contender]:
 
         return integrate
 
-    controlled = [
+    return [
         Contender(
             method=f"{OURS} adaptive",
             setting=f"tol={tolerance:.0e}" if tolerance else "tol=default",
@@ -187,7 +210,5 @@ def adaptive_contenders(case: Case, *, quick: bool) -> list[Contender]:
             prepare=partial(prepare, tolerance),
             momenta=momenta,
         )
-        for tolerance in ADAPTIVE_TOLERANCES[: 2 if quick else None]
+        for tolerance in tolerances
     ]
-    fixed = (replace(each, method=f"{OURS} fixed") for each in fixed_contenders(case, {SVI(8): counts}))
-    return [*controlled, *fixed]

@@ -35,16 +35,25 @@ FEW_TOLERANCES = (0.0, 1e-14, 1e-13, 1e-12)
 FEWEST_TOLERANCES = (0.0, 1e-12, 1e-10)
 """Tolerances for systems that take very long to compile."""
 
+LOOSE_TOLERANCES = (1e-8, 1e-6, 1e-4, 1e-2)
+"""Further tolerances where large errors are of interest."""
+
 TRIALS = 5
 LARGEST_SMALL, LARGEST_QUICK, LARGEST_COUPLED, LARGEST_LAGRANGIAN, LARGEST_UNROLLED = 2, 8, 2, 18, 64
 """Limits on degrees of freedom: compact code is never faster; compiles within about a second; Lagrangian with coupled
 masses (5 rods take minutes); without; unrolled code compiles within a minute."""
 
 
-def heyoka_contenders(case: Case, quick: bool) -> Iterator[Contender]:
-    """Yield the curves ``heyoka``, ``heyoka fast_math`` and ``heyoka.lagrangian``."""
+def heyoka_contenders(case: Case, quick: bool, loose: bool = False) -> Iterator[Contender]:
+    """Yield the curves ``heyoka``, ``heyoka fast_math`` and ``heyoka.lagrangian``.
+
+    Args:
+        case: case to integrate.
+        quick: use few tolerances.
+        loose: extend the first two curves to large errors.
+    """
     variants = list(_variants(case))
-    yield from _two_curves(variants, case, quick)
+    yield from _two_curves(variants, case, quick, LOOSE_TOLERANCES[: 1 if quick else None] if loose else ())
     from_lagrangian = [replace(variant, curve=LAGRANGIAN) for variant in variants if variant.name == LAGRANGIAN]
     yield from _curve(from_lagrangian, case, FEW_TOLERANCES)
 
@@ -55,10 +64,11 @@ def heyoka_ensembles(case: Case, quick: bool) -> Iterator[Contender]:
     return _two_curves(variants, case, quick)
 
 
-def _two_curves(variants: list[_Taylor], case: Case, quick: bool) -> Iterator[Contender]:
-    """Yield the curves without and with ``fast_math``."""
+def _two_curves(variants: list[_Taylor], case: Case, quick: bool, further: Sequence[float] = ()) -> Iterator[Contender]:
+    """Yield the curves without and with ``fast_math``; ``further``: additional tolerances."""
     tolerances: Sequence[float] = FEW_TOLERANCES if quick or case.dimension > LARGEST_QUICK else TOLERANCES
     tolerances = FEWEST_TOLERANCES if case.dimension > LARGEST_LAGRANGIAN else tolerances
+    tolerances = tuple(dict.fromkeys((*tolerances, *further)))
     for fast in (False, True):
         yield from _curve([replace(variant, fast=fast) for variant in variants], case, tolerances)
 
