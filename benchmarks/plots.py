@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from benchmarks.report import OURS, CaseResult
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 COLUMNS = 3
 PANEL, LINE = (4.6, 3.8), 0.25
 """Sizes in inches: of a panel; height of a line of the legend."""
+LINES = ("-", "--", ":", "-.")
 MOST_ABREAST = 4
 """Largest number of methods in a line of the legend; two for a single panel."""
 
@@ -44,11 +45,11 @@ def draw_curves(results: Sequence[CaseResult]) -> Figure:
     width, height = (PANEL[0] * columns, PANEL[1] * lines + LINE * -(-len(methods) // abreast))
     figure = Figure(figsize=(width, height), layout="constrained")
     panels = figure.subplots(lines, columns, squeeze=False).ravel()
-    colors = {method: COLORS[number % len(COLORS)] for number, method in enumerate(methods)}
+    looks = {method: look_of(number) for number, method in enumerate(methods)}
     handles: dict[str, Artist] = {}
     for panel, result in zip(panels, results, strict=False):
         for method in result.methods():
-            handles[method] = _draw_method(panel, result, method, colors[method])
+            handles[method] = _draw_method(panel, result, method, looks[method])
         panel.set(xscale="log", yscale="log", xlabel="time of a trajectory, ms", ylabel="error", title=result.name)
         _label_times(panel)
     for panel in panels[len(results) :]:
@@ -66,9 +67,14 @@ def _label_times(axes: Axes) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _draw_method(axes: Axes, result: CaseResult, method: str, color: str) -> Artist:
+def look_of(number: int) -> dict[str, str]:
+    """Return colour and line style of a method; styles change when all colours are used."""
+    return {"color": COLORS[number % len(COLORS)], "linestyle": LINES[number // len(COLORS) % len(LINES)]}
+
+
+def _draw_method(axes: Axes, result: CaseResult, method: str, look: Mapping[str, str]) -> Artist:
     points = [each for each in result.measurements if each.method == method and not each.failure]
     x, y = [1e3 * point.seconds for point in points], [max(point.error, 1e-18) for point in points]
     width, marker = (2.0, "o") if method.startswith(OURS) else (1.0, "s")
-    line: Artist = axes.plot(x, y, color=color, linewidth=width, marker=marker, markersize=4)[0]
+    line: Artist = axes.plot(x, y, **look, linewidth=width, marker=marker, markersize=4)[0]
     return line
