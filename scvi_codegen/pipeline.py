@@ -128,6 +128,7 @@ def describe(
         unknowns=program.equations.unknowns,
         workspace=workspace_size(program) + uses_fallback_library,
         has_action=program.action or (uses_fallback_library and program.equations.acts),
+        sums_action=program.quantities.integrates,
         map_names=tuple(each.name for each in program.quantities.momentum_maps),
         map_formulas=tuple(each.formula for each in program.quantities.momentum_maps),
         map_exact=tuple(each.exact for each in program.quantities.momentum_maps),

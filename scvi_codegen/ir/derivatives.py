@@ -154,8 +154,8 @@ class Derivatives:
         program = self.program
         wide = (
             self.given
-            + 2 * program.equations.unknowns
-            + program.equations.sites * (program.equations.blocks + 1)
+            + program.equations.unknowns
+            + 2 * program.equations.sites * (program.equations.blocks + 1)
             + self.at_points
         )
         wide += bool(self.damping)  # vectors of gamma h

@@ -59,6 +59,7 @@ class LoweredStageGroup:
         value, derivative: the kernel, and the kernel with its derivatives.
         integrand: summed along the curve with h^(1 + integrand_power), or ``None``: the discrete Lagrangian, or with
             forces their work and impulse.
+        integrand_weights: (n,) weights of this sum, if they are not ``weights``.
     """
 
     name: str
@@ -72,6 +73,7 @@ class LoweredStageGroup:
     blocks: tuple[DerivativeBlock, ...]
     integrand: Kernel | None
     integrand_power: int
+    integrand_weights: tuple[Number, ...] = ()
 
     @property
     def points(self) -> int:

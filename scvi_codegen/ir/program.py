@@ -158,6 +158,7 @@ class Quantities:
         first_order_rates: H_y at (q, y) of a first-order system, or ``None``: velocities solve theta_y^T q' = H_y,
             where ``legendre`` is theta(q, y).
         work_and_impulses: names of work and impulses of forces: of the energy, and momentum maps; none without forces.
+        integrates: whether the method integrates functions along the curve of a step.
     """
 
     legendre: Kernel | None = None
@@ -170,6 +171,7 @@ class Quantities:
     integrals: Integrals | None = None
     first_order_rates: Kernel | None = None
     work_and_impulses: tuple[str, ...] = ()
+    integrates: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -248,6 +250,7 @@ class Program:
         constraints: their kernels, or ``None``.
         rattle: tables of RATTLE, which is tried before Newton's method if applicable.
         damping: the rate of a uniform damping, if there is one.
+        summed: whether the action is summed also where it is no function of both ends of a step.
         loops: of a system of arrays.
     """
 
@@ -265,6 +268,7 @@ class Program:
     constraints: Constraints | None = None
     rattle: Rattle | None = None
     damping: Kernel | None = None
+    summed: bool = False
     loops: RolledTerms = RolledTerms()
 
     @property
@@ -296,7 +300,7 @@ class Program:
             *(
                 quantities.legendre,
                 quantities.energy,
-                *(group.integrand for group in stage_groups),
+                *(group.integrand for group in stage_groups if self.sums),
                 quantities.momentum_kernel,
             ),
             *(quantities.first_order_rates, quantities.inverse_legendre),
@@ -326,10 +330,16 @@ class Program:
 
     @property
     def sums(self) -> int:
-        """Number of sums along a curve of Newton's method: the action, or work and impulses."""
-        if not self.newton:
+        """Number of sums along a curve of Newton's method: work and impulses of forces, then the action."""
+        forced = self.quantities.work_and_impulses
+        if not (self.newton and (forced or self.action or self.summed)):
             return 0
-        return len(self.quantities.work_and_impulses) if self.quantities.work_and_impulses else int(self.action)
+        return len(forced) + 1 if any(group.integrand for group in self.equations.stage_groups) else 0
+
+    @property
+    def between(self) -> bool:
+        """True if the step between two positions is solved: its momenta are functions of these."""
+        return self.sums > 0 and self.equations.sites == self.dimension and not self.quantities.first_order_rates
 
     @property
     def memory(self) -> int:

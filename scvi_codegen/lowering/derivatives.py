@@ -5,6 +5,7 @@ factors; those of forces and momenta at the points serve tangent vectors by fixe
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from sympy import Add, Expr, Mul, S, Symbol
 
@@ -29,6 +30,7 @@ def derivatives_of(
     Args:
         second: whether second derivatives are included.
     """
+    program = replace(program, summed=not forms_of(system).one_form)
     inputs = tuple(
         _input_derivatives(system, group.name, group.results, group.arguments) for group in stages.stage_groups
     )

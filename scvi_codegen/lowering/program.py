@@ -273,6 +273,7 @@ def _quantities(
         first_order_rates=_rates_of_first_order(system),
         integrals=_integrals(system, method, stages),
         work_and_impulses=tuple(each.name for each in work_rates(system)) if integrates else (),
+        integrates=integrates,
     )
 
 

@@ -258,6 +258,7 @@ def lowered_stage_group(system: MechanicalSystem, group: StageGroup, sites: Unkn
         blocks=blocks,
         integrand=_integrand(system, group, u) if group.in_action else None,
         integrand_power=group.scalar_power,
+        integrand_weights=lower_vector(group.scalar_weights),
     )
 
 
@@ -275,13 +276,12 @@ def _results(group: StageGroup, names: tuple[str, ...]) -> str:
 
 
 def _integrand(system: MechanicalSystem, group: StageGroup, u: str) -> Kernel | None:
-    """Return the kernel that is summed along the curve: work and impulses of forces, or the action."""
-    if rates_of_forces := work_rates(system):
-        rates, purpose = [each.rate for each in rates_of_forces], f"Power and impulse rates of the forces at {u}."
-        return system_kernel(system, "exchanges", rates, u=group.arguments, purpose=purpose)
-    if not has_action(system):
-        return None
+    """Return the kernel that is summed along the curve: work and impulses of forces, then the action."""
     assert group.scalar is not None
+    if rates_of_forces := work_rates(system):
+        rates = [*(each.rate for each in rates_of_forces), group.scalar]
+        purpose = f"Power and impulse rates of the forces, and L, at {u}."
+        return system_kernel(system, "exchanges", rates, u=group.arguments, purpose=purpose)
     k = group.scalar_power
     rate = f"d{f'^{k}' * (k > 1)}L/dt{f'^{k}' * (k > 1)}"
     return system_kernel(

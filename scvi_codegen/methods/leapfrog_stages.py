@@ -2,6 +2,8 @@
 
 from itertools import pairwise
 
+from sympy import Expr, S
+
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.derived_expressions import forms_of
@@ -31,7 +33,7 @@ def leapfrog_system(system: MechanicalSystem, method: Method) -> StageSystem:
         )
     kicks, drifts = kicks_and_drifts(method, split)
     moving = tuple(x for x in drifts if x)
-    drift = _rotating_group(split, moving) if split.bodies else _drift_group(split.system, drifts)
+    drift = _rotating_group(split, moving) if split.bodies else _drift_group(split, drifts)
     numbers, more = range(1, len(moving) + 1), len(moving) if split.bodies else 0
     return StageSystem(
         blocks=(
@@ -97,11 +99,24 @@ def _kick_group(split: KineticSplitting, kicks: Vector, drifts: Vector) -> Stage
         weight_names=tuple(f"w_{n}" for n in points),
         gathers=(Gather(arguments=split.system.coordinates, table=places, power=0),),
         scatters=(Scatter(results=split.force, table=later, power=1),),
+        scalar=_potential_part(split.system) if _acts(split) else None,
+        in_action=_acts(split),
     )
 
 
-def _drift_group(system: MechanicalSystem, drifts: Vector) -> StageGroup:
+def _acts(split: KineticSplitting) -> bool:
+    """Return whether the action of a step is a sum over kicks and drifts: with a potential and constant masses."""
+    return not (split.velocity or split.bodies or split.system.auxiliaries or split.system.forces)
+
+
+def _potential_part(system: MechanicalSystem) -> Expr:
+    """Return L without its kinetic energy."""
+    return system.lagrangian.xreplace(dict.fromkeys(system.velocities, S.Zero))
+
+
+def _drift_group(split: KineticSplitting, drifts: Vector) -> StageGroup:
     """Return L_v at the velocity of each drift, which is its momentum."""
+    system, acts = split.system, _acts(split)
     moving = [k for k, x in enumerate(drifts) if x]
     size = len(moving)
     into = Table.joined(Table.constant(size, 1), Table.identity(size))
@@ -111,6 +126,9 @@ def _drift_group(system: MechanicalSystem, drifts: Vector) -> StageGroup:
         abscissae=tuple(mp.fsum(drifts[:k]) for k in moving),
         gathers=(Gather(arguments=system.velocities, table=into, power=-1),),
         scatters=(Scatter(results=forms_of(system).momentum, table=back, power=0),),
+        scalar=system.lagrangian - _potential_part(system) if acts else None,
+        scalar_weights=tuple(drifts[k] for k in moving) if acts else (),
+        in_action=acts,
     )
 
 

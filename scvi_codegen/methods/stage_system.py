@@ -214,11 +214,13 @@ class StageGroup(StagePoints):
 
     If the kernel is the gradient of ``scalar``, sum_n w_n h^(1 + scalar_power) scalar(u_n) is part of a generating
     function, and of the discrete Lagrangian if ``in_action``; if ``forced``, forces are added to the gradient.
-    ``computes`` describes the results of the kernel if the name does not.
+    ``computes`` describes the results of the kernel if the name does not; ``scalar_weights`` replace the weights in the
+    sum of the scalar.
     """
 
     scatters: tuple[Scatter, ...]
     scalar: sympy.Expr | None = None
+    scalar_weights: Vector = ()
     scalar_power: int = 0
     in_action: bool = False
     forced: bool = False

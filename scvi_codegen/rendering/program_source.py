@@ -283,8 +283,8 @@ def workspace_size(program: Program) -> int:
 
 
 def jacobian_size(program: Program) -> int:
-    """Return the doubles of the factors of Newton's method, with p0 as a further unknown for a discrete Lagrangian."""
-    return program.matrix_size(program.equations.sites, program.equations.blocks + (1 if program.action else 0))
+    """Return the doubles of Newton's factors, with p0 as a further unknown for a step between positions."""
+    return program.matrix_size(program.equations.sites, program.equations.blocks + program.between)
 
 
 def scratch_size(program: Program) -> int:

@@ -162,7 +162,7 @@ def check_interface(source: Source, interface: Interface) -> None:
         _compare(name, size, re.search(rf"^  (?:\w+_)?{name} = (\d+),", source.code, re.MULTILINE))
     sums = re.search(r"^  (?:\w+_)?SUMS = (\d+),", source.code, re.MULTILINE)
     if interface.exchange_names and sums:
-        _compare("SUMS", len(interface.exchange_names), sums)
+        _compare("SUMS", len(interface.exchange_names) + 1, sums)
     lengths: dict[str, tuple[object, object]] = {"prefix": (interface.prefix, source.prefix)}
     lengths["defaults"] = (len(interface.defaults), len(interface.parameters))
     lengths["momentum_names"] = (len(interface.momentum_names), interface.dimension if interface.momentum_names else 0)
@@ -263,6 +263,7 @@ class Interface:
         unknowns: length of the run's memory of its last stages.
         workspace: doubles of workspace per call.
         has_action: whether the method has a discrete Lagrangian.
+        sums_action: whether it sums L along the curve of a step, also with forces and constraints.
         has_fallback: whether Newton's method is tried if the fixed-point iteration fails.
         map_names, map_formulas: of the momentum maps, the first integrals from symmetries.
         map_exact: whether the method is known to conserve them exactly, to round-off.
@@ -300,6 +301,7 @@ class Interface:
     unknowns: int = 0
     workspace: int = 0
     has_action: bool = False
+    sums_action: bool = False
     map_names: tuple[str, ...] = ()
     map_formulas: tuple[str, ...] = ()
     map_exact: tuple[bool, ...] = ()

@@ -25,6 +25,9 @@ OPERATIONS = {
     "multipliers": "multipliers",
     "work": "work_and_impulses",
     "discrete_lagrangian": "discrete_lagrangian",
+    "action": "action",
+    "shadow_energy": "shadow_energy",
+    "path": "path",
     "momentum_maps": "momentum_maps",
     "unresolved": "unresolved",
     "jacobian": "jacobian",
@@ -72,12 +75,14 @@ PROPERTIES_OF_SIZES: dict[str, Callable[[Any], bool]] = {
     "with forces": lambda stepper: bool(stepper.interface.exchange_names),
     "without the work of forces": lambda stepper: not stepper.interface.exchange_names,
     "without an action": lambda stepper: not stepper.interface.has_action,
+    "without a sum of L along steps": lambda stepper: not stepper.interface.sums_action,
 }
 """Properties of a stepper of known sizes; one of arrays of run-time sizes has none of them."""
 
 _FIRST = "jacobian tangent pullback sensitivity"
 _DERIVATIVES = f"{_FIRST} chaos chaos_ensemble periodic_orbit fit flow"
 _CURVE = "SVI, SCVI or a Gauss method"
+_ACTIONS = "action shadow_energy path"
 _ORIGINAL = "compile the original system, with fixed steps h, or with time_transformation=... or t_end=..."
 FEATURES = {
     (operation, property_): remedy
@@ -95,6 +100,10 @@ FEATURES = {
         ("in transformed time", "adaptive", "give h (fixed step in tau)"),
         ("in transformed time", "inputs", "compile the original system"),
         ("in transformed time", "chaos chaos_ensemble periodic_orbit fit flow", _ORIGINAL),
+        ("in transformed time", _ACTIONS, _ORIGINAL),
+        ("with a time transformation", "shadow_energy path", "compile the stepper without time_transformation"),
+        ("for a first-order system", _ACTIONS, "use a system whose velocities determine its momenta"),
+        ("without a sum of L along steps", _ACTIONS, f"it requires {_CURVE}"),
         ("in transformed time", "hessian", f"use first derivatives, or {_ORIGINAL}"),
         ("in transformed time of a first-order system", _FIRST, "use the system in physical time"),
         ("for a first-order system", "hessian", "use first derivatives and differences of them"),
@@ -125,7 +134,7 @@ FEATURES = {
             "it requires forces at two or more stages, or velocities that vary along a step; give h and steps (fixed "
             "step size)",
         ),
-        ("without derivatives", _DERIVATIVES, "it was loaded without their source; compile the system"),
+        ("without derivatives", f"{_DERIVATIVES} {_ACTIONS}", "it was loaded without their source; compile the system"),
         (
             "without second derivatives",
             "hessian",

@@ -145,10 +145,10 @@ class Integrator(LinearisedMethod):
             require(self, "work")
         check_inputs_given(self.interface, parameters)
         state = *checked_pair(self.interface, q, p), self._parameters(parameters)
-        q1, p1, values = *np.empty((2, self.dimension)), np.empty(len(self.interface.exchange_names))
+        q1, p1, values = *np.empty((2, self.dimension)), np.empty(len(self.interface.exchange_names) + 1)
         name = "work_and_impulses"
         self._solve(self.binding.with_function(name), name, t, h, state, options, (q1, p1, values))
-        return q1, p1, values
+        return q1, p1, values[:-1]
 
     def step_positions(
         self,

@@ -177,6 +177,14 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
                 )
         return energies
 
+    def action(self, *, cumulative: bool = False) -> Array:
+        """Return (k,) actions, or (n, k) up to each state, as of :meth:`Trajectory.action`; NaN after a failure."""
+        actions = np.full(self.q.shape[:2], np.nan)
+        for j in range(len(self)):
+            actions[self._reached(j), j] = self[j].action(cumulative=True)
+        last = [np.flatnonzero(self._reached(j))[-1] for j in range(len(self))]
+        return actions if cumulative else np.where(self.ok, actions[last, np.arange(len(self))], np.nan)
+
     def momentum_maps(self) -> Array:
         """Return (n, k, c) values of the momentum maps ``stepper.momentum_map_names``; NaN as for :meth:`energy`."""
         return self._momentum_maps()[0]

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Self, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, Self, cast, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +24,7 @@ from scvi_codegen.runtime.core.features import refusal, require
 from scvi_codegen.runtime.core.validation import columns_of_inputs
 from scvi_codegen.runtime.events.detection import crossings_of
 from scvi_codegen.runtime.events.event import Crossings, Event, EventLike, as_events
+from scvi_codegen.runtime.paths.actions import actions_between, compensated_sums, shadow_energy
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.rotations.quantities import named_quantities
 from scvi_codegen.runtime.run.accuracy import TOLERABLE_ERROR, unresolved_parts
@@ -227,6 +228,43 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
         ]
         values, sizes = (concatenated(part) for part in zip(*maps, strict=True))
         return relative_changes(values, sizes)
+
+    @overload
+    def action(self, *, cumulative: Literal[False] = False) -> float: ...
+    @overload
+    def action(self, *, cumulative: Literal[True]) -> Array: ...
+    def action(self, *, cumulative: bool = False) -> float | Array:
+        """Return the action of the run, sum h b_i L along the curves of its steps; or (n,) actions up to each state.
+
+        Without forces this is the sum of the discrete Lagrangians, so that dS = p1 . dq1 - p0 . dq0 for neighbouring
+        runs, to round-off. With forces, damping, impacts and constraints it is the action of L alone, without their
+        work and impulses. The steps are computed again from the saved states; sums are compensated.
+
+        Raises:
+            MethodError: if the method has no sum of L (Runge-Kutta methods other than Gauss), in transformed time, and
+                for first-order systems.
+            StateError: if the states are not at whole steps.
+        """
+        sums = compensated_sums(np.concatenate([[0.0], *(actions_between(piece) for piece in self.pieces or (self,))]))
+        return sums if cumulative else float(sums[-1])
+
+    def shadow_energy(self, order: int = 12) -> Array:
+        """Return (n,) energies of the shadow Hamiltonian, of which the states are an exact solution.
+
+        p . q' - S' with central differences of the states and the action (Skeel & Hardy, SIAM J. Sci. Comput. 23 (2001)
+        1172): constant to round-off for small h, where the energy oscillates by O(h^r), so that slow damping or another
+        defect of a run shows after few steps. For SVI of degree 1 and 2, Stoermer-Verlet and compositions.
+
+        Args:
+            order: of the differences, even, 2 to 24; NaN at the first and last ``order / 2`` states.
+
+        Raises:
+            MethodError: for other methods, whose long steps make the differences less accurate than the energy, and if
+                the energy is not conserved.
+            StateError: if the states are not those of all steps of one size.
+        """
+        require(self.stepper, "shadow_energy")
+        return shadow_energy(self, order)
 
     def work(self) -> Array:
         """Return (n,) work of the forces since the first state: sum h b_i f . v along the curves of the steps.

@@ -101,7 +101,7 @@ static linearised_step linearised_in(const step_data *step, real *workspace)
   at.dz = at.v + STEP_INPUTS;
   at.rows = at.dz + N;
   at.x = at.rows + SITES * (B + 1);
-  at.points = at.x + N;
+  at.points = at.x + SITES * (B + 1);
 #ifdef DAMPED
   at.growth = growth_of(step);
   at.grown = at.points + MOST_AT_POINTS;

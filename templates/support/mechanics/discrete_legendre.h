@@ -34,9 +34,11 @@ SELDOM int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q
   return all_finite(p0, M) && all_finite(p1, M) && all_finite(action, 1) ? OK : NOT_FINITE;
 }
 #elif defined(DISCRETE_LAGRANGIAN)
+#include "../newton/newton_between.h"
+
 /* Discrete Lagrangian L_d(q0, q1) and its discrete Legendre transforms p0 = -D1 L_d, p1 = D2 L_d (Marsden & West, Acta
- * Numerica 2001, sec. 1.3). On failure p0, p1 and the action are undefined. Requires: newton.h; sums_along, which sums
- * the Lagrangian along the curve z. */
+ * Numerica 2001, sec. 1.3). On failure p0, p1 and the action are undefined. Requires: newton_between.h; sums_along,
+ * which sums the Lagrangian along the curve z. */
 
 SELDOM int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q1, const real *parameters,
     const solver_options *options, real *p0, real *p1, real *action, solver_report *report, real *workspace)
@@ -45,18 +47,12 @@ SELDOM int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q
   const real carry_q[M] = {0};
   solver_report unread;
   newton_data *data = newton_in(workspace + SCRATCH);
-  real v[M], start_p[M], increment[M];
+  real start_p[M], increment[M];
   const step_data step = step_from(t, h, q0, start_p, carry_q, carry_q, parameters, workspace);
-  int keep = 0, status;
+  int status;
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
-  for (int i = 0; i < M; i++)
-    v[i] = (q1[i] - q0[i]) / h;
-  status = NAME(momentum)(t, q0, v, parameters, start_p, workspace);
-  if (status == OK) {
-    start_on_line(v, start_p, data->z);
-    status = newton(&step, data, q1, start_p, increment, &keep, options ? options : &standard, report);
-  }
+  status = newton_between(&step, data, q1, start_p, increment, options ? options : &standard, report);
   if (status != OK)
     return status;
   for (int i = 0; i < M; i++) {
