@@ -20,10 +20,11 @@ from samples import lowered
 from scvi_codegen import SCVI, SVI, Gauss, SpectralCollocation, SystemDefinitionError, problem
 from scvi_codegen.formulas.expressions import gradient, jacobian
 from scvi_codegen.ir.arithmetic import DEEPEST_EXPRESSION, lower_kernel
-from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
+from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation, loads
 from scvi_codegen.models.systems import fput_chain
 from scvi_codegen.native.compilers import find_compiler
 from scvi_codegen.rendering.kernels.printer import print_expression, print_number
+from scvi_codegen.rendering.kernels.roots import with_factors_in_roots
 
 DOUBLE_PENDULUM, DUFFING, KEPLER = (problem(name).system for name in ("double-pendulum", "duffing", "kepler"))
 
@@ -255,3 +256,32 @@ def test_printed_numbers_read_back_as_the_same_double(number):
     text = print_number(number)
     assert float(text) == number
     assert any(mark in text for mark in ".e")
+
+
+@pytest.mark.parametrize(
+    ("forces", "products"),
+    [
+        ((-a * x * (x**2 + y**2) ** sympy.Rational(-3, 2), -a * y * (x**2 + y**2) ** sympy.Rational(-3, 2)), 2),
+        ((x * y * (a + y**2) ** sympy.Rational(-5, 2) + t, -x), 1),
+        (((x**2 + y**2) ** sympy.Rational(-3, 2) + x, x * (x**2 + y**2) ** sympy.Rational(-3, 2)), 0),
+        ((x * (1 + x**2) ** sympy.Rational(-1, 2), y * (1 + y**2) ** sympy.Rational(-1, 2)), 0),
+    ],
+    ids=["kepler", "sum", "alone", "two roots"],
+)
+def test_factors_of_few_roots_are_part_of_them(forces, products):
+    kernel = kernel_of(*forces)
+    rewritten = with_factors_in_roots(kernel)
+    counts = rewritten.operation_counts()
+    assert sum(count for name, count in counts.items() if name.endswith("_times")) == products
+    assert (rewritten == kernel) == (products == 0)
+    functions = FLOATS | {f"inverse_root_{k}_times": lambda x, f, k=k: f * x ** (-k / 2) for k in (1, 3, 5, 7)}
+    point = [0.7, -0.4], 0.3, [1.9]
+    found, expected = (interpret(each, *point, float, functions) for each in (rewritten, kernel))
+    np.testing.assert_allclose(found, expected, rtol=1e-14)
+    used = {
+        load.index
+        for each in (*rewritten.temporaries, *rewritten.results)
+        for load in loads(each)
+        if load.source == "w"
+    }
+    assert used == set(range(len(rewritten.temporaries)))

@@ -15,16 +15,47 @@ pytestmark = pytest.mark.usefixtures("as_users_compile")
 CHECK = """
 #include "power.c"
 
-void check(const double *x, double *y)
+void check(const double *x, double *y, double *three)
 {
   for (int n = 0; n < 8; n += LANES) {
-    lane_view view;
+    lane_view view, times;
     memcpy(view.lane, x + n, sizeof view);
+    times.all = lanes_inverse_root_%d_times(view.all, lanes_of(3.0));
     view.all = lanes_inverse_root_%d(view.all);
     memcpy(y + n, view.lane, sizeof view);
+    memcpy(three + n, times.lane, sizeof times);
   }
 }
 """
+
+TOTALS = """
+#include "power.c"
+
+int check(const double *x)
+{
+#ifdef SUMS_OF_EIGHT
+  lanes all[8];
+  lane_view totals;
+  memcpy(all, x, sizeof all); /* of any alignment */
+  totals.all = totals_of_eight(all);
+  for (int k = 0; k < 8; k++)
+    if (totals.lane[k] != lanes_total(all[k]))
+      return k + 1;
+#endif
+  return 0;
+}
+"""
+
+
+def test_sums_of_eight_vectors_have_the_bits_of_single_ones(tmp_path):
+    compiler = needs("cc")
+    system = sc.LagrangianSystem.from_text(name="power", coordinates=["q"], lagrangian="q_dot**2/2 - q**4")
+    sc.generate_source(system, sc.SVI(8), prefix="power")[0].write(tmp_path)
+    (tmp_path / "check.c").write_text(TOTALS)
+    command = [compiler, "-march=native", "-O2", "-shared", "-fPIC", "check.c", "-o", "check.so", "-lm"]
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+    x = np.random.default_rng(5).standard_normal(64)
+    assert ctypes.CDLL(str(tmp_path / "check.so")).check(x.ctypes.data_as(ctypes.c_void_p)) == 0
 
 
 @pytest.mark.sampled(2)
@@ -38,7 +69,7 @@ def test_inverse_roots_are_right_to_two_units(tmp_path, k, flags):
     )
     source, _ = sc.generate_source(system, sc.SVI(8), prefix="power")
     source.write(tmp_path)
-    (tmp_path / "check.c").write_text(CHECK % k)
+    (tmp_path / "check.c").write_text(CHECK % (k, k))
     command = [compiler, *flags.split(), "-shared", "-fPIC", "check.c", "-o", "check.so", "-lm"]
     subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
     check = ctypes.CDLL(str(tmp_path / "check.so")).check
@@ -46,10 +77,11 @@ def test_inverse_roots_are_right_to_two_units(tmp_path, k, flags):
     worst = 0.0
     for _ in range(2000):
         x = generator.uniform(1.0, 4.0, 8) * 2.0 ** generator.integers(-80, 80, 8)
-        y = np.empty(8)
-        check(*(array.ctypes.data_as(ctypes.c_void_p) for array in (x, y)))
+        y, three = np.empty(8), np.empty(8)
+        check(*(array.ctypes.data_as(ctypes.c_void_p) for array in (x, y, three)))
         exact = np.longdouble(x) ** (np.longdouble(-k) / 2)
-        worst = max(worst, float(np.max(np.abs((y - exact) / exact))))
+        for found, expected in ((y, exact), (three, 3 * exact)):
+            worst = max(worst, float(np.max(np.abs((found - expected) / expected))))
     assert worst < 2 * 2.0**-52 + k * 2.0**-54
 
 

@@ -105,7 +105,8 @@ Sources: TypeAlias = tuple[str, ...]
 ARRAYS = ("u", "t", "parameters", "kept", "value", "derivative")
 """Arrays that a kernel and its parts may use, in the order of their arguments."""
 
-INVERSE_ROOT = "inverse_root_"
+INVERSE_ROOT, TIMES = "inverse_root_", "_times"
+"""Beginning of the names of inverse roots, and end of those that have a factor as a second operand."""
 OWN_FUNCTIONS = (INVERSE_ROOT, "lanes_")
 
 PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2, "neg": 3}

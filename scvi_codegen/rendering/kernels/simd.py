@@ -16,7 +16,8 @@ from typing import Literal, TypeAlias
 
 from scvi_codegen.ir.equations import AdaptivePredictor, FixedPointIteration, StoredValues
 from scvi_codegen.ir.kernel import Kernel, Number, NumberTable
-from scvi_codegen.rendering.kernels.printer import DOUBLE, INVERSE_ROOT, Sources, lane_functions, print_number
+from scvi_codegen.rendering.kernels.printer import DOUBLE, INVERSE_ROOT, TIMES, Sources, lane_functions, print_number
+from scvi_codegen.rendering.kernels.roots import with_factors_in_roots
 from scvi_codegen.rendering.text import table
 
 Fallback: TypeAlias = Literal["own", "external", "provided", "none"]
@@ -112,10 +113,12 @@ def iteration_source(
         changes: whether it also propagates tangent and adjoint vectors.
     """
     kernels = tuple(fixed_point.kernels if kernels is None else kernels)
+    if meaning.are_points:
+        kernels = tuple(map(with_factors_in_roots, kernels))
     mass = fixed_point.constant_mass
     damping = None if meaning.are_points else fixed_point.damping
     applied = (*kernels, *((mass,) if mass and not meaning.are_points else ()), *((damping,) if damping else ()))
-    functions = set().union(*(lane_functions(kernel, meaning.sources) for kernel in applied))
+    functions = {name.removesuffix(TIMES) for each in applied for name in lane_functions(each, meaning.sources)}
     solver = ("iteration/iteration_solver",) if meaning.are_points else ()
     parts = (f"iteration/{name}" for name in fixed_point.parts)
     return IterationSource(

@@ -83,10 +83,12 @@ PASS drift_words find_drift(const step_points *w, long long i)
 #define DRIFT_OF(w, i) find_drift(w, i)
 #define STRAIGHT_LINE(w, g, i, of) ((w)->step->q0[i] + DRIFT[g] * (of).high)
 #define WITH_LOW_WORDS(w, g, i, x) (x)
+#define RESTS(w, g, i, of) coefficient_rests(w, g, of, i)
 #else
 #define DRIFT_OF(w, i) ((w)->drifts[i])
 #define STRAIGHT_LINE(w, g, i, of) ((void)(of), (w)->base[(g) * M + (i)])
 #define WITH_LOW_WORDS(w, g, i, x) ((x) + (w)->rests[(g) * M + (i)])
+#define RESTS(w, g, i, of) ((w)->rests[(g) * M + (i)])
 #endif
 
 /* sum_j table_gj F_j of a coordinate. */
@@ -117,14 +119,21 @@ static inline lanes sum_of_three(lanes x, lanes y, lanes rest)
   return sum + (((x - (sum - part)) + (y - part)) + rest);
 }
 
+/* Low words of a point with the low part of the coefficients of the forces. */
+PASS lanes coefficient_rests(const step_points *w, int g, drift_words of, long long i)
+{
+  return low_words(w, g, of, i) +
+      w->data->inverse_mass[i] * (w->data->square * SUM_OF_FORCES(PRODUCT_LOW, w, g, i));
+}
+
 /* A point with double-double coefficients. */
 PASS lanes accurate_point(const step_points *w, int g, drift_words of, long long i)
 {
   const iteration_data *data = w->data;
-  const lanes sum = SUM_OF_FORCES(PRODUCT, w, g, i), low = SUM_OF_FORCES(PRODUCT_LOW, w, g, i);
+  const lanes sum = SUM_OF_FORCES(PRODUCT, w, g, i);
   return sum_of_three(lanes_of_number(w->step->q0[i]),
       DRIFT[g] * of.high + data->inverse_mass[i] * (data->square * sum),
-      low_words(w, g, of, i) + data->inverse_mass[i] * (data->square * low + data->square_low * sum));
+      RESTS(w, g, i, of) + data->inverse_mass[i] * (data->square_low * sum));
 }
 
 /* Increments of a coordinate: of q, with its low word, and of p. */
@@ -184,9 +193,38 @@ PASS void refine_points(const step_points *w, section here)
       w->X[g * OF_EACH * EXTENT(w->n) + i] = accurate_point(w, g, DRIFT_OF(w, i), i);
 }
 
+#if defined(SUMS_OF_EIGHT) && defined(EIGHT_COORDINATES)
+/* increments_of eight coordinates, which are lanes; dq_low: low words. */
+PASS void find_eight_increments(const step_points *w, int i, double *dq, double *dq_low, double *dp)
+{
+  const iteration_data *data = w->data;
+  lanes position[8], momentum[8];
+  lane_view high, low, inverse;
+  for (int k = 0; k < 8; k++) {
+    const lanes F = w->F[i + k];
+    const drift_words of = DRIFT_OF(w, i + k);
+    position[k] = multiply_add(POINT_END_POSITION[0], F, POINT_END_POSITION_LOW[0] * F);
+    momentum[k] = multiply_add(data->kick[0], F, data->kick_low[0] * F);
+    high.lane[k] = of.high, low.lane[k] = of.low, inverse.lane[k] = data->inverse_mass[i + k];
+  }
+  const lanes sum = totals_of_eight(position), kick = inverse.all * (data->square * sum);
+  const lanes q = high.all + kick, part = q - high.all, p = totals_of_eight(momentum);
+  const lanes q_low = (high.all - (q - part)) + (kick - part) + (low.all + inverse.all * (data->square_low * sum));
+  memcpy(dq + i, &q, sizeof q);
+  memcpy(dq_low + i, &q_low, sizeof q_low);
+  memcpy(dp + i, &p, sizeof p);
+}
+#endif
+
 /* Computes the increments of a range of coordinates; low words follow those of q. */
 PASS void find_increments(const step_points *w, section here, number *dq, number *dp)
 {
+#if defined(SUMS_OF_EIGHT) && defined(EIGHT_COORDINATES)
+  enum { IN_EIGHTS = GROUPS == 1 ? M / 8 * 8 : 0 };
+  for (int i = 0; i < IN_EIGHTS; i += 8)
+    find_eight_increments(w, i, dq, dq + M, dp);
+  here.first = IN_EIGHTS;
+#endif
   for (long long i = here.first; i < here.end; i++) {
     const end_increments end = increments_of(w, i);
     dq[i] = end.q, dq[EXTENT(w->n) + i] = end.q_low, dp[i] = end.p;
@@ -336,8 +374,7 @@ PASS void measure_points(const step_points *w, const solver_options *options)
   invert_sizes(options, 1.0, w->inverse_size);
   for (int i = 0; i < M; i++)
     for (int g = 0; g < GROUPS; g++)
-      w->rests[g * M + i] = low_words(w, g, w->drifts[i], i) +
-          w->data->inverse_mass[i] * (w->data->square * SUM_OF_FORCES(PRODUCT_LOW, w, g, i));
+      w->rests[g * M + i] = coefficient_rests(w, g, w->drifts[i], i);
 }
 
 PASS number improve(const step_points *w)

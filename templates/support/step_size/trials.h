@@ -125,8 +125,8 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
     now->step.h = h;
     prepare(&now->step, &now->data);
   }
-  now->error = attempt(run, &now->step, &now->data, now->last, now->last ? 0 : now->inside, &now->guess, now->dq, now->dp, now->limits.decay, least,
-      options, report);
+  now->error = attempt(run, &now->step, &now->data, now->last, now->last ? 0 : now->inside, &now->guess, now->dq,
+      now->dp, now->limits.decay, least, options, report);
 }
 
 /* Returns 1 if the momenta change by a small part of the largest one, as they do where nonsmooth forces shorten a
@@ -198,7 +198,8 @@ static inline int down_from_stored(const trial *now, int solved, int down)
   (void)now, (void)solved, (void)down;
   return 0;
 #else
-  const int levels = solved ? down : now->inside > 0 ? now->inside + down : 0;
+  const int levels = solved ? down : now->inside > 0 ? now->inside + down
+                                                     : 0;
   return levels <= INSIDE ? levels : 0;
 #endif
 }
