@@ -30,6 +30,7 @@ typedef struct {
 #ifdef NEWTON_ALONE
 #define HOT static
 #define SHORT_STEPS_FAIL 0
+#define LEVELS_INSIDE 0 /* no predictor from a rejected step */
 
 static inline real smaller(real a, real b)
 {
@@ -49,6 +50,11 @@ static real attempt(run_memory *run, step_data *step, const solver_data *data, i
   return stage_error(step, run->memory, dq, SHARE_OF_TRIAL, decay, least);
 }
 #else
+#ifdef ARRAYS
+#define LEVELS_INSIDE 0 /* the stored curves are those of accepted steps */
+#else
+#define LEVELS_INSIDE INSIDE
+#endif
 #define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
 
 /* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
@@ -194,14 +200,8 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
  * own; a failed one left that of the trial before. */
 static inline int down_from_stored(const trial *now, int solved, int down)
 {
-#if defined(NEWTON_ALONE) || defined(ARRAYS)
-  (void)now, (void)solved, (void)down;
-  return 0;
-#else
-  const int levels = solved ? down : now->inside > 0 ? now->inside + down
-                                                     : 0;
-  return levels <= INSIDE ? levels : 0;
-#endif
+  const int levels = solved ? down : now->inside > 0 ? now->inside + down : 0;
+  return levels <= LEVELS_INSIDE ? levels : 0;
 }
 
 /* Reduces the step size after a failed or rejected trial, by 2 to `most` levels; returns 0 on step size underflow. */
