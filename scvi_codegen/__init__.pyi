@@ -22,6 +22,7 @@ from scvi_codegen.errors import MissingLibraryError as MissingLibraryError
 from scvi_codegen.errors import ModelFileError as ModelFileError
 from scvi_codegen.errors import OrbitError as OrbitError
 from scvi_codegen.errors import PackageError as PackageError
+from scvi_codegen.errors import PathError as PathError
 from scvi_codegen.errors import PlotError as PlotError
 from scvi_codegen.errors import RecordingError as RecordingError
 from scvi_codegen.errors import RecordingWarning as RecordingWarning
@@ -119,6 +120,7 @@ from scvi_codegen.runtime.events.event import Event as Event
 from scvi_codegen.runtime.events.event import impact as impact
 from scvi_codegen.runtime.orbits.periodic_orbit import PeriodicOrbit as PeriodicOrbit
 from scvi_codegen.runtime.orbits.solver import periodic_orbit as periodic_orbit
+from scvi_codegen.runtime.paths.path import Path as Path
 from scvi_codegen.runtime.run.run import Run as Run
 from scvi_codegen.runtime.sensitivity.gradients import Gradient as Gradient
 from scvi_codegen.runtime.sensitivity.step_derivatives import Sensitivity as Sensitivity

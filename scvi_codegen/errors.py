@@ -51,6 +51,10 @@ class ExpressionError(SystemDefinitionError):
         super().__init__(f"{message}\n  {window}\n  {' ' * (column - start)}^ column {column + 1}")
 
 
+class PathError(ScviCodegenError, ArithmeticError):
+    """No path between two positions, or closed path, was found."""
+
+
 class ControlError(ScviCodegenError, ArithmeticError):
     """Failure to find an optimal control; ``motion`` is the last iterate."""
 

@@ -231,6 +231,9 @@ FEATURES: dict[str, Callable[[Kind, Path], Any]] = {
     "symmetries of the system": lambda of, _: sc.symmetries(of.system()),
     "work of forces": lambda of, _: of.run(of.compiled(of.system(forces={"x": "cos(t)"}))).work(),
     "discrete Lagrangian": lambda of, _: of.stepper().discrete_lagrangian(of.flat()[0], of.flat()[0], 0.1),
+    "action": lambda of, _: of.run().action(),
+    "shadow energy": lambda of, _: of.run().shadow_energy(2),
+    "paths": lambda of, _: of.stepper().path(of.q, of.q, 0.4, steps=4),
     "exact map": lambda of, _: sc.exact_map(of.system(), *of.flat(), 0.01, digits=15),
     "derivation": lambda of, _: sc.derive(of.system(), "svi:1").to_text(),
     "verification report": lambda of, _: sc.verify(of.system(), "svi:2", *of.flat(), h=0.05, flags=QUICK_FLAGS),
@@ -267,6 +270,9 @@ SUPPORTS = {
     "momentum maps": "momentum_maps",
     "work of forces": "work",
     "discrete Lagrangian": "discrete_lagrangian",
+    "action": "action",
+    "shadow energy": "shadow_energy",
+    "paths": "path",
     "checkpoints": "checkpoint",
 }
 """Name of a row of the table in ``Stepper.supports``; the others are properties of systems, or use no stepper."""

@@ -1,0 +1,311 @@
+"""Paths: stationary points of the discrete action between two positions, and closed paths."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scvi_codegen.errors import MethodError, PathError, StateError
+from scvi_codegen.native.arguments import checked_number, real_array
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.representation import summary
+from scvi_codegen.runtime.core.features import require
+from scvi_codegen.runtime.core.validation import Array, Parameters, columns_of_inputs, flat_state
+from scvi_codegen.runtime.paths import solver
+from scvi_codegen.runtime.paths.equations import Band, condensed_hessian, negative_directions
+from scvi_codegen.runtime.paths.intervals import Intervals, ManyCoordinates, ReducedIntervals
+from scvi_codegen.validation import checked_count
+
+if TYPE_CHECKING:
+    from scvi_codegen.runtime.trajectory.trajectory import Trajectory
+
+MANY_COORDINATES = 48
+"""Number of coordinates from which derivatives are computed as sparse matrices."""
+SAME_MATRIX, MOST_REPETITIONS = 1e-9, 1000
+"""Distance of equal symmetries of closed paths, and the longest period in multiples of T."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Path:
+    """Path of a system between two positions, or closed path, in N steps.
+
+    Attributes:
+        t: (N + 1,) times.
+        q, p: (N + 1, m) positions and momenta. Those of all steps agree, so that the states are those of a run.
+        action: sum of the discrete Lagrangians; with forces and constraints that of L alone.
+        index: Morse index, the number of negative directions of the second variation; 0 for a minimum of the action.
+            ``None`` with forces.
+        conjugate_times: (c, 2) ends of the steps that contain points conjugate to the first one, as often as their
+            multiplicity; empty for closed paths and with many coordinates.
+        residual: largest jump of the momentum between two steps, relative to the largest momentum.
+        iterations: number of Newton iterations.
+        repetitions: of a closed path, the number of times T after which all coordinates return, else 1; 0 if they do
+            not return.
+        zero_modes: of a closed path, the number of its directions in which it is not isolated.
+        stepper: the compiled integrator.
+        arguments: parameters, inputs and options, as arguments of ``integrate``.
+        solution: the last iterate with its steps and the factors of its Hessian.
+    """
+
+    t: Array
+    q: Array
+    p: Array
+    action: float
+    index: int | None
+    conjugate_times: Array
+    residual: float
+    iterations: int
+    stepper: Any = field(repr=False)
+    repetitions: int = 1
+    zero_modes: int = 0
+    arguments: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    solution: Any = field(default=None, repr=False)
+
+    __repr__ = summary("q", "action", "index", "residual")
+
+    @property
+    def period(self) -> float:
+        """Time after which a closed path repeats in all coordinates."""
+        return self.repetitions * float(self.t[-1] - self.t[0])
+
+    def run(self) -> Trajectory:
+        """Return the run from the first state, of a closed path over its period.
+
+        Unstable paths are left by it: compare ``run.q[-1]`` with ``q[-1]``.
+        """
+        count = len(self.t) - 1
+        run: Trajectory = self.stepper.integrate(
+            self.q[0],
+            self.p[0],
+            h=float(self.t[-1] - self.t[0]) / count,
+            steps=count * max(1, self.repetitions),
+            t=float(self.t[0]),
+            **self.arguments,
+        )
+        return run
+
+    @cached_property
+    def hessian(self) -> Array:
+        """(2m, 2m) Hessian of the action as a function of q0 and q1, by condensation.
+
+        Its upper right block is -B^-1 with B = dq1/dp0 of the run; det B^-1 is the Van Vleck determinant.
+
+        Raises:
+            MethodError: for closed paths, with constraints or rotations, and with many coordinates.
+        """
+        intervals, factors = self.solution.intervals, self.solution.factors
+        if type(intervals) is not Intervals or not isinstance(factors, Band):
+            raise MethodError(
+                "the Hessian by both ends is not available for closed paths, with constraints or rotations, and with "
+                f"{MANY_COORDINATES} coordinates or more"
+            )
+        return condensed_hessian(self.solution.at, factors)
+
+
+def find_path(
+    stepper: Any,
+    q0: Any,
+    q1: Any,
+    T: float | None,
+    *,
+    steps: int,
+    start: Any,
+    homotopy: bool,
+    energy: float | None,
+    closed: Any,
+    t: float,
+    parameters: Parameters,
+    inputs: Mapping[str, Any] | None,
+    options: SolverOptions | None,
+) -> Path:
+    """Return a path; arguments and errors as of :meth:`~scvi_codegen.Stepper.path`."""
+    stepper = stepper.known
+    require(stepper, "path")
+    count = checked_count(steps, "steps", least=2)
+    if T is None:
+        raise StateError("path: give T, the duration of the path (with energy= an estimate of it)")
+    duration, begin = checked_number(T, "the duration T"), checked_number(t, "the time t")
+    if duration == 0:
+        raise StateError("path: T must not be 0")
+    kind = _kind_of_intervals(stepper, closed=closed is not None, energy=energy is not None)
+    h = np.full(count, duration / count)
+    times = begin + np.arange(count) * h
+    intervals = kind(stepper, times, h, _parameters_of_steps(stepper, parameters, inputs, times + h / 2.0), options)
+    arguments = {"parameters": parameters, "options": options, **({"inputs": inputs} if inputs is not None else {})}
+    nodes = _given_nodes(stepper.interface, start, begin, duration, count)
+    if closed is not None:
+        if nodes is None:
+            raise StateError("closed paths require start=: an array (steps + 1, m), or a function of time")
+        M, forced = _symmetry(stepper.interface, closed), bool(stepper.interface.exchange_names)
+        found = solver.closed(intervals, nodes[:count], M, minimise=not forced, symmetric=not forced)
+        return _described(stepper, found, begin, arguments, M)
+    if q0 is None or q1 is None:
+        raise StateError("path: give both positions q0 and q1, or closed= and start=")
+    ends = [stepper._vector(flat_state(stepper.interface, each, name), name) for each, name in ((q0, "q0"), (q1, "q1"))]
+    found = _open_path(intervals, ends, nodes, duration, homotopy=homotopy and start is None)
+    if energy is not None:
+        wanted, values = checked_number(energy, "energy"), intervals.parameters
+
+        def at_start(q: Array, p: Array) -> tuple[float, Array]:
+            return float(stepper.energy(q, p, begin, values)), np.asarray(stepper.velocity(q, p, begin, values)).ravel()
+
+        found = solver.at_energy(found, duration, wanted, at_start)
+    return _described(stepper, found, begin, arguments)
+
+
+def _kind_of_intervals(stepper: Any, *, closed: bool, energy: bool) -> type[Intervals]:
+    """Return the class of the intervals of a system; raise MethodError if it has no such paths."""
+    interface = stepper.interface
+    reduced = bool(interface.constraints or interface.rotations)
+    if any("_dot" in formula for formula in interface.constraints):
+        raise MethodError(
+            "path is not available with nonholonomic constraints: two positions determine no motion; use integrate"
+        )
+    if any(each.startswith("spin") for each in interface.rotations):
+        raise MethodError("path is not available for spins: their direction determines the motion; use integrate")
+    if (closed or energy) and (reduced or interface.inputs):
+        name = "closed=" if closed else "energy="
+        raise MethodError(f"path: {name} is not available with constraints, rotations or inputs; omit it")
+    if closed and energy:
+        raise MethodError("path: energy= is not available for closed paths; omit it and give their T")
+    if reduced:
+        return ReducedIntervals
+    return ManyCoordinates if stepper.dimension >= MANY_COORDINATES and not closed else Intervals
+
+
+def _open_path(
+    intervals: Intervals, ends: list[Array], nodes: Array | None, duration: float, *, homotopy: bool
+) -> solver.Solution:
+    """Return the path between two positions from given nodes, or from the straight line."""
+    count = len(intervals.h)
+    if nodes is None:
+        nodes = ends[0] + (ends[1] - ends[0]) * np.linspace(0.0, 1.0, count + 1)[:, np.newaxis]
+    elif len(nodes) != count + 1:
+        raise StateError(f"start must have {count + 1} rows, one for each node, not {len(nodes)}")
+    nodes[0], nodes[-1] = ends
+    if isinstance(intervals, ReducedIntervals):
+        nodes[1:] = [intervals.on_manifold(each, k, ends[0]) for k, each in enumerate(nodes[1:], 1)]
+    try:
+        return solver.solved(intervals, nodes)
+    except solver.UNSOLVED as error:
+        if not homotopy:
+            raise PathError(f"no path was found ({error}): give another start, or more steps") from error
+    try:
+        return solver.continued(intervals, nodes, duration)
+    except solver.UNSOLVED as error:
+        raise PathError(f"no path was found ({error}): give start=, a path nearby, or more steps") from error
+
+
+def _described(
+    stepper: Any, found: solver.Solution, begin: float, arguments: Mapping[str, Any], M: Array | None = None
+) -> Path:
+    at, intervals, forced = found.at, found.intervals, bool(stepper.interface.exchange_names)
+    count = len(intervals.h)
+    t = begin + intervals.h[0] * np.arange(count + 1)
+    conjugate, zero_modes, repetitions, index = np.empty((0, 2)), 0, 1, None
+    if M is not None:
+        repetitions = _order(M)
+        if not forced:
+            index, zero_modes = found.factors.negative, int((~found.factors.kept).sum())
+    elif intervals.sparse:
+        index = None if forced else found.factors.negative
+    elif not forced:
+        counts = negative_directions(at)
+        index, rises = counts[-1], np.diff(counts)
+        steps = np.repeat(np.arange(1, len(counts)), rises)
+        conjugate = np.stack([t[steps], t[steps + 1]], axis=1)
+    jumps = at.residual if M is None else at.p1[:-1] - at.p0[1:]
+    momenta = np.concatenate([at.p0, at.p1[-1:]])
+    return Path(
+        t=t,
+        q=stepper.named(found.q),
+        p=stepper.named(momenta),
+        action=float(np.sum(at.actions)),
+        index=index,
+        conjugate_times=conjugate,
+        residual=float(np.abs(jumps).max(initial=0.0) / (np.abs(momenta).max() or 1.0)),
+        iterations=found.iterations,
+        stepper=stepper,
+        repetitions=repetitions,
+        zero_modes=zero_modes,
+        arguments=arguments,
+        solution=found,
+    )
+
+
+def _parameters_of_steps(stepper: Any, parameters: Parameters, inputs: Mapping[str, Any] | None, times: Array) -> Array:
+    """Return the (k,) parameters of all steps, or (N, k) with inputs, those of the piece in the middle of each step."""
+    from scvi_codegen.runtime.core.validation import check_inputs_given
+    from scvi_codegen.runtime.inputs.segments import checked_inputs
+
+    if inputs is None:
+        check_inputs_given(stepper.interface, parameters)
+        return np.ascontiguousarray(stepper._parameters(parameters))
+    known = checked_inputs(stepper.interface, inputs)
+    values = np.tile(stepper._parameters(parameters), (len(times), 1))
+    columns = columns_of_inputs(stepper.interface)
+    for k, time in enumerate(times.tolist()):
+        values[k, columns] = np.concatenate([known[name].parameters(time) for name in stepper.interface.inputs])
+    return values
+
+
+def _given_nodes(interface: Any, start: Any, t: float, duration: float, count: int) -> Array | None:
+    """Return the nodes of a start, an array or a function of time; ``None`` without one."""
+    if start is None:
+        return None
+    if callable(start):
+        call: Callable[[float], Any] = start
+        start = [flat_state(interface, call(t + duration * k / count), "start") for k in range(count + 1)]
+    nodes = real_array(flat_state(interface, start, "start"), "start")
+    if nodes.ndim != 2 or nodes.shape[1] != interface.dimension or len(nodes) not in (count, count + 1):
+        raise StateError(
+            f"start must have shape ({count + 1}, {interface.dimension}), a position at each of steps + 1 times, not "
+            f"{nodes.shape}"
+        )
+    if not np.isfinite(nodes).all():
+        raise StateError("start must be finite")
+    return nodes
+
+
+def _symmetry(interface: Any, closed: Any) -> Array:
+    """Return the orthogonal matrix M of q(T) = M q(0)."""
+    names, m = interface.coordinates, interface.dimension
+    if closed is True:
+        return np.eye(m)
+    entries: Sequence[Any] = list(closed) if isinstance(closed, list | tuple) else []
+    if entries and all(isinstance(each, str) for each in entries):
+        M = np.zeros((m, m))
+        plain = [each.removeprefix("-") for each in entries]
+        if sorted(plain) != sorted(names):
+            raise StateError(
+                f"closed must contain each coordinate once, {', '.join(names)}, possibly with a sign: not {entries}"
+            )
+        for row, (each, name) in enumerate(zip(entries, plain, strict=True)):
+            M[row, names.index(name)] = -1.0 if each.startswith("-") else 1.0
+        return M
+    M = real_array(closed, "closed")
+    if M.shape != (m, m) or np.abs(M @ M.T - np.eye(m)).max(initial=0.0) > SAME_MATRIX:
+        raise StateError(
+            f"closed must be True, the names of the {m} coordinates that follow after T, or an orthogonal matrix "
+            f"({m}, {m})"
+        )
+    return M
+
+
+def _order(M: Array) -> int:
+    """Return the least n with M^n = 1, 0 if there is none up to ``MOST_REPETITIONS``."""
+    power = M
+    for n in range(1, MOST_REPETITIONS + 1):
+        if np.abs(power - np.eye(len(M))).max() < SAME_MATRIX * n:
+            return n
+        power = power @ M
+    return 0
+
+
+ArrayOrFunction = ArrayLike | Callable[[float], ArrayLike] | None
+"""Type of the start of a path."""

@@ -1,0 +1,202 @@
+"""Paths between two positions: runs, other coordinates, published orbits, exact indices."""
+
+import numpy as np
+import pytest
+from scipy.special import ellipk
+
+import scvi_codegen as sc
+from scvi_codegen.errors import MethodError, PathError, StateError
+from scvi_codegen.runtime.paths.equations import condensed_hessian
+from scvi_codegen.runtime.paths.intervals import Intervals, ManyCoordinates
+
+KEPLER = sc.problem("kepler").system
+
+
+def compiled(coordinates, lagrangian, method="svi:4", **arguments):
+    return sc.compile_stepper(sc.LagrangianSystem.from_text("system", coordinates, lagrangian, **arguments), method)
+
+
+@pytest.fixture(scope="module")
+def kepler():
+    return sc.compile_stepper(KEPLER, "svi:4")
+
+
+@pytest.fixture(scope="module")
+def oscillator():
+    return compiled(["x"], "x_dot**2/2 - x**2/2")
+
+
+def test_path_is_a_run(kepler):
+    path = kepler.path([1.0, 0.0], [-0.5, 0.8], 2.0, steps=12)
+    run = path.run()
+    assert np.allclose(run.q, path.q, rtol=0, atol=1e-12)
+    assert np.allclose(run.p, path.p, rtol=0, atol=1e-12)
+    assert abs(run.action() - path.action) < 1e-12
+    assert path.residual < 1e-12
+    assert path.index == 0
+    assert np.array_equal(path.q[[0, -1]], [[1.0, 0.0], [-0.5, 0.8]])
+
+
+def test_lambert_problem_of_vallado(kepler):
+    """Vallado, Fundamentals of Astrodynamics, example 7-5: 76 min; published v1 = (2.058913, 2.915965) km/s."""
+    mu, unit = 398600.4418, 6378.137
+    time = np.sqrt(unit**3 / mu)
+    r1, r2 = np.array([15945.34, 0.0]) / unit, np.array([12214.83899, 10249.46731]) / unit
+    coarse, fine = (kepler.path(r1, r2, 76 * 60 / time, steps=n).p[0] * unit / time for n in (10, 20))
+    assert np.abs(fine - [2.058913, 2.915965]).max() < 1.5e-6
+    assert np.abs(fine - coarse).max() < 1e-8
+
+
+def test_several_starts_lead_to_several_paths(kepler):
+    ends, n = [[1.0, 0.0], [-0.5, 0.8]], 24
+    angle = np.arctan2(0.8, -0.5)
+
+    def around(turn):
+        a = np.linspace(0, turn, n + 1)
+        return np.stack([np.cos(a), np.sin(a)], axis=1)
+
+    left, right = (kepler.path(*ends, 3.0, steps=n, start=around(x)) for x in (angle, angle - 2 * np.pi))
+    momenta = [kepler.momentum_maps(path.q[0], path.p[0])[0] for path in (left, right)]
+    assert momenta[0] > 0 > momenta[1]
+    assert all(np.abs(path.run().q[-1] - ends[1]).max() < 1e-11 for path in (left, right))
+
+
+def test_continuation_finds_what_the_straight_line_does_not(kepler):
+    reference = kepler.integrate([1.0, 0.0], [0.0, 1.0], h=0.1, steps=140)
+    q1 = reference.q[-1]
+    with pytest.raises(PathError, match="give another start"):
+        kepler.path([1.0, 0.0], q1, 14.0, steps=56, homotopy=False)
+    path = kepler.path([1.0, 0.0], q1, 14.0, steps=56)
+    assert path.residual < 1e-11
+
+
+@pytest.mark.parametrize(("T", "index"), [(3.0, 0), (3.3, 1), (6.2, 1), (6.4, 2), (9.3, 2), (9.5, 3), (20.0, 6)])
+def test_morse_index_of_the_oscillator(oscillator, T, index):
+    path = oscillator.path([1.0], [0.3], T, steps=40)
+    assert path.index == index == int(T / np.pi)
+    assert len(path.conjugate_times) == index
+    for k, (before, after) in enumerate(path.conjugate_times, 1):
+        assert before <= k * np.pi <= after
+
+
+def test_hessian_by_both_ends_is_that_of_the_run():
+    stepper = sc.compile_stepper(sc.problem("henon-heiles").system, "svi:4")
+    run = stepper.integrate([0.1, 0.2], [0.3, 0.1], h=0.4, steps=25)
+    path = stepper.path(run.q[0], run.q[-1], 10.0, steps=25, start=run.q)
+    M = run.tangent()[-1]
+    A, B, D = M[:2, :2], M[:2, 2:], M[2:, 2:]
+    inverse = np.linalg.inv(B)
+    assert np.abs(path.hessian[:2, 2:] + inverse).max() < 1e-12
+    assert np.abs(path.hessian[:2, :2] - inverse @ A).max() < 1e-12
+    assert np.abs(path.hessian[2:, 2:] - D @ inverse).max() < 1e-12
+    determinants = [np.linalg.det(each[:2, 2:]) for each in run.tangent()[1:]]
+    assert path.index == 5 == np.count_nonzero(np.diff(np.sign(determinants)))
+
+
+def test_duration_at_a_given_energy(kepler):
+    run = kepler.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=20)
+    path = kepler.path(run.q[0], run.q[-1], 2.2, steps=20, energy=float(run.energy()[0]))
+    assert abs(path.t[-1] - 2.0) < 1e-9
+    assert np.abs(path.p - run.p).max() < 1e-8
+
+
+@pytest.mark.parametrize(
+    ("arguments", "q"),
+    [
+        ({"forces": {"x": "-x_dot/10 - x*y_dot", "y": "0"}}, 2),
+        ({"damping": "1/10"}, 2),
+        ({"inputs": ["u"]}, 2),
+        ({"constraints": ["x**2 + y**2 - 1"]}, 2),
+    ],
+    ids=["forces", "damping", "inputs", "constraints"],
+)
+def test_paths_of_other_systems_are_their_runs(arguments, q):
+    driven = " + u*x" if "inputs" in arguments else ""
+    stepper = compiled(["x", "y"], f"(x_dot**2 + y_dot**2)/2 - x**2/2 - y{driven}", "svi:3", **arguments)
+    t = np.linspace(0, 1.5, 31)
+    inputs = {"inputs": {"u": (t, np.sin(3 * t))}} if driven else {}
+    run = stepper.integrate([1.0, 0.0], velocity=[0.0, 0.4], h=0.05, t_end=1.5, **inputs)
+    path = stepper.path(run.q[0], run.q[-1], 1.5, steps=30, **inputs)
+    assert np.abs(path.q - run.q).max() < 1e-12
+    assert np.abs(path.p - run.p).max() < 1e-11
+    assert abs(path.action - run.action()) < 1e-12
+    assert np.abs(path.run().q[-1] - run.q[-1]).max() < 1e-11
+    assert path.index == (None if stepper.supports("work") else 0)
+
+
+def test_constrained_index_is_that_of_the_angle():
+    """A rod without gravity, motion in the plane of a half turn and more: conjugate after half a turn on the sphere."""
+    rod = compiled(["x", "y", "z"], "(x_dot**2 + y_dot**2 + z_dot**2)/2", constraints=["x**2 + y**2 + z**2 - 1"])
+    n = 16
+    for angle, index in ((2.0, 0), (4.0, 1)):
+        a = np.linspace(0, angle, n + 1)
+        curve = np.stack([np.cos(a), np.sin(a), 0.02 * np.sin(np.pi * a / angle)], axis=1)
+        path = rod.path(curve[0], curve[-1], angle, steps=n, start=curve)
+        assert path.index == index
+        assert abs(path.action - angle / 2) < 1e-9
+
+
+def test_paths_of_arrays_of_run_time_sizes():
+    chain = sc.LagrangianSystem.from_text(
+        "chain", ["u[N]"], "sum(i in N, u_dot[i]**2/2 - u[i]**4/4) - sum(i in 0..N-2, (u[i+1] - u[i])**2/2)"
+    )
+    stepper = sc.compile_stepper(chain, "svi:3")
+    ends = np.array([0.1, -0.2, 0.3]), np.array([0.4, 0.1, 0.2])
+    path = stepper.path(*ends, 2.0, steps=12)
+    run = stepper.integrate(ends[0], path.p[0], h=1 / 6, steps=12)
+    assert np.abs(run.q[-1] - ends[1]).max() < 1e-12
+
+
+def test_sparse_derivatives_of_a_lattice_are_those_of_all_columns():
+    lattice = compiled(
+        ["u[12]"], "sum(i in 12, u_dot[i]**2/2 + (u[i]**2 - 1)**2/4) + sum(i in 0..10, (u[i+1] - u[i])**2/4)", "svi:2"
+    )
+    h = np.full(6, 0.3)
+    q = np.linspace(-1, 1, 7)[:, None] + 0.1 * np.random.default_rng(1).normal(size=(7, 12))
+    all_of_them, some = (
+        kind(lattice, 0.3 * np.arange(6), h, lattice.defaults, None).linearised(q)
+        for kind in (Intervals, ManyCoordinates)
+    )
+    many = ManyCoordinates(lattice, 0.3 * np.arange(6), h, lattice.defaults, None)
+    many.linearised(q)
+    dense = np.zeros_like(all_of_them.blocks)
+    dense[:, :, many.rows, many.columns] = some.blocks
+    assert np.abs(dense - all_of_them.blocks).max() < 1e-4 * np.abs(all_of_them.blocks).max()
+    assert some.blocks.shape[-1] < 12 * 12
+
+
+def test_condensation_of_one_inner_node_is_elimination(oscillator):
+    path = oscillator.path([1.0], [0.3], 1.0, steps=2)
+    h, c, s = 1.0, np.cos(1.0), np.sin(1.0)
+    assert np.allclose(path.hessian, np.array([[c, -1], [-1, c]]) / s, atol=1e-6)
+    assert h == path.t[-1]
+    assert condensed_hessian(path.solution.at, path.solution.factors).shape == (2, 2)
+
+
+def test_closed_path_with_another_coordinate_than_time():
+    """Periodic orbit of the pendulum of period 8: the amplitude of its elliptic integral."""
+    pendulum = compiled(["a"], "a_dot**2/2 + cos(a)", "svi:6")
+    path = pendulum.path(T=4.0, steps=12, closed=["-a"], start=lambda t: [np.sin(np.pi * t / 4)])
+    run = path.run()
+    assert path.repetitions == 2
+    assert path.period == 8.0
+    m = (1 + run.energy()[0]) / 2  # sin^2 of half the amplitude
+    assert abs(4 * ellipk(m) - 8.0) < 1e-8
+    assert np.abs(run.q[-1] - run.q[0]).max() < 1e-9
+
+
+def test_refusals_name_the_remedy(kepler, oscillator):
+    for call, error, words in (
+        (lambda: kepler.path([1, 0], [0, 1]), StateError, "give T"),
+        (lambda: kepler.path([1, 0], None, 1.0), StateError, "both positions"),
+        (lambda: kepler.path([1, 0], [0, 1], 0.0), StateError, "must not be 0"),
+        (lambda: kepler.path([1, 0], [0, 1], 1.0, start=np.zeros((4, 2))), StateError, "must have shape"),
+        (lambda: kepler.path(T=1.0, closed=True), StateError, "require start"),
+        (lambda: kepler.path(T=1.0, closed=["x", "x"], start=np.ones((33, 2))), StateError, "each coordinate once"),
+        (lambda: kepler.path(T=1.0, closed=np.ones((2, 2)), start=np.ones((33, 2))), StateError, "orthogonal"),
+        (lambda: kepler.path(T=1.0, closed=True, energy=1.0, start=np.ones((33, 2))), MethodError, "omit it"),
+        (lambda: oscillator.path([1.0], [0.3], np.pi, steps=20), PathError, "no path was found"),
+        (lambda: sc.compile_stepper(KEPLER, "radau-iia:2").path([1, 0], [0, 1], 1.0), MethodError, "sum of L"),
+    ):
+        with pytest.raises(error, match=words):
+            call()
