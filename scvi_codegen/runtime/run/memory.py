@@ -38,7 +38,10 @@ STEPS_PER_CALL, MOST_UNTIMED = 10**5, 2**10
 LARGEST_STEP, MOST_GRID_LEVEL = 2**53, 2**16
 """Largest number of steps that a double represents; a bound of step-size levels beyond all exponents of a double."""
 RANGES = {
-    **dict.fromkeys(("step", "iterations", "rejected", "steps_from_rest", "steps_to_compare"), (0, LARGEST_STEP)),
+    **dict.fromkeys(
+        ("step", "iterations", "rejected", "steps_from_rest", "steps_to_compare", "many", "suspended"),
+        (0, LARGEST_STEP),
+    ),
     **dict.fromkeys(("guess", "turn"), (0, 2)),
     **dict.fromkeys(
         ("grid_level", "change", "change_before", "direction", "failed"), (-MOST_GRID_LEVEL, MOST_GRID_LEVEL)

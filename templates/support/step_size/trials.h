@@ -8,6 +8,9 @@
 
 #define ALLOWED_TO_HALVES 100 /* admissible difference of the half steps, relative to the admissible error estimate */
 #define SPURIOUS REAL(1e-8) /* relative to the state: spurious solutions of the equations differ by more */
+#define MANY_ITERATIONS 10 /* of a step, after which the next one is not larger */
+#define TOO_MANY_ITERATIONS 13 /* the next one is smaller: about ten iterations take the least time per unit of time */
+#define SUSPENDED 8 /* steps without this rule after one that needed as many iterations as a larger one */
 #define STEPS_COMPARED_AFTER_DOUBT 16 /* steps that are compared after one that was shortened by a comparison */
 
 #ifdef ARRAYS
@@ -107,6 +110,7 @@ typedef struct {
   real apart; /* error estimate by two half steps, in the measure of `error`; 0 if they were not computed */
   long long guess, grid_level; /* level of the step size */
   long long change; /* of the level, from the previous step to this */
+  long long iterations; /* of the last trial */
   real length; /* step size; 0 before the first trial */
   int last; /* 1 if the step ends at t_end */
   int inside; /* levels above this one of a rejected step, whose curve is stored; 0: none */
@@ -126,6 +130,7 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
     now->length = size_of_level(run->grid_level);
   }
   h = next_size(now->length, rest, &now->last);
+  now->iterations = report->iterations;
   report->t = now->step.t = now->at.t;
   if (now->last || now->step.h != h) {
     now->step.h = h;
@@ -133,6 +138,7 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
   }
   now->error = attempt(run, &now->step, &now->data, now->last, now->last ? 0 : now->inside, &now->guess, now->dq,
       now->dp, now->limits.decay, least, options, report);
+  now->iterations = report->iterations - now->iterations;
 }
 
 /* Returns 1 if the momenta change by a small part of the largest one, as they do where nonsmooth forces shorten a
@@ -290,11 +296,31 @@ static inline int confirm_step(run_memory *run, trial *now, const solver_options
   return steps_to_compare || run->step % COMPARED == 0 ? compare_step(run, now, steps_to_compare, options, report) : OK;
 }
 
+/* Largest change of level after the iterations of a step. Where they are many, as in lattices whose waves are fast, the
+ * time that a unit of time takes grows with the step size (cf. Gustafsson & Soederlind, SIAM J. Sci. Comput. 18 (1997)
+ * 23). If a smaller step needs as many, the step size is not their cause, and the rule is suspended. */
+static inline int limit_by_iterations(run_memory *run, long long iterations)
+{
+  int most = MOST_UP;
+  if (run->suspended > 0) {
+    run->suspended--;
+  } else if (run->many > 0 && iterations >= run->many) {
+    run->many = 0;
+    run->suspended = SUSPENDED;
+  } else {
+    run->many = iterations > TOO_MANY_ITERATIONS ? iterations : 0;
+    most = run->many > 0 ? -1 : iterations > MANY_ITERATIONS ? 0 : most;
+  }
+  return most;
+}
+
 /* Chooses the size of the next step. The error of a loose tolerance may allow steps at which the iteration fails: the
  * size of such a step is not tried again for some steps (cf. Hairer & Wanner, Solving ODEs II, IV.8). */
 static inline void choose_size(run_memory *run, const trial *now)
 {
   int change = next_change(run, now->error, run->error_before, &now->limits);
+  const int most = limit_by_iterations(run, now->iterations);
+  change = change < most ? change : most;
   if (run->avoiding > 0 && run->avoiding-- && run->grid_level + change >= run->failed)
     change = (int)(run->failed - 1 - run->grid_level);
   run->guess = now->guess;
