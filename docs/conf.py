@@ -19,10 +19,11 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx.ext.intersphinx",
     "mathml",
+    "motions",
     "public_names",
     "search_words",
 ]
-exclude_patterns = ["_extensions"]
+exclude_patterns = ["_extensions", "motions"]
 
 html_theme = "furo"
 html_title = f"scvi_codegen {release}"

@@ -18,7 +18,7 @@ function restart() {
     const began = performance.now(), states = [pointsOf(memory_q, code.time())], span = 10 * settings.speed;
     while (!fault && performance.now() - began < 4 && Math.abs(code.time() - about.t) < span && states.length < 4000) {
       fault = code.advance(16, 4);
-      for (let k = 0; k < 4; k++) states.push(pointsOf(stored_q.subarray(k * m, (k + 1) * m), stored_t[k]));
+      for (let k = 0; k < 4 && !fault; k++) states.push(pointsOf(stored_q.subarray(k * m, (k + 1) * m), stored_t[k]));
     }
     const shown = states.filter((points) => points.flat().every(Number.isFinite));
     start();
@@ -51,14 +51,14 @@ function addSlider(title, label, name, { low, high, log = false, hard = true, ge
     if (document.activeElement !== range) range.value = at;
     range.style.setProperty("--at", `${100 * at}%`);
     range.setAttribute("aria-valuetext", short(x));
-    if (document.activeElement !== number) number.value = Math.abs(x) < 1e-15 ? 0 : +x.toPrecision(5);
+    if (document.activeElement !== number) number.value = Math.abs(x) < 1e-15 ? 0 : +x.toPrecision(4);
   };
   const changed = (x) => { put(x); showSliders(); writeAddress(); };
   range.addEventListener("input", () => { const s = +range.value; changed(clamped(+(log ? low * (high / low) ** s : low + (high - low) * s).toPrecision(4), low, high)); });
   number.addEventListener("change", () => {
     const x = number.valueAsNumber;
     if (!Number.isFinite(x)) tell(`${name} must be a number.`);
-    else if (hard && (x < low || x > high)) { tell(`${name} must be between ${short(low)} and ${short(high)}; ${short(x, 6)} was replaced.`); changed(clamped(x, low, high)); number.value = +get().toPrecision(5); }
+    else if (hard && (x < low || x > high)) { tell(`${name} must be between ${short(low)} and ${short(high)}; ${short(x, 6)} was replaced.`); changed(clamped(x, low, high)); number.value = +get().toPrecision(4); }
     else changed(x);
   });
   number.addEventListener("blur", show);
@@ -79,7 +79,7 @@ if (!about.initial && about.ranges) {
     addSlider("Initial values", set(name, kind === "v"), kind === "q" ? name : `Velocity of ${name}`, { low, high, hard: false, get: () => settings[kind][k], set: (x) => { settings[kind] = settings[kind].with(k, x); restart(); } });
   });
 }
-if (groups.Parameters && about.parameters.length > 10 && groups["Initial values"]) groups["Initial values"].open = false;
+if (groups["Initial values"] && sliders.length > 24) groups["Initial values"].open = false;
 
 /** Adds sliders of a rotation: tilt about the first axis, and the angular velocity in the body. */
 function addRotation({ name, columns, omega: names }) {
@@ -103,17 +103,19 @@ function play(on = !running) {
   by("play").querySelector("span").textContent = running ? "Pause" : "Play";
   last = undefined; target = code.time(); dirty = true;
 }
+/** Makes the present state the initial state; returns whether it can. */
+function takeState() {
+  if (fault || code.velocities()) { tell("The velocities of the present state are undefined; restart first."); return false; }
+  settings.q = Array.from(memory_q); settings.v = Array.from(memory_v);
+  if (source.rods) source.rods.lengths.forEach((_, k) => { settings.q[k] = wrapped(settings.q[k]); });
+  return true;
+}
 const actions = {
   play: () => play(),
-  step: () => { play(false); advance(1); target = code.time(); dirty = true; },
+  step: () => { play(false); single(); target = code.time(); dirty = true; },
   reverse: () => { if (fault) return; turn(); by("reverse").setAttribute("aria-pressed", String(backward())); play(true); },
   restart: () => { pending = []; restart(); writeAddress(); play(true); },
-  here: () => {
-    if (fault || code.velocities()) { tell("The velocities of the present state are undefined; restart first."); return; }
-    settings.q = Array.from(memory_q); settings.v = Array.from(memory_v);
-    if (source.rods) source.rods.lengths.forEach((_, k) => { settings.q[k] = wrapped(settings.q[k]); });
-    restart(); showSliders(); writeAddress();
-  },
+  here: () => { if (takeState()) { restart(); showSliders(); writeAddress(); } },
   share: async () => {
     const here = location.protocol === "about:" ? "" : location.href.split("#")[0], link = here + address();
     try {
@@ -153,7 +155,8 @@ motion.addEventListener("pointerdown", (event) => {
   if (which === undefined) { if (flat) return; dragged = { orbit: true, at: place(event) }; }
   else {
     const was = running;
-    actions.here(); play(false);
+    play(false);
+    if (!takeState()) return;
     if (!source.columns) settings.v = settings.v.map(() => 0); // released at rest
     dragged = { which, was, depth: picture.at[which][2] };
   }
@@ -175,16 +178,6 @@ for (const name of ["pointerup", "pointercancel"]) motion.addEventListener(name,
 motion.addEventListener("dblclick", () => { view.reset(); dirty = true; });
 
 // ---- frames
-/** Returns q between the last two states: a cubic with their positions and velocities. */
-function between(time) {
-  if (!before || m > WHOLE || code.velocities()) return memory_q;
-  const h = code.time() - before.t, s = (time - before.t) / h;
-  if (!(s >= 0 && s < 1)) return memory_q;
-  const [a, b, c, d] = [(1 + 2 * s) * (1 - s) ** 2, s * (1 - s) ** 2 * h, s * s * (3 - 2 * s), s * s * (s - 1) * h];
-  return Float64Array.from(memory_q, (q, k) => a * before.q[k] + b * before.v[k] + c * q + d * memory_v[k]);
-}
-const snapshot = () => { before = m <= WHOLE && !code.velocities() ? { t: code.time(), q: memory_q.slice(), v: memory_v.slice() } : undefined; };
-
 /** Performs the steps of a frame within the time that is left for them. */
 function go(elapsed, until) {
   const sign = backward() ? -1 : 1, speed = settings.speed * sign;
@@ -194,7 +187,7 @@ function go(elapsed, until) {
     const size = adaptive ? 1 : Math.ceil(((target - code.time()) * sign) / settings.step - 1e-9);
     const now = Math.max(1, Math.min(size, Math.floor((until - performance.now()) / stepCost / 2))), began = performance.now(), every = Math.max(1, Math.ceil(size / 48));
     if (now > 1) advance(now - 1, Math.min(every, now - 1));
-    if (!fault) { snapshot(); advance(1); }
+    if (!fault) single();
     performed += now;
     stepCost = 0.8 * stepCost + (0.2 * Math.max(performance.now() - began, 1e-3)) / now;
     if (performance.now() > until) { if ((target - code.time()) * sign > 0) target = code.time(); break; }
@@ -233,7 +226,7 @@ function frame(now) {
 let stale = 0;
 function draw(performed) {
   const [pen, width, height] = fitted(motion), time = running && !pending.length ? target : code.time();
-  picture.draw(pen, between(time), time, width, height);
+  picture.draw(pen, running ? between(time) : memory_q, time, width, height);
   if (running) { panels[frames % panels.length].draw(); stale = panels.length; } else panels.forEach((panel) => panel.draw());
   by("clock").textContent = pending.length ? `computing the state of the link: ${pending[0].toLocaleString("en")} steps to go` : `t = ${code.time().toFixed(2)}`;
   const told = fault ? CAUSES[fault] || `The step failed (status ${fault}).` : performance.now() < noticeEnds ? notice : "";
@@ -243,12 +236,18 @@ function draw(performed) {
 }
 
 function open() {
-  const { error, steps } = readAddress(location.hash);
+  const { error, paused, steps } = readAddress(location.hash);
   if (error) tell(error);
   restart(); showSliders();
   pending = steps && steps.some((n) => n) ? steps : [];
-  play(!error && !pending.length && !calm.matches);
+  play(!error && !paused && !calm.matches);
 }
+/** For scripts and the console: the present state, its address, and steps at once. */
+globalThis.page = {
+  address,
+  state: () => ({ t: code.time(), steps: code.steps(), q: Array.from(memory_q), p: Array.from(memory_p), energy: code.energy(), fault, settings: structuredClone(settings) }),
+  advance: (steps) => { play(false); advance(steps, Math.max(1, Math.ceil(steps / 2000))); target = code.time(); dirty = true; },
+};
 if (window !== parent) document.body.classList.add("embedded");
 by("hint").textContent = source.mesh ? "" : shape.movable.length ? (flat ? "drag a body" : "drag a body, or turn the view") : flat ? "" : "drag to turn the view";
 readColors();

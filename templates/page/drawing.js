@@ -23,7 +23,7 @@ const { source } = shape;
 
 /** Returns the points of a state, [x, y] or [x, y, z] each. */
 function pointsOf(q, t) {
-  if (source.columns) return source.columns.map((columns) => columns.map((c) => q[c]));
+  if (source.columns) return source.columns.map((columns) => columns.map((c) => (c < 0 ? 0 : q[c])));
   if (source.rods) {
     const ends = [[0, 0]], { sign, lengths } = source.rods;
     lengths.forEach((length, k) => {
@@ -183,7 +183,12 @@ const marked = () => {
       view.follow([low, high], width, height);
       const at = points.map((point) => view.to(point)), parts = [], add = (depth, paint) => parts.push([depth, paint]);
       if (!flat) this.ground(pen);
-      shape.trails.forEach((which, k) => trail(pen, trails[k].map((point) => view.to(point)), colors[trailColor(k)]));
+      const sign = backward() ? -1 : 1;
+      shape.trails.forEach((which, k) => {
+        const past = [];
+        for (const point of trails[k]) if (!((point.t - t) * sign > 0)) past.push(view.to(point.at));
+        trail(pen, [...past, at[which]], colors[trailColor(k)]);
+      });
       const largest = heaviest();
       let number = 0;
       for (const mark of shape.marks) {
@@ -278,8 +283,7 @@ function moved(which, place, start, t) {
 const graph = () => {
   const { axes, fields } = source.mesh, names = Object.keys(axes), [xs, ys] = names.map((name) => axes[name]), PAST = 160, WIDE = 420;
   const image = document.createElement("canvas"), past = [];
-  let low = Infinity, high = -Infinity, stale = true, seen = 0;
-  const level = (u) => clamped(Math.round(((u - bounds()[0]) / (bounds()[1] - bounds()[0])) * 255), 0, 255);
+  let low = Infinity, high = -Infinity;
   const bounds = () => { const top = Math.max(high, -low, 1e-300); return low < -1e-9 * top ? [-top, top] : [0, top]; };
   const color = () => (palette ??= Uint32Array.from({ length: 256 }, (_, k) => {
     const signedLevel = bounds()[0] < 0 ? k / 127.5 - 1 : k / 255, end = rgb[signedLevel < 0 ? "c0" : "c1"], s = Math.abs(signedLevel);
@@ -302,7 +306,7 @@ const graph = () => {
   };
   const across = grid(xs, ys ? 200 : WIDE), along = ys && grid(ys, 200);
   return {
-    forget() { low = Infinity; high = -Infinity; past.length = 0; seen = 0; palette = undefined; },
+    forget() { low = Infinity; high = -Infinity; past.length = 0; palette = undefined; },
     ahead() {},
     see(q) {
       const [begin, end] = fields[0].columns;
@@ -330,7 +334,7 @@ const graph = () => {
       paint(image.getContext("2d"), values, WIDE, past.length);
       pen.drawImage(image, left, split, width - left - right, height - split - 26);
       pen.textAlign = "center"; pen.textBaseline = "top";
-      for (const mark of ticks(x0, x1, clamped(width / 110, 3, 8))) pen.fillText(short(mark), px(mark), height - 20);
+      for (const mark of ticks(x0, x1, clamped(width / 110, 3, 8))) if (px(mark) < width - right - 18) pen.fillText(short(mark), px(mark), height - 20);
       pen.font = `italic 13px ${colors.sans}`;
       pen.fillText(names[0], width - right - 3, height - 20); pen.textAlign = "left";
       fields.forEach(({ name }, k) => { pen.fillStyle = colors[hue(k)]; pen.fillText(name, left + 6 + 22 * k, top - 4); });

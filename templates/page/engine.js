@@ -2,14 +2,18 @@
 const by = (id) => document.getElementById(id);
 const about = JSON.parse(by("description").textContent);
 const { m } = about, count = about.quantities.length;
-const bytes = Uint8Array.from(atob(by("wasm").textContent.trim()), (c) => c.charCodeAt(0));
+/** Returns the WebAssembly in the page, which is compressed. */
+async function inflated() {
+  const bytes = Uint8Array.from(atob(by("wasm").textContent.trim()), (c) => c.charCodeAt(0));
+  return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
+}
 let code;
 try {
-  code = new WebAssembly.Instance(new WebAssembly.Module(bytes), {}).exports;
+  code = (await WebAssembly.instantiate(await inflated(), {})).instance.exports;
 } catch (error) {
   by("fault").hidden = false;
   by("fault").textContent = `WebAssembly could not be started (${error.message}). Use a current browser, and allow 'wasm-unsafe-eval' in the content security policy.`;
-  throw error;
+  return;
 }
 code._initialize?.();
 const capacity = code.capacity();
@@ -53,7 +57,7 @@ function readAddress(text) {
     }
   }
   settings = next;
-  return { steps: steps.map((n) => clamped(Math.floor(Math.abs(n)), 0, 1e7)) };
+  return { paused: given.has(".n"), steps: steps.map((n) => clamped(Math.floor(Math.abs(n)), 0, 1e7)) };
 }
 
 /** Returns the part of the address that reproduces the state bit for bit. */
@@ -89,6 +93,7 @@ function start() {
 function turn() {
   legs.push(0);
   fault = code.turn(signed());
+  for (const points of trails) for (const point of points) point.t = NaN; // all are past
   before = undefined;
 }
 
@@ -106,7 +111,7 @@ function keep(t, q, p, energy, quantities) {
   picture.see?.(q, t);
   if (shape.trails.length) {
     const points = pointsOf(q, t);
-    shape.trails.forEach((which, k) => { trails[k].push(points[which]); if (trails[k].length > TRAIL) trails[k].shift(); });
+    shape.trails.forEach((which, k) => { trails[k].push({ t, at: points[which] }); if (trails[k].length > TRAIL) trails[k].shift(); });
   }
   if (counted++ % stride) return;
   const row = new Float64Array(2 + count + 2 * probes.length);
@@ -114,6 +119,27 @@ function keep(t, q, p, energy, quantities) {
   probes.forEach((at, k) => { row[ROW.q + k] = q[at]; row[ROW.p + k] = p[at]; });
   rows.push(row);
   if (rows.length > STORED) { rows = rows.filter((_, k) => k % 2 === 0); stride *= 2; }
+}
+
+/** Returns q between the last two states: a cubic with their positions and velocities. */
+function between(time) {
+  if (!before || m > WHOLE || code.velocities()) return memory_q;
+  const h = code.time() - before.t, s = (time - before.t) / h;
+  if (!(s >= 0 && s < 1)) return memory_q;
+  const [a, b, c, d] = [(1 + 2 * s) * (1 - s) ** 2, s * (1 - s) ** 2 * h, s * s * (3 - 2 * s), s * s * (s - 1) * h];
+  return Float64Array.from(memory_q, (q, k) => a * before.q[k] + b * before.v[k] + c * q + d * memory_v[k]);
+}
+
+/** Performs one step, and adds points of a smooth trail if it takes several frames. */
+function single() {
+  before = m <= WHOLE && !code.velocities() ? { t: code.time(), q: memory_q.slice(), v: memory_v.slice() } : undefined;
+  advance(1);
+  if (fault || !before || !shape.trails.length) return;
+  const h = code.time() - before.t, parts = clamped(Math.ceil((60 * Math.abs(h)) / settings.speed), 1, 8);
+  for (let j = 1; j < parts; j++) {
+    const t = before.t + (h * j) / parts, points = pointsOf(between(t), t);
+    shape.trails.forEach((which, k) => trails[k].splice(-1, 0, { t, at: points[which] }));
+  }
 }
 
 /** Performs steps; every `every`-th state is stored. */

@@ -105,7 +105,7 @@ function plot(canvas, xs, ys, color, { symmetric = false, periods = [0, 0] } = {
   pen.font = `11px ${colors.sans}`; pen.fillStyle = colors.muted; pen.textBaseline = "middle"; pen.textAlign = "right";
   for (const mark of ticks(y0, y1, 3)) { line(pen, [[left, py(mark)], [width - right, py(mark)]], colors.rule, 1); pen.fillText(short(mark), left - 6, py(mark)); }
   pen.textBaseline = "top"; pen.textAlign = "center";
-  for (const mark of ticks(x0, x1, 4)) { const text = short(mark), half = pen.measureText(text).width / 2; if (px(mark) + half < width) pen.fillText(text, px(mark), height - bottom + 4); }
+  for (const mark of ticks(x0, x1, clamped(width / 75, 2, 5))) { const text = short(mark), half = pen.measureText(text).width / 2; if (px(mark) + half < width) pen.fillText(text, px(mark), height - bottom + 4); }
   pen.beginPath();
   for (let k = 0; k < xs.length; k++) {
     const jump = k && periods.some((period, axis) => period && Math.abs((axis ? ys : xs)[k] - (axis ? ys : xs)[k - 1]) > period / 2);

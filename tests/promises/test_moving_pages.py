@@ -1,0 +1,200 @@
+"""Tests of pages that move, in a headless Chromium: bits, controls, address, errors, layout."""
+
+import html
+import importlib.util
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browsing import UNREADABLE
+
+import scvi_codegen as sc
+from scvi_codegen.native.building import PORTABLE_FLAGS
+
+DOCS = Path(__file__).parents[2] / "docs"
+pytestmark = pytest.mark.second
+
+
+def page_of(path: Path, ranges: dict[str, tuple[float, float]] | None = None) -> str:
+    """Return the page of a model file, by the builder of the site."""
+    pytest.importorskip("ziglang", reason="pages are compiled by the extra compiler")
+    spec = importlib.util.spec_from_file_location("page_builder", DOCS / "_extensions" / "page_builder.py")
+    builder = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(builder)
+    return builder.page_of(path, ranges)
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Return the files of two pages: one without calls of the C library, and a field."""
+    folder = tmp_path_factory.mktemp("pages")
+    result = {}
+    for name, ranges in (("figure_eight", None), ("kinks", {"v": (0.05, 0.95)})):
+        result[name] = folder / f"{name}.html"
+        result[name].write_text(page_of(DOCS / "motions" / f"{name}.toml", ranges), encoding="utf-8")
+    return result
+
+
+@pytest.fixture
+def view(browser: Any) -> Iterator[Any]:
+    """Return a page of the browser with touch, which collects messages and requests."""
+    context = browser.new_context(viewport={"width": 1000, "height": 900}, has_touch=True)
+    page = context.new_page()
+    page.messages, page.asked = [], []
+    page.on("console", lambda message: page.messages.append(message.text))
+    page.on("pageerror", lambda error: page.messages.append(str(error)))
+    page.on("request", lambda request: page.asked.append(request.url))
+    yield page
+    context.close()
+
+
+def opened(view: Any, path: Path, address: str = "#.n=0", steps: int = 0) -> Any:
+    """Open a page, and return its state when it has performed the steps of the address."""
+    view.goto("about:blank")
+    view.goto(path.as_uri() + address)
+    return state_when(view, lambda state: state["steps"] >= steps)
+
+
+def state_when(view: Any, condition: Any) -> Any:
+    """Return the first state that satisfies a condition; the policy of the page forbids playwright's own waiting."""
+    for _ in range(200):
+        state = view.evaluate("globalThis.page ? page.state() : null")
+        if state and condition(state):
+            return state
+        time.sleep(0.02)
+    raise AssertionError(state)
+
+
+def middle_of(view: Any) -> tuple[float, float]:
+    """Return the pixels of the middle of the drawing."""
+    box = view.locator("#motion").bounding_box()
+    return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+
+def test_a_page_computes_the_bits_of_python_and_asks_for_nothing(view, pages):
+    state = opened(view, pages["figure_eight"], "#.n=1000", 1000)
+    model = sc.load_model(DOCS / "motions" / "figure_eight.toml")
+    stepper = sc.compile_stepper(model.system, model.method, flags=PORTABLE_FLAGS)
+    run = stepper.integrate(model.q, model.momenta(stepper), h=model.h, steps=1000)
+    assert np.array_equal(state["q"], run.q[-1])
+    assert np.array_equal(state["p"], run.p[-1])
+    kinks = opened(view, pages["kinks"], "#.n=200", 200)
+    model = sc.load_model(DOCS / "motions" / "kinks.toml")
+    stepper = model.stepper()
+    run = stepper.integrate(model.q, velocity=model.velocity, h=model.h, steps=200)
+    assert np.abs(np.array(kinks["q"]) - np.ravel(run.q["u"][-1])).max() < 1e-11
+    assert view.messages == []
+    assert all(url.startswith(("file:", "about:", "data:")) for url in view.asked)
+    text = pages["kinks"].read_text(encoding="utf-8").replace("http://www.w3.org/1998/Math/MathML", "")
+    assert "://" not in text
+
+
+def test_a_link_reproduces_the_bits_after_reversal_and_a_change_of_parameters(view, pages):
+    opened(view, pages["figure_eight"], "#m2=1.01&.n=300", 300)
+    view.keyboard.press("b")
+    view.keyboard.press(" ")
+    view.evaluate("page.advance(123)")
+    state, address = view.evaluate("[page.state(), page.address()]")
+    assert state["t"] < 15
+    assert "m2=1.01" in address
+    again = opened(view, pages["figure_eight"], address, state["steps"])
+    assert {key: again[key] for key in ("t", "q", "p")} == {key: state[key] for key in ("t", "q", "p")}
+
+
+def test_bodies_are_dragged_by_mouse_and_touch(view, pages):
+    before = opened(view, pages["figure_eight"])
+    middle = middle_of(view)  # body 3 is at the origin
+    view.mouse.move(*middle)
+    view.mouse.down()
+    view.mouse.move(middle[0] + 40, middle[1] - 20, steps=4)
+    view.mouse.up()
+    after = view.evaluate("page.state()")
+    assert after["settings"]["q"][:4] == before["settings"]["q"][:4]
+    x, y = after["settings"]["q"][4:]
+    assert x == pytest.approx(2 * y, rel=0.03)
+    assert y > 0.02
+    opened(view, pages["figure_eight"])
+    session = view.context.new_cdp_session(view)
+    for kind, at in (("touchStart", 0), ("touchMove", 20), ("touchMove", 40), ("touchEnd", None)):
+        points = [] if at is None else [{"x": middle[0] + at, "y": middle[1]}]
+        session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    touched = view.evaluate("page.state()")["settings"]["q"]
+    assert touched[4] == pytest.approx(x, rel=0.3)  # the frame follows the motion that is ahead
+    assert touched[5] == pytest.approx(0, abs=1e-3)
+    assert view.messages == []
+
+
+def test_keys_play_step_and_restart(view, pages):
+    opened(view, pages["figure_eight"], "#.n=7", 7)
+    view.keyboard.press("ArrowRight")
+    assert view.evaluate("page.state().steps") == 8
+    view.keyboard.press(" ")
+    state_when(view, lambda state: state["steps"] > 9)
+    view.keyboard.press("r")
+    assert view.evaluate("page.state().steps") < 8
+    view.focus("#play")
+    view.keyboard.press(" ")
+    stopped = view.evaluate("page.state().steps")
+    view.wait_for_timeout(150)
+    assert view.evaluate("page.state().steps") == stopped
+    assert view.inner_text("#play") == "Play"
+
+
+@pytest.mark.parametrize(
+    ("name", "address", "message"),
+    [
+        ("figure_eight", "#.q=0,0,0,0,0,0&.n=5", "infinite or undefined"),
+        ("figure_eight", "#.q=0,0", "this system needs 6"),
+        ("figure_eight", "#m1=x", "is not a number"),
+        ("kinks", "#v=1.5", "v must be between 0.05 and 0.95; the address has 1.5"),
+    ],
+)
+def test_an_error_is_one_line_in_the_page(view, pages, name, address, message):
+    opened(view, pages[name], address)
+    view.wait_for_timeout(100)
+    assert message in view.inner_text("#fault")
+    assert view.messages == []
+
+
+def test_a_number_out_of_range_is_replaced_and_explained(view, pages):
+    opened(view, pages["kinks"])
+    view.fill("input[aria-label='v, value']", "1.2")
+    view.keyboard.press("Enter")
+    view.wait_for_timeout(100)
+    assert "v must be between 0.05 and 0.95; 1.2 was replaced" in view.inner_text("#fault")
+    assert view.evaluate("page.state().settings.parameters.v") == 0.95
+
+
+def test_a_page_in_a_frame_without_address_shows_its_link(view, pages):
+    source = html.escape(pages["figure_eight"].read_text(encoding="utf-8"))
+    view.set_content(f'<iframe sandbox="allow-scripts" width="380" height="600" srcdoc="{source}"></iframe>')
+    frame = view.frames[1]
+    state_when(frame, lambda state: state["steps"] > 2)
+    frame.click("#play")
+    frame.click("#share")
+    assert frame.input_value("#link_text") == frame.evaluate("page.address()")
+    assert view.messages == []
+
+
+@pytest.mark.parametrize("width", [360, 800, 1600])
+def test_a_page_fits_the_screen_is_readable_and_named(browser, pages, width):
+    for name, scheme in (("figure_eight", "light"), ("kinks", "dark")):
+        page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme, reduced_motion="reduce")
+        opened(page, pages[name], "")
+        assert page.inner_text("#play") == "Play"  # nothing moves by itself
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert page.evaluate(UNREADABLE) == []
+        unnamed = """() => [...document.querySelectorAll('button, input, select, canvas')].filter(each =>
+            !(each.getAttribute('aria-label') || each.textContent.trim() || each.labels?.length)).length"""
+        assert page.evaluate(unnamed) == 0
+        page.close()
+
+
+def test_steps_of_a_link_are_spread_over_frames(view, pages):
+    """The page shows progress, instead of blocking the browser for the seconds that the steps take."""
+    opened(view, pages["kinks"], "#.n=100000")
+    assert view.evaluate("page.state().steps") < 100000
+    assert "steps to go" in view.inner_text("#clock")
