@@ -128,7 +128,7 @@ class OwnDirective(SphinxDirective):
 
 def _visit_motion(writer: Any, node: motion) -> None:
     """Write the frame and how to make the page; the picture is the child, without scripts or a compiler."""
-    title, source = html.escape(node["title"]), html.escape(node["text"])
+    title = html.escape(node["title"])
     writer.body.append('<div class="motion">')
     if CAN_COMPILE:
         address = writer.builder.get_relative_uri(
@@ -141,14 +141,15 @@ def _visit_motion(writer: Any, node: motion) -> None:
         writer.body.append(
             f'<p class="motion-links"><a href="{address}">{title} as a page of its own</a></p>'
         )
-    writer.body.append(
-        f"<details><summary>Model file</summary><pre>{source}</pre></details>"
-    )
-    writer.body.append("<noscript>" if CAN_COMPILE else "")
+        writer.body.append("<noscript><style>.motion iframe { display: none }</style>")
 
 
 def _depart_motion(writer: Any, node: motion) -> None:
-    writer.body.append("</noscript></div>" if CAN_COMPILE else "</div>")
+    source = html.escape(node["text"])
+    writer.body.append("</noscript>" if CAN_COMPILE else "")
+    writer.body.append(
+        f"<details><summary>Model file</summary><pre>{source}</pre></details></div>"
+    )
 
 
 def _visit_motions(writer: Any, node: motions) -> None:

@@ -320,8 +320,14 @@ def _shape(model: Any, interface: Any, q: list[float]) -> dict[str, Any]:
             for k, body in enumerate(found)
         ]
         points = list(range(len(found)))
-        return shape | {"dimension": len(columns[0]), "source": {"columns": columns}, "marks": marks,
-                        "trails": points, "movable": points}  # fmt: skip
+        rods, pins = _rods(interface, found)
+        return shape | {
+            "dimension": len(columns[0]),
+            "source": {"columns": columns, "pins": pins},
+            "marks": rods + marks,
+            "trails": points,
+            "movable": points,
+        }
     drawn = SimpleNamespace(
         stepper=model.stepper(), q=np.atleast_2d(q), t=[float(model.t)],
         parameters=[model.parameters.get(name, value) for name, value in zip(interface.parameters, interface.defaults)],  # noqa: B905
@@ -361,6 +367,41 @@ def _shape(model: Any, interface: Any, q: list[float]) -> dict[str, Any]:
         "source": {"mesh": {"axes": {"i": list(range(len(q)))}, "fields": field}},
         "dots": True,
     }
+
+
+def _rods(interface: Any, found: Any) -> tuple[list[dict[str, Any]], list[list[Any]]]:
+    """Return rods of constraints on the distance of two bodies, or of one from a fixed point, and these points."""
+    rods, pins = [], []
+    for text in interface.constraints:
+        constraint = sympy.sympify(
+            text, locals={name: sympy.Symbol(name) for name in interface.parameters}
+        )
+        used = {symbol.name for symbol in constraint.free_symbols}
+        names = [[interface.coordinates[c] for c in body.columns] for body in found]
+        ends = [k for k, each in enumerate(names) if used & {*each}]
+        if len(ends) == 2:
+            rods.append({"kind": "rod", "points": ends})
+        elif len(ends) == 1:
+            place = sympy.symbols(names[ends[0]])
+            centre = sympy.solve([constraint.diff(x) for x in place], place)
+            values = [
+                centre.get(x) if isinstance(centre, dict) else None for x in place
+            ]
+            if all(
+                value is not None and (value.is_Symbol or value.is_number)
+                for value in values
+            ):
+                rods.append(
+                    {"kind": "rod", "points": [len(found) + len(pins), ends[0]]}
+                )
+                rods.append({"kind": "pivot", "points": [len(found) + len(pins)]})
+                pins.append(
+                    [
+                        value.name if value.is_Symbol else float(value)
+                        for value in values
+                    ]
+                )
+    return rods, pins
 
 
 def _solids(interface: Any) -> dict[str, Any]:

@@ -14,7 +14,7 @@ function writeAddress() {
 /** Starts the motion again, and finds the frame of the drawing by running ahead for a moment. */
 function restart() {
   start();
-  if (!fault && m <= WHOLE) {
+  if (!fault && !source.mesh && m <= 400) {
     const began = performance.now(), states = [pointsOf(memory_q, code.time())], span = 10 * settings.speed;
     while (!fault && performance.now() - began < 4 && Math.abs(code.time() - about.t) < span && states.length < 4000) {
       fault = code.advance(16, 4);
@@ -23,7 +23,7 @@ function restart() {
     const shown = states.filter((points) => points.flat().every(Number.isFinite));
     start();
     picture.ahead(shown);
-  } else picture.ahead([]);
+  } else picture.ahead([pointsOf(memory_q, code.time())]);
   target = code.time();
   by("reverse").setAttribute("aria-pressed", "false");
   dirty = true;

@@ -23,7 +23,7 @@ const { source } = shape;
 
 /** Returns the points of a state, [x, y] or [x, y, z] each. */
 function pointsOf(q, t) {
-  if (source.columns) return source.columns.map((columns) => columns.map((c) => (c < 0 ? 0 : q[c])));
+  if (source.columns) return [...source.columns.map((columns) => columns.map((c) => (c < 0 ? 0 : q[c]))), ...(source.pins || []).map((pin) => pin.map(value))];
   if (source.rods) {
     const ends = [[0, 0]], { sign, lengths } = source.rods;
     lengths.forEach((length, k) => {
@@ -82,6 +82,7 @@ function line(pen, points, color, width, alpha = 1) {
   pen.strokeStyle = color; pen.lineWidth = width; pen.globalAlpha = alpha; pen.stroke(); pen.globalAlpha = 1;
 }
 function disc(pen, [x, y], radius, name) {
+  if (!Number.isFinite(x + y)) return;
   pen.beginPath(); pen.arc(x, y, radius, 0, TAU);
   if (flat) pen.fillStyle = colors[name];
   else {
@@ -199,10 +200,10 @@ const marked = () => {
         else if (mark.kind === "wall") add(-1e9, () => wall(pen, a, b));
         else if (mark.kind === "arrow") { const color = colors[hue(number++)]; add(middle, () => arrow(pen, a, b, color)); }
         else if (mark.kind === "pivot") add(middle, () => disc(pen, a, 3.5, "muted"));
-        else if (mark.kind === "particles") mark.points.forEach((k) => add(at[k][2], () => disc(pen, at[k], Math.max(2, (mark.radius || 0) * view.scale) * at[k][3], hue(0))));
+        else if (mark.kind === "particles") mark.points.forEach((k) => add(at[k][2], () => disc(pen, at[k], (mark.radius ? Math.max(2, mark.radius * view.scale) : clamped(Math.min(width, height) / 4 / mark.points.length ** (1 / shape.dimension), 2, 16)) * at[k][3], hue(0))));
         else if (mark.kind === "body" || mark.kind === "bob") {
           const name = hue(mark.color ?? number++), share = mark.mass === undefined ? 1 : Math.cbrt(Math.abs(value(mark.mass)) / largest);
-          add(middle, () => disc(pen, a, clamped(10 * share, 3.5, 10) * a[3], name));
+          add(middle + 0.1 * view.reach, () => disc(pen, a, clamped(10 * share, 3.5, 10) * a[3], name));
           if (mark.name && shape.marks.length < 12) add(1e9, () => { pen.font = `12px ${colors.sans}`; pen.fillStyle = colors.muted; pen.textBaseline = "middle"; pen.textAlign = "left"; pen.fillText(mark.name, a[0] + 14, a[1]); });
         }
       }
