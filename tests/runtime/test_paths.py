@@ -6,6 +6,7 @@ from scipy.special import ellipk
 
 import scvi_codegen as sc
 from scvi_codegen.errors import MethodError, PathError, StateError
+from scvi_codegen.runtime.paths import solver
 from scvi_codegen.runtime.paths.equations import condensed_hessian
 from scvi_codegen.runtime.paths.intervals import Intervals, ManyCoordinates
 
@@ -62,12 +63,15 @@ def test_several_starts_lead_to_several_paths(kepler):
 
 
 def test_continuation_finds_what_the_straight_line_does_not(kepler):
-    reference = kepler.integrate([1.0, 0.0], [0.0, 1.0], h=0.1, steps=140)
-    q1 = reference.q[-1]
-    with pytest.raises(PathError, match="give another start"):
-        kepler.path([1.0, 0.0], q1, 14.0, steps=56, homotopy=False)
-    path = kepler.path([1.0, 0.0], q1, 14.0, steps=56)
-    assert path.residual < 1e-11
+    q1 = kepler.integrate([1.0, 0.0], [0.0, 1.0], h=0.1, steps=140).q[-1]
+    h = np.full(56, 0.25)
+    intervals = Intervals(kepler, 0.25 * np.arange(56), h, kepler.defaults, None)
+    line = np.linspace([1.0, 0.0], q1, 57)
+    with pytest.raises(PathError, match="no progress"):
+        solver.solved(intervals, line)
+    found = solver.continued(intervals, line, 14.0)
+    assert np.abs(found.at.residual).max() < 1e-11
+    assert np.abs(kepler.path([1.0, 0.0], q1, 14.0, steps=56).q - found.q).max() < 1e-9
 
 
 @pytest.mark.parametrize(("T", "index"), [(3.0, 0), (3.3, 1), (6.2, 1), (6.4, 2), (9.3, 2), (9.5, 3), (20.0, 6)])
@@ -200,3 +204,103 @@ def test_refusals_name_the_remedy(kepler, oscillator):
     ):
         with pytest.raises(error, match=words):
             call()
+
+
+def choreography(n, curve, steps, method):
+    names = [f"{axis}{i}" for i in range(n) for axis in "xy"]
+    pairs = [f"1/sqrt((x{i} - x{j})**2 + (y{i} - y{j})**2)" for i in range(n) for j in range(i)]
+    stepper = compiled(names, " + ".join([*(f"{name}_dot**2/2" for name in names), *pairs]), method)
+    follow = [f"{axis}{(i + 1) % n}" for i in range(n) for axis in "xy"]
+    path = stepper.path(
+        T=2 * np.pi / n,
+        steps=steps,
+        closed=follow,
+        start=lambda t: np.concatenate([curve(t + 2 * np.pi * i / n) for i in range(n)]),
+    )
+    assert (path.repetitions, path.index) == (n, 0)
+    return stepper, path, float(stepper.energy(path.q[0], path.p[0]))
+
+
+def test_lagrange_triangle_has_the_energy_of_its_closed_form():
+    _, path, energy = choreography(3, lambda a: [0.9 * np.cos(a), 0.7 * np.sin(a)], 12, "svi:6")
+    assert abs(energy + 1.5 / 3 ** (1 / 3)) < 1e-10
+    assert np.abs(np.hypot(path.q[:, ::2], path.q[:, 1::2]) - 3 ** (-1 / 6)).max() < 1e-9
+
+
+@pytest.mark.second
+def test_figure_eight_has_its_published_energy_and_multipliers():
+    stepper, path, energy = choreography(3, lambda a: [1.1 * np.sin(a), 0.4 * np.sin(2 * a)], 16, "svi:6")
+    published = float(
+        stepper.energy(
+            [0.97000436, -0.24308753, -0.97000436, 0.24308753, 0, 0],
+            [0.466203685, 0.43236573, 0.466203685, 0.43236573, -0.93240737, -0.86473146],
+        )
+    )
+    assert abs(energy - published * (6.32591398 / (2 * np.pi)) ** (2 / 3)) < 2e-8
+    orbit = sc.periodic_orbit(stepper, path.q[0], path.p[0], period=path.period, steps=192, fixed_period=True)
+    phases = np.sort(np.angle(orbit.multipliers) / (2 * np.pi))[::-1][:2]
+    assert np.abs(phases - [0.29809253, 0.00842272]).max() < 1e-7  # Simo 2002
+
+
+@pytest.mark.second
+@pytest.mark.parametrize(
+    ("n", "curve", "q", "v"),
+    [
+        (
+            4,
+            lambda a: [1.4 * np.cos(a), 0.4 * np.sin(3 * a) - 0.25 * np.sin(a)],
+            [1.382857, 0, 0, 0.157030, -1.382857, 0, 0, -0.157030],
+            [0, 0.584873, 1.871935, 0, 0, -0.584873, -1.871935, 0],
+        ),
+        (
+            5,
+            lambda a: [1.7 * np.cos(a), -0.35 * np.sin(4 * a)],
+            [1.657666, 0, 0.439775, -0.169717, -1.268608, -0.267651, -1.268608, 0.267651, 0.439775, 0.169717],
+            [0, -0.593786, 1.822785, 0.128248, 1.271564, 0.168645, -1.271564, 0.168645, -1.822785, 0.128248],
+        ),
+    ],
+    ids=["Gerver's super-eight", "chain of five"],
+)
+def test_choreographies_have_their_published_size_and_energy(n, curve, q, v):
+    stepper, path, energy = choreography(n, curve, 12 * n, "svi:6")
+    assert abs(energy - float(stepper.energy(q, v))) < 1e-5
+    run = path.run()
+    radii = np.hypot(run.q[:, ::2], run.q[:, 1::2])
+    assert abs(radii.max() - np.hypot(q[0], q[1])) < 2e-3
+    again = stepper.path(
+        T=2 * np.pi / n, steps=24, closed=path_symmetry(n, stepper, q, v), start=started(stepper, n, q, v)
+    )
+    assert np.abs(again.q[0] - q).max() < 2e-6  # six digits
+    assert np.abs(again.p[0] - v).max() < 3e-6
+
+
+def started(stepper, n, q, v):
+    return stepper.integrate(q, v, h=2 * np.pi / n / 24, steps=24).q
+
+
+def path_symmetry(n, stepper, q, v):
+    """Return the names of the bodies that follow each other after a part of the period."""
+    after = started(stepper, n, q, v)[-1].reshape(n, 2)
+    before = np.reshape(q, (n, 2))
+    follow = [int(np.argmin(np.abs(before - each).sum(axis=1))) for each in after]
+    return [f"{axis}{i}" for i in follow for axis in "xy"]
+
+
+@pytest.mark.second
+def test_wall_of_a_chain_of_double_wells_is_a_line_of_constant_tension():
+    sites = 64
+    chain = compiled(
+        [f"u[{sites}]"],
+        f"sum(i in {sites}, u_dot[i]**2/2 + (u[i]**2 - 1)**2/4) + 2*sum(i in 0..{sites - 2}, (u[i+1] - u[i])**2)",
+        "svi:2",
+    )
+    i, c = np.arange(sites), 2.0
+
+    def action(moved):
+        ends = (np.tanh((i - 32 + side * moved / 2) / (np.sqrt(2) * c)) for side in (1, -1))
+        path = chain.path(*ends, 20.0, steps=60)
+        assert path.index == 0
+        return path.action
+
+    expected = np.sqrt(8) / 3 * (np.hypot(40, 16) - 40)
+    assert abs(action(16) - action(0) - expected) < 0.02 * expected

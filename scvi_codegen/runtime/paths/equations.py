@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import lapack
-from scipy.sparse import csc_matrix
+from scipy.sparse import csc_matrix, identity
 from scipy.sparse.linalg import splu
 
 from scvi_codegen.errors import PathError
@@ -31,8 +31,12 @@ def hessian_blocks(at: Linearised) -> tuple[Array, Array, Array]:
 class Band:
     """LU factors of the Hessian in band storage, with partial pivoting."""
 
-    def __init__(self, at: Linearised) -> None:
+    def __init__(self, at: Linearised, shift: float = 0.0) -> None:
         diagonal, upper, lower = hessian_blocks(at)
+        self.positive: bool | None = None
+        if shift:
+            diagonal = diagonal + shift * np.eye(diagonal.shape[1])
+            self.positive = not _negative_pivots(diagonal, upper, lower)[-1]
         count, d, _ = diagonal.shape
         self.shape, self.reach = (count, d), 2 * d - 1
         matrix = np.zeros((3 * self.reach + 1, count * d))
@@ -53,7 +57,7 @@ class Band:
 class Sparse:
     """LU factors of the Hessian of many coordinates, of which the entries ``rows``, ``columns`` of blocks are known."""
 
-    def __init__(self, at: Linearised, intervals: Any) -> None:
+    def __init__(self, at: Linearised, intervals: Any, shift: float = 0.0) -> None:
         a, b, c, e = at.blocks
         count, d = a.shape[0] - 1, intervals.dimension
         rows, columns, data = [], [], []
@@ -65,6 +69,7 @@ class Sparse:
         matrix = csc_matrix(
             (np.concatenate(data), (np.concatenate(rows), np.concatenate(columns))), shape=(count * d,) * 2
         )
+        matrix = matrix + shift * identity(count * d, format="csc")
         order = np.arange(count * d).reshape(count, d).T.ravel()  # a site at all times, then the next
         self.order, self.shape = order, (count, d)
         try:
@@ -85,15 +90,23 @@ class Sparse:
         """Number of negative pivots."""
         return int((self.factors.U.diagonal() < 0).sum())
 
+    @property
+    def positive(self) -> bool:
+        """True if the matrix is positive definite."""
+        return not self.negative
 
-def factors_of(at: Linearised, intervals: Intervals) -> Band | Sparse:
-    """Return the factors of the Hessian."""
-    return Sparse(at, intervals) if intervals.sparse else Band(at)
+
+def factors_of(at: Linearised, intervals: Intervals, shift: float = 0.0) -> Band | Sparse:
+    """Return the factors of the Hessian plus ``shift`` times the identity."""
+    return Sparse(at, intervals, shift) if intervals.sparse else Band(at, shift)
 
 
 def negative_directions(at: Linearised) -> list[int]:
     """Return the Morse index of [t_0, t_k], k = 1 to N, by the inertia of the pivots."""
-    diagonal, upper, lower = hessian_blocks(at)
+    return _negative_pivots(*hessian_blocks(at))
+
+
+def _negative_pivots(diagonal: Array, upper: Array, lower: Array) -> list[int]:
     index, inverse = [0], np.zeros_like(diagonal[0])
     for k, block in enumerate(diagonal):
         pivot = block - (lower[k - 1] @ inverse @ upper[k - 1] if k else 0.0)

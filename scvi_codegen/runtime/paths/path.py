@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -190,15 +190,18 @@ def _open_path(
     nodes[0], nodes[-1] = ends
     if isinstance(intervals, ReducedIntervals):
         nodes[1:] = [intervals.on_manifold(each, k, ends[0]) for k, each in enumerate(nodes[1:], 1)]
-    try:
-        return solver.solved(intervals, nodes)
-    except solver.UNSOLVED as error:
-        if not homotopy:
-            raise PathError(f"no path was found ({error}): give another start, or more steps") from error
-    try:
-        return solver.continued(intervals, nodes, duration)
-    except solver.UNSOLVED as error:
-        raise PathError(f"no path was found ({error}): give start=, a path nearby, or more steps") from error
+    attempts: list[Callable[[], solver.Solution]] = [partial(solver.solved, intervals, nodes)]
+    if homotopy:
+        attempts.append(partial(solver.continued, intervals, nodes, duration))
+    if not intervals.stepper.interface.exchange_names:  # many coordinates: quicker than the continuation
+        attempts.insert(1 if intervals.sparse else len(attempts), partial(solver.descended, intervals, nodes))
+    reasons = []
+    for attempt in attempts:
+        try:
+            return attempt()
+        except solver.UNSOLVED as error:
+            reasons.append(str(error))
+    raise PathError(f"no path was found ({'; '.join(reasons)}): give start=, a path nearby, or more steps")
 
 
 def _described(

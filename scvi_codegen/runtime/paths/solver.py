@@ -19,11 +19,18 @@ from scvi_codegen.runtime.paths.intervals import Intervals, Linearised
 
 TOLERANCE = 1e-11
 """Newton correction, relative to 1 + max|q|, at which the iteration ends."""
+ROUNDING, ILL_CONDITIONED = 1e-14, 1e-7
+"""Residual, relative to the momenta, that is rounding, and the correction that then ends the iteration."""
 MOST_ITERATIONS, LEAST_STEP = 60, 1e-4
 FIRST_PART, MOST_GROWTH, LEAST_GROWTH, CONTINUED_ITERATIONS = 16, 2.0, 1.005, 15
 """Continuation: part of the duration it starts from, factors of the duration, and iterations of each."""
 UNSOLVED = PathError, StepFailedError, StateError, ArithmeticError, np.linalg.LinAlgError
-MINIMISER_ITERATIONS = 100
+MINIMISER_ITERATIONS, NEAR_CLOSED = 100, 0.01
+"""Iterations of the minimiser, and relative Newton correction below which a closed path is not minimised first."""
+FIRST_SHIFT, MOST_SHIFT, LEAST_SHIFT, MOST_DESCENTS = 1e-2, 1e3, 1e-10, 60
+"""Shifts of the Hessian relative to its largest entry, and most iterations of the descent."""
+LEAST_DECREASE, NEAR = 1e-4, 1e-3
+"""Part of the predicted decrease of the action that is required (Armijo), and the correction that ends the descent."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +64,8 @@ def newton(
         size = float(np.abs(correction).max(initial=0.0))
         if not np.isfinite(size):
             break
-        if size <= TOLERANCE * (1.0 + float(np.abs(q).max())):
+        rounding = float(np.abs(r).max(initial=0.0)) <= ROUNDING * float(np.abs(at.p0).max() + np.abs(at.p1).max())
+        if size <= (ILL_CONDITIONED if rounding else TOLERANCE) * (1.0 + float(np.abs(q).max())):
             return move(q, correction), at, factors, iteration
         damping = min(1.0, 2.0 * damping)
         while True:
@@ -101,6 +109,39 @@ def continued(intervals: Intervals, q: Array, duration: float) -> Solution:
             if growth < LEAST_GROWTH:
                 raise PathError(f"continuation in the duration ended at {now:g} of {duration:g}") from error
     return Solution(found.q, found.intervals, found.at, found.factors, total)
+
+
+def descended(intervals: Intervals, q: Array) -> Solution:
+    """Return a minimum of the action below q, by Newton's method with a shift that makes the Hessian positive definite.
+
+    Raises:
+        PathError: if there is none, as on paths longer than their first conjugate time.
+    """
+    at = intervals.linearised(q)
+    scale = float(np.abs(at.blocks[3]).max())
+    shift, iterations = FIRST_SHIFT, 0
+    while shift >= LEAST_SHIFT:
+        iterations += 1
+        factors = factors_of(at, intervals, shift * scale)
+        if iterations > MOST_DESCENTS or shift > MOST_SHIFT:
+            raise PathError("no minimum of the action was found")
+        correction = -factors.solve(at.residual)
+        decrease = float(np.sum(correction * at.residual))
+        try:
+            if not factors.positive or decrease >= 0:
+                raise PathError("no direction of descent")
+            trial = intervals.moved(q, correction)
+            there = intervals.linearised(trial)
+            if not there.actions.sum() <= at.actions.sum() + LEAST_DECREASE * decrease:
+                raise PathError("no decrease of the action")
+        except UNSOLVED:
+            shift *= 4.0
+            continue
+        q, at, shift = trial, there, shift / 4.0
+        if float(np.abs(correction).max()) <= NEAR * (1.0 + float(np.abs(q).max())):
+            break
+    found = solved(intervals, q)
+    return Solution(found.q, intervals, found.at, found.factors, iterations + found.iterations)
 
 
 def at_energy(found: Solution, duration: float, energy: float, start: Callable[[Array, Array], Any]) -> Solution:
@@ -172,7 +213,9 @@ def closed(intervals: Intervals, q: Array, M: Array, *, minimise: bool, symmetri
         at = intervals.linearised(whole(nodes)) if derivatives else intervals.evaluated(whole(nodes))
         return at, closed_residual(at, M)
 
-    if minimise:
+    at, r = evaluate(q, True)
+    near = float(np.abs(Closed(at, M, symmetric=symmetric).solve(r)).max()) < NEAR_CLOSED * float(np.abs(q).max())
+    if minimise and not near:
         q = _minimised(evaluate, q)
     found, at, factors, iterations = newton(
         evaluate, lambda at: Closed(at, M, symmetric=symmetric), lambda q, y: q + y, q, MOST_ITERATIONS
