@@ -4,10 +4,24 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
-from benchmarks.cases.unforced import Case, case, gravitating, kepler_case, outer_planets, rotated, scaled
+from benchmarks.cases.unforced import (
+    SYSTEMS,
+    Array,
+    Case,
+    Vector,
+    case,
+    gravitating,
+    hand_solved,
+    kepler_case,
+    outer_planets,
+    rotated,
+    scaled,
+)
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 
 ECCENTRICITIES = (0.0, 0.2, 0.5, 0.9, 0.99, 0.999)
 KEPLER_SPAN = 2000.0
@@ -56,6 +70,38 @@ def _figure_eight_case() -> Case:
     return gravitating((1.0, 1.0, 1.0), positions, speeds, name="figure-eight", span=100.0)
 
 
+def hill(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
+    """Return x'' = 2 y' + 3 x - x/r^3, y'' = -2 x' - y/r^3."""
+    pull = (q[0] * q[0] + q[1] * q[1]) ** -1.5
+    return [2.0 * v[1] + 3.0 * q[0] - pull * q[0], -2.0 * v[0] - pull * q[1]]
+
+
+def swinging_atwood(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
+    """Return (mu + 1) r'' = r theta'^2 - g (mu - cos theta), r theta'' = -2 r' theta' - g sin theta."""
+    fall = of["g"] * (of["mu"] - functions.cos(q[1]))
+    return [(q[0] * v[1] * v[1] - fall) / (of["mu"] + 1.0), -(2.0 * v[0] * v[1] + of["g"] * functions.sin(q[1])) / q[0]]
+
+
+def _rotating(q: Array, momenta: Any) -> Any:
+    """Return velocities from momenta in a rotating frame: p = v + (-y, x)."""
+    return momenta - np.stack([-q[:, 1], q[:, 0]], axis=1).astype(np.longdouble)
+
+
+def _defined_case(name: str, accelerations: Callable[..., list[Any]], spread: float) -> Case:
+    given: Mapping[str, Any] = SYSTEMS["adaptive"][name]
+    q, velocity = (scaled(given[part], spread) for part in ("q", "velocity"))
+    return Case(
+        name=name,
+        system=LagrangianSystem.from_text(name=name, **given["system"]),
+        formulations=hand_solved(accelerations),
+        q=q,
+        velocity=velocity,
+        span=given["span"],
+        step=0.1,
+        velocity_of=partial(_rotating, q) if name == "hill" else None,
+    )
+
+
 def _solar_case(name: str, body: Mapping[str, float], span: float, *, part: float) -> Case:
     """Return the outer solar system with a body on an ellipse, started at perihelion (part 1) or aphelion (-1)."""
     masses, positions, velocities, gravity = outer_planets()
@@ -75,5 +121,7 @@ ADAPTIVE_CASES: Mapping[str, Callable[[], Case]] = {
     "henon-heiles": partial(case, "henon-heiles"),
     "comet": partial(_solar_case, "comet", COMET, ORBITS[1], part=-1.0),
     "figure-eight": _figure_eight_case,
+    "hill": partial(_defined_case, "hill", hill, 0.01),
+    "swinging-atwood": partial(_defined_case, "swinging-atwood", swinging_atwood, 0.01),
 }
 """Functions that build a case, by the name after ``adaptive:``."""

@@ -55,7 +55,7 @@ def own_cache(folder, monkeypatch):
 MOVED = (
     {name: partial(unforced.case, name) for name in sorted(unforced.CASES.keys() - {"fput-chain:64", "fput-chain:256"})}
     | {"forced:double-pendulum": driven_pendulum}
-    | {name: partial(adaptive_case, name) for name in ("comet", "pythagorean")}
+    | {name: partial(adaptive_case, name) for name in ("comet", "pythagorean", "hill", "swinging-atwood")}
 )
 """Systems with accelerations solved by hand."""
 
