@@ -208,7 +208,7 @@ function replay(until) {
 }
 
 function frame(now) {
-  const began = performance.now(), until = began + Math.max(2, BUDGET - drawCost);
+  const began = performance.now(), until = began + Math.max(2, BUDGET - 1.5 - drawCost);
   let performed = 0;
   if (pending.length) replay(until);
   else if (running && !fault) {

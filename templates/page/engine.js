@@ -48,8 +48,10 @@ function readAddress(text) {
     if (key === ".q" || key === ".v") {
       if (listed.length !== m) return { error: `The address has ${listed.length} numbers for "${key}"; this system needs ${m}.` };
       next[key[1]] = listed;
-    } else if (key === ".step" || key === ".speed") next[key.slice(1)] = listed[0];
-    else if (key === ".n") steps = listed;
+    } else if (key === ".step" || key === ".speed") {
+      if (!(listed[0] > 0)) return { error: `"${key}" must be positive; the address has ${entry}.` };
+      next[key.slice(1)] = listed[0];
+    } else if (key === ".n") steps = listed;
     else if (key in ranges) {
       const [low, high] = ranges[key];
       if (listed[0] < low || listed[0] > high) return { error: `${key} must be between ${low} and ${high}; the address has ${entry}.` };

@@ -1,7 +1,7 @@
 """Tests of pages that move, in a headless Chromium: bits, controls, address, errors, layout."""
 
 import html
-import importlib.util
+import importlib
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,23 +18,21 @@ DOCS = Path(__file__).parents[2] / "docs"
 pytestmark = pytest.mark.second
 
 
-def page_of(path: Path, ranges: dict[str, tuple[float, float]] | None = None) -> str:
-    """Return the page of a model file, by the builder of the site."""
-    pytest.importorskip("ziglang", reason="pages are compiled by the extra compiler")
-    spec = importlib.util.spec_from_file_location("page_builder", DOCS / "_extensions" / "page_builder.py")
-    builder = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(builder)
-    return builder.page_of(path, ranges)
+def extension(name: str) -> Any:
+    """Return a module of the site's extensions."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(DOCS / "_extensions"))
+        return importlib.import_module(name)
 
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Return the files of two pages: one without calls of the C library, and a field."""
-    folder = tmp_path_factory.mktemp("pages")
-    result = {}
+    pytest.importorskip("ziglang", reason="pages are compiled by the extra compiler")
+    builder, folder, result = extension("page_builder"), tmp_path_factory.mktemp("pages"), {}
     for name, ranges in (("figure_eight", None), ("kinks", {"v": (0.05, 0.95)})):
         result[name] = folder / f"{name}.html"
-        result[name].write_text(page_of(DOCS / "motions" / f"{name}.toml", ranges), encoding="utf-8")
+        result[name].write_text(builder.page_of(DOCS / "motions" / f"{name}.toml", ranges), encoding="utf-8")
     return result
 
 
@@ -149,6 +147,7 @@ def test_keys_play_step_and_restart(view, pages):
         ("figure_eight", "#.q=0,0,0,0,0,0&.n=5", "infinite or undefined"),
         ("figure_eight", "#.q=0,0", "this system needs 6"),
         ("figure_eight", "#m1=x", "is not a number"),
+        ("figure_eight", "#.step=-1", "must be positive"),
         ("kinks", "#v=1.5", "v must be between 0.05 and 0.95; the address has 1.5"),
     ],
 )
@@ -198,3 +197,21 @@ def test_steps_of_a_link_are_spread_over_frames(view, pages):
     opened(view, pages["kinks"], "#.n=100000")
     assert view.evaluate("page.state().steps") < 100000
     assert "steps to go" in view.inner_text("#clock")
+
+
+def test_the_form_writes_a_model_file_that_is_read(view, tmp_path):
+    pytest.importorskip("sphinx", reason="the form is a directive of the site")
+    view.set_content(extension("motions").OWN)
+    view.add_script_tag(path=DOCS / "_static" / "write_your_own.js")
+    view.evaluate("document.dispatchEvent(new Event('DOMContentLoaded'))")
+    view.fill("#own-lagrangian", "m*(x_dot**2 + y_dot**2)/2 - k*(x**2 + y**2 - 1)**2")
+    view.fill("[data-name=k] input", "2.5")
+    path = tmp_path / "model.toml"
+    path.write_text(view.inner_text("#own pre"), encoding="utf-8")
+    model = sc.load_model(path)
+    assert [str(name) for name in model.system.coordinates] == ["x", "y"]
+    assert model.parameters == {"k": 2.5, "m": 1.0}
+    assert model.integrate().energy_error() < 1e-9
+    view.fill("#own-lagrangian", "x_dot^2")
+    assert "**" in view.inner_text("#own .note")
+    assert view.is_disabled("#own button")
