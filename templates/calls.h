@@ -1,6 +1,6 @@
-/* Runs whose arguments and results are one struct. Requires: NAME, calls_declarations.h; HAS_ADVANCE_TO, HAS_MEASURES_GROWTH, HAS_STEP_ERROR
- * and HAS_REJECTED where the source has these. Functions are called by volatile pointers: not inlined, so that the bits
- * of steps do not depend on these callers. */
+/* Runs whose arguments and results are one struct. Requires: NAME, calls_declarations.h; HAS_ADVANCE_TO,
+ * HAS_MEASURES_GROWTH, HAS_STEP_ERROR and HAS_REJECTED where the source has these. Functions are called by volatile
+ * pointers: not inlined, so that the bits of steps do not depend on these callers. */
 
 static int NAME(call_store)(const NAME(call) *c, long long row, long long steps, long long every)
 {
