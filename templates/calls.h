@@ -1,6 +1,6 @@
-/* Runs whose arguments and results are one struct. Requires: NAME, calls_declarations.h; HAS_ADVANCE_TO,
- * HAS_MEASURES_GROWTH, HAS_STEP_ERROR and HAS_REJECTED where the source has these. Functions are called by volatile
- * pointers: not inlined, so that the bits of steps do not depend on these callers. */
+/* Runs whose arguments and results are one struct. Requires: NAME, STATUS, calls_declarations.h; HAS_ADVANCE_TO,
+ * HAS_MEASURES_GROWTH, HAS_STEP_ERROR, HAS_REJECTED and HAS_SET_FALLBACK where the source has these. Functions are
+ * called by volatile pointers: not inlined, so that the bits of steps do not depend on these callers. */
 
 static int NAME(call_store)(const NAME(call) *c, long long row, long long steps, long long every)
 {
@@ -57,4 +57,90 @@ int NAME(call_integrate)(NAME(call) *c, long long steps, long long every)
       (last != 1 && NAME(energies)(1, c->t + last, c->q + row, c->p + row, c->parameters, c->energies + 1, c->workspace)))
     c->energies[0] = c->energies[1] = 0.0; /* undefined */
   return 0;
+}
+
+/* Advances the present trajectory by at most `steps` steps; returns 1 at its end. */
+static int NAME(call_one)(NAME(each) *c, const double *parameters, long long steps, long long *taken)
+{
+  const long long j = c->next, m = c->coordinates, begun = c->run->step, row = c->rows;
+  double *t = c->times + row, *q = c->positions + row * m, *p = c->momenta + row * m;
+  __typeof__(NAME(advance)) *volatile fixed = NAME(advance);
+  int status = 0, arrived = 0;
+#ifdef HAS_SET_FALLBACK
+  const long long left = c->left;
+  *c->before = *c->run;
+#endif
+  if (!c->t_end) {
+    const long long every = c->segment_every[c->segment], size = steps < c->left ? steps : c->left;
+    status = fixed(c->run, size, every, parameters, c->options, t, q, p, c->iterations + row, c->report, c->workspace);
+    c->left -= size;
+    c->rows += c->run->step / every - begun / every;
+  }
+#ifdef HAS_ADVANCE_TO
+  __typeof__(NAME(advance_to)) *volatile adaptive = NAME(advance_to);
+  if (c->t_end) {
+    status = adaptive(c->run, c->t_end[j], c->tolerance, steps, c->every, parameters, c->options, t, q, p,
+        c->iterations + row, c->report, c->workspace);
+    c->rows += c->report->stored;
+    arrived = c->run->t == c->t_end[j] && c->run->t_low == 0.0;
+  }
+#endif
+#ifdef HAS_SET_FALLBACK
+  if (status == STATUS(FALLBACK_REQUIRED)) { /* the state before this call */
+    *c->run = *c->before;
+    c->rows = row;
+    c->left = left;
+    c->requested = 1;
+    return 0;
+  }
+#endif
+  *taken += c->run->step - begun;
+  c->stored[j] += c->rows - row;
+  c->done[j] = c->run->step;
+  if (c->energies && arrived && !status && c->rows > row) {
+    const long long last = (c->rows - 1) * m;
+    double *energy = c->energies + 2 * j;
+    if (NAME(energies)(1, &c->t, c->q + j * m, c->p + j * m, parameters, energy, c->workspace) ||
+        NAME(energies)(1, c->times + c->rows - 1, c->positions + last, c->momenta + last, parameters, energy + 1,
+            c->workspace))
+      energy[0] = energy[1] = 0.0; /* undefined */
+  }
+  while (!status && !c->t_end && c->left == 0 && ++c->segment < c->segments) {
+    c->left = c->segment_steps[c->segment];
+    if (c->segment_h[c->segment] != c->run->h) {
+      c->run->h = c->segment_h[c->segment];
+      c->run->guess = 0;
+    }
+  }
+  arrived |= status || (!c->t_end && c->segment == c->segments);
+  c->status[j] = arrived ? status : -1;
+  return arrived;
+}
+
+/* Advances trajectories one after the other, from `next` to `end`, by at most `steps` steps in all, and returns their
+ * number; ends earlier if the memory for states is full, or if a step requests Newton's method. */
+long long NAME(call_each)(NAME(each) *c, long long steps)
+{
+  long long taken = 0;
+  c->requested = 0;
+  while (c->next < c->end && taken < steps && !c->requested) {
+    const long long j = c->next, m = c->coordinates, room = c->capacity - c->rows - 2;
+    long long size = steps - taken;
+    if (room < 1)
+      break;
+    if (c->segment < 0) {
+      NAME(start)(c->run, c->t, c->t_end ? 0.0 : c->segment_h[0], c->q + j * m, c->p + j * m);
+      c->segment = 0;
+      c->left = c->t_end ? 0 : c->segment_steps[0];
+    }
+    const long long every = c->t_end ? c->every : c->segment_every[c->segment];
+    size = size / every > room - 1 ? room * every - every : size;
+    if (size < 1)
+      break;
+    if (NAME(call_one)(c, c->parameters + j * c->parameters_each, size, &taken)) {
+      c->next++;
+      c->segment = -1;
+    }
+  }
+  return taken;
 }

@@ -16,3 +16,22 @@ typedef struct {
 } NAME(call);
 int NAME(call_advance)(const NAME(call) *call, long long steps, long long every);
 int NAME(call_integrate)(NAME(call) *call, long long steps, long long every);
+
+/* Arguments and results of trajectories that are integrated one after the other. */
+typedef struct {
+  NAME(run) * run, *before; /* of the present trajectory; copy to which it returns if it requests Newton's method */
+  const NAME(options) *options;
+  const double *q, *p, *parameters, *t_end; /* of all trajectories; t_end NULL: fixed steps, in segments */
+  const long long *segment_steps, *segment_every;
+  const double *segment_h; /* step size from there on */
+  double *times, *positions, *momenta; /* memory for states */
+  int *iterations;
+  int *status; /* of all trajectories, -1 before their end */
+  long long *stored, *done; /* numbers of states and of steps of all trajectories */
+  double *energies; /* of all trajectories at both ends, unless NULL */
+  NAME(report) * report;
+  double *workspace, t, tolerance;
+  long long coordinates, parameters_each, segments, every, capacity;
+  long long rows, next, end, segment, left, requested; /* states in memory; present trajectory, its segment */
+} NAME(each);
+long long NAME(call_each)(NAME(each) *call, long long steps);

@@ -90,6 +90,20 @@ class Binding:
         restored = bytearray() if name == "integrate" else self._ffi.buffer(call.run)
         return self._with_fallback(function, restored, call.workspace)
 
+    def each(self, call: Any) -> Callable[[int], int]:
+        """Return the function ``<prefix>_call_each`` of the largest number of steps; it returns the steps taken."""
+        function: Callable[[int], int] = partial(getattr(self._lib, f"{self._prefix}_call_each"), call)
+
+        def advance(steps: int) -> int:
+            taken = function(steps)
+            if call.requested:
+                self.set_fallback()
+                self._refer_to_fallback(call.workspace)
+                taken += function(steps - taken)
+            return taken
+
+        return advance
+
     def with_function(self, name: str) -> Self:
         """Return this binding, or that of the fallback if only it has the function; MethodError if neither has it."""
         if self.has(name):

@@ -392,7 +392,7 @@ class Stepper(Integrator):
         work.run(progress=progress, threads=threads)
         trajectories = work.result()
         warn_of_unconfirmed(trajectories.confirmations)
-        warn_of_energy_errors(trajectories)
+        warn_of_energy_errors(trajectories, None if work.successive is None else work.successive.energies)
         warn_of_unresolved_members(trajectories)
         return trajectories
 

@@ -1,8 +1,10 @@
 """Ensembles: many trajectories with common fixed steps, or each with adaptive steps of its own.
 
-With common fixed steps trajectories are SIMD lanes (:mod:`scvi_codegen.runtime.ensemble.lanes`). Trajectories with
-adaptive steps are computed by the single integrator, so they are bitwise equal to those of :meth:`Stepper.integrate`.
-C runs without the GIL, so threads share the work; results are bitwise equal for any number of threads.
+With common fixed steps trajectories are SIMD lanes (:mod:`scvi_codegen.runtime.ensemble.lanes`). Others are computed by
+the single integrator, many in one call of C (:mod:`scvi_codegen.runtime.ensemble.successive`), so they are bitwise
+equal to those of :meth:`Stepper.integrate`, which computes trajectories with inputs, output times, changes by events
+or a bound of the global error. C runs without the GIL, so threads share the work; results are bitwise equal for any
+number of threads.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -12,7 +14,7 @@ from itertools import pairwise
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import EventError, StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, real_array
@@ -29,6 +31,7 @@ from scvi_codegen.runtime.ensemble.initial_states import (
 from scvi_codegen.runtime.ensemble.lanes import CommonRuns
 from scvi_codegen.runtime.ensemble.result import EVENT_FAILED, INTERRUPTED, OK, EnsembleTrajectory, Span
 from scvi_codegen.runtime.ensemble.schedule import CommonSteps
+from scvi_codegen.runtime.ensemble.successive import CHUNK_SECONDS, FIRST_CHUNK_STEPS, GROWTH, Rows, SuccessiveRuns
 from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runtime.inputs.segments import (
     Input,
@@ -46,14 +49,7 @@ from scvi_codegen.runtime.run.step_plan import StepPlan, checked_plan, planned_s
 from scvi_codegen.runtime.run.times import WHOLE
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
-from scvi_codegen.validation import checked_count
-
-FIRST_CHUNK_STEPS = 64
-"""Steps of the first chunk of a block, before its speed is known."""
-CHUNK_SECONDS = 0.02
-"""Target duration of a chunk in seconds; bounds the delay of an interruption."""
-GROWTH = 8.0
-"""Largest ratio of successive chunk sizes."""
+from scvi_codegen.validation import LARGEST_COUNT, checked_count
 
 
 class SavedLane(NamedTuple):
@@ -137,6 +133,35 @@ class Ensemble:
             self.parameters[:, columns_of_inputs(interface)] = 0.0
         if fixed is not None and not stepper.changes_states:
             self.common = CommonRuns(stepper, self.options, self.start, self.parameters, self.values_at, fixed)
+        self.states: list[Rows] = []
+        self.successive = self._successive()
+
+    def _successive(self) -> SuccessiveRuns | None:
+        """Return the trajectories that C integrates one after the other, ``None`` for other ensembles."""
+        stepper, common = self.stepper, self.common
+        if self.inputs or stepper.changes_states or stepper.in_tau or not stepper.binding.reusable:
+            return None
+        if common is not None:
+            return common.successive() if common.steps.steps and stepper.ensemble is None else None
+        ends = np.array([plan.t_end for plan in self.plans])
+        if self.error is not None or not (self.t_eval is None or self._saves_ends(ends)):
+            return None
+        return SuccessiveRuns(
+            stepper,
+            self.options,
+            self.start,
+            self.parameters,
+            self.t0,
+            ends,
+            tolerance=self.plans[0].tolerance,
+            save_every=self.save_every if self.t_eval is None else LARGEST_COUNT,
+            store=lambda states: self.states.append(states.copies()),
+        )
+
+    def _saves_ends(self, ends: Array) -> bool:
+        """Return whether the output times are the common end of all trajectories, with or without their start."""
+        times = set() if self.t_eval is None else {*self.t_eval.tolist()} - {self.t0}
+        return times == {*ends.tolist()}
 
     def _plans(self, fixed: CommonSteps | None, t_end: ArrayLike, tolerance: float | None) -> list[StepPlan]:
         """Return the step plan of each trajectory; all must run forward or all backward."""
@@ -145,11 +170,13 @@ class Ensemble:
         ends = real_array(t_end, "t_end")
         if ends.shape not in ((), (len(self),)):
             raise StateError(f"t_end must be one time or {len(self)} times, not of shape {ends.shape}")
-        plans = [checked_plan(None, float(end), tolerance) for end in np.broadcast_to(ends, len(self))]
-        signs = {np.sign(plan.t_end - self.t0) for plan in plans} - {0.0}
-        if len(signs) > 1:
+        worst = int(np.argmin(np.isfinite(ends)))  # the first one that is not finite
+        plan = checked_plan(None, float(ends.flat[worst]), tolerance)
+        if (ends > self.t0).any() and (ends < self.t0).any():
             raise StateError(f"t_end lies on both sides of t = {self.t0:g}: split the ensemble into two")
-        return plans
+        if not ends.ndim:
+            return [plan] * len(self)
+        return [StepPlan(t_end=end, tolerance=plan.tolerance) for end in ends.tolist()]
 
     def _output_times(self, t_eval: ArrayLike | None) -> Array | None:
         """Return the validated output times; raise ``StateError`` if inputs do not cover a run."""
@@ -209,6 +236,11 @@ class Ensemble:
             progress: called with the number of completed steps or trajectories, see :attr:`length`.
             threads: number of threads, by default one per core.
         """
+        if self.successive is not None:
+            unit = self.length / len(self)
+            report = None if progress is None else lambda done: progress(int(done * unit))
+            self.successive.run(progress=report, threads=threads)
+            return
         if self.common is not None:
             self._run_blocks(self.common, progress, threads)
             return
@@ -294,6 +326,9 @@ class Ensemble:
         if self.common is None:
             return self._adaptive_result()
         common, fixed = self.common, self.common.steps
+        if self.successive is not None:
+            common.done, ended = self.successive.done, self.successive.status >= 0
+            common.status = np.where(ended, self.successive.names, OK)
         unfinished = (common.status == OK) & (common.done < fixed.steps)
         spans: tuple[Span, ...] = ()
         if fixed.t_end is not None:
@@ -312,6 +347,8 @@ class Ensemble:
         )
 
     def _adaptive_result(self) -> EnsembleTrajectory:
+        if self.successive is not None and not self.saved:
+            return self._successive_result(self.successive)
         lanes = [self.saved.get(j) or self._unfinished(j) for j in range(len(self))]
         count = max(len(each.t) for each in lanes) if self.t_eval is None else len(self.t_eval)
         t = np.arange(count, dtype=float) if self.t_eval is None else self.t_eval
@@ -322,19 +359,39 @@ class Ensemble:
             q[row, j], p[row, j] = each.q, each.p
             if times is not None:
                 times[row, j] = each.t
+        status = np.array([each.status for each in lanes], dtype="<U32")
+        steps = np.array([each.steps for each in lanes], dtype=np.int64)
+        return self._trajectories(t, times, q, p, status, steps)
+
+    def _successive_result(self, work: SuccessiveRuns) -> EnsembleTrajectory:
+        states, shape = self.states, (1 + int(work.stored.max()), *self.start[0].shape)
+        q, p, times = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape[:2], np.nan)
+        q[0], p[0], times[0] = *self.start, self.t0
+        for rows, j, *values in states:
+            times[rows, j], q[rows, j], p[rows, j] = values
+        if self.t_eval is None:
+            return self._trajectories(np.arange(shape[0], dtype=float), times, q, p, work.names, work.done)
+        at = np.where(self.t_eval == self.t0, 0, 1)
+        missing = np.full_like(q[:1], np.nan)
+        q, p = (np.concatenate([each, missing])[at] for each in (q, p))  # if no trajectory reached the end
+        return self._trajectories(self.t_eval, None, q, p, work.names, work.done)
+
+    def _trajectories(
+        self, t: Array, times: Array | None, q: Array, p: Array, status: NDArray[np.str_], steps: NDArray[np.int64]
+    ) -> EnsembleTrajectory:
         return EnsembleTrajectory(
             t=t,
             times=times,
             q=q,
             p=p,
-            status=np.array([each.status for each in lanes], dtype="<U32"),
-            steps=np.array([each.steps for each in lanes], dtype=np.int64),
+            status=status,
+            steps=steps,
             h=self.plans[0].h,
-            plans=tuple(plan for plan in self.plans if not plan.fixed),
+            plans=() if self.plans[0].fixed else tuple(self.plans),
             confirmations=tuple(self.confirmations),
             parameters=self.parameters,
             stepper=self.stepper,
-            spans=tuple(span for j in range(len(self)) for span in self._spans(j, times)),
+            spans=tuple(span for j in range(len(self)) for span in self._spans(j, times)) if self.inputs else (),
         )
 
     def _spans(self, j: int, times: Array | None) -> Iterator[Span]:

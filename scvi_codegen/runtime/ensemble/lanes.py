@@ -23,6 +23,7 @@ from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.ensemble.result import OK
 from scvi_codegen.runtime.ensemble.schedule import CommonSteps
+from scvi_codegen.runtime.ensemble.successive import FixedSegments, Rows, SuccessiveRuns
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.run_loop import record
 from scvi_codegen.runtime.run.step_plan import StepPlan
@@ -63,6 +64,21 @@ class CommonRuns:
 
     def __len__(self) -> int:
         return len(self.start[0])
+
+    def successive(self) -> SuccessiveRuns:
+        """Return the trajectories as successive runs, which store their states here."""
+        steps, h, segments = self.steps, self.steps.segments[0].h, []
+        for chunk in steps.chunks(0, steps.steps):
+            h = h if chunk.entered is None else chunk.entered.h
+            segments.append((chunk.steps, chunk.save_every, h))
+        numbers, save_every, sizes = zip(*segments, strict=True)
+        fixed = FixedSegments(np.array(numbers, np.int64), np.array(save_every, np.int64), np.array(sizes, float))
+        return SuccessiveRuns(
+            self.stepper, self.options, self.start, self.parameters, steps.t0, fixed, store=self._store
+        )
+
+    def _store(self, states: Rows) -> None:
+        self.q[states.rows, states.trajectories], self.p[states.rows, states.trajectories] = states.q, states.p
 
     def blocks(self) -> tuple[Callable[[int], LaneBlock | SingleBlock], int]:
         """Return a function that makes the block beginning at a trajectory, and the trajectories per block."""

@@ -153,16 +153,18 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
     @property
     def ends(self) -> tuple[Array, Array, Array]:
         """Time, positions and momenta of the last state of each trajectory: (k,), (k, m), (k, m)."""
-        last = [each[0].size - 1 for each in self.each()]
+        last = np.isfinite(self.q).all(axis=2).sum(axis=0) - 1
         j = np.arange(len(self))
         return self._times()[last, j], self.q[last, j], self.p[last, j]
 
     def each(self) -> Iterator[tuple[Array, Array, Array, str, int]]:
         """Yield the times, positions and momenta of each trajectory, its status and its number of steps."""
-        times = self._times()
-        for j, (status, steps) in enumerate(zip(self.status.tolist(), self.steps.tolist(), strict=True)):
-            good = self._reached(j)
-            yield times[good, j], self.q[good, j], self.p[good, j], status, steps
+        return map(self._one, range(len(self)))
+
+    def _one(self, j: int) -> tuple[Array, Array, Array, str, int]:
+        """Return the times, positions and momenta of trajectory j, its status and its number of steps."""
+        good = self._reached(j)
+        return self._times()[good, j], self.q[good, j], self.p[good, j], str(self.status[j]), int(self.steps[j])
 
     def _times(self) -> Array:
         return np.broadcast_to(self.t[:, np.newaxis], self.q.shape[:2]) if self.times is None else self.times

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import lru_cache
-from itertools import islice
 from typing import Any, Final
 
 import numpy as np
@@ -120,13 +119,21 @@ def warn_of_energy_error(trajectory: SavedStates, run: Memory) -> None:
         warn_of_energies(*energies, **limits)
 
 
-def warn_of_energy_errors(ensemble: Any) -> None:
-    """Issue the warning of :func:`warn_of_energy_error` for the worst of ``MOST_CHECKED`` trajectories."""
+def warn_of_energy_errors(ensemble: Any, ends: Array | None = None) -> None:
+    """Issue the warning of :func:`warn_of_energy_error` for the worst of ``MOST_CHECKED`` trajectories.
+
+    ``ends``: (k, 2) energies of the first and the last state where they are known, else NaN.
+    """
     plans, stepper = ensemble.plans, ensemble.stepper
     if stepper.changes_states or not (plans and stepper.interface.conserves_energy and _warnings_enabled.get()):
         return
-    by_trajectory = {}
-    for j, (t, q, p, _, _) in islice(enumerate(ensemble.each()), 0, None, -(-len(plans) // MOST_CHECKED)):
+    by_trajectory, stride = {}, -(-len(plans) // MOST_CHECKED)
+    chosen = np.arange(0, len(plans), stride)
+    if ends is not None:
+        first, last = np.abs(ends[chosen]).T, np.abs(np.diff(ends[chosen])[:, 0])
+        chosen = chosen[~(last <= 0.5 * TOLERABLE_ERROR * np.maximum(first[0], first[1]))]
+    for j in chosen.tolist():
+        t, q, p, _, _ = ensemble._one(j)
         if len(t) and (energies := _changed_energies(stepper, t, q, p, ensemble.parameters[j])):
             by_trajectory[j] = energies
     worst = max(by_trajectory, key=lambda j: relative_energy_change(*by_trajectory[j]), default=None)
@@ -145,7 +152,9 @@ def unresolved_parts(stepper: Integrator, q: Array) -> Array | None:
 
 def warn_of_unresolved_members(ensemble: Any) -> None:
     """Issue the warning of :func:`warn_of_unresolved_fields` for the first of some trajectories that need it."""
-    for j, (t, q, *_) in islice(enumerate(ensemble.each()), 0, None, -(-len(ensemble.parameters) // MOST_SPECTRA)):
+    count = len(ensemble.parameters) if ensemble.stepper.interface.layout.mesh is not None else 0
+    for j in range(0, count, -(-count // MOST_SPECTRA) or 1):
+        t, q, *_ = ensemble._one(j)
         h = ensemble.plans[j].h if ensemble.plans else 0.0
         if len(t) and _unresolved(ensemble.stepper, t, q, h or math.nan, f"trajectory {j}, "):
             return
