@@ -183,7 +183,10 @@ class TestMotions:
 
     def test_a_third_comparison_is_made_where_two_do_not_suffice(self):
         stepper, start = motion_stepper("kepler .6")
-        found = {error: stepper.integrate(**start, error=error).confirmation for error in (1e-9, 1e-11, 1e-12)}
+        found = {
+            error: stepper.integrate(**start, error=error).confirmation
+            for error in (1e-9, 1e-10, 3e-11, 1e-11, 3e-12, 1e-12)
+        }
         assert {each.safety for each in found.values()} == {SAFETY, SAFETY_OF_TWO, SAFETY_OF_ROUNDING}
         for each in found.values():
             assert each.confirmed
