@@ -29,7 +29,7 @@ M, K, C = sympy.symbols("m k c")
 NAMED = {"m": 2.0, "k": 3.0, "c": 0.5}
 
 
-def assert_moves_alike(mechanism: Mechanism, steps: int = 100) -> None:
+def assert_moves_alike(mechanism: Mechanism, steps: int = 200) -> None:
     """Compare trajectories with steps of high order."""
     system = mechanism.system()
     stepper = compile_stepper(system, SVI(4, "gauss-lobatto:5") if system.constraints else SVI(5))

@@ -520,7 +520,7 @@ class TestPlatforms:
             for part in _folders(tmp_path, "a", "b")
         )
         for name, begin in MAGIC.items():
-            place = fmu_module._place(name, "rod")
+            place = fmu_module._library_path(name, "rod")
             library = first.read(place)
             assert library.startswith(begin)
             assert len(set(re.findall(rb"fmi3[A-Z]\w+", library))) == 75

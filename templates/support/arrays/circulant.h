@@ -138,6 +138,27 @@ static void find_eigenvalues(const plan *of, const circulant *by, lanes *spare)
   }
 }
 
+/* Sets all roots of a size: those of a quarter, if there is one, are turned. */
+static void fill_all_roots(roots of_one, long long size)
+{
+  const long long quarter = size % 4 == 0 ? size / 4 : size;
+  fill_roots(of_one, size, 0, quarter);
+  for (long long k = quarter; k < size; k++) {
+    of_one.cosine[k] = of_one.sine[k - quarter];
+    of_one.sine[k] = -of_one.cosine[k - quarter];
+  }
+}
+
+/* Sets the coefficients of the first pass of radix 4 or 8, 2 size numbers at most. */
+static void fill_first(roots of_one, long long size)
+{
+  const long long factor = factor_of(size), together = size / factor;
+  double *next = of_one.first;
+  for (long long r = 1; r < factor; r++, next += 2 * together)
+    for (long long place = 0; place < together; place++)
+      next[place] = of_one.cosine[r * place], next[together + place] = of_one.sine[r * place];
+}
+
 /* Makes the plan of a matrix unless it has these coefficients; not usable if pairs have to be summed. */
 static void make_plan(const plan *of, const circulant *by, lanes *spare)
 {

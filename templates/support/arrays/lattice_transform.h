@@ -34,17 +34,6 @@ static void fill_roots(roots of_one, long long size, long long first, long long 
   }
 }
 
-/* Sets all roots of a size: those of a quarter, if there is one, are turned. */
-static void fill_all_roots(roots of_one, long long size)
-{
-  const long long quarter = size % 4 == 0 ? size / 4 : size;
-  fill_roots(of_one, size, 0, quarter);
-  for (long long k = quarter; k < size; k++) {
-    of_one.cosine[k] = of_one.sine[k - quarter];
-    of_one.sine[k] = -of_one.cosine[k - quarter];
-  }
-}
-
 /* A pass: `left` places of a line are not yet transformed, each of `done` numbers; `factor` of them are combined. */
 typedef struct {
   const axis *along;
@@ -67,16 +56,6 @@ static int can_be_transformed(long long size)
   while (size > 1 && factor_of(size) <= LARGEST_FACTOR)
     size /= factor_of(size);
   return size == 1;
-}
-
-/* Sets the coefficients of the first pass of radix 4 or 8, 2 size numbers at most. */
-static void fill_first(roots of_one, long long size)
-{
-  const long long factor = factor_of(size), together = size / factor;
-  double *next = of_one.first;
-  for (long long r = 1; r < factor; r++, next += 2 * together)
-    for (long long place = 0; place < together; place++)
-      next[place] = of_one.cosine[r * place], next[together + place] = of_one.sine[r * place];
 }
 
 /* Coefficients of `factor` - 1 values, real parts and imaginary parts `width` numbers behind, those of the next value

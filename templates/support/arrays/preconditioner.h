@@ -22,7 +22,7 @@ static int find_lattices(const linear_system *of, lattice *all)
   for (lattice *one = all; one < all + LATTICES; one++)
     for (int a = 0; a < one->axes; a++) {
       const long long size = one->size[a];
-      const roots of_one = {next, next + size};
+      const roots of_one = {next, next + size, NULL};
       one->of_one[a] = of_one;
       next += 2 * size;
       sound &= can_be_transformed(size) && size >= SPACING * COMPONENTS;
