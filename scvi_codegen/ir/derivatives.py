@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from scvi_codegen.ir.equations import LoweredStageGroup
-from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.kernel import Kernel, NumberTable
 from scvi_codegen.ir.program import Program
 
 
@@ -47,6 +47,8 @@ class PointDerivatives:
         given: derivatives of forces, then momenta, with respect to parameters and time, on lanes.
         masses: derivatives of constant masses with respect to parameters, if any.
         steps: number of steps that are solved before vectors are propagated over them.
+        unknowns: (B, points) table from the displacements at the points, divided by h, or from the velocities there, to
+            the unknowns; empty if they do not determine these.
     """
 
     partials: Kernel
@@ -55,6 +57,7 @@ class PointDerivatives:
     given: InputDerivatives
     masses: InputDerivatives | None = None
     steps: int = 32
+    unknowns: NumberTable = ()
 
     @property
     def count(self) -> int:

@@ -12,14 +12,15 @@ from sympy import Add, Expr, Mul, S, Symbol
 from scvi_codegen.formulas.expressions import gradient, gradient_tuple, jacobian
 from scvi_codegen.ir.derivatives import Derivatives, InputDerivatives, PointDerivatives, TimeDerivatives
 from scvi_codegen.ir.equations import FixedPointIteration
-from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.kernel import Kernel, lower_matrix
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.stage_groups import system_kernel
 from scvi_codegen.mechanics.derived_expressions import Entries, forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.stage_system import StageGroup, StageSystem
+from scvi_codegen.methods.stage_system import StageGroup, StageSystem, Velocities
+from scvi_codegen.tables.precision import mp
 
 
 def derivatives_of(
@@ -41,7 +42,7 @@ def derivatives_of(
         damping=_input_derivatives(system, "damping", (stages.damping,), ()) if program.damping else None,
         clock=_time_derivatives(system, stages.stage_groups[0].arguments) if system.clock else None,
         momenta=_momentum_derivatives(system) if program.quantities.first_order_rates else None,
-        iterated=point_derivatives_of(system, program.fixed_point) if program.fixed_point else None,
+        iterated=_iterated(system, stages, program.fixed_point) if program.fixed_point else None,
     )
 
 
@@ -138,6 +139,28 @@ def point_derivatives_of(system: MechanicalSystem, fixed_point: FixedPointIterat
     twin, make = equivalent_lagrangian(system), MAKERS.get(fixed_point.derivatives_part)
     iteration = make(twin) if twin and make else None
     return iteration if iteration and iteration.count + len(iteration.given.entries) <= MOST_DERIVATIVES else None
+
+
+def _iterated(
+    system: MechanicalSystem, stages: StageSystem, fixed_point: FixedPointIteration
+) -> PointDerivatives | None:
+    """Return the kernels of the iteration, with the table from its points to the unknowns of the stage equations."""
+    iteration, shape = point_derivatives_of(system, fixed_point), stages.shape
+    if iteration is None or not isinstance(shape, Velocities) or len(stages.blocks) != len(shape.end):
+        return iteration
+    separable = fixed_point.derivatives_part == "separable_derivatives"
+    G = mp.matrix([list(line) for line in (shape.position if separable else shape.velocity)])
+    try:
+        inverse = mp.inverse(G.T * G) * G.T
+    except ZeroDivisionError:
+        return iteration
+    if G.rows != fixed_point.points or max(map(abs, inverse)) > LARGEST_UNKNOWN:
+        return iteration
+    return replace(iteration, unknowns=lower_matrix(tuple(map(tuple, inverse.tolist()))))
+
+
+LARGEST_UNKNOWN = 1e6
+"""Largest entry of the table from points to unknowns, by which rounding errors grow."""
 
 
 def _separable(system: LagrangianSystem) -> PointDerivatives:

@@ -48,6 +48,7 @@ def test_variation_of_the_action_is_that_of_the_ends(stepper):
     assert np.ptp(energies) < 1e-7  # conserved to the order of the method
 
 
+@pytest.mark.second
 def test_actions_of_constraints_forces_damping_and_ensembles(stepper):
     rod = sc.LagrangianSystem.from_text(
         "rod", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 - 1"]

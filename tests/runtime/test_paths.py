@@ -128,6 +128,7 @@ def test_paths_of_other_systems_are_their_runs(arguments, q):
     assert path.index == (None if stepper.supports("work") else 0)
 
 
+@pytest.mark.second
 def test_constrained_index_is_that_of_the_angle():
     """A rod without gravity, motion in the plane of a half turn and more: conjugate after half a turn on the sphere."""
     rod = compiled(["x", "y", "z"], "(x_dot**2 + y_dot**2 + z_dot**2)/2", constraints=["x**2 + y**2 + z**2 - 1"])
@@ -151,6 +152,7 @@ def test_paths_of_arrays_of_run_time_sizes():
     assert np.abs(run.q[-1] - ends[1]).max() < 1e-12
 
 
+@pytest.mark.second
 def test_sparse_derivatives_of_a_lattice_are_those_of_all_columns():
     lattice = compiled(
         ["u[12]"], "sum(i in 12, u_dot[i]**2/2 + (u[i]**2 - 1)**2/4) + sum(i in 0..10, (u[i+1] - u[i])**2/4)", "svi:2"
@@ -177,6 +179,7 @@ def test_condensation_of_one_inner_node_is_elimination(oscillator):
     assert condensed_hessian(path.solution.at, path.solution.factors).shape == (2, 2)
 
 
+@pytest.mark.second
 def test_closed_path_with_another_coordinate_than_time():
     """Periodic orbit of the pendulum of period 8: the amplitude of its elliptic integral."""
     pendulum = compiled(["a"], "a_dot**2/2 + cos(a)", "svi:6")

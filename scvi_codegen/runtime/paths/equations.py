@@ -10,9 +10,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.linalg import lapack
-from scipy.sparse import csc_matrix, identity
-from scipy.sparse.linalg import splu
 
 from scvi_codegen.errors import PathError
 from scvi_codegen.runtime.core.validation import Array
@@ -32,6 +29,9 @@ class Band:
     """LU factors of the Hessian in band storage, with partial pivoting."""
 
     def __init__(self, at: Linearised, shift: float = 0.0) -> None:
+        from scipy.linalg import lapack  # here, because stepping does not need SciPy
+
+        self.lapack = lapack
         diagonal, upper, lower = hessian_blocks(at)
         self.positive: bool | None = None
         if shift:
@@ -50,7 +50,7 @@ class Band:
 
     def solve(self, r: Array) -> Array:
         """Return the solution for (N - 1, d) right-hand sides."""
-        x, _ = lapack.dgbtrs(self.factors, self.reach, self.reach, r.reshape(-1, 1), self.pivots)
+        x, _ = self.lapack.dgbtrs(self.factors, self.reach, self.reach, r.reshape(-1, 1), self.pivots)
         return np.asarray(x.reshape(self.shape))
 
 
@@ -58,6 +58,9 @@ class Sparse:
     """LU factors of the Hessian of many coordinates, of which the entries ``rows``, ``columns`` of blocks are known."""
 
     def __init__(self, at: Linearised, intervals: Any, shift: float = 0.0) -> None:
+        from scipy.sparse import csc_matrix, identity
+        from scipy.sparse.linalg import splu
+
         a, b, c, e = at.blocks
         count, d = a.shape[0] - 1, intervals.dimension
         rows, columns, data = [], [], []

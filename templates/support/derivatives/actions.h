@@ -1,4 +1,34 @@
 #include "../newton/newton_from_line.h"
+#include "linearise.h"
+
+#ifdef UNKNOWNS_OF_POINTS
+/* Actions of steps that are solved by fixed-point iteration. The unknowns z follow from the values at the points. The
+ * action is stationary in z, so that their rounding errors enter squared. Requires: linearise.h, UNKNOWN_OF_POINTS. */
+
+/* Steps first <= k < end; returns 0 if the iteration fails for one of them. */
+static int actions_by_iteration(propagation *over, long long first, long long end, real *z, real *action)
+{
+  const real nothing[M] = {0};
+  over->guess = first == 0 ? 0 : over->guess;
+  if (!solve_steps(over, first, end))
+    return 0;
+  for (long long k = first; k < end; k++) {
+    const step_data step = step_of(over, k, nothing);
+    const double *stored = stored_of(over, k - first);
+    real sums[SUMS];
+    for (int i = 0; i < M; i++)
+      for (int b = 0; b < B; b++) {
+        z[i * B + b] = 0;
+        for (int n = 0; n < UNKNOWN_POINTS; n++)
+          z[i * B + b] += UNKNOWN_OF_POINTS[b][n] * stored[(n / LANES * M + i) * LANES + n % LANES];
+        z[i * B + b] /= UNKNOWNS_OF_POINTS(step.h);
+      }
+    sums_along(&step, z, sums);
+    action[k] = sums[SUMS - 1];
+  }
+  return all_finite(action + first, (int)(end - first));
+}
+#endif
 
 /* Actions of steps from given states: h sum_n w_n L along the curve of each step, without forces and constraints.
  * Requires: newton_from_line.h, sums_along. */
@@ -11,8 +41,30 @@ int NAME(actions)(long long steps, const real *t, const real *h, const real *q, 
   const real carry[M] = {0};
   newton_data *data = newton_in(workspace + SCRATCH);
   memset(report, 0, sizeof *report);
+#ifdef UNKNOWNS_OF_POINTS
+  propagation over = {.t = t,
+      .h = h,
+      .q = q,
+      .p = p,
+      .parameters = parameters,
+      .options = options ? options : &standard,
+      .q1 = q1,
+      .p1 = p1,
+      .workspace = workspace,
+      .report = report};
+#endif
   for (long long k = 0; k < steps; k++) {
-    const step_data step = step_from(t[k], h[k], q + k * M, p + k * M, carry, carry, parameters + k * stride, workspace);
+#ifdef UNKNOWNS_OF_POINTS
+    const long long end = k + STEPS_AT_ONCE < steps ? k + STEPS_AT_ONCE : steps;
+    if (k % STEPS_AT_ONCE == 0 && stride == 0 && actions_by_iteration(&over, k, end, data->z, action)) {
+      report->steps = end;
+      k = end - 1;
+      continue;
+    }
+    over.guess = 0;
+#endif
+    const real *own = parameters + k * stride;
+    const step_data step = step_from(t[k], h[k], q + k * M, p + k * M, carry, carry, own, workspace);
     real dq[M], dp[2 * M] = {0}, sums[SUMS];
     int keep = 0, status = newton_from_line(&step, data, dp, &keep, options ? options : &standard, report);
     report->t = t[k];

@@ -19,8 +19,8 @@ static int linearise_between(linearised_step *at, const real *q1)
   return 1;
 }
 
-/* From at->v, variations of q0 and h, and those of q1 to the variations of p0 and p1, which replace those of (q0, p0) in
- * at->v. */
+/* From at->v, variations of q0 and h, and those of q1 to the variations of p0 and p1, which replace those of (q0, p0)
+ * in at->v. */
 static void momenta_between(const linearised_step *at, const real *q1, const wide *varied)
 {
   const real h = at->step->h;
