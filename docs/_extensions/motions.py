@@ -5,7 +5,7 @@ without the extra ``compiler``, ``range`` that of the slider of a parameter: ``v
 become visible.
 
 The directive ``motions`` shows one of several such pages, by choice; ``write-your-own`` writes the model file of a
-Lagrangian that the visitor types (``_static/write_your_own.js``).
+Lagrangian that the visitor types (``_static/motions.js``).
 """
 
 import hashlib
@@ -220,6 +220,6 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("motion", MotionDirective)
     app.add_directive("motions", MotionsDirective)
     app.add_directive("write-your-own", OwnDirective)
-    app.add_js_file("write_your_own.js")
+    app.add_js_file("motions.js")
     app.connect("build-finished", _build_pages)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -252,6 +252,11 @@ if (window !== parent) document.body.classList.add("embedded");
 by("hint").textContent = source.mesh ? "" : shape.movable.length ? (flat ? "drag a body" : "drag a body, or turn the view") : flat ? "" : "drag to turn the view";
 readColors();
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { readColors(); dirty = true; });
+addEventListener("message", ({ data }) => { // the colours of a site around this page
+  if (!["light", "dark", "auto"].includes(data)) return;
+  document.documentElement.dataset.theme = data;
+  readColors(); dirty = true;
+});
 addEventListener("resize", () => { dirty = true; });
 addEventListener("hashchange", open);
 open();

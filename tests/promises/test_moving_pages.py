@@ -202,7 +202,7 @@ def test_steps_of_a_link_are_spread_over_frames(view, pages):
 def test_the_form_writes_a_model_file_that_is_read(view, tmp_path):
     pytest.importorskip("sphinx", reason="the form is a directive of the site")
     view.set_content(extension("motions").OWN)
-    view.add_script_tag(path=DOCS / "_static" / "write_your_own.js")
+    view.add_script_tag(path=DOCS / "_static" / "motions.js")
     view.evaluate("document.dispatchEvent(new Event('DOMContentLoaded'))")
     view.fill("#own-lagrangian", "m*(x_dot**2 + y_dot**2)/2 - k*(x**2 + y**2 - 1)**2")
     view.fill("[data-name=k] input", "2.5")

@@ -1,6 +1,10 @@
-// Model file of a Lagrangian that the visitor types: coordinates are the names with a velocity, the others parameters.
+// The colours of pages that move, and the model file of a Lagrangian that the visitor types: coordinates are the names with a velocity, the others parameters.
 "use strict";
 document.addEventListener("DOMContentLoaded", () => {
+  const frames = document.querySelectorAll(".motion iframe"), theme = () => document.body.dataset.theme || "auto";
+  for (const frame of frames) frame.addEventListener("load", () => frame.contentWindow.postMessage(theme(), "*"));
+  const tell = () => { for (const frame of frames) frame.contentWindow?.postMessage(theme(), "*"); };
+  new MutationObserver(tell).observe(document.body, { attributes: true, attributeFilter: ["data-theme"] });
   const box = document.getElementById("own");
   if (!box) return;
   const [lagrangian, values] = box.querySelectorAll("textarea, div"), model = box.querySelector("pre"), note = box.querySelector(".note"), copy = box.querySelector("button");
