@@ -73,7 +73,7 @@ def _tumbling(plan: Plan) -> Race:
     counts: Counts = {"svi:8": halved, "composition:8": (1,)}  # exact in any step
     return replace(
         _ensemble(chosen, chosen, plan),
-        ours=lambda: [*run_contenders(chosen, counts), *our_ensembles(chosen, quick=True)],
+        ours=lambda: [*run_contenders(chosen, counts), *our_ensembles(chosen, counts=counts)],
     )
 
 

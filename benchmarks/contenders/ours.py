@@ -55,7 +55,7 @@ def our_contenders(case: Case, *, methods: Iterable[Method] = (), quick: bool = 
         stepper, seconds = compiled(case.system, method)
         momenta = momenta_of(stepper, case)
         options = f"{stepper.title}, solver auto, {' '.join(stepper.flags)}"
-        for count, setting in _settings(case, method, momenta, quick).items():
+        for count, setting in _settings(case, method, np.hstack([case.q[:1], momenta[:1]]), quick).items():
             prepare = partial(_fixed, stepper, case, momenta, count)
             result.append(Contender(f"{OURS} {method.name}", setting, options, seconds, prepare, momenta))
     return result
@@ -101,37 +101,51 @@ def run_contenders(case: Case, counts: Mapping[str | Method, Iterable[int]]) -> 
     ]
 
 
-def our_ensembles(case: Case, *, quick: bool = False) -> list[Contender]:
-    """Return contenders by SVI(8) with all states of the case as one ensemble, in one thread."""
-    stepper, seconds = compiled(case.system, SVI(8))
-    momenta = momenta_of(stepper, case)
-    began = time.perf_counter()
-    stepper.integrate_ensemble(case.q, momenta, h=case.step, steps=1, threads=1)  # compiled on first use
-    seconds += time.perf_counter() - began
-    options, size = f"{stepper.title}, one thread", len(case.q)
+def our_ensembles(
+    case: Case, *, quick: bool = False, counts: Mapping[str | Method, Iterable[int]] | None = None
+) -> list[Contender]:
+    """Return contenders with all states of the case as one ensemble, in one thread.
+
+    ``counts``: numbers of steps by method; by default those of SVI(8) that suffice for every state.
+    """
     result = []
-    for count, setting in _settings(case, SVI(8), momenta, quick).items():
-        prepare = partial(_prepared_ensemble, stepper, case, momenta, count)
-        result.append(Contender(f"{OURS} ensemble", setting, options, seconds, prepare, momenta, size))
+    for method in counts or (SVI(8),):
+        stepper, seconds = compiled(case.system, method)
+        momenta = momenta_of(stepper, case)
+        began = time.perf_counter()
+        stepper.integrate_ensemble(case.q, momenta, h=case.step, steps=1, threads=1)  # compiled on first use
+        seconds += time.perf_counter() - began
+        options, size = f"{stepper.title}, one thread", len(case.q)
+        if counts is None:
+            settings = _settings(case, SVI(8), np.unique(np.hstack([case.q, momenta]), axis=0), quick)
+        else:
+            settings = {count: f"h={case.span / count:.4g}" for count in counts[method]}
+        for count, setting in settings.items():
+            prepare = partial(_prepared_ensemble, stepper, case, momenta, count)
+            name = f"{OURS} ensemble" if counts is None else f"{OURS} ensemble {getattr(method, 'name', method)}"
+            result.append(Contender(name, setting, options, seconds, prepare, momenta, size))
     return result
 
 
-def _settings(case: Case, method: Method, momenta: Array, quick: bool) -> dict[int, str]:
-    """Return the recommended step sizes by number of steps, as text."""
-    counts = advised_counts(case, method, momenta[0], quick=quick)
+def _settings(case: Case, method: Method, states: Array, quick: bool) -> dict[int, str]:
+    """Return the step sizes recommended for all (k, 2m) states by number of steps, as text."""
+    counts = advised_counts(case, method, states, quick=quick)
     return {count: f"h={case.span / count:.4g} for {tolerance:.0e}" for count, tolerance in counts.items()}
 
 
-def advised_counts(case: Case, method: Method, momentum: Array, *, quick: bool) -> dict[int, float]:
-    """Return numbers of steps that fill the span -> the tolerance for which each is recommended, at the first state."""
+def advised_counts(case: Case, method: Method, states: Array, *, quick: bool) -> dict[int, float]:
+    """Return numbers of steps that fill the span -> the tolerance for which each suffices, from each of the states."""
     counts: dict[int, float] = {}
     solver = "auto" if case.dimension <= LARGEST_NEWTON or case.system.constraints else "fixed-point"
     for tolerance in QUICK_TOLERANCES if quick else TOLERANCES:
         try:
-            advice = advise(case.system, method, case.q[0], momentum, case.span, tolerance, solver=solver)
+            steps = [
+                advise(case.system, method, q, p, case.span, tolerance, solver=solver).steps
+                for q, p in states.reshape(len(states), 2, -1)
+            ]
         except StateError:  # no step size is known to be small enough
             continue
-        counts.setdefault(advice.steps, tolerance)
+        counts.setdefault(max(steps), tolerance)
     return counts
 
 

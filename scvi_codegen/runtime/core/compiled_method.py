@@ -293,6 +293,12 @@ class CompiledMethod(ChosenBySizes):
         return self._linearised("derivatives", "jacobian")
 
     @cached_property
+    def _ensemble_binding(self) -> Binding | None:
+        """Library of trajectories in SIMD lanes, compiled on first use; ``None`` if the method has none."""
+        source = self.ensemble
+        return None if source is None else Binding(building.load(source, flags=self.flags), source.prefix)
+
+    @cached_property
     def _second_derivatives(self) -> Binding:
         """Library with second derivatives of steps, compiled on first use; raises ``MethodError`` if unavailable."""
         return self._linearised("second_derivatives", "hessian")

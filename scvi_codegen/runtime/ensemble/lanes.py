@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.native import building
 from scvi_codegen.native.arguments import empty_array
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions
@@ -82,10 +81,9 @@ class CommonRuns:
 
     def blocks(self) -> tuple[Callable[[int], LaneBlock | SingleBlock], int]:
         """Return a function that makes the block beginning at a trajectory, and the trajectories per block."""
-        source = self.stepper.ensemble
-        if source is None:
+        binding = self.stepper._ensemble_binding
+        if binding is None:
             return lambda first: SingleBlock(self, first), 1
-        binding = Binding(building.load(source, flags=self.stepper.flags), source.prefix)
         return lambda first: LaneBlock(self, first, binding), len(binding.new("block *").active)
 
 
@@ -105,16 +103,14 @@ class LaneBlock:
 
     def _fill(self) -> None:
         """Put a trajectory into each lane; surplus lanes repeat the last one and are inactive."""
-        work, call, pointer = self.work, self.binding.function("set"), self.binding.pointer
-        v = self._velocities()
-        for lane in range(len(self.active)):
-            k = min(lane, self.count - 1)
-            j = self.first + k
-            velocity = self.binding.null if v is None else pointer(v[k])
-            call(self.memory, lane, pointer(work.q[0, j]), pointer(work.p[0, j]), velocity, pointer(work.parameters[j]))
-        self.active[self.count :] = 0.0
+        work, v, lanes = self.work, self._velocities(), np.arange(len(self.active))
+        each = np.minimum(lanes, self.count - 1)
+        self.lanes("q")[:], self.lanes("p")[:] = (x[0, self.first + each].T for x in (work.q, work.p))
+        self.parameters[:] = work.parameters[self.first + each].T
+        self.active[:] = lanes < self.count
         if v is not None:
-            self.active[: self.count] *= np.isfinite(v).all(axis=1)
+            self._at_points()[:] = v[each].T
+            self.active *= np.isfinite(v[each]).all(axis=1)
 
     def _velocities(self) -> Array | None:
         """Return (count, m) initial velocities if the predictor needs them, NaN where undefined; else ``None``."""
@@ -131,6 +127,11 @@ class LaneBlock:
         """Return a (m, lanes) view of a field of the block: ``q``, ``p``, ``carry_q`` or ``carry_p``."""
         field = np.frombuffer(self.binding.buffer(getattr(self.memory, name)), dtype=np.float64)
         return field.reshape(self.work.stepper.dimension, -1)
+
+    def _at_points(self) -> Array:
+        """Return a (points, m, lanes) view of the values that the predictor extrapolates, of two steps."""
+        values = np.frombuffer(self.binding.buffer(self.memory.memory), dtype=np.float64)
+        return values.reshape(-1, self.work.stepper.dimension, len(self.active))
 
     def advance(self, size: int) -> None:
         """Advance by ``size`` steps."""
@@ -154,8 +155,7 @@ class LaneBlock:
 
     def _reset_predictor(self, parameters: Array) -> None:
         """Reset the predictor to the current velocities, as initially; deactivate lanes without velocities."""
-        at_points = np.frombuffer(self.binding.buffer(self.memory.memory), dtype=np.float64)
-        at_points = at_points.reshape(-1, self.work.stepper.dimension, len(self.active))
+        at_points = self._at_points()
         q, p, t = self.lanes("q").T, self.lanes("p").T, float(self.memory.t)
         for lane in np.flatnonzero(self.active[: self.count] > 0.0):
             try:
