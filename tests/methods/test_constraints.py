@@ -112,6 +112,25 @@ def test_multipliers_are_solved_separately_for_constant_masses(s, moving):
         ours.integrate(*start, h=30.0, steps=1)
 
 
+@pytest.mark.second
+def test_adaptive_steps_are_rejected_where_the_iteration_of_multipliers_fails():
+    """Newton's method takes the long steps that the error admits; the iteration of multipliers rejects them."""
+    rods = sc.LagrangianSystem.from_text(
+        name="two rods",
+        coordinates=["x1", "y1", "x2", "y2"],
+        lagrangian="(x1_dot**2 + y1_dot**2 + x2_dot**2 + y2_dot**2)/2 - 9.81*(y1 + y2)",
+        constraints=["x1**2 + y1**2 = 1", "(x2 - x1)**2 + (y2 - y1)**2 = 1"],
+    )
+    ours, newton = (sc.compile_stepper(rods, lobatto(8), solver=solver) for solver in ("auto", "newton"))
+    start, span = ([0.6, -0.8, 1.4, -1.4], newton.momentum([0.6, -0.8, 1.4, -1.4], [0.0] * 4, 0.0)), {"t_end": 5.0}
+    run, long = (stepper.integrate(*start, **span, tolerance=1e-5) for stepper in (ours, newton))
+    exact = newton.integrate(*start, h=0.05, steps=100)
+    assert run.steps > 1.5 * long.steps
+    assert np.abs(run.q[-1] - exact.q[-1]).max() < min(1e-9, np.abs(long.q[-1] - exact.q[-1]).max())
+    thinned = ours.integrate(*start, **span, tolerance=1e-5, save_every=7)
+    assert np.array_equal(thinned.q[-1], run.q[-1])
+
+
 def test_steps_are_symplectic_on_the_tangent_bundle_of_the_circle():
     """The area dq ^ dp of two directions along the constrained phase space, by steps from four neighbours."""
     stepper, eps = sc.compile_stepper(rod(), lobatto(2)), 1e-5

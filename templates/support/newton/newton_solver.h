@@ -4,13 +4,13 @@
 /* Step by Newton's method. Requires: newton.h, the table EXTRAPOLATION: the predictor is sum_c EXTRAPOLATION[c][b] z_c
  * of the previous step; for multipliers the rows from B on. */
 typedef struct {
-  int unused;
+  int rattle_alone; /* 1 if a step whose iteration of the multipliers fails is not solved by Newton's method */
 } solver_data;
 
 static void prepare(const step_data *step, solver_data *data)
 {
   (void)step;
-  data->unused = 0;
+  data->rattle_alone = 0;
 }
 
 /* Recomputes the factors at a stored point, bit for bit; returns 0 if that fails. */
@@ -57,7 +57,7 @@ static int variables_of_momenta(const step_data *step, const real *z, const real
  * step, and from the straight line if there are none or the iteration fails. memory contains the stages and, if factors
  * are reused, the point of the factors; guess is 1 if the stages are valid, 2 if both are. On failure the increments
  * are undefined and memory and guess are unchanged. */
-static int solve(const step_data *step, const solver_data *unused, real *memory, long long *guess, real *dq, real *dp,
+static int solve(const step_data *step, const solver_data *way, real *memory, long long *guess, real *dq, real *dp,
     const solver_options *options, solver_report *report, real *workspace)
 {
   newton_data *data = newton_in(workspace);
@@ -70,7 +70,6 @@ static int solve(const step_data *step, const solver_data *unused, real *memory,
   with_momenta.theta0 = theta;
   step = &with_momenta;
 #endif
-  (void)unused;
   if (POINT > 0 && *guess == 2)
     keep = step->first ? remake_factors(step, memory + N, data) : 1;
 #ifdef RATTLE
@@ -79,6 +78,10 @@ static int solve(const step_data *step, const solver_data *unused, real *memory,
   if (*guess || line_from(step, data) == OK)
     status = rattle(step, data, dp, options, report);
   keep = 0;
+  if (status != OK && way->rattle_alone)
+    return status;
+#else
+  (void)way;
 #endif
   if (status != OK && *guess) {
     guess_from(memory, data);

@@ -11,6 +11,7 @@
 #define MANY_ITERATIONS 10 /* of a step, after which the next one is not larger */
 #define TOO_MANY_ITERATIONS 13 /* the next one is smaller: about ten iterations take the least time per unit of time */
 #define SUSPENDED 8 /* steps without this rule after one that needed as many iterations as a larger one */
+#define FAILURES_BEFORE_NEWTON 3 /* trials of a step in which the iteration of the multipliers fails */
 #define STEPS_COMPARED_AFTER_DOUBT 16 /* steps that are compared after one that was shortened by a comparison */
 
 #ifdef ARRAYS
@@ -114,6 +115,9 @@ typedef struct {
   real length; /* step size; 0 before the first trial */
   int last; /* 1 if the step ends at t_end */
   int inside; /* levels above this one of a rejected step, whose curve is stored; 0: none */
+#ifdef RATTLE
+  int failures; /* trials of the step that failed */
+#endif
 #ifdef ERROR_GROWTH
   coordinates points[GROUPS]; /* of the last trial */
 #endif
@@ -136,6 +140,9 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
     now->step.h = h;
     prepare(&now->step, &now->data);
   }
+#ifdef RATTLE
+  now->data.rattle_alone = run->avoiding >= 0;
+#endif
   now->error = attempt(run, &now->step, &now->data, now->last, now->last ? 0 : now->inside, &now->guess, now->dq,
       now->dp, now->limits.decay, least, options, report);
   now->iterations = report->iterations - now->iterations;
@@ -200,6 +207,12 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
     if (up > 0)
       try_step(run, now, 0, options, report);
   }
+#ifdef RATTLE
+  if (!found && run->avoiding >= 0) { /* the iteration of the multipliers converges at no size */
+    run->avoiding = -AVOIDED;
+    try_first_step(run, now, options, report);
+  }
+#endif
 }
 
 /* Levels from the step whose curve is stored down to the next trial, 0 without a predictor. A solved trial stored its
@@ -226,21 +239,37 @@ static int shorten(run_memory *run, trial *now, int most)
   return size_of_level(run->grid_level) > SMALLEST_RELATIVE_STEP * (MATH(fabs)(now->at.t) + REAL_EPSILON * left);
 }
 
+/* Excludes the size of a failed trial from the next steps. The iteration of the multipliers is cheaper at two smaller
+ * steps than Newton's method at one, so its failure rejects a trial. Where it fails at any size, as near dead points of
+ * a mechanism, Newton's method is admitted for some steps: run->avoiding is then minus their number. */
+static SELDOM void avoid_size(run_memory *run, trial *now)
+{
+  run->failed = run->grid_level;
+  run->avoiding = AVOIDED;
+#ifdef RATTLE
+  if (++now->failures >= FAILURES_BEFORE_NEWTON)
+    run->avoiding = -AVOIDED;
+#else
+  (void)now;
+#endif
+}
+
 /* Tries the next step with smaller and smaller sizes until its error is admissible, or STEP_SIZE_UNDERFLOW. */
 HOT int find_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const real least = LITTLE * now->limits.fewer;
   now->change = run->change - run->grid_level;
+#ifdef RATTLE
+  now->failures = 0;
+#endif
   if (run->error_before > 0)
     try_step(run, now, least, options, report);
   else
     try_first_step(run, now, options, report);
   while (!(now->error <= now->limits.most * GROWTH)) {
     const int failed = run->error_before > 0 && !(now->error < INFINITY);
-    if (failed) {
-      run->failed = run->grid_level;
-      run->avoiding = AVOIDED;
-    }
+    if (failed)
+      avoid_size(run, now);
     if (!shorten(run, now, failed ? DOWN_FAILED : MOST_DOWN))
       return STATUS(STEP_SIZE_UNDERFLOW);
     try_step(run, now, least, options, report);
@@ -321,6 +350,9 @@ static inline void choose_size(run_memory *run, const trial *now)
   int change = next_change(run, now->error, run->error_before, &now->limits);
   const int most = limit_by_iterations(run, now->iterations);
   change = change < most ? change : most;
+#ifdef RATTLE
+  run->avoiding += run->avoiding < 0;
+#endif
   if (run->avoiding > 0 && run->avoiding-- && run->grid_level + change >= run->failed)
     change = (int)(run->failed - 1 - run->grid_level);
   run->guess = now->guess;
