@@ -91,6 +91,8 @@ from scvi_codegen.models.packages.package import load_package as load_package
 from scvi_codegen.models.problems import PROBLEMS as PROBLEMS
 from scvi_codegen.models.problems import problem as problem
 from scvi_codegen.native.options import SolverOptions as SolverOptions
+from scvi_codegen.pages.page import Page as Page
+from scvi_codegen.pages.page import page as page
 from scvi_codegen.pictures.animation import Film as Film
 from scvi_codegen.pictures.animation import animate as animate
 from scvi_codegen.pictures.arrays import plot_arrays as plot_arrays

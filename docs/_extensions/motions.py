@@ -18,10 +18,11 @@ from typing import Any
 
 from docutils import nodes
 from docutils.parsers.rst import directives
-from page_builder import page_of
 from sphinx.application import Sphinx
 from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
+
+from scvi_codegen import page
 
 __all__ = ["setup"]
 
@@ -31,7 +32,7 @@ HERE = Path(__file__).parent
 MADE_OF = b"".join(
     path.read_bytes()
     for path in sorted((HERE.parents[1] / "templates/page").iterdir())
-    + sorted(HERE.glob("page_*"))
+    + sorted((HERE.parents[1] / "scvi_codegen/pages").glob("*.py"))
 )
 """Sources of a page besides its model: a page is written again when they change."""
 LOGGER = logging.getLogger(__name__)
@@ -198,8 +199,7 @@ def _write_page(node: motion, folder: Path) -> None:
     if node["range"]:
         parameter, low, high = node["range"].split()
         ranges[parameter] = float(low), float(high)
-    page = page_of(Path(node["model"]), ranges)
-    (folder / f"{node['name']}.html").write_text(page, encoding="utf-8")
+    page(node["model"], ranges=ranges).save(folder / f"{node['name']}.html")
 
 
 def setup(app: Sphinx) -> dict[str, Any]:

@@ -42,6 +42,7 @@ ABOUT = {
     "export": "Write the states of a run in a folder to one file.",
     "generate": "Generate C code and a Python package for MODEL.",
     "methods": "List the methods and their properties.",
+    "page": "Write a page that computes the motion in the browser.",
     "reproduce": "Reproduce the paper's experiments, with verdicts.",
     "run": "Integrate MODEL and report conserved quantities.",
     "systems": "List the catalogue, or print a system as a file.",

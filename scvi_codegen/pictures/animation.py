@@ -111,7 +111,7 @@ def shape_of(motion: DrawnMotion, positions: Callable[[Array], Array] | None = N
         )
     if (mesh := mesh_of(motion)) is not None and len(mesh.axes) < 3:
         return _graph(motion)
-    if (sign := _hanging(motion)) is not None:
+    if (sign := hanging(motion)) is not None:
         return _pendulum(_lengths(motion), sign)
     if m == 1:
         labels = (coordinates[0], motion.stepper.interface.momenta[0])
@@ -161,10 +161,10 @@ def _pendulum(lengths: Array, sign: float) -> MovingPoints:
     return MovingPoints(points=points, labels=("x", "y"), joined=True, trails=(len(lengths),))
 
 
-def _hanging(motion: DrawnMotion) -> float | None:
+def hanging(motion: DrawnMotion) -> float | None:
     """Return 1 if the coordinates are angles of pendulums that hang at 0, -1 if upright there, else ``None``."""
     # V = sum a_i (1 - cos q_i), all a_i of one sign; T of two neighbouring momenta is not the sum of that of each.
-    numbers, m = _numbers(motion.stepper.interface.coordinates), motion.q.shape[1]
+    numbers, m = numbers_of(motion.stepper.interface.coordinates), motion.q.shape[1]
     if m > MAX_RODS or (m > 1 and numbers is None):
         return None
     generic = GENERIC[0] + GENERIC[1] * np.arange(m)
@@ -188,7 +188,7 @@ def _energies(motion: DrawnMotion, q: Array, p: Array) -> Array:
     return np.asarray(motion.stepper.energy(q, p, motion.t[0], motion.parameters), dtype=float)
 
 
-def _numbers(names: Sequence[str]) -> tuple[int, ...] | None:
+def numbers_of(names: Sequence[str]) -> tuple[int, ...] | None:
     """Return the numbers of theta_1, theta_2, .. or theta1, theta2, ..; ``None`` for other names."""
     result = [NUMBERED.fullmatch(name) for name in names]
     if not all(result) or len({match[1] for match in result if match}) > 1:
@@ -200,7 +200,7 @@ def _lengths(motion: DrawnMotion) -> Array:
     """Return (m,) rod lengths, from parameters by name; 1 if there is none."""
     interface, m = motion.stepper.interface, motion.q.shape[1]
     values = dict(zip(interface.parameters, motion.parameters, strict=True))
-    numbers = _numbers(interface.coordinates) or (0,) * m
+    numbers = numbers_of(interface.coordinates) or (0,) * m
     lengths = []
     for number in numbers:
         names = [f"{name}{end}" for end in (number, f"_{number}", "") for name in LENGTHS]

@@ -31,7 +31,7 @@ FLOORS = """
     compiler fields frameworks
     results
     derivation models advice verification
-    reproduce
+    reproduce pages
     package distributed __init__
     cli
     __main__

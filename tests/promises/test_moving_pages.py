@@ -29,10 +29,10 @@ def extension(name: str) -> Any:
 def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Return the files of two pages: one without calls of the C library, and a field."""
     pytest.importorskip("ziglang", reason="pages are compiled by the extra compiler")
-    builder, folder, result = extension("page_builder"), tmp_path_factory.mktemp("pages"), {}
+    folder, result = tmp_path_factory.mktemp("pages"), {}
     for name, ranges in (("figure_eight", None), ("kinks", {"v": (0.05, 0.95)})):
         result[name] = folder / f"{name}.html"
-        result[name].write_text(builder.page_of(DOCS / "motions" / f"{name}.toml", ranges), encoding="utf-8")
+        sc.page(DOCS / "motions" / f"{name}.toml", ranges=ranges).save(result[name])
     return result
 
 

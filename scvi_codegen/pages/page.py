@@ -1,0 +1,303 @@
+"""Pages that move: a model as one HTML file with its generated C, compiled to WebAssembly, and controls.
+
+:func:`page` generates the C of a model, compiles it with the functions of ``templates/page/entry.c.jinja``, and renders
+``templates/page``. The file needs no network, and evaluates no text as code.
+"""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+import os
+import re
+import tempfile
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import sympy
+
+from scvi_codegen.display.mathml import mathml_terms
+from scvi_codegen.errors import ExpressionError, MethodError, StateError
+from scvi_codegen.files.atomic import regular, write_text
+from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.mechanics.first_order import FirstOrderSystem
+from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_files.document import document_of
+from scvi_codegen.models.model_files.model_file import load_model
+from scvi_codegen.models.packages.package import generate_package
+from scvi_codegen.pages.shape import shape_data
+from scvi_codegen.pages.webassembly import LICENCES, webassembly
+from scvi_codegen.rendering.environment import template_environment
+from scvi_codegen.representation import summary
+from scvi_codegen.validation import ArgumentType, checks_arguments
+from scvi_codegen.version import __version__
+
+CAUSES = (
+    "",
+    "The step failed: the iteration on the stage equations did not converge. Use a smaller step size.",
+    "The step failed: a matrix is singular. Check that no mass is 0.",
+    "The step failed: a value is infinite or undefined. Use other values, or a smaller step size.",
+    "The step size fell below machine precision, as near a collision. Use other initial values.",
+    "The step failed: the iteration converged to a spurious solution. Use a smaller step size.",
+)
+"""Text of each status of the generated C."""
+ARRAY = re.compile(r"(\w+)\[")
+NAME = re.compile(r"[A-Za-z_]\w*\b(?!\()")
+SECONDS = 30
+"""Duration of the span of a model at the speed that a page begins with, unless time is in seconds or so."""
+HEIGHT = 760
+"""Height of a page in a notebook, in pixels."""
+MODEL_OR_PATH = ArgumentType(
+    "a Model or the path of a model file", lambda value: isinstance(value, Model | str | os.PathLike)
+)
+
+
+@checks_arguments(model=MODEL_OR_PATH)
+def page(model: Model | str | os.PathLike[str], *, ranges: Mapping[str, tuple[float, float]] | None = None) -> Page:
+    """Return a page that computes the motion of a model in the browser, with sliders and plots.
+
+    The generated C is compiled to WebAssembly by the extra ``compiler``; its first use takes a minute or two, since it
+    compiles its C library. The file of a field contains the formulas of its initial values if ``model`` is a path.
+
+    Args:
+        model: model, or path of a model file; steps are fixed, or adaptive with a tolerance.
+        ranges: lowest and highest value of the sliders of parameters, by name; by default up to three times the value.
+
+    Returns:
+        The page, which a notebook displays.
+
+    Raises:
+        MethodError: for what a page does not have: events, inputs, time transformations, controllers, steps without a
+            size or tolerance, and systems whose velocities do not determine their momenta.
+        StateError: for a range of an unknown parameter, or one that does not contain its value.
+        ModelFileError: for an invalid model file.
+        BuildError: without the extra ``compiler``, or if compilation fails.
+    """
+    if isinstance(model, Model):
+        return page_of(model, document_of(model), ranges or {})
+    return page_of(load_model(model), tomllib.loads(regular(model).read_text(encoding="utf-8")), ranges or {})
+
+
+def page_of(model: Model, document: Mapping[str, Any], ranges: Mapping[str, tuple[float, float]]) -> Page:
+    """Return the page of a model whose formulas are those of a document. Raises as :func:`page`."""
+    _check(model, ranges)
+    adaptive = model.h is None
+    result = Page(model.with_known_sizes() if adaptive else model, document, dict(ranges), adaptive=adaptive)
+    result.html  # noqa: B018  (reports errors here)
+    return result
+
+
+def _check(model: Model, ranges: Mapping[str, tuple[float, float]]) -> None:
+    """Raise an error for what a page does not have."""
+    name = model.system.name
+    refused = {
+        "events": model.events,
+        "inputs": getattr(model.system, "inputs", ()),
+        "time transformations": model.has_time_transformation,
+    }
+    for feature, given in refused.items():
+        if given:
+            raise MethodError(f"a page has no {feature}, which {name} has: omit them, or use run and animate()")
+    if isinstance(model.system, FirstOrderSystem):
+        raise MethodError(f"a page starts from velocities; {name} is of first order: use run and animate()")
+    if model.h is None and model.tolerance is None:
+        raise MethodError(f"a page requires a step size or tolerance; {name} has neither: give [run] step or tolerance")
+    for parameter, limits in ranges.items():
+        value = model.parameters.get(parameter)
+        if value is None or np.ndim(value):
+            known = ", ".join(key for key, each in model.parameters.items() if np.ndim(each) == 0)
+            raise StateError(f"the range of {parameter!r} is of no parameter of {name}: use one of {known or 'none'}")
+        low, high = limits
+        if not (math.isfinite(low) and math.isfinite(high) and low < high and low <= value <= high):
+            raise StateError(f"the range {low:g} .. {high:g} of {parameter} must contain its value {value:g}: widen it")
+
+
+@dataclass(frozen=True, eq=False)
+class Page:
+    """Page of a model, which a notebook displays.
+
+    Attributes:
+        model: system, method, initial state and step size.
+        document: sections of its model file.
+        ranges: limits of sliders by parameter.
+        adaptive: whether the step size is adaptive.
+    """
+
+    model: Model
+    document: Mapping[str, Any] = field(repr=False)
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    adaptive: bool = False
+
+    __repr__ = summary("model")
+
+    @cached_property
+    def html(self) -> str:
+        """Text of the file."""
+        model, document = self.model, self.document
+        with tempfile.TemporaryDirectory(prefix="scvi-codegen-") as temporary:
+            folder = generate_package(model, Path(temporary, "motion"))
+            interface = _interface(folder, model)
+            initial = _initial(document, [*model.mesh.points, *interface.parameters]) if model.mesh else ()
+            (folder / "page.c").write_text(_entry(folder, model, interface, initial, self.adaptive), encoding="utf-8")
+            code = webassembly(folder, ("page.c", "motion.c"))
+        description = _description(self, interface, initial=bool(initial))
+        return (
+            template_environment()
+            .get_template("page/page.html.jinja")
+            .render(
+                title=html.escape(interface.system),
+                method=html.escape(interface.title.split(": ", 1)[-1]),
+                version=__version__,
+                licences=LICENCES,
+                lagrangian=_lagrangian(document),
+                description=json.dumps(description, separators=(",", ":")).replace("<", "\\u003c"),
+                wasm=code,
+            )
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the file, atomically."""
+        write_text(path, self.html)
+
+    def _repr_html_(self) -> str:
+        title = html.escape(f"{self.model.system.name}: a page that moves")
+        return (
+            f'<iframe sandbox="allow-scripts" title="{title}" srcdoc="{html.escape(self.html)}"'
+            f' style="width: 100%; height: {HEIGHT}px; border: 0"></iframe>'
+        )
+
+
+def _interface(folder: Path, model: Model) -> SimpleNamespace:
+    """Return names, sizes and titles of a generated integrator, of either kind."""
+    data = json.loads((folder / "interface.json").read_text(encoding="utf-8"))
+    if "interface" in data:
+        return SimpleNamespace(**data["interface"], array=False)
+    scalars = {name: value for name, value in model.parameters.items() if np.ndim(value) == 0}
+    return SimpleNamespace(
+        array=True, title=data["title"], system=model.system.name, coordinates=[], momentum_names=[], rotations=[],
+        constraints=[], map_names=[], parameters=list(scalars), defaults=list(scalars.values()), conserves_energy=True,
+        sizes=data["sizes"],
+    )  # fmt: skip
+
+
+def _entry(folder: Path, model: Model, interface: Any, initial: Sequence[str], adaptive: bool) -> str:
+    """Return the C of the functions that the page calls."""
+    header, size = (folder / "motion.h").read_text(encoding="utf-8"), len(_flat(model.q))
+
+    def listed(word: str) -> list[str]:
+        found = re.search(rf"\*{word}\[\d+\]; /\* (.*?) \*/", header, re.DOTALL)
+        return ARRAY.findall(found[1]) if found else []
+
+    def words(name: str) -> list[str]:
+        return (folder / f"{name}.txt").read_text(encoding="utf-8").split()
+
+    numbers, tables = [repr(value) for value in _values(model, interface).values()], {}
+    if interface.array:
+        for name in listed("field"):
+            numbers += words(f"field_{name}")
+        tables = {name: words(f"table_{name}") for name in listed("table")}
+    axes = {name: np.ravel(nodes).tolist() for name, nodes in model.mesh.points.items()} if model.mesh else {}
+    return (
+        template_environment()
+        .get_template("page/entry.c.jinja")
+        .render(
+            array=interface.array, m=size, capacity=256 if size < 64 else 16, maps=len(interface.map_names),
+            values=numbers, sizes=list(interface.sizes.values()) if interface.array else (), tables=tables,
+            constraints=interface.constraints, adaptive=adaptive, initial=initial,
+            axes={f"at_{name}": nodes for name, nodes in axes.items()},
+            names={f"at_{name}": k for k, name in enumerate(interface.parameters)},
+        )
+    )  # fmt: skip
+
+
+def _values(model: Model, interface: Any) -> dict[str, float]:
+    """Return the scalar parameters by name, in order."""
+    pairs = zip(interface.parameters, interface.defaults, strict=True)
+    return {name: float(model.parameters.get(name, default)) for name, default in pairs}
+
+
+def _initial(document: Mapping[str, Any], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the formulas of the only field and its rate as C, or none if an initial value is no formula."""
+    known = {name: symbol(f"at_{name}") for name in names}
+    tables = [document.get("initial", {}).get(key) for key in ("q", "q_dot")]
+    formulas = [next(iter(each.values())) if isinstance(each, dict) and len(each) == 1 else each for each in tables]
+    if not all(isinstance(formula, str) for formula in formulas):
+        return ()
+    try:
+        texts = tuple(sympy.ccode(parse_expression(str(formula), known)) for formula in formulas)
+    except ExpressionError:
+        return ()
+    return () if any("\n" in text for text in texts) else texts  # of functions that C does not have
+
+
+def _lagrangian(document: Mapping[str, Any]) -> list[str]:
+    """Return the Lagrangian or density as written, as terms of MathML; none of sums over indices and the like."""
+    text = document.get("field", {}).get("density") or document.get("system", {}).get("lagrangian")
+    try:
+        density = parse_expression(str(text or ""), {name: symbol(name) for name in NAME.findall(str(text))})
+    except ExpressionError:
+        return []
+    return list(mathml_terms(density, sympy.Symbol("L")))
+
+
+def _flat(state: Any) -> list[float]:
+    """Return the numbers of a state: a sequence, or arrays by name."""
+    parts = state.values() if isinstance(state, Mapping) else [state]
+    result: list[float] = np.concatenate([np.ravel(part) for part in parts]).astype(float).tolist()
+    return result
+
+
+def _velocity(model: Model) -> list[float]:
+    """Return the initial velocities, from momenta if these are given."""
+    if model.velocity is not None:
+        return _flat(model.velocity)
+    if model.p is None:
+        return [0.0] * model.dimension
+    stepper = model.stepper()
+    if model.array_system is not None:
+        raise MethodError(f"a page of arrays requires initial velocities; {model.system.name} has momenta: give q_dot")
+    velocity = stepper.velocity(model.q, model.p, model.t, model.parameters)
+    if not np.allclose(stepper.momentum(model.q, velocity, model.t, model.parameters), model.p, rtol=1e-9, atol=1e-12):
+        raise MethodError(
+            f"a page starts from velocities, which do not determine the momenta of {model.system.name}: use run and"
+            " animate()"
+        )
+    return _flat(velocity)
+
+
+def _description(shown: Page, interface: Any, *, initial: bool) -> dict[str, Any]:
+    """Return what the scripts of the page read."""
+    model, adaptive = shown.model, shown.adaptive
+    q, v = _flat(model.q), _velocity(model)
+    shape = shape_data(model, interface, q)
+    rods = "rods" in shape["source"]
+    parameters = []
+    for name, value in _values(model, interface).items():
+        size = abs(value) or 1.0
+        default = (size / 20, 3 * size) if value > 0 else (-3 * size, 3 * size if value else size)
+        low, high = shown.ranges.get(name, default)
+        parameters.append({"name": name, "value": value, "low": low, "high": high})
+    span = abs(float(model.end - model.t))
+    speed = 1.0 if 0.3 < span / SECONDS < 4 else float(f"{span / SECONDS:.0e}")
+    step = float(model.tolerance if adaptive else model.h)  # type: ignore[arg-type]
+    largest = [max([1.0, *(abs(x) for x in kind)]) for kind in (q, v)]
+    return {
+        "m": len(q), "q": q, "v": v, "t": float(model.t), "coordinates": interface.coordinates,
+        "momenta": interface.momentum_names, "parameters": parameters, "quantities": interface.map_names,
+        "energy": {"label": "Energy", "conserved": bool(interface.conserves_energy)}, "plots": [], "causes": CAUSES,
+        "initial": initial,
+        "step": {"kind": "adaptive" if adaptive else "fixed", "value": step,
+                 **({"low": 1e-15, "high": 1e-4} if adaptive else {"low": step / 20, "high": step * 8})},
+        "speed": {"value": speed, "low": speed / 50, "high": speed * 20},
+        "ranges": {"q": [[-math.pi, math.pi] if rods else [-2 * largest[0], 2 * largest[0]]] * len(q),
+                   "v": [[-12.0, 12.0] if rods else [-2 * largest[1], 2 * largest[1]]] * len(q)},
+        "shape": shape,
+    }  # fmt: skip

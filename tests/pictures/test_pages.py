@@ -1,0 +1,156 @@
+"""Pages that move: what they describe, what they refuse, and the bits of their WebAssembly."""
+
+import base64
+import gzip
+import html
+import importlib.util
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from programs import needs
+
+import scvi_codegen as sc
+from scvi_codegen.native.building import PORTABLE_FLAGS
+from scvi_codegen.pages import page as pages
+
+MOTIONS = Path(__file__).parents[2] / "docs" / "motions"
+OSCILLATOR = """[system]
+name = "a </script><b> oscillator"
+coordinates = ["x", "y"]
+lagrangian = "m*(x_dot**2 + y_dot**2)/2 - k*(x**2 + y**2)/2"
+[parameters]
+k = 1.0
+m = 1.0
+[initial]
+q = [1.0, 0.0]
+q_dot = [0.0, 0.5]
+[run]
+step = 0.1
+span = 20.0
+"""
+NODE = """
+const fs = require("fs"), code = new WebAssembly.Instance(new WebAssembly.Module(fs.readFileSync(0)), {}).exports;
+code._initialize?.();
+const view = (k) => new Float64Array(code.memory.buffer, code.memory_of(k), 2);
+view(1).set([1, 0]); view(3).set([0, 0.5]);
+const statuses = [code.start(0, 0.1), code.advance(200, 1)];
+console.log(JSON.stringify([statuses, Array.from(view(1)), Array.from(view(2))]));
+"""
+
+
+def written(folder, text=OSCILLATOR):
+    """Return the path of a model file."""
+    path = folder / "model.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def described(text):
+    """Return what the scripts of a page read."""
+    return json.loads(re.search(r'id="description">(.*?)</script>', text, re.DOTALL)[1])
+
+
+@pytest.fixture
+def without_compiler(monkeypatch):
+    """Replace compilation."""
+    monkeypatch.setattr(pages, "webassembly", lambda folder, sources: "")
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "marks"),
+    [
+        ("double_pendulum", {"rods": {"sign": 1.0, "lengths": ["l1", "l2"]}}, ["rod", "pivot", "bob", "bob"]),
+        ("figure_eight", {"columns": [[0, 1], [2, 3], [4, 5]], "pins": []}, ["body"] * 3),
+    ],
+)
+@pytest.mark.usefixtures("without_compiler")
+def test_shapes_are_those_of_animations(name, source, marks):
+    shape = described(sc.page(MOTIONS / f"{name}.toml").html)["shape"]
+    assert shape["source"] == source
+    assert [each["kind"] for each in shape["marks"]] == marks
+
+
+@pytest.mark.usefixtures("without_compiler")
+def test_a_page_has_no_address_no_text_as_code_and_the_licences(tmp_path):
+    page = sc.page(written(tmp_path), ranges={"k": (0.5, 2.0)})
+    text, data = page.html, described(page.html)
+    assert "://" not in text.replace("http://www.w3.org/1998/Math/MathML", "")
+    assert "<b> oscillator" not in text
+    assert not re.search(r"\beval\(|new Function", text)
+    assert re.search(r"default-src 'none'.*script-src 'unsafe-inline' 'wasm-unsafe-eval'", text)
+    assert all(word in text for word in ("musl", "compiler-rt", "MIT licence"))
+    assert [(each["low"], each["high"]) for each in data["parameters"]] == [(0.5, 2.0), (0.05, 3.0)]
+    assert (data["q"], data["v"], data["step"]["value"]) == ([1.0, 0.0], [0.0, 0.5], 0.1)
+    frame = page._repr_html_()
+    assert frame.startswith('<iframe sandbox="allow-scripts" ')
+    assert html.unescape(re.search(r'srcdoc="([^"]*)"', frame)[1]) == text
+    page.save(tmp_path / "page.html")
+    assert (tmp_path / "page.html").read_text(encoding="utf-8").rstrip("\n") == text.rstrip("\n")
+
+
+@pytest.mark.usefixtures("without_compiler")
+def test_momenta_become_velocities(tmp_path):
+    text = OSCILLATOR.replace("q_dot = [0.0, 0.5]", "p = [0.0, 1.0]").replace("m = 1.0", "m = 2.0")
+    assert described(sc.page(written(tmp_path, text)).html)["v"] == [0.0, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "ranges", "message"),
+    [
+        ("step = 0.1", "error = 1e-9", {}, "requires a step size or tolerance"),
+        ("[run]", '[[events]]\nfunction = "x"\n[run]', {}, "no events, which .* omit them"),
+        ("", "", {"g": (0, 1)}, "'g' is of no parameter of .*: use one of k, m"),
+        ("", "", {"k": (2, 3)}, "range 2 .. 3 of k must contain its value 1: widen it"),
+    ],
+)
+@pytest.mark.usefixtures("without_compiler")
+def test_what_a_page_lacks_is_refused(tmp_path, old, new, ranges, message):
+    with pytest.raises((sc.MethodError, sc.StateError), match=message):
+        sc.page(written(tmp_path, OSCILLATOR.replace(old, new, 1)), ranges=ranges)
+
+
+@pytest.mark.usefixtures("without_compiler")
+def test_hamiltonians_start_from_the_velocities_of_their_momenta():
+    system = sc.HamiltonianSystem.from_text("h", ["q"], hamiltonian="p_q**2/2 + q**4/4 + p_q**4/10")
+    model = sc.Model(system=system, method="gauss:2", q=[1.0], p=[0.5], h=0.1, span=1.0)
+    assert described(sc.page(model).html)["v"] == pytest.approx([0.5 + 0.4 * 0.5**3])
+
+
+@pytest.mark.usefixtures("without_compiler")
+def test_momenta_that_velocities_do_not_determine_are_refused():
+    system = sc.HamiltonianSystem.from_text("h", ["q"], hamiltonian="cos(p_q) + q**2/2")
+    model = sc.Model(system=system, method="gauss:2", q=[1.0], p=[2.8], h=0.1, span=1.0)
+    with pytest.raises((sc.MethodError, sc.StateError), match="velocit"):
+        sc.page(model)
+
+
+def test_a_missing_compiler_is_an_error_with_its_remedy(tmp_path, monkeypatch):
+    find = importlib.util.find_spec
+    absent = lambda name, *more: None if name == "ziglang" else find(name, *more)  # noqa: E731
+    monkeypatch.setattr(importlib.util, "find_spec", absent)
+    with pytest.raises(sc.BuildError, match=r"pip install 'scvi-codegen\[compiler\]'"):
+        sc.page(written(tmp_path))
+
+
+@pytest.mark.second
+def test_the_webassembly_computes_the_bits_of_python_within_200_kilobytes(tmp_path):
+    node = needs("node")
+    pytest.importorskip("ziglang", reason="pages are compiled by the extra compiler")
+    command = [sys.executable, "-m", "scvi_codegen", "page", str(written(tmp_path)), "-o", str(tmp_path / "page.html")]
+    subprocess.run(command, check=True, capture_output=True)
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert len(text) < 200_000
+    code = gzip.decompress(base64.b64decode(re.search(r'id="wasm">(.*?)</script>', text)[1]))
+    done = subprocess.run([node, "-e", NODE], input=code, capture_output=True, check=True)
+    statuses, q, p = json.loads(done.stdout)
+    assert statuses == [0, 0]
+    model = sc.load_model(tmp_path / "model.toml")
+    stepper = sc.compile_stepper(model.system, model.method, flags=PORTABLE_FLAGS)
+    run = stepper.integrate(model.q, velocity=model.velocity, h=0.1, steps=200)
+    assert np.array_equal(q, run.q[-1])
+    assert np.array_equal(p, run.p[-1])
