@@ -15,7 +15,7 @@ static int actions_by_iteration(propagation *over, long long first, long long en
   for (long long k = first; k < end; k++) {
     const step_data step = step_of(over, k, nothing);
     const double *stored = stored_of(over, k - first);
-    real sums[SUMS];
+    real totals[SUMS];
     for (int i = 0; i < M; i++)
       for (int b = 0; b < B; b++) {
         z[i * B + b] = 0;
@@ -23,8 +23,8 @@ static int actions_by_iteration(propagation *over, long long first, long long en
           z[i * B + b] += UNKNOWN_OF_POINTS[b][n] * stored[(n / LANES * M + i) * LANES + n % LANES];
         z[i * B + b] /= UNKNOWNS_OF_POINTS(step.h);
       }
-    sums_along(&step, z, sums);
-    action[k] = sums[SUMS - 1];
+    sums_along(&step, z, totals);
+    action[k] = totals[SUMS - 1];
   }
   return all_finite(action + first, (int)(end - first));
 }
@@ -65,7 +65,7 @@ int NAME(actions)(long long steps, const real *t, const real *h, const real *q, 
 #endif
     const real *own = parameters + k * stride;
     const step_data step = step_from(t[k], h[k], q + k * M, p + k * M, carry, carry, own, workspace);
-    real dq[M], dp[2 * M] = {0}, sums[SUMS];
+    real dq[M], dp[2 * M] = {0}, totals[SUMS];
     int keep = 0, status = newton_from_line(&step, data, dp, &keep, options ? options : &standard, report);
     report->t = t[k];
     if (status != OK)
@@ -75,8 +75,8 @@ int NAME(actions)(long long steps, const real *t, const real *h, const real *q, 
       q1[k * M + i] = step.q0[i] + dq[i];
       p1[k * M + i] = step.p0[i] + (dp[i] + dp[M + i]);
     }
-    sums_along(&step, data->z, sums);
-    action[k] = sums[SUMS - 1];
+    sums_along(&step, data->z, totals);
+    action[k] = totals[SUMS - 1];
     if (!all_finite(action + k, 1) || !all_finite(q1 + k * M, M) || !all_finite(p1 + k * M, M))
       return NOT_FINITE;
     report->steps++;

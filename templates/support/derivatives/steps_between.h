@@ -83,7 +83,7 @@ int NAME(steps_between)(long long steps, const real *t, const real *h, const rea
   const real carry[M] = {0};
   memset(report, 0, sizeof *report);
   for (long long k = 0; k < steps; k++) {
-    real start_p[M], increment[M], sums[SUMS];
+    real start_p[M], increment[M], totals[SUMS];
     const step_data step = step_from(t[k], h[k], q0 + k * M, start_p, carry, carry, parameters + k * stride, workspace);
     linearised_step at = linearised_in(&step, workspace);
     int status = newton_between(&step, at.data, q1 + k * M, start_p, increment, options ? options : &standard, report);
@@ -94,8 +94,8 @@ int NAME(steps_between)(long long steps, const real *t, const real *h, const rea
       p0[k * M + i] = start_p[i];
       p1[k * M + i] = at.p1[i] = start_p[i] + increment[i];
     }
-    sums_along(&step, at.data->z, sums);
-    action[k] = sums[SUMS - 1];
+    sums_along(&step, at.data->z, totals);
+    action[k] = totals[SUMS - 1];
     at.shape = band_of(SITES, B + 1);
     if (count > 0 && !linearise_between(&at, q1 + k * M))
       return SINGULAR;
