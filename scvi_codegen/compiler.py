@@ -28,7 +28,8 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import SVI, StoermerVerlet, as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import TUNED_FLAGS
-from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.native.compilers import REORDERING_FLAGS
+from scvi_codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS, Interface, Source
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.events.event import EventLike, as_events
@@ -61,6 +62,7 @@ def compile_stepper(
     controller: str | None = None,
     sizes: Mapping[str, int] | None = None,
     tables: Mapping[str, ArrayLike] | None = None,
+    precision: str = "double",
 ) -> Stepper:
     """Derive, generate, compile and load the integrator of ``system`` by ``method``.
 
@@ -91,11 +93,15 @@ def compile_stepper(
             or have a fixed-point iteration over stage positions (SVI, SC, Runge-Kutta); others, and systems without
             such loops, are compiled with the sizes of each call, once.
         tables: with ``sizes``, index tables of shape (rows, columns) by name.
+        precision: ``"double"``, or ``"double-double"`` for states and results of 31 digits: fixed steps of separable
+            systems (constant diagonal masses, forces of positions and time) by SVI, spectral collocation, SCVI and
+            Runge-Kutta methods (docs/digits.md).
 
     Raises:
         BuildError: if there is no C compiler.
         MethodError: if the method, the solver or another argument is not available for the system.
     """
+    check_precision(precision, flags)
     if symmetries != ():
         from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES
 
@@ -112,7 +118,11 @@ def compile_stepper(
         if symmetries:
             raise MethodError(f"symmetries= is unavailable for '{system.name}': {SIZES_REQUIRED}")
         chosen, method = method, as_method(method)
-    sources = CachedSources(system, method, solver, prefix, symmetries, time_transformation, controller)
+    if precision == DOUBLE_DOUBLE and (events is not None or not known_sizes):
+        of_arrays = "arrays of run-time sizes: pass sizes={..}"
+        what = of_arrays if events is None else "events=: find them in the results"
+        raise MethodError(f"precision='double-double' is not available with {what}")
+    sources = CachedSources(system, method, solver, prefix, symmetries, time_transformation, controller, precision)
     variants = Variants(make=sources.variant, lacking=lambda name: name == "second_derivatives" and system.damping != 0)
     if not known_sizes:
         source, interface, reason = sources.of_run_time_sizes()
@@ -130,9 +140,24 @@ def compile_stepper(
         further: dict[str, Any] = {"events": as_events(events), "of_sizes": of_sizes, "reason": reason}
         return Stepper(source, interface, variants=variants, flags=flags, **further)
     source, interface = sources.integrator()
+    if precision == DOUBLE_DOUBLE:
+        from scvi_codegen.runtime.trajectory.double_double import DoubleDoubleStepper  # here, because it imports mpmath
+
+        return cast(Stepper, DoubleDoubleStepper(source, interface, flags))
     interface = replace(interface, layout=replace(interface.layout, **drawn))
     cast(MechanicalSystem, system).store_key()
     return Stepper(source, interface, variants=variants, flags=flags, events=as_events(events))
+
+
+def check_precision(precision: str, flags: Sequence[str]) -> None:
+    """Raise :class:`MethodError` for an unknown precision, and for flags that would destroy it."""
+    if precision not in PRECISIONS:
+        raise MethodError(f"unknown precision {precision!r}: use {' or '.join(map(repr, PRECISIONS))}")
+    if precision == DOUBLE_DOUBLE and (worst := [flag for flag in flags if flag in REORDERING_FLAGS]):
+        raise MethodError(
+            f"the compiler flag {worst[0]!r} reorders sums, which destroys precision='double-double': omit it "
+            "(-fno-math-errno, -fno-trapping-math and -ffp-contract=fast are harmless)"
+        )
 
 
 def _at_sizes(
@@ -160,17 +185,21 @@ class CachedSources:
         symmetries: Sequence[Symmetry],
         g: str | Expr | None,
         controller: str | None = None,
+        precision: str = "double",
     ) -> None:
+        self.precision = precision
         self.system, self.method, self.solver, self.prefix = system, method, solver, prefix
         self.symmetries, self.g, self.controller = symmetries, g, controller
-        self.key = (*system.key(), *method.key(), key_of((solver, prefix, tuple(symmetries), g, controller)))
+        choices = (solver, prefix, tuple(symmetries), g, controller, *([precision] if precision != "double" else []))
+        self.key = (*system.key(), *method.key(), key_of(choices))
 
     @cached_property
     def derived(self) -> Sources:
         """The sources that are not in the cache."""
         from scvi_codegen.pipeline import Sources
 
-        return Sources(self.system, self.method, self.solver, self.prefix, self.symmetries, self.g, self.controller)
+        chosen = self.solver, self.prefix, self.symmetries, self.g, self.controller, self.precision
+        return Sources(self.system, self.method, *chosen)
 
     def integrator(self) -> tuple[Source, Interface]:
         """Return the C source and its interface."""

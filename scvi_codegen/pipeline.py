@@ -29,10 +29,11 @@ from sympy import Expr
 from scvi_codegen.controllers import controller_named
 from scvi_codegen.errors import MethodError, SizesRequiredError
 from scvi_codegen.indices import SIZES_REQUIRED
+from scvi_codegen.ir.derivatives import PointDerivatives
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.arrays import check_solver as check_solver_of_arrays
 from scvi_codegen.lowering.control import control_of, error_growth_of
-from scvi_codegen.lowering.derivatives import derivatives_of
+from scvi_codegen.lowering.derivatives import derivatives_of, point_derivatives_of
 from scvi_codegen.lowering.loops import transforms, with_sums
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.mechanics.arrays.legendre import SiteHamiltonian, site_hamiltonian
@@ -55,11 +56,12 @@ from scvi_codegen.rendering.program_source import (
     Embedded,
     render,
     render_derivatives,
+    render_double_double,
     render_embedded,
     render_ensemble,
     workspace_size,
 )
-from scvi_codegen.rendering.source import ArrayLayout, Interface, Source
+from scvi_codegen.rendering.source import DOUBLE_DOUBLE, ArrayLayout, Interface, Source
 from scvi_codegen.runtime.events.event import EventLike, as_events
 from scvi_codegen.validation import checks_arguments
 
@@ -94,6 +96,13 @@ def program_of(
     parts = roll_terms(system)
     rolled = with_sums(program_part(parts.rest), parts) if parts else None
     return rolled or program_part(system)
+
+
+def lower_unrolled(
+    system: MechanicalSystem, method: Method, *, prefix: str, symmetries: Sequence[Symmetry] = (), **further: Any
+) -> Program:
+    """Return the program without loops over terms, which kernels in double-double arithmetic do not have."""
+    return lower(system, method, prefix=c_identifier(prefix), symmetries=all_symmetries(system, symmetries), **further)
 
 
 def c_identifier(name: str) -> str:
@@ -224,8 +233,9 @@ class Sources:
         symmetries: Sequence[Symmetry] = (),
         g: str | Expr | None = None,
         controller: str | None = None,
+        precision: str = "double",
     ) -> None:
-        self.method, self.solver, self.g = method, solver, g
+        self.method, self.solver, self.g, self.precision = method, solver, g, precision
         self.controller = controller_named(controller, in_tau=g is not None)
         self.prefix = c_identifier(prefix or f"{system.name}_{method.name}")
         self._programs: dict[bool, Program] = {}
@@ -241,7 +251,8 @@ class Sources:
                 self.sites = site_hamiltonian(system)
         else:
             self.system = form = discretised_form(system, method)
-            self._derived = partial(program_of, form, method, prefix=self.prefix, symmetries=symmetries)
+            derive = lower_unrolled if precision == DOUBLE_DOUBLE else program_of
+            self._derived = partial(derive, form, method, prefix=self.prefix, symmetries=symmetries)
 
     def _program_of_arrays(self, **_: bool) -> Program:
         """Return the program of arrays; raise :class:`SizesRequiredError` if there is none for run-time sizes."""
@@ -268,6 +279,8 @@ class Sources:
     @property
     def uses_fallback_library(self) -> bool:
         """Return whether Newton's iteration comes from a separate fallback library."""
+        if self.precision == DOUBLE_DOUBLE:
+            return False
         return self.solver == "auto" and self.program().fixed_point is not None and not self.program().newton
 
     @cached_property
@@ -275,9 +288,10 @@ class Sources:
         """Interface of the generated library."""
         if self.of_arrays:
             return describe_arrays(self.system, self.method, prefix=self.prefix, solver=self.solver, sites=self.sites)
-        return describe(
+        interface = describe(
             self.program(), self.system, self.method, uses_fallback_library=self.uses_fallback_library, g=self.g
         )
+        return replace(interface, precision="" if self.precision == "double" else self.precision)
 
     def integrator(self, *, controlled: bool = True) -> tuple[Source, Interface]:
         """Return the C source and its interface.
@@ -285,11 +299,44 @@ class Sources:
         It has fixed steps and, if ``controlled`` and the method has an error estimate, those of the controller.
         """
         program = self.program()
+        if self.precision == DOUBLE_DOUBLE:
+            return render_double_double(program, self._point_derivatives()), self.interface
         control = control_of(program, self.controller, self.system, self.g)
         if control and controlled and not (self.of_arrays or control.density):
             control = replace(control, growth=error_growth_of(self.system, program))
         fallback: Fallback | None = "external" if self.uses_fallback_library else None
         return render(program, control if controlled else None, fallback=fallback), self.interface
+
+    def _point_derivatives(self) -> PointDerivatives:
+        """Return the derivatives of forces for the correction to two words.
+
+        Raises:
+            MethodError: if the system or the method has no steps in double-double arithmetic.
+        """
+        fixed_point = self.program().fixed_point
+        reason = ""
+        if self.of_arrays:
+            reason = "arrays have sizes known at run time: pass sizes={..}"
+        elif self.g is not None or self.system.clock:
+            reason = "time is transformed: use fixed steps h in physical time"
+        elif self.system.constraints:
+            reason = "it has constraints: use independent coordinates"
+        elif self.system.inputs:
+            reason = "it has tabulated inputs: write them as functions of t"
+        elif self.solver not in ("auto", "fixed-point"):
+            reason = f"solver={self.solver!r} is not available: omit it"
+        elif fixed_point is None or fixed_point.name != "separable":
+            reason = (
+                "it requires constant diagonal masses, forces of positions and time, and SVI, spectral collocation, "
+                "SCVI or a Runge-Kutta method with at most 32 points"
+            )
+        derivatives = None if reason or fixed_point is None else point_derivatives_of(self.system, fixed_point)
+        if derivatives is None:
+            reason = reason or "its forces have too many derivatives: use precision='double'"
+            raise MethodError(
+                f"precision='double-double' is not available for '{self.system.name}' by {self.method.name}: {reason}"
+            )
+        return derivatives
 
     def fallback(self) -> Source | None:
         """Return the source with Newton's iteration if the integrator itself contains none."""
@@ -331,7 +378,7 @@ class Sources:
             "second_derivatives": lambda: self.tangent(second=True),
             "changes": lambda: self.changes(int(count)),
         }
-        return None if self.of_arrays else variants[kind]()
+        return None if self.of_arrays or self.precision == DOUBLE_DOUBLE else variants[kind]()
 
 
 @checks_arguments(system=SYSTEM, symmetries=SYMMETRIES)

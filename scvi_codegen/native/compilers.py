@@ -38,6 +38,9 @@ ALLOWED = re.compile(
     re.ASCII,
 )
 
+REORDERING_FLAGS = frozenset(("-ffast-math", "-Ofast", "-fassociative-math", "-funsafe-math-optimizations"))
+"""Flags that permit the compiler to reorder sums."""
+
 
 def check_flags(flags: Sequence[str], error: type[ValueError] = ValueError) -> None:
     """Raise an error for a flag that is not allowed."""

@@ -9,6 +9,7 @@ from jinja2.runtime import Context
 
 from scvi_codegen.files.cache import template_folder
 from scvi_codegen.ir.kernel import Kernel, Number
+from scvi_codegen.rendering.kernels.double_double import pair_kernel_text
 from scvi_codegen.rendering.kernels.functions import kernel_text, lane_kernel_text, lane_mass_text, power_of_h
 from scvi_codegen.rendering.kernels.printer import print_number
 from scvi_codegen.rendering.text import table, wrapped, wrapped_comment, wrapped_comment_lines, wrapped_prototypes
@@ -74,6 +75,7 @@ FILTERS: dict[str, Callable[..., object]] = {
     "kernel_text": _kernel_text,
     "lane_kernel_text": _lane_kernel_text,
     "lane_mass_text": _lane_mass_text,
+    "pair_kernel_text": pair_kernel_text,
     "rests": _rests,
     "transposed": lambda rows: tuple(zip(*rows, strict=True)),
     "wrapped": wrapped,

@@ -15,11 +15,12 @@ from dataclasses import dataclass, replace
 from itertools import accumulate, chain
 from typing import Any, Literal, TypeAlias, cast, get_args
 
-from scvi_codegen.ir.derivatives import Derivatives
+from scvi_codegen.ir.derivatives import Derivatives, PointDerivatives
 from scvi_codegen.ir.equations import Control, StoredValues
 from scvi_codegen.ir.kernel import Kernel, is_divided
 from scvi_codegen.ir.program import Program
 from scvi_codegen.rendering.environment import support_text, template_environment
+from scvi_codegen.rendering.kernels.double_double import arithmetic_headers, uses_functions
 from scvi_codegen.rendering.kernels.functions import unrolled_equations
 from scvi_codegen.rendering.kernels.loops import loop_context
 from scvi_codegen.rendering.kernels.printer import DOUBLE, SINGLE, Target, constants, inverse_roots
@@ -45,6 +46,7 @@ DECLARATIONS = {
     "stepper": "parts/declarations.h.jinja",
     "ensemble": "parts/ensemble_declarations.h.jinja",
     "events": "parts/events_declarations.h.jinja",
+    "double_double": "parts/double_double_declarations.h.jinja",
 }
 """Inner part of a header by the name of its template."""
 
@@ -179,6 +181,38 @@ def render_derivatives(derivatives: Derivatives) -> Source:
     program = derivatives.program
     context = _context(program, DOUBLE, None, kernels=(*program.kernels, *derivatives.kernels), beside=derivatives)
     return _render(program.prefix, context | {"derivatives": derivatives, "unrolled_equations": None})
+
+
+def render_double_double(program: Program, derivatives: PointDerivatives) -> Source:
+    """Return the source of a separable program in double-double arithmetic.
+
+    Args:
+        program: with a fixed-point iteration of separable systems, and without Newton's method.
+        derivatives: of the forces at the points.
+
+    Raises:
+        MethodError: for a function that has no double-double form.
+    """
+    fixed_point = program.fixed_point
+    assert fixed_point is not None  # by the caller
+    mass = fixed_point.constant_mass
+    assert mass is not None  # of separable systems
+    tables = [replace(each, in_two_parts=not each.is_matrix or each.in_two_parts) for each in fixed_point.own_tables]
+    program = replace(program, fixed_point=replace(fixed_point, own_tables=tuple(tables)))
+    quantities, lanes = program.quantities, (derivatives.partials, derivatives.products[0])
+    states = (quantities.energy, *((quantities.momentum_kernel,) if quantities.momentum_kernel else ()))
+    numbers, vectors = (mass, *states), fixed_point.kernels
+    context = {
+        **_context(program, DOUBLE, None),
+        **_lane_context(program, lanes, changes=False),
+        "derivatives": derivatives,
+        "kernels_of_numbers": numbers,
+        "kernels_of_vectors": vectors,
+        "has_functions": uses_functions((*numbers, *vectors)),
+        "own_headers": arithmetic_headers(),
+        "hot": "static",
+    }
+    return _render(program.prefix, context, "double_double")
 
 
 def render_embedded(program: Program, precision: Embedded, control: Control | None = None) -> Source:

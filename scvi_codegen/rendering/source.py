@@ -129,6 +129,9 @@ class Source:
         return cls.from_record(json.loads(text))
 
 
+DOUBLE_DOUBLE = "double-double"
+"""Precision of states of two words, 31 digits."""
+PRECISIONS = ("double", DOUBLE_DOUBLE)
 COMPONENTS = {"rotation": 4, "direction": 3, "spin": 2}
 """Number of homogeneous coordinates by kind."""
 NUMBER = re.compile(r"\d+(\.\d*)?", re.ASCII)
@@ -288,6 +291,7 @@ class Interface:
             and half of which take the place of momenta; else none.
         lengths: cutoffs, skins and periods of lists of neighbours, ``("near", "cutoff", "5*s/2")``, which every run
             checks.
+        precision: :data:`DOUBLE_DOUBLE`, or "" for double precision.
     """
 
     prefix: str
@@ -322,6 +326,12 @@ class Interface:
     layout: ArrayLayout = ArrayLayout()
     variables: tuple[str, ...] = ()
     lengths: tuple[tuple[str, ...], ...] = ()
+    precision: str = ""
+
+    @property
+    def words(self) -> int:
+        """Number of doubles of each number of a state: 2 in double-double arithmetic."""
+        return 2 if self.precision == DOUBLE_DOUBLE else 1
 
     @property
     def dimension(self) -> int:

@@ -57,7 +57,7 @@ OWNERS = {
     "jinja2": "display rendering",
     "markupsafe": "display reproduce",
     "matplotlib": "pictures reproduce",
-    "mpmath": "display tables",
+    "mpmath": "display runtime tables",
     "pandas": "files runtime",
     "platformdirs": "files",
     "rebound": "frameworks",

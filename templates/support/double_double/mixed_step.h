@@ -1,0 +1,188 @@
+#include "../iteration/iteration_solver.h"
+#include "../iteration/separable_iteration.h"
+
+/* Step in double-double arithmetic by mixed precision. separable_iteration.h solves the stage equations in double, to
+ * 1e-16; their residual in pairs, r = q0 + h c v0 + h^2 A F(X) / m - X, has 16 digits as one word, so that the
+ * correction D = r + h^2 A F_q(X) D / m, solved in double by fixed-point iteration, makes X accurate to 32 digits. Two
+ * evaluations of the forces in pairs are enough: those of the residual and those at X + D. Requires: the kernels
+ * force_lanes_pairs, mass_pairs, point_derivatives and derivative_product. */
+
+#define CORRECTED 1e-34 /* last change of D, relative to the state */
+#define MOST_CORRECTIONS 200
+
+/* Arguments of a step, and its points. */
+typedef struct {
+  dd t, square, inverse_mass[M], drift[M]; /* h^2; h v */
+  double h, scale[M], inverse_size[M]; /* scale: h^2 / m */
+  const double *parameters;
+  ddl X[GROUPS][M], F[GROUPS][M], base[GROUPS][M]; /* base: points without forces */
+  lanes rest[GROUPS][M], vector[GROUPS][M + POINT_DERIVATIVES]; /* vector: D, then the derivatives */
+} pair_step;
+
+static inline double lane_of(const lanes *x, int j)
+{
+  return ((const lane_view *)x)->lane[j];
+}
+
+/* sum_j table_gj x_j of a coordinate: Dot2 (Ogita, Rump & Oishi 2005) with the low words of both factors. */
+static inline ddl sum_of_pairs(const lanes *table, const lanes *low, int g, const ddl (*x)[M], int i)
+{
+  ddl sum[2] = {{{0.0}, {0.0}}, {{0.0}, {0.0}}};
+#pragma GCC unroll 16
+  for (int j = 0; j < POINTS; j++) {
+    const lanes a = table[j * GROUPS + g], b = low[j * GROUPS + g];
+    const ddl *at = &x[j / LANES][i];
+    const lanes high = lanes_of(lane_of(&at->high, j % LANES)), rest = lanes_of(lane_of(&at->low, j % LANES));
+    const ddl product = ddl_two_product(a, high), next = ddl_two_sum(sum[j % 2].high, product.high);
+    sum[j % 2].high = next.high;
+    sum[j % 2].low += multiply_add(a, rest, multiply_add(b, high, product.low + next.low));
+  }
+  return ddl_add(ddl_fast_two_sum(sum[0].high, sum[0].low), ddl_fast_two_sum(sum[1].high, sum[1].low));
+}
+
+/* Sum over all points, in an order that does not depend on the vector length. */
+static inline dd total_of_pairs(ddl *x)
+{
+  enum { WHOLE = (POINTS & -POINTS) / LANES };
+  for (int n = WHOLE; n < GROUPS; n++)
+    x[n % WHOLE] = ddl_add(x[n % WHOLE], x[n]);
+  for (int half = WHOLE / 2; half > 0; half /= 2)
+    for (int n = 0; n < half; n++)
+      x[n] = ddl_add(x[n], x[n + half]);
+  ddl sum = x[0];
+  for (int half = LANES / 2; half > 0; half /= 2) {
+    lane_view high = {sum.high}, low = {sum.low};
+    for (int j = 0; j < half; j++) {
+      high.lane[j] = high.lane[j + half];
+      low.lane[j] = low.lane[j + half];
+    }
+    const ddl other = {high.all, low.all};
+    sum = ddl_add(sum, other);
+  }
+  return dd_of(lane_of(&sum.high, 0), lane_of(&sum.low, 0));
+}
+
+static inline dd weighted_total(const lanes *weights, const lanes *low, const ddl (*x)[M], int i)
+{
+  ddl part[GROUPS];
+  for (int n = 0; n < GROUPS; n++) {
+    const ddl weight = {weights[n], low[n]};
+    part[n] = ddl_multiply(weight, x[n][i]);
+  }
+  return total_of_pairs(part);
+}
+
+static inline void forces_of_pairs(pair_step *w)
+{
+  for (int n = 0; n < GROUPS; n++) {
+    const ddl part = {ABSCISSA[n], ABSCISSA_LOW[n]};
+    force_lanes_pairs(w->X[n], ddl_add(ddl_of(w->t), ddl_scale(part, lanes_of(w->h))), w->parameters, w->F[n]);
+  }
+}
+
+static void begin_pairs(pair_step *w, const step_data *step, double t_low, const double *points)
+{
+  const double h = step->h;
+  dd masses[M];
+  lanes X[GROUPS][M];
+  w->t = dd_of(step->t, t_low);
+  w->h = h;
+  w->square = dd_two_product(h, h);
+  w->parameters = step->parameters;
+  memcpy(X, points, sizeof X);
+  mass_pairs(NULL, w->t, step->parameters, masses);
+  for (int i = 0; i < M; i++) {
+    const dd q = dd_of(step->q0[i], step->carry_q[i]), p = dd_of(step->p0[i], step->carry_p[i]);
+    w->inverse_mass[i] = dd_divide(dd_of(1.0, 0.0), masses[i]);
+    w->drift[i] = dd_scale(dd_divide(p, masses[i]), h);
+    w->scale[i] = w->square.high * w->inverse_mass[i].high;
+    w->inverse_size[i] = fabs(q.high) + fabs(w->drift[i].high);
+    for (int n = 0; n < GROUPS; n++) {
+      const ddl node = {DRIFT[n], DRIFT_LOW[n]};
+      w->base[n][i] = ddl_add(ddl_of(q), ddl_multiply(node, ddl_of(w->drift[i])));
+      w->X[n][i] = ddl_word(X[n][i]);
+    }
+  }
+  const double largest = largest_number(w->inverse_size);
+  for (int i = 0; i < M; i++)
+    w->inverse_size[i] = 1.0 / (w->inverse_size[i] + 1e-3 * largest + DBL_MIN);
+}
+
+/* Residual of the stage equations, as one word. */
+static inline void find_residual(pair_step *w)
+{
+  for (int i = 0; i < M; i++)
+    for (int n = 0; n < GROUPS; n++) {
+      const dd unit = dd_multiply(w->square, w->inverse_mass[i]);
+      const ddl sum = sum_of_pairs(PRODUCT, PRODUCT_LOW, n, w->F, i);
+      const ddl point = ddl_add(w->base[n][i], ddl_multiply(sum, ddl_of(unit)));
+      w->rest[n][i] = ddl_subtract(point, w->X[n][i]).high;
+    }
+}
+
+/* Solves for the correction D, which starts as the residual. */
+static inline int find_correction(pair_step *w)
+{
+  double last = INFINITY;
+  for (int n = 0; n < GROUPS; n++) {
+    lanes X[M];
+    for (int i = 0; i < M; i++) {
+      X[i] = w->X[n][i].high;
+      w->vector[n][i] = w->rest[n][i];
+    }
+    point_derivatives(X, w->t.high + w->h * ABSCISSA[n], w->parameters, w->vector[n] + M);
+  }
+  for (int k = 0; k < MOST_CORRECTIONS; k++) {
+    lanes f[GROUPS][M], moved[GROUPS] = {{0.0}};
+    for (int n = 0; n < GROUPS; n++)
+      derivative_product(w->vector[n], lanes_of(w->t.high), w->parameters, f[n]);
+    for (int i = 0; i < M; i++)
+      for (int n = 0; n < GROUPS; n++) {
+        const lanes next = w->rest[n][i] + w->scale[i] * apply(PRODUCT, n, f, i);
+        const lanes change = (next - w->vector[n][i]) * (1e15 * w->inverse_size[i]); /* squares are normal */
+        moved[n] = moved[n] + change * change;
+        w->vector[n][i] = next;
+      }
+    const double change = sqrt(points_total(moved)) / 1e15, rate = change / last;
+    if (!is_finite(change))
+      return NOT_FINITE;
+    if (change <= CORRECTED || (k > 0 && rate < 0.5 && change * rate <= CORRECTED))
+      return OK;
+    last = change;
+  }
+  return NOT_CONVERGED;
+}
+
+/* Computes the state (q1, p1) after a step, high words, then low words. On failure it is undefined. */
+HOT int solve_in_pairs(const step_data *step, double t_low, const solver_data *data, double *memory, long long *guess,
+    const solver_options *options, solver_report *report, double *workspace, double *q1, double *p1)
+{
+  double dq[2 * M], dp[2 * M];
+  lanes points[GROUPS * M];
+  step_data in_double = *step;
+  pair_step w;
+  int status;
+  in_double.points = (double *)points;
+  status = solve(&in_double, data, memory, guess, dq, dp, options, report, workspace);
+  if (status != OK)
+    return status;
+  begin_pairs(&w, step, t_low, (const double *)points);
+  forces_of_pairs(&w);
+  find_residual(&w);
+  status = find_correction(&w);
+  if (status != OK)
+    return status;
+  for (int n = 0; n < GROUPS; n++)
+    for (int i = 0; i < M; i++)
+      w.X[n][i] = ddl_two_sum(w.X[n][i].high, w.vector[n][i]);
+  forces_of_pairs(&w);
+  for (int i = 0; i < M; i++) {
+    const dd unit = dd_multiply(w.square, w.inverse_mass[i]);
+    const dd end = dd_multiply(weighted_total(POINT_END_POSITION, POINT_END_POSITION_LOW, w.F, i), unit);
+    const dd kick = dd_scale(weighted_total(POINT_END_MOMENTUM, POINT_END_MOMENTUM_LOW, w.F, i), w.h);
+    const dd q = dd_add(dd_of(step->q0[i], step->carry_q[i]), dd_add(w.drift[i], end));
+    const dd p = dd_add(dd_of(step->p0[i], step->carry_p[i]), kick);
+    q1[i] = q.high, q1[M + i] = q.low, p1[i] = p.high, p1[M + i] = p.low;
+  }
+  return all_finite(q1, 2 * M) && all_finite(p1, 2 * M) ? OK : NOT_FINITE;
+}

@@ -1,0 +1,124 @@
+/* Double-double arithmetic of numbers or of vectors of them (Dekker 1971; Joldes, Muller & Popescu 2017): a PAIR is the
+ * unrounded sum of its high and its low word. This text is included for each NUMBER, with the names of its functions
+ * by OF. It needs IEEE arithmetic as written: contraction to FMA is harmless, reassociation is not. */
+typedef struct {
+  NUMBER high, low;
+} PAIR;
+
+static inline PAIR OF(word)(NUMBER x)
+{
+  const PAIR result = {x, BROADCAST(0.0)};
+  return result;
+}
+
+static inline PAIR OF(two_sum)(NUMBER a, NUMBER b)
+{
+  const NUMBER sum = a + b, part = sum - a;
+  const PAIR result = {sum, (a - (sum - part)) + (b - part)};
+  return result;
+}
+
+/* The same for |a| >= |b| or a = 0. */
+static inline PAIR OF(fast_two_sum)(NUMBER a, NUMBER b)
+{
+  const NUMBER sum = a + b;
+  const PAIR result = {sum, b - (sum - a)};
+  return result;
+}
+
+static inline PAIR OF(two_product)(NUMBER a, NUMBER b)
+{
+  const NUMBER product = a * b;
+  const PAIR result = {product, FMA(a, b, -product)};
+  return result;
+}
+
+/* Relative error 3 u^2 (u = 2^-53), also if the high words cancel. */
+static inline PAIR OF(add)(PAIR a, PAIR b)
+{
+  const PAIR high = OF(two_sum)(a.high, b.high), low = OF(two_sum)(a.low, b.low);
+  const PAIR sum = OF(fast_two_sum)(high.high, high.low + low.high);
+  return OF(fast_two_sum)(sum.high, sum.low + low.low);
+}
+
+/* The same for a and b of equal sign, or |b| << |a|, with half the operations. */
+static inline PAIR OF(plus)(PAIR a, PAIR b)
+{
+  const PAIR sum = OF(two_sum)(a.high, b.high);
+  return OF(fast_two_sum)(sum.high, sum.low + (a.low + b.low));
+}
+
+static inline PAIR OF(negative)(PAIR a)
+{
+  const PAIR result = {-a.high, -a.low};
+  return result;
+}
+
+static inline PAIR OF(subtract)(PAIR a, PAIR b)
+{
+  return OF(add)(a, OF(negative)(b));
+}
+
+static inline PAIR OF(multiply)(PAIR a, PAIR b)
+{
+  const PAIR product = OF(two_product)(a.high, b.high);
+  return OF(fast_two_sum)(product.high, product.low + FMA(a.high, b.low, a.low * b.high));
+}
+
+/* Product with one word. */
+static inline PAIR OF(scale)(PAIR a, NUMBER b)
+{
+  const PAIR product = OF(two_product)(a.high, b);
+  return OF(fast_two_sum)(product.high, FMA(a.low, b, product.low));
+}
+
+static inline PAIR OF(square)(PAIR a)
+{
+  const PAIR product = OF(two_product)(a.high, a.high);
+  return OF(fast_two_sum)(product.high, FMA(a.high + a.high, a.low, product.low));
+}
+
+/* The quotient of the high words, corrected twice, since one correction leaves its own rounding error, 2^-105. */
+static inline PAIR OF(divide)(PAIR a, PAIR b)
+{
+  const NUMBER first = a.high / b.high;
+  const PAIR rest = OF(subtract)(a, OF(scale)(b, first));
+  const NUMBER second = rest.high / b.high;
+  const NUMBER third = OF(subtract)(rest, OF(scale)(b, second)).high / b.high;
+  const PAIR sum = OF(fast_two_sum)(first, second);
+  return OF(fast_two_sum)(sum.high, sum.low + third);
+}
+
+/* The root of the high word, corrected; 0 for 0, where the correction would be 0/0. */
+static inline PAIR OF(sqrt)(PAIR x)
+{
+  const NUMBER y = OF(root)(x.high);
+  return OF(fast_two_sum)(y, (FMA(-y, y, x.high) + x.low) / (y + y + DBL_MIN));
+}
+
+/* x^(-1/2) from y = x.high^(-1/2): with e = 1 - x y^2 by the series of (1 - e)^(-1/2). */
+static inline PAIR OF(inverse_root_1)(PAIR x)
+{
+  const NUMBER y = 1.0 / OF(root)(x.high);
+  const PAIR square = OF(two_product)(y, y), product = OF(two_product)(x.high, square.high);
+  const NUMBER e = (1.0 - product.high) - (product.low + FMA(x.high, square.low, x.low * square.high));
+  return OF(fast_two_sum)(y, y * (e * (0.5 + 0.375 * e)));
+}
+
+static inline PAIR OF(inverse_root_3)(PAIR x)
+{
+  const PAIR y = OF(inverse_root_1)(x);
+  return OF(multiply)(y, OF(square)(y));
+}
+
+static inline PAIR OF(inverse_root_5)(PAIR x)
+{
+  const PAIR y = OF(inverse_root_1)(x);
+  return OF(multiply)(y, OF(square)(OF(square)(y)));
+}
+
+static inline PAIR OF(inverse_root_7)(PAIR x)
+{
+  const PAIR y = OF(inverse_root_1)(x), square = OF(square)(y);
+  return OF(multiply)(OF(multiply)(y, square), OF(square)(square));
+}

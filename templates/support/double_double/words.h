@@ -1,0 +1,76 @@
+/* Operations on single words for pairs of numbers (pairs.h, functions.h). */
+#if defined(__ASSOCIATIVE_MATH__) || (defined(__clang__) && defined(__FAST_MATH__))
+#error "compile without -fassociative-math (part of -ffast-math and -Ofast): it removes the rounding errors that are kept"
+#endif
+#if FLT_EVAL_METHOD == 2
+#error "compile for SSE2 (-mfpmath=sse -msse2): x87 registers round twice"
+#endif
+
+#define TO_INTEGER 6755399441055744.0 /* 1.5 2^52: adding and subtracting it rounds to a whole number */
+
+static inline double dd_root(double x)
+{
+  return sqrt(x);
+}
+
+static inline double dd_log_of(double x)
+{
+  return log(x);
+}
+
+static inline double dd_asinh_of(double x)
+{
+  return asinh(x);
+}
+
+static inline double dd_atan2_of(double y, double x)
+{
+  return atan2(y, x);
+}
+
+static inline double dd_sign(double x)
+{
+  return copysign(1.0, x);
+}
+
+static inline double dd_is_small(double x)
+{
+  return fabs(x) < 0.25 ? 1.0 : 0.0;
+}
+
+static inline double dd_are_equal(double a, double b)
+{
+  return a == b ? 1.0 : 0.0;
+}
+
+static inline double dd_select(double chosen, double a, double b)
+{
+  return chosen != 0.0 ? a : b;
+}
+
+static inline double dd_limited(double x, double most)
+{
+  return x > most ? most : x < -most ? -most : x;
+}
+
+/* An angle, NaN if reducing it would lose digits. */
+static inline double dd_angle(double x)
+{
+  return fabs(x) <= 1e9 ? x : (double)NAN;
+}
+
+/* Row of a table of a power of two of rows; 0 for NaN, whose conversion would be undefined. */
+static inline int dd_row(double k, int rows)
+{
+  return k == k ? (int)((long long)k & (rows - 1)) : 0;
+}
+
+/* 2^n with n = k / 64, rounded down: 0 below the normal numbers, infinite above. */
+static inline double dd_power_of_2(double k)
+{
+  const long long n = (k == k ? (long long)k : 0) >> 6, biased = n < -1023 ? 0 : n > 1024 ? 2047 : n + 1023;
+  const unsigned long long bits = (unsigned long long)biased << 52;
+  double x;
+  memcpy(&x, &bits, sizeof x);
+  return x;
+}

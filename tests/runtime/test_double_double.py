@@ -1,0 +1,259 @@
+"""Double-double arithmetic: elementary functions, one step and conserved quantities against mpmath, refusals."""
+
+import ctypes
+import subprocess
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpmath import mp
+
+import scvi_codegen as sc
+from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.native.building import TUNED_FLAGS
+from scvi_codegen.native.compilers import REORDERING_FLAGS
+from scvi_codegen.rendering.kernels.double_double import FUNCTIONS, arithmetic_headers
+from scvi_codegen.runtime.trajectory.double_double import DoubleDoubleStepper, two_words
+
+KEPLER = "m*(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2)"
+ROOTS = ("sqrt", "inverse_root_1", "inverse_root_3", "inverse_root_5", "inverse_root_7")
+RANGES = {
+    **dict.fromkeys(ROOTS, (1e-5, 1e5)),
+    **dict.fromkeys(("asinh", "atan", "divide"), (1e-9, 1e9)),
+    **dict.fromkeys(("asin", "acos", "atanh"), (1e-9, 0.999)),
+    **dict.fromkeys(("sin", "cos", "tan"), (1e-9, 1e4)),
+    **dict.fromkeys(("sinh", "cosh", "exp"), (1e-9, 600.0)),
+    "tanh": (1e-9, 40.0),
+    "acosh": (1.0001, 1e9),
+    "atan2": (1e-9, 1e9),
+    "pow": (0.1, 10.0),
+    "log": (1e-250, 1e250),
+}
+"""Magnitudes of random arguments; of both signs where the function is defined there."""
+POSITIVE = (*ROOTS, "acosh", "pow", "log")
+
+
+def compiled_functions(folder: Path) -> ctypes.CDLL:
+    """Return a library of ``number_f`` and ``vector_f`` of arrays of high words, then low words."""
+    support, headers = Path(sc.__file__).parent.parent / "templates" / "support", arithmetic_headers()
+    if not support.is_dir():
+        pytest.skip("needs the templates of a checkout")
+
+    def text(name: str) -> str:
+        return headers.get(f"support/{name}") or (support / name).read_text()
+
+    names = ["core/vectors.h", *(f"double_double/{name}.h" for name in ("words", "number_pairs", "vector_words"))]
+    names += [f"double_double/{name}.h" for name in ("vector_pairs", "conversions", "tables_of_functions")]
+    names += ["double_double/number_functions.h", "double_double/vector_functions.h"]
+    code = "#include <float.h>\n#include <math.h>\n#include <string.h>\n#define POINTS 8\n#define PARAMETERS 1\n"
+    code += "\n".join(line for name in names for line in text(name).split("\n") if '#include "' not in line)
+    for f in RANGES:
+        for kind, pair, step in (("number", "dd", "1"), ("vector", "ddl", "LANES")):
+            second = ", b" if f in ("pow", "atan2", "divide") else ""
+            loads = "".join(
+                f"memcpy(&{x}.high, {x}s + i, sizeof {x}.high); memcpy(&{x}.low, {x}s + n + i, sizeof {x}.low);"
+                for x in "ab"
+            )
+            stores = "memcpy(to + i, &r.high, sizeof r.high); memcpy(to + n + i, &r.low, sizeof r.low);"
+            code += f"\nvoid {kind}_{f}(int n, const double *as, const double *bs, double *to) {{"
+            code += f"for (int i = 0; i < n; i += {step}) {{ {pair} a, b; {loads}"
+            code += f"{pair} r = {pair}_{f}(a{second}); {stores} }} }}"
+    (folder / "functions.c").write_text(code)
+    flags = [*TUNED_FLAGS, "-std=c99", "-shared", "-fPIC"]
+    subprocess.run(["cc", *flags, "functions.c", "-o", "functions.so", "-lm"], cwd=folder, check=True)
+    return ctypes.CDLL(str(folder / "functions.so"))
+
+
+def check_functions(folder: Path, count: int) -> None:
+    library, rng = compiled_functions(folder), np.random.default_rng(7)
+    assert {*RANGES} == {*FUNCTIONS, *ROOTS, "divide"}
+
+    def pairs(low: float, high: float) -> np.ndarray:
+        values = np.exp(rng.uniform(np.log(low), np.log(high), count))
+        return np.concatenate([values, values * rng.uniform(-1.0, 1.0, count) * 2.0**-54])
+
+    for f, (low, high) in RANGES.items():
+        x, y = pairs(low, high), pairs(0.1, 3.0)
+        for each in (x, y) if f not in POSITIVE else (y,):
+            each *= np.tile(rng.choice([-1.0, 1.0], count), 2)
+        for kind in ("number", "vector"):
+            found = np.empty(2 * count)
+            pointers = (each.ctypes.data_as(ctypes.c_void_p) for each in (x, y, found))
+            getattr(library, f"{kind}_{f}")(count, *pointers)
+            with mp.workdps(70):
+                for i in range(count):
+                    a, b, c = (mp.mpf(each[i]) + mp.mpf(each[count + i]) for each in (x, y, found))
+                    if f.startswith("inverse_root"):
+                        exact = a ** (-mp.mpf(int(f[-1])) / 2)
+                    else:
+                        two = {"pow": mp.power, "atan2": mp.atan2, "divide": mp.fdiv}.get(f)
+                        exact = two(a, b) if two else getattr(mp, f)(a)
+                    assert abs(c - exact) <= 1e-30 * abs(exact), (kind, f, a, b)
+
+
+def test_functions(tmp_path: Path) -> None:
+    """Every function is accurate to 1e-30 for random arguments of all magnitudes, numbers and lanes."""
+    check_functions(tmp_path, 160)
+
+
+@pytest.mark.full
+def test_functions_at_many_arguments(tmp_path: Path) -> None:
+    """The same for 1e5 arguments each."""
+    check_functions(tmp_path, 100_000)
+
+
+def system(name: str) -> sc.LagrangianSystem:
+    texts = {
+        "kepler": (["x", "y"], KEPLER, {"m": 1.0, "mu": 1.0}),
+        "driven": (["q"], "q_dot**2/2 + cos(q) + q*sin(t)/3", {}),
+        "quartic": (["q"], "q_dot**2/2 - exp(q)*q**2/10 - tanh(q)/7", {}),
+    }
+    coordinates, text, parameters = texts[name]
+    return sc.LagrangianSystem.from_text(name=name, coordinates=coordinates, lagrangian=text, parameters=parameters)
+
+
+def force(name: str, q: list, t: object) -> list:
+    """Return L_q by formulas written here."""
+    if name == "kepler":
+        inverse = 1 / mp.sqrt(q[0] ** 2 + q[1] ** 2) ** 3
+        return [-inverse * x for x in q]
+    if name == "driven":
+        return [-mp.sin(q[0]) + mp.sin(t) / 3]
+    e = mp.exp(q[0])
+    return [-e * (q[0] ** 2 + 2 * q[0]) / 10 - (1 - mp.tanh(q[0]) ** 2) / 7]
+
+
+def gauss_step(name: str, q: list, v: list, t: object, h: object, stages: int) -> tuple[list, list]:
+    """Return a step of Gauss's collocation method for m = 1 in 60 digits, with Legendre polynomials."""
+    near = map(mp.mpf, np.polynomial.legendre.leggauss(stages)[0].tolist())
+    roots = [mp.findroot(lambda x: mp.legendre(stages, x), (x, x + 1e-9)) for x in near]
+    c, values = [(1 + x) / 2 for x in roots], [[mp.one, x] for x in roots]
+    for x, P in zip(roots, values, strict=True):
+        for n in range(1, stages):
+            P.append(((2 * n + 1) * x * P[n] - n * P[n - 1]) / (n + 1))
+    b = [1 / mp.fsum((2 * k + 1) * P[k] ** 2 for k in range(stages)) for P in values]
+    areas = [
+        [x, *((P[k + 1] - P[k - 1]) / (2 * (2 * k + 1)) for k in range(1, stages))]
+        for x, P in zip(c, values, strict=True)
+    ]
+    terms = [[w * (2 * k + 1) * P[k] for k in range(stages)] for w, P in zip(b, values, strict=True)]
+    a = [[mp.fdot(term, area) for term in terms] for area in areas]
+    F = [force(name, q, t) for _ in c]
+    for _ in range(80):
+        V = [[v[i] + h * mp.fdot(line, [f[i] for f in F]) for i in range(len(q))] for line in a]
+        X = [[q[i] + h * mp.fdot(line, [u[i] for u in V]) for i in range(len(q))] for line in a]
+        F = [force(name, x, t + h * node) for x, node in zip(X, c, strict=True)]
+    V = [[v[i] + h * mp.fdot(line, [f[i] for f in F]) for i in range(len(q))] for line in a]
+    q1 = [q[i] + h * mp.fdot(b, [u[i] for u in V]) for i in range(len(q))]
+    return q1, [v[i] + h * mp.fdot(b, [f[i] for f in F]) for i in range(len(q))]
+
+
+@pytest.mark.parametrize(("name", "stages", "h"), [("kepler", 8, 0.125), ("driven", 6, 0.25), ("quartic", 3, 0.0625)])
+def test_step(name: str, stages: int, h: float) -> None:
+    """One step is accurate to 2e-30, from a state of two words; later ones use the predictor."""
+    stepper = sc.compile_stepper(system(name), f"svi:{stages}", precision="double-double")
+    q, v = (["0.6", "0.1"], ["0.2", "1.3"]) if name == "kepler" else (["0.7"], ["0.3"])
+    run = stepper.integrate(q, velocity=v, h=h, steps=4, t=0.5)
+    with mp.workdps(60):
+        for k in (0, 3):
+            start = [list(run.mp(part)[k]) for part in "qp"]
+            exact = gauss_step(name, *start, mp.mpf(0.5) + k * mp.mpf(h), mp.mpf(h), stages)
+            for part, values in zip("qp", exact, strict=True):
+                worst = max(abs(x - y) for x, y in zip(run.mp(part)[k + 1], values, strict=True))
+                assert worst <= 2e-30 * max(map(abs, values))
+
+
+def test_conserved_quantities() -> None:
+    """Energy and angular momentum of 1000 steps stay within 1e-29, also with parameters of two words."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
+    parameters = {"m": "0.1", "mu": Fraction(1, 10)}
+    with mp.workdps(50):
+        root = mp.sqrt(3)
+    run = stepper.integrate(["0.5", 0], velocity=["0", root], h=0.0625, steps=1000, parameters=parameters)
+    assert run.energy_error() < 1e-29
+    maps = run.mp("momentum_maps")
+    assert max(abs(x - maps[0, 0]) for x in maps[:, 0]) < 1e-29
+    with mp.workdps(40):
+        assert abs(run.mp("energy")[0] - (mp.mpf("0.1") * 3 / 2 - mp.mpf("0.2"))) < 1e-32
+        assert abs(run.mp("p")[0, 1] - root / 10) < 1e-32
+    again = stepper.integrate(run.mp("q")[500], run.mp("p")[500], h=0.0625, steps=500, parameters=parameters)
+    assert max(abs(x - y) for x, y in zip(again.mp("q")[-1], run.mp("q")[-1], strict=True)) < 1e-28
+    double = sc.compile_stepper(system("kepler"), "svi:12").integrate(
+        [0.5, 0.0], velocity=[0.0, float(mp.sqrt(3))], h=0.0625, steps=1000, parameters={"m": 0.1, "mu": 0.1}
+    )
+    assert np.abs(double.q - run.q).max() < 1e-9
+
+
+def test_numbers() -> None:
+    """Floats, text, fractions, mpmath numbers and long doubles become two words; other values are refused by name."""
+    with mp.workdps(50):
+        third = mp.mpf(1) / 3
+        for value in ("1/3", Fraction(1, 3), third):
+            high, low = two_words(value, "q")
+            assert high == 1 / 3
+            assert abs(mp.mpf(high) + mp.mpf(low) - third) < 1e-32
+    assert two_words(0.1, "q") == (0.1, 0.0)
+    assert two_words(10**17 + 1, "q") == (1e17, 1.0)
+    long = np.longdouble(1) / 3
+    high, low = two_words(long, "q")
+    assert np.longdouble(high) + np.longdouble(low) == long
+    for wrong in ("x", None, True, 1j, [1.0], "1/0"):
+        with pytest.raises(StateError, match="q must be a real number"):
+            two_words(wrong, "q")
+    for wrong in (float("inf"), "nan", "1e999999999", mp.inf):
+        with pytest.raises(StateError, match=r"q is .*: it must be finite"):
+            two_words(wrong, "q")
+
+
+def test_refusals() -> None:
+    """What double-double arithmetic does not have is refused with a remedy."""
+    kepler = system("kepler")
+    for flag in REORDERING_FLAGS:
+        with pytest.raises(MethodError, match="reorders sums"):
+            sc.compile_stepper(kepler, "svi:4", precision="double-double", flags=("-O2", flag))
+    with pytest.raises(MethodError, match="unknown precision 'quad'"):
+        sc.compile_stepper(kepler, "svi:4", precision="quad")
+    refused = {"solver": "newton", "time_transformation": "distance", "events": "x"}
+    for name, value in refused.items():
+        with pytest.raises(MethodError, match="precision='double-double' is not available"):
+            sc.compile_stepper(kepler, "svi:4", precision="double-double", **{name: value})
+    with pytest.raises(MethodError, match="constant diagonal masses"):
+        sc.compile_stepper(kepler, "stoermer-verlet", precision="double-double")
+    friction = sc.LagrangianSystem.from_text(
+        name="friction", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2", forces={"q": "-q_dot"}
+    )
+    with pytest.raises(MethodError, match="constant diagonal masses"):
+        sc.compile_stepper(friction, "svi:4", precision="double-double")
+    stepper = sc.compile_stepper(kepler, "svi:4", precision="double-double")
+    assert isinstance(stepper, DoubleDoubleStepper)
+    assert not stepper.supports("adaptive")
+    assert stepper.supports("momentum_maps")
+    start = {"velocity": [0.0, 1.0], "h": 0.1}
+    with pytest.raises(MethodError, match="adaptive steps are not available"):
+        stepper.integrate([1.0, 0.0], velocity=[0.0, 1.0], t_end=1.0)
+    with pytest.raises(MethodError, match="t_eval is not available"):
+        stepper.integrate([1.0, 0.0], **start, steps=3, t_eval=[0.1])
+    with pytest.raises(StateError, match=r"q must have 2 values \(x, y\), not 1"):
+        stepper.integrate([1.0], **start, steps=3)
+    with pytest.raises(StateError, match="not a multiple of h"):
+        stepper.integrate([1.0, 0.0], **start, t_end=0.25)
+    with pytest.raises(StateError, match="no 'mass' in parameters"):
+        stepper.integrate([1.0, 0.0], **start, steps=3, parameters={"mass": 1.0})
+    with pytest.raises(MethodError, match="integrate_ensemble is not available"):
+        _ = stepper.integrate_ensemble
+    with pytest.raises(StateError, match="no quantity 'z'"):
+        stepper.integrate([1.0, 0.0], **start, steps=1).mp("z")
+
+
+def test_associative_math_is_an_error(tmp_path: Path) -> None:
+    """The C itself refuses to be compiled with reordered sums."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:4", precision="double-double")
+    source = stepper.source.amalgamated()
+    (tmp_path / f"{source.prefix}.h").write_text(source.header)
+    (tmp_path / "step.c").write_text(source.code)
+    for flag, wanted in (("-ffast-math", "-fassociative-math"), ("-O1", "")):
+        command = ["cc", "-std=c99", flag, "-c", "step.c", "-o", "step.o"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert (done.returncode != 0) == bool(wanted)
+        assert wanted in done.stderr
