@@ -92,6 +92,7 @@ def check_functions(folder: Path, count: int) -> None:
                     assert abs(c - exact) <= 1e-30 * abs(exact), (kind, f, a, b)
 
 
+@pytest.mark.second
 def test_functions(tmp_path: Path) -> None:
     """Every function is accurate to 1e-30 for random arguments of all magnitudes, numbers and lanes."""
     check_functions(tmp_path, 160)
