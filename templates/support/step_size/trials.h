@@ -219,7 +219,8 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
  * own; a failed one left that of the trial before. */
 static inline int down_from_stored(const trial *now, int solved, int down)
 {
-  const int levels = solved ? down : now->inside > 0 ? now->inside + down : 0;
+  const int levels = solved ? down : now->inside > 0 ? now->inside + down
+                                                     : 0;
   return levels <= LEVELS_INSIDE ? levels : 0;
 }
 
@@ -338,7 +339,8 @@ static inline int limit_by_iterations(run_memory *run, long long iterations)
     run->suspended = SUSPENDED;
   } else {
     run->many = iterations > TOO_MANY_ITERATIONS ? iterations : 0;
-    most = run->many > 0 ? -1 : iterations > MANY_ITERATIONS ? 0 : most;
+    most = run->many > 0 ? -1 : iterations > MANY_ITERATIONS ? 0
+                                                             : most;
   }
   return most;
 }
