@@ -186,6 +186,13 @@ def test_conserved_quantities() -> None:
     assert np.abs(double.q - run.q).max() < 1e-9
 
 
+def test_large_steps() -> None:
+    """Corrections whose last changes are rounding errors are accepted, near pericentre with 16 steps a period."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:24", precision="double-double")
+    run = stepper.integrate([0.5, 0.0], velocity=[0.0, 3.0**0.5], h=0.392699092626572, steps=12_000, save_every=100)
+    assert run.energy_error() < 3e-29
+
+
 def test_numbers() -> None:
     """Floats, text, fractions, mpmath numbers and long doubles become two words; other values are refused by name."""
     with mp.workdps(50):
