@@ -20,6 +20,7 @@ extensions = [
     "sphinx.ext.intersphinx",
     "mathml",
     "motions",
+    "notebooks",
     "public_names",
     "search_words",
 ]
