@@ -24,6 +24,8 @@ from scvi_codegen.rendering.text import preprocessed
 FOLDER = template_folder()
 HEADERS = sorted(str(path.relative_to(FOLDER)) for path in FOLDER.glob("support/*/*.h"))
 ELSEWHERE = {
+    "support/double_double/functions.h": "tests/runtime/test_double_double.py",
+    "support/double_double/pairs.h": "tests/runtime/test_double_double.py",
     "support/frameworks/fmu.h": "tests/models/test_fmu.py",
     "support/frameworks/fmu_unsupported.h": "tests/models/test_fmu.py",
     "support/frameworks/xla_flow.h": "tests/rendering/test_flow_text.py",
@@ -48,7 +50,7 @@ CELLS = (
 )
 GENERATED = (
     r"core/|newton/stages|newton/band|arrays/(?:arrays|lattice_transform|circulant|convolutions)|derivatives/linear"
-    r"|mechanics/damping"
+    r"|mechanics/damping|double_double/(?!mixed_step|pair_)"
 )
 """Headers with types that the generated part uses."""
 CHOSEN = (
@@ -87,6 +89,8 @@ def sources() -> tuple[Source, ...]:
     made.append(Sources(drift, SVI(1)).variant("derivatives"))
     made.append(with_casadi_flow(kepler.variant("second_derivatives"), 10, 5, second=True))
     made.append(with_flow_of_rows(kepler.variant("derivatives")))
+    pendulum = problem("planar-pendulum").system
+    made.append(Sources(pendulum, SVI(2), precision="double-double").integrator()[0])
     return (*made, *oscillator.sources)
 
 

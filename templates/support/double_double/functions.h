@@ -74,7 +74,7 @@ static inline PAIR OF(exp_and_rest)(PAIR x, PAIR *less_1)
   const PAIR T = {PICK(k, POWERS, 0) * scale, PICK(k, POWERS, 1) * scale}, small = OF(multiply)(T, e);
   const PAIR far = OF(add)(T, OF(word)(BROADCAST(-1.0)));
   const PAIR T_1 = {OF(select)(chosen, PICK(near, POWERS_LESS_1, 0), far.high),
-    OF(select)(chosen, PICK(near, POWERS_LESS_1, 1), far.low)};
+      OF(select)(chosen, PICK(near, POWERS_LESS_1, 1), far.low)};
   *less_1 = OF(add)(T_1, small);
   return OF(add)(T, small);
 }

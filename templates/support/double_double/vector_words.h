@@ -2,14 +2,14 @@
 #include "words.h"
 
 /* Operations on single words, lane by lane. */
-#define LANE_OPERATION(f)                 \
-  static inline lanes ddl_##f(lanes x)    \
-  {                                       \
-    lane_view view = {x};                 \
-    for (int j = 0; j < LANES; j++)       \
+#define LANE_OPERATION(f)                  \
+  static inline lanes ddl_##f(lanes x)     \
+  {                                        \
+    lane_view view = {x};                  \
+    for (int j = 0; j < LANES; j++)        \
       view.lane[j] = dd_##f(view.lane[j]); \
-    return view.all;                      \
-  }                                       \
+    return view.all;                       \
+  }                                        \
   static inline lanes ddl_##f(lanes x)
 
 LANE_OPERATION(root);
@@ -20,14 +20,14 @@ LANE_OPERATION(is_small);
 LANE_OPERATION(angle);
 LANE_OPERATION(power_of_2);
 
-#define LANE_OPERATION_OF_TWO(f)                           \
-  static inline lanes ddl_##f(lanes x, lanes y)            \
-  {                                                        \
-    lane_view view = {x}, other = {y};                     \
-    for (int j = 0; j < LANES; j++)                        \
-      view.lane[j] = dd_##f(view.lane[j], other.lane[j]);  \
-    return view.all;                                       \
-  }                                                        \
+#define LANE_OPERATION_OF_TWO(f)                          \
+  static inline lanes ddl_##f(lanes x, lanes y)           \
+  {                                                       \
+    lane_view view = {x}, other = {y};                    \
+    for (int j = 0; j < LANES; j++)                       \
+      view.lane[j] = dd_##f(view.lane[j], other.lane[j]); \
+    return view.all;                                      \
+  }                                                       \
   static inline lanes ddl_##f(lanes x, lanes y)
 
 LANE_OPERATION_OF_TWO(atan2_of);

@@ -1,6 +1,6 @@
 /* Operations on single words for pairs of numbers (pairs.h, functions.h). */
 #if defined(__ASSOCIATIVE_MATH__) || (defined(__clang__) && defined(__FAST_MATH__))
-#error "compile without -fassociative-math (part of -ffast-math and -Ofast): it removes the rounding errors that are kept"
+#error "compile without -fassociative-math (part of -ffast-math and -Ofast), which removes rounding errors"
 #endif
 #if FLT_EVAL_METHOD == 2
 #error "compile for SSE2 (-mfpmath=sse -msse2): x87 registers round twice"
@@ -50,7 +50,8 @@ static inline double dd_select(double chosen, double a, double b)
 
 static inline double dd_limited(double x, double most)
 {
-  return x > most ? most : x < -most ? -most : x;
+  return x > most ? most : x < -most ? -most
+                                     : x;
 }
 
 /* An angle, NaN if reducing it would lose digits. */
@@ -68,7 +69,8 @@ static inline int dd_row(double k, int rows)
 /* 2^n with n = k / 64, rounded down: 0 below the normal numbers, infinite above. */
 static inline double dd_power_of_2(double k)
 {
-  const long long n = (k == k ? (long long)k : 0) >> 6, biased = n < -1023 ? 0 : n > 1024 ? 2047 : n + 1023;
+  const long long n = (k == k ? (long long)k : 0) >> 6, biased = n < -1023 ? 0 : n > 1024 ? 2047
+                                                                                          : n + 1023;
   const unsigned long long bits = (unsigned long long)biased << 52;
   double x;
   memcpy(&x, &bits, sizeof x);
