@@ -50,7 +50,8 @@ LEVELS = """
 typedef double real;
 typedef struct { int guess; long long change, change_before; } run_memory;
 struct predictor_tables_of { const real *alone, *last, *before; };
-static const real PREDICTOR_INSIDE[2][1][1] = {{{0}}}, PREDICTOR_ALONE[5][1] = {{0}}, PREDICTOR_LAST[5][5][1] = {{{0}}}, PREDICTOR_BEFORE[5][5][1] = {{{0}}};
+static const real PREDICTOR_INSIDE[2][1][1] = {{{0}}};
+static const real PREDICTOR_ALONE[5][1] = {{0}}, PREDICTOR_LAST[5][5][1] = {{{0}}}, PREDICTOR_BEFORE[5][5][1] = {{{0}}};
 PREDICTOR
 int main(void)
 {
