@@ -1,8 +1,7 @@
 """Directive ``motion``: a page that moves, embedded in a page of the site.
 
 The option ``model`` is the path of a model file, ``picture`` the image for readers without scripts and for sites built
-without the extra ``compiler``, ``range`` that of the slider of a parameter: ``v 0.05 0.95``. Pages are loaded when they
-become visible.
+without the extra ``compiler``. Pages are loaded when they become visible.
 
 The directive ``motions`` shows one of several such pages, by choice; ``write-your-own`` writes the model file of a
 Lagrangian that the visitor types (``_static/motions.js``).
@@ -39,7 +38,7 @@ LOGGER = logging.getLogger(__name__)
 
 
 class motion(nodes.General, nodes.Element):  # noqa: N801  (docutils names nodes in lower case)
-    """A page that moves: name, title, path and text of the model file, range of a slider; its child is the picture."""
+    """A page that moves: name, title, path and text of the model file; its child is the picture."""
 
 
 class motions(nodes.General, nodes.Element):  # noqa: N801
@@ -54,7 +53,6 @@ class MotionDirective(SphinxDirective):
     option_spec = {  # noqa: RUF012  (docutils reads the class attribute)
         "picture": directives.unchanged_required,
         "model": directives.unchanged_required,
-        "range": directives.unchanged_required,
     }
 
     def run(self) -> list[nodes.Node]:
@@ -65,14 +63,7 @@ class MotionDirective(SphinxDirective):
         title = self.arguments[0]
         key = hashlib.sha256(text.encode() + MADE_OF).hexdigest()[:8]
         name = f"{nodes.make_id(title)}-{key}"
-        node = motion(
-            "",
-            name=name,
-            title=title,
-            model=path,
-            text=text,
-            range=self.options.get("range", ""),
-        )
+        node = motion("", name=name, title=title, model=path, text=text)
         if "picture" in self.options:
             node += nodes.image(uri=self.options["picture"], alt=title)
         return [node]
@@ -195,11 +186,7 @@ def _build_pages(app: Sphinx, failure: Exception | None) -> None:
 
 def _write_page(node: motion, folder: Path) -> None:
     LOGGER.info("page that moves: %s", node["title"])
-    ranges = {}
-    if node["range"]:
-        parameter, low, high = node["range"].split()
-        ranges[parameter] = float(low), float(high)
-    page(node["model"], ranges=ranges).save(folder / f"{node['name']}.html")
+    page(node["model"]).save(folder / f"{node['name']}.html")
 
 
 def setup(app: Sphinx) -> dict[str, Any]:

@@ -64,6 +64,7 @@ class Model(TimeSpan):
         tables: index tables of shape (rows, columns) by name, for array sizes known at run time.
         events: zero crossings that runs record, which may change the state.
         mesh: of the fields of a density.
+        page: ranges of sliders, speed and plots of :func:`~scvi_codegen.page`, as its arguments.
 
     Raises:
         ModelFileError: naming the field, unless exactly one of p and velocity, at most one of h, tolerance and error,
@@ -82,6 +83,7 @@ class Model(TimeSpan):
     tables: Mapping[str, Any] = field(default_factory=dict)
     events: tuple[Event, ...] = ()
     mesh: Any = field(default=None, compare=False, repr=False)
+    page: Mapping[str, Any] = field(default_factory=dict)
 
     __repr__ = summary("system", "method", "h", "span", "steps")
 
@@ -90,6 +92,7 @@ class Model(TimeSpan):
         arrays = self.array_system
         if arrays is not None and self.mesh is None:
             object.__setattr__(self, "mesh", arrays.mesh)
+        object.__setattr__(self, "page", _with_lists(self.page))
         object.__setattr__(self, "method", as_method(self.method, one_coordinate(arrays) if arrays else self.system))
         if isinstance(self.system, FirstOrderSystem) and self.p is self.velocity is None:
             for name, half in zip(("q", "p"), self.system.halves(self.q), strict=True):
@@ -413,6 +416,13 @@ class Model(TimeSpan):
         values = tuple(values)
         check_length(values, names, name)
         return tuple(real(value, f"{name}[{i}] ({names[i]})") for i, value in enumerate(values))
+
+
+def _with_lists(value: Any) -> Any:
+    """Return a value with lists for tuples, as in model files."""
+    if isinstance(value, Mapping):
+        return {name: _with_lists(each) for name, each in value.items()}
+    return [_with_lists(each) for each in value] if isinstance(value, list | tuple) else value
 
 
 def _equal(one: Any, other: Any) -> bool:

@@ -14,7 +14,7 @@ import re
 import tempfile
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,20 +24,22 @@ import numpy as np
 import sympy
 
 from scvi_codegen.display.mathml import mathml_terms
-from scvi_codegen.errors import ExpressionError, MethodError, StateError
+from scvi_codegen.errors import ArgumentError, ExpressionError, MethodError, StateError, closest
 from scvi_codegen.files.atomic import regular, write_text
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS
 from scvi_codegen.mechanics.first_order import FirstOrderSystem
-from scvi_codegen.models.model import Model
+from scvi_codegen.models.model import DEFAULT_METHOD, Model
 from scvi_codegen.models.model_files.document import document_of
 from scvi_codegen.models.model_files.model_file import load_model
+from scvi_codegen.models.model_files.page_section import check_page
 from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.pages.shape import shape_data
 from scvi_codegen.pages.webassembly import LICENCES, webassembly
 from scvi_codegen.rendering.environment import template_environment
 from scvi_codegen.representation import summary
-from scvi_codegen.validation import ArgumentType, checks_arguments
+from scvi_codegen.validation import ArgumentType, checks_arguments, keyword_hint
 from scvi_codegen.version import __version__
 
 CAUSES = (
@@ -55,21 +57,39 @@ SECONDS = 30
 """Duration of the span of a model at the speed that a page begins with, unless time is in seconds or so."""
 HEIGHT = 760
 """Height of a page in a notebook, in pixels."""
-MODEL_OR_PATH = ArgumentType(
-    "a Model or the path of a model file", lambda value: isinstance(value, Model | str | os.PathLike)
+WHOLE = 24
+"""Number of coordinates up to which plots show each of them; of more, two nodes."""
+MODEL = ArgumentType(
+    "a Model, a system or the path of a model file",
+    lambda value: isinstance(value, Model | str | os.PathLike) or SYSTEM_OR_ARRAYS.accepts(value),
 )
 
 
-@checks_arguments(model=MODEL_OR_PATH)
-def page(model: Model | str | os.PathLike[str], *, ranges: Mapping[str, tuple[float, float]] | None = None) -> Page:
+@checks_arguments(model=MODEL)
+def page(
+    model: Any,
+    *,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+    speed: float | None = None,
+    plots: Sequence[tuple[str, str]] | None = None,
+    **motion: Any,
+) -> Page:
     """Return a page that computes the motion of a model in the browser, with sliders and plots.
 
     The generated C is compiled to WebAssembly by the extra ``compiler``; its first use takes a minute or two, since it
     compiles its C library. The file of a field contains the formulas of its initial values if ``model`` is a path.
+    ``ranges``, ``speed`` and ``plots`` replace those of ``[page]`` in a model file.
 
     Args:
-        model: model, or path of a model file; steps are fixed, or adaptive with a tolerance.
-        ranges: lowest and highest value of the sliders of parameters, by name; by default up to three times the value.
+        model: model, path of a model file, or system; steps are fixed, or adaptive with a tolerance.
+        ranges: lowest and highest value of sliders by name: of parameters, coordinates (``x``) and initial velocities
+            (``x_dot``); by default up to three times the value of a parameter.
+        speed: time of the model per second, with which the page begins; by default the span takes 30 s if it is not
+            of that order.
+        plots: names of the variables of each plot, the horizontal one first: t, energy, coordinates, momenta, and
+            conserved quantities.
+        motion: of a system, the arguments of :class:`Model`: ``q``, ``velocity`` or ``p``, ``h`` or ``tolerance``, and
+            also ``method`` (default SVI(8)) and others; default of ``span``: 30.
 
     Returns:
         The page, which a notebook displays.
@@ -77,20 +97,47 @@ def page(model: Model | str | os.PathLike[str], *, ranges: Mapping[str, tuple[fl
     Raises:
         MethodError: for what a page does not have: events, inputs, time transformations, controllers, steps without a
             size or tolerance, and systems whose velocities do not determine their momenta.
-        StateError: for a range of an unknown parameter, or one that does not contain its value.
-        ModelFileError: for an invalid model file.
+        StateError: for a range of a parameter that does not contain its value, and an unknown variable of a plot.
+        ModelFileError: for an invalid model file, unknown sliders and values of the wrong form.
+        ArgumentError: for unknown arguments, and those of a motion beside a model.
         BuildError: without the extra ``compiler``, or if compilation fails.
     """
+    given = {"ranges": ranges, "speed": speed, "plots": plots}
+    settings = {name: value for name, value in given.items() if value is not None}
+    if SYSTEM_OR_ARRAYS.accepts(model):
+        model = _model_of(model, motion)
+    elif motion:
+        raise ArgumentError(f"page() takes {', '.join(motion)} for a system alone: change them in the model")
     if isinstance(model, Model):
-        return page_of(model, document_of(model), ranges or {})
-    return page_of(load_model(model), tomllib.loads(regular(model).read_text(encoding="utf-8")), ranges or {})
+        return page_of(model, document_of(model), settings)
+    return page_of(load_model(model), tomllib.loads(regular(model).read_text(encoding="utf-8")), settings)
 
 
-def page_of(model: Model, document: Mapping[str, Any], ranges: Mapping[str, tuple[float, float]]) -> Page:
-    """Return the page of a model whose formulas are those of a document. Raises as :func:`page`."""
+def _model_of(system: Any, motion: Mapping[str, Any]) -> Model:
+    """Return the model of a system with the arguments of its motion."""
+    known = [name for name in Model.__dataclass_fields__ if name not in ("system", "page")]
+    for name in motion:
+        if name not in known:
+            raise ArgumentError(f"page() takes no {name!r}{keyword_hint(name, known)}")
+    if "q" not in motion:
+        raise ArgumentError(f"a page of the system {system.name} requires its initial state: give q, and velocity or p")
+    default = {} if "steps" in motion else {"span": 30.0}
+    return Model(**{"system": system, "method": DEFAULT_METHOD, **default, **motion})
+
+
+def page_of(model: Model, document: Mapping[str, Any], settings: Mapping[str, Any]) -> Page:
+    """Return the page of a model whose formulas are those of a document. Raises as :func:`page`.
+
+    Args:
+        model: with the settings of its file.
+        document: sections of the file.
+        settings: ranges, speed and plots, which replace those of the file.
+    """
+    ranges = {**model.page.get("ranges", {}), **settings.get("ranges", {})}
+    model = replace(model, page={**model.page, **settings, "ranges": ranges})
     _check(model, ranges)
     adaptive = model.h is None
-    result = Page(model.with_known_sizes() if adaptive else model, document, dict(ranges), adaptive=adaptive)
+    result = Page(model.with_known_sizes() if adaptive else model, document, adaptive=adaptive)
     result.html  # noqa: B018  (reports errors here)
     return result
 
@@ -110,13 +157,10 @@ def _check(model: Model, ranges: Mapping[str, tuple[float, float]]) -> None:
         raise MethodError(f"a page starts from velocities; {name} is of first order: use run and animate()")
     if model.h is None and model.tolerance is None:
         raise MethodError(f"a page requires a step size or tolerance; {name} has neither: give [run] step or tolerance")
-    for parameter, limits in ranges.items():
-        value = model.parameters.get(parameter)
-        if value is None or np.ndim(value):
-            known = ", ".join(key for key, each in model.parameters.items() if np.ndim(each) == 0)
-            raise StateError(f"the range of {parameter!r} is of no parameter of {name}: use one of {known or 'none'}")
-        low, high = limits
-        if not (math.isfinite(low) and math.isfinite(high) and low < high and low <= value <= high):
+    check_page(model.page, model, "page")
+    for parameter in ranges.keys() & model.parameters.keys():
+        (low, high), value = ranges[parameter], model.parameters[parameter]
+        if not low <= value <= high:
             raise StateError(f"the range {low:g} .. {high:g} of {parameter} must contain its value {value:g}: widen it")
 
 
@@ -125,15 +169,13 @@ class Page:
     """Page of a model, which a notebook displays.
 
     Attributes:
-        model: system, method, initial state and step size.
+        model: system, method, initial state, step size, and the settings of the page.
         document: sections of its model file.
-        ranges: limits of sliders by parameter.
         adaptive: whether the step size is adaptive.
     """
 
     model: Model
     document: Mapping[str, Any] = field(repr=False)
-    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     adaptive: bool = False
 
     __repr__ = summary("model")
@@ -143,7 +185,7 @@ class Page:
         """Text of the file."""
         model, document = self.model, self.document
         with tempfile.TemporaryDirectory(prefix="scvi-codegen-") as temporary:
-            folder = generate_package(model, Path(temporary, "motion"))
+            folder = generate_package(replace(model, page={}), Path(temporary, "motion"))
             interface = _interface(folder, model)
             initial = _initial(document, [*model.mesh.points, *interface.parameters]) if model.mesh else ()
             (folder / "page.c").write_text(_entry(folder, model, interface, initial, self.adaptive), encoding="utf-8")
@@ -276,6 +318,7 @@ def _velocity(model: Model) -> list[float]:
 def _description(shown: Page, interface: Any, *, initial: bool) -> dict[str, Any]:
     """Return what the scripts of the page read."""
     model, adaptive = shown.model, shown.adaptive
+    ranges = model.page.get("ranges", {})
     q, v = _flat(model.q), _velocity(model)
     shape = shape_data(model, interface, q)
     rods = "rods" in shape["source"]
@@ -283,21 +326,44 @@ def _description(shown: Page, interface: Any, *, initial: bool) -> dict[str, Any
     for name, value in _values(model, interface).items():
         size = abs(value) or 1.0
         default = (size / 20, 3 * size) if value > 0 else (-3 * size, 3 * size if value else size)
-        low, high = shown.ranges.get(name, default)
+        low, high = ranges.get(name, default)
         parameters.append({"name": name, "value": value, "low": low, "high": high})
     span = abs(float(model.end - model.t))
-    speed = 1.0 if 0.3 < span / SECONDS < 4 else float(f"{span / SECONDS:.0e}")
+    speed = model.page.get("speed", 1.0 if 0.3 < span / SECONDS < 4 else float(f"{span / SECONDS:.0e}"))
     step = float(model.tolerance if adaptive else model.h)  # type: ignore[arg-type]
-    largest = [max([1.0, *(abs(x) for x in kind)]) for kind in (q, v)]
+    limits = [math.pi, 12.0] if rods else [2 * max([1.0, *(abs(x) for x in kind)]) for kind in (q, v)]
+    names = interface.coordinates or [""] * len(q)
+    sliders = {
+        kind: [ranges.get(f"{name}{ending}", [-limit, limit]) for name in names]
+        for kind, ending, limit in zip("qv", ("", "_dot"), limits, strict=True)
+    }
+    variables = _variables(interface, shape, len(q))
+    plots = [[_variable(name, variables) for name in reversed(pair)] for pair in model.page.get("plots", ())]
     return {
         "m": len(q), "q": q, "v": v, "t": float(model.t), "coordinates": interface.coordinates,
         "momenta": interface.momentum_names, "parameters": parameters, "quantities": interface.map_names,
-        "energy": {"label": "Energy", "conserved": bool(interface.conserves_energy)}, "plots": [], "causes": CAUSES,
-        "initial": initial,
+        "energy": {"label": "Energy", "conserved": bool(interface.conserves_energy)}, "plots": plots, "causes": CAUSES,
+        "initial": initial, "whole": WHOLE,
         "step": {"kind": "adaptive" if adaptive else "fixed", "value": step,
                  **({"low": 1e-15, "high": 1e-4} if adaptive else {"low": step / 20, "high": step * 8})},
         "speed": {"value": speed, "low": speed / 50, "high": speed * 20},
-        "ranges": {"q": [[-math.pi, math.pi] if rods else [-2 * largest[0], 2 * largest[0]]] * len(q),
-                   "v": [[-12.0, 12.0] if rods else [-2 * largest[1], 2 * largest[1]]] * len(q)},
-        "shape": shape,
+        "ranges": sliders, "shape": shape,
     }  # fmt: skip
+
+
+def _variables(interface: Any, shape: Mapping[str, Any], size: int) -> list[str]:
+    """Return the names of the variables of plots, as in ``plots.js``."""
+    if size <= WHOLE and interface.coordinates:
+        solids = [f"{each['name']}.{axis}" for each in shape["source"].get("solids", ()) for axis in "xyz"]
+        names = [*interface.coordinates, *interface.momentum_names, *solids]
+    else:
+        nodes = range(size) if size <= WHOLE else (size // 4, size // 2)
+        names = [f"{kind}.{node}" for node in nodes for kind in "qp"]
+    return ["t", *names, "energy", *interface.map_names]
+
+
+def _variable(name: str, known: Sequence[str]) -> str:
+    """Return the name of a variable of plots, if it is known."""
+    if name not in known:
+        raise StateError(f"page plots: unknown variable {name!r}{closest(name, known)} Known: {', '.join(known)}")
+    return name

@@ -25,7 +25,7 @@ const stored_quantities = block(8, capacity * count);
 const clamped = (x, low, high) => Math.min(high, Math.max(low, x));
 const STORED = 2000; // states of the history at most; then every second one is removed
 const TRAIL = 900; // points of a trail
-const WHOLE = 24; // coordinates up to which the history contains all of them
+const WHOLE = about.whole; // coordinates up to which the history contains all of them
 
 // ---- settings: they determine the motion, and are in the address
 const initial = {

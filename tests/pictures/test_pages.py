@@ -62,17 +62,20 @@ def without_compiler(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "source", "marks"),
+    ("name", "source", "kinds"),
     [
-        ("double_pendulum", {"rods": {"sign": 1.0, "lengths": ["l1", "l2"]}}, ["rod", "pivot", "bob", "bob"]),
+        pytest.param(
+            *("double_pendulum", {"rods": {"sign": 1.0, "lengths": ["l1", "l2"]}}, ["rod", "pivot", "bob", "bob"]),
+            marks=pytest.mark.second,
+        ),
         ("figure_eight", {"columns": [[0, 1], [2, 3], [4, 5]], "pins": []}, ["body"] * 3),
     ],
 )
 @pytest.mark.usefixtures("without_compiler")
-def test_shapes_are_those_of_animations(name, source, marks):
+def test_shapes_are_those_of_animations(name, source, kinds):
     shape = described(sc.page(MOTIONS / f"{name}.toml").html)["shape"]
     assert shape["source"] == source
-    assert [each["kind"] for each in shape["marks"]] == marks
+    assert [each["kind"] for each in shape["marks"]] == kinds
 
 
 @pytest.mark.usefixtures("without_compiler")
@@ -93,6 +96,7 @@ def test_a_page_has_no_address_no_text_as_code_and_the_licences(tmp_path):
     assert (tmp_path / "page.html").read_text(encoding="utf-8").rstrip("\n") == text.rstrip("\n")
 
 
+@pytest.mark.second
 @pytest.mark.usefixtures("without_compiler")
 def test_momenta_become_velocities(tmp_path):
     text = OSCILLATOR.replace("q_dot = [0.0, 0.5]", "p = [0.0, 1.0]").replace("m = 1.0", "m = 2.0")
@@ -104,16 +108,17 @@ def test_momenta_become_velocities(tmp_path):
     [
         ("step = 0.1", "error = 1e-9", {}, "requires a step size or tolerance"),
         ("[run]", '[[events]]\nfunction = "x"\n[run]', {}, "no events, which .* omit them"),
-        ("", "", {"g": (0, 1)}, "'g' is of no parameter of .*: use one of k, m"),
+        ("", "", {"g": (0, 1)}, "unknown slider 'g' in page ranges. Known: k, m, x, y, x_dot"),
         ("", "", {"k": (2, 3)}, "range 2 .. 3 of k must contain its value 1: widen it"),
     ],
 )
 @pytest.mark.usefixtures("without_compiler")
 def test_what_a_page_lacks_is_refused(tmp_path, old, new, ranges, message):
-    with pytest.raises((sc.MethodError, sc.StateError), match=message):
+    with pytest.raises((sc.MethodError, sc.StateError, sc.ModelFileError), match=message):
         sc.page(written(tmp_path, OSCILLATOR.replace(old, new, 1)), ranges=ranges)
 
 
+@pytest.mark.second
 @pytest.mark.usefixtures("without_compiler")
 def test_hamiltonians_start_from_the_velocities_of_their_momenta():
     system = sc.HamiltonianSystem.from_text("h", ["q"], hamiltonian="p_q**2/2 + q**4/4 + p_q**4/10")
@@ -121,12 +126,83 @@ def test_hamiltonians_start_from_the_velocities_of_their_momenta():
     assert described(sc.page(model).html)["v"] == pytest.approx([0.5 + 0.4 * 0.5**3])
 
 
+@pytest.mark.second
 @pytest.mark.usefixtures("without_compiler")
 def test_momenta_that_velocities_do_not_determine_are_refused():
     system = sc.HamiltonianSystem.from_text("h", ["q"], hamiltonian="cos(p_q) + q**2/2")
     model = sc.Model(system=system, method="gauss:2", q=[1.0], p=[2.8], h=0.1, span=1.0)
     with pytest.raises((sc.MethodError, sc.StateError), match="velocit"):
         sc.page(model)
+
+
+PAGE = """
+[page]
+ranges = { k = [0.5, 2.0], x = [-3.0, 3.0], y_dot = [-1.0, 1.0] }
+speed = 0.5
+plots = [["x", "p_x"], ["t", "energy"]]
+"""
+
+
+@pytest.mark.usefixtures("without_compiler")
+def test_the_section_page_sets_sliders_speed_and_plots_and_arguments_replace_it(tmp_path):
+    path = written(tmp_path, OSCILLATOR + PAGE)
+    shown = sc.page(path, ranges={"k": (0.9, 1.1)})
+    data = described(shown.html)
+    assert [(each["name"], each["low"], each["high"]) for each in data["parameters"]] == [
+        ("k", 0.9, 1.1),
+        ("m", 0.05, 3.0),
+    ]
+    assert data["ranges"] == {"q": [[-3.0, 3.0], [-2.0, 2.0]], "v": [[-2.0, 2.0], [-1.0, 1.0]]}
+    assert data["speed"]["value"] == 0.5
+    assert data["plots"] == [["p_x", "x"], ["energy", "t"]]  # the vertical one first
+    model = sc.load_model(path, {"parameters": {"k": 3.0}})  # outside its range, which is of no concern to others
+    assert model.page["speed"] == 0.5
+    sc.save_model(model, tmp_path / "again.toml")
+    assert sc.load_model(tmp_path / "again.toml") == model
+    with pytest.raises(sc.StateError, match=r"unknown variable 'p_z'; did you mean 'p_[xy]'\? Known: t, x, y"):
+        sc.page(path, plots=[("t", "p_z")])
+    with pytest.raises(sc.ArgumentError, match="takes h for a system alone"):
+        sc.page(path, h=0.1)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("speed", "sped", r"unknown key 'sped' in \[page\]; did you mean 'speed'\?"),
+        ("y_dot", "z_dot", r"unknown slider 'z_dot' in \[page\] ranges; did you mean '[xy]_dot'\?"),
+        ("[0.5, 2.0]", "2.0", r"ranges k must be two numbers, \[lowest, highest\], not 2.0"),
+        ("[0.5, 2.0]", "[2.0, 0.5]", "k is 2 .. 0.5: the first number must be less"),
+        ("[0.5, 2.0]", "[0.5, inf]", "ranges k .*finite"),
+        ("0.5\n", "-0.5\n", "speed is -0.5: it must be positive"),
+        ('["x", "p_x"]', '"x"', "plots must be pairs of names"),
+    ],
+)
+def test_mistakes_in_the_section_page_are_errors(tmp_path, old, new, message):
+    with pytest.raises(sc.ModelFileError, match=message):
+        sc.load_model(written(tmp_path, OSCILLATOR + PAGE.replace(old, new, 1)))
+
+
+@pytest.mark.usefixtures("without_compiler")
+def test_a_system_with_its_motion_has_a_page(tmp_path):
+    model = sc.load_model(written(tmp_path))
+    motion = {"q": model.q, "velocity": model.velocity}
+    ours = described(sc.page(model.system, **motion, h=0.1, method=model.method).html)
+    assert ours == described(sc.page(model).html)
+    for change, message in (
+        ({"h": 0.1, "velocities": [0.0, 0.0]}, "takes no 'velocities'; did you mean 'velocity'"),
+        ({}, "requires a step size or tolerance"),
+        ({"q": [1.0], "h": 0.1}, "q"),
+    ):
+        with pytest.raises(sc.ScviCodegenError, match=message):
+            sc.page(model.system, **motion | change)
+    with pytest.raises(sc.ArgumentError, match="requires its initial state: give q"):
+        sc.page(model.system, h=0.1)
+
+
+@pytest.mark.usefixtures("without_compiler")
+def test_parameters_of_initial_formulas_are_used(recwarn):
+    sc.page(MOTIONS / "kinks.toml")
+    assert [str(each.message) for each in recwarn] == []
 
 
 def test_a_missing_compiler_is_an_error_with_its_remedy(tmp_path, monkeypatch):

@@ -22,7 +22,7 @@ from scvi_codegen.pages.page import page_of
     type=(str, float, float),
     multiple=True,
     metavar="NAME LOW HIGH",
-    help="Range of the slider of a parameter; may be repeated.",
+    help="Range of the slider of a parameter, coordinate x or velocity x_dot; may be repeated.",
 )
 @reporting
 def page(model_name: str, output: str, ranges: tuple[tuple[str, float, float], ...], **choices: Any) -> None:
@@ -40,6 +40,6 @@ def page(model_name: str, output: str, ranges: tuple[tuple[str, float, float], .
     model = read_model(model_name, choices)
     own = Path(model_name).is_file() and not {"initial", "system", "field"} & sections_of(choices).keys()
     document = tomllib.loads(read_text(model_name, "utf-8")) if own else document_of(model)
-    page_of(model, document, {name: (low, high) for name, low, high in ranges}).save(output)
+    page_of(model, document, {"ranges": {name: (low, high) for name, low, high in ranges}}).save(output)
     tell(system=model.system.name, method=model.method.name, written=[output])
     note(f"wrote {output}")

@@ -24,6 +24,7 @@ from scvi_codegen.methods import fitted
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.document import document_of, motion_of, with_files
 from scvi_codegen.models.model_files.input_tables import InputTable
+from scvi_codegen.models.model_files.page_section import PAGE_KEYS, check_page
 from scvi_codegen.models.model_files.sections import (
     FORMULAS,
     TORQUES,
@@ -58,12 +59,12 @@ FIELD_KEYS = (
     *("name", "fields", "momenta", "space", "boundary", "density", "hamiltonian", "dissipation"),
     *("scalars", "point_lagrangians", "discretisation"),
 )
-KEYS = {"system": SYSTEM_KEYS, "field": FIELD_KEYS} | {
+KEYS = {"system": SYSTEM_KEYS, "field": FIELD_KEYS, "page": PAGE_KEYS} | {
     section: tuple(option.key for option in options_of(section)) for section in ("initial", "run")
 }
 SECTIONS = (
     *("system", "field", "forces", *TORQUES, "inputs", "sizes", "parameters", "tables", "initial"),
-    *("events", "method", "run"),
+    *("events", "method", "run", "page"),
 )
 ARRAY_SECTIONS = ("sizes", "tables")
 """Sections of systems with arrays."""
@@ -145,7 +146,9 @@ def _written(model: Model, stem: str | None) -> dict[str, str]:
         document = document_of(model, as_arrays=as_arrays)
         shortened, files = (document, {}) if stem is None else with_files(document, stem)
         text = tomli_w.dumps(shortened, multiline_strings=True)
-        again = _read_model(document, {}) if files else parse_model(text)
+        with warnings.catch_warnings():  # formulas of initial values, which used parameters, are numbers now
+            warnings.simplefilter("ignore", SystemDefinitionWarning)
+            again = _read_model(document, {}) if files else parse_model(text)
         if again == model:
             return {f"{stem}.toml": text, **files}
         part = "method" if again.method != model.method else "system" if again.system != model.system else "state"
@@ -177,7 +180,9 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
     method = read_method(fitted(specification, one_coordinate(arrays) if arrays else system))
     values |= {"inputs": _read_inputs(document.get("inputs", {}), folder), "solver": solver}
     events = read_events(document.get("events", []))
-    model = Model(system=system, method=method, events=events, **values, **read_run(document["run"]))
+    values |= {"page": document.get("page", {}), **read_run(document["run"])}
+    model = Model(system=system, method=method, events=events, **values)
+    check_page(model.page, model)
     return _with_time_transformation(model, document, specification)
 
 
