@@ -81,13 +81,14 @@ def page(
     ``ranges``, ``speed`` and ``plots`` replace those of ``[page]`` in a model file.
 
     Args:
-        model: model, path of a model file, or system; steps are fixed, or adaptive with a tolerance.
+        model: model, path of a model file, or system (of a field, that of its mesh); steps are fixed, or adaptive
+            with a tolerance.
         ranges: lowest and highest value of sliders by name: of parameters, coordinates (``x``) and initial velocities
             (``x_dot``); by default up to three times the value of a parameter.
         speed: time of the model per second, with which the page begins; by default the span takes 30 s if it is not
             of that order.
         plots: names of the variables of each plot, the horizontal one first: t, energy, coordinates, momenta, and
-            conserved quantities.
+            conserved quantities; of arrays and fields nodes, as ``q.40``.
         motion: of a system, the arguments of :class:`Model`: ``q``, ``velocity`` or ``p``, ``h`` or ``tolerance``, and
             also ``method`` (default SVI(8)) and others; default of ``span``: 30.
 

@@ -31,7 +31,7 @@ if (m <= WHOLE && about.coordinates.length) {
   }));
 } else probes.forEach((at, k) => {
   const name = source.mesh?.fields.find(({ columns: [begin, end] }) => at >= begin && at < end)?.name || "q";
-  variables.push({ name: `q.${k}`, label: `${name}, node ${at}`, of: (row) => row[ROW.q + k] }, { name: `p.${k}`, label: `p, node ${at}`, of: (row) => row[ROW.p + k] });
+  variables.push({ name: `q.${at}`, label: `${name}, node ${at}`, of: (row) => row[ROW.q + k] }, { name: `p.${at}`, label: `p, node ${at}`, of: (row) => row[ROW.p + k] });
 });
 if (about.energy) variables.push({ name: "energy", label: "energy", of: (row) => row[1] });
 about.quantities.forEach((name, k) => variables.push({ name, label: name, of: (row) => row[2 + k] }));
@@ -51,7 +51,7 @@ function addPanel(title, draw) {
   return panel;
 }
 const solid = (source.solids || [])[0];
-const defaults = about.plots.length ? about.plots : [solid ? [`${solid.name}.y`, `${solid.name}.x`] : m <= WHOLE && about.coordinates.length ? [about.momenta[0] || "t", about.coordinates[0]] : ["q.0", "t"]];
+const defaults = about.plots.length ? about.plots : [solid ? [`${solid.name}.y`, `${solid.name}.x`] : m <= WHOLE && about.coordinates.length ? [about.momenta[0] || "t", about.coordinates[0]] : [`q.${probes[0]}`, "t"]];
 for (const [y, x] of defaults) {
   const shown = { y: named(y, 2), x: named(x, 0) };
   const panel = addPanel("Plot of two variables", ({ canvas }) => {

@@ -30,9 +30,9 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Return the files of two pages: one without calls of the C library, and a field."""
     pytest.importorskip("ziglang", reason="pages are compiled by the extra compiler")
     folder, result = tmp_path_factory.mktemp("pages"), {}
-    for name in ("figure_eight", "kinks"):
+    for name, plots in (("figure_eight", [("x3", "y3"), ("t", "energy")]), ("kinks", [("q.80", "t")])):
         result[name] = folder / f"{name}.html"
-        sc.page(DOCS / "motions" / f"{name}.toml").save(result[name])
+        sc.page(DOCS / "motions" / f"{name}.toml", plots=plots).save(result[name])
     return result
 
 
@@ -136,6 +136,21 @@ def test_bodies_are_dragged_by_mouse_and_touch(view, pages):
     assert touched[4] == pytest.approx(x, rel=0.3)  # the frame follows the motion that is ahead
     assert touched[5] == pytest.approx(0, abs=1e-3)
     assert view.messages == []
+
+
+@pytest.mark.parametrize(
+    ("name", "shown", "count"),
+    [
+        ("figure_eight", ["y\N{SUBSCRIPT THREE}", "x\N{SUBSCRIPT THREE}", "energy", "t"], 19),
+        ("kinks", ["t", "u, node 80"], 6),
+    ],
+)
+def test_plots_are_those_given_and_offer_all_variables(view, pages, name, shown, count):
+    """Those of three bodies are t, the state, energy, momentum, centre of mass and angular momentum."""
+    opened(view, pages[name])
+    chosen = view.evaluate("[...document.querySelectorAll('.choices select')].map((s) => s.selectedOptions[0].text)")
+    assert chosen == shown
+    assert view.evaluate("document.querySelector('.choices select').length") == count
 
 
 def test_keys_play_step_and_restart(view, pages):
