@@ -44,7 +44,14 @@ def copied(original: Any) -> Any:
 def test_every_option_of_a_stepper_is_in_the_table() -> None:
     signature = inspect.signature(compile_stepper)
     options = {name for name, each in signature.parameters.items() if each.kind is each.KEYWORD_ONLY}
-    assert options - {"sizes", "tables"} == set(STEPPERS) - {""}  # these two replace the system
+    assert options - {"sizes", "tables", "precision"} == set(STEPPERS) - {""}  # these two replace the system
+
+
+def test_pickled_stepper_in_double_double_takes_the_same_steps() -> None:
+    own = compile_stepper(KEPLER, "svi:3", flags=QUICK_FLAGS, precision="double-double")
+    runs = [each.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=3) for each in (own, copied(own))]
+    for name in ("q", "q_low", "p", "p_low"):
+        assert np.array_equal(*(getattr(run, name) for run in runs))
 
 
 @pytest.mark.sampled(3)

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from scvi_codegen.cli.command_group import check_writable, note, reporting, tell
+from scvi_codegen.cli.command_group import check_writable, reporting, tell
 from scvi_codegen.cli.model_options import model_arguments, read_model, sections_of
 from scvi_codegen.files.atomic import read_text
 from scvi_codegen.models.model_files.document import document_of
@@ -41,5 +41,4 @@ def page(model_name: str, output: str, ranges: tuple[tuple[str, float, float], .
     own = Path(model_name).is_file() and not {"initial", "system", "field"} & sections_of(choices).keys()
     document = tomllib.loads(read_text(model_name, "utf-8")) if own else document_of(model)
     page_of(model, document, {"ranges": {name: (low, high) for name, low, high in ranges}}).save(output)
-    tell(system=model.system.name, method=model.method.name, written=[output])
-    note(f"wrote {output}")
+    tell(f"wrote {output}", system=model.system.name, method=model.method.name, written=[output])
