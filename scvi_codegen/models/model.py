@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from scvi_codegen.runtime.inputs.segments import Input
     from scvi_codegen.runtime.run.global_error import GlobalError
     from scvi_codegen.runtime.run.run import Run
+    from scvi_codegen.runtime.trajectory.double_double import DoubleDoubleTrajectory
     from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 DEFAULT_METHOD = SVI(8)
@@ -56,8 +57,8 @@ class Model(TimeSpan):
             or axis and angle.
         p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
         velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
-        h, tolerance, error, span, steps, save_every, t, time_transformation, controller, solver_tolerance,
-            max_iterations, threads: as of :class:`~scvi_codegen.models.time_span.TimeSpan`.
+        h, tolerance, error, span, steps, save_every, t, time_transformation, controller, precision,
+            solver_tolerance, max_iterations, threads: as of :class:`~scvi_codegen.models.time_span.TimeSpan`.
         inputs: by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as :meth:`Stepper.integrate` accepts
             it, or a number; a run requires all inputs of the system.
         fields: arrays of parameters by name, for array sizes known at run time; others keep their default value.
@@ -250,6 +251,7 @@ class Model(TimeSpan):
         """Compile a stepper for runs of this model; raises as :func:`~scvi_codegen.compile_stepper`."""
         from scvi_codegen.compiler import compile_stepper  # imported here: not needed for reading a model
 
+        self._check_double("a stepper of a model, for certificates, recordings, ensembles, advice and pages,")
         self._check_controller()
         stepper = compile_stepper(
             self.system,
@@ -379,6 +381,7 @@ class Model(TimeSpan):
 
     def integrate(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> Trajectory:
         """Integrate over the whole span; raises as :meth:`Stepper.integrate`."""
+        self._check_double("integrate() of a model (call integrate_in_double_double())")
         stepper, arguments = self.stepper(), self._run_arguments()
         if self.h is None and self.has_time_transformation and self.error is None:
             plan = self.start(stepper).plan
@@ -387,9 +390,39 @@ class Model(TimeSpan):
         trajectory: Trajectory = stepper.integrate(**arguments, progress=progress)
         return trajectory
 
+    def integrate_in_double_double(self, *, progress: Callable[[int], None] | None = None) -> DoubleDoubleTrajectory:
+        """Integrate over the whole span in double-double arithmetic.
+
+        Raises:
+            ModelFileError: for adaptive steps, time transformations, controllers, inputs, and a shorter last step.
+            MethodError: for other systems and methods that this arithmetic does not have.
+        """
+        from scvi_codegen.compiler import compile_stepper
+
+        for what, given in (
+            ("an adaptive step size (give a fixed step, --step)", self.h is None),
+            (f"the time transformation {self.time_transformation or ''}", self.has_time_transformation),
+            (f"the controller {self.controller}", self.controller is not None),
+            (f"the input {', '.join(self.system.inputs)}", bool(self.system.inputs)),
+        ):
+            if given:
+                self._check_double(what)
+        if self.has_shorter_last_step:
+            self._check_double(f"the span {self.span:g}, which is not a whole number of steps of {self.step:g},")
+        model = self.with_known_sizes()
+        stepper: Any = compile_stepper(
+            model.system, model.method, solver=model.solver, events=model.events or None, precision="double-double"
+        )
+        arguments = {name: value for name, value in model._run_arguments().items() if value is not None}
+        arguments |= {"p": model.p, "velocity": model.velocity, "parameters": model.parameters}
+        result: DoubleDoubleTrajectory = stepper.integrate(
+            model.q, **arguments, options=model.solver_options, progress=progress
+        )
+        return result
+
     def _run_arguments(self) -> dict[str, Any]:
         """Return the arguments of :meth:`Stepper.integrate` and ensembles for time, steps, saved states and inputs."""
-        others = ("span", "threads")
+        others = ("span", "threads")  # and choices, which are arguments of the stepper
         arguments = {
             option.field: getattr(self, option.field)
             for option in RUN_FIELDS

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from scvi_codegen.controllers import CONTROLLERS, SYMPLECTIC
 from scvi_codegen.errors import ModelFileError
+from scvi_codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.validation import TOLERANCE_RANGE, checked_count
 
 NUMBER, COUNT, TEXT, CHOICE, SWITCH, METHOD = "number", "count", "text", "choice", "switch", "method"
@@ -153,6 +154,11 @@ class RunOptions:
         + ", ".join(f"{name}: {each.summary}" for name, each in CONTROLLERS.items() if not each.in_tau)
         + ".",
         choices=(SYMPLECTIC, *CONTROLLERS),
+    )
+    precision: str | None = run_option(
+        *("run", CHOICE, "", f"Arithmetic [double]; {DOUBLE_DOUBLE}: 31 digits, with fixed steps."),
+        choices=PRECISIONS,
+        common=False,
     )
     span: float | None = run_option("run", NUMBER, "T", "Duration of the run.", determines=DURATION)
     steps: int | None = run_option("run", COUNT, "N", "Number of steps, instead of --span.", determines=DURATION)

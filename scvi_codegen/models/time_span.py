@@ -17,6 +17,7 @@ from scvi_codegen.models.options import (
     options_of,
 )
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.validation import LARGEST_COUNT
 
 
@@ -39,6 +40,7 @@ class TimeSpan(RunOptions):
             :func:`~scvi_codegen.compile_stepper`; requires a span. A system in transformed time has its own.
         controller: name of the step-size controller, ``None`` for the default; without ``time_transformation`` it
             requires adaptive steps.
+        precision: ``"double-double"`` for runs with states of two words; ``None`` means ``"double"``.
         solver_tolerance, max_iterations: of the iteration on the stage equations, as of
             :class:`~scvi_codegen.SolverOptions`.
         threads: number of threads per step, for array sizes known at run time.
@@ -50,6 +52,8 @@ class TimeSpan(RunOptions):
         for option in RUN_FIELDS:
             if (value := getattr(self, option.field)) is not None:
                 object.__setattr__(self, option.field, option.checked(value))
+        if self.precision not in (None, *PRECISIONS):
+            raise ModelFileError(f"unknown precision {self.precision!r}: use {' or '.join(map(repr, PRECISIONS))}")
         if self.h is None:
             if self.span is None:
                 raise ModelFileError("adaptive steps require a time span: give span, not steps")
@@ -67,6 +71,19 @@ class TimeSpan(RunOptions):
         if self.controller is not None and self.time_transformation is None and self.h is not None:
             raise ModelFileError(
                 f"the controller {self.controller} determines adaptive steps: leave out the step size or the controller"
+            )
+
+    @property
+    def in_double_double(self) -> bool:
+        """True if states have two words."""
+        return self.precision == DOUBLE_DOUBLE
+
+    def _check_double(self, what: str) -> None:
+        """Raise an error if states have two words, which something is not available with."""
+        if self.in_double_double:
+            raise ModelFileError(
+                f"{what} is not available with precision = 'double-double': omit it, or use precision = 'double' "
+                "([run] precision, run --precision)"
             )
 
     def _run_section(self) -> dict[str, Any]:

@@ -136,6 +136,7 @@ def page_of(model: Model, document: Mapping[str, Any], settings: Mapping[str, An
     """
     ranges = {**model.page.get("ranges", {}), **settings.get("ranges", {})}
     model = replace(model, page={**model.page, **settings, "ranges": ranges})
+    model._check_double("a page")
     _check(model, ranges)
     adaptive = model.h is None
     result = Page(model.with_known_sizes() if adaptive else model, document, adaptive=adaptive)

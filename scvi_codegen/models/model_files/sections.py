@@ -194,7 +194,8 @@ def read_run(section: Section) -> dict[str, Any]:
     if not STEP_KEYS & section.keys() and "steps" in section:
         raise ModelFileError("[run] has steps but no step: give the step size")
     fields = [option for option in options_of("run") if option in FIELDS and option.key in section]
-    return {option.field: option.read(section[option.key], f"[run] {option.key}") for option in fields}
+    numbers = {option.field: option.read(section[option.key], f"[run] {option.key}") for option in fields}
+    return {**numbers, "precision": section.get("precision")}
 
 
 FORMULAS = ("lagrangian", "hamiltonian", "dissipation", "damping", "constraints")

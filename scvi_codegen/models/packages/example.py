@@ -95,7 +95,8 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
 
 
 def _check_options(model: Model) -> None:
-    """Reject a controller beside a fixed step size; warn of options that generated programs do not use."""
+    """Reject double-double arithmetic, and a controller of fixed steps; warn of options without effect in programs."""
+    model._check_double("a generated program or FMU")
     model._check_controller()
     names = [option.key for option in RUN_FIELDS if option.solver_option and getattr(model, option.field) is not None]
     if names:

@@ -6,8 +6,9 @@ as arrays of high and of low words, or as mpmath numbers. In C a vector is its h
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from numbers import Rational
 from typing import Any
 
@@ -16,6 +17,7 @@ from mpmath import mp
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.native import building
 from scvi_codegen.native.arguments import checked_number, checked_step, empty_array
 from scvi_codegen.native.binding import Binding
@@ -28,8 +30,8 @@ from scvi_codegen.runtime.run.times import steps_to, times_after
 from scvi_codegen.validation import checked_count
 
 Array = NDArray[np.float64]
-DIGITS = 40
-"""Digits of mpmath numbers, more than two words have."""
+DIGITS, SHOWN_DIGITS = 40, 32
+"""Digits of mpmath numbers, more than two words have; of states in reports."""
 
 
 def two_words(value: Any, name: str) -> tuple[float, float]:
@@ -145,6 +147,17 @@ class DoubleDoubleTrajectory:
             raise StateError(f"there is no quantity {name!r}: use one of {', '.join(known)}")
         k = self.stepper.coordinates.index(name)
         return as_mpmath(self.q[:, k], self.q_low[:, k])
+
+    def final_texts(self) -> tuple[list[str], list[str]]:
+        """Return the last positions and momenta as text of 32 digits."""
+        with mp.workdps(DIGITS):
+            q, p = ([mp.nstr(value, SHOWN_DIGITS) for value in self.mp(name)[-1]] for name in "qp")
+        return q, p
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write times, states, parameters (both words of each), h and iterations to a ``.npz`` file."""
+        names = [each.name for each in fields(self) if each.name != "stepper"]
+        write_atomically(path, lambda file: np.savez(file, **{name: getattr(self, name) for name in names}))
 
     def _states(self, function: str, count: int) -> Array:
         """Return (n, 2, count) words of a function of all states."""

@@ -1,0 +1,89 @@
+"""Option --precision of ``run`` and key of model files: digits of the final state, both words, refusals."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from mpmath import mp
+
+import scvi_codegen as sc
+from scvi_codegen.cli import main
+
+TEXT = """
+[system]
+name = "spring"
+coordinates = ["q"]
+lagrangian = "q_dot**2/2 - q**2/2"
+[initial]
+q = [0.5]
+q_dot = [0.25]
+[method]
+method = "svi:10"
+[run]
+step = 0.125
+steps = 16
+precision = "double-double"
+"""
+
+
+@pytest.fixture
+def spring(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a model file in the working folder."""
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "spring.toml"
+    path.write_text(TEXT)
+    return path
+
+
+def test_final_state_is_exact_to_thirty_digits(spring: Path) -> None:
+    """The text, the document and the file agree with the solution q = cos(t)/2 + sin(t)/4."""
+    shown = CliRunner().invoke(main, ["run", str(spring), "-o", "states.npz"])
+    document = json.loads(CliRunner().invoke(main, ["run", str(spring), "--json"]).stdout)
+    with mp.workdps(40), np.load("states.npz") as saved:
+        exact = mp.cos(2) / 2 + mp.sin(2) / 4
+        last = next(line for line in shown.stdout.splitlines() if line.startswith("  q = "))
+        words = [document["final"][name]["q"] for name in ("q", "q_low")]
+        numbers = mp.mpf(last.split()[2]), sum(map(mp.mpf, words)), mp.mpf(saved["q"][-1, 0]) + saved["q_low"][-1, 0]
+        assert max(abs(number - exact) for number in numbers) < 1e-30
+        momentum = mp.mpf(saved["p"][-1, 0]) + saved["p_low"][-1, 0]
+        assert abs(momentum - (mp.cos(2) / 4 - mp.sin(2) / 2)) < 1e-30
+    assert document["run"]["precision"] == "double-double"
+    model = sc.load_model(spring)
+    sc.save_model(model, "again.toml")
+    assert sc.load_model("again.toml") == model
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["run", "--tolerance", "1e-9", "--span", "2"], "--tolerance 1e-09 is not available"),
+        (["run", "--plot", "a.png"], "--plot a.png is not available"),
+        (["run", "--ensemble", "a.toml"], "--ensemble a.toml is not available"),
+        (["run", "-o", "a.run"], "-o a.run is not available with --precision double-double: give a file NAME.npz"),
+        (["run", "--span", "1.3"], "the span 1.3, which is not a whole number of steps of 0.125, is not available"),
+        (["run", "--event", "q"], "not available with events="),
+        (["generate", "-o", "spring_svi"], "a generated program or FMU is not available"),
+        (["generate", "--fmu", "-o", "spring.fmu"], "a generated program or FMU is not available"),
+        (["verify"], "for certificates, recordings, ensembles, advice and pages, is not available"),
+        (["page", "-o", "a.html"], "a page is not available"),
+    ],
+)
+def test_other_options_and_commands_are_refused(spring: Path, words: list[str], message: str) -> None:
+    """Nothing is computed in double without a word."""
+    if "--span" in words:
+        spring.write_text(TEXT.replace("steps = 16\n", ""))
+    done = CliRunner().invoke(main, [words[0], str(spring), *words[1:]])
+    assert done.exit_code
+    assert message in " ".join(done.output.split())
+    assert sorted(path.name for path in spring.parent.iterdir()) == ["spring.toml"]
+
+
+def test_precision_is_read_and_replaced(spring: Path) -> None:
+    """The flag replaces the value of the file; unknown values and integrate() are refused."""
+    assert not sc.load_model(spring, {"run": {"precision": "double"}}).in_double_double
+    with pytest.raises(sc.ModelFileError, match="unknown precision 'quad': use 'double' or 'double-double'"):
+        sc.load_model(spring, {"run": {"precision": "quad"}})
+    with pytest.raises(sc.ModelFileError, match=r"call integrate_in_double_double\(\)"):
+        sc.load_model(spring).integrate()
