@@ -283,7 +283,7 @@ def _initial(document: Mapping[str, Any], names: Sequence[str]) -> tuple[str, ..
 
 
 def _lagrangian(document: Mapping[str, Any]) -> list[str]:
-    """Return the Lagrangian or density as written, as terms of MathML; none of sums over indices and the like."""
+    """Return the Lagrangian or density as written, as terms of MathML; none of array systems and the like."""
     text = document.get("field", {}).get("density") or document.get("system", {}).get("lagrangian")
     try:
         density = parse_expression(str(text or ""), {name: symbol(name) for name in NAME.findall(str(text))})

@@ -42,5 +42,8 @@ def test_bodies_tumble_in_mujoco_as_in_the_equations():
 
 def test_bodies_are_measured_without_peers():
     result = bench.SECTIONS["rotations:bodies"](bench.Plan(quick=True, peers=(), repeats=1), lambda text: None)
-    assert result.methods() == ["scvi-codegen runs", "scvi-codegen ensemble"]
+    assert result.methods() == [
+        "scvi-codegen runs",
+        *(f"scvi-codegen ensemble {name}" for name in ("svi:8", "composition:8")),
+    ]
     assert min(each.error for each in result.measurements) < 1e-8

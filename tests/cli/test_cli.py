@@ -77,7 +77,7 @@ class TestHelp:
 
     @pytest.mark.parametrize("long", ["read", pytest.param("run", marks=pytest.mark.full)])
     def test_every_example_of_the_help_is_accepted(self, long):
-        """Certificates, which have tests of their own, are only read as they stand, or run."""
+        """Certificates and pages, which have tests of their own, are only read as they stand; certificates also run."""
         texts = [output_of("--help"), *(output_of(command, "--help") for command in ABOUT)]
         Path("mine.toml").write_text(output_of("systems", "kepler"))
         shutil.copy(Path(__file__).parents[2] / "examples/fput_ring.toml", "ring.toml")
@@ -89,7 +89,7 @@ class TestHelp:
             if "--steps" not in words and words[0] == "run":
                 words += ["--span", "10"] if "--span" not in words else []
             words += ["--list"] if words[0] == "reproduce" else []  # running it takes minutes
-            if long == "read" and words[0] == "verify":
+            if words[0] == "page" or (long == "read" and words[0] == "verify"):
                 context = main.make_context("scvi-codegen", words)
                 main.resolve_command(context, words)[1].make_context(words[0], words[1:], parent=context)
             else:

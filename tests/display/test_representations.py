@@ -13,7 +13,7 @@ from samples import QUICK_FLAGS
 import scvi_codegen as sc
 from scvi_codegen.representation import LONGEST
 
-NEEDS_LIBRARIES = {"ControlledMotion", "GravitatingBodies", "JaxFlow", "TorchFlow"}
+NEEDS_LIBRARIES = {"ControlledMotion", "GravitatingBodies", "JaxFlow", "Page", "TorchFlow"}
 """Made by optional libraries only."""
 NAME = "a system whose name is as long as a sentence that says what moves in it and for what reason"
 
@@ -62,6 +62,7 @@ def runs(folder: Path) -> Iterator[Any]:
         "spectral-elements", degree=2, elements=2
     )
     flat = sc.compile_stepper(mesh.system, "svi:2", flags=QUICK_FLAGS).integrate({"u": np.ones(5)}, h=0.1, steps=3)
+    yield sc.compile_stepper(pushed, "svi:2", flags=QUICK_FLAGS).path([0.0], [1.0], 1.0, steps=2, inputs=data)
     yield mesh.local_laws(flat, "energy")["energy"]
 
 

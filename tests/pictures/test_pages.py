@@ -113,7 +113,7 @@ def test_momenta_become_velocities(tmp_path):
     ],
 )
 @pytest.mark.usefixtures("without_compiler")
-def test_what_a_page_lacks_is_refused(tmp_path, old, new, ranges, message):
+def test_unsupported_systems_are_refused(tmp_path, old, new, ranges, message):
     with pytest.raises((sc.MethodError, sc.StateError, sc.ModelFileError), match=message):
         sc.page(written(tmp_path, OSCILLATOR.replace(old, new, 1)), ranges=ranges)
 

@@ -30,7 +30,7 @@ TITLES = {
 
 
 def record(measured: dict[str, Any], day: str) -> dict[str, Any]:
-    """Return the part of a report that is kept."""
+    """Return the part of a report that is recorded."""
     cases = [{"name": case["name"], "rows": case["rows"]} for case in measured["cases"]]
     return {"date": day, "machine": measured["machine"], "cases": cases}
 
@@ -111,8 +111,8 @@ def main() -> None:
         measured = [json.loads(Path(name).read_text(encoding="utf-8")) for name in reports]
         day = datetime.now(UTC).date().isoformat()
         cases = {case["name"]: case for each in measured for case in record(each, day)["cases"]}
-        kept = record(measured[0], day) | {"cases": [cases[name] for name in TITLES if name in cases]}
-        RECORD.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
+        whole = record(measured[0], day) | {"cases": [cases[name] for name in TITLES if name in cases]}
+        RECORD.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
     PAGE.write_text(page(json.loads(RECORD.read_text(encoding="utf-8"))), encoding="utf-8")
 
 

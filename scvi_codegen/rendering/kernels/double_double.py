@@ -23,7 +23,7 @@ FUNCTIONS = frozenset(
 )
 """Elementary functions of ``templates/support/double_double/functions.h``."""
 
-PER_TURN, PER_OCTAVE, NEAR = 128, 64, 64
+PER_TURN, PER_BINADE, NEAR = 128, 64, 64
 """Rows of the tables of sines and cosines, of powers of 2, and of powers less 1."""
 
 
@@ -163,7 +163,7 @@ def _words(value: Number, count: int) -> list[str]:
 def _tables_of_functions() -> str:
     """Return the tables and coefficients of the elementary functions of pairs."""
     with mp.workdps(80):
-        angle, exponent = mp.pi / 64, mp.log(2) / PER_OCTAVE
+        angle, exponent = mp.pi / 64, mp.log(2) / PER_BINADE
         sines = [(-1) ** (n + 1) / mp.factorial(2 * n + 3) for n in range(7)]
         cosines = [(-1) ** (n + 1) / mp.factorial(2 * n + 2) for n in range(7)]
         exponential = [1 / mp.factorial(n + 2) for n in range(11)]
@@ -171,7 +171,7 @@ def _tables_of_functions() -> str:
         for k in range(PER_TURN):
             both = [mp.zero if abs(x) < mp.mpf(10) ** -60 else x for x in (mp.sin(k * angle), mp.cos(k * angle))]
             turn.append([*_words(both[0], 2), *_words(both[1], 2)])
-        powers = [_words(mp.exp(k * exponent), 2) for k in range(PER_OCTAVE)]
+        powers = [_words(mp.exp(k * exponent), 2) for k in range(PER_BINADE)]
         signed = [k if k < NEAR else k - 2 * NEAR for k in range(2 * NEAR)]  # row of k: k modulo the number of rows
         near = [_words(mp.expm1(k * exponent), 2) for k in signed]
         scalars = {"PER_UNIT_OF_ANGLE": 1 / angle, "PER_UNIT_OF_EXPONENT": 1 / exponent}
