@@ -1,7 +1,7 @@
 /* Order of search results (html_search_scorer): pages with the words of the query in their title come first, then those
  * with the words in headings and index entries, guides before the glossary, and last pages that only use the terms: API
  * entries, theory, examples and measurements. */
-const supporting = {reference: -10, gallery: -8, coming_from: -8, performance: -6, theory: -4, glossary: -2};
+const supporting = {reference: -10, gallery: -8, notebooks: -8, coming_from: -8, performance: -6, theory: -4, glossary: -2};
 const stems = (text) => {
   const words = text.toLowerCase().split(/[^\p{L}\p{N}]+/u).filter((word) => word && !stopwords.has(word));
   return new Set(words.map((word) => new Stemmer().stemWord(word)));
