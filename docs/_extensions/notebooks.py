@@ -1,4 +1,4 @@
-"""Notebooks as pages: they are executed when the site is built, and the results stand below their cells.
+"""Notebooks as pages: they are executed when the site is built, and the results are shown below their cells.
 
 A page that consists of ``{notebook} PATH`` is replaced by the notebook of that path. Notebooks are saved without
 outputs, so results on the site are always those of the current code. Each runs in a process of its own, with the

@@ -232,7 +232,7 @@ function draw(performed) {
   const told = fault ? CAUSES[fault] || `The step failed (status ${fault}).` : performance.now() < noticeEnds ? notice : "";
   by("fault").hidden = !told;
   if (by("fault").textContent !== told) by("fault").textContent = told;
-  if (frames % 20 === 0 || !running) by("status").textContent = `${code.steps().toLocaleString("en")} steps${performed ? `, ${performed} a frame` : ""}; ${short(code.iterations(), 2)} iterations a step${code.error() >= 0 ? `; largest error of a step about ${short(code.error(), 1)}` : ""}`;
+  if (frames % 20 === 0 || !running) by("status").textContent = `${code.steps().toLocaleString("en")} steps${performed ? `, ${performed} a frame` : ""}${code.steps() > 0 ? `; ${short(code.iterations(), 2)} iterations a step${code.error() > 0 ? `; largest error of a step about ${short(code.error(), 1)}` : ""}` : ""}`;
 }
 
 function open() {

@@ -54,20 +54,20 @@ const view = {
     this.fresh = false;
     this.width = width; this.height = height;
     this.scale = (Math.min(width, height) / 2 / this.reach) * this.zoom;
-    [this.cos, this.sin, this.up, this.slope] = [Math.cos(this.turn), Math.sin(this.turn), Math.cos(this.tilt), Math.sin(this.tilt)];
+    [this.cos, this.sin, this.up, this.sine] = [Math.cos(this.turn), Math.sin(this.turn), Math.cos(this.tilt), Math.sin(this.tilt)];
   },
   to(point) {
     const [x, y, z] = point.map((u, k) => u - this.centre[k]);
     if (flat) return [this.width / 2 + this.scale * x, this.height / 2 - this.scale * y, 0, 1];
-    const across = this.cos * x + this.sin * y, away = this.cos * y - this.sin * x, depth = this.slope * z - this.up * away;
+    const across = this.cos * x + this.sin * y, away = this.cos * y - this.sin * x, depth = this.sine * z - this.up * away;
     const near = 1 / (1 - clamped(depth / (5 * this.reach), -4, 0.8));
-    return [this.width / 2 + this.scale * near * across, this.height / 2 - this.scale * near * (this.up * z + this.slope * away), depth, near];
+    return [this.width / 2 + this.scale * near * across, this.height / 2 - this.scale * near * (this.up * z + this.sine * away), depth, near];
   },
   /** Returns the point at pixels, in the plane, or in space at a depth. */
   from([a, b], depth = 0) {
     const near = flat ? 1 : 1 / (1 - depth / (5 * this.reach)), u = (a - this.width / 2) / this.scale / near, w = (this.height / 2 - b) / this.scale / near;
     if (flat) return [this.centre[0] + u, this.centre[1] + w];
-    const z = this.up * w + this.slope * depth, away = this.slope * w - this.up * depth;
+    const z = this.up * w + this.sine * depth, away = this.sine * w - this.up * depth;
     return [this.cos * u - this.sin * away, this.sin * u + this.cos * away, z].map((x, k) => x + this.centre[k]);
   },
   orbit(dx, dy) { this.turn -= dx * 0.008; this.tilt = clamped(this.tilt + dy * 0.008, -1.5, 1.5); },
@@ -151,7 +151,7 @@ function lighting([a, b, c, d]) {
   const [u, v] = [0, 1].map((k) => [0, 1, 2].map((j) => (k ? d || c : c)[j] - (k ? b : a)[j]));
   const normal = unit([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]);
   const [x, y, z] = normal, across = view.cos * x + view.sin * y, away = view.cos * y - view.sin * x;
-  const facing = view.slope * z - view.up * away, up = view.up * z + view.slope * away, light = Math.sign(facing || 1) * (-0.45 * across + 0.6 * up + 0.66 * facing);
+  const facing = view.sine * z - view.up * away, up = view.up * z + view.sine * away, light = Math.sign(facing || 1) * (-0.45 * across + 0.6 * up + 0.66 * facing);
   return clamped(0.75 * light - 0.45, -0.5, 0.35);
 }
 

@@ -65,7 +65,8 @@ def page(recorded: dict[str, Any]) -> str:
         for name, row in rows_of(recorded).items()
     ]
     table = "\n".join(lines)
-    versions = machine["versions"]
+    versions, load = machine["versions"], float(machine["load"].split(",")[0])
+    busy = " (other programs ran)" if load > int(machine["cores"]) / 2 else ""
     return f"""# What would change our mind: claims and how to check them
 
 <!-- index: falsifiable, reproducibility, evidence, check the numbers -->
@@ -92,16 +93,16 @@ takes longer at equal error with its default options. It is wrong if a ratio "de
 
 `{command}`
 
-on {recorded["date"]}: {machine["processor"]}, {machine["cores"]} cores, load {machine["load"]} (other programs ran), heyoka
+on {recorded["date"]}: {machine["processor"]}, {machine["cores"]} cores, load {machine["load"]}{busy}, heyoka
 {versions["heyoka"]}, version {versions["scvi-codegen"]}. Times are processor times of one trajectory.
 
 | problem | error | time stated | recorded | default stated | recorded | best stated | recorded |
 | --- | --- | --- | --- | --- | --- | --- | --- |
 {table}
 
-Problems of the benchmarks that are missing here, among them the outer solar system of the README, have no record yet.
-The claim does not cover other classes of problems: the [pages of benchmarks](performance.md) name those on which other
-programs are faster, and [limits](limits.md) those for which they are better suited.
+Problems of the benchmarks that are missing here have no record yet. The claim does not cover other classes of problems:
+the [pages of benchmarks](performance.md) name those on which other programs are faster, and [limits](limits.md) those
+for which they are better suited.
 """
 
 

@@ -159,7 +159,7 @@ def at_energy(found: Solution, duration: float, energy: float, start: Callable[[
         along = -factors.solve(by_time)
         value, velocity = start(q[0], at.p0[0])
         first = at.blocks[1][0] if not intervals.sparse else _first_block(at, intervals)
-        slope = velocity @ (first @ along[0] + at.by_h[0][0] / count)
+        derivative = velocity @ (first @ along[0] + at.by_h[0][0] / count)
 
         def correction(
             r: Array,
@@ -167,11 +167,11 @@ def at_energy(found: Solution, duration: float, energy: float, start: Callable[[
             factors: Any = factors,
             first: Any = first,
             velocity: Array = velocity,
-            slope: float = slope,
+            derivative: float = derivative,
             along: Array = along,
         ) -> tuple[Array, float]:
             own = -factors.solve(r)
-            change = -(miss + velocity @ (first @ own[0])) / slope
+            change = -(miss + velocity @ (first @ own[0])) / derivative
             return own + change * along, float(change)
 
         moved, change = correction(at.residual, value - energy)
