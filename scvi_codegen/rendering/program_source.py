@@ -31,6 +31,7 @@ from scvi_codegen.rendering.kernels.simd import (
     iteration_source,
     lane_table,
     predictor_text,
+    splitting_source,
 )
 from scvi_codegen.rendering.source import ExampleInput, Interface, Source
 from scvi_codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, MAX_ITERATIONS, ROUNDING_UNITS, included
@@ -255,21 +256,29 @@ def _control_context(program: Program, control: Control | None) -> dict[str, obj
 
 
 def render_ensemble(program: Program) -> Source | None:
-    """Return source that integrates many trajectories at once, one per lane; ``None`` without a fixed-point iteration.
+    """Return source that integrates many trajectories at once, one per lane, by fixed-point iteration or explicitly.
 
-    Also ``None`` with integrals: with a time transformation, trajectories have no common times.
+    ``None`` for other steps, for rigid bodies turned in closed form, and with integrals: with a time transformation,
+    trajectories have no common times.
     """
-    fixed_point = program.fixed_point
-    if fixed_point is None or not fixed_point.serves_many or program.quantities.integrals:
+    fixed_point, split = program.fixed_point, program.splitting
+    if program.quantities.integrals:
+        return None
+    if split is not None and not split.bodies:
+        kernels, points, source = split.kernels, 1, splitting_source(split)
+    elif fixed_point is not None and fixed_point.serves_many:
+        kernels, points = fixed_point.kernels, len(fixed_point.guess.abscissae)
+        source = iteration_source(fixed_point, TRAJECTORIES)
+    else:
         return None
     prefix = f"{program.prefix}_ensemble"
     context = {
         "program": program,
-        "points": len(fixed_point.guess.abscissae),
-        "cut": is_divided(fixed_point.kernels),
-        "needs_velocities": fixed_point.kept is StoredValues.VELOCITIES,
+        "points": points,
+        "cut": is_divided(kernels),
+        "needs_velocities": fixed_point is not None and fixed_point.kept is StoredValues.VELOCITIES,
         "hot": "static",
-        "fixed_point": iteration_source(fixed_point, TRAJECTORIES),
+        "fixed_point": source,
     }
     return _render(prefix, context, "ensemble")
 

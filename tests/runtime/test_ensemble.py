@@ -64,11 +64,16 @@ def coupled_with_inputs() -> sc.LagrangianSystem:
     )
 
 
+RELATIVISTIC = sc.HamiltonianSystem.from_text(
+    "relativistic", ["q"], "sqrt(1 + p_q**2) + k*q**2/2 + cos(t)*q", parameters={"k": 1.0}
+)
 WITH_INPUTS = {"pushed pendulum": pushed_pendulum, "coupled with inputs": coupled_with_inputs}
 
 
 @cache
 def stepper_of(system: str, method: Method) -> sc.Stepper:
+    if system == "relativistic":
+        return sc.compile_stepper(RELATIVISTIC, method)
     if system in WITH_INPUTS:
         solver = "newton" if isinstance(method, sc.SCVI) else "auto"  # which has no lanes
         return sc.compile_stepper(WITH_INPUTS[system](), method, solver=solver)
@@ -80,7 +85,7 @@ def states(name: str, count: int) -> tuple[np.ndarray, np.ndarray]:
     if name == "eccentric":
         zero, e = np.zeros(4), ECCENTRICITIES
         return np.column_stack([1 - e, zero])[:count], np.column_stack([zero, np.sqrt((1 + e) / (1 - e))])[:count]
-    if name in WITH_INPUTS:
+    if name in WITH_INPUTS or name == "relativistic":
         dimension = stepper_of(name, sc.SVI(3)).dimension
         return tuple(np.random.default_rng(2).uniform(-1, 1, (2, count, dimension)))
     q, p = sample_named(name).state
@@ -154,8 +159,15 @@ CASES = {
     },
     **{
         f"backward {method.name}": Case("driven-duffing", method, 9, {"h": -0.02, "steps": 50, "t": 2.0}, 3e-13)
-        for method in (sc.SVI(5), sc.SCVI(3))
+        for method in (sc.SVI(5), sc.SCVI(3), sc.Composition.of(8))
     },
+    "drift of momenta": Case(
+        "relativistic",
+        sc.Composition.of(4),
+        9,
+        {"h": 0.1, "t_end": 1.94, "parameters": {"k": np.linspace(1, 2, 9)}},
+        3e-14,
+    ),
     "newton": Case(
         "harmonic-oscillator", sc.SVI(5), 9, {"h": 0.5, "steps": 50, "save_every": 7, "parameters": {"k": STIFF}}, 1e-10
     ),

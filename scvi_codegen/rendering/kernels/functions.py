@@ -255,7 +255,7 @@ def kernel_text(kernel: Kernel, target: Target, *, partials: bool = False) -> st
     return _text(kernel, target, None, partial(print_statements, target=target), partials=partials)
 
 
-def lane_kernel_text(kernel: Kernel, fixed_point: FixedPointIteration, lanes: Lanes) -> str:
+def lane_kernel_text(kernel: Kernel, fixed_point: FixedPointIteration | None, lanes: Lanes) -> str:
     """Return a function of vectors."""
     printed = partial(print_lane_statements, fixed_point=fixed_point, sources=lanes.sources)
     return _text(kernel, DOUBLE, lanes, printed)
@@ -286,7 +286,7 @@ def _text(kernel: Kernel, target: Target, lanes: Lanes | None, printed: Printed,
     return "\n\n".join([*texts, f"{comment}\n{whole}"])
 
 
-def lane_mass_text(kernel: Kernel, fixed_point: FixedPointIteration, lanes: Lanes, target: Target) -> str:
+def lane_mass_text(kernel: Kernel, fixed_point: FixedPointIteration | None, lanes: Lanes, target: Target) -> str:
     """Return the function of constant masses: of numbers for one trajectory, or of vectors for many."""
     return kernel_text(kernel, target) if lanes.are_points else lane_kernel_text(kernel, fixed_point, lanes)
 

@@ -194,7 +194,7 @@ def print_statements(code: Kernel | Part, target: Target = DOUBLE) -> list[str]:
     ]
 
 
-def print_lane_statements(code: Kernel | Part, fixed_point: FixedPointIteration, sources: Sources) -> list[str]:
+def print_lane_statements(code: Kernel | Part, fixed_point: FixedPointIteration | None, sources: Sources) -> list[str]:
     """Return the statements of a kernel of vectors, or of one of its parts.
 
     Variables that are the same in every lane remain numbers; derivatives are stored at their indices in the mass.
@@ -219,7 +219,8 @@ def _call(part: Part) -> str:
     return f"{part.name}({', '.join(array for array in ARRAYS if part.uses(array))});"
 
 
-def _mass_element(fixed_point: FixedPointIteration, k: int) -> str:
+def _mass_element(fixed_point: FixedPointIteration | None, k: int) -> str:
+    assert fixed_point is not None  # explicit steps have no mass matrix
     i, j = fixed_point.mass_entries[k] if fixed_point.mass_entries else (k, k)
     return f"derivative[{i}]" if fixed_point.diagonal else f"derivative[{i} * M + {j}]"
 

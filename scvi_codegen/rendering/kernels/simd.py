@@ -11,10 +11,10 @@ library is set once, for all steppers of a source: one generator makes one Newto
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
-from scvi_codegen.ir.equations import AdaptivePredictor, FixedPointIteration, StoredValues
+from scvi_codegen.ir.equations import AdaptivePredictor, FixedPointIteration, Splitting, StoredValues
 from scvi_codegen.ir.kernel import Kernel, Number, NumberTable
 from scvi_codegen.rendering.kernels.printer import DOUBLE, INVERSE_ROOT, TIMES, Sources, lane_functions, print_number
 from scvi_codegen.rendering.kernels.roots import with_factors_in_roots
@@ -86,9 +86,9 @@ class IterationSource:
     mass: Kernel | None
     damping: Kernel | None
     support: tuple[str, ...]
-    error_defines: Mapping[str, str]
-    highest: str
-    next: str
+    error_defines: Mapping[str, str] = field(default_factory=dict)
+    highest: str = ""
+    next: str = ""
 
     @property
     def inverse_roots(self) -> bool:
@@ -138,6 +138,26 @@ def iteration_source(
         error_defines=_kept(fixed_point),
         highest=lane_table("HIGHEST", fixed_point.guess.highest),
         next=lane_table("NEXT", fixed_point.guess.next),
+    )
+
+
+def splitting_source(split: Splitting) -> IterationSource:
+    """Return the template data of explicit steps of many trajectories, which are lanes."""
+    kernels = (split.force,) if split.by_masses else (split.force, split.drift)
+    functions = {name for each in (*kernels, split.drift) for name in lane_functions(each, TRAJECTORIES.sources)}
+    sizes = {"LEAPS": str(len(split.kicks)), "EXPLICIT_STEPS": "1", "SPLITTING": "static inline"}
+    tables = (("KICK", split.kicks), ("DRIFT", split.drifts), ("KICK_ABSCISSA", split.abscissae))
+    return IterationSource(
+        lanes=1,
+        whole=False,
+        meaning=TRAJECTORIES,
+        defines=sizes | ({"CONSTANT_MASSES": "1"} if split.by_masses else {}),
+        functions=tuple(map(_vector_function, sorted(functions))),
+        tables=tuple(lane_table(name, numbers, len(numbers)) for name, numbers in tables),
+        kernels=kernels,
+        mass=split.drift if split.by_masses else None,
+        damping=None,
+        support=("iteration/splitting",),
     )
 
 

@@ -157,3 +157,8 @@ typedef struct {
 typedef struct {
   long long first, end;
 } section;
+
+/* Stored values at the points, of the last step and of the one before, which the next step overwrites. */
+typedef struct {
+  lanes (*last)[M], (*before)[M];
+} history;

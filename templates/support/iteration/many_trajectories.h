@@ -5,11 +5,6 @@
  * trajectories, which become inactive, never for all. Requires: trajectories.h, stagnation.h, and the tables
  * LAST_ALONE, LAST, BEFORE, which extrapolate stored values into the next step. */
 
-/* Stored values at the points, of the last step and of the one before, which the next step overwrites. */
-typedef struct {
-  lanes (*last)[M], (*before)[M];
-} history;
-
 /* Memory for the values to be stored. */
 static inline coordinates *kept(history past, coordinates *own)
 {

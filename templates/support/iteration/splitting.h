@@ -1,14 +1,16 @@
-#include "../core/status_codes.h"
-#include "../core/step.h"
-
 /* Explicit splitting method (Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. II.5): for every n
  *   p += h KICK[n] F(q, t + h KICK_ABSCISSA[n]),      q += h DRIFT[n] v,
  * with v = M^-1 p for constant masses (CONSTANT_MASSES), else v(p, t), for rigid bodies (ROTATING_BODIES) with the flow
- * of their kinetic energy in the time h DRIFT[n]. */
+ * of their kinetic energy in the time h DRIFT[n]. Of many trajectories, which are SIMD lanes, if LANES is
+ * defined. Requires: step.h, status_codes.h; or trajectories.h. */
+#ifndef LANES
+typedef real number; /* a value of the trajectory */
+#endif
+
 #ifdef CONSTANT_MASSES
 /* Drift with constant masses. Requires: the kernel mass. */
 typedef struct {
-  real inverse_mass[M];
+  number inverse_mass[M];
 } solver_data;
 
 static void prepare(const step_data *step, solver_data *data)
@@ -19,7 +21,7 @@ static void prepare(const step_data *step, solver_data *data)
 }
 
 /* Advances the positions by a part of the step with the momenta p0 + dp. */
-static inline void drift(const step_data *step, const solver_data *data, real part, real *dp, real *dq)
+static inline void drift(const step_data *step, const solver_data *data, real part, number *dp, number *dq)
 {
   for (int i = 0; i < M; i++)
     dq[i] += step->h * part * data->inverse_mass[i] * (step->p0[i] + (step->carry_p[i] + dp[i]));
@@ -48,9 +50,9 @@ static void prepare(const step_data *step, solver_data *data)
 }
 
 /* Advances the positions by a part of the step with the momenta p0 + dp. */
-static inline void drift(const step_data *step, const solver_data *data, real part, real *dp, real *dq)
+static inline void drift(const step_data *step, const solver_data *data, real part, number *dp, number *dq)
 {
-  real p[M], v[M];
+  number p[M], v[M];
   for (int i = 0; i < M; i++)
     p[i] = step->p0[i] + (step->carry_p[i] + dp[i]);
   drift_velocity(p, step->t, step->parameters, v);
@@ -74,22 +76,17 @@ static inline void drift(const step_data *step, const solver_data *data, real pa
 
 /* Requires: a drift, LEAPS, the tables, and the kernel force. */
 
-/* Computes the increments of one step; memory contains the last force, which the next step reuses if it starts with a
- * kick. */
-SPLITTING int solve(const step_data *step, const solver_data *data, real *memory, long long *guess, real *dq, real *dp,
-    const solver_options *options, solver_report *report, real *workspace)
+/* Computes the increments of one step. F is the last force; it is that of the first kick if `known`. */
+SPLITTING void leap(const step_data *step, const solver_data *data, int known, number *F, number *dq, number *dp)
 {
-  real F[M], u[M];
-  (void)options;
-  (void)workspace;
-  memcpy(F, memory, sizeof F);
-  memset(dq, 0, sizeof(real) * M);
-  memset(dp, 0, sizeof(real) * M);
+  number u[M];
+  memset(dq, 0, sizeof(number) * M);
+  memset(dp, 0, sizeof(number) * M);
   for (int n = 0; n < LEAPS; n++) {
     if (KICK[n] != 0) {
       for (int i = 0; i < M; i++)
         u[i] = step->q0[i] + (step->carry_q[i] + dq[i]);
-      if (n > 0 || !*guess)
+      if (n > 0 || !known)
         force(u, step->t + KICK_ABSCISSA[n] * step->h, step->parameters, F);
       for (int i = 0; i < M; i++)
         dp[i] += step->h * KICK[n] * F[i];
@@ -97,6 +94,19 @@ SPLITTING int solve(const step_data *step, const solver_data *data, real *memory
     if (DRIFT[n] != 0)
       drift(step, data, DRIFT[n], dp, dq);
   }
+}
+
+#ifndef LANES
+/* Computes the increments of one step; memory contains the last force, which the next step reuses if it starts with a
+ * kick. */
+SPLITTING int solve(const step_data *step, const solver_data *data, real *memory, long long *guess, real *dq, real *dp,
+    const solver_options *options, solver_report *report, real *workspace)
+{
+  real F[M];
+  (void)options;
+  (void)workspace;
+  memcpy(F, memory, sizeof F);
+  leap(step, data, *guess > 0, F, dq, dp);
   report->iterations++;
   if (!reaches(step, dq, dp))
     return NOT_FINITE;
@@ -104,3 +114,22 @@ SPLITTING int solve(const step_data *step, const solver_data *data, real *memory
   *guess = 1;
   return OK;
 }
+#else
+typedef solver_data iteration_data;
+
+static void prepare_iteration(const step_data *step, iteration_data *data)
+{
+  prepare(step, data);
+}
+
+/* Computes the increments of one step of each trajectory; the last step has stored its last force. */
+static inline void fixed_point(const step_data *step, const iteration_data *data, history past, long long *guess,
+    lanes *dq, lanes *dp, const solver_options *options, solver_report *report)
+{
+  (void)options;
+  memcpy(past.before[0], past.last[0], sizeof(lanes) * M);
+  leap(step, data, *guess > 0, past.before[0], dq, dp);
+  report->iterations++;
+  *guess = 1;
+}
+#endif

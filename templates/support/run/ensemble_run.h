@@ -1,7 +1,8 @@
-#include "../iteration/many_trajectories.h"
+#include "../core/trajectories.h"
 
-/* Ensemble runs with compensated sums; trajectories are SIMD lanes. Requires: many_trajectories.h, numbers.h, and
- * prepare_iteration and iteration of a solver, which compute the increments of a step. */
+/* Ensemble runs with compensated sums; trajectories are SIMD lanes. Requires: trajectories.h, numbers.h, and
+ * prepare_iteration and fixed_point of a solver, which compute the increments of a step; EXPLICIT_STEPS if it does not
+ * iterate. */
 
 void NAME(start)(block_memory *block, double t, double h)
 {
@@ -84,6 +85,7 @@ static void store_states(const state *now, int count, double *q, double *p)
   }
 }
 
+#ifndef EXPLICIT_STEPS
 /* Results of a step of which some trajectories are repeated. */
 typedef struct {
   lanes curve[S][M], position[2 * M], momentum[2 * M];
@@ -126,6 +128,7 @@ static SELDOM int repeats_failed(first_results *stored, history past, long long 
   *guess = 0;
   return 1;
 }
+#endif
 
 void NAME(advance)(block_memory *block, int count, long long steps, long long every, const solver_options *options,
     double *q, double *p, long long row_length)
@@ -135,7 +138,9 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
   iteration_data data;
   solver_report report = {.active = block->active};
   lanes parameters[P + 1], memory[2][S][M];
+#ifndef EXPLICIT_STEPS
   first_results stored_results;
+#endif
   lanes dq[2 * M] = {{0.0}}, dp[2 * M] = {{0.0}}; /* increments, then their low words */
   step_data step = {.t = block->t,
       .h = block->h,
@@ -152,12 +157,16 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
     const long long parity = block->step % 2;
     const history past = {memory[1 - parity], memory[parity]};
     step.t = block->t;
+#ifdef EXPLICIT_STEPS
+    fixed_point(&step, &data, past, &block->guess, dq, dp, options ? options : &standard, &report);
+#else
     memcpy(stored_results.active, block->active, sizeof stored_results.active);
     stored_results.repeated = 0;
     do
       fixed_point(&step, &data, past, &block->guess, dq, dp, options ? options : &standard, &report);
     while (memcmp(stored_results.active, block->active, sizeof stored_results.active) != 0 && block->step > 0 &&
         repeats_failed(&stored_results, past, &block->guess, dq, dp, block->active));
+#endif
     drop_infinite(&now, dq, dp, block->active);
     add_increments(now.q, now.carry_q, dq, block->active);
     add_increments(now.p, now.carry_p, dp, block->active);
