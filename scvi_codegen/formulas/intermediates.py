@@ -172,6 +172,16 @@ def written_size(expression: Expr) -> int:
     return size(expression)
 
 
+def distinct_nodes(expressions: Sequence[Expr]) -> int:
+    """Return the number of different nodes in expressions and in the definitions of the quantities in them."""
+    seen, pending = set(expressions), list(expressions)
+    while pending:
+        new = set(pending.pop().args) - seen
+        seen |= new
+        pending += new
+    return len(seen)
+
+
 def inner_of(expression: Expr) -> tuple[Intermediate, ...]:
     """Return the quantities in an expression, without those in their definitions."""
     seen, quantities, pending = {expression}, [], [expression]

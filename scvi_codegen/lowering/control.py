@@ -28,6 +28,7 @@ from sympy import Expr
 from scvi_codegen.controllers import Controller
 from scvi_codegen.controllers.predictive import PREDICTIVE
 from scvi_codegen.formulas.expressions import gradient_tuple, jacobian
+from scvi_codegen.formulas.intermediates import distinct_nodes
 from scvi_codegen.ir.arithmetic import INVERSE_ROOTS
 from scvi_codegen.ir.equations import (
     AdaptivePredictor,
@@ -192,8 +193,9 @@ def _padded(rows: list[list[float]], through: NumberTable, lanes: int) -> Number
 
 MOST_NODES = 3, 4
 """Largest numbers of nodes at round-off level and above; those nearest to the Gauss points of as many are chosen."""
-MOST_COORDINATES, MOST_DERIVATIVES = 20, 180
-"""Largest numbers of coordinates and of distinct derivatives F_q, to limit the time of compilation."""
+MOST_COORDINATES, MOST_DERIVATIVES, MOST_OPERATIONS = 20, 180, 1500
+"""Largest numbers of coordinates, of distinct derivatives F_q and of operations in coupled equations (a chain of five
+links has 1200): their derivatives would take more than half of the time of compilation of larger systems."""
 
 
 def error_growth_of(system: MechanicalSystem, program: Program) -> ErrorGrowth | None:
@@ -207,9 +209,10 @@ def error_growth_of(system: MechanicalSystem, program: Program) -> ErrorGrowth |
     which = [_nodes(points, most) for most in MOST_NODES]
     if make is None or twin is None or len(set(points)) < len(points) or len(which[0]) < 2:
         return None
-    partials, product, energy = make(twin)
-    if partials.values > MOST_DERIVATIVES:
+    kernels = make(twin)
+    if kernels is None or kernels[0].values > MOST_DERIVATIVES:
         return None
+    partials, product, energy = kernels
     lanes = fixed_point.lanes
     tables = (
         IterationTable("TANGENT_INTEGRALS", pad_matrix(cardinal_integrals(points, points, mp.zero), lanes)),
@@ -247,10 +250,12 @@ def _separable_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, None]:
     return partials, products[0], None
 
 
-def _coupled_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, Kernel]:
-    """Return kernels of L_vv dq'' = -E_q dq - E_v dq', with E(q, v, a) the Euler-Lagrange residual."""
+def _coupled_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, Kernel] | None:
+    """Return kernels of L_vv dq'' = -E_q dq - E_v dq', E(q, v, a) the Euler-Lagrange residual, unless too large."""
     forms, of = forms_of(system), (*system.coordinates, *system.velocities)
     residual = [-each for each in forms.euler_lagrange]
+    if distinct_nodes(residual) > MOST_OPERATIONS:
+        return None
     entries = jacobian(residual, of) or NOTHING
     different = tuple(dict.fromkeys(entries.values()))
     partials = system_kernel(
@@ -275,7 +280,7 @@ def _coupled_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, Kernel]:
     return partials, product, energy
 
 
-GROWTH_KERNELS: Mapping[str, Callable[[LagrangianSystem], tuple[Kernel, Kernel, Kernel | None]]] = {
+GROWTH_KERNELS: Mapping[str, Callable[[LagrangianSystem], tuple[Kernel, Kernel, Kernel | None] | None]] = {
     "separable_derivatives": _separable_growth,
     "coupled_derivatives": _coupled_growth,
 }
