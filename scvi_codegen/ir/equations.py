@@ -104,25 +104,27 @@ class Rattle:
     Attributes:
         force: L_q at u = q.
         mass: M (no arguments).
-        products: (e, f) of derivatives of constraints with respect to the same coordinate.
-        entries: of each product the two constraints (k, l).
         abscissae: (s + 1,) of the points; weights: (s + 1,), of p1 = p0 + h sum_n w_n F_n.
         start: (s,), 0 except for rounding, and momentum: (s, s), from forces at the points but the last to velocities,
             M V_b = (1 + start[b]) p0 + h sum_n momentum[n][b] F_n.
         position: (s, s) from them to the points but the first, u_i = q0 + h sum_b position[b][i] V_b.
-        response: (s, s), the product of both, h^2 sum_n response[n][i] F_n / M.
+        response: (s, s), the product of both, h^2 sum_n response[n][i] F_n / M; inverse: its inverse.
     """
 
     force: Kernel
     mass: Kernel
-    products: tuple[tuple[int, int], ...]
-    entries: tuple[tuple[int, int], ...]
     abscissae: tuple[Number, ...]
     weights: tuple[Number, ...]
     start: tuple[Number, ...]
     momentum: NumberTable
     position: NumberTable
     response: NumberTable
+    inverse: NumberTable
+
+    @property
+    def lanes(self) -> int:
+        """Number of SIMD lanes, s rounded up to a power of two."""
+        return 1 << (len(self.start) - 1).bit_length()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -316,10 +316,24 @@ class Program:
         return tuple(sorted(extra).index(place) for place in extra)
 
     @property
+    def constraint_products(self) -> tuple[tuple[int, int, int, int], ...]:
+        """Products of derivatives e, f of constraints with respect to the same coordinate, e, f, row, distance.
+
+        They are terms of the entries of G M^-1 G^T at this distance below the diagonal, in the order of the positions.
+        """
+        entries = self.constraints.entries if self.constraints else ()
+        places = [(self.constraint_positions[k], i) for k, i in entries]
+        return tuple(
+            (e, f, row, row - column)
+            for e, (row, i) in enumerate(places)
+            for f, (column, j) in enumerate(places)
+            if i == j and row >= column
+        )
+
+    @property
     def constraint_reach(self) -> int:
         """Largest distance of coupled constraints in this order."""
-        places = self.constraint_positions
-        return max(abs(places[k] - places[j]) for k, j in self.rattle.entries) if self.rattle else 0
+        return max((distance for *_, distance in self.constraint_products), default=0)
 
     @property
     def action(self) -> bool:

@@ -5,10 +5,10 @@ explicit in forces and multipliers (Lobatto IIIA and IIIB), which leaves s equat
 
     g(u_i) = 0,   u_i = q0 + h c_i M^-1 p0 + h^2 sum_n a_in M^-1 (F_n + G_n^T lambda_n),   i = 1 .. s, n = 0 .. s - 1,
 
-then one for the momentum at the end, G_s M^-1 (.. + h w_s G_s^T lambda_s) + g_t = 0. The first are solved by a
-simplified Newton iteration with the matrix h^2 a_in G_i M^-1 G_n^T, a band matrix if the constraints form a chain,
-factorised once per step. Changes of forces and derivatives with the positions are neglected, an error of order h^2 that
-the iteration removes. SVI(1) is RATTLE.
+then one for the momentum at the end, G_s M^-1 (.. + h w_s G_s^T lambda_s) + g_t = 0. The first are solved iteratively:
+with P_n = G_n M^-1 G_n^T, a band matrix if the constraints form a chain, and R = (a_in), the correction of lambda is
+-P_n^-1 (R^-1 (g + G du))_n / h^2. Changes of forces and derivatives within the step are neglected, an error of order h
+that the iteration removes. SVI(1) is RATTLE.
 
 Constraints of systems of arrays are solved by RATTLE and its symmetric compositions. A step of h is, with G0 and G1 the
 derivatives of the constraints at its ends,
@@ -54,7 +54,7 @@ from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageSystem, Velocities
-from scvi_codegen.tables.basis import matrix_product, transpose
+from scvi_codegen.tables.basis import matrix_product, rounded, transpose
 from scvi_codegen.tables.precision import Vector, mp
 
 
@@ -63,23 +63,18 @@ def rattle_of(system: MechanicalSystem, stages: StageSystem) -> Rattle | None:
     forms, tables = forms_of(system), velocity_tables(stages.shape)
     if any(velocity_conditions(system)) or not forms.separable or tables is None:
         return None
-    partials = list(constraint_jacobian(system))
-    entries_at: dict[int, list[int]] = {}
-    for e, (_, i) in enumerate(partials):
-        entries_at.setdefault(i, []).append(e)
-    products = tuple((e, f) for entries in entries_at.values() for e in entries for f in entries)
     position, momentum = tables.position[1:], tuple(line[:-1] for line in tables.momentum)
+    response = transpose(matrix_product(position, momentum))
     return Rattle(
         force=system_kernel(system, "constrained_force", forms.force, u=system.coordinates, purpose="L_q at u = q."),
         mass=system_kernel(system, "constrained_mass", forms.mass.values(), u=(), purpose="The constant masses."),
-        products=products,
-        entries=tuple((partials[e][0], partials[f][0]) for e, f in products),
         abscissae=lower_vector(tables.abscissae),
         weights=lower_vector(tables.end_momentum),
         position=lower_matrix(transpose(position)),
         start=lower_vector(tuple(line[0] / tables.end_momentum[0] - 1 for line in momentum)),
         momentum=lower_matrix(transpose(momentum)),
-        response=lower_matrix(transpose(matrix_product(position, momentum))),
+        response=lower_matrix(response),
+        inverse=lower_matrix(rounded((mp.matrix(response) ** -1).tolist())),
     )
 
 

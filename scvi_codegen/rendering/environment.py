@@ -27,13 +27,15 @@ def _numbers(context: Context, values: Sequence[Number]) -> list[str]:
 
 
 @pass_context
-def _vector(context: Context, name: str, values: Sequence[Number]) -> str:
-    return table(f"static const {context['target'].scalar} {name}[{len(values)}]", _numbers(context, values))
+def _vector(context: Context, name: str, values: Sequence[Number], size: str = "") -> str:
+    """Return the table of numbers, padded with zeros to ``size``, an expression in C."""
+    return table(f"static const {context['target'].scalar} {name}[{size or len(values)}]", _numbers(context, values))
 
 
 @pass_context
-def _matrix(context: Context, name: str, rows: Rows) -> str:
-    size = f"[{len(rows)}][{len(rows[0])}]"
+def _matrix(context: Context, name: str, rows: Rows, columns: str = "") -> str:
+    """Return the table of rows, padded with zeros to so many columns."""
+    size = f"[{len(rows)}][{columns or len(rows[0])}]"
     return table(f"static const {context['target'].scalar} {name}{size}", [_numbers(context, row) for row in rows])
 
 
@@ -43,8 +45,10 @@ def _rests(context: Context, rows: Rows) -> Rows:
     return [list(map(context["target"].rest, row)) for row in rows]
 
 
-def _pairs(name: str, entries: Sequence[tuple[int, int]]) -> str:
-    return table(f"static const int {name}[{len(entries)}][2]", [f"{{{i}, {j}}}" for i, j in entries])
+def _pairs(name: str, entries: Sequence[tuple[int, ...]]) -> str:
+    """Return the table of tuples of integers of one length."""
+    rows = [f"{{{', '.join(map(str, entry))}}}" for entry in entries]
+    return table(f"static const int {name}[{len(entries)}][{len(entries[0])}]", rows)
 
 
 @pass_context
