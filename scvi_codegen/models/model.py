@@ -66,6 +66,7 @@ class Model(TimeSpan):
         events: zero crossings that runs record, which may change the state.
         mesh: of the fields of a density.
         page: ranges of sliders, speed and plots of :func:`~scvi_codegen.page`, as its arguments.
+        picture: points, and rods, springs, walls, bodies and trails between them, as of :func:`~scvi_codegen.page`.
 
     Raises:
         ModelFileError: naming the field, unless exactly one of p and velocity, at most one of h, tolerance and error,
@@ -85,6 +86,7 @@ class Model(TimeSpan):
     events: tuple[Event, ...] = ()
     mesh: Any = field(default=None, compare=False, repr=False)
     page: Mapping[str, Any] = field(default_factory=dict)
+    picture: Mapping[str, Any] = field(default_factory=dict)
 
     __repr__ = summary("system", "method", "h", "span", "steps")
 
@@ -94,6 +96,7 @@ class Model(TimeSpan):
         if arrays is not None and self.mesh is None:
             object.__setattr__(self, "mesh", arrays.mesh)
         object.__setattr__(self, "page", _with_lists(self.page))
+        object.__setattr__(self, "picture", _with_lists(self.picture))
         object.__setattr__(self, "method", as_method(self.method, one_coordinate(arrays) if arrays else self.system))
         if isinstance(self.system, FirstOrderSystem) and self.p is self.velocity is None:
             for name, half in zip(("q", "p"), self.system.halves(self.q), strict=True):

@@ -33,10 +33,11 @@ from scvi_codegen.mechanics.first_order import FirstOrderSystem
 from scvi_codegen.models.model import DEFAULT_METHOD, Model
 from scvi_codegen.models.model_files.document import document_of
 from scvi_codegen.models.model_files.model_file import load_model
-from scvi_codegen.models.model_files.page_section import check_page
+from scvi_codegen.models.model_files.page_section import check_page, check_picture, drawn_system_of_model
 from scvi_codegen.models.packages.package import generate_package
-from scvi_codegen.pages.shape import shape_data
 from scvi_codegen.pages.webassembly import LICENCES, webassembly
+from scvi_codegen.pictures.recognition import shape_of
+from scvi_codegen.pictures.shape import DrawnSystem, shape_of_picture
 from scvi_codegen.rendering.environment import template_environment
 from scvi_codegen.representation import summary
 from scvi_codegen.validation import ArgumentType, checks_arguments, keyword_hint
@@ -53,6 +54,8 @@ CAUSES = (
 """Text of each status of the generated C."""
 ARRAY = re.compile(r"(\w+)\[")
 NAME = re.compile(r"[A-Za-z_]\w*\b(?!\()")
+LONG_NUMBER = re.compile(r"\d{12}")
+"""Numbers of robots from files, with which a Lagrangian is not shown."""
 SECONDS = 30
 """Duration of the span of a model at the speed that a page begins with, unless time is in seconds or so."""
 HEIGHT = 760
@@ -72,13 +75,14 @@ def page(
     ranges: Mapping[str, tuple[float, float]] | None = None,
     speed: float | None = None,
     plots: Sequence[tuple[str, str]] | None = None,
+    picture: Mapping[str, Any] | None = None,
     **motion: Any,
 ) -> Page:
     """Return a page that computes the motion of a model in the browser, with sliders and plots.
 
     The generated C is compiled to WebAssembly by the extra ``compiler``; its first use takes a minute or two, since it
     compiles its C library. The file of a field contains the formulas of its initial values if ``model`` is a path.
-    ``ranges``, ``speed`` and ``plots`` replace those of ``[page]`` in a model file.
+    ``ranges``, ``speed`` and ``plots`` replace those of ``[page]`` in a model file, ``picture`` its ``[picture]``.
 
     Args:
         model: model, path of a model file, or system (of a field, that of its mesh); steps are fixed, or adaptive
@@ -89,6 +93,10 @@ def page(
             of that order.
         plots: names of the variables of each plot, the horizontal one first: t, energy, coordinates, momenta, and
             conserved quantities; of arrays and fields nodes, as ``q.40``.
+        picture: what is drawn instead of what is recognised: ``points``, two or three formulas or numbers by name, in
+            coordinates, momenta, parameters, entries of rotations and t; ``rods``, ``springs`` and ``walls``, lists of
+            points; ``bodies``, points that are drawn and dragged, by default those that move; ``trails``, points whose
+            paths are drawn, by default those of the bodies.
         motion: of a system, the arguments of :class:`Model`: ``q``, ``velocity`` or ``p``, ``h`` or ``tolerance``, and
             also ``method`` (default SVI(8)) and others; default of ``span``: 30.
 
@@ -105,6 +113,8 @@ def page(
     """
     given = {"ranges": ranges, "speed": speed, "plots": plots}
     settings = {name: value for name, value in given.items() if value is not None}
+    if picture is not None:
+        settings["picture"] = picture
     if SYSTEM_OR_ARRAYS.accepts(model):
         model = _model_of(model, motion)
     elif motion:
@@ -116,7 +126,7 @@ def page(
 
 def _model_of(system: Any, motion: Mapping[str, Any]) -> Model:
     """Return the model of a system with the arguments of its motion."""
-    known = [name for name in Model.__dataclass_fields__ if name not in ("system", "page")]
+    known = [name for name in Model.__dataclass_fields__ if name not in ("system", "page", "picture")]
     for name in motion:
         if name not in known:
             raise ArgumentError(f"page() takes no {name!r}{keyword_hint(name, known)}")
@@ -132,8 +142,10 @@ def page_of(model: Model, document: Mapping[str, Any], settings: Mapping[str, An
     Args:
         model: with the settings of its file.
         document: sections of the file.
-        settings: ranges, speed and plots, which replace those of the file.
+        settings: ranges, speed, plots and the picture, which replace those of the file.
     """
+    settings = dict(settings)
+    model = replace(model, picture=settings.pop("picture", model.picture))
     ranges = {**model.page.get("ranges", {}), **settings.get("ranges", {})}
     model = replace(model, page={**model.page, **settings, "ranges": ranges})
     model._check_double("a page")
@@ -160,6 +172,7 @@ def _check(model: Model, ranges: Mapping[str, tuple[float, float]]) -> None:
     if model.h is None and model.tolerance is None:
         raise MethodError(f"a page requires a step size or tolerance; {name} has neither: give [run] step or tolerance")
     check_page(model.page, model, "page")
+    check_picture(model)
     for parameter in ranges.keys() & model.parameters.keys():
         (low, high), value = ranges[parameter], model.parameters[parameter]
         if not low <= value <= high:
@@ -187,7 +200,7 @@ class Page:
         """Text of the file."""
         model, document = self.model, self.document
         with tempfile.TemporaryDirectory(prefix="scvi-codegen-") as temporary:
-            folder = generate_package(replace(model, page={}), Path(temporary, "motion"))
+            folder = generate_package(replace(model, page={}, picture={}), Path(temporary, "motion"))
             interface = _interface(folder, model)
             initial = _initial(document, [*model.mesh.points, *interface.parameters]) if model.mesh else ()
             (folder / "page.c").write_text(_entry(folder, model, interface, initial, self.adaptive), encoding="utf-8")
@@ -284,12 +297,12 @@ def _initial(document: Mapping[str, Any], names: Sequence[str]) -> tuple[str, ..
 
 def _lagrangian(document: Mapping[str, Any]) -> list[str]:
     """Return the Lagrangian or density as written, as terms of MathML; none of array systems and the like."""
-    text = document.get("field", {}).get("density") or document.get("system", {}).get("lagrangian")
+    text = str(document.get("field", {}).get("density") or document.get("system", {}).get("lagrangian") or "")
     try:
-        density = parse_expression(str(text or ""), {name: symbol(name) for name in NAME.findall(str(text))})
+        density = parse_expression(text, {name: symbol(name) for name in NAME.findall(text)})
     except ExpressionError:
         return []
-    return list(mathml_terms(density, sympy.Symbol("L")))
+    return [] if LONG_NUMBER.search(str(density)) else list(mathml_terms(density, sympy.Symbol("L")))
 
 
 def _flat(state: Any) -> list[float]:
@@ -317,13 +330,23 @@ def _velocity(model: Model) -> list[float]:
     return _flat(velocity)
 
 
+def _drawn_system(model: Model, interface: Any) -> DrawnSystem:
+    """Return what the recognition of a shape reads of a model; a stepper is compiled where it needs the energy."""
+
+    def energy(q: Any, p: Any) -> Any:
+        return np.asarray(model.stepper().energy(q, p, model.t, model.parameters), dtype=float)
+
+    drawn = drawn_system_of_model(model)
+    return drawn if interface.array else replace(drawn, interface=interface, energy=energy)
+
+
 def _description(shown: Page, interface: Any, *, initial: bool) -> dict[str, Any]:
     """Return what the scripts of the page read."""
     model, adaptive = shown.model, shown.adaptive
     ranges = model.page.get("ranges", {})
     q, v = _flat(model.q), _velocity(model)
-    shape = shape_data(model, interface, q)
-    rods = "rods" in shape["source"]
+    drawn = _drawn_system(model, interface)
+    shape = (shape_of_picture(drawn, model.picture) if model.picture else shape_of(drawn)).to_data()
     parameters = []
     for name, value in _values(model, interface).items():
         size = abs(value) or 1.0
@@ -333,7 +356,11 @@ def _description(shown: Page, interface: Any, *, initial: bool) -> dict[str, Any
     span = abs(float(model.end - model.t))
     speed = model.page.get("speed", 1.0 if 0.3 < span / SECONDS < 4 else float(f"{span / SECONDS:.0e}"))
     step = float(model.tolerance if adaptive else model.h)  # type: ignore[arg-type]
-    limits = [math.pi, 12.0] if rods else [2 * max([1.0, *(abs(x) for x in kind)]) for kind in (q, v)]
+    limits = (
+        [math.pi, 12.0]
+        if len(shape["angles"]) == len(q)
+        else [2 * max([1.0, *(abs(x) for x in kind)]) for kind in (q, v)]
+    )
     names = interface.coordinates or [""] * len(q)
     sliders = {
         kind: [ranges.get(f"{name}{ending}", [-limit, limit]) for name in names]
@@ -356,7 +383,7 @@ def _description(shown: Page, interface: Any, *, initial: bool) -> dict[str, Any
 def _variables(interface: Any, shape: Mapping[str, Any], size: int) -> list[str]:
     """Return the names of the variables of plots, as in ``plots.js``."""
     if size <= WHOLE and interface.coordinates:
-        solids = [f"{each['name']}.{axis}" for each in shape["source"].get("solids", ()) for axis in "xyz"]
+        solids = [f"{each['name']}.{axis}" for each in shape["solids"] for axis in "xyz"]
         names = [*interface.coordinates, *interface.momentum_names, *solids]
     else:
         nodes = range(size) if size <= WHOLE else (size // 4, size // 2)

@@ -1,16 +1,12 @@
-"""Animations of trajectories, for a notebook or a file, and recognition of the shapes to animate.
-
-Shapes are recognised from coordinates and energies: bodies, chained pendulums, chains, points.
-"""
+"""Animations of trajectories, for a notebook or a file."""
 
 from __future__ import annotations
 
 import math
 import os
-import re
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -20,11 +16,7 @@ import numpy as np
 
 from scvi_codegen.errors import PlotError, StateError
 from scvi_codegen.files.atomic import replaced
-from scvi_codegen.mechanics.symmetry.sampling import bodies
-from scvi_codegen.pictures.arrays import array_values, mesh_of
-from scvi_codegen.pictures.attitudes import solids
 from scvi_codegen.pictures.canvas import (
-    COLORS,
     MOTIONS,
     Array,
     DrawnMotion,
@@ -36,7 +28,8 @@ from scvi_codegen.pictures.canvas import (
     several,
     style,
 )
-from scvi_codegen.pictures.robots import links_of, skeleton
+from scvi_codegen.pictures.recognition import shape_of
+from scvi_codegen.pictures.shape import DrawnSystem, MovingShape, shape_of_picture
 from scvi_codegen.representation import summary
 from scvi_codegen.validation import REAL, checks_arguments
 
@@ -44,168 +37,57 @@ if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
     from matplotlib.axes import Axes
 
-NUMBERED = re.compile(r"(.*?)_?(\d+)")
-LENGTHS = ("l", "L", "length")
-"""Names of parameters that are rod lengths, alone or followed by a number."""
-MAX_RODS = 6
-GENERIC = 0.3, 0.17
-"""First angle, and difference between angles, of a state without accidental symmetry."""
+
+def drawn_system_of(motion: DrawnMotion) -> DrawnSystem:
+    """Return what the recognition of a shape reads of a trajectory."""
+    stepper: Any = motion.stepper
+    q: Any = motion.q
+    interface, layout = stepper.interface, stepper.interface.layout
+    arrays = stepper.arrays(np.asarray(q)[:1]) if interface.arrays else {a.name: q[a.name] for a in layout.coordinates}
+    shapes = {name: np.shape(values)[1:] for name, values in arrays.items()}
+
+    def energy(q: Array, p: Array) -> Array:
+        return np.asarray(stepper.energy(q, p, motion.t[0], motion.parameters), dtype=float)
+
+    return DrawnSystem(
+        interface=interface, momenta=interface.momenta, shapes=shapes, energy=None if layout.coordinates else energy,
+        mesh=layout.mesh, links=layout.links, lengths=interface.lengths,
+    )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MovingPoints:
-    """Points, lines and labels that represent a state.
+@dataclass(frozen=True, kw_only=True)
+class _Positions(MovingShape):
+    """Points whose positions a function of q returns."""
 
-    Attributes:
-        points: function from q and p (n, m) to (n, k, d) positions of k points in the plane or in space.
-        joined: draw a line through the points of a state.
-        solids: slices of points that a line joins each, or none.
-        joints: mark the points of solids.
-        trails: indices of the points whose paths are drawn.
-        labels: labels of the d axes.
-        names: names of the points, or none.
-        equal: use one scale for all axes.
-    """
+    function: Callable[[Array], Array]
 
-    points: Callable[[Array, Array], Array]
-    labels: tuple[str, ...]
-    joined: bool = False
-    solids: tuple[slice, ...] = ()
-    joints: bool = False
-    trails: tuple[int, ...] = ()
-    names: tuple[str, ...] = ()
-    equal: bool = True
+    def positions(self, t: Any, q: Array, p: Array, parameters: Any) -> Array:
+        return np.asarray(self.function(q), dtype=float)
 
 
-def shape_of(motion: DrawnMotion, positions: Callable[[Array], Array] | None = None) -> MovingPoints:
-    """Return the shape of a system: bodies by coordinate names, pendulums by energy, else a point or a chain.
-
-    Args:
-        motion: trajectory whose coordinates are examined.
-        positions: function from q (n, m) to (n, k, 2) or (n, k, 3) positions of k points, instead of those recognised.
+def drawn_shape(
+    motion: DrawnMotion, positions: Callable[[Array], Array] | None = None, picture: Mapping[str, Any] | None = None
+) -> MovingShape:
+    """Return the shape of a trajectory: that of a function or a picture if one is given, else recognised.
 
     Raises:
         StateError: if ``positions`` returns another shape.
+        ModelFileError: for mistakes in ``picture``.
     """
-    coordinates, m = motion.stepper.interface.coordinates, motion.q.shape[1]
-    if positions is not None:
-        tried = np.shape(positions(motion.q[:1]))
-        if len(tried) != 3 or tried[0] != 1 or tried[2] not in (2, 3):
-            raise StateError(f"positions(q) must have shape (n, k, 2) or (n, k, 3); for n = 1 it has {tried}")
-        return MovingPoints(
-            points=lambda q, p: np.asarray(positions(q), dtype=float),
-            labels=tuple("xyz"[: tried[2]]),
-            trails=tuple(range(tried[1])),
-        )
-    if links_of(motion):
-        points, parts, tips = skeleton(motion)
-        return MovingPoints(points=lambda q, p: points, labels=tuple("xyz"), solids=parts, trails=tips, joints=True)
-    if motion.stepper.interface.rotations:
-        return _solids(motion)
-    if result := bodies(coordinates):
-        columns = np.array([body.columns for body in result])
-        names = tuple(body.name for body in result if body.name)
-        labels = tuple("xyz"[: columns.shape[1]])
-        return MovingPoints(
-            points=lambda q, p: q[:, columns], labels=labels, trails=tuple(range(len(result))), names=names
-        )
-    if (mesh := mesh_of(motion)) is not None and len(mesh.axes) < 3:
-        return _graph(motion)
-    if (sign := hanging(motion)) is not None:
-        return _pendulum(_lengths(motion), sign)
-    if m == 1:
-        labels = (coordinates[0], motion.stepper.interface.momenta[0])
-        return MovingPoints(points=lambda q, p: np.stack([q, p], axis=2), labels=labels, trails=(0,), equal=False)
-    if m == 2:
-        return MovingPoints(points=lambda q, p: q[:, np.newaxis], labels=tuple(coordinates), trails=(0,))
-    positions_of_indices = np.arange(1.0, m + 1)
-    return MovingPoints(
-        points=lambda q, p: np.stack([np.broadcast_to(positions_of_indices, q.shape), q], axis=2),
-        labels=("number of the coordinate", "q"),
-        joined=True,
-        equal=False,
-    )
+    if positions is None:
+        drawn = drawn_system_of(motion)
+        return shape_of(drawn) if picture is None else shape_of_picture(drawn, picture)
+    tried = np.shape(positions(motion.q[:1]))
+    if len(tried) != 3 or tried[0] != 1 or tried[2] not in (2, 3):
+        raise StateError(f"positions(q) must have shape (n, k, 2) or (n, k, 3); for n = 1 it has {tried}")
+    numbers = range(tried[1])
+    marks = [{"kind": "body", "points": [k]} for k in numbers]
+    return _Positions(function=positions, dimension=tried[2], points=[[0]] * tried[1], marks=marks, trails=numbers)
 
 
-def _solids(motion: DrawnMotion) -> MovingPoints:
-    """Return a box for each rotation, an arrow for each direction and spin, at (x, y, z) if these are coordinates."""
-    coordinates = motion.stepper.interface.coordinates
-    columns = [coordinates.index(name) for name in "xyz" if name in coordinates]
-    centres = motion.q[:, columns] if len(columns) == 3 else np.zeros((len(motion.q), 3))
-    points, parts, trails = solids(motion, centres)
-    return MovingPoints(points=lambda q, p: points, labels=tuple("xyz"), solids=parts, trails=trails)
-
-
-def _graph(motion: DrawnMotion) -> MovingPoints:
-    """Return the graph of the first field of a mesh, a line over x or the lines of a surface over x and y."""
-    mesh, (name, values) = mesh_of(motion), array_values(motion, None)
-    points = np.stack([*(np.broadcast_to(grid, values.shape) for grid in mesh.points.values()), values], axis=-1)
-    count = values.shape[-1]
-    lines = tuple(slice(k, k + count) for k in range(0, values[0].size, count))
-    return MovingPoints(
-        points=lambda q, p: points.reshape(len(points), -1, points.shape[-1]),
-        labels=(*(axis.name for axis in mesh.axes), name),
-        solids=lines,
-        equal=False,
-    )
-
-
-def _pendulum(lengths: Array, sign: float) -> MovingPoints:
-    """Return a chain of rods, each hanging from (sign 1) or standing on (-1) the end of the previous one."""
-
-    def points(q: Array, p: Array) -> Array:
-        rods = np.stack([lengths * np.sin(q), -sign * lengths * np.cos(q)], axis=2)
-        ends = np.cumsum(rods, axis=1)
-        return np.concatenate([np.zeros_like(ends[:, :1]), ends], axis=1)
-
-    return MovingPoints(points=points, labels=("x", "y"), joined=True, trails=(len(lengths),))
-
-
-def hanging(motion: DrawnMotion) -> float | None:
-    """Return 1 if the coordinates are angles of pendulums that hang at 0, -1 if upright there, else ``None``."""
-    # V = sum a_i (1 - cos q_i), all a_i of one sign; T of two neighbouring momenta is not the sum of that of each.
-    numbers, m = numbers_of(motion.stepper.interface.coordinates), motion.q.shape[1]
-    if m > MAX_RODS or (m > 1 and numbers is None):
-        return None
-    generic = GENERIC[0] + GENERIC[1] * np.arange(m)
-    q = np.concatenate([np.zeros((1, m)), math.pi * np.eye(m), [generic]])
-    try:
-        at_rest = _energies(motion, q, np.zeros_like(q))
-        a = (at_rest[1:-1] - at_rest[0]) / 2
-        expected = at_rest[0] + a @ (1.0 - np.cos(generic))
-        alone, both = np.eye(m), np.eye(m)[:-1] + np.eye(m)[1:]
-        kinetic = _energies(motion, np.zeros_like(alone), alone) - at_rest[0]
-        coupled = _energies(motion, np.zeros_like(both), both) - at_rest[0] - kinetic[:-1] - kinetic[1:]
-    except StateError:
-        return None
-    close = math.isclose(at_rest[-1], expected, rel_tol=0.0, abs_tol=1e-9 * float(np.abs(a).max()))
-    one_sign = bool((a > 0.0).all() or (a < 0.0).all())
-    together = bool((np.abs(coupled) > 1e-9 * np.abs(kinetic).max()).all())
-    return float(np.sign(a[0])) if close and one_sign and together else None
-
-
-def _energies(motion: DrawnMotion, q: Array, p: Array) -> Array:
-    return np.asarray(motion.stepper.energy(q, p, motion.t[0], motion.parameters), dtype=float)
-
-
-def numbers_of(names: Sequence[str]) -> tuple[int, ...] | None:
-    """Return the numbers of theta_1, theta_2, .. or theta1, theta2, ..; ``None`` for other names."""
-    result = [NUMBERED.fullmatch(name) for name in names]
-    if not all(result) or len({match[1] for match in result if match}) > 1:
-        return None
-    return tuple(int(match[2]) for match in result if match)
-
-
-def _lengths(motion: DrawnMotion) -> Array:
-    """Return (m,) rod lengths, from parameters by name; 1 if there is none."""
-    interface, m = motion.stepper.interface, motion.q.shape[1]
-    values = dict(zip(interface.parameters, motion.parameters, strict=True))
-    numbers = numbers_of(interface.coordinates) or (0,) * m
-    lengths = []
-    for number in numbers:
-        names = [f"{name}{end}" for end in (number, f"_{number}", "") for name in LENGTHS]
-        lengths.append(next((float(values[name]) for name in names if name in values), 1.0))
-    return np.array(lengths)
+def positions_of(shape: MovingShape, motion: DrawnMotion) -> Array:
+    """Return the points (n, k, d) of a shape in the states of a trajectory."""
+    return shape.positions(motion.t, np.asarray(motion.q), np.asarray(motion.p), motion.parameters)
 
 
 FILMS = (".gif", ".html", ".mp4")
@@ -229,12 +111,14 @@ def animate(
     *,
     seconds: float = 8.0,
     positions: Callable[[Array], Array] | None = None,
+    picture: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Film:
     """Animate trajectories: bodies, pendulums, robots, chains, fields, or a point in the plane of the coordinates.
 
     Bodies are recognised by coordinate names (x, y or sun_x, sun_y, ..), pendulums by their potential energy, with rod
-    lengths from parameters named l, or l1, l2, .., for example. Other numbered coordinates are a chain.
+    lengths from parameters named l, or l1, l2, .., for example, polar and spherical coordinates by their kinetic
+    energy. Other coordinates are a chain.
 
     Args:
         trajectory: trajectory to animate, or several of the same system, together; states at equidistant times are the
@@ -242,6 +126,8 @@ def animate(
         path: file .gif, .html or .mp4 (with ffmpeg); ``None`` to write none.
         seconds: duration of the animation.
         positions: function from q (n, m) to (n, k, 2) or (n, k, 3) positions of k points, instead of those recognised.
+        picture: formulas of points, and the rods, springs, walls, bodies and trails between them, instead of what is
+            recognised: the section ``[picture]`` of a model file, as :func:`scvi_codegen.page` takes it.
         progress: function called with the number of frames drawn and that of all; by default they are shown on stderr
             if that is a terminal and the animation takes more than a second.
 
@@ -250,14 +136,15 @@ def animate(
 
     Raises:
         StateError: for another suffix, a duration that is not positive, or positions of a wrong shape.
+        ModelFileError: for mistakes in ``picture``.
         PlotError: without matplotlib, or without ffmpeg for .mp4.
     """
     if path is not None:
         check_plot_path(path, FILMS)
     if not 0.0 < seconds < float("inf"):
         raise StateError(f"seconds must be a positive number, not {seconds!r}")
-    film = Film(trajectory, float(seconds), positions, progress or _shown_on_terminal())
-    film.shapes  # noqa: B018  (checks positions)
+    film = Film(trajectory, float(seconds), positions, picture, progress or _shown_on_terminal())
+    film.shapes  # noqa: B018  (checks positions and picture)
     if path is not None:
         film.save(path)
     return film
@@ -270,12 +157,13 @@ class Film:
     Attributes:
         trajectory: animated trajectory, or several.
         seconds: duration.
-        positions, progress: as of :func:`animate`.
+        positions, picture, progress: as of :func:`animate`.
     """
 
     trajectory: Motions
     seconds: float
     positions: Callable[[Array], Array] | None = None
+    picture: Mapping[str, Any] | None = None
     progress: Callable[[int, int], None] | None = None
 
     __repr__ = summary("seconds", "trajectory")
@@ -293,9 +181,9 @@ class Film:
         return tuple(at_times(each, times) for each in motions)
 
     @cached_property
-    def shapes(self) -> tuple[MovingPoints, ...]:
-        """Points, lines and labels that represent the states of each trajectory."""
-        return tuple(shape_of(each, self.positions) for each in self.shown)
+    def shapes(self) -> tuple[MovingShape, ...]:
+        """Points and marks that represent the states of each trajectory."""
+        return tuple(drawn_shape(each, self.positions, self.picture) for each in self.shown)
 
     @cached_property
     def frames(self) -> Any:
@@ -356,62 +244,102 @@ def _shown_on_terminal() -> Callable[[int, int], None]:
     return show
 
 
+WIDTHS = {"wall": 2.0, "rod": 1.8, "link": 1.8, "spring": 1.0, "arrow": 1.5, "curve": 1.2, "box": 1.2, "top": 1.2}
+"""Widths of marks that are lines; others are dots."""
+SIZES = {"pivot": 3, "particles": 4}
+HALF_SIDES = np.array([0.5, 0.3, 0.12])
+"""Half sides of the box that represents a rigid body, along its axes."""
+EDGES = [0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4]
+"""Path along all edges of a box; bits of a corner are the signs of its three coordinates."""
+CORNERS = np.array([[1 if number >> k & 1 else -1 for k in range(3)] for number in EDGES]) * HALF_SIDES
+COILS = 10
+
+
+def _path(kind: str, points: Array) -> Array:
+    """Return the line of a mark through its points (k, d): edges of a box, coils of a spring, or the points."""
+    if kind in ("box", "top"):
+        centre, axes = points[0], points[1:] - points[0]
+        return np.concatenate([centre + CORNERS @ axes, centre[np.newaxis], points[-1:]])
+    if kind == "spring":
+        along = points[1] - points[0]
+        across: Array = np.array([along[1], -along[0]]) if len(along) == 2 else np.cross(along, [0.3, 0.2, 1.0])
+        sides = np.array([0.0, 0.0, *[0.06, -0.06] * COILS, 0.0, 0.0])
+        shares = np.array([0.0, *np.linspace(0.12, 0.88, 2 * COILS + 2), 1.0])
+        points = points[0] + np.multiply.outer(shares, along) + np.multiply.outer(sides, across)
+    return points
+
+
+def _marks_of(shape: MovingShape) -> Sequence[Mapping[str, Any]]:
+    """Return the marks of a shape; those of a field are the curves along its last axis."""
+    if shape.mesh is None:
+        return shape.marks
+    sizes = [len(nodes) for nodes in shape.mesh["axes"].values()]
+    starts = range(0, math.prod(sizes), sizes[-1])
+    return [{"kind": "curve", "points": range(k, k + sizes[-1]), "color": 0, **shape.mesh} for k in starts]
+
+
 class _Scene:
-    """Axes with points, a line through them, and trails, which show one state of each trajectory at a time."""
+    """Axes with marks and trails, which show one state of each trajectory at a time."""
 
     def __init__(
-        self, figure: Any, motions: Sequence[DrawnMotion], shapes: Sequence[MovingPoints], report: Callable[[], None]
+        self, figure: Any, motions: Sequence[DrawnMotion], shapes: Sequence[MovingShape], report: Callable[[], None]
     ) -> None:
-        self.motion, self.shape, self.report = motions[0], shapes[0], report
-        parts = [each.points(motion.q, motion.p) for each, motion in zip(shapes, motions, strict=True)]
-        self.drawn_points = np.concatenate(parts, axis=1)
-        shape, count, alone = shapes[0], parts[0].shape[1], len(motions) == 1
-        dimension = self.drawn_points.shape[2]
+        self.motion, self.report, shape = motions[0], report, shapes[0]
+        parts = [positions_of(each, motion) for each, motion in zip(shapes, motions, strict=True)]
+        self.points = np.concatenate(parts, axis=1)
+        dimension = self.points.shape[2]
         self.axes: Axes = figure.add_subplot(projection="3d" if dimension == 3 else None)
-        flat = self.drawn_points.reshape(-1, dimension)
+        flat = self.points.reshape(-1, dimension)
         flat = flat[np.isfinite(flat).all(axis=1)]
         low, high = flat.min(axis=0), flat.max(axis=0)
         half = (high - low) / 2
-        if self.shape.equal:
+        if shape.equal:
             half[:] = half.max()
         half = np.where(half > 0.0, half, 1.0) * (1.0 + 2 * MARGIN)
-        for letter, label, middle, size in zip("xyz", self.shape.labels, (low + high) / 2, half, strict=False):
+        for letter, label, middle, size in zip("xyz", shape.labels or "xyz", (low + high) / 2, half, strict=False):
             self.axes.set(**{f"{letter}lim": (middle - size, middle + size), f"{letter}label": label})
-        if self.shape.equal:
+        if shape.equal:
             self.axes.set_aspect("equal")
         if dimension == 3:
             self.axes.locator_params(nbins=5)  # more labels overlap
-        nothing: list[list[float]] = [[]] * dimension
-        single = [slice(0, count)] if shape.joined else [slice(k, k + 1) for k in range(count)]
-        marks = list(shape.solids) or single
-        names = shape.names if shape.names and alone else ("",) * len(marks)
-        few = len(marks) <= len(COLORS)  # a surface has one colour
-        line = "o-" if shape.joined or shape.joints else "-" if shape.solids else "o"
-        form = {"markersize": 3 if shape.joints else 5, "linewidth": 1.2}
-        self.trails, self.marks = [], []
+        self.trails: list[tuple[int, Any]] = []
+        self.marks: list[tuple[str, list[int], Any]] = []
         for number in range(len(motions)):
-            for k in shape.trails:
-                drawn = color(k if alone and not shape.joints else number)
-                trail = self.axes.plot(*nothing, color=drawn, linewidth=1.0, alpha=0.5)[0]
-                self.trails.append((number * count + k, trail))
-            for k, (which, name) in enumerate(zip(marks, names, strict=True)):
-                drawn = color(k * few if alone else number)
-                mark = self.axes.plot(*nothing, line, color=drawn, label=name, **form)[0]
-                self.marks.append((slice(number * count + which.start, number * count + which.stop), mark))
-        if any(names):
+            self._add(shape, number * parts[0].shape[1], number if len(motions) > 1 else None)
+        if self.axes.get_legend_handles_labels()[1]:
             self.axes.legend(loc="upper right", fontsize=8)
 
+    def _add(self, shape: MovingShape, first: int, which: int | None) -> None:
+        """Add the lines of a shape whose points begin at one, in one colour if it is one of several (``which``)."""
+        nothing: list[list[float]] = [[]] * self.points.shape[2]
+        bodies = [mark["points"][0] for mark in shape.marks if mark["kind"] in ("body", "bob")]
+        for k, point in enumerate(shape.trails):
+            drawn = color((bodies.index(point) if point in bodies else k) if which is None else which)
+            line = self.axes.plot(*nothing, color=drawn, linewidth=1.0, alpha=0.5)[0]
+            self.trails.append((first + point, line))
+        count = 0
+        for mark in _marks_of(shape):
+            kind, name = mark["kind"], mark.get("name", "") if which is None else ""
+            neutral = kind in ("rod", "wall", "spring", "pivot") and which is None
+            drawn = "0.35" if neutral else color(mark.get("color", count) if which is None else which)
+            count += kind in ("body", "bob")
+            form = "-" if kind in WIDTHS else "o"
+            form = "o-" if kind == "link" or mark.get("dots") else form
+            size = {"markersize": SIZES.get(kind, 3 if kind in WIDTHS else 5), "linewidth": WIDTHS.get(kind, 0.0)}
+            line = self.axes.plot(*nothing, form, color=drawn, label=name, **size)[0]
+            self.marks.append((kind, [first + k for k in mark["points"]], line))
+
     def show(self, frame: int) -> list[Any]:
-        first = max(0, frame - round(TRAIL * len(self.drawn_points)))
+        first = max(0, frame - round(TRAIL * len(self.points)))
         rows = np.arange(first, frame + 1)[:: max(1, (frame - first) // TRAIL_POINTS)]
         for k, trail in self.trails:
-            _set(trail, np.concatenate([self.drawn_points[rows, k], self.drawn_points[frame : frame + 1, k]]))
-        for which, mark in self.marks:
-            _set(mark, self.drawn_points[frame, which])
+            _set(trail, np.concatenate([self.points[rows, k], self.points[frame : frame + 1, k]]))
+        for kind, which, line in self.marks:
+            _set(line, _path(kind, self.points[frame, which]))
         interface = self.motion.stepper.interface
         self.axes.set_title(plain(f"{interface.system}, t = {self.motion.t[frame]:.6g}"))
         self.report()
-        return [line for _, line in (*self.trails, *self.marks)]
+        return [line for _, line in self.trails] + [line for *_, line in self.marks]
 
 
 def _set(line: Any, points: Array) -> None:

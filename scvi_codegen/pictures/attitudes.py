@@ -1,4 +1,4 @@
-"""Plots of rotations, directions and spins: paths of body axes on the unit sphere, bodies for animations."""
+"""Plots of rotations, directions and spins: paths of body axes on the unit sphere."""
 
 from __future__ import annotations
 
@@ -15,10 +15,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 CIRCLE = np.linspace(0.0, 2 * np.pi, 73)
-HALF_SIDES = np.array([0.5, 0.3, 0.12])
-"""Half sides of the box that represents a body, along its axes."""
-BOX = [0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4]
-"""Path along all edges of a box; bits of a corner are the signs of its three coordinates."""
 
 
 def unit_vectors(motion: DrawnMotion, axis: int = 3) -> dict[str, Array]:
@@ -88,31 +84,3 @@ def draw_unit_vectors(axes: Axes, motion: DrawnMotion, plane: tuple[int, int], w
     axes.set(xlabel="xyz"[plane[0]], ylabel="xyz"[plane[1]], title="body axes")
     axes.legend(fontsize=8)
     axes.set_aspect("equal")
-
-
-def solids(motion: DrawnMotion, centres: Array) -> tuple[Array, tuple[slice, ...], tuple[int, ...]]:
-    """Return the points (n, k, 3) of a box for each rotation and of an arrow for each direction and spin.
-
-    Args:
-        motion: trajectory of a system with rotations.
-        centres: (n, 3) positions of their common centre.
-
-    Returns:
-        Points, the slice of those of each solid, which a line joins, and the numbers of points that leave a trail.
-    """
-    corners = np.array([[1 if number >> k & 1 else -1 for k in range(3)] for number in BOX]) * HALF_SIDES
-    parts: list[Array] = []
-    ends, trails = [0], []
-    for (kind, name, *_), vector in zip(
-        map(str.split, motion.stepper.interface.rotations), unit_vectors(motion).values(), strict=True
-    ):
-        tip = vector[:, np.newaxis]
-        if kind == "rotation":
-            box = np.einsum("nij,kj->nki", motion.rotation(name), corners)
-            parts.append(np.concatenate([box, 0.0 * tip, tip], axis=1))
-        else:
-            parts.append(np.concatenate([0.0 * tip, tip], axis=1))
-        ends.append(ends[-1] + parts[-1].shape[1])
-        trails.append(ends[-1] - 1)
-    points = np.concatenate(parts, axis=1) + centres[:, np.newaxis]
-    return points, tuple(map(slice, ends[:-1], ends[1:])), tuple(trails)

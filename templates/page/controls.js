@@ -14,16 +14,16 @@ function writeAddress() {
 /** Starts the motion again, and finds the frame of the drawing by running ahead for a moment. */
 function restart() {
   start();
-  if (!fault && !source.mesh && m <= 400) {
-    const began = performance.now(), states = [pointsOf(memory_q, code.time())], span = 10 * settings.speed;
+  if (!fault && !shape.mesh && m <= 400) {
+    const began = performance.now(), states = [pointsOf(memory_q, memory_p, code.time())], span = 10 * settings.speed;
     while (!fault && performance.now() - began < 4 && Math.abs(code.time() - about.t) < span && states.length < 4000) {
       fault = code.advance(16, 4);
-      for (let k = 0; k < 4 && !fault; k++) states.push(pointsOf(stored_q.subarray(k * m, (k + 1) * m), stored_t[k]));
+      for (let k = 0; k < 4 && !fault; k++) states.push(pointsOf(stored_q.subarray(k * m, (k + 1) * m), stored_p.subarray(k * m, (k + 1) * m), stored_t[k]));
     }
     const shown = states.filter((points) => points.flat().every(Number.isFinite));
     start();
     picture.ahead(shown);
-  } else picture.ahead([pointsOf(memory_q, code.time())]);
+  } else picture.ahead([pointsOf(memory_q, memory_p, code.time())]);
   target = code.time();
   by("reverse").setAttribute("aria-pressed", "false");
   dirty = true;
@@ -70,7 +70,7 @@ addSlider("Time", "Speed", "Speed", { ...about.speed, log: true, get: () => sett
 const adaptive = about.step.kind === "adaptive";
 addSlider("Time", adaptive ? "Tolerance" : "Step size", adaptive ? "Tolerance" : "Step size", { ...about.step, log: true, get: () => settings.step, set: (x) => { settings.step = x; restart(); } });
 for (const { name, low, high, log } of about.parameters) addSlider("Parameters", set(name), name, { low, high, log, get: () => settings.parameters[name], set: (x) => { settings.parameters[name] = x; restart(); } });
-const rotations = (source.solids || []).filter((each) => each.columns.length === 4);
+const rotations = shape.solids.filter((each) => each.rates);
 if (rotations.length) rotations.forEach(addRotation);
 if (!about.initial && about.ranges) {
   for (const kind of ["q", "v"]) about.coordinates.forEach((name, k) => {
@@ -82,7 +82,7 @@ if (!about.initial && about.ranges) {
 if (groups["Initial values"] && sliders.length > 24) groups["Initial values"].open = false;
 
 /** Adds sliders of a rotation: tilt about the first axis, and the angular velocity in the body. */
-function addRotation({ name, columns, omega: names }) {
+function addRotation({ name, columns, rates: names }) {
   const product = ([a, b, c, d], [w, x, y, z]) => [a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y, a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w];
   const attitude = () => columns.map((c) => settings.q[c]);
   const omega = () => { const [w, x, y, z] = attitude(); return product([w, -x, -y, -z], columns.map((c) => settings.v[c])).slice(1).map((u) => 2 * u); };
@@ -107,7 +107,7 @@ function play(on = !running) {
 function takeState() {
   if (fault || code.velocities()) { tell("The velocities of the present state are undefined; restart first."); return false; }
   settings.q = Array.from(memory_q); settings.v = Array.from(memory_v);
-  if (source.rods) source.rods.lengths.forEach((_, k) => { settings.q[k] = wrapped(settings.q[k]); });
+  for (const k of shape.angles) settings.q[k] = wrapped(settings.q[k]);
   return true;
 }
 const actions = {
@@ -132,11 +132,11 @@ if (about.initial) by("here").remove();
 const keys = { " ": "play", ArrowRight: "step", b: "reverse", r: "restart", h: "here", c: "share" };
 document.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input[type=number], select, #link_text, summary")) return;
-  if (event.target === motion && !flat && !source.mesh) {
+  if (event.target === motion && !flat && !shape.mesh) {
     const turned = { ArrowLeft: [-12, 0], ArrowRight: [12, 0], ArrowUp: [0, 12], ArrowDown: [0, -12] }[event.key];
     if (turned) { view.orbit(...turned); event.preventDefault(); dirty = true; return; }
   }
-  if (event.target === motion && !source.mesh && "+-0".includes(event.key)) { if (event.key === "0") view.reset(); else view.enlarge(event.key === "+" ? 1.15 : 1 / 1.15); dirty = true; return; }
+  if (event.target === motion && !shape.mesh && "+-0".includes(event.key)) { if (event.key === "0") view.reset(); else view.enlarge(event.key === "+" ? 1.15 : 1 / 1.15); dirty = true; return; }
   if (event.key === "ArrowRight" && event.target.matches("input")) return;
   if (event.key === " " && event.target.matches("button:not(#play)")) return;
   const id = keys[event.key.toLowerCase?.() ?? event.key] || keys[event.key];
@@ -149,7 +149,7 @@ const place = ({ clientX, clientY }) => { const box = motion.getBoundingClientRe
 const reachOf = (event) => (event.pointerType === "touch" || event.touches ? 44 : 26);
 motion.addEventListener("touchstart", (event) => { if (event.touches.length === 1 && picture.near(place(event.touches[0]), 44) !== undefined) event.preventDefault(); }, { passive: false });
 motion.addEventListener("pointerdown", (event) => {
-  if (source.mesh || pending.length) return;
+  if (shape.mesh || pending.length) return;
   by("hint").classList.add("gone");
   const which = picture.near(place(event), reachOf(event));
   if (which === undefined) { if (flat) return; dragged = { orbit: true, at: place(event) }; }
@@ -157,7 +157,7 @@ motion.addEventListener("pointerdown", (event) => {
     const was = running;
     play(false);
     if (!takeState()) return;
-    if (!source.columns) settings.v = settings.v.map(() => 0); // released at rest
+    if (shape.points[which].some((k) => k < 1 || k > m)) settings.v = settings.v.map(() => 0); // no coordinates: released at rest
     dragged = { which, was, depth: picture.at[which][2] };
   }
   motion.classList.add("dragging");
@@ -165,7 +165,7 @@ motion.addEventListener("pointerdown", (event) => {
 });
 motion.addEventListener("pointermove", (event) => {
   const at = place(event);
-  if (!dragged) { if (!source.mesh && picture.at) motion.classList.toggle("near", !flat || picture.near(at, reachOf(event)) !== undefined); return; }
+  if (!dragged) { if (!shape.mesh && picture.at) motion.classList.toggle("near", !flat || picture.near(at, reachOf(event)) !== undefined); return; }
   if (dragged.orbit) { view.orbit(at[0] - dragged.at[0], at[1] - dragged.at[1]); dragged.at = at; dirty = true; return; }
   settings.q = moved(dragged.which, view.from(at, dragged.depth), settings.q, about.t);
   start(); target = code.time(); showSliders(); writeAddress(); dirty = true;
@@ -226,7 +226,7 @@ function frame(now) {
 let stale = 0;
 function draw(performed) {
   const [pen, width, height] = fitted(motion), time = running && !pending.length ? target : code.time();
-  picture.draw(pen, running ? between(time) : memory_q, time, width, height);
+  picture.draw(pen, ...(running ? between(time) : [memory_q, memory_p]), time, width, height);
   if (running) { panels[frames % panels.length].draw(); stale = panels.length; } else panels.forEach((panel) => panel.draw());
   by("clock").textContent = pending.length ? `computing the state of the link: ${pending[0].toLocaleString("en")} steps to go` : `t = ${code.time().toFixed(2)}`;
   const told = fault ? CAUSES[fault] || `The step failed (status ${fault}).` : performance.now() < noticeEnds ? notice : "";
@@ -249,7 +249,7 @@ globalThis.page = {
   advance: (steps) => { play(false); advance(steps, Math.max(1, Math.ceil(steps / 2000))); target = code.time(); dirty = true; },
 };
 if (window !== parent) document.body.classList.add("embedded");
-by("hint").textContent = source.mesh ? "" : shape.movable.length ? (flat ? "drag a body" : "drag a body, or turn the view") : flat ? "" : "drag to turn the view";
+by("hint").textContent = shape.mesh ? "" : shape.movable.length ? (flat ? "drag a body" : "drag a body, or turn the view") : flat ? "" : "drag to turn the view";
 readColors();
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { readColors(); dirty = true; });
 addEventListener("message", ({ data }) => { // the colours of a site around this page

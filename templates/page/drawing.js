@@ -12,33 +12,31 @@ function readColors() {
 const mixed = (from, to, share, white = 0) => `rgb(${rgb[from].map((x, k) => { const u = x + (255 - x) * white; return Math.round(u + (rgb[to][k] - u) * share); }).join()})`;
 const hue = (k) => "c" + (k % 6);
 
-// ---- points of a shape
-const { shape } = about, flat = shape.dimension === 2;
-const rotation = ([w, x, y, z]) => [
-  [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-  [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-  [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]];
+// ---- points of a shape: registers of a straight-line program (scvi_codegen/pictures/shape.py)
+const { shape } = about, flat = shape.dimension === 2, START = 1 + 2 * m + about.parameters.length;
 const unit = (list) => { const norm = Math.hypot(...list) || 1; return list.map((x) => x / norm); };
-const { source } = shape;
+const registers = new Float64Array(START + shape.program.length);
+shape.program.forEach((entry, k) => { if (!entry.length) registers[START + k] = entry; });
+const operations = shape.program.flatMap((entry, k) => (entry.length ? [[START + k, ...entry]] : []));
+/** Returns x rounded to an integer, halves to the even one. */
+const rint = (x) => { const low = Math.floor(x); return x - low === 0.5 ? low + Math.abs(low % 2) : Math.round(x); };
+const FUNCTIONS = { pow: Math.pow, rint, unit_step: (x) => (x >= 0 ? 1 : 0), ...Object.fromEntries(["sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "exp", "log"].map((name) => [name, Math[name]])) };
 
 /** Returns the points of a state, [x, y] or [x, y, z] each. */
-function pointsOf(q, t) {
-  if (source.columns) return [...source.columns.map((columns) => columns.map((c) => (c < 0 ? 0 : q[c]))), ...(source.pins || []).map((pin) => pin.map(value))];
-  if (source.rods) {
-    const ends = [[0, 0]], { sign, lengths } = source.rods;
-    lengths.forEach((length, k) => {
-      const l = value(length), [x, y] = ends[k];
-      ends.push([x + l * Math.sin(q[k]), y - sign * l * Math.cos(q[k])]);
-    });
-    return ends;
+function pointsOf(q, p, t) {
+  if (!shape.points.length) return [];
+  registers[0] = t; registers.set(q, 1); registers.set(p, 1 + m); registers.set(memory_parameters, 1 + 2 * m);
+  for (const entry of operations) {
+    let x = registers[entry[2]];
+    if (entry[1] === "add") for (let k = 3; k < entry.length; k++) x += registers[entry[k]];
+    else if (entry[1] === "mul") for (let k = 3; k < entry.length; k++) x *= registers[entry[k]];
+    else x = FUNCTIONS[entry[1]](x, registers[entry[3]]);
+    registers[entry[0]] = x;
   }
-  if (source.solids) return source.solids.flatMap((solid) => {
-    const centre = solid.centre ? solid.centre.map((c) => q[c]) : [0, 0, 0], part = solid.columns.map((c) => q[c]);
-    const tip = solid.columns.length === 4 ? rotation(unit(part)).map((row) => row[2]) : unit(part);
-    return [centre, centre.map((x, k) => x + tip[k])];
-  });
-  return [];
+  const periods = shape.box.map((k) => registers[k]);
+  return shape.points.map((point) => point.map((k, axis) => (periods.length ? registers[k] - periods[axis] * Math.floor(registers[k] / periods[axis]) : registers[k])));
 }
+const constant = (k) => shape.points[k].every((each) => each >= START && !shape.program[each - START].length || each > 2 * m && each < START);
 
 // ---- views
 /** Returns a view of the plane, or of space from a camera that orbits: to(point) gives pixels and the depth. */
@@ -47,26 +45,28 @@ const view = {
   /** Moves towards the box of what is drawn, at once when a motion begins. */
   follow([low, high], width, height) {
     const margin = flat ? 0.86 : 0.8, middle = low.map((x, k) => (x + high[k]) / 2), half = high.map((x, k) => (x - low[k]) / 2);
+    this.fitting = [width, height].map((size, k) => (0.43 * size) / (half[k] || 1));
     const wanted = flat ? Math.max(half[0] * Math.min(1, height / width), half[1] * Math.min(1, width / height)) : Math.hypot(...half) * 0.85;
     const target = (wanted || 1) / margin, share = this.fresh ? 1 : 0.12;
     this.reach += (target - this.reach) * share;
-    this.centre = middle.map((x, k) => (this.centre[k] ?? 0) + (x - (this.centre[k] ?? 0)) * share);
+    this.centre = middle.map((x, k) => (this.centre[k] ?? 0) + (x - (this.centre[k] ?? 0)) * (shape.equal ? share : 1));
     this.fresh = false;
     this.width = width; this.height = height;
     this.scale = (Math.min(width, height) / 2 / this.reach) * this.zoom;
+    this.scales = shape.equal ? [this.scale, this.scale] : this.fitting.map((x) => x * this.zoom);
     [this.cos, this.sin, this.up, this.sine] = [Math.cos(this.turn), Math.sin(this.turn), Math.cos(this.tilt), Math.sin(this.tilt)];
   },
   to(point) {
     const [x, y, z] = point.map((u, k) => u - this.centre[k]);
-    if (flat) return [this.width / 2 + this.scale * x, this.height / 2 - this.scale * y, 0, 1];
+    if (flat) return [this.width / 2 + this.scales[0] * x, this.height / 2 - this.scales[1] * y, 0, 1];
     const across = this.cos * x + this.sin * y, away = this.cos * y - this.sin * x, depth = this.sine * z - this.up * away;
     const near = 1 / (1 - clamped(depth / (5 * this.reach), -4, 0.8));
     return [this.width / 2 + this.scale * near * across, this.height / 2 - this.scale * near * (this.up * z + this.sine * away), depth, near];
   },
   /** Returns the point at pixels, in the plane, or in space at a depth. */
   from([a, b], depth = 0) {
-    const near = flat ? 1 : 1 / (1 - depth / (5 * this.reach)), u = (a - this.width / 2) / this.scale / near, w = (this.height / 2 - b) / this.scale / near;
-    if (flat) return [this.centre[0] + u, this.centre[1] + w];
+    if (flat) return [this.centre[0] + (a - this.width / 2) / this.scales[0], this.centre[1] + (this.height / 2 - b) / this.scales[1]];
+    const near = 1 / (1 - depth / (5 * this.reach)), u = (a - this.width / 2) / this.scale / near, w = (this.height / 2 - b) / this.scale / near;
     const z = this.up * w + this.sine * depth, away = this.sine * w - this.up * depth;
     return [this.cos * u - this.sin * away, this.sin * u + this.cos * away, z].map((x, k) => x + this.centre[k]);
   },
@@ -165,25 +165,30 @@ const marked = () => {
       low[k] = Math.min(low[k], Math.max(x, first ? first[0][k] - limit : x)); high[k] = Math.max(high[k], Math.min(x, first ? first[1][k] + limit : x));
     });
   };
-  const bodies = (source.solids || []).map((solid) => faces(solid.form, solid.size || 1, hue(0)));
+  const bodies = Object.fromEntries(["box", "top"].map((kind) => [kind, faces(kind, 1, hue(0))]));
+  const centred = shape.solids.length && constant(shape.solids[0].centre);
   const heaviest = () => Math.max(...shape.marks.map(({ mass }) => (mass === undefined ? 0 : Math.abs(value(mass))))) || 1;
   return {
     forget() { low = shape.dimension === 3 ? [Infinity, Infinity, Infinity] : [Infinity, Infinity]; high = low.map((x) => -x); first = undefined; this.begun = false; },
     /** Sets the frame to what the first seconds of the motion need. */
     ahead(states) {
       states.forEach(grown);
-      if (source.rods) { const reach = source.rods.lengths.reduce((sum, length) => sum + Math.abs(value(length)), 0); low = [-reach, -reach]; high = [reach, reach]; }
-      if (source.solids && !source.solids.some(({ centre }) => centre)) { low = [-0.65, -0.65, -0.65]; high = [0.65, 0.65, 0.65]; }
-      if (shape.box) { low = shape.box.map(() => 0); high = [...shape.box]; }
+      for (const { kind, points } of shape.marks) if (kind === "rod" && constant(points[0]) && states.length) { // all that the rods reach
+        const at = points.map((k) => states[0][k]), reach = at.reduce((sum, x, k) => sum + (k ? Math.hypot(...x.map((u, j) => u - at[k - 1][j])) : 0), 0);
+        grown([at[0].map((x) => x - reach), at[0].map((x) => x + reach)]);
+      }
+      if (centred) { low = [-0.65, -0.65, -0.65]; high = [0.65, 0.65, 0.65]; }
+      if (shape.box.length) { low = shape.box.map(() => 0); high = shape.box.map((k) => registers[k]); }
       first = [[...low], [...high]];
       view.fresh = true;
     },
-    draw(pen, q, t, width, height) {
-      const points = pointsOf(q, t);
+    draw(pen, q, p, t, width, height) {
+      const points = pointsOf(q, p, t);
       grown(points);
       view.follow([low, high], width, height);
       const at = points.map((point) => view.to(point)), parts = [], add = (depth, paint) => parts.push([depth, paint]);
       if (!flat) this.ground(pen);
+      if (shape.labels.length) this.axes(pen, width, height);
       const sign = backward() ? -1 : 1;
       shape.trails.forEach((which, k) => {
         const past = [];
@@ -194,7 +199,11 @@ const marked = () => {
       let number = 0;
       for (const mark of shape.marks) {
         const [a, b] = mark.points.map((k) => at[k]), middle = mark.points.reduce((sum, k) => sum + at[k][2], 0) / mark.points.length;
-        if (mark.kind === "rod") add(middle, () => line(pen, mark.points.map((k) => at[k]), colors.ink, 2.5 * a[3]));
+        if (bodies[mark.kind]) this.solid(pen, mark.points.map((k) => points[k]), bodies[mark.kind], hue(mark.color), add);
+        else if (mark.kind === "link") {
+          const name = mark.color < 0 ? "muted" : hue(mark.color);
+          add(middle, () => { line(pen, [a, b], mixed(name, "ink", 0.15), 7 * a[3]); [a, b].forEach((end) => disc(pen, end, 5 * end[3], name)); });
+        } else if (mark.kind === "rod") add(middle, () => line(pen, mark.points.map((k) => at[k]), colors.ink, 2.5 * a[3]));
         else if (mark.kind === "line") add(middle, () => line(pen, mark.points.map((k) => at[k]), colors.muted, 1.2));
         else if (mark.kind === "spring") add(middle, () => spring(pen, a, b, colors.muted));
         else if (mark.kind === "wall") add(-1e9, () => wall(pen, a, b));
@@ -207,29 +216,36 @@ const marked = () => {
           if (mark.name && shape.marks.length < 12) add(1e9, () => { pen.font = `12px ${colors.sans}`; pen.fillStyle = colors.muted; pen.textBaseline = "middle"; pen.textAlign = "left"; pen.fillText(mark.name, a[0] + 14, a[1]); });
         }
       }
-      (source.solids || []).forEach((solid, k) => {
-        if (solid.columns.length !== 4) return;
-        const centre = points[2 * k], rows = rotation(unit(solid.columns.map((c) => q[c])));
-        for (const { points: corners, color, light } of bodies[k]) {
-          const placed = corners.map((p) => rows.map((row, j) => centre[j] + row[0] * p[0] + row[1] * p[1] + row[2] * p[2])), turned = placed.map((p) => view.to(p));
-          const shade = lighting(placed);
-          add(turned.reduce((sum, p) => sum + p[2], 0) / turned.length, () => {
-            pen.beginPath(); turned.forEach(([x, y], j) => (j ? pen.lineTo(x, y) : pen.moveTo(x, y))); pen.closePath();
-            pen.fillStyle = pen.strokeStyle = shade > 0 ? mixed(color, "white", shade + light * (1 - shade)) : mixed(color, "black", -shade, light); pen.fill(); pen.lineWidth = 0.7; pen.stroke();
-          });
-        }
-      });
       parts.sort((x, y) => x[0] - y[0]).forEach(([, paint]) => paint());
       this.at = at;
     },
+    /** Adds the faces of a body whose points are its centre and the ends of its axes. */
+    solid(pen, [centre, ...ends], parts, hueOfBody, add) {
+      for (const { points: corners, color, light } of parts) {
+        const placed = corners.map((p) => centre.map((x, j) => x + p.reduce((sum, u, k) => sum + u * (ends[k][j] - x), 0))), turned = placed.map((p) => view.to(p));
+        const shade = lighting(placed), name = color === "c0" ? hueOfBody : color;
+        add(turned.reduce((sum, p) => sum + p[2], 0) / turned.length, () => {
+          pen.beginPath(); turned.forEach(([x, y], j) => (j ? pen.lineTo(x, y) : pen.moveTo(x, y))); pen.closePath();
+          pen.fillStyle = pen.strokeStyle = shade > 0 ? mixed(name, "white", shade + light * (1 - shade)) : mixed(name, "black", -shade, light); pen.fill(); pen.lineWidth = 0.7; pen.stroke();
+        });
+      }
+    },
+    /** Draws axes with numbers, of points that are no positions in space. */
+    axes(pen, width, height) {
+      pen.font = `12px ${colors.sans}`;
+      const [low, high] = [view.from([0, height]), view.from([width, 0])];
+      const text = (string, x, y, align, baseline) => { pen.fillStyle = colors.muted; pen.textAlign = align; pen.textBaseline = baseline; pen.fillText(string, x, y); };
+      for (const mark of ticks(low[0], high[0], clamped(width / 110, 3, 8))) { const [x] = view.to([mark, 0]); line(pen, [[x, 0], [x, height]], colors.rule, 1); if (x > 40 && x < width - 60) text(short(mark), x, height - 6, "center", "bottom"); }
+      for (const mark of ticks(low[1], high[1], clamped(height / 80, 3, 8))) { const [, y] = view.to([0, mark]); line(pen, [[0, y], [width, y]], colors.rule, 1); if (y > 40 && y < height - 30) text(short(mark), 8, y, "left", "middle"); }
+      text(spelled(shape.labels[0]), width - 12, height - 6, "right", "bottom"); text(spelled(shape.labels[1]), 12, 32, "left", "top");
+    },
     /** Draws what shows the directions of space: a sphere about one solid, or else a floor. */
     ground(pen) {
-      if (shape.box && shape.box.length === 3) {
-        const corner = (k) => view.to(shape.box.map((length, axis) => ((k >> axis) & 1) * length));
+      if (shape.box.length === 3) {
+        const corner = (k) => view.to(shape.box.map((register, axis) => ((k >> axis) & 1) * registers[register]));
         for (let k = 0; k < 8; k++) for (let axis = 0; axis < 3; axis++) if (!((k >> axis) & 1)) line(pen, [corner(k), corner(k | (1 << axis))], colors.edge, 1);
         return;
       }
-      const centred = source.solids && !source.solids.some(({ centre }) => centre);
       const circle = (f) => Array.from({ length: 73 }, (_, k) => view.to(f((k * TAU) / 72)));
       if (centred) {
         for (const z of [-0.6, 0, 0.6]) { const r = Math.sqrt(1 - z * z); this.halves(pen, circle((u) => [r * Math.cos(u), r * Math.sin(u), z])); }
@@ -263,7 +279,7 @@ const trailColor = (k) => {
 
 /** Returns coordinates with which a point of the shape is at a place: damped Gauss-Newton (Levenberg-Marquardt). */
 function moved(which, place, start, t) {
-  const q = Float64Array.from(start), error = (x) => pointsOf(x, t)[which].map((u, k) => u - place[k]), d = 1e-6;
+  const q = Float64Array.from(start), p = Float64Array.from(memory_p), error = (x) => pointsOf(x, p, t)[which].map((u, k) => u - place[k]), d = 1e-6;
   const size = (e) => e.reduce((sum, u) => sum + u * u, 0);
   let damping = 1e-3;
   for (let round = 0; round < 30; round++) {
@@ -282,7 +298,7 @@ function moved(which, place, start, t) {
 
 // ---- the drawing of fields and chains: a graph over x above its past, or an image over x and y
 const graph = () => {
-  const { axes, fields } = source.mesh, names = Object.keys(axes), [xs, ys] = names.map((name) => axes[name]), PAST = 160, WIDE = 420;
+  const { axes, fields, dots } = shape.mesh, names = Object.keys(axes), [xs, ys] = names.map((name) => axes[name]), PAST = 160, WIDE = 420;
   const image = document.createElement("canvas"), past = [];
   let low = Infinity, high = -Infinity;
   const bounds = () => { const top = Math.max(high, -low, 1e-300); return low < -1e-9 * top ? [-top, top] : [0, top]; };
@@ -316,7 +332,7 @@ const graph = () => {
       past.push(Float32Array.from(across, ([j, s]) => q[begin + j] + s * (q[begin + j + 1] - q[begin + j])));
       if (past.length > 2 * PAST) past.splice(0, past.length, ...past.filter((_, k) => k % 2 === 1));
     },
-    draw(pen, q, t, width, height) {
+    draw(pen, q, p, t, width, height) {
       const left = 46, right = 16, top = 36, [first, last] = bounds(), x0 = xs[0], x1 = xs[xs.length - 1];
       pen.font = `12px ${colors.sans}`; pen.fillStyle = colors.muted;
       if (ys) return this.plane(pen, q, width, height);
@@ -326,9 +342,10 @@ const graph = () => {
       for (const mark of ticks(first, last, 5)) { line(pen, [[left, py(mark)], [width - right, py(mark)]], colors.rule, 1); pen.fillText(short(mark), left - 6, py(mark)); }
       fields.forEach(({ columns: [begin, end] }, k) => {
         const points = Array.from(q.subarray(begin, end), (u, j) => [px(xs[j]), py(u)]);
-        line(pen, points, colors[hue(k)], shape.dots ? 1.2 : 2.2, shape.dots ? 0.5 : 1);
-        if (shape.dots) points.forEach((point) => disc(pen, point, clamped(width / xs.length / 4, 2, 6), hue(k)));
+        line(pen, points, colors[hue(k)], dots ? 1.2 : 2.2, dots ? 0.5 : 1);
+        if (dots) points.forEach((point) => disc(pen, point, clamped(width / xs.length / 4, 2, 6), hue(k)));
       });
+      pen.fillStyle = colors.muted;
       image.width = WIDE; image.height = past.length;
       const values = new Float32Array(WIDE * past.length);
       past.forEach((row, k) => values.set(row, k * WIDE));
@@ -366,7 +383,7 @@ const graph = () => {
     near() {},
   };
 };
-const picture = source.mesh ? graph() : marked();
+const picture = shape.mesh ? graph() : marked();
 
 /** Returns round numbers between two bounds, about `wanted` of them. */
 function ticks(low, high, wanted) {

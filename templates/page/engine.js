@@ -112,7 +112,7 @@ function forget() {
 function keep(t, q, p, energy, quantities) {
   picture.see?.(q, t);
   if (shape.trails.length) {
-    const points = pointsOf(q, t);
+    const points = pointsOf(q, p, t);
     shape.trails.forEach((which, k) => { trails[k].push({ t, at: points[which] }); if (trails[k].length > TRAIL) trails[k].shift(); });
   }
   if (counted++ % stride) return;
@@ -123,23 +123,24 @@ function keep(t, q, p, energy, quantities) {
   if (rows.length > STORED) { rows = rows.filter((_, k) => k % 2 === 0); stride *= 2; }
 }
 
-/** Returns q between the last two states: a cubic with their positions and velocities. */
+/** Returns q and p between the last two states: a cubic with their positions and velocities, and a line. */
 function between(time) {
-  if (!before || m > WHOLE || code.velocities()) return memory_q;
+  if (!before || m > WHOLE || code.velocities()) return [memory_q, memory_p];
   const h = code.time() - before.t, s = (time - before.t) / h;
-  if (!(s >= 0 && s < 1)) return memory_q;
+  if (!(s >= 0 && s < 1)) return [memory_q, memory_p];
   const [a, b, c, d] = [(1 + 2 * s) * (1 - s) ** 2, s * (1 - s) ** 2 * h, s * s * (3 - 2 * s), s * s * (s - 1) * h];
-  return Float64Array.from(memory_q, (q, k) => a * before.q[k] + b * before.v[k] + c * q + d * memory_v[k]);
+  const q = Float64Array.from(memory_q, (x, k) => a * before.q[k] + b * before.v[k] + c * x + d * memory_v[k]);
+  return [q, Float64Array.from(memory_p, (x, k) => before.p[k] + s * (x - before.p[k]))];
 }
 
 /** Performs one step, and adds points of a smooth trail if it takes several frames. */
 function single() {
-  before = m <= WHOLE && !code.velocities() ? { t: code.time(), q: memory_q.slice(), v: memory_v.slice() } : undefined;
+  before = m <= WHOLE && !code.velocities() ? { t: code.time(), q: memory_q.slice(), v: memory_v.slice(), p: memory_p.slice() } : undefined;
   advance(1);
   if (fault || !before || !shape.trails.length) return;
   const h = code.time() - before.t, parts = clamped(Math.ceil((60 * Math.abs(h)) / settings.speed), 1, 8);
   for (let j = 1; j < parts; j++) {
-    const t = before.t + (h * j) / parts, points = pointsOf(between(t), t);
+    const t = before.t + (h * j) / parts, points = pointsOf(...between(t), t);
     shape.trails.forEach((which, k) => trails[k].splice(-1, 0, { t, at: points[which] }));
   }
 }

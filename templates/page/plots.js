@@ -22,15 +22,15 @@ const wrapped = (angle) => angle - TAU * Math.round(angle / TAU);
 // ---- variables
 const variables = [{ name: "t", label: "t", of: (row) => row[0] }];
 if (m <= WHOLE && about.coordinates.length) {
-  const turning = source.rods ? source.rods.lengths.length : 0;
-  about.coordinates.forEach((name, k) => variables.push({ name, label: spelled(name), of: k < turning ? (row) => wrapped(row[ROW.q + k]) : (row) => row[ROW.q + k], period: k < turning ? TAU : 0 }));
+  const turning = new Set(shape.angles);
+  about.coordinates.forEach((name, k) => variables.push({ name, label: spelled(name), of: turning.has(k) ? (row) => wrapped(row[ROW.q + k]) : (row) => row[ROW.q + k], period: turning.has(k) ? TAU : 0 }));
   about.momenta.forEach((name, k) => variables.push({ name, label: spelled(name), of: (row) => row[ROW.p + k] }));
-  (source.solids || []).forEach((solid, j) => "xyz".split("").forEach((letter, axis) => {
-    const columns = solid.columns.map((c) => ROW.q + c);
-    variables.push({ name: `${solid.name}.${letter}`, label: `${solid.name} axis ${letter}`, of: (row) => { const part = unit(columns.map((c) => row[c])); return part.length === 4 ? rotation(part)[axis][2] : part[axis]; } });
-  }));
+  const points = (row) => pointsOf(row.subarray(ROW.q, ROW.q + m), row.subarray(ROW.p, ROW.p + m), row[0]);
+  for (const { name, tip, centre } of shape.solids) "xyz".split("").forEach((letter, axis) => {
+    variables.push({ name: `${name}.${letter}`, label: `${name} axis ${letter}`, of: (row) => { const at = points(row); return at[tip][axis] - at[centre][axis]; } });
+  });
 } else probes.forEach((at, k) => {
-  const name = source.mesh?.fields.find(({ columns: [begin, end] }) => at >= begin && at < end)?.name || "q";
+  const name = shape.mesh?.fields.find(({ columns: [begin, end] }) => at >= begin && at < end)?.name || "q";
   variables.push({ name: `q.${at}`, label: `${name}, node ${at}`, of: (row) => row[ROW.q + k] }, { name: `p.${at}`, label: `p, node ${at}`, of: (row) => row[ROW.p + k] });
 });
 if (about.energy) variables.push({ name: "energy", label: "energy", of: (row) => row[1] });
@@ -50,7 +50,7 @@ function addPanel(title, draw) {
   panels.push(panel);
   return panel;
 }
-const solid = (source.solids || [])[0];
+const [solid] = shape.solids;
 const defaults = about.plots.length ? about.plots : [solid ? [`${solid.name}.y`, `${solid.name}.x`] : m <= WHOLE && about.coordinates.length ? [about.momenta[0] || "t", about.coordinates[0]] : [`q.${probes[0]}`, "t"]];
 for (const [y, x] of defaults) {
   const shown = { y: named(y, 2), x: named(x, 0) };

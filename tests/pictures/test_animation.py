@@ -6,13 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from samples import compile_quickly
-from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
 from scvi_codegen.errors import PlotError, StateError
 from scvi_codegen.mechanics.multibody.trees.tree import identifier
-from scvi_codegen.pictures.animation import shape_of
-from scvi_codegen.pictures.robots import skeleton
+from scvi_codegen.pictures.animation import drawn_shape, positions_of
+from scvi_codegen.pictures.recognition import shape_of
+from scvi_codegen.pictures.shape import DrawnSystem
 
 pytest.importorskip("matplotlib")
 
@@ -22,6 +22,18 @@ def run_of(name: str, steps: int = 40, **parameters: float) -> sc.Trajectory:
     stepper = compile_quickly(given.system.with_parameters(**parameters), sc.SVI(2))
     p = given.p if given.velocity is None else stepper.momentum(given.q, given.velocity)
     return stepper.integrate(given.q, p, h=given.step / 4, steps=steps)
+
+
+def positions(run, q, p=None):
+    """Return the points of the shape of a run in states."""
+    q = np.array(q)
+    shape = drawn_shape(run)
+    return shape.positions(np.zeros(len(q)), q, np.zeros_like(q) if p is None else p, run.parameters)
+
+
+def is_pendulum(run):
+    """Return whether a run is drawn with rods."""
+    return any(mark["kind"] == "rod" for mark in drawn_shape(run).marks)
 
 
 def run_with(lagrangian: str, coordinates: list[str], **parameters: float) -> sc.Trajectory:
@@ -60,17 +72,13 @@ def test_links_are_where_mujoco_has_them(name):
             values |= dict(zip((f"R_{joint}_{axis}" for axis in "wxyz"), turn, strict=True))
         else:
             values[joint] = at[0]
-    layout = SimpleNamespace(links=system.links)
-    names = [q.name for q in system.coordinates]
-    interface = SimpleNamespace(coordinates=names, layout=layout)
+    names, turning = [q.name for q in system.coordinates], [each.declaration for each in system.rotations]
+    interface = SimpleNamespace(coordinates=names, parameters=(), rotations=turning)
+    shape = shape_of(
+        DrawnSystem(interface=interface, momenta=[f"p_{name}" for name in names], shapes={}, links=system.links)
+    )
     q = np.array([[values[name] for name in names]])
-
-    def rotation(member: str) -> np.ndarray:
-        quaternion = [values[f"{member}_{axis}"] for axis in "xyzw"]
-        return Rotation.from_quat(quaternion).as_matrix()[np.newaxis]
-
-    motion = SimpleNamespace(q=q, stepper=SimpleNamespace(interface=interface), rotation=rotation)
-    points = skeleton(motion)[0][0]
+    points = shape.positions(np.zeros(1), q, q, ())[0]
     for k, link in enumerate(system.links):
         j = joints.index(link.name)
         anchor = data.xanchor[j].copy()  # before the displacement of a slide
@@ -82,20 +90,18 @@ def test_links_are_where_mujoco_has_them(name):
 class TestShapes:
     def test_a_double_pendulum_hangs_from_the_origin_by_its_rods(self):
         run = run_of("double-pendulum", l1=2.0, l2=0.5)
-        shape = shape_of(run)
-        (places,) = shape.points(np.array([[np.pi / 2, 0.0]]), np.zeros((1, 2)))
+        (places,) = positions(run, [[np.pi / 2, 0.0]])
         assert np.allclose(places, [[0.0, 0.0], [2.0, 0.0], [2.0, -0.5]])
-        assert shape.joined
-        save_every = shape.points(run.q, run.p)
-        assert np.allclose(np.linalg.norm(np.diff(save_every, axis=1), axis=2), [2.0, 0.5])
+        assert is_pendulum(run)
+        assert np.allclose(np.linalg.norm(np.diff(positions(run, run.q), axis=1), axis=2), [2.0, 0.5])
 
     def test_a_constant_in_the_potential_does_not_change_the_picture(self):
         pendulums = "a1_dot**2 + a2_dot**2/2 + a1_dot*a2_dot*cos(a1 - a2) + 2*cos(a1) + cos(a2) - 7"
-        assert shape_of(run_with(pendulums, ["a1", "a2"])).joined
+        assert is_pendulum(run_with(pendulums, ["a1", "a2"]))
 
     def test_angle_from_the_upright_position_is_drawn_upright_at_zero(self):
         run = run_with("m*l**2*q_dot**2/2 - m*g*l*cos(q)", ["q"], m=1.0, l=3.0, g=9.81)
-        (places,) = shape_of(run).points(np.array([[0.0]]), np.zeros((1, 1)))
+        (places,) = positions(run, [[0.0]])
         assert np.allclose(places, [[0.0, 0.0], [0.0, 3.0]])
 
     @pytest.mark.sampled(2)
@@ -113,25 +119,59 @@ class TestShapes:
         ids=["spring", "two wells", "free", "apart", "angles between", "up and down", "no numbers"],
     )
     def test_systems_that_resemble_pendulums_are_not_drawn_as_such(self, lagrangian, coordinates):
-        assert not shape_of(run_with(lagrangian, coordinates)).joined
+        assert not is_pendulum(run_with(lagrangian, coordinates))
 
     def test_bodies_are_points_with_names(self):
-        shape = shape_of(run_of("outer-solar-system", 2))
-        assert shape.names == ("sun", "jupiter", "saturn", "uranus", "neptune", "pluto")
-        assert shape.points(np.arange(18.0)[np.newaxis], np.zeros((1, 18))).shape == (1, 6, 3)
+        run = run_of("outer-solar-system", 2)
+        assert tuple(mark["name"] for mark in drawn_shape(run).marks) == (
+            "sun",
+            "jupiter",
+            "saturn",
+            "uranus",
+            "neptune",
+            "pluto",
+        )
+        assert np.array_equal(positions(run, [np.arange(18.0)])[0], np.arange(18.0).reshape(6, 3))
 
     def test_chains_are_drawn_next_to_each_other(self):
-        shape = shape_of(run_of("fput-chain", 2))
-        (places,) = shape.points(np.arange(8.0)[np.newaxis], np.zeros((1, 8)))
-        assert shape.joined
+        (places,) = positions(run_of("fput-chain", 2), [np.arange(8.0)])
         assert np.array_equal(places, np.stack([np.arange(1.0, 9.0), np.arange(8.0)], axis=1))
 
     def test_one_coordinate_uses_its_phase_plane_and_two_their_plane(self):
         oscillator, kepler = run_of("harmonic-oscillator"), run_of("kepler")
-        assert np.array_equal(
-            shape_of(oscillator).points(oscillator.q, oscillator.p)[:, 0], np.hstack([oscillator.q, oscillator.p])
-        )
-        assert np.array_equal(shape_of(kepler).points(kepler.q, kepler.p)[:, 0], kepler.q)
+        drawn = positions_of(drawn_shape(oscillator), oscillator)
+        assert np.array_equal(drawn[:, 0], np.hstack([oscillator.q, oscillator.p]))
+        assert np.array_equal(positions_of(drawn_shape(kepler), kepler)[:, 0], kepler.q)
+
+    @pytest.mark.sampled(1)
+    @pytest.mark.parametrize(
+        ("lagrangian", "coordinates", "place"),
+        [
+            ("(r_dot**2 + r**2*phi_dot**2)/2 + 1/r", ["r", "phi"], lambda r, u: [r * np.cos(u), r * np.sin(u)]),
+            ("(s_dot**2 + s**2*a_dot**2)/2 + 3*s*cos(a)", ["s", "a"], lambda r, u: [r * np.sin(u), -r * np.cos(u)]),
+            ("(s_dot**2 + s**2*a_dot**2)/2 - 3*s*sin(a)", ["s", "a"], lambda r, u: [r * np.cos(u), r * np.sin(u)]),
+            (
+                "(r_dot**2 + r**2*u_dot**2 + z_dot**2)/2",
+                ["r", "u", "z"],
+                lambda r, u, z: [r * np.cos(u), r * np.sin(u), z],
+            ),
+            (
+                "(r_dot**2 + r**2*u_dot**2 + r**2*sin(u)**2*v_dot**2)/2",
+                ["r", "u", "v"],
+                lambda r, u, v: [r * np.sin(u) * np.cos(v), r * np.sin(u) * np.sin(v), r * np.cos(u)],
+            ),
+            (
+                "2*(u_dot**2 + sin(u)**2*v_dot**2) + 4*cos(u)",
+                ["u", "v"],
+                lambda u, v: [np.sin(u) * np.cos(v), np.sin(u) * np.sin(v), -np.cos(u)],
+            ),
+            ("(r_dot**2 + (1 + r**2)*phi_dot**2)/2", ["r", "phi"], lambda r, u: [r, u]),
+        ],
+        ids=["polar", "elastic pendulum", "gravity", "cylindrical", "spherical", "on a sphere", "no polar coordinates"],
+    )
+    def test_curvilinear_coordinates_are_drawn_as_positions(self, lagrangian, coordinates, place):
+        q = np.array([0.8, 0.7, 0.3])[: len(coordinates)]
+        assert np.allclose(positions(run_with(lagrangian, coordinates), [q])[0, -1], place(*q))
 
 
 class TestFilm:
@@ -148,9 +188,9 @@ class TestFilm:
         for frame in (3, 40):
             film.animation._func(frame)
             (axes,) = film.animation._fig.axes
-            rods = axes.lines[-1].get_xydata()
             x = np.cumsum(np.sin(run.q[frame]))
-            assert np.allclose(rods, np.stack([[0, *x], [0, *-np.cumsum(np.cos(run.q[frame]))]], axis=1))
+            rods = np.stack([[0, *x], [0, *-np.cumsum(np.cos(run.q[frame]))]], axis=1)
+            assert any(np.allclose(line.get_xydata(), rods) for line in axes.lines if len(line.get_xdata()) == 3)
             assert axes.get_title() == f"double pendulum, t = {run.t[frame]:.6g}"
 
     @pytest.mark.sampled(2)

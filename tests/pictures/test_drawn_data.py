@@ -25,9 +25,11 @@ def motion(names: str, links: tuple[Any, ...] = ()) -> Any:
     """Return a trajectory whose coordinates are sines of t, and whose momenta are sines of 2 t."""
     interface = SimpleNamespace(system="S", title="S by M", map_names=("a", "b"), changes_energy="", rotations=())
     interface.coordinates, interface.momenta = (tuple(f"{p}{each}" for each in names.split()) for p in ("", "p_"))
-    interface.layout = SimpleNamespace(links=links, mesh=None)
+    interface.arrays = interface.lengths = interface.parameters = ()
+    interface.layout = SimpleNamespace(links=links, mesh=None, coordinates=())
     q, p = (np.sin(T[:, np.newaxis] * rate + 1.7 * np.arange(len(names.split()))) for rate in (1.0, 2.0))
-    made = SimpleNamespace(t=T, q=q, p=p, stepper=SimpleNamespace(interface=interface), observed=None)
+    stepper = SimpleNamespace(interface=interface)
+    made = SimpleNamespace(t=T, q=q, p=p, stepper=stepper, observed=None, parameters=())
     made.energy, made.momentum_errors = (lambda: 2.0 - 1e-9 * T), (lambda: 1e-9 * np.stack([-T, T**2], 1))
     return made
 

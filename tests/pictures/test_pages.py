@@ -61,23 +61,6 @@ def without_compiler(monkeypatch):
     monkeypatch.setattr(pages, "webassembly", lambda folder, sources: "")
 
 
-@pytest.mark.parametrize(
-    ("name", "source", "kinds"),
-    [
-        pytest.param(
-            *("double_pendulum", {"rods": {"sign": 1.0, "lengths": ["l1", "l2"]}}, ["rod", "pivot", "bob", "bob"]),
-            marks=pytest.mark.second,
-        ),
-        ("figure_eight", {"columns": [[0, 1], [2, 3], [4, 5]], "pins": []}, ["body"] * 3),
-    ],
-)
-@pytest.mark.usefixtures("without_compiler")
-def test_shapes_are_those_of_animations(name, source, kinds):
-    shape = described(sc.page(MOTIONS / f"{name}.toml").html)["shape"]
-    assert shape["source"] == source
-    assert [each["kind"] for each in shape["marks"]] == kinds
-
-
 @pytest.mark.usefixtures("without_compiler")
 def test_a_page_has_no_address_no_text_as_code_and_the_licences(tmp_path):
     page = sc.page(written(tmp_path), ranges={"k": (0.5, 2.0)})

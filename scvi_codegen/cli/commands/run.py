@@ -222,7 +222,7 @@ def _run_one(model: Model, output: str | None, plot: str | None, *, advised: flo
     tell(summary(model, outcome, known, account), **run_numbers(model, outcome, known, account))
     result = outcome.trajectory
     draw = result.plot if model.array_system is None else result.plot.field
-    written = _write_outputs(result, output, plot, draw=draw)
+    written = _write_outputs(model, result, output, plot, draw=draw)
     tell(written=written)
     if outcome.failure is not None:
         raise CommandFailure(f"{outcome.failure}\n{_kept(outcome, written)}", FAILURE)
@@ -294,7 +294,7 @@ def _run_ensemble(model: Model, path: str, outputs: tuple[str | None, str | None
     outcome = integrate_states(load_ensemble(path, model))
     balance = energy_balance(outcome.result)
     tell(ensemble_summary(model, outcome, balance), **ensemble_numbers(model, outcome, balance))
-    written = _write_outputs(outcome.result, *outputs, draw=outcome.result.plot)
+    written = _write_outputs(model, outcome.result, *outputs, draw=outcome.result.plot)
     continuation = (
         f"the computed states were {'written: ' + ' and '.join(written) if written else 'not written to a file (-o)'}"
     )
@@ -308,11 +308,12 @@ def _run_ensemble(model: Model, path: str, outputs: tuple[str | None, str | None
         tell(f"wrote {path}", written=written)
 
 
-def _write_outputs(result: Any, output: str | None, plot: str | None, *, draw: Any) -> list[str]:
+def _write_outputs(model: Model, result: Any, output: str | None, plot: str | None, *, draw: Any) -> list[str]:
     if output is not None:
         result.save(output)
     if plot is not None and Path(plot).suffix.lower() in FILMS:
-        result.animate(plot, progress=(lambda *_: None) if is_quiet() else None)
+        progress = (lambda *_: None) if is_quiet() else None
+        result.animate(plot, picture=model.picture or None, progress=progress)
     elif plot is not None:
         draw(plot)
     return [path for path in (output, plot) if path is not None]

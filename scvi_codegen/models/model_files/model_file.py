@@ -24,7 +24,7 @@ from scvi_codegen.methods import fitted
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.document import document_of, motion_of, with_files
 from scvi_codegen.models.model_files.input_tables import InputTable
-from scvi_codegen.models.model_files.page_section import PAGE_KEYS, check_page
+from scvi_codegen.models.model_files.page_section import PAGE_KEYS, PICTURE_KEYS, check_page, check_picture
 from scvi_codegen.models.model_files.sections import (
     FORMULAS,
     TORQUES,
@@ -59,12 +59,12 @@ FIELD_KEYS = (
     *("name", "fields", "momenta", "space", "boundary", "density", "hamiltonian", "dissipation"),
     *("scalars", "point_lagrangians", "discretisation"),
 )
-KEYS = {"system": SYSTEM_KEYS, "field": FIELD_KEYS, "page": PAGE_KEYS} | {
+KEYS = {"system": SYSTEM_KEYS, "field": FIELD_KEYS, "page": PAGE_KEYS, "picture": PICTURE_KEYS} | {
     section: tuple(option.key for option in options_of(section)) for section in ("initial", "run")
 }
 SECTIONS = (
     *("system", "field", "forces", *TORQUES, "inputs", "sizes", "parameters", "tables", "initial"),
-    *("events", "method", "run", "page"),
+    *("events", "method", "run", "page", "picture"),
 )
 ARRAY_SECTIONS = ("sizes", "tables")
 """Sections of systems with arrays."""
@@ -180,9 +180,10 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
     method = read_method(fitted(specification, one_coordinate(arrays) if arrays else system))
     values |= {"inputs": _read_inputs(document.get("inputs", {}), folder), "solver": solver}
     events = read_events(document.get("events", []))
-    values |= {"page": document.get("page", {}), **read_run(document["run"])}
+    values |= {"page": document.get("page", {}), "picture": document.get("picture", {}), **read_run(document["run"])}
     model = Model(system=system, method=method, events=events, **values)
     check_page(model.page, model)
+    check_picture(model)
     return _with_time_transformation(model, document, specification)
 
 

@@ -1,7 +1,9 @@
-"""Section ``[page]`` of model files: ranges of sliders, speed and plots of a page in the browser."""
+"""Sections ``[page]`` and ``[picture]`` of model files: sliders, speed and plots of a page, and what is drawn."""
 
 from __future__ import annotations
 
+import math
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,8 +12,10 @@ from scvi_codegen.errors import ModelFileError
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.sections import Section, check_keys
 from scvi_codegen.models.options import real
+from scvi_codegen.pictures.shape import MARKS, DrawnSystem, shape_of_picture
 
 PAGE_KEYS = ("ranges", "speed", "plots")
+PICTURE_KEYS = ("points", *MARKS)
 
 
 def slider_names(model: Model) -> list[str]:
@@ -48,3 +52,31 @@ def check_page(section: Section, model: Model, where: str = "[page]") -> None:
     pairs = isinstance(plots, list | tuple) and all(isinstance(each, list | tuple) and len(each) == 2 for each in plots)
     if not pairs or not all(isinstance(name, str) for each in plots for name in each):
         raise ModelFileError(f'{where} plots must be pairs of names, [["t", "energy"]], not {plots!r}')
+
+
+def drawn_system_of_model(model: Model) -> DrawnSystem:
+    """Return what formulas of a picture may use of a model: names of coordinates, momenta, parameters and rotations."""
+    system, scalars = model.system, [name for name, value in model.parameters.items() if np.ndim(value) == 0]
+    if model.array_system is not None:
+        interface = SimpleNamespace(coordinates=[], parameters=scalars, rotations=[], constraints=[], map_names=[])
+        lengths = [length for each in model.array_system.neighbours for length in each.lengths]
+        sized = {name: np.shape(values) for name, values in model.q.items()}
+        return DrawnSystem(interface=interface, momenta=[], shapes=sized, mesh=model.mesh, lengths=lengths)
+    interface = SimpleNamespace(
+        coordinates=[each.name for each in system.coordinates], parameters=[each.name for each in system.parameters],
+        rotations=[each.declaration for each in system.rotations], constraints=[], map_names=[],
+    )  # fmt: skip
+    momenta, links = [each.name for each in system.momentum_symbols], getattr(system, "links", ())
+    shapes: dict[str, tuple[int, ...]] = {}
+    for array in system.arrays:
+        if sum(map(math.prod, shapes.values())) < system.dimension:
+            shapes[array.name] = array.shape({})
+    return DrawnSystem(
+        interface=interface, momenta=momenta, shapes=shapes, mesh=model.mesh, links=links, lengths=system.lengths
+    )
+
+
+def check_picture(model: Model) -> None:
+    """Raise ModelFileError for mistakes in the section ``[picture]`` of a model."""
+    if model.picture:
+        shape_of_picture(drawn_system_of_model(model), model.picture, "[picture]")

@@ -128,6 +128,7 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
         *,
         seconds: float = 8.0,
         positions: Callable[[Array], Array] | None = None,
+        picture: Mapping[str, Any] | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> Film:
         """Return an animation of the first trajectories (at most 64) together, as :meth:`Trajectory.animate`."""
@@ -138,6 +139,7 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
             path,
             seconds=seconds,
             positions=positions,
+            picture=picture,
             progress=progress,
         )
 

@@ -442,12 +442,13 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
         *,
         seconds: float = 8.0,
         positions: Callable[[Array], Array] | None = None,
+        picture: Mapping[str, Any] | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> Film:
         """Return an animation for a notebook, or write .gif, .html or .mp4; see :func:`scvi_codegen.animate`."""
         from scvi_codegen.pictures.animation import animate
 
-        return animate(self, path, seconds=seconds, positions=positions, progress=progress)
+        return animate(self, path, seconds=seconds, positions=positions, picture=picture, progress=progress)
 
     @checks_arguments()
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
