@@ -36,6 +36,7 @@ from scvi_codegen.lowering.control import control_of, error_growth_of
 from scvi_codegen.lowering.derivatives import derivatives_of, point_derivatives_of
 from scvi_codegen.lowering.loops import transforms, with_sums
 from scvi_codegen.lowering.program import lower
+from scvi_codegen.lowering.solvers.points import summing_action
 from scvi_codegen.mechanics.arrays.legendre import SiteHamiltonian, site_hamiltonian
 from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
 from scvi_codegen.mechanics.arrays.system import ArraySystem
@@ -358,6 +359,19 @@ class Sources:
         with announced(f"deriving the {'second ' * second}derivatives of {self.system.name} by {self.method.name}"):
             return render_derivatives(derivatives_of(self.system, stages, program, second=second))
 
+    def acting(self) -> Source | None:
+        """Return the source of runs that sum the action of their steps; ``None`` if another solver takes the steps."""
+        program = self.program()
+        stages = discretise(self.system, self.method)
+        found = program.fixed_point and summing_action(program.fixed_point, self.system, stages.shape)
+        if not (found and program.quantities.integrates and self.uses_fallback_library) or self.g is not None:
+            return None
+        control = control_of(program, self.controller, self.system, None)
+        if control:
+            control = replace(control, growth=error_growth_of(self.system, program))
+        program = replace(program, fixed_point=found, acts_along=True)
+        return render(program, control, fallback="external")
+
     def changes(self, count: int) -> Source | None:
         """Return the ensemble source with tangent vectors; ``None`` unless it is a fixed point with constant mass."""
         twin, fixed_point = equivalent_lagrangian(self.system), self.program().fixed_point
@@ -374,6 +388,7 @@ class Sources:
         variants: dict[str, Callable[[], Source | None]] = {
             "ensemble": lambda: render_ensemble(self.program()),
             "fallback": self.fallback,
+            "acting": self.acting,
             "derivatives": self.tangent,
             "second_derivatives": lambda: self.tangent(second=True),
             "changes": lambda: self.changes(int(count)),

@@ -38,6 +38,7 @@ def run_numbers(
         **_conserved(trajectory),
         "work": None if account is None or account.work is None else float(account.work[-1]),
         "energy_balance": None if account is None or account.work is None else _largest(account.values),
+        "action": trajectory.action() if model.action else None,
         "step_error": trajectory.step_error,
         "worst_step_time": trajectory.worst_step_time,
         "final": {"t": t, "q": _named(model, q), "p": _named(model, p)},

@@ -125,6 +125,8 @@ def summary(model: Model, outcome: RunOutcome, known: Known | None, account: Ene
         lines.append(f"{_speed(outcome, model)}; prepared in {outcome.preparation:.2f} s")
         with np.errstate(all="ignore"):
             lines += conserved(trajectory, account)
+        if model.action:
+            lines.append(f"action: {trajectory.action():.15g}")
         lines += worst_step(trajectory)
     return "\n".join(
         [*lines, *event_counts(trajectory.events), *final_state(run.stepper.interface, *outcome.end[1:], known)]

@@ -251,6 +251,7 @@ class Program:
         rattle: tables of RATTLE, which is tried before Newton's method if applicable.
         damping: the rate of a uniform damping, if there is one.
         summed: whether the action is summed also where it is no function of both ends of a step.
+        acts_along: whether runs sum the action of their steps.
         loops: of a system of arrays.
     """
 
@@ -269,6 +270,7 @@ class Program:
     rattle: Rattle | None = None
     damping: Kernel | None = None
     summed: bool = False
+    acts_along: bool = False
     loops: RolledTerms = RolledTerms()
 
     @property

@@ -58,7 +58,7 @@ class Model(TimeSpan):
         p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
         velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
         h, tolerance, error, span, steps, save_every, t, time_transformation, controller, precision,
-            solver_tolerance, max_iterations, threads: as of :class:`~scvi_codegen.models.time_span.TimeSpan`.
+            solver_tolerance, max_iterations, threads, action: as of :class:`~scvi_codegen.models.time_span.TimeSpan`.
         inputs: by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as :meth:`Stepper.integrate` accepts
             it, or a number; a run requires all inputs of the system.
         fields: arrays of parameters by name, for array sizes known at run time; others keep their default value.
@@ -265,6 +265,11 @@ class Model(TimeSpan):
         )
         if self.mesh is not None and stepper.interface.layout.mesh is None:
             stepper.interface = replace(stepper.interface, layout=replace(stepper.interface.layout, mesh=self.mesh))
+        if self.action:
+            from scvi_codegen.runtime.core.features import require  # not needed for reading a model
+
+            require(stepper, "action")
+            stepper = stepper.acting
         return stepper.with_events(self.events) if self.events else stepper
 
     def momenta(self, stepper: Stepper) -> Array:
@@ -425,7 +430,7 @@ class Model(TimeSpan):
 
     def _run_arguments(self) -> dict[str, Any]:
         """Return the arguments of :meth:`Stepper.integrate` and ensembles for time, steps, saved states and inputs."""
-        others = ("span", "threads")  # and choices, which are arguments of the stepper
+        others = ("span", "threads", "action")  # and choices, which are arguments of the stepper
         arguments = {
             option.field: getattr(self, option.field)
             for option in RUN_FIELDS

@@ -182,6 +182,7 @@ class RunOptions:
         unavailable={IN_ENSEMBLE: "its trajectories are distributed over all cores"},
         common=False,
     )
+    action: bool = run_option("run", SWITCH, "", "Sum the action along the run.", default=False, common=False)
 
 
 _TABLE: Mapping[str, Option] = {

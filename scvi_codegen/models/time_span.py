@@ -44,6 +44,7 @@ class TimeSpan(RunOptions):
         solver_tolerance, max_iterations: of the iteration on the stage equations, as of
             :class:`~scvi_codegen.SolverOptions`.
         threads: number of threads per step, for array sizes known at run time.
+        action: whether runs sum the action, as of :meth:`Stepper.integrate <scvi_codegen.Stepper.integrate>`.
     """
 
     def _check_time_span(self) -> None:

@@ -28,6 +28,7 @@ RUNS = {
     "solver_tolerance": 1e-12,
     "max_iterations": 30,
     "threads": 2,
+    "action": True,
     "q": [0.5],
     "p": [0.25],
     "velocity": [0.125],
@@ -61,7 +62,7 @@ def test_key_of_an_option_sets_its_field_and_is_written(option):
     sections = {"initial": [], "run": []}
     for each in FIELDS:
         if each.name in values:
-            sections[each.section].append(f"{each.key} = {values[each.name]!r}")
+            sections[each.section].append(f"{each.key} = {values[each.name]!r}".replace("True", "true"))
     model = parse_model(model_file(sections, arrays=option.name == "threads"))
     found = getattr(model, option.field)
     assert (list(found) if isinstance(found, tuple) else found) == RUNS[option.name]
@@ -109,6 +110,7 @@ OCCURRENCES = {
     "solver_tolerance": set(),
     "max_iterations": set(),
     "threads": {"models/model.py"},
+    "action": {"cli/commands/cache.py", "cli/running.py", "cli/json_documents.py", "models/model.py"},
 }
 """Files of models and commands beside the table in which an option is read: those that act on its value."""
 

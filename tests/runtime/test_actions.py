@@ -35,17 +35,66 @@ def test_variation_of_the_action_is_that_of_the_ends(stepper):
     def run(z, h=0.2):
         return stepper.integrate(z[:2], z[2:], h=h, steps=30)
 
+    def action(z, h=0.2):
+        return stepper.integrate(z[:2], z[2:], h=h, steps=30, action=True).action()
+
     base = run(START)
     derivatives = base.sensitivity()
     for i, e in enumerate(np.eye(4)):
         expected = base.p[-1] @ derivatives.state[-1, :2, i] - base.p[0] @ e[:2]
-        assert abs(central(lambda x, e=e: run(START + x * e).action()) - expected) < 2e-11
+        assert abs(central(lambda x, e=e: action(START + x * e)) - expected) < 2e-11
     energies = [
         -central(lambda x, k=k: stepper.discrete_lagrangian(base.q[k], base.q[k + 1], 0.2 + x)) for k in range(30)
     ]
     expected = base.p[-1] @ derivatives.h[-1, :2] - np.sum(energies)
-    assert abs(central(lambda x: run(START, 0.2 + x).action(), 2e-4) - expected) < 2e-11
+    assert abs(central(lambda x: action(START, 0.2 + x), 2e-4) - expected) < 2e-11
     assert np.ptp(energies) < 1e-7  # conserved to the order of the method
+
+
+SUMMED = [
+    ({"lagrangian": "(x_dot**2 + y_dot**2)/2 - x**4 - x**2*y - y**2"}, "gauss:2", {"h": 0.1, "t_end": 2.33}),
+    ({"lagrangian": "(x_dot**2 + y_dot**2)/2 - x**4 - x**2*y - y**2"}, "svi:4", {"t_end": 9.0}),
+    (
+        {"lagrangian": "(x_dot**2*(1 + x**2) + y_dot**2)/2 - x**2*y*t", "forces": {"x": "-y_dot*x_dot", "y": "0"}},
+        sc.SVI(3, quadrature="gauss-legendre:5"),
+        {"h": -0.1, "steps": 20},
+    ),
+    (
+        {"lagrangian": "(x_dot**2 + y_dot**2)/2 + u*x - y**2", "inputs": ["u"]},
+        "svi:2",
+        {"h": 0.07, "t_end": 1.0, "inputs": {"u": ([0.0, 0.4, 1.0], [0.0, 1.0, 0.0])}},
+    ),
+]
+
+
+@pytest.mark.parametrize(("arguments", "method", "steps"), SUMMED, ids=["gauss", "adaptive", "forces", "inputs"])
+def test_action_summed_by_the_run_is_that_of_its_steps(arguments, method, steps):
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_text("system", ["x", "y"], **arguments), method)
+    without, run = (stepper.integrate([0.3, 0.1], velocity=[0.1, 0.2], action=x, **steps) for x in (False, True))
+    assert without.actions is None
+    assert all(np.isfinite(piece.actions).all() for piece in run.pieces or (run,))
+    assert np.array_equal(without.q, run.q)
+    assert np.allclose(run.action(cumulative=True), without.action(cumulative=True), rtol=0, atol=1e-14)
+    assert abs(run[2:].action() - without[2:].action()) < 1e-14 if not run.pieces else True
+
+
+def test_action_is_summed_for_hamiltonians_rotations_and_arrays():
+    top = sc.LagrangianSystem.from_text(
+        "top", [], "(omega_1**2 + 2*omega_2**2 + 3*omega_3**2)/2 - R_33", rotations={"R": "omega"}
+    )
+    oscillator = sc.HamiltonianSystem.from_text("oscillator", ["x"], "p_x**2/2 + p_x**4/8 + x**2/2 + x*p_x/5")
+    chain = sc.LagrangianSystem.from_text(
+        "chain", ["u[N]"], "sum(i in N, u_dot[i]**2/2 - u[i]**4/4) - sum(i in 0..N-2, (u[i+1] - u[i])**2/2)"
+    )
+    for system, q, start in (
+        (top, {"R": [1, 0, 0, 0]}, {"velocity": {"omega": [0.1, 0.2, 2]}}),
+        (oscillator, [1.0], {"p": [0.2]}),
+        (chain, {"u": [0.1, 0.2, 0.3]}, {}),
+    ):
+        stepper = sc.compile_stepper(system, "svi:3")
+        without, run = (stepper.integrate(q, h=0.05, steps=30, action=x, **start) for x in (False, True))
+        assert np.isfinite(run.actions).all()
+        assert abs(run.action() - without.action()) < 1e-14
 
 
 @pytest.mark.second

@@ -38,6 +38,7 @@ rounded map still has a generating function: its energy error does not drift.
 """
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from typing import Any
@@ -66,7 +67,7 @@ from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.rotations.axial import Turn, axial_turns, frame_potential
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.stage_system import Accelerations, Velocities
+from scvi_codegen.methods.stage_system import Accelerations, Shape, Velocities
 from scvi_codegen.tables.basis import matrix_product, transpose
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
@@ -220,6 +221,32 @@ def _turn_kernel(system: MechanicalSystem, turns: Sequence[Turn], *, lanes: bool
     changes = ((*t.change(q, g), *t.change(p, g)) for t, g in zip(turns, rotations, strict=True))
     purpose = "Changes q (g - 1) and p (g - 1) of vectors by rotations, u = (q, p, g - 1)."
     return system_kernel(system, "turn_lanes", map(Add, *changes), u=(*q, *p, *sum(rotations, ())), purpose=purpose)
+
+
+def summing_action(
+    fixed_point: FixedPointIteration, system: MechanicalSystem, shape: Shape | None
+) -> FixedPointIteration | None:
+    """Return an iteration with the kernel of L at the points, whose sums are the action of a run; ``None`` if unknown.
+
+    Not with damping and turns, whose steps are more than the curve through the points.
+    """
+    name, macros = fixed_point.name, dict(fixed_point.macros)
+    if system.damping != 0 or system.integrands or {"TURNS", "MOVING_FRAME"} & {*macros}:
+        return None
+    twin = StepProblem(system, shape).lagrangian
+    if name == "Hamiltonian":
+        arguments, velocities = forms_of(system).legendre_arguments, forms_of(system).legendre
+        scalar = Add(*(p * v for p, v in zip(system.auxiliaries, velocities, strict=True)), -system.formula)
+    elif name in ("separable", "coupled") and twin:
+        system, arguments, scalar = twin, (*twin.coordinates, *twin.velocities), twin.lagrangian
+    else:
+        return None
+    own = fixed_point.own_tables
+    if name == "separable":
+        found = separable_iteration(StepProblem(system, shape), velocities=True)
+        own = (*own, *(table for table in found.own_tables if table.name == "VELOCITY")) if found else own
+    kernel = system_kernel(system, "integrand_lanes", (scalar,), u=arguments, purpose="L at all points.")
+    return replace(fixed_point, own_tables=own, kernels=(*fixed_point.kernels, kernel))
 
 
 def _nearly_equal(one: Matrix, other: Matrix) -> bool:

@@ -122,6 +122,7 @@ class CompiledMethod(ChosenBySizes):
         self._event_variants: dict[tuple[Event, ...], Self] = {}
         self._released_runs: list[Any] = []
         self._known: dict[Hashable, Self] = {}
+        self._with_action: Self | None = None
         self._entries: dict[Event, tuple[Event, ...]] = {}
         self._plain = cast(Source, source)
         self.shapes = shapes_of(interface)
@@ -144,9 +145,19 @@ class CompiledMethod(ChosenBySizes):
         else:
             self.binding = Binding(library, interface.prefix, interface.workspace, fallback=self._load_fallback)
 
-    def _copy(self, events: tuple[Event, ...]) -> Self:
+    @property
+    def acting(self) -> Self:
+        """The stepper whose runs sum the action of their steps; itself if they are computed again for it."""
+        stepper = self.known
+        if stepper._with_action is None:
+            source = stepper._variants["acting"]
+            found = stepper._with_action = stepper._copy(stepper.events, source) if source else stepper
+            found._with_action = found
+        return stepper._with_action
+
+    def _copy(self, events: tuple[Event, ...], source: Source | None = None) -> Self:
         return type(self)(
-            self._plain,
+            source or self._plain,
             self.interface,
             variants=self._variants,
             flags=self.flags,

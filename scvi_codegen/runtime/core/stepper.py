@@ -95,6 +95,7 @@ class Stepper(Integrator):
         check_growth: bool | None = None,
         tables: Mapping[str, ArrayLike] | None = None,
         threads: int | None = None,
+        action: bool = False,
     ) -> Trajectory:
         """Integrate ``steps`` steps of h, or to t_end, and save every ``save_every``-th state and the initial one.
 
@@ -140,6 +141,9 @@ class Stepper(Integrator):
                 column; and the number of threads per step, by default one, with bitwise equal results. Threads pay off
                 if a step takes longer than some tens of microseconds; they are started by each call of C. The shapes
                 of the arrays determine the sizes, and without p and velocity the initial velocity is 0.
+            action: sum the action along the run, for :meth:`Trajectory.action`, which otherwise computes the steps
+                again. SVI and Gauss methods solved by fixed-point iteration sum it in the loop over the steps (arrays
+                of run-time sizes are compiled with the sizes of the call); others ignore this.
 
         Returns:
             A :class:`Trajectory` of steps // save_every + 1 states, fewer if an event ended it; with inputs states
@@ -153,7 +157,7 @@ class Stepper(Integrator):
         """
         if type(save_every) is not int or save_every != 1:
             save_every = checked_count(save_every, "save_every", least=1)
-        stepper, interface, segments = self if events is None else self.with_events(events), self.interface, None
+        stepper, interface, segments = self._for_run(events, action=action), self.interface, None
         if not (inputs is None and t_eval is None and observe is None and tables is None and threads is None):
             self._check_not_of_run(tables, threads)
             stride = None if save_every == 1 else save_every
@@ -194,6 +198,14 @@ class Stepper(Integrator):
             warn_of_error_growth(run, trajectory, check_growth, repeat)
         run._release()
         return trajectory
+
+    def _for_run(self, events: EventLike | Sequence[EventLike] | None, *, action: bool) -> Self:
+        """Return the stepper of runs with these events, ``None`` for its own, that sum the action if requested."""
+        stepper = self if events is None else self.with_events(events)
+        if action:
+            require(stepper, "action")
+            return stepper.acting
+        return stepper
 
     def _confirmed(
         self, error: float, q: States, p: States | None, start: dict[str, Any], saved: dict[str, Any]

@@ -116,6 +116,7 @@ class Memory:
         self._start_function = binding.function("start", memory)
         self._step_error = binding.function("step_error", memory) if binding.has("step_error") else None
         self._plan, self.longest, self._can_measure_growth = NO_PLAN, 0.0, hasattr(memory, "measures_growth")
+        self._sums_action = hasattr(memory, "actions")
         firsts = {name: parameter_index(stepper.interface, f"{name}_0") for name in stepper.interface.inputs}
         self._inputs = {name: slice(first, first + 5) for name, first in firsts.items()}
 
@@ -362,6 +363,8 @@ class Memory:
         if len(saved) != size:
             raise StateError(f"invalid saved run: it has {len(saved)} bytes, those of this stepper have {size}")
         buffer[:], self._watch = saved[: len(buffer)], watch
+        if self._sums_action:
+            self._memory.actions = binding.null
         if watch is not None:
             binding.buffer(watch)[:] = saved[len(buffer) :]
 
@@ -431,11 +434,15 @@ class Memory:
         if self._unset_inputs and steps:
             self.check_inputs()
         call = self._call
-        call.t, call.q, call.p, call.iterations = output_arrays
+        call.t, call.q, call.p, call.iterations, *actions = output_arrays
+        if actions:
+            (self._memory.actions,) = actions
         try:
             return self._take(steps, save_every)
         finally:
             call.t, call.q, call.p, call.iterations = self._discarded
+            if actions:
+                self._memory.actions = self.stepper.binding.null
 
     @property
     def iterations(self) -> int:

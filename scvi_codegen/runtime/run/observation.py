@@ -7,6 +7,7 @@ saved. States are therefore bitwise equal with and without events.
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from scvi_codegen.runtime.run.observer import StateChunk
 from scvi_codegen.runtime.run.observers import AtTimes, Saver
 from scvi_codegen.runtime.run.run_loop import record, trajectory_of
 from scvi_codegen.runtime.run.singular_time import ProgressWatch
+from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.run.times import WHOLE
 from scvi_codegen.runtime.trajectory.time_transformation import part_of_step
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
@@ -122,7 +124,10 @@ class Observation:
                 self.run.rollback(before)
                 part, failure, self.arrived = record(self.run, reached), None, False
                 t, q, p = self.search.last
-                part = self._with_state(part, part.step_sizes, t, q, p, self._state_within_step(part, t)[2])
+                lengths = part.step_sizes.copy()
+                if self.run.plan.adaptive:
+                    lengths[-1] = t - part.t[-1]
+                part = self._with_state(part, lengths, t, q, p, self._state_within_step(part, t)[2])
                 self.run._watch = self.search.watch
         return part, None, failure
 
@@ -132,8 +137,6 @@ class Observation:
         run = self.run
         (t, q, p, iterations), sizes, numbers, failure = self.search.advance(run, size)
         self.arrived = self.end is not None and t[-1] == self.end
-        if len(t) > 1:
-            self.saver.cut_step(sizes[0])  # known only now
         part = trajectory_of(run, (t, run.stepper.named(q), run.stepper.named(p), iterations), sizes)
         return part, numbers, failure
 
@@ -173,7 +176,7 @@ class Observation:
         self, part: Trajectory, lengths: Array, t: float, q: Array, p: Array, tau: float | None
     ) -> Trajectory:
         """Return a chunk with one more state within a step appended."""
-        return self._made(
+        made = self._made(
             np.append(part.t, t),
             np.concatenate([part.q, [q]]),
             np.concatenate([part.p, [p]]),
@@ -181,9 +184,23 @@ class Observation:
             np.append(lengths, np.nan),
             np.append(part.stepped, t if tau is None else tau),
         )
+        if part.actions is not None:
+            made.actions = np.append(part.actions, part.actions[-1] + self._action_until(part, t))
+        return made
+
+    def _action_until(self, part: Trajectory, t: float) -> float:
+        """Return the action of the part of a step from the last state of a chunk to a time."""
+        if t == (begin := float(part.t[-1])):
+            return 0.0
+        settings: dict[str, Any] = {"t": begin, "parameters": self.run.parameters, "options": self.run.options}
+        run = Memory.started(self.run.stepper, part.q[-1], part.p[-1], plan=StepPlan(h=t - begin), **settings)
+        run.advance(1)
+        return float(run._memory.action)
 
     def _pass_on(self, part: Trajectory, numbers: NDArray[np.int64] | None = None, *, is_first: bool = False) -> None:
         """Pass a chunk to the saver; its steps end at the last state, unless these are their numbers."""
+        if len(part) > 1:
+            self.saver.cut_step(float(part.step_sizes[0]))  # known only now
         if numbers is None:
             numbers = self.run.steps - (len(part) - 1 - self.ended) + np.arange(len(part))
         iterations = self.iterations + np.cumsum(part.iterations, dtype=np.int64)
@@ -193,10 +210,13 @@ class Observation:
 
     def trajectory(self) -> Trajectory:
         """Return all states saved so far."""
-        t, q, p, sizes, stepped, count = (np.concatenate(arrays) for arrays in zip(*self.saver.rows, strict=True))
+        t, q, p, sizes, stepped, count, actions = (
+            np.concatenate(arrays) for arrays in zip(*self.saver.rows, strict=True)
+        )
         fields = {"q": q, "p": p, **self.saver.fields()}
         states = t, fields.pop("q"), fields.pop("p"), np.diff(count, prepend=count[:1]).astype(np.int32)
         trajectory = self._made(*states, sizes, stepped)
+        trajectory.actions = actions if self.run._sums_action else None
         return replace(trajectory, **fields) if fields else trajectory
 
     def _made(

@@ -48,12 +48,13 @@ class Saver(Observer):
         within_steps: with ``save_every=1``, also states after changes by events within steps.
 
     Attributes:
-        rows: arrays t, q, p, step sizes, independent variables and numbers of iterations of each chunk.
+        rows: arrays t, q, p, step sizes, independent variables, numbers of iterations and actions (NaN unless the run
+            sums them) of each chunk.
     """
 
     def __init__(self, save_every: int = 1, *, within_steps: bool = True) -> None:
         self.save_every, self.within_steps = checked_count(save_every, "save_every", least=1), within_steps
-        self.rows: list[tuple[Array, Array, Array, Array, Array, NDArray[np.int64]]] = []
+        self.rows: list[tuple[Array, Array, Array, Array, Array, NDArray[np.int64], Array]] = []
 
     def wanted(self, chunk: StateChunk) -> NDArray[np.bool_]:
         """Return which states of a chunk to save."""
@@ -72,7 +73,8 @@ class Saver(Observer):
         """Save some states of a chunk."""
         part = chunk.states
         t, q, p, sizes, stepped = (each[wanted] for each in (part.t, part.q, part.p, part.step_sizes, part.stepped))
-        self.rows.append((t, q, p, sizes, stepped, chunk.iterations[wanted]))
+        actions = np.full(len(t), np.nan) if part.actions is None else part.actions[wanted]
+        self.rows.append((t, q, p, sizes, stepped, chunk.iterations[wanted], actions))
 
     def cut_step(self, size: float) -> None:
         """Set the size of the step that follows the last state, which an event may have cut, if that is saved."""
@@ -99,7 +101,8 @@ class AtTimes(Saver):
         times = self.times[after & (forward * self.times <= right)]
         q, p, stepped = states_and_steps_at(part, times)
         before = np.searchsorted(forward * part.t, forward * times, side="right") - 1
-        self.rows.append((times, q, p, step_sizes_at(part, times), stepped, chunk.iterations[before]))
+        unknown = np.full(len(times), np.nan)
+        self.rows.append((times, q, p, step_sizes_at(part, times), stepped, chunk.iterations[before], unknown))
 
     def cut_step(self, size: float) -> None:
         """Output times are within steps."""
@@ -134,8 +137,8 @@ class Observed(Saver):
         if not wanted.any():
             return
         self.save(chunk, wanted)
-        t, q, p, sizes, stepped, count = self.rows[-1]
-        self.rows[-1] = t, q[:0], p[:0], sizes, stepped, count
+        t, q, p, sizes, stepped, count, actions = self.rows[-1]
+        self.rows[-1] = t, q[:0], p[:0], sizes, stepped, count, actions
         self.ends = [*self.ends[:1], (q[-1], p[-1])]
         stepper, parameters = chunk.run.stepper, chunk.states.parameters
         energies = stepper._energy_parts(q, p, t, parameters)

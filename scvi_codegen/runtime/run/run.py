@@ -44,7 +44,8 @@ class Run(Memory, AttitudeHistory):
             run: Self = stepper._released_runs.pop()
         except IndexError:
             run, binding = cls(stepper), stepper.binding
-            if binding.reusable and binding._workspace + FIRST_STEPS * len(run._q) <= MOST_KEPT:
+            size = binding._workspace + FIRST_STEPS * len(run._q)
+            if binding.reusable and not run._sums_action and size <= MOST_KEPT:
                 run._rows = ShortRuns(run)
         return run
 

@@ -10,7 +10,6 @@ from math import isfinite
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.native.arguments import empty_array
@@ -25,7 +24,8 @@ from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import checked_count
 
-States = tuple[Array, Array, Array, NDArray[np.int32]]
+States = tuple[Any, ...]
+"""Times, positions, momenta, iterations and, of a run that sums it, the action."""
 NATIVE_DOUBLE, INT32 = struct.Struct("d"), np.dtype(np.int32)
 FIRST_STEPS = 256
 """Number of saved states of the first C call, before the speed of the steps is known."""
@@ -82,30 +82,29 @@ class StateRows:
     """Memory for the times, positions, momenta and iterations of states of a run.
 
     Attributes:
-        states: the arrays.
+        states: the arrays; of a run that sums the action, also its values.
         starts: pointers to their first rows.
     """
 
     def __init__(self, memory: Memory, rows: int) -> None:
         m, binding = len(memory._q), memory.stepper.binding
         t, q, p = empty_array((rows,)), empty_array((rows, m)), empty_array((rows, m))
-        self.states: States = t, q, p, np.zeros(rows, INT32)
-        self.starts = *binding.pointers(t, q, p), binding.integers(self.states[3])
+        actions = (np.zeros(rows),) if memory._sums_action else ()
+        self.states: States = t, q, p, np.zeros(rows, INT32), *actions
+        self.starts = *binding.pointers(t, q, p), binding.integers(self.states[3]), *binding.pointers(*actions)
 
     def after(self, row: int) -> tuple[Any, ...]:
         """Return pointers to a row."""
-        (t, q, p, iterations), begin = self.starts, row * self.states[1].shape[1]
-        return t + row, q + begin, p + begin, iterations + row
+        (t, q, p, *others), begin = self.starts, row * self.states[1].shape[1]
+        return t + row, q + begin, p + begin, *(each + row for each in others)
 
     def first(self, count: int) -> States:
         """Return the first rows, in the same memory."""
-        t, q, p, iterations = self.states
-        return t[:count], q[:count], p[:count], iterations[:count]
+        return tuple(each[:count] for each in self.states)
 
     def copies(self, count: int) -> States:
         """Return copies of the first rows."""
-        t, q, p, iterations = self.first(count)
-        return t.copy(), q.copy(), p.copy(), iterations.copy()
+        return tuple(each.copy() for each in self.first(count))
 
 
 class ShortRuns(StateRows):
@@ -198,8 +197,10 @@ class _StateRecorder:
         kept: StateRows | None = memory._rows
         self.rows = kept if kept is not None and rows <= len(kept.states[0]) else StateRows(memory, rows)
         if not filled:
-            t, q, p, _ = self.rows.states
+            t, q, p, _, *actions = self.rows.states
             t[0], q[0], p[0] = memory.t, memory._q, memory._p
+            for each in actions:
+                each[0] = memory._memory.action
         self.earlier: list[States] = []
         self.watch = ProgressWatch(memory.stepper, plan.t_end) if plan.tau else None
 
@@ -237,8 +238,7 @@ class _StateRecorder:
         """Return the states saved so far."""
         memory, states = self.memory, self._states()
         if self.earlier:
-            t, q, p, iterations = map(np.concatenate, zip(*self.earlier, states, strict=True))
-            states = t, q, p, iterations
+            states = tuple(map(np.concatenate, zip(*self.earlier, states, strict=True)))
         if not memory._plan.h:
             return trajectory_of(memory, states, _differences(states[0], whole=self.save_every == 1))
         tau, h = None, memory._memory.h
@@ -275,7 +275,8 @@ def _trajectory(
     """
     plan, stepper = memory._plan, memory.stepper
     trajectory = Trajectory.__new__(Trajectory)
-    t, q, p, trajectory.iterations = states
+    t, q, p, trajectory.iterations, *actions = states
+    trajectory.actions = actions[0] if actions else None
     if stepper.shapes is not None:
         q, p = stepper.named(q), stepper.named(p)
     trajectory.t, trajectory.q, trajectory.p, trajectory.step_sizes = t, q, p, step_sizes

@@ -28,6 +28,7 @@ def joined(pieces: Sequence[Result]) -> Result:
         **states,
         **{name: getattr(last, name) for name in same},
         step_sizes=np.concatenate([*(piece.step_sizes[:-1] for piece in every), last.step_sizes[-1:]]),
+        actions=None,
         events=tuple(map(joined_crossings, zip(*(piece.events for piece in every), strict=True))),
         pieces=tuple(pieces),
     )

@@ -24,7 +24,7 @@ from scvi_codegen.runtime.core.features import refusal, require
 from scvi_codegen.runtime.core.validation import columns_of_inputs
 from scvi_codegen.runtime.events.detection import crossings_of
 from scvi_codegen.runtime.events.event import Crossings, Event, EventLike, as_events
-from scvi_codegen.runtime.paths.actions import actions_between, compensated_sums, shadow_energy
+from scvi_codegen.runtime.paths.actions import actions_until, compensated_sums, shadow_energy
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.rotations.quantities import named_quantities
 from scvi_codegen.runtime.run.accuracy import TOLERABLE_ERROR, unresolved_parts
@@ -75,6 +75,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
         confirmation: the comparison with a second run if ``error=`` was passed, else ``None``.
         observed: (n, ..) values that ``observe`` returned, else ``None``; q and p are then those of both ends.
         conserved: (n, 3 + k) energies and momentum maps with ``observe``, else ``None``.
+        actions: (n,) action up to each state if the run summed it (``action=True``), else ``None``; see :meth:`action`.
         pieces: with inputs, the trajectories between their breakpoints, each with its parameters; the first state of
             each is the last of the previous one. ``parameters`` are then those of the first.
 
@@ -87,6 +88,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
     confirmation: GlobalError | None = field(default=None, repr=False)
     observed: Array | None = field(default=None, repr=False)
     conserved: Array | None = field(default=None, repr=False)
+    actions: Array | None = field(default=None, repr=False)
     pieces: tuple[Self, ...] = field(default=(), repr=False)
 
     def __repr__(self) -> str:
@@ -133,6 +135,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
             self,
             **{name: getattr(self, name)[rows] for name in ("t", "q", "p", "iterations")},
             tau=None if self.tau is None else self.tau[rows],
+            actions=None if self.actions is None else self.actions[rows],
             step_sizes=lengths,
             events=tuple(crossings.chosen((crossings.t >= low) & (crossings.t <= high)) for crossings in self.events),
         )
@@ -238,15 +241,19 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
 
         Without forces this is the sum of the discrete Lagrangians, so that dS = p1 . dq1 - p0 . dq0 for neighbouring
         runs, to round-off. With forces, damping, impacts and constraints it is the action of L alone, without their
-        work and impulses. The steps are computed again from the saved states; sums are compensated.
+        work and impulses. Sums are compensated. Unless the run summed it (``action=True``), the steps are computed
+        again from the saved states.
 
         Raises:
             MethodError: if the method has no sum of L (Runge-Kutta methods other than Gauss), in transformed time, and
                 for first-order systems.
             StateError: if the states are not at whole steps.
         """
-        sums = compensated_sums(np.concatenate([[0.0], *(actions_between(piece) for piece in self.pieces or (self,))]))
-        return sums if cumulative else float(sums[-1])
+        require(self.stepper, "action")
+        parts = [actions_until(piece, piece.actions) for piece in self.pieces or (self,)]
+        ends = compensated_sums(np.array([0.0, *(part[-1] for part in parts)]))
+        sums = concatenated([part + end for part, end in zip(parts, ends, strict=False)])
+        return sums if cumulative else float(ends[-1])
 
     def shadow_energy(self, order: int = 12) -> Array:
         """Return (n,) energies of the shadow Hamiltonian, of which the states are an exact solution.

@@ -149,7 +149,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   return OK;
 }
 
-#ifdef TIME_TRANSFORMATION
+#if defined(TIME_TRANSFORMATION) || defined(RUN_ACTION)
 /* Integrals along a step solved by fixed-point iteration. Requires: the kernel integrand_lanes. */
 
 /* Quadrature of the momenta at the converged velocities, which `memory` contains. */

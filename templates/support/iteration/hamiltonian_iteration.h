@@ -212,7 +212,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   return iterate(step, data, past, steps, dq, dp, options, report, 0);
 }
 
-#ifdef TIME_TRANSFORMATION
+#if defined(TIME_TRANSFORMATION) || defined(RUN_ACTION)
 /* Integrals along a step solved by fixed-point iteration. Requires: the kernel integrand_lanes. */
 
 /* Quadrature of the momenta at the converged velocities and forces, which `memory` contains. */

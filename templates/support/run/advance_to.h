@@ -47,6 +47,7 @@ int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long step
       memcpy(q + stored * M, now.at.q, sizeof(real) * M);
       memcpy(p + stored * M, now.at.p, sizeof(real) * M);
       iterations[stored] = (int)run->iterations;
+      store_action(run, stored);
       run->iterations = 0;
     }
   }
