@@ -27,13 +27,17 @@ from scvi_codegen.display.mathml import mathml_terms
 from scvi_codegen.errors import ArgumentError, ExpressionError, MethodError, StateError, closest
 from scvi_codegen.files.atomic import regular, write_text
 from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.formulas.symbols import input_parameters, symbol
 from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS
-from scvi_codegen.mechanics.first_order import FirstOrderSystem
 from scvi_codegen.models.model import DEFAULT_METHOD, Model
 from scvi_codegen.models.model_files.document import document_of
 from scvi_codegen.models.model_files.model_file import load_model
-from scvi_codegen.models.model_files.page_section import check_page, check_picture, drawn_system_of_model
+from scvi_codegen.models.model_files.page_section import (
+    check_page,
+    check_picture,
+    drawn_system_of_model,
+    starts_from_momenta,
+)
 from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.pages.webassembly import LICENCES, webassembly
 from scvi_codegen.pictures.recognition import shape_of
@@ -50,8 +54,13 @@ CAUSES = (
     "The step failed: a value is infinite or undefined. Use other values, or a smaller step size.",
     "The step size fell below machine precision, as near a collision. Use other initial values.",
     "The step failed: the iteration converged to a spurious solution. Use a smaller step size.",
+    "",
+    "The step failed: a wall is passed without an impact. Use a smaller step size.",
+    "The step failed: the changes of the state by events do not end. Use other initial values.",
+    "The initial state is behind a wall. Use other initial values.",
+    "The step failed: it has too many events. Use a smaller step size.",
 )
-"""Text of each status of the generated C."""
+"""Text of each status of the generated C, then of ``entry.c.jinja``."""
 ARRAY = re.compile(r"(\w+)\[")
 NAME = re.compile(r"[A-Za-z_]\w*\b(?!\()")
 LONG_NUMBER = re.compile(r"\d{12}")
@@ -104,8 +113,7 @@ def page(
         The page, which a notebook displays.
 
     Raises:
-        MethodError: for what a page does not have: events, inputs, time transformations, controllers, steps without a
-            size or tolerance, and systems whose velocities do not determine their momenta.
+        MethodError: without a step size or tolerance, and for inputs that are tables instead of numbers.
         StateError: for a range of a parameter that does not contain its value, and an unknown variable of a plot.
         ModelFileError: for an invalid model file, unknown sliders and values of the wrong form.
         ArgumentError: for unknown arguments, and those of a motion beside a model.
@@ -150,8 +158,12 @@ def page_of(model: Model, document: Mapping[str, Any], settings: Mapping[str, An
     model = replace(model, page={**model.page, **settings, "ranges": ranges})
     model._check_double("a page")
     _check(model, ranges)
-    adaptive = model.h is None
-    result = Page(model.with_known_sizes() if adaptive else model, document, adaptive=adaptive)
+    adaptive = model.h is None or model.time_transformation is not None
+    acting = tuple(
+        each for each in model.events if each.changes_state or each.terminal
+    )  # others do not affect the motion
+    model = replace(model, events=acting)
+    result = Page(model.with_known_sizes() if adaptive or acting else model, document, adaptive=adaptive)
     result.html  # noqa: B018  (reports errors here)
     return result
 
@@ -159,22 +171,18 @@ def page_of(model: Model, document: Mapping[str, Any], settings: Mapping[str, An
 def _check(model: Model, ranges: Mapping[str, tuple[float, float]]) -> None:
     """Raise an error for what a page does not have."""
     name = model.system.name
-    refused = {
-        "events": model.events,
-        "inputs": getattr(model.system, "inputs", ()),
-        "time transformations": model.has_time_transformation,
-    }
-    for feature, given in refused.items():
-        if given:
-            raise MethodError(f"a page has no {feature}, which {name} has: omit them, or use run and animate()")
-    if isinstance(model.system, FirstOrderSystem):
-        raise MethodError(f"a page starts from velocities; {name} is of first order: use run and animate()")
+    for each, value in model.inputs.items():
+        if isinstance(value, tuple):
+            raise MethodError(f"a slider sets the input {each} of {name}, which is a table: give a number")
     if model.h is None and model.tolerance is None:
         raise MethodError(f"a page requires a step size or tolerance; {name} has neither: give [run] step or tolerance")
+    if model.h is None and model.has_time_transformation:
+        raise MethodError(f"a page requires the step size in tau of {name}, not a tolerance: give [run] step")
     check_page(model.page, model, "page")
     check_picture(model)
-    for parameter in ranges.keys() & model.parameters.keys():
-        (low, high), value = ranges[parameter], model.parameters[parameter]
+    values = model.parameters | {each: model.inputs.get(each, 0.0) for each in getattr(model.system, "inputs", ())}
+    for parameter in ranges.keys() & values.keys():
+        (low, high), value = ranges[parameter], values[parameter]
         if not low <= value <= high:
             raise StateError(f"the range {low:g} .. {high:g} of {parameter} must contain its value {value:g}: widen it")
 
@@ -204,7 +212,8 @@ class Page:
             interface = _interface(folder, model)
             initial = _initial(document, [*model.mesh.points, *interface.parameters]) if model.mesh else ()
             (folder / "page.c").write_text(_entry(folder, model, interface, initial, self.adaptive), encoding="utf-8")
-            code = webassembly(folder, ("page.c", "motion.c"))
+            sources = ("page.c", "motion.c", *(["motion_events.c"] if model.events else []))
+            code = webassembly(folder, sources)
         description = _description(self, interface, initial=bool(initial))
         return (
             template_environment()
@@ -241,7 +250,7 @@ def _interface(folder: Path, model: Model) -> SimpleNamespace:
     return SimpleNamespace(
         array=True, title=data["title"], system=model.system.name, coordinates=[], momentum_names=[], rotations=[],
         constraints=[], map_names=[], parameters=list(scalars), defaults=list(scalars.values()), conserves_energy=True,
-        sizes=data["sizes"],
+        sizes=data["sizes"], inputs=[], energy_parameter="",
     )  # fmt: skip
 
 
@@ -268,7 +277,9 @@ def _entry(folder: Path, model: Model, interface: Any, initial: Sequence[str], a
         .render(
             array=interface.array, m=size, capacity=256 if size < 64 else 16, maps=len(interface.map_names),
             values=numbers, sizes=list(interface.sizes.values()) if interface.array else (), tables=tables,
-            constraints=interface.constraints, adaptive=adaptive, initial=initial,
+            constraints=interface.constraints, adaptive=adaptive, initial=initial, events=model.events,
+            acting=any(each.changes_state for each in model.events), velocities=not starts_from_momenta(model),
+            level=interface.parameters.index(energy) if (energy := interface.energy_parameter) else None,
             axes={f"at_{name}": nodes for name, nodes in axes.items()},
             names={f"at_{name}": k for k, name in enumerate(interface.parameters)},
         )
@@ -276,9 +287,10 @@ def _entry(folder: Path, model: Model, interface: Any, initial: Sequence[str], a
 
 
 def _values(model: Model, interface: Any) -> dict[str, float]:
-    """Return the scalar parameters by name, in order."""
+    """Return the scalar parameters by name, in order, with those that contain inputs and the energy of the state."""
+    known = model.parameters | {f"{name}_0": value for name, value in model.inputs.items()}
     pairs = zip(interface.parameters, interface.defaults, strict=True)
-    return {name: float(model.parameters.get(name, default)) for name, default in pairs}
+    return {name: float(known.get(name, default)) for name, default in pairs}
 
 
 def _initial(document: Mapping[str, Any], names: Sequence[str]) -> tuple[str, ...]:
@@ -296,13 +308,15 @@ def _initial(document: Mapping[str, Any], names: Sequence[str]) -> tuple[str, ..
 
 
 def _lagrangian(document: Mapping[str, Any]) -> list[str]:
-    """Return the Lagrangian or density as written, as terms of MathML; none of array systems and the like."""
-    text = str(document.get("field", {}).get("density") or document.get("system", {}).get("lagrangian") or "")
+    """Return the Lagrangian, density or Hamiltonian as written, as terms of MathML; none of array systems."""
+    system = document.get("system", {})
+    text = str(document.get("field", {}).get("density") or system.get("lagrangian") or system.get("hamiltonian") or "")
     try:
         density = parse_expression(text, {name: symbol(name) for name in NAME.findall(text)})
     except ExpressionError:
         return []
-    return [] if LONG_NUMBER.search(str(density)) else list(mathml_terms(density, sympy.Symbol("L")))
+    name = sympy.Symbol("H" if "hamiltonian" in system else "L")
+    return [] if LONG_NUMBER.search(str(density)) else list(mathml_terms(density, name))
 
 
 def _flat(state: Any) -> list[float]:
@@ -312,22 +326,17 @@ def _flat(state: Any) -> list[float]:
     return result
 
 
-def _velocity(model: Model) -> list[float]:
-    """Return the initial velocities, from momenta if these are given."""
-    if model.velocity is not None:
-        return _flat(model.velocity)
-    if model.p is None:
+def _rates(model: Model) -> list[float]:
+    """Return the initial velocities, or momenta: see :func:`starts_from_momenta`."""
+    given, other = (model.p, model.velocity) if starts_from_momenta(model) else (model.velocity, model.p)
+    if given is not None:
+        return _flat(given)
+    if other is None:
         return [0.0] * model.dimension
     stepper = model.stepper()
-    if model.array_system is not None:
-        raise MethodError(f"a page of arrays requires initial velocities; {model.system.name} has momenta: give q_dot")
-    velocity = stepper.velocity(model.q, model.p, model.t, model.parameters)
-    if not np.allclose(stepper.momentum(model.q, velocity, model.t, model.parameters), model.p, rtol=1e-9, atol=1e-12):
-        raise MethodError(
-            f"a page starts from velocities, which do not determine the momenta of {model.system.name}: use run and"
-            " animate()"
-        )
-    return _flat(velocity)
+    if starts_from_momenta(model):
+        return _flat(model.momenta(stepper))
+    return _flat(stepper.velocity(model.q, model.p, model.t, model.parameters))
 
 
 def _drawn_system(model: Model, interface: Any) -> DrawnSystem:
@@ -344,37 +353,47 @@ def _description(shown: Page, interface: Any, *, initial: bool) -> dict[str, Any
     """Return what the scripts of the page read."""
     model, adaptive = shown.model, shown.adaptive
     ranges = model.page.get("ranges", {})
-    q, v = _flat(model.q), _velocity(model)
+    q, v = _flat(model.q), _rates(model)
     drawn = _drawn_system(model, interface)
     shape = (shape_of_picture(drawn, model.picture) if model.picture else shape_of(drawn)).to_data()
-    parameters = []
-    for name, value in _values(model, interface).items():
+    parameters, inputs = [], {f"{name}_0": name for name in interface.inputs}
+    unchanged = {interface.energy_parameter, *input_parameters(interface.inputs)} - inputs.keys()
+    for place, (name, value) in enumerate(_values(model, interface).items()):
         size = abs(value) or 1.0
         default = (size / 20, 3 * size) if value > 0 else (-3 * size, 3 * size if value else size)
-        low, high = ranges.get(name, default)
-        parameters.append({"name": name, "value": value, "low": low, "high": high})
+        if name in inputs:
+            default = (-3 * size, 3 * size)
+        low, high = ranges.get(inputs.get(name, name), default)
+        each = {"name": inputs.get(name, name), "value": value, "low": low, "high": high, "place": place}
+        if name not in unchanged:
+            parameters.append(each | ({"input": True} if name in inputs else {}))
     span = abs(float(model.end - model.t))
     speed = model.page.get("speed", 1.0 if 0.3 < span / SECONDS < 4 else float(f"{span / SECONDS:.0e}"))
-    step = float(model.tolerance if adaptive else model.h)  # type: ignore[arg-type]
+    step = float(model.h if model.h is not None else model.tolerance)  # type: ignore[arg-type]
+    label = "Tolerance" if model.h is None else "Step size in tau" if model.has_time_transformation else "Step size"
     limits = (
         [math.pi, 12.0]
         if len(shape["angles"]) == len(q)
         else [2 * max([1.0, *(abs(x) for x in kind)]) for kind in (q, v)]
     )
     names = interface.coordinates or [""] * len(q)
+    rates = interface.momentum_names if starts_from_momenta(model) else [f"{name}_dot" for name in names]
     sliders = {
-        kind: [ranges.get(f"{name}{ending}", [-limit, limit]) for name in names]
-        for kind, ending, limit in zip("qv", ("", "_dot"), limits, strict=True)
+        kind: [ranges.get(name, [-limit, limit]) for name in known]
+        for kind, known, limit in zip("qv", (names, rates or names), limits, strict=True)
     }
+    conserved = all(each.restitution == 1.0 for each in model.events if each.changes_state)
     variables = _variables(interface, shape, len(q))
     plots = [[_variable(name, variables) for name in reversed(pair)] for pair in model.page.get("plots", ())]
     return {
         "m": len(q), "q": q, "v": v, "t": float(model.t), "coordinates": interface.coordinates,
         "momenta": interface.momentum_names, "parameters": parameters, "quantities": interface.map_names,
-        "energy": {"label": "Energy", "conserved": bool(interface.conserves_energy)}, "plots": plots, "causes": CAUSES,
+        "energy": {"label": "Energy", "conserved": bool(interface.conserves_energy) and conserved}, "plots": plots,
+        "causes": CAUSES, "events": [str(each.function) for each in model.events],
+        "from_momenta": starts_from_momenta(model), "values": len(interface.parameters),
         "initial": initial, "whole": WHOLE,
-        "step": {"kind": "adaptive" if adaptive else "fixed", "value": step,
-                 **({"low": 1e-15, "high": 1e-4} if adaptive else {"low": step / 20, "high": step * 8})},
+        "step": {"adaptive": adaptive or model.has_time_transformation, "label": label, "value": step,
+                 **({"low": 1e-15, "high": 1e-4} if model.h is None else {"low": step / 20, "high": step * 8})},
         "speed": {"value": speed, "low": speed / 50, "high": speed * 20},
         "ranges": sliders, "shape": shape,
     }  # fmt: skip

@@ -18,7 +18,7 @@ function restart() {
     const began = performance.now(), states = [pointsOf(memory_q, memory_p, code.time())], span = 10 * settings.speed;
     while (!fault && performance.now() - began < 4 && Math.abs(code.time() - about.t) < span && states.length < 4000) {
       fault = code.advance(16, 4);
-      for (let k = 0; k < 4 && !fault; k++) states.push(pointsOf(stored_q.subarray(k * m, (k + 1) * m), stored_p.subarray(k * m, (k + 1) * m), stored_t[k]));
+      for (let k = 0; k < code.stored() && !fault; k++) states.push(pointsOf(stored_q.subarray(k * m, (k + 1) * m), stored_p.subarray(k * m, (k + 1) * m), stored_t[k]));
     }
     const shown = states.filter((points) => points.flat().every(Number.isFinite));
     start();
@@ -67,16 +67,20 @@ function addSlider(title, label, name, { low, high, log = false, hard = true, ge
 }
 const showSliders = () => sliders.forEach((show) => show());
 addSlider("Time", "Speed", "Speed", { ...about.speed, log: true, get: () => settings.speed, set: (x) => { settings.speed = x; } });
-const adaptive = about.step.kind === "adaptive";
-addSlider("Time", adaptive ? "Tolerance" : "Step size", adaptive ? "Tolerance" : "Step size", { ...about.step, log: true, get: () => settings.step, set: (x) => { settings.step = x; restart(); } });
-for (const { name, low, high, log } of about.parameters) addSlider("Parameters", set(name), name, { low, high, log, get: () => settings.parameters[name], set: (x) => { settings.parameters[name] = x; restart(); } });
-const rotations = shape.solids.filter((each) => each.rates);
+const { adaptive } = about.step; // of unknown durations
+addSlider("Time", about.step.label.replace(" in tau", ""), about.step.label, { ...about.step, log: true, get: () => settings.step, set: (x) => { settings.step = x; restart(); } });
+for (const { name, low, high, input } of about.parameters) {
+  if (input) addSlider("Inputs", set(name), name, { low, high, get: () => held[name], set: (x) => { hold(name, x); dirty = true; } });
+  else addSlider("Parameters", set(name), name, { low, high, get: () => settings.parameters[name], set: (x) => { settings.parameters[name] = x; restart(); } });
+}
+const rotations = about.from_momenta ? [] : shape.solids.filter((each) => each.rates);
 if (rotations.length) rotations.forEach(addRotation);
 if (!about.initial && about.ranges) {
   for (const kind of ["q", "v"]) about.coordinates.forEach((name, k) => {
     if (rotations.some(({ columns }) => columns.includes(k))) return;
     const [low, high] = about.ranges[kind][k];
-    addSlider("Initial values", set(name, kind === "v"), kind === "q" ? name : `Velocity of ${name}`, { low, high, hard: false, get: () => settings[kind][k], set: (x) => { settings[kind] = settings[kind].with(k, x); restart(); } });
+    const momentum = kind === "v" && about.from_momenta ? about.momenta[k] : "";
+    addSlider("Initial values", set(momentum || name, kind === "v" && !momentum), momentum || (kind === "q" ? name : `Velocity of ${name}`), { low, high, hard: false, get: () => settings[kind][k], set: (x) => { settings[kind] = settings[kind].with(k, x); restart(); } });
   });
 }
 if (groups["Initial values"] && sliders.length > 24) groups["Initial values"].open = false;
@@ -105,8 +109,8 @@ function play(on = !running) {
 }
 /** Makes the present state the initial state; returns whether it can. */
 function takeState() {
-  if (fault || code.velocities()) { tell("The velocities of the present state are undefined; restart first."); return false; }
-  settings.q = Array.from(memory_q); settings.v = Array.from(memory_v);
+  if (fault || (!about.from_momenta && code.velocities(-1))) { tell("The velocities of the present state are undefined; restart first."); return false; }
+  settings.q = Array.from(memory_q); settings.v = Array.from(memory_rates);
   for (const k of shape.angles) settings.q[k] = wrapped(settings.q[k]);
   return true;
 }
@@ -157,7 +161,7 @@ motion.addEventListener("pointerdown", (event) => {
     const was = running;
     play(false);
     if (!takeState()) return;
-    if (shape.points[which].some((k) => k < 1 || k > m)) settings.v = settings.v.map(() => 0); // no coordinates: released at rest
+    if (shape.points[which].some((k) => k < 1 || k > (about.from_momenta ? 2 * m : m))) settings.v = settings.v.map(() => 0); // no coordinates: released at rest
     dragged = { which, was, depth: picture.at[which][2] };
   }
   motion.classList.add("dragging");
@@ -167,7 +171,9 @@ motion.addEventListener("pointermove", (event) => {
   const at = place(event);
   if (!dragged) { if (!shape.mesh && picture.at) motion.classList.toggle("near", !flat || picture.near(at, reachOf(event)) !== undefined); return; }
   if (dragged.orbit) { view.orbit(at[0] - dragged.at[0], at[1] - dragged.at[1]); dragged.at = at; dirty = true; return; }
-  settings.q = moved(dragged.which, view.from(at, dragged.depth), settings.q, about.t);
+  const there = moved(dragged.which, view.from(at, dragged.depth), about.t);
+  settings.q = there.slice(0, m);
+  if (there.length > m) settings.v = there.slice(m);
   start(); target = code.time(); showSliders(); writeAddress(); dirty = true;
 });
 for (const name of ["pointerup", "pointercancel"]) motion.addEventListener(name, () => {
@@ -197,10 +203,13 @@ function go(elapsed, until) {
 
 /** Performs the steps of an address, as many as a frame allows. */
 function replay(until) {
-  const every = Math.max(1, Math.ceil(pending[0] / 2000));
   while (pending.length && !fault && performance.now() < until) {
-    if (pending[0] > 0) { const now = Math.min(pending[0], 64 * every); advance(now, every); pending[0] -= now; }
-    if (pending[0] === 0 && pending.shift() === 0 && pending.length) turn();
+    const leg = pending[0];
+    if (leg > 0) { const every = Math.ceil(leg / 2000), now = Math.min(leg, 64 * every); advance(now, every); pending[0] -= now; }
+    else {
+      pending.shift();
+      if (leg === "r") turn(); else if (Array.isArray(leg)) hold(...leg);
+    }
   }
   if (fault) pending = [];
   if (!pending.length) { by("reverse").setAttribute("aria-pressed", String(backward())); target = code.time(); }
@@ -224,12 +233,18 @@ function frame(now) {
   requestAnimationFrame(frame);
 }
 let stale = 0;
+/** Returns the text of a status of the generated C: from 100 on of the event that ends the motion, from 200 on of impacts. */
+function causeOf(status) {
+  if (status >= 200) return `The impacts at ${about.events[status - 200]} = 0 accumulate: the motion ends.`;
+  if (status >= 100) return `The motion ends at the event ${about.events[status - 100]} = 0.`;
+  return CAUSES[status] || `The step failed (status ${status}).`;
+}
 function draw(performed) {
   const [pen, width, height] = fitted(motion), time = running && !pending.length ? target : code.time();
   picture.draw(pen, ...(running ? between(time) : [memory_q, memory_p]), time, width, height);
   if (running) { panels[frames % panels.length].draw(); stale = panels.length; } else panels.forEach((panel) => panel.draw());
-  by("clock").textContent = pending.length ? `computing the state of the link: ${pending[0].toLocaleString("en")} steps to go` : `t = ${code.time().toFixed(2)}`;
-  const told = fault ? CAUSES[fault] || `The step failed (status ${fault}).` : performance.now() < noticeEnds ? notice : "";
+  by("clock").textContent = pending.length ? `computing the state of the link: ${pending.reduce((sum, leg) => sum + (leg > 0 && +leg), 0).toLocaleString("en")} steps to go` : `t = ${code.time().toFixed(2)}`;
+  const told = fault ? causeOf(fault) : performance.now() < noticeEnds ? notice : "";
   by("fault").hidden = !told;
   if (by("fault").textContent !== told) by("fault").textContent = told;
   if (frames % 20 === 0 || !running) by("status").textContent = `${code.steps().toLocaleString("en")} steps${performed ? `, ${performed} a frame` : ""}${code.steps() > 0 ? `; ${short(code.iterations(), 2)} iterations a step${code.error() > 0 ? `; largest error of a step about ${short(code.error(), 1)}` : ""}` : ""}`;
@@ -239,7 +254,7 @@ function open() {
   const { error, paused, steps } = readAddress(location.hash);
   if (error) tell(error);
   restart(); showSliders();
-  pending = steps && steps.some((n) => n) ? steps : [];
+  pending = steps && steps.some((leg) => leg) ? steps : [];
   play(!error && !paused && !calm.matches);
 }
 /** For scripts and the console: the present state, its address, and steps at once. */

@@ -13,7 +13,7 @@ const mixed = (from, to, share, white = 0) => `rgb(${rgb[from].map((x, k) => { c
 const hue = (k) => "c" + (k % 6);
 
 // ---- points of a shape: registers of a straight-line program (scvi_codegen/pictures/shape.py)
-const { shape } = about, flat = shape.dimension === 2, START = 1 + 2 * m + about.parameters.length;
+const { shape } = about, flat = shape.dimension === 2, START = 1 + 2 * m + about.values;
 const unit = (list) => { const norm = Math.hypot(...list) || 1; return list.map((x) => x / norm); };
 const registers = new Float64Array(START + shape.program.length);
 shape.program.forEach((entry, k) => { if (!entry.length) registers[START + k] = entry; });
@@ -278,8 +278,9 @@ const trailColor = (k) => {
 };
 
 /** Returns coordinates with which a point of the shape is at a place: damped Gauss-Newton (Levenberg-Marquardt). */
-function moved(which, place, start, t) {
-  const q = Float64Array.from(start), p = Float64Array.from(memory_p), error = (x) => pointsOf(x, p, t)[which].map((u, k) => u - place[k]), d = 1e-6;
+function moved(which, place, t) {
+  const free = about.from_momenta && shape.points[which].some((k) => k > m && k <= 2 * m) ? [...settings.q, ...settings.v] : settings.q; // with momenta that are positions
+  const q = Float64Array.from(free), p = Float64Array.from(memory_p), error = (x) => pointsOf(x.subarray(0, m), x.length > m ? x.subarray(m) : p, t)[which].map((u, k) => u - place[k]), d = 1e-6;
   const size = (e) => e.reduce((sum, u) => sum + u * u, 0);
   let damping = 1e-3;
   for (let round = 0; round < 30; round++) {

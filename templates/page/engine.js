@@ -18,9 +18,11 @@ try {
 code._initialize?.();
 const capacity = code.capacity();
 const block = (k, length) => new Float64Array(code.memory.buffer, length ? code.memory_of(k) : 0, length);
-const memory_parameters = block(0, about.parameters.length), memory_q = block(1, m), memory_p = block(2, m), memory_v = block(3, m);
+const memory_parameters = block(0, about.values), memory_q = block(1, m), memory_p = block(2, m), memory_v = block(3, m);
 const stored_t = block(4, capacity), stored_q = block(5, capacity * m), stored_p = block(6, capacity * m), stored_energy = block(7, capacity);
 const stored_quantities = block(8, capacity * count);
+const memory_rates = about.from_momenta ? memory_p : memory_v; // given at the start
+const events = about.events.length > 0;
 
 const clamped = (x, low, high) => Math.min(high, Math.max(low, x));
 const STORED = 2000; // states of the history at most; then every second one is removed
@@ -33,16 +35,30 @@ const initial = {
   parameters: Object.fromEntries(about.parameters.map(({ name, value }) => [name, value])),
 };
 let settings = structuredClone(initial);
-let legs = [0]; // numbers of steps between reversals of the direction of time
+let legs = [0]; // numbers of steps, "r" where the direction of time is reversed, and new values of inputs
 const value = (given) => (typeof given === "string" ? settings.parameters[given] : given);
 const ranges = Object.fromEntries(about.parameters.map(({ name, low, high }) => [name, [low, high]]));
+const inputs = Object.fromEntries(about.parameters.filter(({ input }) => input).map(({ name, place }) => [name, place]));
+let held = Object.fromEntries(Object.keys(inputs).map((name) => [name, initial.parameters[name]])); // present values of inputs
 
-/** Sets the settings from the address; returns the numbers of steps to perform, or an error. */
+/** Sets the settings from the address; returns the legs to perform, or an error. */
 function readAddress(text) {
   const given = new URLSearchParams(text.replace(/^#/, "")), next = structuredClone(initial);
   const numbers = (list) => list.split(",").map(Number), finite = (list) => list.every(Number.isFinite);
+  const outside = (name, x) => { const [low, high] = ranges[name]; return x >= low && x <= high ? "" : `${name} must be between ${low} and ${high}; the address has ${x}.`; };
   let steps = [0];
   for (const [key, entry] of given) {
+    if (key === ".n") {
+      steps = entry.split(",").map((leg) => {
+        const [, name, x] = leg.match(/^(\w+):(.+)$/) || [];
+        return leg === "r" ? leg : name in inputs ? [name, Number(x)] : clamped(Math.floor(Math.abs(leg || NaN)), 0, 1e7);
+      });
+      for (const leg of steps) {
+        if (Number.isNaN(leg)) return { error: `The address has ".n=${entry}", which is no list of numbers of steps, r, and inputs as F:1. Correct or remove it.` };
+        if (Array.isArray(leg) && outside(...leg)) return { error: outside(...leg) };
+      }
+      continue;
+    }
     const listed = numbers(entry);
     if (!finite(listed) || entry === "") return { error: `The address has "${key}=${entry}", which is not a number. Correct or remove it.` };
     if (key === ".q" || key === ".v") {
@@ -51,15 +67,14 @@ function readAddress(text) {
     } else if (key === ".step" || key === ".speed") {
       if (!(listed[0] > 0)) return { error: `"${key}" must be positive; the address has ${entry}.` };
       next[key.slice(1)] = listed[0];
-    } else if (key === ".n") steps = listed;
-    else if (key in ranges) {
-      const [low, high] = ranges[key];
-      if (listed[0] < low || listed[0] > high) return { error: `${key} must be between ${low} and ${high}; the address has ${entry}.` };
+    } else if (key in ranges) {
+      if (outside(key, listed[0])) return { error: outside(key, listed[0]) };
       next.parameters[key] = listed[0];
     }
   }
   settings = next;
-  return { paused: given.has(".n"), steps: steps.map((n) => clamped(Math.floor(Math.abs(n)), 0, 1e7)) };
+  held = Object.fromEntries(Object.keys(inputs).map((name) => [name, settings.parameters[name]]));
+  return { paused: given.has(".n"), steps };
 }
 
 /** Returns the part of the address that reproduces the state bit for bit. */
@@ -68,24 +83,25 @@ function address(withSteps = true) {
   for (const [name, x] of Object.entries(settings.parameters)) if (x !== initial.parameters[name]) parts.push(`${encodeURIComponent(name)}=${x}`);
   for (const name of ["step", "speed"]) if (settings[name] !== initial[name]) parts.push(`.${name}=${settings[name]}`);
   if (!about.initial) for (const name of ["q", "v"]) if (String(settings[name]) !== String(initial[name])) parts.push(`.${name}=${settings[name].join(",")}`);
-  if (withSteps && legs.some((n) => n)) parts.push(`.n=${legs.join(",")}`);
+  if (withSteps && (legs.length > 1 || legs[0])) parts.push(`.n=${legs.map((leg) => (Array.isArray(leg) ? leg.join(":") : leg)).join(",")}`);
   return "#" + parts.join("&");
 }
 
 // ---- the run
 let fault = 0, energy0 = 0, quantities0 = [], rows = [], trails = [], stride = 1, counted = 0, before;
-const backward = () => legs.length % 2 === 0;
+const backward = () => legs.filter((leg) => leg === "r").length % 2 === 1;
 const signed = () => (backward() ? -settings.step : settings.step);
 const probes = m <= WHOLE ? Array.from({ length: m }, (_, k) => k) : [Math.floor(m / 4), Math.floor(m / 2)];
 const ROW = { t: 0, energy: 1, quantities: 2, q: 2 + count, p: 2 + count + probes.length };
 
 /** Starts from the initial values. */
 function start() {
-  about.parameters.forEach(({ name }, k) => (memory_parameters[k] = settings.parameters[name]));
+  Object.assign(settings.parameters, held);
+  about.parameters.forEach(({ name, place }) => (memory_parameters[place] = settings.parameters[name]));
   if (about.initial) {
     code.initial();
     settings.q = Array.from(memory_q); settings.v = Array.from(memory_v);
-  } else { memory_q.set(settings.q); memory_v.set(settings.v); }
+  } else { memory_q.set(settings.q); memory_rates.set(settings.v); }
   legs = [0];
   fault = code.start(about.t, settings.step);
   forget();
@@ -93,10 +109,18 @@ function start() {
 
 /** Reverses the direction of time at the present state. */
 function turn() {
-  legs.push(0);
+  legs.push("r", 0);
   fault = code.turn(signed());
   for (const points of trails) for (const point of points) point.t = NaN; // all are past
   before = undefined;
+}
+
+/** Sets an input for the steps to come. */
+function hold(name, x) {
+  held[name] = memory_parameters[inputs[name]] = x;
+  const last = legs.length - 2;
+  if (legs[last + 1] === 0 && legs[last]?.[0] === name && legs[last] !== "r") legs[last][1] = x;
+  else legs.push([name, x], 0);
 }
 
 function forget() {
@@ -123,25 +147,36 @@ function keep(t, q, p, energy, quantities) {
   if (rows.length > STORED) { rows = rows.filter((_, k) => k % 2 === 0); stride *= 2; }
 }
 
-/** Returns q and p between the last two states: a cubic with their positions and velocities, and a line. */
+/** Returns q and p between the states of the last step: a cubic with their positions and velocities, after an event the
+ * parabola of both positions and the first velocity; p on a line. */
 function between(time) {
-  if (!before || m > WHOLE || code.velocities()) return [memory_q, memory_p];
-  const h = code.time() - before.t, s = (time - before.t) / h;
-  if (!(s >= 0 && s < 1)) return [memory_q, memory_p];
+  const now = [memory_q, memory_p], way = backward() ? -1 : 1;
+  if (!before || (!before[1] && code.velocities(-1))) return now;
+  const ends = [...before, { t: code.time(), q: memory_q, p: memory_p }], k = Math.max(1, ends.findIndex(({ t }) => (t - time) * way > 0)), [from, to] = ends.slice(k - 1, k + 1);
+  const h = to.t - from.t, s = (time - from.t) / h;
+  if (!(s >= 0 && s < 1)) return now;
+  const p = Float64Array.from(to.p, (x, i) => from.p[i] + s * (x - from.p[i]));
+  if (before[1]) return [Float64Array.from(to.q, (x, i) => from.q[i] + from.v[i] * s * h + (x - from.q[i] - from.v[i] * h) * s * s), p];
   const [a, b, c, d] = [(1 + 2 * s) * (1 - s) ** 2, s * (1 - s) ** 2 * h, s * s * (3 - 2 * s), s * s * (s - 1) * h];
-  const q = Float64Array.from(memory_q, (x, k) => a * before.q[k] + b * before.v[k] + c * x + d * memory_v[k]);
-  return [q, Float64Array.from(memory_p, (x, k) => before.p[k] + s * (x - before.p[k]))];
+  return [Float64Array.from(to.q, (x, i) => a * from.q[i] + b * from.v[i] + c * x + d * memory_v[i]), p];
 }
 
 /** Performs one step, and adds points of a smooth trail if it takes several frames. */
 function single() {
-  before = m <= WHOLE && !code.velocities() ? { t: code.time(), q: memory_q.slice(), v: memory_v.slice(), p: memory_p.slice() } : undefined;
+  before = m <= WHOLE && !code.velocities(-1) ? [{ t: code.time(), q: memory_q.slice(), p: memory_p.slice(), v: memory_v.slice() }] : undefined;
   advance(1);
+  if (before && events) {
+    for (let k = 0; k < code.stored() - 1; k++) if (!code.velocities(k)) before.push({ t: stored_t[k], q: stored_q.slice(k * m, (k + 1) * m), p: stored_p.slice(k * m, (k + 1) * m), v: memory_v.slice() });
+  }
   if (fault || !before || !shape.trails.length) return;
-  const h = code.time() - before.t, parts = clamped(Math.ceil((60 * Math.abs(h)) / settings.speed), 1, 8);
+  const t0 = before[0].t, h = code.time() - t0, parts = clamped(Math.ceil((60 * Math.abs(h)) / settings.speed), 1, 8);
   for (let j = 1; j < parts; j++) {
-    const t = before.t + (h * j) / parts, points = pointsOf(...between(t), t);
-    shape.trails.forEach((which, k) => trails[k].splice(-1, 0, { t, at: points[which] }));
+    const t = t0 + (h * j) / parts, points = pointsOf(...between(t), t);
+    shape.trails.forEach((which, k) => {
+      let at = trails[k].length;
+      while (at > 1 && (trails[k][at - 1].t - t) * h > 0) at--;
+      trails[k].splice(at, 0, { t, at: points[which] });
+    });
   }
 }
 
@@ -150,7 +185,7 @@ function advance(steps, every = 1) {
   while (steps > 0 && !fault) {
     const now = Math.min(steps, every * capacity), first = code.steps();
     fault = code.advance(now, every);
-    const done = code.steps() - first, stored = Math.floor(code.steps() / every) - Math.floor(first / every);
+    const done = code.steps() - first, stored = code.stored();
     for (let k = 0; k < stored; k++) {
       keep(stored_t[k], stored_q.subarray(k * m, (k + 1) * m), stored_p.subarray(k * m, (k + 1) * m), stored_energy[k], stored_quantities.subarray(k * count, (k + 1) * count));
     }

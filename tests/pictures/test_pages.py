@@ -7,7 +7,6 @@ import importlib.util
 import json
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -34,12 +33,40 @@ step = 0.1
 span = 20.0
 """
 NODE = """
-const fs = require("fs"), code = new WebAssembly.Instance(new WebAssembly.Module(fs.readFileSync(0)), {}).exports;
+const fs = require("fs"), about = JSON.parse(process.argv[1]), m = about.m;
+const code = new WebAssembly.Instance(new WebAssembly.Module(fs.readFileSync(0)), {}).exports;
 code._initialize?.();
-const view = (k) => new Float64Array(code.memory.buffer, code.memory_of(k), 2);
-view(1).set([1, 0]); view(3).set([0, 0.5]);
-const statuses = [code.start(0, 0.1), code.advance(200, 1)];
-console.log(JSON.stringify([statuses, Array.from(view(1)), Array.from(view(2))]));
+const view = (k, size) => new Float64Array(code.memory.buffer, code.memory_of(k), size);
+about.parameters.forEach(({ place, value }) => { view(0, place + 1)[place] = value; });
+view(1, m).set(about.q); view(about.from_momenta ? 2 : 3, m).set(about.v);
+const statuses = [code.start(about.t, about.step.value), code.advance(about.steps, 1)], stored = code.stored();
+const [q, p] = [1, 2].map((k) => Array.from(view(k, m)));
+console.log(JSON.stringify({ statuses, stored, t: code.time(), q, p, energy: code.energy() }));
+"""
+BOX = (
+    OSCILLATOR.replace("[parameters]", 'inputs = ["F"]\n[forces]\nx = "F"\n[inputs]\nF = 0.5\n[parameters]')
+    + """
+[[events]]
+function = "4*x + 3"
+direction = -1
+restitution = 0.5
+[[events]]
+function = "y"
+"""
+)
+TRANSFORMED = OSCILLATOR.replace("[parameters]", 'time_transformation = "1/(1 + x**2)"\n[parameters]')
+FIRST_ORDER = """[system]
+name = "first-order oscillator"
+coordinates = ["y", "x"]
+lagrangian = "y*x_dot - (x**2 + y**2)/2"
+[initial]
+q = [0.5, 1.0]
+[run]
+tolerance = 1e-12
+span = 6.0
+[[events]]
+function = "x + y"
+terminal = true
 """
 
 
@@ -90,7 +117,15 @@ def test_momenta_become_velocities(tmp_path):
     ("old", "new", "ranges", "message"),
     [
         ("step = 0.1", "error = 1e-9", {}, "requires a step size or tolerance"),
-        ("[run]", '[[events]]\nfunction = "x"\n[run]', {}, "no events, which .* omit them"),
+        (
+            *(
+                "[parameters]",
+                'inputs = ["F"]\n[forces]\nx = "F"\n[inputs]\nF = { t = [0, 1], values = [0, 1] }\n[parameters]',
+                {},
+            ),
+            "slider sets the input F of .*, which is a table: give a number",
+        ),
+        ("[parameters]", 'inputs = ["F"]\n[forces]\nx = "F"\n[parameters]', {"F": (1, 2)}, "1 .. 2 of F must contain"),
         ("", "", {"g": (0, 1)}, "unknown slider 'g' in page ranges. Known: k, m, x, y, x_dot"),
         ("", "", {"k": (2, 3)}, "range 2 .. 3 of k must contain its value 1: widen it"),
     ],
@@ -101,21 +136,15 @@ def test_unsupported_systems_are_refused(tmp_path, old, new, ranges, message):
         sc.page(written(tmp_path, OSCILLATOR.replace(old, new, 1)), ranges=ranges)
 
 
-@pytest.mark.second
 @pytest.mark.usefixtures("without_compiler")
-def test_hamiltonians_start_from_the_velocities_of_their_momenta():
-    system = sc.HamiltonianSystem.from_text("h", ["q"], hamiltonian="p_q**2/2 + q**4/4 + p_q**4/10")
-    model = sc.Model(system=system, method="gauss:2", q=[1.0], p=[0.5], h=0.1, span=1.0)
-    assert described(sc.page(model).html)["v"] == pytest.approx([0.5 + 0.4 * 0.5**3])
-
-
-@pytest.mark.second
-@pytest.mark.usefixtures("without_compiler")
-def test_momenta_that_velocities_do_not_determine_are_refused():
+def test_hamiltonians_start_from_momenta():
+    """These need not be functions of the velocities."""
     system = sc.HamiltonianSystem.from_text("h", ["q"], hamiltonian="cos(p_q) + q**2/2")
-    model = sc.Model(system=system, method="gauss:2", q=[1.0], p=[2.8], h=0.1, span=1.0)
-    with pytest.raises((sc.MethodError, sc.StateError), match="velocit"):
-        sc.page(model)
+    model = sc.Model(
+        system=system, method="gauss:2", q=[1.0], p=[2.8], h=0.1, span=1.0, page={"ranges": {"p_q": (2.0, 3.0)}}
+    )
+    data = described(sc.page(model).html)
+    assert (data["from_momenta"], data["v"], data["ranges"]["v"]) == (True, [2.8], [[2.0, 3.0]])
 
 
 PAGE = """
@@ -197,19 +226,32 @@ def test_a_missing_compiler_is_an_error_with_its_remedy(tmp_path, monkeypatch):
 
 
 @pytest.mark.second
-def test_the_webassembly_computes_the_bits_of_python_within_200_kilobytes(tmp_path):
+@pytest.mark.parametrize(
+    ("text", "steps", "statuses"),
+    [
+        pytest.param(BOX, 200, [0, 0], id="impacts and inputs"),
+        pytest.param(TRANSFORMED, 200, [0, 0], id="transformed time"),
+        pytest.param(FIRST_ORDER, 100, [0, 100], id="first order, adaptive, until an event"),
+    ],
+)
+def test_the_webassembly_computes_the_bits_of_python_within_200_kilobytes(tmp_path, text, steps, statuses):
     node = needs("node")
     pytest.importorskip("ziglang", reason="pages are compiled by the extra compiler")
-    command = [sys.executable, "-m", "scvi_codegen", "page", str(written(tmp_path)), "-o", str(tmp_path / "page.html")]
-    subprocess.run(command, check=True, capture_output=True)
-    text = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert len(text) < 200_000
-    code = gzip.decompress(base64.b64decode(re.search(r'id="wasm">(.*?)</script>', text)[1]))
-    done = subprocess.run([node, "-e", NODE], input=code, capture_output=True, check=True)
-    statuses, q, p = json.loads(done.stdout)
-    assert statuses == [0, 0]
-    model = sc.load_model(tmp_path / "model.toml")
-    stepper = sc.compile_stepper(model.system, model.method, flags=PORTABLE_FLAGS)
-    run = stepper.integrate(model.q, velocity=model.velocity, h=0.1, steps=200)
-    assert np.array_equal(q, run.q[-1])
-    assert np.array_equal(p, run.p[-1])
+    path = written(tmp_path, text)
+    page = sc.page(path)
+    assert len(page.html) < 200_000
+    about = described(page.html) | {"steps": steps}
+    code = gzip.decompress(base64.b64decode(re.search(r'id="wasm">(.*?)</script>', page.html)[1]))
+    done = subprocess.run([node, "-e", NODE, json.dumps(about)], input=code, capture_output=True, check=True)
+    state = json.loads(done.stdout)
+    assert state["statuses"] == statuses
+    model = sc.load_model(path)
+    stepper = sc.compile_stepper(model.system, model.method, flags=PORTABLE_FLAGS, events=page.model.events or None)
+    known = {"inputs": model.inputs} if model.inputs else {}
+    h = {"h": model.h, "steps": steps} if model.h else {"tolerance": model.tolerance, "t_end": model.end}
+    run = stepper.integrate(model.q, model.momenta(stepper), parameters=model.parameters, **h, **known)
+    assert state["t"] == run.t[-1]
+    assert np.array_equal(state["q"], run.q[-1])
+    assert np.array_equal(state["p"], run.p[-1])
+    assert state["energy"] == run.energy()[-1]
+    assert state["stored"] == len(run.t) - 1

@@ -112,6 +112,27 @@ def test_a_link_reproduces_the_bits_after_reversal_and_a_change_of_parameters(vi
     assert {key: again[key] for key in ("t", "q", "p")} == {key: state[key] for key in ("t", "q", "p")}
 
 
+def test_a_link_reproduces_the_inputs_of_each_step_through_impacts(view, tmp_path):
+    pytest.importorskip("ziglang", reason="pages are compiled by the extra compiler")
+    system = sc.LagrangianSystem.from_text("ball", ["y"], lagrangian="y_dot**2/2 - y", inputs=["F"], forces={"y": "F"})
+    path, wall = tmp_path / "ball.html", sc.impact("y", restitution=0.9)
+    sc.page(system, q=[1.0], velocity=[0.0], h=0.1, events=[wall], method="svi:2", ranges={"F": (-2, 2)}).save(path)
+    opened(view, path, "#.n=17", 17)
+    view.fill("input[aria-label='F, value']", "-0.5")
+    view.keyboard.press("Enter")
+    view.evaluate("page.advance(30)")
+    view.keyboard.press("Tab")
+    state, address = view.evaluate("[page.state(), page.address()]")
+    assert address == "#.n=17,F:-0.5,30"
+    assert 0 <= state["q"][0] < 1
+    again = opened(view, path, address, 47)
+    assert {key: again[key] for key in ("t", "q", "p")} == {key: state[key] for key in ("t", "q", "p")}
+    opened(view, path, "#F=2.5")
+    view.wait_for_timeout(100)
+    assert "F must be between -2 and 2; the address has 2.5" in view.inner_text("#fault")
+    assert view.messages == []
+
+
 def test_bodies_are_dragged_by_mouse_and_touch(view, pages):
     view.add_init_script(
         "performance.now = () => 0"

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.errors import ModelFileError
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.sections import Section, check_keys
 from scvi_codegen.models.options import real
@@ -18,13 +19,24 @@ PAGE_KEYS = ("ranges", "speed", "plots")
 PICTURE_KEYS = ("points", *MARKS)
 
 
+def starts_from_momenta(model: Model) -> bool:
+    """Return whether a page starts from momenta instead of velocities: of a Hamiltonian, and in transformed time."""
+    if model.array_system is not None:
+        return model.p is not None
+    return model.in_transformed_time or (isinstance(model.system, HamiltonianSystem) and not model.system.rotations)
+
+
 def slider_names(model: Model) -> list[str]:
-    """Return the names of sliders: scalar parameters, coordinates other than those of rotations, and velocities."""
+    """Return the names of sliders: scalar parameters, inputs, coordinates without rotations, velocities or momenta."""
     names = [name for name, value in model.parameters.items() if np.ndim(value) == 0]
+    names += getattr(model.system, "inputs", ())
     if model.array_system is not None or model.mesh is not None:
         return names
     turning = {name for each in model.system.rotations for name in each.coordinates}
     free = [each.name for each in model.system.coordinates if each.name not in turning]
+    if starts_from_momenta(model):
+        momenta = getattr(model.system, "momenta", None) or [f"p_{name}" for name in free]
+        return [*names, *free, *map(str, momenta)]
     return [*names, *free, *(f"{name}_dot" for name in free)]
 
 
