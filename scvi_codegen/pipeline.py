@@ -158,6 +158,7 @@ def describe(
         solver=_solver_of(program),
         variables=tuple(each.name for each in getattr(system, "variables", ())),
         lengths=system.lengths,
+        originals=tuple((x.name, system.text_of(f)) for x, f in system.replaced.items()),
     )
 
 
@@ -321,7 +322,7 @@ class Sources:
         elif self.g is not None or self.system.clock:
             reason = "time is transformed: use fixed steps h in physical time"
         elif self.system.constraints:
-            reason = "it has constraints: use independent coordinates"
+            reason = "it has constraints: use independent coordinates (rods in a plane: eliminate_constraints)"
         elif self.system.inputs:
             reason = "it has tabulated inputs: write them as functions of t"
         elif self.solver not in ("auto", "fixed-point"):

@@ -26,7 +26,7 @@ class EnergyAccount(NamedTuple):
 
     Attributes:
         reason: why the exact energy changes; empty if it is conserved.
-        initial: energy of the first state.
+        initial: energy of the first state; 0 if it is at most 1e-8 of p.v, as of a pendulum that starts horizontally.
         change: (n,) E - E0.
         work: (n,) work of forces and damping, and energy exchanged at events; ``None`` if unknown or none.
     """
@@ -76,4 +76,8 @@ def energy_account(states: Any, *, limited: bool = False) -> EnergyAccount:
     )
     known = reason and hasattr(states, "_exchanged_energy") and not long
     work = states._exchanged_energy(energy) if known else None
-    return EnergyAccount(reason, float(energy[0]), energy - energy[0], work)
+    initial, change = float(energy[0]), energy - energy[0]
+    if np.abs(change).max() > 1e-3 * abs(initial) and hasattr(states, "velocity"):
+        action = np.abs(np.sum(states.p * states.velocity, axis=-1)).max()
+        initial = 0.0 if abs(initial) <= 1e-8 * action else initial
+    return EnergyAccount(reason, initial, change, work)

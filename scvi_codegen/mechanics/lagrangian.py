@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +43,7 @@ class LagrangianSystem(MechanicalSystem):
         dual_energy: the kinetic energy as a function of coordinates and momenta if that takes fewer operations than the
             mass matrix, which then is not computed, else 0.
         links: of a robot from a file, the geometry of its moving links, for pictures.
+        eliminated: of a system in angles of rods, the maps from and to the original system: :attr:`elimination`.
 
     Raises:
         SystemDefinitionError: naming the symbol at fault, if a name is invalid or used twice, L contains an unknown
@@ -54,6 +55,7 @@ class LagrangianSystem(MechanicalSystem):
     reduced: Reduced | None = None
     dual_energy: Expr = field(default_factory=zero)
     links: tuple[Any, ...] = field(default=(), compare=False, repr=False)
+    eliminated: Any = field(default=None, compare=False, repr=False)
 
     __repr__ = summary("name", "coordinates")
 
@@ -68,6 +70,21 @@ class LagrangianSystem(MechanicalSystem):
     def formula(self) -> Expr:
         """L."""
         return self.lagrangian
+
+    @property
+    def elimination(self) -> Any:
+        """:class:`Elimination` of a system in angles: maps to and from the one with constraints; else ``None``."""
+        if self.eliminated is None:
+            return None
+        values = {each.name: value for each, value in self.constants.items()}
+        original = self.eliminated.original
+        kept = {each.name: values[each.name] for each in original.parameters}
+        return replace(self.eliminated, original=original.with_parameters(**kept))
+
+    @property
+    def replaced(self) -> dict[Symbol, Expr]:
+        """See :attr:`MechanicalSystem.replaced`."""
+        return self.eliminated.replaced if self.eliminated else {}
 
     @classmethod
     @checks_arguments(SystemDefinitionError, constraints=TEXTS)

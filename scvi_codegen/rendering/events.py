@@ -105,7 +105,10 @@ class EventFormulas:
     def __init__(self, interface: Interface, events: Sequence[SearchedEvent]) -> None:
         self.interface = interface
         self._turning = RotationNames.of_states(interface.rotations, _names(interface))
-        self._known, self._grammar = self._turning.symbols | _names(interface), _Grammar(interface, self._turning)
+        own = _names(interface)
+        self._known, self._grammar = self._turning.symbols | own, _Grammar(interface, self._turning)
+        self._replaced = {symbol(name): self._turning.read(text, own) for name, text in interface.originals}
+        self._known |= {each.name: each for each in self._replaced}
         elements = [self._elements(event) for event in events]
         self.elements, self.events = [*map(len, elements)], [each for element in elements for each in element]
         self.q = [symbol(name) for name in interface.coordinates]
@@ -147,7 +150,9 @@ class EventFormulas:
         if isinstance(formula, str) and grammar.arrays and is_indexed(formula):
             formula = formula_of_entries(formula, grammar.arrays, self._known, grammar.tables, grammar.rules)
         expression = self._turning.in_coordinates(_expression(formula, self._known, role, self._turning.read))
-        return cast(Expr, expression.xreplace(input_formulas(self.interface.inputs, symbol(TIME))))
+        return cast(
+            Expr, expression.xreplace({**self._replaced, **input_formulas(self.interface.inputs, symbol(TIME))})
+        )
 
     def _elements(self, event: SearchedEvent) -> list[SearchedEvent]:
         """Return the events of the elements of the loops of an event, with formulas of the entries of arrays."""

@@ -292,6 +292,8 @@ class Interface:
         lengths: cutoffs, skins and periods of lists of neighbours, ``("near", "cutoff", "5*s/2")``, which every run
             checks.
         precision: :data:`DOUBLE_DOUBLE`, or "" for double precision.
+        originals: of a system in angles of rods, the names of the coordinates and velocities that they replace, with
+            their formulas, ``("x", "l*sin(angle)")``.
     """
 
     prefix: str
@@ -327,6 +329,7 @@ class Interface:
     variables: tuple[str, ...] = ()
     lengths: tuple[tuple[str, ...], ...] = ()
     precision: str = ""
+    originals: tuple[tuple[str, ...], ...] = ()
 
     @property
     def words(self) -> int:
@@ -379,6 +382,8 @@ class Interface:
             valid = False
         if not valid:
             raise ValueError(f"indices is {interface.indices!r:.60}: it must contain whole numbers")
+        if any(len(each) != 2 for each in interface.originals):
+            raise ValueError(f"originals is {interface.originals!r:.60}: it must contain names, each with a formula")
         kinds = [kind for kind, *_ in map(str.split, filter(DECLARED.fullmatch, interface.rotations))]
         if len(kinds) < len(interface.rotations) or sum(COMPONENTS[kind] for kind in kinds) > interface.dimension:
             raise ValueError(f"rotations is {interface.rotations!r:.60}: it must declare some of the coordinates")

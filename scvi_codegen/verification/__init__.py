@@ -35,6 +35,7 @@ from scvi_codegen.validation import TEXTS, checks_arguments
 from scvi_codegen.verification.certificate import Certificate, Check, Outcome, issued
 from scvi_codegen.verification.convergence import convergence_checks, identity_checks
 from scvi_codegen.verification.derivatives import derivative_checks, time_transformation_derivative_checks
+from scvi_codegen.verification.elimination import elimination_checks
 from scvi_codegen.verification.impacts import impact_checks
 from scvi_codegen.verification.roundoff import roundoff_checks
 from scvi_codegen.verification.stepping import predictor_checks, step_checks
@@ -146,6 +147,7 @@ def _certificate(
         *(time_transformation_derivative_checks(runs) if system.clock else ()),
         *convergence_checks(tested),
         *identity_checks(tested),
+        *elimination_checks(in_time, start),
         *impact_checks(tested, watched),
         largest_step(tested),
     )

@@ -63,7 +63,8 @@ INHERITED = ("degree", "quadrature", "nodes", "stages")
 def chosen_method(document: Document, changes: Document) -> Section:
     """Return the method of a file, or the default one, with the given changes."""
     default: Section = DEFAULT_METHOD.specification()
-    if document.get("system", {}).get("constraints"):
+    section = {**document.get("system", {}), **changes.get("system", {})}
+    if section.get("constraints") and not section.get("eliminate_constraints"):
         default = {"method": "svi", "degree": 6}
     base = _split_method_name(document.get("method", default))
     return _changed_method(base, _split_method_name(changes.get("method", {})))
@@ -306,7 +307,9 @@ def read_catalogue(section: Section) -> Problem | None:
     """Return the entry of the catalogue that a section ``[system]`` names, if any."""
     if "catalogue" not in section:
         return None
-    check_keys(section, ("catalogue", "time_transformation"), "key", "[system] beside catalogue")
+    check_keys(
+        section, ("catalogue", "time_transformation", "eliminate_constraints"), "key", "[system] beside catalogue"
+    )
     name = text_of(section, "catalogue", "[system]")
     return in_section("[system]", lambda: problem(name))
 

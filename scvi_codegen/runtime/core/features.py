@@ -112,7 +112,11 @@ FEATURES = {
             "error check_growth hessian chaos_ensemble flow advice",
             "make them terminal and restart",
         ),
-        ("with constraints", "periodic_orbit fit", "use independent coordinates"),
+        (
+            "with constraints",
+            "periodic_orbit fit",
+            "use independent coordinates (rods in a plane: eliminate_constraints)",
+        ),
         ("with constraints of arrays", "threads", "omit threads; the step uses one"),
         (
             "with constraints of arrays by a composition",

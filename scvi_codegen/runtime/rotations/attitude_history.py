@@ -123,9 +123,12 @@ class AttitudeHistory:
             return np.asarray(p[..., columns])
         if name.endswith(DOT) and (columns := _columns(interface, name.removesuffix(DOT))) is not None:
             return np.asarray(self._velocities(q, p, None)[..., columns])
-        derived = values_by_name(interface, q, p, self._velocities(q, p, None)) if interface.rotations else {}
-        if name in derived:
-            return derived[name]
+        if interface.rotations or interface.originals:
+            times = getattr(self, "times", None)
+            velocity = self._velocities(q, p, None)
+            derived = values_by_name(interface, q, p, velocity, self.t if times is None else times, self.parameters)
+            if name in derived:
+                return derived[name]
         if name in ("q", "p", "velocity"):  # no coordinate has this name: whole state vectors
             return {"q": q, "p": p}[name] if name != "velocity" else self._velocities(q, p, None)
         shown = [name for name, _ in coordinate_shapes(interface)]
@@ -136,6 +139,7 @@ class AttitudeHistory:
                     *shown,
                     *(f"p_{each}" for each in shown),
                     *(f"{each}{DOT}" for each in shown),
+                    *(each for each, _ in interface.originals),
                     "t",
                     "energy",
                     "q",

@@ -1,10 +1,11 @@
-"""Named quantities of rotations, directions, spins and fields on meshes, for tables and files."""
+"""Named quantities of rotations, directions, spins, meshes and eliminated coordinates, for tables and files."""
 
 from typing import Any
 
 import numpy as np
 
 from scvi_codegen.files.labelled_arrays import LONG_NAMES, NamedQuantity
+from scvi_codegen.formulas.symbols import DOT, TIME, symbol
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.rotations.attitudes import angular_velocity, body_momentum, matrices, unit_vectors
@@ -25,6 +26,7 @@ def named_quantities(interface: Interface) -> tuple[NamedQuantity, ...]:
         )
     variables = [name for name in interface.momenta if name in interface.variables]
     named = tuple(NamedQuantity(name, (), (), f"variable {name} of the state") for name in variables)
+    named += tuple(NamedQuantity(x, (), (x,), f"{x} = {text}", {}) for x, text in interface.originals)
     return named + tuple(
         each for member in members_of(interface.dimension, interface.rotations) for each in _names(member)
     )
@@ -39,11 +41,13 @@ def _free_name(name: str) -> str:
     return name if name not in LONG_NAMES else f"{name}_"
 
 
-def values_by_name(interface: Interface, q: Array, p: Array, velocity: Array) -> dict[str, Array]:
-    """Return (.., 3) vectors and (.., 3, 3) matrices by name, of (.., m) states."""
+def values_by_name(
+    interface: Interface, q: Array, p: Array, velocity: Array, t: Array, parameters: Array
+) -> dict[str, Array]:
+    """Return (.., 3) vectors and (.., 3, 3) matrices by name, of (.., m) states at times t."""
     if (mesh := _mesh(interface)) is not None:
         return {_free_name(name): values for name, values in mesh.fields_of(q, p, velocity).items()}
-    result: dict[str, Array] = {}
+    result = _originals(interface, q, velocity, t, parameters)
     if interface.variables:
         result |= {name: p[..., k] for k, name in enumerate(interface.momenta)}
     for member in members_of(interface.dimension, interface.rotations):
@@ -59,6 +63,28 @@ def values_by_name(interface: Interface, q: Array, p: Array, velocity: Array) ->
             values = (spins(own, momenta),)
         result |= zip((each.name for each in _names(member)), values, strict=True)
     return result
+
+
+def _originals(interface: Interface, q: Array, velocity: Array, t: Array, parameters: Array) -> dict[str, Array]:
+    """Return coordinates and velocities that angles of rods replaced (:mod:`scvi_codegen.mechanics.elimination`)."""
+    if not interface.originals:
+        return {}
+    from scvi_codegen.formulas.grammar import parse_expression  # imported here: SymPy
+    from scvi_codegen.formulas.numpy_values import array_value
+
+    shape = q.shape[:-1]
+    times = np.reshape(t, np.shape(t) + (1,) * (len(shape) - np.ndim(t)))
+    rates = [f"{name}{DOT}" for name in interface.coordinates]
+    values = zip(
+        (*interface.coordinates, *rates), np.moveaxis(np.concatenate([q, velocity], axis=-1), -1, 0), strict=True
+    )
+    numbers = zip(interface.parameters, np.moveaxis(np.asarray(parameters), -1, 0), strict=True)
+    known: dict[Any, Any] = {symbol(name): value for name, value in (*values, *numbers, (TIME, times))}
+    names = {each.name: each for each in known}
+    return {
+        name: np.array(np.broadcast_to(array_value(parse_expression(text, names), known), shape))
+        for name, text in interface.originals
+    }
 
 
 def spins(q: Array, p: Array) -> Array:
