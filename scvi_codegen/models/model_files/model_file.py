@@ -225,7 +225,6 @@ def _of_known_sizes(
 
 def _in_angles(system: LagrangianSystem, values: dict[str, Any]) -> dict[str, Any]:
     """Return the fields of a model with the state in the angles of rods."""
-    assert system.elimination is not None  # by construction
     state = in_section("[initial]", partial(system.elimination.from_original, **values))
     return {"t": values["t"], **{name: tuple(vector.tolist()) for name, vector in state.items()}}
 
