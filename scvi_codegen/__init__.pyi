@@ -58,7 +58,7 @@ from scvi_codegen.mechanics.arrays.rolling import roll_sums as roll_sums
 from scvi_codegen.mechanics.arrays.rolling import unroll_sums as unroll_sums
 from scvi_codegen.mechanics.derived_systems import change_coordinates as change_coordinates
 from scvi_codegen.mechanics.derived_systems import variational_system as variational_system
-from scvi_codegen.mechanics.elimination import Elimination as Elimination
+from scvi_codegen.mechanics.elimination import EliminatedRods as EliminatedRods
 from scvi_codegen.mechanics.elimination import eliminate_constraints as eliminate_constraints
 from scvi_codegen.mechanics.first_order import FirstOrderSystem as FirstOrderSystem
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem as HamiltonianSystem

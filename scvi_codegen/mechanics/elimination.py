@@ -59,7 +59,7 @@ class Rod(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Elimination:
+class EliminatedRods:
     """Maps between a system with constraints and the same system in the angles of its rods.
 
     Attributes:
@@ -270,7 +270,7 @@ def eliminate_constraints(
     ):
         if present:
             raise SystemDefinitionError(f"eliminate_constraints: '{known.name}' has {what}")
-    found, reasons = _Search(known).rods()
+    found, reasons = _RodSearch(known).rods()
     if not found:
         listed = "; ".join(f"'{text}' {reason}" for text, reason in reasons.items())
         raise SystemDefinitionError(
@@ -283,7 +283,7 @@ def eliminate_constraints(
 def eliminable_rods(system: MechanicalSystem) -> int:
     """Return the number of constraints that :func:`eliminate_constraints` would replace by angles."""
     plain = type(system) is LagrangianSystem and system.constraints and not (system.rotations or system.clock)
-    return len(_Search(system).rods()[0]) if plain and isinstance(system, LagrangianSystem) else 0
+    return len(_RodSearch(system).rods()[0]) if plain and isinstance(system, LagrangianSystem) else 0
 
 
 def _in_angles(system: LagrangianSystem, rods: Sequence[Rod], reasons: Mapping[str, str]) -> LagrangianSystem:
@@ -291,7 +291,7 @@ def _in_angles(system: LagrangianSystem, rods: Sequence[Rod], reasons: Mapping[s
     for rod in rods:
         a, b = (f.xreplace(places) for f in rod.support)
         places |= {rod.x: a + rod.length * sympy.sin(rod.angle), rod.y: b - rod.length * sympy.cos(rod.angle)}
-    elimination = Elimination(
+    elimination = EliminatedRods(
         original=system,
         rods=tuple(rods),
         positions=tuple(places.get(q, q) for q in system.coordinates),
@@ -383,7 +383,7 @@ def _chain(rod: Rod, rods: Sequence[Rod], system: LagrangianSystem) -> tuple[lis
         support = inner.support
 
 
-class _Search:
+class _RodSearch:
     """Search for rods: first those on supports whose position is known, then those of points that move freely."""
 
     def __init__(self, system: LagrangianSystem) -> None:

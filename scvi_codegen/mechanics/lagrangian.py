@@ -73,7 +73,7 @@ class LagrangianSystem(MechanicalSystem):
 
     @property
     def elimination(self) -> Any:
-        """:class:`Elimination` of a system in angles: maps to and from the one with constraints; else ``None``."""
+        """:class:`EliminatedRods` of a system in angles: maps to and from the one with constraints; else ``None``."""
         if self.eliminated is None:
             return None
         values = {each.name: value for each, value in self.constants.items()}
