@@ -66,13 +66,13 @@ class EliminatedRods:
         original: the system with constraints.
         rods: the rods that became angles, each after the rods that carry it.
         positions: the original coordinates as expressions in the new ones, parallel to ``original.coordinates``.
-        kept: reason why it was kept, by the text of each remaining constraint.
+        remaining: reason why it remains, by the text of each remaining constraint.
     """
 
     original: LagrangianSystem
     rods: tuple[Rod, ...]
     positions: tuple[Expr, ...]
-    kept: Mapping[str, str]
+    remaining: Mapping[str, str]
 
     @property
     def coordinates(self) -> tuple[Symbol, ...]:
@@ -295,7 +295,7 @@ def _in_angles(system: LagrangianSystem, rods: Sequence[Rod], reasons: Mapping[s
         original=system,
         rods=tuple(rods),
         positions=tuple(places.get(q, q) for q in system.coordinates),
-        kept=dict(reasons),
+        remaining=dict(reasons),
     )
     eliminated = {rod.constraint for rod in rods}
     moved = in_other_coordinates(

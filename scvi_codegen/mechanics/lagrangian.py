@@ -78,8 +78,8 @@ class LagrangianSystem(MechanicalSystem):
             return None
         values = {each.name: value for each, value in self.constants.items()}
         original = self.eliminated.original
-        kept = {each.name: values[each.name] for each in original.parameters}
-        return replace(self.eliminated, original=original.with_parameters(**kept))
+        own = {each.name: values[each.name] for each in original.parameters}
+        return replace(self.eliminated, original=original.with_parameters(**own))
 
     @property
     def replaced(self) -> dict[Symbol, Expr]:
