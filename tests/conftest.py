@@ -14,7 +14,7 @@ import pytest
 from browsing import chromium
 from record_tiers import COSTS_VARIABLE
 from samples import UNOPTIMISED, Sample, compile_quickly, sample_named, stepper_for
-from tiers import UNOPTIMISED_TIERS, long_ones_first, mark_the_rest_full, mark_the_rest_second
+from tiers import UNOPTIMISED_TIERS, long_ones_first, mark_later_tiers, mark_the_rest_full
 
 from scvi_codegen import LagrangianSystem, Stepper
 from scvi_codegen.methods.method import Method
@@ -78,7 +78,7 @@ def _record_skipped(report: pytest.TestReport | pytest.CollectReport) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     mark_the_rest_full(items)
     if not any("::" in argument for argument in config.args):  # tests that are named run in any tier but the full one
-        mark_the_rest_second(items)
+        mark_later_tiers(items)
     long_ones_first(items)
 
 

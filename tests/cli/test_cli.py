@@ -76,6 +76,7 @@ class TestHelp:
             assert "Example" in output_of(command, "-h") or command == "methods"
 
     @pytest.mark.parametrize("long", ["read", pytest.param("run", marks=pytest.mark.full)])
+    @pytest.mark.second
     def test_every_example_of_the_help_is_accepted(self, long):
         """Certificates and pages, which have tests of their own, are only read as they stand; certificates also run."""
         texts = [output_of("--help"), *(output_of(command, "--help") for command in ABOUT)]

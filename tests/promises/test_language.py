@@ -2,6 +2,7 @@
 
 import re
 
+import pytest
 from language import (
     FRAGMENT,
     RETIRED_NAMES,
@@ -30,6 +31,7 @@ def excepted(text):
     return str(text.path.relative_to(ROOT)) in EXCEPTIONS
 
 
+@pytest.mark.second
 def test_docstrings_name_the_thing():
     found = list(docstrings())
     fragments = [f"{place(text)}: {text.text.splitlines()[0]}" for text in found if FRAGMENT.match(text.text)]

@@ -10,6 +10,7 @@ pytestmark = [pytest.mark.long, pytest.mark.usefixtures("as_users_compile")]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.second
 def test_the_readme_runs_from_top_to_bottom(tmp_path, monkeypatch):
     found = [part for part in runnable(README) if part.kind == "python" or part.text.startswith(PROGRAM)]
     assert {part.kind for part in found} == {"python", "command"}

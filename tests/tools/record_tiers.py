@@ -2,15 +2,17 @@
 
 ::
 
-    $ SCVI_CODEGEN_CACHE=$(mktemp -d) SCVI_CODEGEN_TESTS_COSTS=costs.txt pytest -n auto -m 'not full'
-    $ python tests/tools/record_tiers.py costs.txt --seconds 260
+    $ export SCVI_CODEGEN_CACHE=$(mktemp -d) SCVI_CODEGEN_TESTS_COSTS=costs.txt SCVI_CODEGEN_TESTS_PART=all
+    $ pytest -n auto -m 'not full'
+    $ python tests/tools/record_tiers.py costs.txt --quick 260 --both 1000
 
 Costs are processor seconds, of the processes that a test starts, too. All cases of a test that together cost at most a
 threshold are quick, of others the first cases within the threshold. The threshold is the largest for which all quick
-cases together cost at most the given seconds.
+cases together cost at most the given seconds. A second threshold limits the cases of both tiers in the same way.
 """
 
 import argparse
+from bisect import bisect_right
 from collections import defaultdict
 from itertools import accumulate
 from pathlib import Path
@@ -30,34 +32,37 @@ def read_costs(path: Path) -> dict[str, list[float]]:
     return costs
 
 
-def quick_counts(costs: dict[str, list[float]], threshold: float) -> dict[str, int]:
-    """Return the numbers of leading cases that cost at most ``threshold`` together."""
-    return {name: sum(total <= threshold for total in accumulate(cases)) for name, cases in costs.items()}
+def leading_cases(costs: dict[str, list[float]], seconds: float) -> dict[str, int]:
+    """Return the numbers of leading cases under the largest threshold by which all cost at most ``seconds``."""
+    thresholds = sorted({total for cases in costs.values() for total in accumulate(cases)})
+    totals = {name: list(accumulate(cases)) for name, cases in costs.items()}
+
+    def counts(threshold: float) -> dict[str, int]:
+        return {name: bisect_right(cases, threshold) for name, cases in totals.items()}
+
+    def cost(threshold: float) -> float:
+        return sum(totals[name][count - 1] for name, count in counts(threshold).items() if count)
+
+    largest = bisect_right(thresholds, seconds, key=cost)
+    print(f"at most {thresholds[largest - 1]:.2f} s a test: {cost(thresholds[largest - 1]):.0f} s")
+    return counts(thresholds[largest - 1])
 
 
 def main() -> None:
-    """Write the file for the given budget."""
+    """Write the file for the given budgets."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("costs", type=Path)
-    parser.add_argument("--seconds", type=float, required=True, help="processor time of the quick tier")
+    parser.add_argument("--quick", type=float, required=True, help="processor time of the quick tier in seconds")
+    parser.add_argument("--both", type=float, required=True, help="processor time of the quick and the second tier")
     arguments = parser.parse_args()
     costs = read_costs(arguments.costs)
-    thresholds = sorted({total for cases in costs.values() for total in accumulate(cases)})
-
-    def seconds(threshold: float) -> float:
-        counts = quick_counts(costs, threshold)
-        return sum(sum(cases[: counts[name]]) for name, cases in costs.items())
-
-    low, high = 0, len(thresholds) - 1
-    while low < high:
-        middle = (low + high + 1) // 2
-        low, high = (middle, high) if seconds(thresholds[middle]) <= arguments.seconds else (low, middle - 1)
-    counts = quick_counts(costs, thresholds[low])
-    lines = [f"{counts[name]} {name}\n" for name, cases in sorted(costs.items()) if counts[name] < len(cases)]
+    quick, both = leading_cases(costs, arguments.quick), leading_cases(costs, arguments.both)
+    lines = [
+        f"{quick[name]} {both[name]} {name}\n" for name, cases in sorted(costs.items()) if quick[name] < len(cases)
+    ]
     SECOND_TIER.write_text("".join(lines), encoding="utf-8")
-    quick = sum(counts.values())
-    cases = sum(map(len, costs.values()))
-    print(f"threshold {thresholds[low]:.2f} s: {quick} of {cases} cases, {seconds(thresholds[low]):.0f} s")
+    numbers = (sum(each.values()) for each in (quick, both))
+    print("quick: {}, both: {}, all: {} cases".format(*numbers, sum(map(len, costs.values()))))
 
 
 if __name__ == "__main__":

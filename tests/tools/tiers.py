@@ -1,8 +1,11 @@
 """Tiers of the tests: quick (the default), second, full.
 
-The quick tier keeps every test function that is not listed in ``second_tier.txt``, of those listed the number of cases
-before their name, in the order of the file, and all cases marked ``quick``. The file is measured: ``record_tiers.py``
-writes it. The second tier is the rest of what is not marked ``full``.
+``second_tier.txt`` lists test functions after two numbers of cases, in the order of the file: the first ones are quick,
+the further ones up to the second number are of the second tier, the others are full. Cases marked ``quick`` and
+functions that are not listed are quick; the marks ``second`` and ``full`` are left as they are. The file is measured:
+``record_tiers.py`` writes it. Of the cases that it makes full, one in ``PARTS`` is of the second tier where the
+environment variable ``SCVI_CODEGEN_TESTS_PART`` is a number, which ``.ci/run`` sets to the number of commits: so many
+runs reach all of them. With ``all`` all of them are.
 
 ``@pytest.mark.covering`` on a test with several parametrised arguments keeps few of their combinations, so that each
 value of each argument is in one; ``@pytest.mark.covering(2)`` so that each is in two (where there are as many).
@@ -11,7 +14,9 @@ value of each argument is in one; ``@pytest.mark.covering(2)`` so that each is i
 begins it before others, so that no process waits for another at the end.
 """
 
+import os
 import re
+import zlib
 from collections import Counter, defaultdict
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from pathlib import Path
@@ -25,6 +30,8 @@ QUICK, SECOND = "not full and not second", "second"
 """Expressions of the quick tier, as in pyproject.toml, and of the second."""
 UNOPTIMISED_TIERS = (QUICK, SECOND, "not full")
 SECOND_TIER = Path(__file__).with_name("second_tier.txt")
+PARTS = 8
+"""Number of parts of the measured full tier, of which a run with SCVI_CODEGEN_TESTS_PART takes one."""
 
 Combination = tuple[tuple[str, int], ...]
 """Which value of each argument."""
@@ -74,21 +81,24 @@ def function_of(nodeid: str) -> str:
     return nodeid.partition("[")[0]
 
 
-def quick_cases() -> dict[str, int]:
-    """Return the number of cases in the quick tier by test function, of those that ``second_tier.txt`` lists."""
+def listed_cases() -> dict[str, tuple[int, int]]:
+    """Return the numbers of cases in the quick tier and in both, by test function of ``second_tier.txt``."""
     lines = (line.split() for line in SECOND_TIER.read_text(encoding="utf-8").splitlines())
-    return {name: int(count) for count, name in lines}
+    return {name: (int(quick), int(both)) for quick, both, name in lines}
 
 
-def mark_the_rest_second(items: Iterable[pytest.Item]) -> None:
-    """Mark the cases of listed tests that are neither quick nor of the full tier as tests of the second tier."""
-    left = quick_cases()
+def mark_later_tiers(items: Iterable[pytest.Item]) -> None:
+    """Mark the cases of listed tests that are not quick."""
+    listed, part = listed_cases(), os.environ.get("SCVI_CODEGEN_TESTS_PART", "")
+    seen: Counter[str] = Counter()
     for item in items:
         name = function_of(item.nodeid)
-        if name in left and not item.get_closest_marker("full") and not item.get_closest_marker("quick"):
-            left[name] -= 1
-            if left[name] < 0:
-                item.add_marker(pytest.mark.second)
+        if name in listed and not any(map(item.get_closest_marker, ("quick", "second", "full"))):
+            quick, both = listed[name]
+            seen[name] += 1
+            rotated = part == "all" or (part.isdigit() and (zlib.crc32(item.nodeid.encode()) - int(part)) % PARTS == 0)
+            if seen[name] > quick:
+                item.add_marker(pytest.mark.second if seen[name] <= both or rotated else pytest.mark.full)
 
 
 def long_ones_first(items: list[pytest.Item]) -> None:

@@ -139,6 +139,7 @@ def headers_of(name: str) -> Iterator[str]:
         yield from (header.removeprefix("support/") for header, _ in source.support)
 
 
+@pytest.mark.second
 def test_every_stepping_algorithm_is_verified() -> None:
     """Those that one of the systems of this file includes; the list of others cannot grow unnoticed."""
     covered = {header for name in SYSTEMS for header in headers_of(name)}
