@@ -128,6 +128,63 @@ def test_paths_of_other_systems_are_their_runs(arguments, q):
     assert path.index == (None if stepper.supports("work") else 0)
 
 
+def driven():
+    return compiled(["x"], "x_dot**2/2 - x**2/2 + u*x", inputs=["u"])
+
+
+@pytest.mark.second
+def test_paths_between_attitudes_are_their_runs():
+    """A rigid body, and one coupled with a position; with a given duration, and with a given energy."""
+    for position, coupling in (([], "1"), (["x"], "x")):
+        kinetic = "(omega_1**2 + 2*omega_2**2 + 3*omega_3**2)/2" + " + x_dot**2/2 - x**2" * bool(position)
+        body = compiled(position, f"{kinetic} - R_33*{coupling}", "svi:3", rotations={"R": "omega"})
+        at, moving = (dict.fromkeys(position, value) for value in (0.2, 0.1))
+        velocity = {**moving, "omega": [0.3, 0.2, 0.9]}
+        run = body.integrate({**at, "R": [1, 0, 0, 0]}, velocity=velocity, h=0.1, steps=15)
+        path = body.path({**at, "R": [1, 0, 0, 0]}, run.q[-1], 1.5, steps=15)
+        free = body.path(run.q[0], run.q[-1], 1.6, steps=15, energy=float(run.energy()[0]))
+        for each in (path, free):
+            assert abs(each.t[-1] - 1.5) < 1e-11
+            assert np.abs(each.q - run.q).max() < 1e-11
+            assert np.abs(each.p - run.p).max() < 1e-10
+            assert abs(each.action - run.action()) < 1e-11
+        assert path.index == 0
+
+
+@pytest.mark.second
+def test_closed_paths_of_constraints_rotations_inputs_and_arrays():
+    rod = compiled(["x", "y"], "(x_dot**2 + y_dot**2)/2 - y", "svi:4", constraints=["x**2 + y**2 - 1"])
+
+    def swing(t):
+        return [np.sin(1.5 * np.sin(np.pi * t / 4)), -np.cos(1.5 * np.sin(np.pi * t / 4))]
+
+    path = rod.path(T=4.0, steps=24, closed=["-x", "y"], start=swing)
+    run = path.run()
+    assert np.abs(run.q[-1] - run.q[0]).max() < 1e-9
+    assert abs(4 * ellipk((1 + run.energy()[0]) / 2) - 8.0) < 1e-8  # of its elliptic integral
+    free = rod.path(run.q[0], run.q[9], 1.4, steps=9, energy=float(run.energy()[0]))
+    assert abs(free.t[-1] - 1.5) < 1e-9
+    body = compiled([], "(omega_1**2 + 2*omega_2**2 + 3*omega_3**2)/2", "svi:3", rotations={"R": "omega"})
+    angle = np.linspace(0, np.pi, 25)[:, None] * [[0, 0, 0, 1]]
+    start = np.cos(angle[:, 3:]) * [[1, 0, 0, 0]] + np.sin(angle) + 1e-3 * np.sin(3 * angle[:, 3:]) * [[0, 1, 1, 0]]
+    turn = body.path(T=2 * np.pi, steps=24, closed=-np.eye(4), start=start)
+    assert abs(turn.action - 3 * np.pi) < 1e-5  # one turn about the third axis, with omega = 1
+    assert np.abs(turn.run().q[24] + turn.q[0]).max() < 1e-7
+    t = np.linspace(0, 3, 61)
+    forced = driven().path(
+        T=3.0, steps=60, closed=True, start=np.full((61, 1), 0.1), inputs={"u": (t, np.cos(2 * np.pi * t / 3))}
+    )
+    assert abs(forced.q[0, 0] - 1 / (1 - (2 * np.pi / 3) ** 2)) < 4e-4  # the input is interpolated linearly
+    assert np.abs(forced.run().q[-1] - forced.q[0]).max() < 1e-12
+    chain = compiled(
+        ["u[N]"], "sum(i in N, u_dot[i]**2/2 + u[i]**4/4) + sum(i in 0..N-2, (u[i+1] - u[i])**2/2)", "svi:3"
+    )
+    here = {"steps": 12, "start": lambda t: {"u": [np.cos(np.pi * t), 0.1, -0.3]}}
+    rest = chain.path(T=1.0, closed=["-u[0]", "-u[1]", "-u[2]"], **here)
+    assert (rest.index, rest.repetitions) == (0, 2)
+    assert np.abs(rest.q["u"]).max() < 1e-6  # the minimum
+
+
 @pytest.mark.second
 def test_constrained_index_is_that_of_the_angle():
     """A rod without gravity, motion in the plane of a half turn and more: conjugate after half a turn on the sphere."""
@@ -202,6 +259,11 @@ def test_refusals_name_the_remedy(kepler, oscillator):
         (lambda: kepler.path(T=1.0, closed=["x", "x"], start=np.ones((33, 2))), StateError, "each coordinate once"),
         (lambda: kepler.path(T=1.0, closed=np.ones((2, 2)), start=np.ones((33, 2))), StateError, "orthogonal"),
         (lambda: kepler.path(T=1.0, closed=True, energy=1.0, start=np.ones((33, 2))), MethodError, "omit it"),
+        (
+            lambda: driven().path([0.1], [0.3], 1.0, energy=1.0, inputs={"u": 1.0}),
+            MethodError,
+            "which change the energy",
+        ),
         (lambda: oscillator.path([1.0], [0.3], np.pi, steps=20), PathError, "no path was found"),
         (lambda: sc.compile_stepper(KEPLER, "radau-iia:2").path([1, 0], [0, 1], 1.0), MethodError, "sum of L"),
     ):
@@ -275,6 +337,40 @@ def test_choreographies_have_their_published_size_and_energy(n, curve, q, v):
     )
     assert np.abs(again.q[0] - q).max() < 2e-6  # six digits
     assert np.abs(again.p[0] - v).max() < 3e-6
+
+
+SIMO = {
+    # x1, v1; x2, u2, y2, v2; x3, v3 of bodies (x, u; y, v), 1 and 3 on the axis y = 0, 4 the mirror image of 2
+    "super-eight": "1.382856843618421 .5848726308148733 0 -1.871935245878676 -.1570299222812179 0 "
+    "-1.382856843618421 -.5848726308148733",
+    "second": "1.308472291674295 .4119449647358835 -.05339857721898453 -1.090116404238875 -.4755600203079249 "
+    "-.6493199205040803 -1.201675137236327 .8866948762722759",
+    "third": "1.002314883462055 -.2937902777320299 -.5286940940236307 -.1758266190939168 .5671259540672383 "
+    "1.023613101650529 .05507330458520999 -1.753435925569013",
+    "fourth": "1.207710178581697 .5905411760872022 -.5305032275357562 -3.508653351422321 .05154372421761804 "
+    ".2672327117843965 -.1467037235101761 -1.12500659965584",
+}
+
+
+@pytest.mark.second
+def test_choreographies_of_four_bodies_are_those_of_sixteen_published_digits():
+    """Simo 2000; digits of W. Christian, Open Source Physics, ch. 9."""
+    names = [f"{axis}{i}" for i in range(4) for axis in "xy"]
+    pairs = [f"1/sqrt((x{i} - x{j})**2 + (y{i} - y{j})**2)" for i in range(4) for j in range(i)]
+    stepper = compiled(names, " + ".join([*(f"{name}_dot**2/2" for name in names), *pairs]), "svi:8")
+    for text in SIMO.values():
+        x1, v1, x2, u2, y2, v2, x3, v3 = map(float, text.split())
+        q, v = [x1, 0, x2, y2, x3, 0, x2, -y2], [0, v1, u2, v2, 0, v3, -u2, v2]
+        start = stepper.integrate(q, v, h=np.pi / 480, steps=240).q
+        path = stepper.path(T=np.pi / 2, steps=240, closed=[*names[2:], *names[:2]], start=start)
+        assert (path.repetitions, path.index) == (4, 0)
+        assert max(np.abs(path.q[0] - q).max(), np.abs(path.p[0] - v).max()) < 2e-12
+        assert np.abs(stepper.integrate(q, v, t_end=2 * np.pi, check_growth=False).q[-1] - q).max() < 1e-8
+        orbit = sc.periodic_orbit(stepper, q, v, period=2 * np.pi, steps=960, fixed_period=True)
+        sizes = np.sort(np.abs(orbit.multipliers))
+        assert np.abs(orbit.q - q).max() < 1e-9
+        assert not orbit.stable
+        assert abs(sizes[0] * sizes[-1] - 1) < 1e-4  # reciprocal pairs
 
 
 def started(stepper, n, q, v):

@@ -609,7 +609,20 @@ class StepperOfRunTimeSizes(Stepper):
     momentum, velocity = _bound(Stepper.momentum), _bound(Stepper.velocity)
     initial_momentum = _bound(Stepper.initial_momentum)
     jacobian, sensitivity = _bound(Stepper.jacobian), _bound(Stepper.sensitivity)
-    jvp, vjp, path = _bound(Stepper.jvp), _bound(Stepper.vjp), _bound(Stepper.path)
+    jvp, vjp = _bound(Stepper.jvp), _bound(Stepper.vjp)
+
+    def _path(self, q0: Any = None, *arguments: Any, **named: Any) -> Path:
+        """Return a path; the positions that determine the sizes are q0, or of closed paths the first of ``start``."""
+        start = named.get("start")
+        if q0 is not None or start is None:
+            return cast(Path, self._call_bound(Stepper.path, False, q0, arguments, **named))
+        if callable(start):
+            first = start(named.get("t", 0.0))
+        else:
+            first = {name: x[0] for name, x in start.items()} if isinstance(start, Mapping) else start[0]
+        return cast(Path, self.bind(first, named.get("parameters"))[0].path(None, *arguments, **named))
+
+    path: Any = wraps(Stepper.path)(_path)
 
     def _call_bound(
         self,

@@ -147,8 +147,7 @@ class Closed:
     """
 
     def __init__(self, at: Linearised, M: Array, *, symmetric: bool) -> None:
-        self.shape = at.p0.shape
-        count, d = self.shape
+        self.shape = count, d = at.p0.shape[0], len(M)
         a, b, c, e = at.blocks
         matrix = np.zeros((count * d,) * 2)
         for k in range(count):
@@ -178,6 +177,6 @@ class Closed:
         return int((self.values[self.kept] < 0).sum())
 
 
-def closed_residual(at: Linearised, M: Array) -> Array:
+def closed_residual(at: Linearised, M: Array, intervals: Intervals) -> Array:
     """Return the (N, d) residuals of the nodes of a closed path."""
-    return np.concatenate([(M.T @ at.p1[-1] - at.p0[0])[np.newaxis], at.residual])
+    return np.concatenate([intervals.tangent(0, M.T @ at.p1[-1] - at.p0[0])[np.newaxis], at.residual])

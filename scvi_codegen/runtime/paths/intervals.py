@@ -19,6 +19,8 @@ from scvi_codegen.runtime.rotations.states import members_of
 
 CONVERGED, MOST_ITERATIONS = 1e-13, 20
 """Largest relative miss of a step that is solved by shooting, and most Newton iterations."""
+SMALL_PART = 1e-5
+"""Part of a step by which it is lengthened for its derivative."""
 PROBED = 1e-5
 """Derivatives below this part of the largest are not computed for many coordinates; they change the rate of Newton's
 iteration, not its result."""
@@ -49,6 +51,7 @@ class Intervals:
     """Steps between positions of an unconstrained system, all solved in one call of C."""
 
     sparse = False
+    symmetry: Array | None = None  # of a closed path
 
     def __init__(self, stepper: Any, t: Array, h: Array, parameters: Array, options: SolverOptions | None) -> None:
         self.stepper, self.t, self.h, self.parameters, self.options = stepper, t, h, parameters, options
@@ -70,6 +73,14 @@ class Intervals:
     def tangent(self, k: int, vector: Array) -> Array:
         """Return the components of a covector at node k in its tangent space."""
         return vector
+
+    def on_manifold_all(self, q: Array) -> Array:
+        """Return the nearest admissible positions of nodes, with rotations of the lengths of the first."""
+        return q
+
+    def basis_map(self, M: Array) -> Array:
+        """Return the symmetry of a closed path between the tangent spaces of its ends."""
+        return M
 
     def evaluated(self, q: Array) -> Linearised:
         """Return momenta and residuals; raise StepFailedError if a step is not solved."""
@@ -226,6 +237,14 @@ class ReducedIntervals(Intervals):
             result = self.stepper.project(result, t=t, parameters=self._parameters_of(min(k, len(self.t) - 1)))[0]
         return np.asarray(result)
 
+    def on_manifold_all(self, q: Array) -> Array:
+        """See :meth:`Intervals.on_manifold_all`."""
+        return np.array([self.on_manifold(each, k, q[0]) for k, each in enumerate(q)])
+
+    def basis_map(self, M: Array) -> Array:
+        """See :meth:`Intervals.basis_map`; the last basis is M times the first one."""
+        return np.eye(self._bases[0].shape[1])
+
     def tangent(self, k: int, vector: Array) -> Array:
         """See :meth:`Intervals.tangent`."""
         return np.asarray(self._bases[k].T @ vector)
@@ -244,7 +263,9 @@ class ReducedIntervals(Intervals):
         own = [self._parameters_of(min(k, count - 1)) for k in range(count + 1)]
         like: list[Any] = self._bases or [None] * (count + 1)
         self._bases = bases = [self._basis(q[k], times[k], own[k], like[k]) for k in range(count + 1)]
-        d = bases[0].shape[1]
+        if self.symmetry is not None:
+            bases[count] = self.symmetry @ bases[0]
+        d, by_h = bases[0].shape[1], np.empty((2, count, bases[0].shape[1]))
         p0, p1, actions, blocks = (
             np.empty((count, m)),
             np.empty((count, m)),
@@ -278,10 +299,26 @@ class ReducedIntervals(Intervals):
             inverse = np.linalg.inv(B)
             blocks[0, k], blocks[1, k] = -Z0.T @ W @ inverse @ A, Z0.T @ W @ inverse
             blocks[2, k], blocks[3, k] = C - D @ inverse @ A, D @ inverse
+            by_h[:, k] = self._by_h(q[k], p0[k], step, (Z0, Z1, W), D, inverse)
             if self.stepper.interface.sums_action:
                 actions[k] = self._action(q[k], p0[k], step)
         residual = np.array([bases[k].T @ (p1[k - 1] - p0[k]) for k in range(1, count)]).reshape(count - 1, d)
-        return Linearised(p0, p1, actions, residual, blocks)
+        return Linearised(p0, p1, actions, residual, blocks, by_h)
+
+    def _by_h(
+        self, q: Array, p: Array, step: dict[str, Any], bases: tuple[Array, Array, Array], D: Array, inverse: Array
+    ) -> tuple[Array, Array]:
+        """Return the derivatives of p0 and p1 with respect to h at fixed ends, by central differences of the step."""
+        Z0, Z1, W = bases
+        h = step["h"]
+        (q_less, p_less), (q_more, p_more) = (
+            self.stepper.step(q, p, options=self.options, **step | {"h": h * (1.0 + x)})
+            for x in (-SMALL_PART, SMALL_PART)
+        )
+        along, kicked = (
+            Z1.T @ (more - less) / (2.0 * SMALL_PART * h) for less, more in ((q_less, q_more), (p_less, p_more))
+        )
+        return -Z0.T @ W @ inverse @ along, kicked - D @ inverse @ along
 
     def _covector(self, q: Array, basis: Array, v: Array, t: float, parameters: Array) -> Array:
         try:

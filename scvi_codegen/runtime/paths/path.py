@@ -19,6 +19,7 @@ from scvi_codegen.runtime.core.validation import Array, Parameters, columns_of_i
 from scvi_codegen.runtime.paths import solver
 from scvi_codegen.runtime.paths.equations import Band, condensed_hessian, negative_directions
 from scvi_codegen.runtime.paths.intervals import Intervals, ManyCoordinates, ReducedIntervals
+from scvi_codegen.runtime.rotations.states import flat_states
 from scvi_codegen.validation import checked_count
 
 if TYPE_CHECKING:
@@ -142,20 +143,29 @@ def find_path(
         if nodes is None:
             raise StateError("closed paths require start=: an array (steps + 1, m), or a function of time")
         M, forced = _symmetry(stepper.interface, closed), bool(stepper.interface.exchange_names)
-        found = solver.closed(intervals, nodes[:count], M, minimise=not forced, symmetric=not forced)
+        minimised = not (forced or isinstance(intervals, ReducedIntervals))
+        found = solver.closed(intervals, nodes[:count], M, minimise=minimised, symmetric=not forced)
         return _described(stepper, found, begin, arguments, M)
     if q0 is None or q1 is None:
         raise StateError("path: give both positions q0 and q1, or closed= and start=")
-    ends = [stepper._vector(flat_state(stepper.interface, each, name), name) for each, name in ((q0, "q0"), (q1, "q1"))]
+    ends = [stepper._vector(_positions(stepper.interface, each, name), name) for each, name in ((q0, "q0"), (q1, "q1"))]
     found = _open_path(intervals, ends, nodes, duration, homotopy=homotopy and start is None)
     if energy is not None:
         wanted, values = checked_number(energy, "energy"), intervals.parameters
 
         def at_start(q: Array, p: Array) -> tuple[float, Array]:
-            return float(stepper.energy(q, p, begin, values)), np.asarray(stepper.velocity(q, p, begin, values)).ravel()
+            velocity = np.asarray(stepper.velocity(q, p, begin, values)).ravel()
+            return float(stepper.energy(q, p, begin, values)), velocity
 
         found = solver.at_energy(found, duration, wanted, at_start)
     return _described(stepper, found, begin, arguments)
+
+
+def _positions(interface: Any, values: Any, name: str) -> Any:
+    """Return positions by name, also attitudes, as (.., m) numbers, and other values as they are."""
+    if interface.rotations and isinstance(values, Mapping):
+        return flat_states(interface, values, None, "p")[0]
+    return flat_state(interface, values, name)
 
 
 def _kind_of_intervals(stepper: Any, *, closed: bool, energy: bool) -> type[Intervals]:
@@ -168,9 +178,11 @@ def _kind_of_intervals(stepper: Any, *, closed: bool, energy: bool) -> type[Inte
         )
     if any(each.startswith("spin") for each in interface.rotations):
         raise MethodError("path is not available for spins: their direction determines the motion; use integrate")
-    if (closed or energy) and (reduced or interface.inputs):
-        name = "closed=" if closed else "energy="
-        raise MethodError(f"path: {name} is not available with constraints, rotations or inputs; omit it")
+    if energy and interface.inputs:
+        raise MethodError(
+            "path: energy= is not available with inputs, which change the energy and whose times do not follow the "
+            "duration; omit it"
+        )
     if closed and energy:
         raise MethodError("path: energy= is not available for closed paths; omit it and give their T")
     if reduced:
@@ -263,8 +275,8 @@ def _given_nodes(interface: Any, start: Any, t: float, duration: float, count: i
         return None
     if callable(start):
         call: Callable[[float], Any] = start
-        start = [flat_state(interface, call(t + duration * k / count), "start") for k in range(count + 1)]
-    nodes = real_array(flat_state(interface, start, "start"), "start")
+        start = [_positions(interface, call(t + duration * k / count), "start") for k in range(count + 1)]
+    nodes = real_array(_positions(interface, start, "start"), "start")
     if nodes.ndim != 2 or nodes.shape[1] != interface.dimension or len(nodes) not in (count, count + 1):
         raise StateError(
             f"start must have shape ({count + 1}, {interface.dimension}), a position at each of steps + 1 times, not "
@@ -283,7 +295,8 @@ def _symmetry(interface: Any, closed: Any) -> Array:
     entries: Sequence[Any] = list(closed) if isinstance(closed, list | tuple) else []
     if entries and all(isinstance(each, str) for each in entries):
         M = np.zeros((m, m))
-        plain = [each.removeprefix("-") for each in entries]
+        elements = str.maketrans({"[": "_", "]": "", ",": "_", " ": ""})  # u[0, 1] is the coordinate u_0_1
+        plain = [each.removeprefix("-").translate(elements) for each in entries]
         if sorted(plain) != sorted(names):
             raise StateError(
                 f"closed must contain each coordinate once, {', '.join(names)}, possibly with a sign: not {entries}"

@@ -6,6 +6,7 @@ Newton Methods for Nonlinear Problems, sec. 3.3), which does not depend on units
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -159,6 +160,7 @@ def at_energy(found: Solution, duration: float, energy: float, start: Callable[[
         along = -factors.solve(by_time)
         value, velocity = start(q[0], at.p0[0])
         first = at.blocks[1][0] if not intervals.sparse else _first_block(at, intervals)
+        velocity = intervals.tangent(0, velocity)
         derivative = velocity @ (first @ along[0] + at.by_h[0][0] / count)
 
         def correction(
@@ -205,20 +207,27 @@ def _first_block(at: Linearised, intervals: Any) -> Any:
 
 def closed(intervals: Intervals, q: Array, M: Array, *, minimise: bool, symmetric: bool) -> Solution:
     """Return the closed path q_N = M q_0 near the (N, d) nodes q; with ``minimise`` near a minimum of the action."""
+    intervals.symmetry = M
 
     def whole(nodes: Array) -> Array:
         return np.concatenate([nodes, (M @ nodes[0])[np.newaxis]])
 
+    def moved(nodes: Array, y: Array) -> Array:
+        return intervals.moved(whole(nodes), y)[:-1]
+
     def evaluate(nodes: Array, derivatives: bool) -> tuple[Linearised, Array]:
         at = intervals.linearised(whole(nodes)) if derivatives else intervals.evaluated(whole(nodes))
-        return at, closed_residual(at, M)
+        return at, closed_residual(at, M, intervals)
 
+    q = intervals.on_manifold_all(q)
     at, r = evaluate(q, True)
-    near = float(np.abs(Closed(at, M, symmetric=symmetric).solve(r)).max()) < NEAR_CLOSED * float(np.abs(q).max())
+    near = float(np.abs(Closed(at, intervals.basis_map(M), symmetric=symmetric).solve(r)).max()) < NEAR_CLOSED * float(
+        np.abs(q).max()
+    )
     if minimise and not near:
         q = _minimised(evaluate, q)
     found, at, factors, iterations = newton(
-        evaluate, lambda at: Closed(at, M, symmetric=symmetric), lambda q, y: q + y, q, MOST_ITERATIONS
+        evaluate, lambda at: Closed(at, intervals.basis_map(M), symmetric=symmetric), moved, q, MOST_ITERATIONS
     )
     return Solution(whole(found), intervals, at, factors, iterations)
 
@@ -231,10 +240,11 @@ def _minimised(evaluate: Callable[[Array, bool], tuple[Linearised, Array]], q: A
         try:
             at, r = evaluate(x.reshape(q.shape), False)
         except UNSOLVED:
-            return 1e10, np.zeros_like(x)
+            return math.inf, np.full_like(x, math.inf)
         return float(at.actions.sum()), r.ravel()
 
     before = action(q.ravel())[1]
-    result = minimize(action, q.ravel(), jac=True, method="L-BFGS-B", options={"maxiter": MINIMISER_ITERATIONS})
+    with np.errstate(all="ignore"):  # the action may be unbounded below
+        result = minimize(action, q.ravel(), jac=True, method="L-BFGS-B", options={"maxiter": MINIMISER_ITERATIONS})
     after = np.abs(result.jac).max()
     return np.asarray(result.x.reshape(q.shape)) if after < np.abs(before).max() or not before.any() else q
