@@ -43,6 +43,7 @@ ABOUT = {
     "generate": "Generate C code and a Python package for MODEL.",
     "methods": "List the methods and their properties.",
     "page": "Write a page that computes the motion in the browser.",
+    "path": "Find motions between two positions, and closed paths.",
     "reproduce": "Reproduce the paper's experiments, with verdicts.",
     "run": "Integrate MODEL and report conserved quantities.",
     "systems": "List the catalogue, or print a system as a file.",

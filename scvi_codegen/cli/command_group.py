@@ -23,6 +23,7 @@ from scvi_codegen.errors import (
     AccuracyWarning,
     BuildError,
     MethodWarning,
+    PathError,
     RecordingError,
     ScviCodegenError,
     StepFailedError,
@@ -115,7 +116,7 @@ def errors_as_messages() -> Iterator[None]:
     try:
         with _warnings_as_lines():
             yield
-    except (StepFailedError, BuildError, RecordingError) as error:
+    except (StepFailedError, PathError, BuildError, RecordingError) as error:
         raise CommandFailure(str(error), FAILURE) from error
     except ScviCodegenError as error:
         cause = error.__cause__

@@ -19,7 +19,7 @@ from scvi_codegen.mechanics.first_order import FirstOrderSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import Method, as_method
 from scvi_codegen.methods.galerkin import SVI
-from scvi_codegen.models.options import RUN_FIELDS, STATE, VELOCITY, check_alternatives, real
+from scvi_codegen.models.options import RUN_FIELDS, STATE, VELOCITY, check_alternatives, checked_path_value, real
 from scvi_codegen.models.problems import Problem
 from scvi_codegen.models.time_span import TimeSpan, check_length
 from scvi_codegen.representation import summary
@@ -65,6 +65,7 @@ class Model(TimeSpan):
         tables: index tables of shape (rows, columns) by name, for array sizes known at run time.
         events: zero crossings that runs record, which may change the state.
         mesh: of the fields of a density.
+        path: ends and kind of the paths of ``scvi-codegen path``, by the keys of the section ``[path]``.
         page: ranges of sliders, speed and plots of :func:`~scvi_codegen.page`, as its arguments.
         picture: points, and rods, springs, walls, bodies and trails between them, as of :func:`~scvi_codegen.page`.
 
@@ -85,6 +86,7 @@ class Model(TimeSpan):
     tables: Mapping[str, Any] = field(default_factory=dict)
     events: tuple[Event, ...] = ()
     mesh: Any = field(default=None, compare=False, repr=False)
+    path: Mapping[str, Any] = field(default_factory=dict)
     page: Mapping[str, Any] = field(default_factory=dict)
     picture: Mapping[str, Any] = field(default_factory=dict)
 
@@ -96,6 +98,7 @@ class Model(TimeSpan):
         if arrays is not None and self.mesh is None:
             object.__setattr__(self, "mesh", arrays.mesh)
         object.__setattr__(self, "page", _with_lists(self.page))
+        object.__setattr__(self, "path", {key: checked_path_value(key, each) for key, each in self.path.items()})
         object.__setattr__(self, "picture", _with_lists(self.picture))
         object.__setattr__(self, "method", as_method(self.method, one_coordinate(arrays) if arrays else self.system))
         if isinstance(self.system, FirstOrderSystem) and self.p is self.velocity is None:

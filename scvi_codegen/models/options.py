@@ -185,7 +185,7 @@ class RunOptions:
     action: bool = run_option("run", SWITCH, "", "Sum the action along the run.", default=False, common=False)
 
 
-_TABLE: Mapping[str, Option] = {
+_TABLE: dict[str, Option] = {
     "method": Option(
         *("method", METHOD, "NAME"),
         "Method, with its degree or number of stages: svi:6, gauss:3, .. (see 'scvi-codegen methods').",
@@ -251,6 +251,17 @@ _TABLE: Mapping[str, Option] = {
         common=False,
     ),
 }
+_TABLE |= {
+    "start": Option(
+        "path", NUMBERS, "Q1,Q2,..", "Position at the start [that of MODEL].", key="from", flag="--from", common=False
+    ),
+    "to": Option("path", NUMBERS, "Q1,Q2,..", "Position at the end.", common=False),
+    "energy": Option("path", NUMBER, "E", "Energy of the path; --span is an estimate of its duration.", common=False),
+    "closed": Option(
+        "path", TEXT, "NAMES", "Closed path: true, or the coordinates that follow, x2,-y2,..", common=False
+    ),
+    "starts": Option("path", COUNT, "N", "Number of further starts at random [0].", common=False),
+}
 OPTIONS = tuple(option.named(name) for name, option in _TABLE.items())
 KEYED = tuple(option for option in OPTIONS if option.section and not option.is_section)
 """Options with a key of their own in a section of model files."""
@@ -274,6 +285,23 @@ METHOD_KEYS = tuple(option.name for option in options_of("method") if option.com
 """Options that specify the method."""
 STATE = {option.key: option.field for option in options_of("initial") if option.kind == NUMBERS}
 """Field of a model by key of ``[initial]``."""
+
+
+def checked_path_value(key: str, value: Any) -> Any:
+    """Return a value of the section ``[path]``, or raise :class:`ModelFileError`."""
+    options, where = {option.key: option for option in options_of("path")}, f"[path] {key}"
+    if key not in options:
+        raise ModelFileError(f"there is no key {where}: use {', '.join(options)}")
+    if options[key].kind == NUMBERS:
+        if not isinstance(value, list | tuple):
+            raise ModelFileError(f"{where} must be a list of numbers, not {value!r}")
+        return [real(each, where) for each in value]
+    if options[key].kind != TEXT:
+        return options[key].read(value, where)
+    names = isinstance(value, list | tuple) and all(isinstance(each, str) for each in value)
+    if value is not True and not names and not isinstance(value, str):
+        raise ModelFileError(f"{where} must be true or a list of coordinates with signs, not {value!r}")
+    return list(value) if names else value
 
 
 def alternatives(*sections: str) -> Iterator[tuple[Option, Option]]:

@@ -134,7 +134,7 @@ def page(
 
 def _model_of(system: Any, motion: Mapping[str, Any]) -> Model:
     """Return the model of a system with the arguments of its motion."""
-    known = [name for name in Model.__dataclass_fields__ if name not in ("system", "page", "picture")]
+    known = [name for name in Model.__dataclass_fields__ if name not in ("system", "path", "page", "picture")]
     for name in motion:
         if name not in known:
             raise ArgumentError(f"page() takes no {name!r}{keyword_hint(name, known)}")

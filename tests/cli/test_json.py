@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +10,13 @@ import click
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from scipy.special import ellipk
 
 import scvi_codegen as sc
 from scvi_codegen import verification
 from scvi_codegen.cli import command_group, main
 from scvi_codegen.methods import specification_of
-from scvi_codegen.models.model_files.model_file import parse_model
+from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 
 KEPLER = ("kepler", "--step", "0.1", "--steps", "50", "--method", "svi:4")
 QUIET_COMMANDS = (
@@ -32,6 +34,7 @@ QUIET_COMMANDS = (
     ("reproduce", "--list"),
     ("doctor",),
     ("page", "planar-pendulum", "-o", "pendulum.html"),
+    ("path", "kepler", "--from", "1,0", "--to=-0.5,0.8", "--span", "2", "--step", "0.1"),
 )
 """Of every command one at least, after a run in the folder ``orbit.run``."""
 
@@ -141,6 +144,35 @@ def test_json_of_lists_and_model_files():
     tableau = document("methods", "--tableau", "gauss:2")
     assert tableau["b"] == [0.5, 0.5]
     assert np.sum(tableau["A"], axis=1) == pytest.approx(tableau["c"], abs=1e-16)
+
+
+def test_json_of_paths_is_that_of_the_model_file_and_of_the_interface():
+    words = ("--from", "0,0", "--to", "0.1,0.3", "--span", "3", "--step", "0.25", "--starts", "2", "--method", "svi:4")
+    found = document("path", "henon-heiles", *words, "-o", "path.npz")
+    text = invoke("systems", "henon-heiles").stdout
+    text = re.sub("(span|step) = .*", lambda line: f"{line[1]} = {3.0 if line[1] == 'span' else 0.25}", text)
+    text += "\n[path]\nfrom = [0.0, 0.0]\nto = [0.1, 0.3]\nstarts = 2\n"
+    Path("own.toml").write_text(text)
+    assert document("path", "own.toml", "--method", "svi:4")["paths"] == found["paths"]
+    assert parse_model(dump_model(parse_model(text))) == parse_model(text)
+    stepper = sc.compile_stepper(sc.problem("henon-heiles").system, "svi:4")
+    direct = stepper.path([0.0, 0.0], [0.1, 0.3], 3.0, steps=12)
+    assert any(abs(each["action"] - direct.action) < 1e-12 for each in found["paths"])
+    assert found["paths"] == sorted(found["paths"], key=lambda each: each["action"])
+    with np.load("path.npz") as file:
+        assert np.abs(file["q"][[0, -1]] - [[0, 0], [0.1, 0.3]]).max() < 1e-12
+        assert file["p"][0].tolist() == list(found["paths"][0]["momenta"].values())
+    closed = ("--closed=-q", "--q", "0", "--velocity", "1.5", "--span", "4", "--step", "0.2")
+    (swing,) = document("path", "planar-pendulum", *closed)["paths"]
+    assert swing["period"] == 8.0
+    assert 4 * ellipk((1 + swing["energy"]) / 2) == pytest.approx(8.0, abs=1e-9)
+    for wrong, status, message in (
+        (("--to", "1,2"), 2, "give those of q"),
+        ((), 2, "give the end of the path"),
+        (("--to", "1", "--closed", "true"), 2, "not both"),
+        (("--q", "1", "--to", "0.3", "--span", str(math.pi), "--step", "0.2"), 1, "no path was found"),
+    ):
+        assert message in invoke("path", "harmonic-oscillator", *wrong, status=status).output
 
 
 def test_certificate_equals_the_saved_one():

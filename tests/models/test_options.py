@@ -13,6 +13,7 @@ import pytest
 import scvi_codegen
 from scvi_codegen import Model, ModelFileError
 from scvi_codegen.cli.commands.derive import derive
+from scvi_codegen.cli.commands.path import path
 from scvi_codegen.cli.commands.run import run
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 from scvi_codegen.models.options import FIELDS, OPTIONS, RUN_FIELDS, alternatives, options_of
@@ -85,7 +86,9 @@ def test_alternatives_exclude_each_other_in_files(one, other):
 def test_flags_of_commands_are_those_of_the_table():
     common = {option.name for option in OPTIONS if option.common}
     assert common <= {each.name for each in derive.params}
-    assert {option.name for option in OPTIONS} <= {each.name for each in run.params}
+    of_paths = {option.name for option in OPTIONS if option.section == "path"}
+    assert {option.name for option in OPTIONS} - of_paths <= {each.name for each in run.params}
+    assert common | of_paths <= {each.name for each in path.params}
     assert not {option.name for option in OPTIONS if not option.common} & {each.name for each in derive.params}
 
 
@@ -110,7 +113,13 @@ OCCURRENCES = {
     "solver_tolerance": set(),
     "max_iterations": set(),
     "threads": {"models/model.py"},
-    "action": {"cli/commands/cache.py", "cli/running.py", "cli/json_documents.py", "models/model.py"},
+    "action": {
+        "cli/commands/cache.py",
+        "cli/commands/path.py",
+        "cli/running.py",
+        "cli/json_documents.py",
+        "models/model.py",
+    },
 }
 """Files of models and commands beside the table in which an option is read: those that act on its value."""
 

@@ -42,7 +42,11 @@ def document_of(model: Model, *, as_arrays: bool = True) -> dict[str, Any]:
     if model.tables and "field" not in document:
         declared = {each.partition("[")[0]: each for each in system.definition.get("tables", ())}
         document["tables"] = {declared[name]: np.asarray(rows).tolist() for name, rows in model.tables.items()}
-    return {**document, **motion, **{name: each for name in ("page", "picture") if (each := getattr(model, name))}}
+    return {
+        **document,
+        **motion,
+        **{name: each for name in ("path", "page", "picture") if (each := getattr(model, name))},
+    }
 
 
 def _system_and_state(

@@ -58,6 +58,11 @@ class Intervals:
         self.binding = stepper.tangent
         self.dimension = stepper.dimension
 
+    @property
+    def parameters_at_start(self) -> Array:
+        """(k,) parameters of the first step."""
+        return np.ascontiguousarray(self.parameters[0] if self.parameters.ndim == 2 else self.parameters)
+
     def lasting(self, duration: float) -> Intervals:
         """Return the intervals of a path of another duration."""
         count = len(self.h)

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 MANY_COORDINATES = 48
 """Number of coordinates from which derivatives are computed as sparse matrices."""
+WAVES, SAME_PATH = 3, 1e-6
+"""Sine waves of a start at random, and distance of equal paths relative to their size."""
 SAME_MATRIX, MOST_REPETITIONS = 1e-9, 1000
 """Distance of equal symmetries of closed paths, and the longest period in multiples of T."""
 
@@ -159,6 +161,36 @@ def find_path(
 
         found = solver.at_energy(found, duration, wanted, at_start)
     return _described(stepper, found, begin, arguments)
+
+
+def different_paths(stepper: Any, q0: Any, q1: Any, T: float, *, starts: int = 0, **arguments: Any) -> list[Path]:
+    """Return the different paths from the straight line and from curves at random, that of least action first.
+
+    Args:
+        starts: number of curves at random: the line and sine waves of the size of the distance of the ends.
+        arguments: further ones of :meth:`~scvi_codegen.Stepper.path`.
+
+    Raises:
+        PathError: if no path is found.
+    """
+    random, count, paths, reason = np.random.default_rng(0), arguments["steps"], list[Path](), None
+    ends = [real_array(_positions(stepper.interface, each, "the ends"), "the ends") for each in (q0, q1)]
+    s = np.linspace(0.0, 1.0, count + 1)[:, np.newaxis]
+    line, k = ends[0] + (ends[1] - ends[0]) * s, np.arange(1, WAVES + 1)
+    size = max(float(np.abs(line).max()), float(np.abs(ends[1] - ends[0]).max())) or 1.0
+    for trial in range(starts + 1):
+        waves = size * random.standard_normal((WAVES, line.shape[1])) / k[:, np.newaxis]
+        try:
+            found = stepper.path(q0, q1, T, start=line + np.sin(np.pi * s * k) @ waves if trial else None, **arguments)
+        except PathError as error:
+            reason = reason or error
+            continue
+        known = (np.abs(each.q - found.q).max() + abs(each.t[-1] - found.t[-1]) for each in paths)
+        if all(distance > SAME_PATH * size for distance in known):
+            paths.append(found)
+    if not paths:
+        raise PathError(f"{reason} ({starts} starts at random were tried)" if starts else str(reason)) from reason
+    return sorted(paths, key=lambda each: each.action)
 
 
 def _positions(interface: Any, values: Any, name: str) -> Any:
