@@ -74,6 +74,19 @@ def test_continuation_finds_what_the_straight_line_does_not(kepler):
     assert np.abs(kepler.path([1.0, 0.0], q1, 14.0, steps=56).q - found.q).max() < 1e-9
 
 
+def test_starts_at_random_find_paths_where_the_continuation_ends_at_a_fold():
+    stepper = sc.compile_stepper(sc.problem("henon-heiles").system, "svi:4")
+    q0, p0 = [0.26, 0.14], [0.27, 0.21]
+    q1, T = stepper.integrate(q0, p0, h=0.2, steps=45).q[-1], 9.0
+    intervals = Intervals(stepper, 0.5 * np.arange(18), np.full(18, 0.5), stepper.defaults, None)
+    line = np.linspace(q0, q1, 19)
+    for attempt in (solver.solved, lambda *each: solver.continued(*each, T), solver.descended):
+        with pytest.raises(PathError):
+            attempt(intervals, line)
+    path = stepper.path(q0, q1, T, steps=18)
+    assert np.abs(path.run().q[-1] - q1).max() < 1e-9
+
+
 @pytest.mark.parametrize(("T", "index"), [(3.0, 0), (3.3, 1), (6.2, 1), (6.4, 2), (9.3, 2), (9.5, 3), (20.0, 6)])
 def test_morse_index_of_the_oscillator(oscillator, T, index):
     path = oscillator.path([1.0], [0.3], T, steps=40)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
 
 MANY_COORDINATES = 48
 """Number of coordinates from which derivatives are computed as sparse matrices."""
-WAVES, SAME_PATH = 3, 1e-6
-"""Sine waves of a start at random, and distance of equal paths relative to their size."""
+WAVES, RANDOM_STARTS, FEW_ITERATIONS, SAME_PATH = 3, 10, 25, 1e-6
+"""Sine waves of a start at random, number of starts and of their iterations, and relative distance of equal paths."""
 SAME_MATRIX, MOST_REPETITIONS = 1e-9, 1000
 """Distance of equal symmetries of closed paths, and the longest period in multiples of T."""
 
@@ -173,15 +174,13 @@ def different_paths(stepper: Any, q0: Any, q1: Any, T: float, *, starts: int = 0
     Raises:
         PathError: if no path is found.
     """
-    random, count, paths, reason = np.random.default_rng(0), arguments["steps"], list[Path](), None
+    paths, reason = list[Path](), None
     ends = [real_array(_positions(stepper.interface, each, "the ends"), "the ends") for each in (q0, q1)]
-    s = np.linspace(0.0, 1.0, count + 1)[:, np.newaxis]
-    line, k = ends[0] + (ends[1] - ends[0]) * s, np.arange(1, WAVES + 1)
-    size = max(float(np.abs(line).max()), float(np.abs(ends[1] - ends[0]).max())) or 1.0
-    for trial in range(starts + 1):
-        waves = size * random.standard_normal((WAVES, line.shape[1])) / k[:, np.newaxis]
+    line = ends[0] + (ends[1] - ends[0]) * np.linspace(0.0, 1.0, arguments["steps"] + 1)[:, np.newaxis]
+    size = _size(line)
+    for start in chain([None], islice(curves_at_random(line), starts)):
         try:
-            found = stepper.path(q0, q1, T, start=line + np.sin(np.pi * s * k) @ waves if trial else None, **arguments)
+            found = stepper.path(q0, q1, T, start=start, **arguments)
         except PathError as error:
             reason = reason or error
             continue
@@ -191,6 +190,20 @@ def different_paths(stepper: Any, q0: Any, q1: Any, T: float, *, starts: int = 0
     if not paths:
         raise PathError(f"{reason} ({starts} starts at random were tried)" if starts else str(reason)) from reason
     return sorted(paths, key=lambda each: each.action)
+
+
+def curves_at_random(line: Array) -> Iterator[Array]:
+    """Yield a straight line plus sine waves of its size, the same at each call."""
+    random, k = np.random.default_rng(0), np.arange(1, WAVES + 1)
+    shapes = np.sin(np.pi * np.linspace(0.0, 1.0, len(line))[:, np.newaxis] * k) / k
+    shapes[[0, -1]] = 0.0
+    while True:
+        yield line + _size(line) * shapes @ random.standard_normal((WAVES, line.shape[1]))
+
+
+def _size(line: Array) -> float:
+    """Return the largest entry of the positions, and of their differences."""
+    return max(float(np.abs(line).max()), float(np.ptp(line, axis=0).max())) or 1.0
 
 
 def _positions(interface: Any, values: Any, name: str) -> Any:
@@ -239,13 +252,24 @@ def _open_path(
         attempts.append(partial(solver.continued, intervals, nodes, duration))
     if not intervals.stepper.interface.exchange_names:  # many coordinates: quicker than the continuation
         attempts.insert(1 if intervals.sparse else len(attempts), partial(solver.descended, intervals, nodes))
+    if homotopy and not intervals.sparse:
+        attempts.extend(partial(_from, intervals, start) for start in islice(curves_at_random(nodes), RANDOM_STARTS))
     reasons = []
     for attempt in attempts:
         try:
             return attempt()
         except solver.UNSOLVED as error:
             reasons.append(str(error))
-    raise PathError(f"no path was found ({'; '.join(reasons)}): give start=, a path nearby, or more steps")
+    raise PathError(
+        f"no path was found ({'; '.join(dict.fromkeys(reasons))}): give start=, a path nearby, or more steps"
+    )
+
+
+def _from(intervals: Intervals, start: Array) -> solver.Solution:
+    """Return the path near a start, whose inner nodes are moved to the manifold."""
+    if isinstance(intervals, ReducedIntervals):
+        start[1:-1] = [intervals.on_manifold(each, k, start[0]) for k, each in enumerate(start[1:-1], 1)]
+    return solver.solved(intervals, start, FEW_ITERATIONS)
 
 
 def _described(
