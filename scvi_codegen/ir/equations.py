@@ -107,8 +107,10 @@ class Rattle:
         abscissae: (s + 1,) of the points; weights: (s + 1,), of p1 = p0 + h sum_n w_n F_n.
         start: (s,), 0 except for rounding, and momentum: (s, s), from forces at the points but the last to velocities,
             M V_b = (1 + start[b]) p0 + h sum_n momentum[n][b] F_n.
-        position: (s, s) from them to the points but the first, u_i = q0 + h sum_b position[b][i] V_b.
-        response: (s, s), the product of both, h^2 sum_n response[n][i] F_n / M; inverse: its inverse.
+        drift: (s,), the positions without forces, u_i = q0 + h drift[i] p0 / M: the abscissae but for rounding.
+        response: (s, s), from them to the points but the first, h^2 sum_n response[n][i] F_n / M; inverse: its inverse.
+        next_positions: (s + 1, s), of the next step, u_i = q0 + h sum_b next_positions[b][i] V_b, extrapolated from the
+            velocities of a step; next_multipliers: (s + 1, s), of the next step, extrapolated.
     """
 
     force: Kernel
@@ -117,9 +119,11 @@ class Rattle:
     weights: tuple[Number, ...]
     start: tuple[Number, ...]
     momentum: NumberTable
-    position: NumberTable
+    drift: tuple[Number, ...]
     response: NumberTable
     inverse: NumberTable
+    next_positions: NumberTable
+    next_multipliers: NumberTable
 
     @property
     def lanes(self) -> int:

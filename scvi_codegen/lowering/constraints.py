@@ -33,7 +33,7 @@ from sympy import Symbol
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.equations import ConstrainedSteps, Constraints, Rattle
-from scvi_codegen.ir.kernel import RolledKernel, lower_matrix, lower_vector
+from scvi_codegen.ir.kernel import NumberTable, RolledKernel, lower_matrix, lower_vector
 from scvi_codegen.lowering.solvers.tables import velocity_tables
 from scvi_codegen.lowering.stage_groups import rolled_kernel, system_kernel
 from scvi_codegen.mechanics.arrays.system import (
@@ -58,23 +58,31 @@ from scvi_codegen.tables.basis import matrix_product, rounded, transpose
 from scvi_codegen.tables.precision import Vector, mp
 
 
-def rattle_of(system: MechanicalSystem, stages: StageSystem) -> Rattle | None:
-    """Return the tables of such steps; ``None`` if they are not applicable."""
+def rattle_of(system: MechanicalSystem, stages: StageSystem, predictor: NumberTable) -> Rattle | None:
+    """Return the tables of such steps; ``None`` if they are not applicable.
+
+    Args:
+        predictor: (2 (s + 1), s + 1) tables to the unknowns of the next step, of velocities and of multipliers.
+    """
     forms, tables = forms_of(system), velocity_tables(stages.shape)
     if any(velocity_conditions(system)) or not forms.separable or tables is None:
         return None
     position, momentum = tables.position[1:], tuple(line[:-1] for line in tables.momentum)
+    start = tuple(line[0] / tables.end_momentum[0] for line in momentum)
     response = transpose(matrix_product(position, momentum))
+    velocities = tuple(row[:-1] for row in predictor[: len(position) + 1])
     return Rattle(
         force=system_kernel(system, "constrained_force", forms.force, u=system.coordinates, purpose="L_q at u = q."),
         mass=system_kernel(system, "constrained_mass", forms.mass.values(), u=(), purpose="The constant masses."),
         abscissae=lower_vector(tables.abscissae),
         weights=lower_vector(tables.end_momentum),
-        position=lower_matrix(transpose(position)),
-        start=lower_vector(tuple(line[0] / tables.end_momentum[0] - 1 for line in momentum)),
+        start=lower_vector(tuple(x - 1 for x in start)),
         momentum=lower_matrix(transpose(momentum)),
+        drift=lower_vector(tuple(mp.fdot(line, start) for line in position)),
         response=lower_matrix(response),
         inverse=lower_matrix(rounded((mp.matrix(response) ** -1).tolist())),
+        next_positions=lower_matrix(matrix_product(velocities, transpose(position))),
+        next_multipliers=tuple(row[:-1] for row in predictor[len(position) + 1 :]),
     )
 
 

@@ -179,13 +179,15 @@ def lower(
     alone = fixed_point is not None and not fallback and not system.integrands
     newton = solver in ("auto", "newton") and splitting is None and not alone
     polynomial = method.exactness.curve != 0
+    curve = newton and polynomial and splitting is None
+    equations = _equations(system, method, stages, newton=newton, curve=curve)
     return program(
         newton=newton,
         polynomial_curves=polynomial,
-        equations=_equations(system, method, stages, newton=newton, curve=newton and polynomial and splitting is None),
+        equations=equations,
         quantities=_quantities(system, method, stages, symmetries),
         constraints=lowered_constraints(system) if system.constraints else None,
-        rattle=rattle_of(system, stages) if system.constraints and solver == "auto" else None,
+        rattle=rattle_of(system, stages, equations.extrapolation) if system.constraints and solver == "auto" else None,
         damping=damping_kernel(system),
     )
 

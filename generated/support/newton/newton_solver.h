@@ -76,10 +76,7 @@ static int solve(const step_data *step, const solver_data *way, real *memory, lo
   if (POINT > 0 && *guess == 2)
     keep = step->first ? remake_factors(step, memory + N, data) : 1;
 #ifdef RATTLE
-  if (*guess)
-    guess_from(memory, data);
-  if (*guess || line_from(step, data) == OK)
-    status = rattle(step, data, dp, options, report);
+  status = rattle(step, *guess ? memory : NULL, data, dp, options, report);
   keep = 0;
   if (status != OK && way->rattle_alone)
     return status;

@@ -2,24 +2,30 @@
 
 /* Constrained steps on Lobatto points for constant diagonal masses (RATTLE for two points; Lobatto IIIA-IIIB: L.
  * Jay, SIAM J. Numer. Anal. 33, 1996), without the full Newton matrix: iteration for the multipliers that give g = 0
- * at the points, then the multipliers that project p1 onto the tangent space. With the positions
+ * at the points, then the multipliers that project p1 onto the tangent space. With the forces f = F + G^T lambda, F =
+ * L_q, positions are
  *
- *   u = q0 + h c M^-1 p0 + h^2 R M^-1 (F + G^T lambda),
+ *   u = q0 + h c M^-1 p0 + h^2 R M^-1 f,
  *
- * R = RATTLE_RESPONSE, the correction of lambda at point n solves P_n dlambda_n = -(R^-1 (g + G du))_n / h^2 with
- * P_n = G M^-1 G^T at this point, a band matrix factorised as L D L^T (Golub & Van Loan, Matrix Computations, sec.
- * 4.3.6). It neglects that F and G vary between the points and with u, an error of order h. SIMD lanes are points.
- * Requires: newton.h, constraints.h, the kernels constrained_force and constrained_mass; the tables RATTLE_ABSCISSA,
- * RATTLE_WEIGHT, RATTLE_START, RATTLE_MOMENTUM and its low words, RATTLE_POSITION, RATTLE_RESPONSE and its inverse,
- * padded with zeros; PRODUCT, {e, f, row, distance}: the product of derivatives e and f is part of the entry of P in
- * this row at this distance below the diagonal; CONSTRAINT_POSITION of constraints, CONSTRAINT_REACH of P. */
+ * c = RATTLE_DRIFT, R = RATTLE_RESPONSE. The correction of lambda at each point solves P dlambda = -G M^-1 df -
+ * R^-1 g / h^2, where df is the change of the forces since those of u, and P = G M^-1 G^T at this point is a band
+ * matrix factorised as L D L^T (Golub & Van Loan, Matrix Computations, sec. 4.3.6). It neglects that G varies
+ * between the points, an error of order h, and that F varies with u. SIMD lanes are points.
+ *
+ * Requires: newton.h, constraints.h, the kernels constrained_force and constrained_mass; the tables
+ * RATTLE_ABSCISSA, RATTLE_WEIGHT, RATTLE_START, RATTLE_MOMENTUM, RATTLE_RESPONSE and RATTLE_DRIFT with their low
+ * words, RATTLE_INVERSE of R, and from the unknowns of the previous step RATTLE_POSITIONS, in units of h, and
+ * RATTLE_MULTIPLIERS, padded with zeros; PRODUCT, {e, f, row, distance}: the product of derivatives e and f is part
+ * of the entry of P in this row at this distance below the diagonal; CONSTRAINT_POSITION of constraints,
+ * CONSTRAINT_REACH of P; POINT_LANES; FORMER_POINTS, the indices that shift lanes by one point. */
 #define RATTLE
 #pragma GCC diagnostic ignored "-Wpsabi" /* all functions with vector arguments are static */
 
 #define PREDICTED REAL(4.0) /* multiple of the next update, from the convergence rate, that is below the tolerance */
-#define FASTEST_MULTIPLIERS REAL(1e-3) /* credible convergence rate; a lower one is accidental .. */
-#define SUDDEN REAL(0.03) /* .. as is a rate that is lower than this part of the previous one */
+#define FASTEST_MULTIPLIERS REAL(1e-3) /* credible convergence rate; a lower one is accidental */
 #define SLOWEST_MULTIPLIERS REAL(0.5) /* convergence rate of the multipliers beyond which Newton's method is faster */
+#define TRANSIENT_ITERATIONS 2 /* that need not contract */
+#define REUSED_FACTORS REAL(1e-2) /* relative update below which the factors of P are reused in the next iteration */
 #define MULTIPLIER_ROUNDOFF (64 * REAL_EPSILON) /* updates below it that decrease slowly are rounding errors */
 
 enum {
@@ -28,15 +34,34 @@ enum {
 };
 typedef real lanes __attribute__((vector_size(LANE_BYTES)));
 
-/* Positions u at all points but the first; forces L_q and derivatives G at all; multipliers at all but the last. */
+#if defined(__AVX512F__) && POINT_LANES >= 8 && !defined(__clang__)
+#pragma GCC target("prefer-vector-width=512") /* loops over lanes become whole vectors, not halves */
+#endif
+#ifdef __clang__
+#define FORMER(x, first) __builtin_shufflevector(x, first, FORMER_POINTS)
+#else
+#ifdef SINGLE_PRECISION
+typedef int lane_numbers __attribute__((vector_size(LANE_BYTES)));
+#else
+typedef long long lane_numbers __attribute__((vector_size(LANE_BYTES)));
+#endif
+#define FORMER(x, first) __builtin_shuffle(x, first, (lane_numbers){FORMER_POINTS})
+#endif
+
+/* Positions u, forces L_q, derivatives G and g at all points but the first, where the second and third are first_force
+ * and first_derivative; multipliers and the forces f of u at all but the last. `base` is u without forces. */
 typedef struct {
-  real inverse_mass[M], force[M][POINT_LANES + 1], derivative[CONSTRAINT_ENTRIES][POINT_LANES + 1];
-  lanes u[M], g[CONSTRAINTS], lambda[CONSTRAINTS];
+  real u[M][POINT_LANES], f[M][POINT_LANES], force[M][POINT_LANES], g[CONSTRAINTS][POINT_LANES];
+  real derivative[CONSTRAINT_ENTRIES][POINT_LANES], first_force[M], first_derivative[CONSTRAINT_ENTRIES];
+  real inverse_mass[M];
+  lanes base[M], lambda[CONSTRAINTS];
 } rattle_step;
 
 typedef lanes factors[CONSTRAINTS][CONSTRAINT_REACH + 1]; /* L below its diagonal, D^-1 at distance 0 */
 
 #define LANE_FUNCTION static inline __attribute__((always_inline)) /* vectors are not passed to functions */
+
+#define IN_MEMORY(values) __asm__("" : "+m"(values)) /* after they were stored */
 
 LANE_FUNCTION lanes load(const real *x)
 {
@@ -51,53 +76,50 @@ LANE_FUNCTION lanes lanes_of(real x)
   return zero + x;
 }
 
-/* sum_n table_n x_n. */
-LANE_FUNCTION lanes times(const real (*table)[POINT_LANES], const lanes *x)
+/* sum_n table_n x_n of numbers in memory, from which vector instructions broadcast. */
+LANE_FUNCTION lanes times(const real (*table)[POINT_LANES], int count, const real *x)
 {
-  lanes sum = load(table[0]) * (*x)[0], other = lanes_of(0);
-#pragma GCC unroll 8
-  for (int n = 1; n < DEGREE; n += 2)
-    other += load(table[n]) * (*x)[n];
-#pragma GCC unroll 8
-  for (int n = 2; n < DEGREE; n += 2)
-    sum += load(table[n]) * (*x)[n];
+  lanes sum = load(table[0]) * x[0], other = lanes_of(0);
+#pragma GCC unroll 16
+  for (int n = 1; n < count; n += 2)
+    other += load(table[n]) * x[n];
+#pragma GCC unroll 16
+  for (int n = 2; n < count; n += 2)
+    sum += load(table[n]) * x[n];
   return sum + other;
 }
 
 /* Evaluates forces, constraints and their derivatives at all points but the first. */
-static inline void evaluate_points(const step_data *step, rattle_step *now)
+static __attribute__((flatten)) void evaluate_points(const step_data *step, rattle_step *restrict now)
 {
-  real u[M][POINT_LANES], f[M][POINT_LANES], g[CONSTRAINTS][POINT_LANES], d[CONSTRAINT_ENTRIES][POINT_LANES];
-  memcpy(u, now->u, sizeof u);
   for (int n = 0; n < POINT_LANES; n++) {
-    real x[M], force[M], value[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES];
+    real u[M], force[M], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES];
     const real t = step->t + RATTLE_ABSCISSA[n + 1] * step->h;
+#pragma GCC unroll 64
     for (int i = 0; i < M; i++)
-      x[i] = u[i][n];
-    constrained_force(x, t, step->parameters, force);
-    constraints(x, t, step->parameters, value, derivative);
+      u[i] = now->u[i][n];
+    constrained_force(u, t, step->parameters, force);
+    constraints(u, t, step->parameters, g, derivative);
+#pragma GCC unroll 64
     for (int i = 0; i < M; i++)
-      f[i][n] = force[i];
+      now->force[i][n] = force[i];
+#pragma GCC unroll 64
     for (int k = 0; k < CONSTRAINTS; k++)
-      g[k][n] = value[k];
+      now->g[k][n] = g[k];
+#pragma GCC unroll 64
     for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-      d[e][n] = derivative[e];
+      now->derivative[e][n] = derivative[e];
   }
-  for (int i = 0; i < M; i++)
-    memcpy(now->force[i] + 1, f[i], sizeof f[i]);
-  for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-    memcpy(now->derivative[e] + 1, d[e], sizeof d[e]);
-  memcpy(now->g, g, sizeof g);
 }
 
-/* Factorises P at points from `first` on. Singular matrices lead to solutions that are not finite. */
-static inline void factorise_points(const rattle_step *now, int first, factors l)
+/* Factorises P with these derivatives. Singular matrices lead to solutions that are not finite. */
+static inline void factorise_points(const lanes *derivative, const real *inverse_mass, factors l)
 {
   memset(l, 0, sizeof(factors));
+#pragma GCC unroll 64
   for (int q = 0; q < PRODUCTS; q++) {
     const int e = PRODUCT[q][0], f = PRODUCT[q][1];
-    l[PRODUCT[q][2]][PRODUCT[q][3]] +=
-        now->inverse_mass[CONSTRAINT_ENTRY[e][1]] * load(now->derivative[e] + first) * load(now->derivative[f] + first);
+    l[PRODUCT[q][2]][PRODUCT[q][3]] += inverse_mass[CONSTRAINT_ENTRY[e][1]] * derivative[e] * derivative[f];
   }
   for (int k = 0; k < CONSTRAINTS; k++) {
     const int reach = least(k, CONSTRAINT_REACH);
@@ -126,21 +148,21 @@ static inline void solve_points(factors l, lanes *x)
   }
 }
 
-/* f += G^T lambda at all points but the last; lambda_k is lambda[order[k]]. */
-static inline void add_constraint_forces(const rattle_step *now, const lanes *lambda, const int *order, lanes *f)
+/* Derivatives at all points but the last. */
+static inline void former_derivatives(const rattle_step *now, lanes *derivative)
 {
-  for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
-    const int k = CONSTRAINT_ENTRY[e][0];
-    f[CONSTRAINT_ENTRY[e][1]] += load(now->derivative[e]) * lambda[order ? order[k] : k];
-  }
+  for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+    derivative[e] = FORMER(load(now->derivative[e]), lanes_of(now->first_derivative[e]));
 }
 
 /* f = L_q + G^T lambda at all points but the last. */
-static inline void all_forces(const rattle_step *now, lanes *f)
+static inline void all_forces(const rattle_step *now, const lanes *derivative, lanes *f)
 {
   for (int i = 0; i < M; i++)
-    f[i] = load(now->force[i]);
-  add_constraint_forces(now, now->lambda, NULL, f);
+    f[i] = FORMER(load(now->force[i]), lanes_of(now->first_force[i]));
+#pragma GCC unroll 64
+  for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+    f[CONSTRAINT_ENTRY[e][1]] += derivative[e] * now->lambda[CONSTRAINT_ENTRY[e][0]];
 }
 
 /* Inverse sizes of the terms of the displacements, whose largest size is returned: forces and reactions cancel at a
@@ -149,9 +171,9 @@ static real invert_term_sizes(const step_data *step, const rattle_step *now, rea
 {
   real largest = 0;
   for (int i = 0; i < M; i++)
-    size[i] = MATH(fabs)(now->force[i][0]);
+    size[i] = MATH(fabs)(now->first_force[i]);
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-    size[CONSTRAINT_ENTRY[e][1]] += MATH(fabs)(now->derivative[e][0] * now->lambda[CONSTRAINT_ENTRY[e][0]][0]);
+    size[CONSTRAINT_ENTRY[e][1]] += MATH(fabs)(now->first_derivative[e] * now->lambda[CONSTRAINT_ENTRY[e][0]][0]);
   for (int i = 0; i < M; i++) {
     const real change = MATH(fabs)(step->p0[i]) + MATH(fabs)(step->h) * size[i];
     size[i] = MATH(fabs)(step->q0[i]) + MATH(fabs)(step->h * now->inverse_mass[i]) * change;
@@ -161,90 +183,113 @@ static real invert_term_sizes(const step_data *step, const rattle_step *now, rea
   return largest;
 }
 
-/* Returns 1 if the iterate that `moved` led to is accepted: its update, or the next one as predicted from the rate of
- * the last updates, is below the tolerance, or rounding ended the decrease. 0: continue; -1: convergence is slow. */
-static inline int accepts(const movement *moved, const real *last, const solver_options *options, int k)
+/* Returns 1 if the iterate that `moved` led to is accepted: its update, or the next one as predicted from the lower of
+ * the last two rates, is below the tolerance, or rounding ended the decrease. 0: continue; -1: convergence is slow.
+ * The rate is that of the largest coordinates: updates of one that is held at 0 may be rounding errors of others. */
+static inline int accepts(const movement *moved, const movement *last, const solver_options *options, int k)
 {
-  const real now = options->absolute ? moved->absolute : moved->relative, tolerance = options->tolerance;
-  const real rest = PREDICTED * larger(now, FASTEST_MULTIPLIERS * last[0]);
-  if (options->absolute ? now < tolerance : now <= tolerance)
+  const int absolute = options->absolute;
+  const real now = absolute ? moved->absolute : moved->relative, tolerance = options->tolerance;
+  const real before = absolute ? last[0].absolute : last[0].relative;
+  const real earlier = absolute ? last[1].absolute : last[1].relative;
+  const real next = PREDICTED * now * larger(now, FASTEST_MULTIPLIERS * before); /* times `before` */
+  const int stagnant = moved->overall >= SLOWEST_MULTIPLIERS * last[0].overall &&
+      moved->overall >= SLOWEST_MULTIPLIERS * SLOWEST_MULTIPLIERS * last[1].overall;
+  if (absolute ? now < tolerance : now <= tolerance)
     return 1;
-  if (k > 0 && rest * now <= tolerance * last[0] && PREDICTED * now * (SUDDEN * last[0]) <= tolerance * last[1])
+  if (k > 0 && next <= tolerance * before && PREDICTED * now * before <= tolerance * earlier)
     return 1;
-  if (!options->absolute && moved->overall <= MULTIPLIER_ROUNDOFF && now >= STOPPED_SHRINKING * last[0])
+  if (!absolute && moved->overall <= MULTIPLIER_ROUNDOFF && now >= STOPPED_SHRINKING * before)
     return 1;
-  if (k > 1 && !(now < SLOWEST_MULTIPLIERS * last[0]))
-    return !options->absolute && moved->overall <= ROUNDOFF_LEVEL && now >= last[0] ? 1
-        : moved->overall > ROUNDOFF_LEVEL                                           ? -1
-                                                                                    : 0;
-  return 0;
+  if (!absolute && stagnant && moved->overall <= ROUNDOFF_LEVEL && moved->overall >= last[0].overall)
+    return 1;
+  return k > TRANSIENT_ITERATIONS && stagnant && moved->overall > ROUNDOFF_LEVEL ? -1 : 0;
 }
 
-/* One iteration: updates lambda and u by `change`. */
-static inline void iterate(const step_data *step, rattle_step *now, const lanes *base, const real *scale, lanes *change)
+/* One iteration: updates lambda, f and u, the last by `change`. */
+static inline void iterate(const step_data *step, rattle_step *now, factors l, int factorised, lanes *change)
 {
-  factors l;
-  lanes f[M], next[M], residual[CONSTRAINTS], x[CONSTRAINTS];
-  factorise_points(now, 0, l);
-  all_forces(now, f);
-  memcpy(residual, now->g, sizeof residual);
+  const real hh = step->h * step->h, scale = 1 / hh;
+  lanes derivative[CONSTRAINT_ENTRIES], push[M], x[CONSTRAINTS];
+  former_derivatives(now, derivative);
+  if (!factorised)
+    factorise_points(derivative, now->inverse_mass, l);
+  all_forces(now, derivative, push);
   for (int i = 0; i < M; i++)
-    next[i] = base[i] + scale[i] * times(RATTLE_RESPONSE, &f[i]);
-  for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
-    const int i = CONSTRAINT_ENTRY[e][1];
-    residual[CONSTRAINT_ENTRY[e][0]] += load(now->derivative[e] + 1) * (next[i] - now->u[i]);
-  }
+    push[i] = (push[i] - load(now->f[i])) * now->inverse_mass[i];
   for (int k = 0; k < CONSTRAINTS; k++)
-    x[CONSTRAINT_POSITION[k]] = times(RATTLE_INVERSE, &residual[k]) * (-1 / (step->h * step->h));
+    x[CONSTRAINT_POSITION[k]] = times(RATTLE_INVERSE, DEGREE, now->g[k]) * scale;
+#pragma GCC unroll 64
+  for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+    x[CONSTRAINT_POSITION[CONSTRAINT_ENTRY[e][0]]] += derivative[e] * push[CONSTRAINT_ENTRY[e][1]];
   solve_points(l, x);
   for (int k = 0; k < CONSTRAINTS; k++)
-    now->lambda[k] += x[CONSTRAINT_POSITION[k]];
-  memset(f, 0, sizeof f);
-  add_constraint_forces(now, x, CONSTRAINT_POSITION, f);
+    now->lambda[k] -= x[CONSTRAINT_POSITION[k]];
+  all_forces(now, derivative, push);
+  memcpy(now->f, push, sizeof push);
+  IN_MEMORY(now->f);
   for (int i = 0; i < M; i++) {
-    next[i] += scale[i] * times(RATTLE_RESPONSE, &f[i]);
-    change[i] = next[i] - now->u[i];
-    now->u[i] = next[i];
+    const real by = hh * now->inverse_mass[i];
+    const lanes u = now->base[i] + by * times(RATTLE_RESPONSE, DEGREE, now->f[i]);
+    change[i] = u - load(now->u[i]);
+    memcpy(now->u[i], &u, sizeof u);
   }
 }
 
-/* Measures a change in units of these inverse sizes. */
+/* Replaces x by the larger of x and |y|. */
+LANE_FUNCTION void keep_larger(lanes *x, const lanes *y)
+{
+  real largest[POINT_LANES], other[POINT_LANES];
+  memcpy(largest, x, sizeof largest);
+  memcpy(other, y, sizeof other);
+  for (int n = 0; n < POINT_LANES; n++) {
+    const real size = MATH(fabs)(other[n]);
+    largest[n] = size > largest[n] ? size : largest[n];
+  }
+  memcpy(x, largest, sizeof largest);
+}
+
+LANE_FUNCTION real largest_lane(const lanes *x)
+{
+  real largest[POINT_LANES];
+  memcpy(largest, x, sizeof largest);
+  for (int half = POINT_LANES / 2; half > 0; half /= 2)
+    for (int n = 0; n < half; n++)
+      largest[n] = larger(largest[n + half], largest[n]);
+  return largest[0];
+}
+
+/* Measures a change in units of these inverse sizes. Lanes beyond the points do not change. */
 static inline movement measure_change(const lanes *change, const real *inverse_size, real largest_size)
 {
   movement moved = no_movement();
-  real relative[POINT_LANES] = {0}, absolute[POINT_LANES] = {0};
-  for (int i = 0; i < M; i++)
-    for (int n = 0; n < POINT_LANES; n++) {
-      const real size = MATH(fabs)(change[i][n]);
-      relative[n] = larger(size * inverse_size[i], relative[n]);
-      absolute[n] = larger(size, absolute[n]);
-    }
-  for (int n = 0; n < DEGREE; n++) {
-    moved.relative = larger(relative[n], moved.relative);
-    moved.absolute = larger(absolute[n], moved.absolute);
+  lanes relative = {0}, absolute = {0};
+  for (int i = 0; i < M; i++) {
+    const lanes ratio = change[i] * inverse_size[i];
+    keep_larger(&relative, &ratio);
+    keep_larger(&absolute, &change[i]);
   }
+  moved.relative = largest_lane(&relative);
+  moved.absolute = largest_lane(&absolute);
   moved.overall = moved.absolute > 0 ? moved.absolute / largest_size : 0;
   return moved;
 }
 
-/* Solves g(u) = 0 for lambda and u; evaluates forces and constraints there. Returns NOT_CONVERGED or NOT_FINITE on
- * failure. */
+/* Solves g(u) = 0 for lambda and u; evaluates forces and constraints there. Returns NOT_CONVERGED on failure. */
 static int solve_constraints(const step_data *step, rattle_step *now, const solver_options *options,
     solver_report *report)
 {
-  lanes base[M], change[M];
-  real scale[M], inverse_size[M], largest_size = 0, last[2] = {(real)INFINITY, (real)INFINITY};
-  const lanes abscissa = load(RATTLE_ABSCISSA + 1);
-  for (int i = 0; i < M; i++) {
-    const real start = step->h * step->p0[i] * now->inverse_mass[i];
-    base[i] = step->q0[i] + (step->carry_q[i] + abscissa * start);
-    scale[i] = step->h * step->h * now->inverse_mass[i];
-  }
+  factors l;
+  lanes change[M];
+  real inverse_size[M], largest_size = 0;
+  const movement unknown = {(real)INFINITY, (real)INFINITY, (real)INFINITY, 0};
+  movement last[2] = {unknown, unknown};
+  int factorised = 0;
   evaluate_points(step, now);
   for (int k = 0; k < least(options->max_iterations, MOST_ITERATIONS); k++) {
     movement moved;
     int verdict;
-    iterate(step, now, base, scale, change);
+    iterate(step, now, l, factorised, change);
     if (k == 0)
       largest_size = invert_term_sizes(step, now, inverse_size);
     moved = measure_change(change, inverse_size, largest_size);
@@ -256,61 +301,79 @@ static int solve_constraints(const step_data *step, rattle_step *now, const solv
       return OK;
     if (verdict < 0)
       return NOT_CONVERGED;
+    factorised = moved.overall < REUSED_FACTORS;
     last[1] = last[0];
-    last[0] = report->change;
+    last[0] = moved;
   }
   return NOT_CONVERGED;
 }
 
-/* Initial values: the first point, and a guess of the others, from the unknowns in data->z. */
-static void begin(const step_data *step, const newton_data *data, rattle_step *now)
+/* Initial values: the first point, and a guess of the others from the unknowns of the previous step, or if they are
+ * NULL motion without forces. Rounded tables would be those of another method, whose energy drifts: the low words of R
+ * act on the guess of the forces. */
+static void begin(const step_data *step, const real *memory, rattle_step *now)
 {
-  real force[M], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES];
-  constrained_mass(NULL, step->t, step->parameters, now->inverse_mass);
-  constrained_force(step->q0, step->t, step->parameters, force);
-  constraints(step->q0, step->t, step->parameters, g, derivative);
+  const lanes drift = load(RATTLE_DRIFT), drift_low = load(RATTLE_DRIFT_LOW);
+  real g[CONSTRAINTS], mass[M];
+  constrained_mass(NULL, step->t, step->parameters, mass);
+  constrained_force(step->q0, step->t, step->parameters, now->first_force);
+  constraints(step->q0, step->t, step->parameters, g, now->first_derivative);
   for (int i = 0; i < M; i++) {
-    lanes z = {0};
-    memcpy(&z, data->z + i * B, sizeof(real) * DEGREE);
-    now->inverse_mass[i] = 1 / now->inverse_mass[i];
-    now->force[i][0] = force[i];
-    now->u[i] = step->q0[i] + (step->carry_q[i] + step->h * times(RATTLE_POSITION, &z));
+    const real v = step->p0[i] / mass[i], moved = step->h * v;
+    lanes low = drift_low * moved, x = drift * moved, f = lanes_of(0);
+    now->inverse_mass[i] = 1 / mass[i];
+    now->base[i] = x;
+    if (memory) {
+      const lanes z = times(RATTLE_POSITIONS, B, memory + i * B), bend = z - drift * v;
+      x = step->h * z;
+      memcpy(now->f[i], &bend, sizeof bend);
+      IN_MEMORY(now->f[i]);
+      f = mass[i] / step->h * times(RATTLE_INVERSE, DEGREE, now->f[i]);
+    }
+    memcpy(now->f[i], &f, sizeof f);
+    IN_MEMORY(now->f[i]);
+    low += step->h * step->h * now->inverse_mass[i] * times(RATTLE_RESPONSE_LOW, DEGREE, now->f[i]);
+    x = step->q0[i] + (step->carry_q[i] + x);
+    now->base[i] = step->q0[i] + (step->carry_q[i] + (low + now->base[i]));
+    memcpy(now->u[i], &x, sizeof x);
   }
-  for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-    now->derivative[e][0] = derivative[e];
-  for (int k = 0; k < CONSTRAINTS; k++) {
-    now->lambda[k] = lanes_of(0);
-    memcpy(now->lambda + k, data->z + (M + k) * B, sizeof(real) * DEGREE);
-  }
+  for (int k = 0; k < CONSTRAINTS; k++)
+    now->lambda[k] = memory ? times(RATTLE_MULTIPLIERS, B, memory + (M + k) * B) : lanes_of(0);
 }
 
 /* Computes p1 - p0 on the tangent space, and the unknowns z of the step. */
-static int finish_step(const step_data *step, const rattle_step *now, newton_data *data, real *dp)
+static int finish_step(const step_data *step, rattle_step *now, newton_data *data, real *dp)
 {
   const real weight = step->h * RATTLE_WEIGHT[DEGREE];
   const lanes start = load(RATTLE_START);
   factors l;
-  lanes f[M], x[CONSTRAINTS];
+  lanes derivative[CONSTRAINT_ENTRIES], f[M], x[CONSTRAINTS];
   real u[2 * M], value[M + 2 * CONSTRAINTS];
-  all_forces(now, f);
+  former_derivatives(now, derivative);
+  all_forces(now, derivative, f);
+  memcpy(now->f, f, sizeof f);
+  IN_MEMORY(now->f);
   for (int i = 0; i < M; i++) {
-    real sum = RATTLE_WEIGHT[DEGREE] * now->force[i][DEGREE];
+    real sum = RATTLE_WEIGHT[DEGREE] * now->force[i][DEGREE - 1];
     for (int n = 0; n < DEGREE; n++)
-      sum += RATTLE_WEIGHT[n] * f[i][n];
+      sum += RATTLE_WEIGHT[n] * now->f[i][n];
     dp[i] = step->h * sum;
     u[i] = now->u[i][DEGREE - 1];
     u[M + i] = (step->p0[i] + dp[i]) * now->inverse_mass[i];
   }
   constrained_motion(u, step->t + step->h, step->parameters, value);
-  factorise_points(now, 1, l);
+  for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+    derivative[e] = load(now->derivative[e]);
+  factorise_points(derivative, now->inverse_mass, l);
   for (int k = 0; k < CONSTRAINTS; k++)
     x[CONSTRAINT_POSITION[k]] = lanes_of(-value[M + k] / weight);
   solve_points(l, x);
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-    dp[CONSTRAINT_ENTRY[e][1]] +=
-        weight * now->derivative[e][DEGREE] * x[CONSTRAINT_POSITION[CONSTRAINT_ENTRY[e][0]]][DEGREE - 1];
+    dp[CONSTRAINT_ENTRY[e][1]] += weight * now->derivative[e][DEGREE - 1] *
+        x[CONSTRAINT_POSITION[CONSTRAINT_ENTRY[e][0]]][DEGREE - 1];
   for (int i = 0; i < M; i++) {
-    const lanes push = times(RATTLE_MOMENTUM, &f[i]) + times(RATTLE_MOMENTUM_LOW, &f[i]);
+    const lanes push = times(RATTLE_MOMENTUM, DEGREE, now->f[i]) +
+        times(RATTLE_MOMENTUM_LOW, DEGREE, now->f[i]);
     const lanes z = (step->p0[i] + (start * step->p0[i] + step->h * push)) * now->inverse_mass[i];
     memcpy(data->z + i * B, &z, sizeof(real) * DEGREE);
     data->z[i * B + DEGREE] = (step->p0[i] + dp[i]) * now->inverse_mass[i];
@@ -322,13 +385,14 @@ static int finish_step(const step_data *step, const rattle_step *now, newton_dat
   return all_finite(data->z, N) ? OK : NOT_FINITE;
 }
 
-/* Computes the unknowns z of the step, from their initial guess, and p1 - p0. On failure they are undefined. */
-static int rattle(const step_data *step, newton_data *data, real *dp, const solver_options *options,
+/* Computes the unknowns z of the step, and p1 - p0, with a guess from those of the previous step, if they are not NULL.
+ * On failure they are undefined. */
+static int rattle(const step_data *step, const real *memory, newton_data *data, real *dp, const solver_options *options,
     solver_report *report)
 {
   rattle_step now;
   int status;
-  begin(step, data, &now);
+  begin(step, memory, &now);
   status = solve_constraints(step, &now, options, report);
   return status == OK ? finish_step(step, &now, data, dp) : status;
 }
