@@ -1,8 +1,8 @@
 """Benchmark: this package and other integrators, compared at equal error.
 
-    cases/       systems with their initial states and spans: unforced, published, forced, adaptive, rotations, robots,
-                 fields, large array systems; accelerations derived by hand, and final states in extended precision,
-                 independent of the package's steppers (references)
+    cases/       systems with their initial states and spans: unforced, published, suites, forced, adaptive, rotations,
+                 robots, rods, fields, large array systems; accelerations derived by hand, and final states in extended
+                 precision, independent of the package's steppers (references)
     contenders/  functions from a case and a step size or tolerance to its final state: steppers of this package; peers:
                  heyoka (taylor), IRKGL16 (irkgl16), REBOUND, CyRK, SciPy (peers), MuJoCo, Pinocchio, Exudyn (engines),
                  OpenMM (arrays), PyDy (mechanisms), py-pde and spectral methods by hand (pdes)
@@ -17,6 +17,8 @@ The rules: medians of alternating rounds; stepping time only, compile time apart
 the best formulation known to us, which are named; whole work-precision curves, no step or tolerance tuned afterwards.
 """
 
+import csv
+import io
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -71,6 +73,21 @@ class Report:
         legend = [LEGEND] if self.cases else []
         return "\n\n".join([header_lines(self.machine), *(result.text() for result in self.results), *legend])
 
+    def work_precision(self) -> str:
+        """Return all measurements as CSV, one row per setting, in the terms of SciML's ``WorkPrecisionSet``.
+
+        Errors are relative, of the final positions; times in seconds of one solution, medians.
+        """
+        file = io.StringIO()
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["prob", "name", "setting", "error", "time", "numruns", "compile_time"])
+        for case in self.cases:
+            for each in case.measurements:
+                if not each.failure:
+                    numbers = (each.error, each.seconds, each.repeats, each.compile_seconds)
+                    writer.writerow([case.name, each.method, each.setting, *map(repr, numbers)])
+        return file.getvalue()
+
     def data(self) -> dict[str, Any]:
         """Return all tables and measurements as data for ``json.dump``."""
         return {
@@ -86,7 +103,7 @@ def benchmark(
     names: Sequence[str] = (),
     plan: Plan | None = None,
     *,
-    json_path: str | None = None,
+    output: str | None = None,
     plot_path: str | None = None,
     report_activity: ReportActivity = lambda text: None,
     show: ReportActivity = lambda text: None,
@@ -96,7 +113,7 @@ def benchmark(
     Args:
         names: names of sections, by default all; ``kepler`` means ``kepler:0.2`` and ``kepler:0.5``.
         plan: settings of the measurement.
-        json_path: file to write, after each section.
+        output: file to write, after each section: JSON, or .csv for :meth:`Report.work_precision`.
         plot_path: file of the plot.
         report_activity: called with a description of each activity.
         show: called with the text of the report, section by section.
@@ -110,8 +127,9 @@ def benchmark(
 
         check_plot_path(plot_path)
     for report in _reports(tuple(dict.fromkeys(sections or SECTIONS)), plan or Plan(), report_activity, show):
-        if json_path is not None:
-            write_text(json_path, json.dumps(report.data(), indent=1, allow_nan=False) + "\n")
+        if output is not None:
+            text = json.dumps(report.data(), indent=1, allow_nan=False) + "\n"
+            write_text(output, report.work_precision() if output.endswith(".csv") else text)
     if plot_path is not None and report.cases:
         from benchmarks.plots import plot_curves
 

@@ -19,7 +19,7 @@ from scvi_codegen.cli.command_group import (
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
 @click.argument("sections", nargs=-1, metavar="[SECTION ...]")
 @click.option("--peers", metavar="NAME,..", help="Peers: some of heyoka, mujoco, rebound, cyrk, ..; '' for none.")
-@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Write all measurements as JSON.")
+@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Write all measurements as JSON, or as .csv.")
 @click.option("--plot", type=click.Path(), metavar="FILE", help="Work-precision plot, .png or .svg.")
 @click.option("--repeats", type=int, default=5, show_default=True, help="Timed rounds.")
 @click.option("--quick", is_flag=True, help="Smoke test: short spans and few settings.")
@@ -38,6 +38,8 @@ def main(
       forced:double-pendulum                                                friction and driving forces
       ensemble:planar-pendulum, :kepler:0.2, :outer-solar-system            64 trajectories at once
       published:henon-heiles, :outer-solar-system, :black-hole              problems of IRKGL16's authors
+      sciml:pleiades, .., heyoka:three-bodies, ..                           problems of other projects' benchmarks
+      rods:1, :2, :5                                                        constraints, and the angles of the rods
       precision:kepler:0.5, ..  all degrees and peers from 1e-3 to round-off; of all cases of this list until :dumbbell
       adaptive:kepler:0.9, ..   adaptive and fixed step size; heyoka and IAS15
       rotations:free-top, :heavy-top, :dumbbell, :bodies                    rigid bodies; heyoka, MuJoCo
@@ -61,7 +63,7 @@ def main(
             check_writable(Path(path), hint)
     names = tuple(PEERS) if peers is None else tuple(filter(None, peers.split(",")))
     plan = Plan(peers=names, repeats=repeats, quick=quick)
-    report = benchmark(sections, plan, json_path=output, plot_path=plot, report_activity=note, show=tell)
+    report = benchmark(sections, plan, output=output, plot_path=plot, report_activity=note, show=tell)
     tell(**report.data())
     if report.interrupted:
         raise CommandFailure(

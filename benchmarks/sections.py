@@ -13,7 +13,9 @@ from benchmarks.cases.large import atoms, bodies, field, ring
 from benchmarks.cases.published import PUBLISHED_CASES, published_case
 from benchmarks.cases.references import Reference, rms_error
 from benchmarks.cases.robots import ROBOTS
+from benchmarks.cases.rods import RODS, rods, with_constraints
 from benchmarks.cases.rotations import BODIES, FEW_BODIES, ROTATIONS, tumbling
+from benchmarks.cases.suites import SUITE_CASES, SUITE_ENDS, suite_case
 from benchmarks.cases.unforced import CASES, STATES, Case, case
 from benchmarks.comparison import Race
 from benchmarks.contenders.arrays import step_counts
@@ -92,11 +94,27 @@ def _precision(make: Callable[[], Case], name: str, plan: Plan) -> Race:
     return Race(case=chosen, ours=partial(degree_contenders, chosen, quick=plan.quick), peers=peers)
 
 
-def _published(name: str, plan: Plan) -> Race:
-    """Return a problem of IRKGL16's authors, at advised and at adaptive step sizes."""
-    chosen = _shortened(published_case(name), plan)
+def _published(make: Callable[[], Case], plan: Plan) -> Race:
+    """Return a published problem, at advised and at adaptive step sizes."""
+    chosen = _shortened(make(), plan)
     both = (our_contenders, adaptive_contenders)
     return Race(case=chosen, ours=lambda: [each for make in both for each in make(chosen, quick=plan.quick)])
+
+
+def _suite(name: str, plan: Plan) -> Race:
+    """Return a problem of another project's benchmark; the end of one is published, that of a part of it is not."""
+    race = _published(partial(suite_case, name), plan)
+    return replace(race, ends=SUITE_ENDS[name]) if name in SUITE_ENDS and not plan.quick else race
+
+
+def _rods(n: int, plan: Plan) -> Race:
+    """Return a chain of rods in angles, and with constraints."""
+    chosen = _shortened(rods(n), plan)
+    return Race(
+        case=chosen,
+        ours=lambda: [*with_constraints(chosen, n, quick=plan.quick), *adaptive_contenders(chosen, quick=plan.quick)],
+        peers={"heyoka": lambda case, _: heyoka_contenders(case, True)},
+    )
 
 
 def _rotation(name: str, plan: Plan) -> Race:
@@ -164,7 +182,9 @@ BUILDERS: dict[str, Callable[[Plan], Race]] = {
     **{name: partial(_single, make) for name, make in CASES.items()},
     **{f"ensemble:{name}": partial(_copies, name) for name in ENSEMBLES},
     "forced:double-pendulum": partial(_single, driven_pendulum),
-    **{f"published:{name}": partial(_published, name) for name in PUBLISHED_CASES},
+    **{f"published:{name}": partial(_published, partial(published_case, name)) for name in PUBLISHED_CASES},
+    **{name: partial(_suite, name) for name in SUITE_CASES},
+    **{f"rods:{n}": partial(_rods, n) for n in RODS},
     **{f"precision:{name}": partial(_precision, make, name) for name, make in ALL_CASES.items()},
     **{f"adaptive:{name}": partial(_adaptive, name) for name in ADAPTIVE_CASES},
     **{f"rotations:{name}": partial(_rotation, name) for name in ROTATIONS},

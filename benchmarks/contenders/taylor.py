@@ -197,7 +197,7 @@ def _formulations(case: Case) -> Iterator[tuple[str, list[Any], Formulation]]:
     most = LARGEST_LAGRANGIAN if forms_of(case.system).separable else LARGEST_COUPLED
     if 2 * m == case.size and m <= most and not any(case.system.forces):
         yield LAGRANGIAN, _from_lagrangian(case), plain
-    if case.bodies is not None and not case.bodies.fixed_centre:
+    if case.bodies is not None and case.bodies.axes == 3 and not case.bodies.fixed_centre:
         yield "heyoka.model.nbody", _n_bodies(case), plain
 
 

@@ -1,5 +1,6 @@
 """The benchmark's own arithmetic: references against closed forms, equal error, ratios. No peer is needed."""
 
+import csv
 import json
 import math
 import re
@@ -21,12 +22,14 @@ from benchmarks.cases import unforced
 from benchmarks.cases.adaptive import adaptive_case
 from benchmarks.cases.forced import driven_pendulum
 from benchmarks.cases.references import Reference, equal_steps, gauss_tables, reference, rms_error, states_after
+from benchmarks.cases.rods import rods
+from benchmarks.cases.suites import SUITE_CASES, SUITE_ENDS, suite_case
 from benchmarks.contenders import ours, peers
 from benchmarks.contenders.ours import our_ensembles
 from benchmarks.contenders.tracing import rates_text
 from benchmarks.report import FLOOR, Contender, Point, ResultTable, common_error, frontier, time_at
 from benchmarks.tables import drift_row, fitted_rate
-from scvi_codegen import SVI, StateError, SystemDefinitionError
+from scvi_codegen import SVI, StateError, SystemDefinitionError, compile_stepper
 from scvi_codegen.native import building
 
 ROOT = Path(bench.__file__).parents[1]
@@ -56,6 +59,8 @@ MOVED = (
     {name: partial(unforced.case, name) for name in sorted(unforced.CASES.keys() - {"fput-chain:64", "fput-chain:256"})}
     | {"forced:double-pendulum": driven_pendulum}
     | {name: partial(adaptive_case, name) for name in ("comet", "pythagorean", "hill", "swinging-atwood")}
+    | {name: partial(suite_case, name) for name in SUITE_CASES.keys() - {"sciml:henon-heiles", "sciml:pendulum"}}
+    | {f"rods:{n}": partial(rods, n) for n in (2, 5)}
 )
 """Systems with accelerations solved by hand."""
 
@@ -79,6 +84,14 @@ class TestCases:
         masses, others, forces = terms(*x, t, *system.defaults)
         assert mp.norm(masses * mp.matrix(accelerations) + others - forces) < 1e-12 * (1 + mp.norm(forces))
         assert any(force != 0 for force in system.forces) == name.startswith("forced")
+
+    @pytest.mark.second
+    def test_published_end_of_the_suite_of_heyoka_is_reached(self):
+        """Sun, Jupiter and Saturn after 100,000 years: positions of published quadruple precision, within 2e-9."""
+        chosen = suite_case("heyoka:three-bodies")
+        stepper = compile_stepper(chosen.system, "svi:8")
+        run = stepper.integrate(chosen.q[0], velocity=chosen.velocity[0], t_end=chosen.span, check_growth=False)
+        assert rms_error(run.q[-1:], SUITE_ENDS["heyoka:three-bodies"](chosen, None)) < 2e-9
 
     def test_the_formulation_in_momenta_agrees_with_the_one_in_velocities(self):
         chosen = unforced.case("relativistic-particle")
@@ -344,7 +357,7 @@ class TestCommand:
         messages = []
         plan = bench.Plan(peers=("heyoka", "cyrk", "rebound"), quick=True, methods=(SVI(4),))
         names = ["planar-pendulum", "drift"]
-        text = bench.benchmark(names, plan, json_path=str(path), report_activity=messages.append).text()
+        text = bench.benchmark(names, plan, output=str(path), report_activity=messages.append).text()
         assert "skipped heyoka: heyoka is not installed (pip install 'scvi-codegen[bench]')" in text
         assert "skipped cyrk: CyRK is not installed" in text
         data = json.loads(path.read_text())
@@ -353,6 +366,12 @@ class TestCommand:
         assert max(found["error"] for found in data["cases"][0]["measurements"]) < 1e-6
         assert len(data["tables"][0]["rows"]) == 6
         assert "planar-pendulum: reference" in messages
+        table = tmp_path / "out.csv"
+        bench.benchmark(names[:1], plan, output=str(table))
+        head, *rows = csv.reader(table.read_text().splitlines())
+        assert head == ["prob", "name", "setting", "error", "time", "numruns", "compile_time"]
+        assert [row[0] for row in rows] == names[:1] * len(data["cases"][0]["measurements"])
+        assert float(rows[-1][3]) == data["cases"][0]["measurements"][-1]["error"]
 
     def test_interrupt_saves_completed_measurements(self, tmp_path, monkeypatch):
         def interrupt(plan, report_activity):
@@ -366,7 +385,7 @@ class TestCommand:
         monkeypatch.setattr(bench, "SECTIONS", sections)
         path = tmp_path / "out.json"
         shown = []
-        found = bench.benchmark(json_path=str(path), show=shown.append)
+        found = bench.benchmark(output=str(path), show=shown.append)
         assert [text.strip().splitlines()[0] for text in shown[1:]] == ["done: kept", "bad: failed: no"]
         assert (found.results[0], found.interrupted) == (done, "two")
         assert "bad: failed: no" in found.text()
@@ -384,7 +403,7 @@ class TestCommand:
             return ResultTable(name=name, title="x", columns={"a": ""}, rows=({"a": name},))
 
         monkeypatch.setattr(bench, "SECTIONS", {name: partial(section, name) for name in ("one", "two", "three")})
-        bench.benchmark(json_path=str(path))
+        bench.benchmark(output=str(path))
         assert measured == [("one", []), ("two", ["one"]), ("three", ["one", "two"])]
 
     def test_benchmark_command_draws_a_picture(self, tmp_path):

@@ -1,9 +1,10 @@
 """Write the page on claims, ``docs/claims.md``, from recorded measurements.
 
-python -m benchmarks planar-pendulum kepler outer-solar-system --peers heyoka -o benchmarks/recorded.json
-python tests/tools/remake_claims.py
+python -m benchmarks planar-pendulum .. fput-chain:256 --peers heyoka -o report.json    (the sections of TITLES)
+python tests/tools/remake_claims.py report.json
 
-The record is what ``-o`` writes, with the key ``date``, without the single settings of each method.
+The record is what ``-o`` writes, with the key ``date``, without the single settings of each method. It is replaced as a
+whole, so that one date, machine and version describe it.
 """
 
 # ruff: noqa: E501  (rows of tables)
@@ -25,6 +26,11 @@ TITLES = {
     "kepler:0.5": "Kepler e = 0.5, T = 2000",
     "henon-heiles": "Henon-Heiles, T = 1000",
     "outer-solar-system": "outer solar system, 200,000 days",
+    "double-pendulum": "double pendulum, T = 1000",
+    "relativistic-particle": "relativistic particle, T = 1000",
+    "fput-chain:8": "FPUT chain of 8, T = 1000",
+    "fput-chain:64": "FPUT chain of 64, T = 1000",
+    "fput-chain:256": "FPUT chain of 256, T = 1000",
 }
 """Rows of the table of ``docs/performance.md`` by section of the benchmark."""
 
@@ -47,7 +53,18 @@ def stated() -> dict[str, list[str]]:
     """Return error, time, and both ratios of ``docs/performance.md`` by title of the row."""
     page = (ROOT / "docs" / "performance.md").read_text(encoding="utf-8")
     rows = [line.strip("| ").split(" | ") for line in page.splitlines() if line.count(" | ") == 4]
-    return {row[0]: row[1:] for row in rows}
+    known = {re.sub(r" \(.*\)", "", row[0]): row[1:] for row in rows}
+    for title, cells in list(known.items()):  # "FPUT chain of 8 / 64 / 256" is a row for each of them
+        if numbers := re.search(r"\d+( / \d+)+", title):
+            parts = [cell.removesuffix(" ms").split(" / ") for cell in cells]
+            for k, number in enumerate(numbers[0].split(" / ")):
+                known[title.replace(numbers[0], number)] = [each[min(k, len(each) - 1)] for each in parts]
+    return known
+
+
+def _with_unit(cells: list[str]) -> list[str]:
+    error, time, *ratios = cells
+    return [error, time if time.endswith("ms") else f"{time} ms", *ratios]
 
 
 def page(recorded: dict[str, Any]) -> str:
@@ -59,6 +76,20 @@ def page(recorded: dict[str, Any]) -> str:
     mercury, moon = re.search(r"within (\S+) km .*? at Mercury and (\S+) km at the Moon", readme).groups()
     machine, documented = recorded["machine"], stated()
     command = f"python -m benchmarks {' '.join(case['name'] for case in recorded['cases'])} --peers heyoka"
+    missing = [name for name in TITLES if name not in rows_of(recorded)]
+    listed = "".join(f"| {TITLES[name]} | {' | '.join(_with_unit(documented[TITLES[name]]))} |\n" for name in missing)
+    unrecorded = f"""
+These claims are stated but are not in the last record:
+
+| problem | error | time stated | default stated | best stated |
+| --- | --- | --- | --- | --- |
+{listed}
+Record all claims together, on an idle machine, by
+
+`python -m benchmarks {" ".join(TITLES)} --peers heyoka -o report.json`
+
+and `python tests/tools/remake_claims.py report.json`.
+""" * bool(missing)
     lines = [
         f"| {TITLES[name]} | {row['at_error']:.0e} | {documented[TITLES[name]][1]} | {1e3 * row['seconds']:.2g} ms "
         f"| {documented[TITLES[name]][2]} | {row['default']:.2g} | {documented[TITLES[name]][3]} | {row['best']:.2g} |"
@@ -99,8 +130,8 @@ on {recorded["date"]}: {machine["processor"]}, {machine["cores"]} cores, load {m
 | problem | error | time stated | recorded | default stated | recorded | best stated | recorded |
 | --- | --- | --- | --- | --- | --- | --- | --- |
 {table}
-
-Problems of the benchmarks that are missing here have no record yet. The claim does not cover other classes of problems:
+{unrecorded}
+The claim does not cover other classes of problems:
 the [pages of benchmarks](performance.md) name those on which other programs are faster, and [limits](limits.md) those
 for which they are better suited.
 """
