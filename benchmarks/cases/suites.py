@@ -43,7 +43,7 @@ def suite_case(name: str) -> Case:
     return replace(SUITE_CASES[name](), name=name)
 
 
-def _repeated(vector: Sequence[float]) -> Array:
+def _repeated(vector: Sequence[float] | Array) -> Array:
     return np.tile(np.array(vector, dtype=float), (STATES, 1))
 
 
