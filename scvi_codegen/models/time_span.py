@@ -92,7 +92,7 @@ class TimeSpan(RunOptions):
         section = {option.key: getattr(self, option.field) for option in options_of("run")}
         if self.time_transformation is not None and self.controller is None:
             section["controller"] = default_controller(in_tau=True)
-        return {key: value for key, value in section.items() if value is not None}
+        return {key: value for key, value in section.items() if value is not None and value is not False}
 
     def _with_step_size(self, *, steps: int | None = None, **chosen: Any) -> Self:
         """Return the model whose step size another option determines, over the same time span or ``steps`` steps."""
