@@ -257,19 +257,19 @@ def eliminate_constraints(
     if isinstance(known, ArraySystem):
         if sizes is None:
             raise SystemDefinitionError(
-                f"eliminate_constraints: the number of rods of '{known.name}' depends on the sizes "
-                f"{', '.join(known.sizes)}: give them, sizes={{'{known.sizes[0]}': 8}}"
+                f"the number of rods of '{known.name}' depends on the sizes {', '.join(known.sizes)}: give them, "
+                f"eliminate_constraints(system, sizes={{'{known.sizes[0]}': 8}})"
             )
         known = unroll_sums(known, sizes, tables=tables)
     if not isinstance(known, LagrangianSystem) or type(known) is not LagrangianSystem:
         raise SystemDefinitionError(f"eliminate_constraints requires a Lagrangian with constraints, not {known!r}")
     for what, present in (
-        ("no constraints", not known.constraints),
-        ("rotations or directions: write it with constraints", bool(known.rotations)),
-        ("a time transformation: eliminate its constraints first", known.clock is not None),
+        ("has no constraints", not known.constraints),
+        ("has rotations or directions, which angles of rods in a plane do not replace", bool(known.rotations)),
+        ("is in transformed time: eliminate its constraints before reparametrise", known.clock is not None),
     ):
         if present:
-            raise SystemDefinitionError(f"eliminate_constraints: '{known.name}' has {what}")
+            raise SystemDefinitionError(f"no constraints of '{known.name}' can be eliminated: it {what}")
     found, reasons = _RodSearch(known).rods()
     if not found:
         listed = "; ".join(f"'{text}' {reason}" for text, reason in reasons.items())

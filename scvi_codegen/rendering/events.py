@@ -197,6 +197,11 @@ class EventFormulas:
         self._set_rates_of_rotations(new)
         indices = [named.get(name, -1) for name in new]
         for index, (name, value) in zip(indices, new.items(), strict=True):
+            if index < 0 and symbol(name) in self._replaced:
+                raise EventError(
+                    f"the event '{event.function}' sets '{name}', which follows from the angles of rods: set these or "
+                    "their velocities, use impact(..) for a wall, or integrate with constraints"
+                )
             if index < 0:
                 known = [str(x) for each in self._turning.rotations for x in (*each.rates, *each.momenta)] + [*named]
                 raise EventError(

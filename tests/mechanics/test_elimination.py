@@ -151,6 +151,19 @@ def test_constraints_that_are_no_rods_are_named(constraint: str, reason: str) ->
     assert reason in str(caught.value)
 
 
+def test_other_systems_are_rejected() -> None:
+    """Without constraints or in transformed time nothing can be eliminated; arrays require sizes."""
+    free = sc.LagrangianSystem.from_text(name="free", **ROD)
+    with pytest.raises(sc.SystemDefinitionError, match="of 'free' can be eliminated: it has no constraints"):
+        sc.eliminate_constraints(free)
+    timed = sc.reparametrise(_named("dumbbell"), "1 + x1**2")
+    with pytest.raises(sc.SystemDefinitionError, match="it is in transformed time"):
+        sc.eliminate_constraints(timed)
+    chain = sc.LagrangianSystem.from_text(name="chain", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2)")
+    with pytest.raises(sc.SystemDefinitionError, match="depends on the sizes N: give them"):
+        sc.eliminate_constraints(chain)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -203,6 +216,8 @@ def test_model_files_events_and_derived_quantities(tmp_path) -> None:
     (crossing,) = run.events
     at = model.system.elimination.to_original(crossing.q, crossing.q)[0]
     assert np.abs(at[:, 3] + 1.5).max() < 1e-14
+    with pytest.raises(sc.EventError, match="sets 'r_1_1_dot', which follows from the angles of rods"):
+        run.stepper.integrate(model.q, run.p[0], t_end=1.0, events=sc.Event("r_1_1", then={"r_1_1_dot": 0}))
     ensemble = run.stepper.integrate_ensemble(np.tile(model.q, (2, 1)), velocity=np.zeros((2, 2)), h=0.1, steps=2)
     assert np.abs(ensemble["r_0_1"][-1] + np.cos(ensemble.q[-1, :, 0])).max() < 1e-15
     plain = parse_model(MODEL.replace("eliminate_constraints = true", "")).with_known_sizes()
