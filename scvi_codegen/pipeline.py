@@ -159,6 +159,7 @@ def describe(
         variables=tuple(each.name for each in getattr(system, "variables", ())),
         lengths=system.lengths,
         originals=tuple((x.name, system.text_of(f)) for x, f in system.replaced.items()),
+        original_arrays=tuple(map(str, system.eliminated.original.arrays)) if system.replaced else (),  # type: ignore[attr-defined]
     )
 
 

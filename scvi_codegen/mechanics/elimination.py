@@ -305,7 +305,7 @@ def _in_angles(system: LagrangianSystem, rods: Sequence[Rod], reasons: Mapping[s
         name=f"{system.name} in angles",
         lagrangian=lambda replaced: _lagrangian(system, rods, replaced, elimination.coordinates),
     )
-    return replace(moved, eliminated=elimination)
+    return replace(moved, eliminated=elimination, indices=system.indices)
 
 
 def _lagrangian(

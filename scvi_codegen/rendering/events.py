@@ -243,9 +243,11 @@ class _Grammar:
 
 def _arrays(interface: Interface) -> list[Array]:
     """Return the arrays whose entries a function may contain: coordinates, parameters, velocities and momenta."""
-    arrays = [parse_coordinate(declaration) for declaration in interface.arrays]
-    moving = [Array(array.name + DOT, array.axes) for array in arrays if array.elements[0] in interface.coordinates]
-    return [*arrays, *moving, *momentum_arrays(arrays, interface.momenta)]
+    own = [parse_coordinate(declaration) for declaration in interface.arrays]
+    arrays = [*own, *map(parse_coordinate, interface.original_arrays)]
+    positions = {*interface.coordinates, *(name for name, _ in interface.originals)}
+    moving = [Array(array.name + DOT, array.axes) for array in arrays if array.elements[0] in positions]
+    return [*arrays, *moving, *momentum_arrays(own, interface.momenta)]
 
 
 def _names(interface: Interface) -> dict[str, Symbol]:

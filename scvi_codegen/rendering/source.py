@@ -294,6 +294,7 @@ class Interface:
         precision: :data:`DOUBLE_DOUBLE`, or "" for double precision.
         originals: of a system in angles of rods, the names of the coordinates and velocities that they replace, with
             their formulas, ``("x", "l*sin(angle)")``.
+        original_arrays: declarations of the arrays of the original system.
     """
 
     prefix: str
@@ -330,6 +331,7 @@ class Interface:
     lengths: tuple[tuple[str, ...], ...] = ()
     precision: str = ""
     originals: tuple[tuple[str, ...], ...] = ()
+    original_arrays: tuple[str, ...] = ()
 
     @property
     def words(self) -> int:

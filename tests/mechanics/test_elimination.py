@@ -194,7 +194,7 @@ g = 9.81
 [initial]
 q = [[1.0, 0.0], [2.0, 0.0]]
 [[events]]
-function = "r_1_1 + 1.5"
+function = "r[N-1, 1] + 1.5"
 [method]
 method = "svi:6"
 [run]
