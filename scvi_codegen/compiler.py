@@ -93,8 +93,8 @@ def compile_stepper(
             or have a fixed-point iteration over stage positions (SVI, SC, Runge-Kutta); others, and systems without
             such loops, are compiled with the sizes of each call, once.
         tables: with ``sizes``, index tables of shape (rows, columns) by name.
-        precision: ``"double"``, or ``"double-double"`` for states and results of 31 digits: fixed steps of separable
-            systems (constant diagonal masses, forces of positions and time) by SVI, spectral collocation, SCVI and
+        precision: ``"double"``, or ``"double-double"`` for states and results of 31 digits, of separable systems
+            (constant diagonal masses, forces of positions and time) by SVI, spectral collocation, SCVI and
             Runge-Kutta methods (docs/digits.md).
 
     Raises:
@@ -140,10 +140,6 @@ def compile_stepper(
         further: dict[str, Any] = {"events": as_events(events), "of_sizes": of_sizes, "reason": reason}
         return Stepper(source, interface, variants=variants, flags=flags, **further)
     source, interface = sources.integrator()
-    if precision == DOUBLE_DOUBLE:
-        from scvi_codegen.runtime.trajectory.double_double import DoubleDoubleStepper  # here, because it imports mpmath
-
-        return cast(Stepper, DoubleDoubleStepper(source, interface, flags))
     interface = replace(interface, layout=replace(interface.layout, **drawn))
     cast(MechanicalSystem, system).store_key()
     return Stepper(source, interface, variants=variants, flags=flags, events=as_events(events))

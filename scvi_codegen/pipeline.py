@@ -239,6 +239,7 @@ class Sources:
         precision: str = "double",
     ) -> None:
         self.method, self.solver, self.g, self.precision = method, solver, g, precision
+        self._arguments = system, method, solver, prefix, symmetries, g, controller
         self.controller = controller_named(controller, in_tau=g is not None)
         self.prefix = c_identifier(prefix or f"{system.name}_{method.name}")
         self._programs: dict[bool, Program] = {}
@@ -272,6 +273,11 @@ class Sources:
         loops = replace(program.loops, maps=layout.maps, continued=layout.continued, **functions)
         return replace(program, loops=loops)
 
+    @cached_property
+    def _in_double(self) -> Sources:
+        """The sources in double precision."""
+        return Sources(*self._arguments)
+
     def program(self, *, fallback: bool = False) -> Program:
         """Return the lowered program; with ``fallback`` it also contains Newton's iteration as a fallback."""
         if fallback not in self._programs:
@@ -303,7 +309,9 @@ class Sources:
         """
         program = self.program()
         if self.precision == DOUBLE_DOUBLE:
-            return render_double_double(program, self._point_derivatives()), self.interface
+            derivatives = self._point_derivatives()
+            control = control_of(program, self.controller, self.system) if controlled else None
+            return render_double_double(program, derivatives, control), self.interface
         control = control_of(program, self.controller, self.system, self.g)
         if control and controlled and not (self.of_arrays or control.density):
             control = replace(control, growth=error_growth_of(self.system, program))
@@ -395,7 +403,9 @@ class Sources:
             "second_derivatives": lambda: self.tangent(second=True),
             "changes": lambda: self.changes(int(count)),
         }
-        return None if self.of_arrays or self.precision == DOUBLE_DOUBLE else variants[kind]()
+        if self.precision == DOUBLE_DOUBLE:  # derivatives are those of the step in double
+            return None if kind in ("ensemble", "fallback") else self._in_double.variant(name)
+        return None if self.of_arrays else variants[kind]()
 
 
 @checks_arguments(system=SYSTEM, symmetries=SYMMETRIES)

@@ -4,7 +4,7 @@
 
 static int NAME(call_store)(const NAME(call) *c, long long row, long long steps, long long every)
 {
-  double *t = c->t + row, *q = c->q + row * c->coordinates, *p = c->p + row * c->coordinates;
+  double *t = c->t + row * c->words, *q = c->q + row * c->coordinates, *p = c->p + row * c->coordinates;
   __typeof__(NAME(advance)) *volatile fixed = NAME(advance);
 #ifdef HAS_ADVANCE_TO
   __typeof__(NAME(advance_to)) *volatile adaptive = NAME(advance_to);

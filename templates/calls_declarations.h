@@ -3,14 +3,14 @@ typedef struct {
   NAME(run) * run;
   const double *parameters;
   const NAME(options) *options;
-  double *t, *q, *p; /* memory for states */
+  double *t, *q, *p; /* memory for states: `words` numbers for t, `coordinates` numbers for q and for p */
   int *iterations;
   const double *start; /* t, q and p at the start of a run */
   double *sizes; /* of the steps that follow the states, unless NULL */
   NAME(report) * report;
   double *workspace;
   double h, t_end, tolerance; /* h = 0: adaptive steps */
-  long long coordinates, measures_growth, has_energies;
+  long long words, coordinates, measures_growth, has_energies;
   double error, error_t, energies[2];
   long long stored, steps, rejected;
 } NAME(call);

@@ -14,6 +14,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.files.energy import EnergyAccount
 from scvi_codegen.models.model import Model
 from scvi_codegen.results.recording import RecordedRun
+from scvi_codegen.runtime.core.words import low_words
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
@@ -41,11 +42,16 @@ def run_numbers(
         "action": trajectory.action() if model.action else None,
         "step_error": trajectory.step_error,
         "worst_step_time": trajectory.worst_step_time,
-        "final": {"t": t, "q": _named(model, q), "p": _named(model, p)},
+        "final": {"t": t, "q": _named(model, q), "p": _named(model, p), **_low_words(model, q, p)},
         "final_error": None if known is None else {"q": _named(model, known.q), "p": _named(model, known.p)},
         "chaotic": None if known is None else known.chaotic,
         "failure": failure_text(outcome),
     }
+
+
+def _low_words(model: Model, q: Any, p: Any) -> dict[str, Any]:
+    """Return the low words of a state in double-double arithmetic."""
+    return {"q_low": _named(model, low_words(q)), "p_low": _named(model, low_words(p))} if model.precision else {}
 
 
 def failure_text(outcome: RunOutcome | RecordedOutcome) -> str | None:

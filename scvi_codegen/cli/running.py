@@ -18,6 +18,7 @@ from scvi_codegen.models.model import Model
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.representation import counted
 from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.core.words import Words, as_text
 from scvi_codegen.runtime.events.event import Crossings
 from scvi_codegen.runtime.inputs.segments import record_segments
 from scvi_codegen.runtime.run.accuracy import TOLERABLE_ERROR, without_accuracy_warnings
@@ -151,6 +152,7 @@ def known_at_end(model: Model, outcome: RunOutcome) -> Known | None:
     run, trajectory = outcome.run, outcome.trajectory
     if (
         model.array_system is not None
+        or model.in_double_double
         or model.events
         or not run.steps
         or outcome.failure is not None
@@ -214,6 +216,11 @@ def final_state(interface: Interface, positions: Array, momenta: Array, known: K
     names, columns = interface.coordinates, interface.momentum_columns
     shown, column = names[:SHOWN_COORDINATES], max(map(len, columns[:SHOWN_COORDINATES]))
     width = max(map(len, shown))
+    if isinstance(positions, Words):
+        yield "final state (in two words)"
+        for name, q, other, p in zip(shown, as_text(positions), columns, as_text(momenta), strict=False):
+            yield f"  {name:{width}} = {q:40} {other:{column}} = {p}"
+        return
     yield f"final state ({_how_known(known)})"
     for i, (name, other, q, p) in enumerate(zip(shown, columns, positions, momenta, strict=False)):
         known_q, known_p = (known.q[i], known.p[i]) if known else (0.0, 0.0)

@@ -24,9 +24,9 @@ MAX_STEPS = 10**9
 def model_with_adaptive_steps(model: Model, tolerance: float) -> Model:
     """Return the model with adaptive steps whose local error is bounded by the tolerance, or by round-off."""
     check_tolerance(tolerance)
-    if tolerance < ROUND_OFF:
+    if tolerance < ROUND_OFF and not model.in_double_double:
         click.echo(f"Warning: tolerance {tolerance:g} is below double precision: round-off is used instead", err=True)
-    allowed = tolerance if tolerance >= ROUND_OFF else None
+    allowed = tolerance if tolerance >= ROUND_OFF or model.in_double_double else None
     return model._with_step_size(tolerance=allowed)
 
 

@@ -68,7 +68,7 @@ def energy_account(states: Any, *, limited: bool = False) -> EnergyAccount:
         states: a trajectory, or a recorded run, of which the work is unknown.
         limited: whether the work is computed only for short runs of few coordinates.
     """
-    energy = np.asarray(states.energy())
+    energy = np.asanyarray(states.energy())
     stepper: Any = getattr(states, "stepper", None)
     reason = "" if stepper is None else energy_reason(stepper)
     long = limited and not (
@@ -76,7 +76,7 @@ def energy_account(states: Any, *, limited: bool = False) -> EnergyAccount:
     )
     known = reason and hasattr(states, "_exchanged_energy") and not long
     work = states._exchanged_energy(energy) if known else None
-    initial, change = float(energy[0]), energy - energy[0]
+    initial, change = float(energy[0]), energy - energy[:1]
     if np.abs(change).max() > 1e-3 * abs(initial) and hasattr(states, "velocity"):
         action = np.abs(np.sum(states.p * states.velocity, axis=-1)).max()
         initial = 0.0 if abs(initial) <= 1e-8 * action else initial

@@ -77,6 +77,7 @@ class States:
         quantities: derived quantities of t (n,), q and p (n, m): velocity (n, m), energy (n,), momentum_map (n, c), and
             the attitudes by name.
         units: of t, q, p and these, as far as known.
+        low: low words of t, q, p and parameters in double-double arithmetic, by name of the file's arrays.
     """
 
     count: int
@@ -90,6 +91,7 @@ class States:
     attitudes: tuple[NamedQuantity, ...] = ()
     quantities: Callable[[Array, Array, Array], Mapping[str, Array]] | None = None
     units: Mapping[str, str] = field(default_factory=dict)
+    low: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def attributes(self) -> dict[str, Any]:
@@ -225,6 +227,7 @@ def _write_npz(states: States, path: Path) -> None:
         "coordinates": np.array(states.coordinates),
         "parameter_names": np.array(list(states.parameters), dtype=str),
         **{name: np.array(text) for name, text in states.about.items()},
+        **states.low,
     }
     with zipfile.ZipFile(path, "w") as archive:
         for i, (name, (shape, kind)) in enumerate(states.columns().items()):

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from scvi_codegen.runtime.inputs.segments import Input
     from scvi_codegen.runtime.run.global_error import GlobalError
     from scvi_codegen.runtime.run.run import Run
-    from scvi_codegen.runtime.trajectory.double_double import DoubleDoubleTrajectory
     from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 DEFAULT_METHOD = SVI(8)
@@ -257,7 +256,6 @@ class Model(TimeSpan):
         """Compile a stepper for runs of this model; raises as :func:`~scvi_codegen.compile_stepper`."""
         from scvi_codegen.compiler import compile_stepper  # imported here: not needed for reading a model
 
-        self._check_double("a stepper of a model, for certificates, recordings, ensembles, advice and pages,")
         self._check_controller()
         stepper = compile_stepper(
             self.system,
@@ -265,6 +263,7 @@ class Model(TimeSpan):
             solver=self.solver,
             time_transformation=self.time_transformation,
             controller=self.controller,
+            precision=self.precision or "double",
         )
         if self.mesh is not None and stepper.interface.layout.mesh is None:
             stepper.interface = replace(stepper.interface, layout=replace(stepper.interface.layout, mesh=self.mesh))
@@ -278,7 +277,7 @@ class Model(TimeSpan):
     def momenta(self, stepper: Stepper) -> Array:
         """Return the (m,) initial momenta: ``p``, or the Legendre transform of the velocities."""
         if self.p is not None:
-            return np.array(self.p)
+            return self.p if self.in_double_double else np.array(self.p)
         assert self.velocity is not None  # by construction
         return stepper.momentum(self.q, self.velocity, self.t, self.parameters_at_start(stepper))
 
@@ -392,7 +391,6 @@ class Model(TimeSpan):
 
     def integrate(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> Trajectory:
         """Integrate over the whole span; raises as :meth:`Stepper.integrate`."""
-        self._check_double("integrate() of a model (call integrate_in_double_double())")
         stepper, arguments = self.stepper(), self._run_arguments()
         if self.h is None and self.has_time_transformation and self.error is None:
             plan = self.start(stepper).plan
@@ -400,36 +398,6 @@ class Model(TimeSpan):
         arguments |= {**self.initial_state(stepper), **self._common(None, threads), "parameters": self.parameters}
         trajectory: Trajectory = stepper.integrate(**arguments, progress=progress)
         return trajectory
-
-    def integrate_in_double_double(self, *, progress: Callable[[int], None] | None = None) -> DoubleDoubleTrajectory:
-        """Integrate over the whole span in double-double arithmetic.
-
-        Raises:
-            ModelFileError: for adaptive steps, time transformations, controllers, inputs, and a shorter last step.
-            MethodError: for other systems and methods that this arithmetic does not have.
-        """
-        from scvi_codegen.compiler import compile_stepper
-
-        for what, given in (
-            ("an adaptive step size (give a fixed step, --step)", self.h is None),
-            (f"the time transformation {self.time_transformation or ''}", self.has_time_transformation),
-            (f"the controller {self.controller}", self.controller is not None),
-            (f"the input {', '.join(self.system.inputs)}", bool(self.system.inputs)),
-        ):
-            if given:
-                self._check_double(what)
-        if self.has_shorter_last_step:
-            self._check_double(f"the span {self.span:g}, which is not a whole number of steps of {self.step:g},")
-        model = self.with_known_sizes()
-        stepper: Any = compile_stepper(
-            model.system, model.method, solver=model.solver, events=model.events or None, precision="double-double"
-        )
-        arguments = {name: value for name, value in model._run_arguments().items() if value is not None}
-        arguments |= {"p": model.p, "velocity": model.velocity, "parameters": model.parameters}
-        result: DoubleDoubleTrajectory = stepper.integrate(
-            model.q, **arguments, options=model.solver_options, progress=progress
-        )
-        return result
 
     def _run_arguments(self) -> dict[str, Any]:
         """Return the arguments of :meth:`Stepper.integrate` and ensembles for time, steps, saved states and inputs."""

@@ -156,9 +156,7 @@ class RunOptions:
         choices=(SYMPLECTIC, *CONTROLLERS),
     )
     precision: str | None = run_option(
-        *("run", CHOICE, "", f"Arithmetic [double]; {DOUBLE_DOUBLE}: 31 digits, with fixed steps."),
-        choices=PRECISIONS,
-        common=False,
+        *("run", CHOICE, "", f"Arithmetic [double]; {DOUBLE_DOUBLE}: 31 digits."), choices=PRECISIONS, common=False
     )
     span: float | None = run_option("run", NUMBER, "T", "Duration of the run.", determines=DURATION)
     steps: int | None = run_option("run", COUNT, "N", "Number of steps, instead of --span.", determines=DURATION)

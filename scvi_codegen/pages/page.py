@@ -333,6 +333,7 @@ def _rates(model: Model) -> list[float]:
         return _flat(given)
     if other is None:
         return [0.0] * model.dimension
+    model._check_double("a page")
     stepper = model.stepper()
     if starts_from_momenta(model):
         return _flat(model.momenta(stepper))

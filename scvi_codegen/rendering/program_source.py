@@ -47,7 +47,6 @@ DECLARATIONS = {
     "stepper": "parts/declarations.h.jinja",
     "ensemble": "parts/ensemble_declarations.h.jinja",
     "events": "parts/events_declarations.h.jinja",
-    "double_double": "parts/double_double_declarations.h.jinja",
 }
 """Inner part of a header by the name of its template."""
 
@@ -184,8 +183,8 @@ def render_derivatives(derivatives: Derivatives) -> Source:
     return _render(program.prefix, context | {"derivatives": derivatives, "unrolled_equations": None})
 
 
-def render_double_double(program: Program, derivatives: PointDerivatives) -> Source:
-    """Return the source of a separable program in double-double arithmetic.
+def render_double_double(program: Program, derivatives: PointDerivatives, control: Control | None = None) -> Source:
+    """Return the source of a separable program in double-double arithmetic; control as of :func:`render`.
 
     Args:
         program: with a fixed-point iteration of separable systems, and without Newton's method.
@@ -203,17 +202,18 @@ def render_double_double(program: Program, derivatives: PointDerivatives) -> Sou
     quantities, lanes = program.quantities, (derivatives.partials, derivatives.products[0])
     states = (quantities.energy, *((quantities.momentum_kernel,) if quantities.momentum_kernel else ()))
     numbers, vectors = (mass, *states), fixed_point.kernels
-    context = {
-        **_context(program, DOUBLE, None),
+    context = _context(program, DOUBLE, control)
+    context |= {
         **_lane_context(program, lanes, changes=False),
-        "derivatives": derivatives,
-        "kernels_of_numbers": numbers,
-        "kernels_of_vectors": vectors,
-        "has_functions": uses_functions((*numbers, *vectors)),
-        "own_headers": arithmetic_headers(),
-        "hot": "static",
+        "two_words": {
+            "derivatives": derivatives.count,
+            "of_numbers": numbers,
+            "of_vectors": vectors,
+            "functions": uses_functions((*numbers, *vectors)),
+        },
+        "own_headers": {**arithmetic_headers(), **cast("Mapping[str, str]", context["own_headers"])},
     }
-    return _render(program.prefix, context, "double_double")
+    return _render(program.prefix, context)
 
 
 def render_embedded(program: Program, precision: Embedded, control: Control | None = None) -> Source:
@@ -232,7 +232,7 @@ def render_embedded(program: Program, precision: Embedded, control: Control | No
 def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") -> Source:
     """Return the source of entry templates from their context, with defaults for all of them."""
     common = {"prefix": prefix, "target": DOUBLE, "real": DOUBLE.scalar, "max_iterations": MAX_ITERATIONS}
-    environment, context = template_environment(), {**common, **context}
+    environment, context = template_environment(), {**common, "two_words": None, **context}
     header = entry if entry in DECLARATIONS else "stepper"
     code = environment.get_template(f"{entry}.c.jinja").render(context)
     headers = cast("Mapping[str, str]", context.get("own_headers", {}))

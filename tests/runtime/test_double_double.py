@@ -14,7 +14,7 @@ from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.native.compilers import REORDERING_FLAGS
 from scvi_codegen.rendering.kernels.double_double import FUNCTIONS, arithmetic_headers
-from scvi_codegen.runtime.trajectory.double_double import DoubleDoubleStepper, two_words
+from scvi_codegen.runtime.core.words import as_mpmath, two_words
 
 KEPLER = "m*(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2)"
 ROOTS = ("sqrt", "inverse_root_1", "inverse_root_3", "inverse_root_5", "inverse_root_7")
@@ -234,24 +234,73 @@ def test_refusals() -> None:
     with pytest.raises(MethodError, match="constant diagonal masses"):
         sc.compile_stepper(friction, "svi:4", precision="double-double")
     stepper = sc.compile_stepper(kepler, "svi:4", precision="double-double")
-    assert isinstance(stepper, DoubleDoubleStepper)
-    assert not stepper.supports("adaptive")
-    assert stepper.supports("momentum_maps")
+    assert stepper.supports("adaptive")
+    assert not stepper.supports("ensembles")
     start = {"velocity": [0.0, 1.0], "h": 0.1}
-    with pytest.raises(MethodError, match="adaptive steps are not available"):
-        stepper.integrate([1.0, 0.0], velocity=[0.0, 1.0], t_end=1.0)
-    with pytest.raises(MethodError, match="t_eval is not available"):
-        stepper.integrate([1.0, 0.0], **start, steps=3, t_eval=[0.1])
-    with pytest.raises(StateError, match=r"q must have 2 values \(x, y\), not 1"):
+    with pytest.raises(StateError, match=r"q must have shape \(2,\)"):
         stepper.integrate([1.0], **start, steps=3)
-    with pytest.raises(StateError, match="not a multiple of h"):
-        stepper.integrate([1.0, 0.0], **start, t_end=0.25)
-    with pytest.raises(StateError, match="no 'mass' in parameters"):
+    with pytest.raises(StateError, match="no parameter 'mass'"):
         stepper.integrate([1.0, 0.0], **start, steps=3, parameters={"mass": 1.0})
-    with pytest.raises(MethodError, match="integrate_ensemble is not available"):
-        _ = stepper.integrate_ensemble
-    with pytest.raises(StateError, match="no quantity 'z'"):
-        stepper.integrate([1.0, 0.0], **start, steps=1).mp("z")
+    for call, word in (
+        (lambda: stepper.integrate([1.0, 0.0], **start, steps=3, events="x"), "events="),
+        (lambda: stepper.integrate([1.0, 0.0], velocity=[0.0, 1.0], t_end=1.0, error=1e-9), "error="),
+        (lambda: stepper.integrate_ensemble([[1.0, 0.0]], [[0.0, 1.0]], h=0.1, steps=3), "integrate_ensemble"),
+        (lambda: stepper.integrate([1.0, 0.0], **start, steps=3).action(), "action"),
+        (lambda: stepper.discrete_lagrangian([1.0, 0.0], [1.0, 0.1], 0.1), "discrete_lagrangian"),
+    ):
+        with pytest.raises(MethodError, match=f"{word} is not available with precision='double-double'"):
+            call()
+    run = stepper.integrate([1.0, 0.0], **start, steps=1)
+    with pytest.raises(StateError, match="'z'"):
+        run.mp("z")
+    with pytest.raises(StateError, match=r"NAME\.npz"):
+        run.save("a.csv")
+
+
+def exact_orbit(t: object) -> list:
+    """Return the position at t > 0 on the ellipse of eccentricity 1/2 that starts at pericentre."""
+    half = mp.mpf(1) / 2
+    mean = mp.fmod(t, 2 * mp.pi)
+    angle = mp.findroot(lambda x: x - half * mp.sin(x) - mean, mean)
+    return [mp.cos(angle) - half, mp.sqrt(1 - half**2) * mp.sin(angle)]
+
+
+def test_runs() -> None:
+    """Adaptive steps, a shorter last step, output times, dense output and restarts have both words."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
+    with mp.workdps(50):
+        start = {"q": ["0.5", "0"], "velocity": ["0", mp.sqrt(3)]}
+
+        def error(q: object, t: float) -> float:
+            return float(max(abs(x - y) for x, y in zip(as_mpmath(q), exact_orbit(t), strict=True)))
+
+        adaptive = stepper.integrate(**start, t_end=7.0)
+        fixed = stepper.integrate(**start, h=0.07, t_end=6.01)
+        loose = stepper.integrate(**start, t_end=7.0, tolerance=1e-22)
+        assert max(error(adaptive.q[-1], 7.0), error(fixed.q[-1], 6.01), error(fixed.at(3.3)[0], 3.3)) < 1e-29
+        assert error(adaptive.at([1.1])[0][0], 1.1) < 1e-29
+        assert 1e-26 < error(loose.q[-1], 7.0) < 1e-20
+        assert len(loose) < len(adaptive)
+        for steps in ({"t_end": 7.0}, {"h": 0.07, "steps": 100}):
+            times = stepper.integrate(**start, **steps, t_eval=[0.1, 6.1])
+            assert max(error(times.q[0], 0.1), error(times.q[1], 6.1)) < 1e-29
+        run = stepper.start(**start, h=0.07)
+        run.advance(40)
+        copy = stepper.from_checkpoint(run.checkpoint())
+        part = copy.record(45)
+        assert np.array_equal(part.q_low, fixed.q_low[40:86])
+        assert np.array_equal(part.t_low, fixed.t_low[40:86])
+        part = adaptive[5:]
+        assert np.array_equal(part.q_low, adaptive.q_low[5:])
+        assert part.momentum_maps().low.any()
+        q1, p1 = stepper.step(fixed.q[3], fixed.p[3], 0.07)
+        assert max(abs(as_mpmath(q1) - as_mpmath(fixed.q[4]))) < 1e-31
+        assert fixed[3:5].mp("p").shape == (2, 2)
+        assert abs(p1 - fixed.p[4]).max() < 1e-31
+        double = sc.compile_stepper(system("kepler"), "svi:12").integrate(
+            [0.5, 0.0], velocity=[0.0, 3.0**0.5], h=0.07, steps=85
+        )
+        assert np.abs(fixed[:86].sensitivity().state - double.sensitivity().state).max() < 1e-9
 
 
 def test_associative_math_is_an_error(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """Command ``scvi-codegen run``: integrate a model or an ensemble, in memory or into a folder, and print a summary."""
 
-import time
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +22,12 @@ from scvi_codegen.cli.recording import RecordedOutcome, Recording, check_format,
 from scvi_codegen.cli.reports import known_account
 from scvi_codegen.cli.running import RunOutcome, integrate_model, known_at_end, summary
 from scvi_codegen.cli.step_selection import model_with_adaptive_steps, model_with_advised_step, model_with_global_error
-from scvi_codegen.cli.supervision import check_memory, progress_bar
 from scvi_codegen.files.export import FORMATS
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.ensemble_file import load_ensemble
 from scvi_codegen.models.options import IN_ENSEMBLE, OPTIONS, STEP_SIZE, WITH_INPUTS, check_available
 from scvi_codegen.pictures.animation import FILMS
 from scvi_codegen.pictures.canvas import PICTURES, check_plot_path
-from scvi_codegen.representation import counted
 from scvi_codegen.runtime.run.global_error import GlobalError
 
 ABOUT = """\
@@ -136,9 +133,9 @@ def run(
     _check_combination(choices, plot=plot, ensemble=ensemble, wanted=wanted, folder=output if recorded else None)
     model = read_model(model_name, choices)
     if model.in_double_double:
-        refused = {"--ensemble": ensemble, "--plot": plot, **{f"--{name}": value for name, value in wanted.items()}}
-        _run_in_double_double(model, output, refused)
-        return
+        model = _in_double_double(
+            model, {"--ensemble": ensemble, "-o": output, **{f"--{k}": wanted[k] for k in wanted}}
+        )
     if ensemble is not None:
         check_available(model, IN_ENSEMBLE)
     for option, needed in (
@@ -160,6 +157,14 @@ def run(
     else:
         _run_one(model, output, plot, advised=wanted["advise"])
     _check_confirmed(confirmation)
+
+
+def _in_double_double(model: Model, options: dict[str, Any]) -> Model:
+    """Return the model at known sizes; reject options that states of two words do not have."""
+    for flag, value in options.items():
+        if value is not None and flag != "--tolerance" and not (flag == "-o" and Path(value).suffix.lower() == ".npz"):
+            model._check_double(f"{flag} {value}{' (write a file NAME.npz)' * (flag == '-o')}")
+    return model.with_known_sizes()
 
 
 def _check_confirmed(confirmation: GlobalError | None) -> None:
@@ -237,43 +242,6 @@ def _run_one(model: Model, output: str | None, plot: str | None, *, advised: flo
     tell(missed=missed or None)
     if missed:
         raise CommandFailure(missed, FAILURE)
-
-
-def _run_in_double_double(model: Model, output: str | None, refused: dict[str, Any]) -> None:
-    """Integrate with states of two words and print the final state with all its digits; reject other options."""
-    for flag, value in refused.items():
-        if value is not None:
-            model._check_double(f"{flag} {value}")
-    if output is not None and Path(output).suffix.lower() != ".npz":
-        raise click.UsageError(f"-o {output} is not available with --precision double-double: give a file NAME.npz")
-    check_memory(model)
-    began = time.perf_counter()
-    with progress_bar(model.step_count if model.h is not None else 0) as show:
-        result = model.integrate_in_double_double(progress=show)
-    seconds = time.perf_counter() - began
-    names, error = result.stepper.coordinates, result.energy_error()
-    columns = result.stepper.interface.momentum_columns
-    q, p = result.final_texts()
-    lines = [
-        f"{model.system.name}\n{model.method.title}; precision double-double",
-        f"{counted(model.step_count, 'step')} of {result.h:g} from t = {model.t:g} to t = {result.t[-1]:g}; "
-        f"{counted(len(result), 'state')} saved; {seconds:.3g} s with compilation",
-        f"energy: largest change {error:.1e} (relative)\nfinal state",
-        *(f"  {a} = {x:40} {b} = {y}" for a, x, b, y in zip(names, q, columns, p, strict=True)),
-    ]
-    last = {name: dict(zip(names, getattr(result, name)[-1], strict=True)) for name in ("q", "q_low", "p", "p_low")}
-    numbers: dict[str, Any] = {
-        "steps": model.step_count,
-        "states": len(result),
-        "seconds": seconds,
-        "energy_error": error,
-    }
-    final = {"t": result.t[-1], "t_low": result.t_low[-1], **last}
-    numbers |= {"system": model.system.name, "method": model.method.name, "run": model._run_section()}
-    tell("\n".join(lines), **numbers, final=final)
-    if output is not None:
-        result.save(output)
-        tell(f"wrote {output}", written=[output])
 
 
 def _finish_recording(outcome: RecordedOutcome) -> None:

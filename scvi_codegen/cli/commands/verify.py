@@ -58,6 +58,7 @@ def _verified(name: str, choices: Choices) -> Certificate:
         model = read_model(name, choices)
         if model.array_system is not None and (model.h is None or model.array_system.constraints):
             model = with_known_sizes(model, "verify (adaptive steps, constraints)")
+        model._check_double("a certificate")
         return _certificate(model, model.stepper())
     if choices["solver"] != "auto" or any(choices[choice] is not None for choice in METHOD_KEYS):
         raise click.UsageError(f"'{name}' is a generated folder: its method and solver are those it was generated with")

@@ -11,7 +11,8 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.indices import Array, Loop, Place
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.rendering.source import ArrayLayout, Interface
-from scvi_codegen.runtime.core.validation import NamedState, check_named
+from scvi_codegen.runtime.core.validation import check_named
+from scvi_codegen.runtime.core.words import NamedState
 
 Numbers = NDArray[np.float64]
 IndexTable = NDArray[np.int32]

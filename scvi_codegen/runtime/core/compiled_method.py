@@ -20,7 +20,8 @@ from scvi_codegen.runtime.arrays.any_size import check_few_coordinates
 from scvi_codegen.runtime.arrays.binding import ArrayBinding
 from scvi_codegen.runtime.arrays.interface import RunSizes
 from scvi_codegen.runtime.core.features import Support, check_features, require
-from scvi_codegen.runtime.core.validation import Array, named, shapes_of
+from scvi_codegen.runtime.core.validation import Array, shapes_of
+from scvi_codegen.runtime.core.words import named
 from scvi_codegen.runtime.events.array_events import EventBinding
 from scvi_codegen.runtime.events.event import Event, EventLike, as_events
 
@@ -394,6 +395,8 @@ class CompiledMethod(ChosenBySizes):
         wanted = as_events(events)
         if wanted == self.events:
             return self
+        if wanted and self.interface.words > 1:
+            require(self, "events")
         if wanted not in self._event_variants:
             while len(self._event_variants) >= MOST_EVENT_SETS:
                 self._event_variants.pop(next(iter(self._event_variants)), None)

@@ -62,6 +62,7 @@ PROPERTIES: dict[str, Callable[[Any], bool]] = {
     "without a mesh": lambda stepper: stepper.interface.layout.mesh is None,
     "with sizes known when compiled": lambda stepper: not stepper.run_time_sizes,
     "with sizes known at run time": lambda stepper: stepper.run_time_sizes,
+    "with precision='double-double'": lambda stepper: stepper.interface.words > 1,
     "without derivatives": lambda stepper: stepper._lacks("derivatives"),
     "without second derivatives": lambda stepper: stepper._lacks("second_derivatives"),
     "without an error estimate": lambda stepper: not (stepper._has_error_estimate or stepper._has_tau),
@@ -83,6 +84,10 @@ _FIRST = "jacobian tangent pullback sensitivity"
 _DERIVATIVES = f"{_FIRST} chaos chaos_ensemble periodic_orbit fit flow"
 _CURVE = "SVI, SCVI or a Gauss method"
 _ACTIONS = "action shadow_energy path"
+_IN_DOUBLE = (
+    "error check_growth events inputs ensembles project multipliers work discrete_lagrangian chaos_ensemble "
+    f"periodic_orbit energy fit flow advice {_ACTIONS}"
+)
 _ORIGINAL = "compile the original system, with fixed steps h, or with time_transformation=... or t_end=..."
 FEATURES = {
     (operation, property_): remedy
@@ -92,6 +97,7 @@ FEATURES = {
             "ensembles chaos_ensemble periodic_orbit fit flow",
             "this requires fixed steps h; compile the stepper without time_transformation",
         ),
+        ("with precision='double-double'", _IN_DOUBLE, "omit it, or use precision='double'"),
         ("with a time transformation", "check_growth", "it requires adaptive steps; omit it"),
         ("in transformed time", "check_growth", "it requires adaptive steps; omit it"),
         ("with a time transformation", "adaptive", "give h (constant step in tau) and t_end, and no tolerance"),

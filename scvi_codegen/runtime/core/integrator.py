@@ -10,6 +10,7 @@ from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, step_failure
 from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.validation import Array, Parameters, States, check_inputs_given
+from scvi_codegen.runtime.core.words import block_of
 from scvi_codegen.runtime.rotations.states import checked_pair
 from scvi_codegen.runtime.sensitivity.step_derivatives import LinearisedMethod
 
@@ -46,10 +47,10 @@ class Integrator(LinearisedMethod):
         """
         q0, p0 = checked_pair(self.interface, q, p)
         check_inputs_given(self.interface, parameters)
-        q1, p1 = np.empty_like(q0), np.empty_like(p0)
-        arrays = (q0, p0, self._parameters_at(q0, p0, parameters))
+        arrays = [*map(block_of, (q0, p0, self._parameters_at(q0, p0, parameters)))]
+        q1, p1 = np.empty_like(arrays[0]), np.empty_like(arrays[1])
         self._solve(self.binding, "step", t, h, arrays, options, (q1, p1))
-        return self.named(q1), self.named(p1)
+        return self.named(self._numbers(q1)), self.named(self._numbers(p1))
 
     def _solve(
         self,

@@ -18,12 +18,12 @@ from scvi_codegen.runtime.core.validation import (
     Array,
     Parameters,
     States,
-    by_name,
     checked_parameters,
     checked_vector,
     coordinate_shapes,
     parameter_index,
 )
+from scvi_codegen.runtime.core.words import block_of, by_name, from_block
 from scvi_codegen.runtime.rotations.states import checked_pair, checked_states, is_one_state
 
 REPORTED = 1e-3
@@ -123,7 +123,9 @@ class StateFunctions(CompiledMethod):
         """Return the energy p.v - L: a float for (m,) states, (n,) for (n, m) with one time or (n,) times."""
         times, positions, momenta = checked_states(self.interface, q, p, t)
         result = self._energies_of(times, positions, momenta, self._parameters(parameters))
-        return float(result[0]) if is_one_state(self.interface, q) else result
+        if not is_one_state(self.interface, q):
+            return result
+        return float(result[0]) if self.interface.words == 1 else result.reshape(())
 
     def _energy_parts(self, q: Array, p: Array, t: Array, parameters: Array) -> Array:
         """Return (n, 3) kinetic, potential and total energies of (n, m) states; parts of run-time sizes, else NaN."""
@@ -142,12 +144,15 @@ class StateFunctions(CompiledMethod):
         Raises:
             StateError: if a state is outside the domain of L.
         """
-        result, binding = np.empty(len(t)), self.binding
-        at, positions, momenta, energies = binding.pointers(t, q, p, result)
-        values, workspace = binding.pointer(parameters), binding.workspace()
+        result, binding = np.empty(len(t) * self.interface.words), self.binding
+        arrays = t if self.interface.words == 1 else block_of(t[:, None]), *map(block_of, (q, p)), result
+        at, positions, momenta, energies = binding.pointers(*arrays)
+        values, workspace = binding.pointer(block_of(parameters)), binding.workspace()
         status = binding.function("energies")(len(t), at, positions, momenta, values, energies, workspace)
         if status:
             raise StateError(f"the energy of a state cannot be computed: {REASONS[status]}")
+        if self.interface.words > 1:
+            result = from_block(result.reshape(-1, 2))[:, 0]
         if name := self.interface.energy_parameter:
             result = parameters[parameter_index(self.interface, name)] + result / self.rates(q, p, parameters)
         return result
@@ -169,15 +174,17 @@ class StateFunctions(CompiledMethod):
     ) -> tuple[Array, Array]:
         """Return (n, k) momentum maps and the root sum of squares of their terms, the scale of rounding errors."""
         times, positions, momenta = checked_states(self.interface, q, p, t)
-        values, sizes = np.empty((2, len(times), len(self.momentum_map_names)))
+        sizes = np.empty((len(times), len(self.momentum_map_names)))
+        values = np.empty((len(times), sizes.shape[1] * self.interface.words))
         if not values.size:
             return values, sizes
-        arrays = times, positions, momenta, self._parameters(parameters), values, sizes
+        times = times if self.interface.words == 1 else times[:, None]
+        arrays = *map(block_of, (times, positions, momenta, self._parameters(parameters))), values, sizes
         sizes_of = () if self.problem is None else (self.binding.workspace(),)
         status = self.binding.function("momentum_maps")(len(times), *map(self.binding.pointer, arrays), *sizes_of)
         if status:
             raise StateError(f"the momentum maps of a state cannot be computed: {REASONS[status]}")
-        return values, sizes
+        return self._numbers(values), sizes
 
     def _transform(
         self, name: str, q: States, other: States, t: ArrayLike, parameters: Parameters, label: str
@@ -186,7 +193,7 @@ class StateFunctions(CompiledMethod):
             at, values = checked_number(t, "the time t"), self._parameters(parameters)
             return self._transformed(name, at, *checked_pair(self.interface, q, other, label), values)
         times, positions, others = checked_states(self.interface, q, other, t, second=label)
-        values, result = self._parameters(parameters), np.empty_like(others)
+        values, result = self._parameters(parameters), others.copy()
         for k, (at, position, row) in enumerate(zip(times.tolist(), positions, others, strict=True)):
             result[k] = self._transformed(name, at, position, row, values)
         return result
@@ -208,13 +215,17 @@ class StateFunctions(CompiledMethod):
         if self.interface.layout.momenta:
             other_form = "give momenta p instead of velocity" if name == "momentum" else "use the momenta p"
             raise StateError(f"velocities are unavailable for a system defined by a Hamiltonian: {other_form}")
-        result = np.empty_like(other)
-        pointers = map(self.binding.pointer, (q, other, values, result))
+        result = np.empty(len(other) * self.interface.words)
+        pointers = map(self.binding.pointer, (*map(block_of, (q, other, values)), result))
         status = self.binding.function(name)(t, *pointers, self.binding.workspace())
         if status:
             hint = "; if the Hamiltonian is singular in p, give p instead of velocity" if name == "momentum" else ""
             raise StateError(f"the {name} at q = {q} and {other} cannot be computed: {REASONS[status]}{hint}")
-        return result
+        return self._numbers(result)
+
+    def _numbers(self, block: Array) -> Array:
+        """Return the numbers of an array of C, whose low words follow the high words in double-double arithmetic."""
+        return block if self.interface.words == 1 else from_block(block)
 
     def arrays(self, values: Array) -> dict[str, Array]:
         """Return (.., m) positions, momenta or velocities by the names of coordinates and of arrays of known sizes.

@@ -3,9 +3,10 @@
 import difflib
 import math
 import re
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, KeysView, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,56 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.rendering.source import NAME_IN_FORMULA, NUMBER, Interface
+from scvi_codegen.runtime.core.words import Shapes, low_words, split, with_low
 
 Array = NDArray[np.float64]
-Shapes = Sequence[tuple[str, tuple[int, ...]]]
-Key = TypeVar("Key", bound=Hashable)
-
-
-class NamedState(np.ndarray[Any, Any]):
-    """Numbers (.., m) of states with arrays of coordinates, also by name: ``q["u"]`` has the shape (.., *shape of u).
-
-    Slices of states have names as well; results of arithmetic are ordinary arrays.
-    """
-
-    shapes: Shapes | None = None
-
-    def __array_finalize__(self, other: Any) -> None:
-        self.shapes = getattr(other, "shapes", None)
-
-    def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False) -> Any:
-        plain = np.asarray(array)
-        return plain if plain.ndim else plain[()]
-
-    def __getitem__(self, key: Any) -> Any:
-        if not isinstance(key, str):
-            return super().__getitem__(key)
-        arrays = by_name(np.asarray(self), self.shapes or ())
-        if key not in arrays:
-            raise KeyError(f"there is no array '{key}' among {', '.join(arrays) or 'no names'}")
-        return arrays[key]
-
-    def keys(self) -> KeysView[str]:
-        """Return the names of the arrays."""
-        return dict(self.shapes or ()).keys()
-
-    def values(self) -> list[Array]:
-        """Return the arrays in order."""
-        return list(by_name(np.asarray(self), self.shapes or ()).values())
-
-    def items(self) -> list[tuple[str, Array]]:
-        """Return the names and the arrays in order."""
-        return list(by_name(np.asarray(self), self.shapes or ()).items())
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return named, (np.asarray(self), self.shapes)
-
-
-def named(values: Array, shapes: Shapes | None) -> Array:
-    """Return states that have the arrays of these names and shapes; shares memory."""
-    state = values.view(NamedState)
-    state.shapes = shapes
-    return state
 
 
 class EntryNames(Sequence[str]):
@@ -121,15 +75,6 @@ def flat_state(interface: Interface, value: Any, name: str) -> Any:
     array = real_array(value, name)
     whole = array.shape[-len(shape) :] == shape
     return array.reshape(*array.shape[: -len(shape)], -1) if whole and array.ndim != 1 else value
-
-
-def by_name(values: Array, shapes: Iterable[tuple[Key, tuple[int, ...]]]) -> dict[Key, Array]:
-    """Return (.., m) numbers as arrays of these names and shapes; shares memory."""
-    arrays, first = {}, 0
-    for name, shape in shapes:
-        end = first + math.prod(shape)
-        arrays[name], first = values[..., first:end].reshape((*values.shape[:-1], *shape)), end
-    return arrays
 
 
 def shapes_of(interface: Interface) -> Shapes | None:
@@ -208,6 +153,11 @@ def _short_vector(value: Any, count: int) -> Array | None:
 
 def checked_vector(interface: Interface, value: States, name: str) -> Array:
     """Return a finite, contiguous (m,) copy; for one coordinate a number suffices."""
+    if interface.precision:
+        value, low = split(value, name)
+        high = checked_vector(replace(interface, precision=""), value, name)
+        words: Array = with_low(high, np.asarray(flat_state(interface, low, name), dtype=float).reshape(high.shape))
+        return words
     if (vector := _short_vector(value, len(interface.coordinates))) is not None:
         return vector
     array, coordinates = real_array(flat_state(interface, value, name), name), interface.coordinates
@@ -224,6 +174,13 @@ def checked_vector(interface: Interface, value: States, name: str) -> Array:
 
 def checked_parameters(interface: Interface, parameters: Parameters, base: Array | None = None) -> Array:
     """Return the (k,) parameter values in order; by default those of ``base``, or the defaults."""
+    if interface.precision:
+        parameters, low = split(parameters, "parameters")
+        doubles = replace(interface, precision="")
+        high = checked_parameters(doubles, parameters, base if base is None else np.asarray(base))
+        before = np.zeros(high.shape) if base is None else low_words(base)
+        words: Array = with_low(high, checked_parameters(replace(doubles, lengths=()), low, before))
+        return words
     names, values = interface.parameters, np.array(interface.defaults if base is None else base, dtype=float)
     if isinstance(parameters, Mapping):
         for name, where, value in parameter_columns(interface, parameters):

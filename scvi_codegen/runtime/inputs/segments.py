@@ -249,6 +249,8 @@ def prepared_segments(
     if run.plan.fixed:
         for segment in planned_segments(run.t, t_end, run.h, inputs):
             run.update(parameters=values(segment.middle), h=segment.h)
+            if run.stepper.interface.words > 1 and segment.end is not None:
+                run._step_to(segment.end)
             yield segment.steps
         return
     for end in breakpoints_until(run.t, t_end, inputs):
@@ -262,12 +264,14 @@ class Segment(NamedTuple):
     Attributes:
         start: start time as a double-double number.
         middle: a time inside the piece.
+        end: time at which a shorter step ends.
     """
 
     steps: int
     h: float
     start: tuple[float, float]
     middle: float
+    end: float | None = None
 
 
 def planned_segments(t: float, t_end: float, h: float, inputs: Mapping[str, Input]) -> list[Segment]:
@@ -281,7 +285,7 @@ def planned_segments(t: float, t_end: float, h: float, inputs: Mapping[str, Inpu
             now = time_after_steps(now, h, whole)
         rest = (end - now[0]) - now[1]
         if forward * rest > negligible:
-            segments.append(Segment(1, rest, now, middle))
+            segments.append(Segment(1, rest, now, middle, end))
             now = time_after_steps(now, rest, 1)
     return segments
 
@@ -300,9 +304,9 @@ def with_final_state(piece: Trajectory, run: Run) -> Trajectory:
     iterations, run.iterations = run.iterations, 0
     return replace(
         piece,
-        t=np.append(piece.t, run.t),
-        q=np.append(piece.q, [run.q], axis=0),
-        p=np.append(piece.p, [run.p], axis=0),
+        t=np.concatenate([piece.t, run._times]),
+        q=np.concatenate([piece.q, run.q[None]]),
+        p=np.concatenate([piece.p, run.p[None]]),
         iterations=np.append(piece.iterations, np.int32(iterations)),
         step_sizes=np.append(piece.step_sizes, run.h),
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.rendering.source import COMPONENTS, Interface
-from scvi_codegen.runtime.core.validation import Array, Shapes, States, checked_vector, flat_state, shapes_of
+from scvi_codegen.runtime.core.validation import Array, States, checked_vector, flat_state, shapes_of
+from scvi_codegen.runtime.core.words import Shapes, split, with_low
 from scvi_codegen.runtime.rotations.attitudes import (
     matrices,
     momenta_of_body,
@@ -99,6 +100,12 @@ def checked_states(
     interface: Interface, q: States, p: States, t: ArrayLike, *, second: str = "p"
 ) -> tuple[Array, Array, Array]:
     """Return (n,) times and contiguous (n, m) positions and momenta (or what ``second`` names) of one or n states."""
+    if interface.precision:
+        words = [split(each, name) for each, name in ((q, "q"), (p, second), (t, "the time t"))]
+        doubles = replace(interface, precision="")
+        high, low = (checked_states(doubles, *each, second=second) for each in zip(*words, strict=True))
+        times, positions, momenta = map(with_low, high, low)
+        return times, positions, momenta
     q, p = flat = flat_states(interface, q, p, second)
     positions, momenta = (real_array(each, name) for each, name in zip(flat, ("q", second), strict=True))
     if positions.ndim <= 1:
@@ -119,6 +126,8 @@ def checked_states(
 
 def is_one_state(interface: Interface, q: States) -> bool:
     """Return whether these are the positions of one state, not of several."""
+    if interface.precision:
+        q = split(q, "q")[0]
     plain = not isinstance(q, Mapping) and real_array(q, "q").ndim == 1
     return plain or real_array(flat_states(interface, q, None, "p")[0], "q").ndim == 1
 

@@ -21,7 +21,8 @@ from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, wa
 from scvi_codegen.runtime.constraints.projection import projected
 from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.core.validation import Array, by_name, coordinate_shapes
+from scvi_codegen.runtime.core.validation import Array, coordinate_shapes
+from scvi_codegen.runtime.core.words import by_name
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
@@ -289,7 +290,7 @@ def warn_of_error_growth(
     plan = run._plan
     if plan.h or plan.tau or requested is False or len(states.t) < 2 or not _warnings_enabled.get():
         return
-    if run.stepper.changes_states:
+    if run.stepper.changes_states or run.stepper.interface.words > 1:
         return
     measured = run._growth
     if measured is not None and not requested:
@@ -316,7 +317,8 @@ def measured_growth(stepper: Integrator, plan: StepPlan, requested: bool | None)
                 "check_growth=True requires adaptive steps, but the step size is fixed: give t_end without h, or omit "
                 "check_growth"
             )
-    if requested is not None or not plan.adaptive or stepper.changes_states or not _warnings_enabled.get():
+    double = stepper.interface.words == 1 and not stepper.changes_states
+    if requested is not None or not plan.adaptive or not double or not _warnings_enabled.get():
         return 0
     return 1 + (plan.tolerance > ROUNDOFF) + (plan.tolerance > LOOSE_TOLERANCE)
 

@@ -8,6 +8,7 @@ import math
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from fractions import Fraction
 from typing import Any, Self, TypeVar, cast
 
 import numpy as np
@@ -27,6 +28,7 @@ from scvi_codegen.runtime.core.validation import (
     no_input,
     parameter_index,
 )
+from scvi_codegen.runtime.core.words import block_of, with_low
 from scvi_codegen.runtime.rotations.states import checked_pair
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.saving import checkpoint
@@ -99,8 +101,13 @@ class Memory:
         self.stepper, binding = stepper, stepper.binding
         self._memory = memory = binding.new("run *")
         self._q, self._p = map(binding.vector, (memory.q, memory.p))
-        self._parameters = stepper.defaults
-        self._arguments = binding.pointer(self._parameters), binding.null
+        values = self._parameters = stepper.defaults
+        if stepper.interface.words > 1:
+            carries = map(binding.vector, (memory.carry_q, memory.carry_p))
+            self._q, self._p = (with_low(high, low) for high, low in zip((self._q, self._p), carries, strict=True))
+            values = np.concatenate([values, np.zeros(len(values))])
+            self._parameters = stepper._numbers(values)
+        self._arguments = binding.pointer(values), binding.null
         self._options: SolverOptions | None = None
         self._has_defaults = False  # whether no parameter differs from its default
         self._watch: Any = None  # state of the search for events in C
@@ -109,7 +116,8 @@ class Memory:
         self._has_tau = stepper.in_tau  # whether steps are steps of tau
         self._report, self._workspace = binding.new("report *"), binding.workspace(memory)
         self._calls: tuple[Any, ...] = ()
-        self._discarded = *(binding.numbers(f"double[{stepper.dimension}]"),) * 3, binding.numbers("int *")
+        width = max(2, stepper.dimension * stepper.interface.words)
+        self._discarded = *(binding.numbers(f"double[{width}]"),) * 3, binding.numbers("int *")
         self._call = self._new_call(*self._discarded)
         self._take = binding.call("advance", self._call)  # function of numbers of steps and of those between states
         self._untimed = len(self._q) <= MOST_UNTIMED  # whether ``advance`` takes steps without looking at the clock
@@ -125,7 +133,9 @@ class Memory:
         call = self.stepper.binding.new("call *")
         call.run, (call.parameters, call.options) = self._memory, self._arguments
         call.t, call.q, call.p, call.iterations = t, q, p, iterations
-        call.report, call.workspace, call.coordinates = self._report, self._workspace, len(self._q)
+        call.report, call.workspace = self._report, self._workspace
+        call.words = self.stepper.interface.words
+        call.coordinates = call.words * len(self._q)
         self._calls = *self._calls, call
         return call
 
@@ -152,7 +162,7 @@ class Memory:
 
     def _begin(self, q: States, p: States, t: float, growth: int = 0) -> None:
         """Start at (q, p) and t after :meth:`_set_up`; ``growth``: value of ``measures_growth`` in C."""
-        q, p = checked_pair(self.stepper.interface, q, p)
+        q, p = map(block_of, checked_pair(self.stepper.interface, q, p))
         self._start_function(t, self._plan.h, *self.stepper.binding.pointers(q, p))
         if growth and self._can_measure_growth:
             self._memory.measures_growth = growth
@@ -248,6 +258,18 @@ class Memory:
         """Time, the rounded compensated sum of all steps."""
         return _time(self._memory)
 
+    @property
+    def _times(self) -> Array:
+        """(1,) time, with its low word in double-double arithmetic."""
+        high = np.array([self.t])
+        return high if self.stepper.interface.words == 1 else with_low(high, np.array([self._memory.t_low]))
+
+    def _step_to(self, end: float) -> None:
+        """Let the next step, in double-double arithmetic, end at a time: its size has two words as well."""
+        exact = Fraction(end) - Fraction(self.t) - Fraction(self._memory.t_low)
+        self._memory.h = float(exact)
+        self._memory.h_low = float(exact - Fraction(self._memory.h))
+
     def left_to(self, end: float) -> float:
         """Return the time left to ``end``, computed with the low word of the run's time."""
         return (end - self.t) - float(getattr(self._memory, "t_low", 0.0))
@@ -270,6 +292,8 @@ class Memory:
         if h is not None and checked_step(h) != self._memory.h:
             self.plan = StepPlan(h=checked_step(h))
             self._memory.h, self._memory.guess = self.plan.h, 0
+            if self.stepper.interface.words > 1:
+                self._memory.h_low = 0.0
         if plan is not None:
             self.plan = plan
 
@@ -419,7 +443,7 @@ class Memory:
 
     def _fill(self, steps: int, q: Array, p: Array) -> Array:
         """Take steps in one C call, copy the states after each to the rows of q and p, and return their times."""
-        t, pointer = np.empty(steps), self.stepper.binding.pointer
+        t, pointer = np.empty(steps), self.stepper.binding.pointer  # of doubles
         arrays = (pointer(t), pointer(q), pointer(p), pointer(np.empty(steps, dtype=np.int32)))
         if status := self._advance(steps, 1, arrays):
             raise self._failure(status)
@@ -485,6 +509,12 @@ class Memory:
         """Return the energies of the first and the last state of a run so far; ``None`` outside the domain of L."""
         if self._ends is not None:
             return self._ends
+        if self.stepper.interface.words > 1:
+            try:
+                energies = self.stepper._energies_of(t[[0, -1]], q[[0, -1]], p[[0, -1]], self._parameters)
+            except StateError:
+                return None
+            return float(energies[0]), float(energies[1])
         binding, values = self.stepper.binding, []
         (start, positions, momenta), m = binding.pointers(t, q, p), len(self._q)
         function, energy = binding.function("energies"), binding.numbers("double *")

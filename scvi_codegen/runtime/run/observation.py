@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import EventError, StepFailedError
+from scvi_codegen.runtime.core.words import Words
 from scvi_codegen.runtime.events.detection import CrossingSearch
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.memory import Memory
@@ -22,6 +23,7 @@ from scvi_codegen.runtime.run.run_loop import record, trajectory_of
 from scvi_codegen.runtime.run.singular_time import ProgressWatch
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.run.times import WHOLE
+from scvi_codegen.runtime.trajectory.dense_output import stepped_to
 from scvi_codegen.runtime.trajectory.time_transformation import part_of_step
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import checked_count
@@ -158,7 +160,10 @@ class Observation:
         self.partial_steps = int(abs(lengths[-1]) > WHOLE * abs(self.run.h))
         if tau is None and lengths[-1] != 0.0:
             run = self.run
-            q, p = run.stepper.step(q, p, lengths[-1], run.t, run.parameters, options=run.options)
+            if isinstance(q, Words):
+                q, p = stepped_to(run, q, p, run._times, self.end)
+            else:
+                q, p = run.stepper.step(q, p, lengths[-1], run.t, run.parameters, options=run.options)
         return self._with_state(part, lengths, self.end, q, p, tau)
 
     def _state_within_step(self, part: Trajectory, t: float) -> tuple[Array, Array, float | None]:
@@ -178,8 +183,8 @@ class Observation:
         """Return a chunk with one more state within a step appended."""
         made = self._made(
             np.append(part.t, t),
-            np.concatenate([part.q, [q]]),
-            np.concatenate([part.p, [p]]),
+            np.concatenate([part.q, q[None]]),
+            np.concatenate([part.p, p[None]]),
             np.append(part.iterations, np.int32(0)),
             np.append(lengths, np.nan),
             np.append(part.stepped, t if tau is None else tau),

@@ -163,7 +163,7 @@ class Observed(Saver):
         observed: Any = self.observed
         if isinstance(self.observer, Observer):
             observed = real_array(self.observer.result(), "the result of observe")
-        q, p = (np.array(each) for each in zip(*self.ends, strict=True))
+        q, p = (np.concatenate([end[None] for end in each]) for each in zip(*self.ends, strict=True))
         return {"q": q, "p": p, "observed": np.array(observed), "conserved": np.array(self.conserved)}
 
 

@@ -45,7 +45,8 @@ class Run(Memory, AttitudeHistory):
         except IndexError:
             run, binding = cls(stepper), stepper.binding
             size = binding._workspace + FIRST_STEPS * len(run._q)
-            if binding.reusable and not run._sums_action and size <= MOST_KEPT:
+            is_plain = binding.reusable and not run._sums_action and stepper.interface.words == 1
+            if is_plain and size <= MOST_KEPT:
                 run._rows = ShortRuns(run)
         return run
 

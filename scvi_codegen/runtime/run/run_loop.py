@@ -14,6 +14,7 @@ import numpy as np
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.native.arguments import empty_array
 from scvi_codegen.runtime.core.validation import BINARY64, FEW, NUMBERS, SEQUENCES, Array
+from scvi_codegen.runtime.core.words import block_of, from_block
 from scvi_codegen.runtime.events.event import Crossings
 from scvi_codegen.runtime.rotations.states import checked_pair
 from scvi_codegen.runtime.run.chunks import drive
@@ -87,8 +88,10 @@ class StateRows:
     """
 
     def __init__(self, memory: Memory, rows: int) -> None:
-        m, binding = len(memory._q), memory.stepper.binding
-        t, q, p = empty_array((rows,)), empty_array((rows, m)), empty_array((rows, m))
+        binding, self.words = memory.stepper.binding, memory.stepper.interface.words
+        m = self.words * len(memory._q)
+        t = empty_array((rows,) if self.words == 1 else (rows, self.words))
+        q, p = empty_array((rows, m)), empty_array((rows, m))
         actions = (np.zeros(rows),) if memory._sums_action else ()
         self.states: States = t, q, p, np.zeros(rows, INT32), *actions
         self.starts = *binding.pointers(t, q, p), binding.integers(self.states[3]), *binding.pointers(*actions)
@@ -96,11 +99,12 @@ class StateRows:
     def after(self, row: int) -> tuple[Any, ...]:
         """Return pointers to a row."""
         (t, q, p, *others), begin = self.starts, row * self.states[1].shape[1]
-        return t + row, q + begin, p + begin, *(each + row for each in others)
+        return t + self.words * row, q + begin, p + begin, *(each + row for each in others)
 
     def first(self, count: int) -> States:
-        """Return the first rows, in the same memory."""
-        return tuple(each[:count] for each in self.states)
+        """Return the first rows, in the same memory; copies of numbers of two words."""
+        t, q, p, *others = (each[:count] for each in self.states)
+        return (t, q, p, *others) if self.words == 1 else (*_numbers(t, q, p), *others)
 
     def copies(self, count: int) -> States:
         """Return copies of the first rows."""
@@ -156,6 +160,11 @@ class ShortRuns(StateRows):
         return (t.copy(), q.copy(), p.copy(), iterations.copy()), sizes
 
 
+def _numbers(t: Array, q: Array, p: Array) -> tuple[Array, Array, Array]:
+    """Return times (n, 2) and states (n, 2m) of two words as numbers, contiguous copies."""
+    return from_block(t)[:, 0].copy(), from_block(q).copy(), from_block(p).copy()
+
+
 def integrate_short(
     run: Memory, q: Any, p: Any, t: float, steps: int | None, save_every: int, growth: int
 ) -> Trajectory:
@@ -198,7 +207,8 @@ class _StateRecorder:
         self.rows = kept if kept is not None and rows <= len(kept.states[0]) else StateRows(memory, rows)
         if not filled:
             t, q, p, _, *actions = self.rows.states
-            t[0], q[0], p[0] = memory.t, memory._q, memory._p
+            t[0] = memory.t if self.rows.words == 1 else (memory.t, memory._memory.t_low)
+            q[0], p[0] = map(block_of, (memory._q, memory._p))
             for each in actions:
                 each[0] = memory._memory.action
         self.earlier: list[States] = []
@@ -232,7 +242,7 @@ class _StateRecorder:
         capacity = len(rows.states[0])
         if rows is self.memory._rows or 2 * count <= capacity:
             return rows.copies(count)
-        return rows.states if count == capacity else rows.first(count)
+        return rows.states if count == capacity and rows.words == 1 else rows.first(count)
 
     def trajectory(self) -> Trajectory:
         """Return the states saved so far."""

@@ -21,6 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import step_failure
+from scvi_codegen.runtime.core.words import Words, low_words
+from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.saved_states import ROUNDINGS, SavedStates
 from scvi_codegen.runtime.trajectory.time_transformation import states_in_transformed_time
@@ -62,8 +64,12 @@ def states_and_steps_at(states: SavedStates, times: Array) -> tuple[Array, Array
                 saved = int(left[k])
                 run = states._restarted(saved, float(states.step_sizes[saved]))
             run.advance(int(whole[k]) - run.steps)
-            t[k], q[k], p[k] = run.t, run.q, run.p
-    _take_partial_steps(states, t, times - t, q, p)
+            t[k : k + 1], q[k], p[k] = run._times, run.q, run.p
+    if isinstance(q, Words):
+        for k in np.flatnonzero(t - times):
+            q[k], p[k] = stepped_to(states, q[k], p[k], t[k : k + 1], times[k])
+    else:
+        _take_partial_steps(states, t, times - t, q, p)
     return q, p, times
 
 
@@ -79,6 +85,7 @@ def _integrate_to_each(
         to_last = replace(plan, t_end=float(times[rows[-1]]))
         settings = {"t": states.t[left[rows[0]]], "parameters": states.parameters, "options": states.options}
         run = stepper._run(q[rows[0]], p[rows[0]], plan=to_last, **settings)
+        run._memory.t_low = low_words(states.t)[left[rows[0]]]
         reached = run._recorded(None, times=times[rows])
         q[rows], p[rows] = reached.q, reached.p
     return q, p
@@ -106,6 +113,16 @@ def _take_partial_steps(states: SavedStates, t: Array, h: Array, q: Array, p: Ar
             raise step_failure(status, report, step=0, h=length, failures=binding.failures)
         iterations += report.iterations
     return iterations
+
+
+def stepped_to(states: SavedStates | Memory, q: Array, p: Array, t: Array, end: float) -> tuple[Array, Array]:
+    """Return the state after one step from (1,) time t of two words to ``end``, whose size has two words as well."""
+    settings: dict[str, Any] = {"parameters": states.parameters, "options": states.options}
+    run = Memory.started(states.stepper, q, p, plan=StepPlan(h=end - t[0]), t=float(t[0]), **settings)
+    run._memory.t_low = low_words(t)[0]
+    run._step_to(end)
+    run.advance(1)
+    return run.q, run.p
 
 
 def checked_times(t: ArrayLike, name: str) -> Array:

@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, cast, overload
 
 import numpy as np
@@ -22,6 +23,7 @@ from scvi_codegen.files.labelled_arrays import checked_units, to_dataset
 from scvi_codegen.runtime.constraints.projection import constraint_values, multipliers
 from scvi_codegen.runtime.core.features import refusal, require
 from scvi_codegen.runtime.core.validation import columns_of_inputs
+from scvi_codegen.runtime.core.words import Words, as_mpmath, low_words
 from scvi_codegen.runtime.events.detection import crossings_of
 from scvi_codegen.runtime.events.event import Crossings, Event, EventLike, as_events
 from scvi_codegen.runtime.paths.actions import actions_until, compensated_sums, shadow_energy
@@ -217,6 +219,34 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
             size = action
         return float(np.max(np.abs(account.values))) / (size or 1.0)
 
+    @property
+    def t_low(self) -> Array:
+        """(n,) low words of the times; 0 in double precision."""
+        return low_words(self.t)
+
+    @property
+    def q_low(self) -> Array:
+        """(n, m) low words of the positions."""
+        return low_words(self.q)
+
+    @property
+    def p_low(self) -> Array:
+        """(n, m) low words of the momenta."""
+        return low_words(self.p)
+
+    def mp(self, name: str) -> Any:
+        """Return a quantity as mpmath numbers of 40 digits in an object array.
+
+        Args:
+            name: ``"t"``, ``"q"``, ``"p"``, ``"parameters"``, ``"energy"``, ``"momentum_maps"``, or a coordinate.
+
+        Raises:
+            StateError: for an unknown name.
+        """
+        if name in ("energy", "momentum_maps"):
+            return as_mpmath(getattr(self, name)())
+        return as_mpmath(getattr(self, name) if name in ("t", "q", "p", "parameters") else self[name])
+
     def momentum_maps(self) -> Array:
         """Return (n, k) conserved quantities, in the order of ``stepper.momentum_map_names``."""
         if self.conserved is not None:
@@ -332,6 +362,9 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
             attitudes=named_quantities(interface),
             quantities=derived,
             units=checked_units(units),
+            low={f"{name}_low": low_words(getattr(self, name)) for name in ("t", "q", "p", "parameters")}
+            if isinstance(self.q, Words)
+            else {},
         )
 
     def unresolved(self) -> Array:
@@ -461,15 +494,17 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
         """Write a file in the format of its suffix, atomically; the error of an unknown suffix lists the formats.
 
-        An ``.npz`` file has arrays t, q, p, iterations, h, parameters, coordinates, parameter_names, and strings
-        title, system, method, version. A CSV file has columns t, coordinates x, momenta p_x, iterations, velocities
-        x_dot and energy, NaN where undefined. HDF5 and Zarr files (``.h5``, ``.nc``, ``.zarr``)
-        contain the variables of :meth:`to_xarray`.
+        An ``.npz`` file has arrays t, q, p, iterations, h, parameters, coordinates, parameter_names, and strings title,
+        system, method, version; in double-double arithmetic also t_low, q_low, p_low and parameters_low. A CSV file has
+        columns t, coordinates x, momenta p_x, iterations, velocities x_dot and energy, NaN where undefined. HDF5 and
+        Zarr files (``.h5``, ``.nc``, ``.zarr``) contain the variables of :meth:`to_xarray`.
 
         Raises:
             StateError: if the suffix is unknown, or the format has no units.
             MissingLibraryError: if h5netcdf or zarr is not installed (extra ``data``).
         """
+        if isinstance(self.q, Words) and Path(path).suffix.lower() != ".npz":
+            raise StateError(f"{path} would lose the low words of double-double arithmetic: give a file NAME.npz")
         write_states(self.states(units), path)
 
     def to_xarray(self, *, units: Mapping[str, str] | None = None) -> xarray.Dataset:

@@ -1,4 +1,3 @@
-#include "../iteration/iteration_solver.h"
 #include "../iteration/separable_iteration.h"
 
 /* Step in double-double arithmetic by mixed precision. separable_iteration.h solves the stage equations in double, to
@@ -13,8 +12,8 @@
 
 /* Arguments of a step, and its points. */
 typedef struct {
-  dd t, square, inverse_mass[M], drift[M]; /* h^2; h v */
-  double h, scale[M], inverse_size[M]; /* scale: h^2 / m */
+  dd t, h, square, inverse_mass[M], drift[M]; /* h^2; h v */
+  double scale[M], inverse_size[M]; /* scale: h^2 / m */
   const double *parameters;
   ddl X[GROUPS][M], F[GROUPS][M], base[GROUPS][M]; /* base: points without forces */
   lanes rest[GROUPS][M], vector[GROUPS][M + POINT_DERIVATIVES]; /* vector: D, then the derivatives */
@@ -77,25 +76,25 @@ static inline void forces_of_pairs(pair_step *w)
 {
   for (int n = 0; n < GROUPS; n++) {
     const ddl part = {ABSCISSA[n], ABSCISSA_LOW[n]};
-    force_lanes_pairs(w->X[n], ddl_add(ddl_of(w->t), ddl_scale(part, lanes_of(w->h))), w->parameters, w->F[n]);
+    force_lanes_pairs(w->X[n], ddl_add(ddl_of(w->t), ddl_multiply(part, ddl_of(w->h))), w->parameters, w->F[n]);
   }
 }
 
-static void begin_pairs(pair_step *w, const step_data *step, double t_low, const double *points)
+static void begin_pairs(pair_step *w, const step_data *step, double t_low, double h_low)
 {
-  const double h = step->h;
+  const dd h = dd_of(step->h, h_low);
   dd masses[M];
   lanes X[GROUPS][M];
   w->t = dd_of(step->t, t_low);
   w->h = h;
-  w->square = dd_two_product(h, h);
+  w->square = dd_multiply(h, h);
   w->parameters = step->parameters;
-  memcpy(X, points, sizeof X);
+  memcpy(X, step->points, sizeof X);
   mass_pairs(NULL, w->t, step->parameters, masses);
   for (int i = 0; i < M; i++) {
     const dd q = dd_of(step->q0[i], step->carry_q[i]), p = dd_of(step->p0[i], step->carry_p[i]);
     w->inverse_mass[i] = dd_divide(dd_of(1.0, 0.0), masses[i]);
-    w->drift[i] = dd_scale(dd_divide(p, masses[i]), h);
+    w->drift[i] = dd_multiply(dd_divide(p, masses[i]), h);
     w->scale[i] = w->square.high * w->inverse_mass[i].high;
     w->inverse_size[i] = fabs(q.high) + fabs(w->drift[i].high);
     for (int n = 0; n < GROUPS; n++) {
@@ -133,7 +132,7 @@ static inline int find_correction(pair_step *w)
       for (int j = 0; j < LANES; j++)
         size = larger(size, fabs(lane_of(&w->rest[n][i], j)) * w->inverse_size[i]);
     }
-    point_derivatives(X, w->t.high + w->h * ABSCISSA[n], w->parameters, w->vector[n] + M);
+    point_derivatives(X, w->t.high + w->h.high * ABSCISSA[n], w->parameters, w->vector[n] + M);
   }
   for (int k = 0; k < MOST_CORRECTIONS; k++) {
     lanes f[GROUPS][M], moved[GROUPS] = {{0.0}};
@@ -159,20 +158,12 @@ static inline int find_correction(pair_step *w)
   return NOT_CONVERGED;
 }
 
-/* Computes the state (q1, p1) after a step, high words, then low words. On failure it is undefined. */
-HOT int solve_in_pairs(const step_data *step, double t_low, const solver_data *data, double *memory, long long *guess,
-    const solver_options *options, solver_report *report, double *workspace, double *q1, double *p1)
+/* Replaces the increments of a step, solved in double, by those in two words. On failure they are undefined. */
+HOT int refine_increments(const step_data *step, double t_low, double h_low, double *dq, double *dp)
 {
-  double dq[2 * M], dp[2 * M];
-  lanes points[GROUPS * M];
-  step_data in_double = *step;
   pair_step w;
   int status;
-  in_double.points = (double *)points;
-  status = solve(&in_double, data, memory, guess, dq, dp, options, report, workspace);
-  if (status != OK)
-    return status;
-  begin_pairs(&w, step, t_low, (const double *)points);
+  begin_pairs(&w, step, t_low, h_low);
   forces_of_pairs(&w);
   find_residual(&w);
   status = find_correction(&w);
@@ -185,10 +176,9 @@ HOT int solve_in_pairs(const step_data *step, double t_low, const solver_data *d
   for (int i = 0; i < M; i++) {
     const dd unit = dd_multiply(w.square, w.inverse_mass[i]);
     const dd end = dd_multiply(weighted_total(POINT_END_POSITION, POINT_END_POSITION_LOW, w.F, i), unit);
-    const dd kick = dd_scale(weighted_total(POINT_END_MOMENTUM, POINT_END_MOMENTUM_LOW, w.F, i), w.h);
-    const dd q = dd_add(dd_of(step->q0[i], step->carry_q[i]), dd_add(w.drift[i], end));
-    const dd p = dd_add(dd_of(step->p0[i], step->carry_p[i]), kick);
-    q1[i] = q.high, q1[M + i] = q.low, p1[i] = p.high, p1[M + i] = p.low;
+    const dd q = dd_add(w.drift[i], end);
+    const dd p = dd_multiply(weighted_total(POINT_END_MOMENTUM, POINT_END_MOMENTUM_LOW, w.F, i), w.h);
+    dq[i] = q.high, dq[M + i] = q.low, dp[i] = p.high, dp[M + i] = p.low;
   }
-  return all_finite(q1, 2 * M) && all_finite(p1, 2 * M) ? OK : NOT_FINITE;
+  return all_finite(dq, 2 * M) && all_finite(dp, 2 * M) ? OK : NOT_FINITE;
 }

@@ -76,7 +76,7 @@ int NAME(energies)(long long count, const double *t, const double *q, const doub
   (void)workspace;
   for (long long k = 0; k < count; k++) {
     const int status =
-        energy_of(dd_of(t[k], t[count + k]), q + k * 2 * M, p + k * 2 * M, parameters, energy + 2 * k);
+        energy_of(dd_of(t[2 * k], t[2 * k + 1]), q + k * 2 * M, p + k * 2 * M, parameters, energy + 2 * k);
     if (status != OK)
       return status;
   }
@@ -92,7 +92,7 @@ int NAME(momentum_maps)(long long count, const double *t, const double *q, const
     dd u[2 * M], value[2 * MAPS];
     load_pairs(q + k * 2 * M, u);
     load_pairs(p + k * 2 * M, u + M);
-    momentum_maps_pairs(u, dd_of(t[k], t[count + k]), parameters, value);
+    momentum_maps_pairs(u, dd_of(t[2 * k], t[2 * k + 1]), parameters, value);
     for (int j = 0; j < MAPS; j++) {
       map[(2 * k) * MAPS + j] = value[j].high;
       map[(2 * k + 1) * MAPS + j] = value[j].low;

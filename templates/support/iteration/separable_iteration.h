@@ -429,7 +429,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
 #ifndef ARRAYS
   remember_curve(F, past);
 #endif
-#ifdef ERROR_GROWTH
+#if defined(ERROR_GROWTH) || defined(DOUBLE_DOUBLE)
   if (step->points)
     memcpy(step->points, X, sizeof X);
 #endif

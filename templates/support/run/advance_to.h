@@ -12,6 +12,14 @@ static inline int has_arrived(real t, real t_low, real t_end)
   return t == t_end && t_low == 0;
 }
 
+/* What is left to t_end after the last step, whose size is rounded; 0 for other steps. */
+static inline real rest_of_last(const trial *now)
+{
+  const real span = now->t_end - now->at.t, part = span - now->t_end;
+  const real rest = (now->t_end - (span - part)) - (now->at.t + part);
+  return now->last ? (span - now->step.h) + (rest - now->at.t_low) : 0;
+}
+
 int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long steps, long long every,
     const real *parameters, const solver_options *options, real *t, real *q, real *p, int *iterations,
     solver_report *report, real *workspace)
@@ -26,7 +34,9 @@ int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long step
   memset(report, 0, sizeof *report);
   now.step = step_from(run->t, 0, now.at.q, now.at.p, now.at.carry_q, now.at.carry_p, parameters, workspace);
   load_state(run, &now.at);
-#ifdef ERROR_GROWTH
+#ifdef DOUBLE_DOUBLE
+  now.step.points = (double *)now.points;
+#elif defined(ERROR_GROWTH)
   now.step.points = run->measures_growth ? (double *)now.points : NULL;
 #endif
   while (report->steps < steps && !has_arrived(now.at.t, now.at.t_low, t_end)) {
@@ -34,7 +44,10 @@ int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long step
     int status = find_step(run, &now, options, report);
     if (status == OK)
       status = confirm_step(run, &now, options, report);
+    if (status == OK)
+      status = refine_increments(&now.step, now.at.t_low, rest_of_last(&now), now.dq, now.dp);
     if (status != OK) {
+      run->guess = 0;
       save_state(&now.at, run);
       return status;
     }
@@ -43,9 +56,7 @@ int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long step
     report->steps++;
     if (run->step % every == 0 || has_arrived(now.at.t, now.at.t_low, t_end)) {
       const long long stored = report->stored++;
-      t[stored] = now.at.t;
-      memcpy(q + stored * M, now.at.q, sizeof(real) * M);
-      memcpy(p + stored * M, now.at.p, sizeof(real) * M);
+      store_row(&now.at, stored, t, q, p);
       iterations[stored] = (int)run->iterations;
       store_action(run, stored);
       run->iterations = 0;

@@ -18,10 +18,18 @@ enum {
                           * distinguished */
 #define LAST_STEP REAL(1e-6) /* relative to the step: a step that ends so near t_end ends at t_end */
 #define FIRST_STEP REAL_EPSILON /* of the whole span: first trial step size */
+#ifdef DOUBLE_DOUBLE
+#define ROUNDOFF_ERROR 1e-32
+#else
 #define ROUNDOFF_ERROR (REAL(0.03125) * REAL_EPSILON) /* of a step: the sum over a million steps is of the size of
                                                        * rounding errors */
+#endif
+#ifdef DOUBLE_DOUBLE
+#define LEAST_UNRESOLVED (64.0 * REAL_EPSILON * REAL_EPSILON)
+#else
 #define LEAST_UNRESOLVED (REAL(65536.0) * REAL_EPSILON * REAL_EPSILON) /* of a curve: smaller values are rounding
                                                                         * errors */
+#endif
 #ifndef ITERATION_PART
 #define ITERATION_PART REAL(0.00390625) /* tolerance of the stage equations relative to that of a step */
 #endif

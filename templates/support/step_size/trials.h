@@ -118,7 +118,7 @@ typedef struct {
 #ifdef RATTLE
   int failures; /* trials of the step that failed */
 #endif
-#ifdef ERROR_GROWTH
+#if defined(ERROR_GROWTH) || defined(DOUBLE_DOUBLE)
   coordinates points[GROUPS]; /* of the last trial */
 #endif
 } trial;

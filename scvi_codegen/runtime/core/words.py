@@ -1,0 +1,231 @@
+"""Arrays of states: entries by name, and double-double numbers as arrays of high words that carry the low words.
+
+Numbers go in as floats, text (``"0.1"`` is one tenth), fractions, mpmath numbers or ``numpy.longdouble``. In C a vector
+is its high words, followed by its low words.
+"""
+
+import math
+from collections.abc import Hashable, Iterable, KeysView, Mapping, Sequence
+from numbers import Rational
+from typing import Any, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import StateError
+
+Array = NDArray[np.float64]
+Shapes = Sequence[tuple[str, tuple[int, ...]]]
+Key = TypeVar("Key", bound=Hashable)
+DIGITS, SHOWN_DIGITS = 40, 32
+"""Digits of mpmath numbers, more than two words have; of numbers in reports."""
+
+
+class NamedState(np.ndarray[Any, Any]):
+    """Numbers (.., m) of states with arrays of coordinates, also by name: ``q["u"]`` has the shape (.., *shape of u).
+
+    Slices of states have names as well; results of arithmetic are ordinary arrays.
+    """
+
+    shapes: Shapes | None = None
+
+    def __array_finalize__(self, other: Any) -> None:
+        self.shapes = getattr(other, "shapes", None)
+
+    def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False) -> Any:
+        plain = np.asarray(array)
+        return plain if plain.ndim else plain[()]
+
+    def __getitem__(self, key: Any) -> Any:
+        if not isinstance(key, str):
+            return super().__getitem__(key)
+        arrays = by_name(np.asarray(self), self.shapes or ())
+        if key not in arrays:
+            raise KeyError(f"there is no array '{key}' among {', '.join(arrays) or 'no names'}")
+        return arrays[key]
+
+    def keys(self) -> KeysView[str]:
+        """Return the names of the arrays."""
+        return dict(self.shapes or ()).keys()
+
+    def values(self) -> list[Array]:
+        """Return the arrays in order."""
+        return list(by_name(np.asarray(self), self.shapes or ()).values())
+
+    def items(self) -> list[tuple[str, Array]]:
+        """Return the names and the arrays in order."""
+        return list(by_name(np.asarray(self), self.shapes or ()).items())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return named, (np.asarray(self), self.shapes)
+
+
+def named(values: Array, shapes: Shapes | None) -> Array:
+    """Return states that have the arrays of these names and shapes; shares memory."""
+    state = values if isinstance(values, NamedState) else values.view(NamedState)  # or with low words
+    state.shapes = shapes
+    return state
+
+
+def by_name(values: Array, shapes: Iterable[tuple[Key, tuple[int, ...]]]) -> dict[Key, Array]:
+    """Return (.., m) numbers as arrays of these names and shapes; shares memory."""
+    arrays, first = {}, 0
+    for name, shape in shapes:
+        end = first + math.prod(shape)
+        arrays[name], first = values[..., first:end].reshape((*values.shape[:-1], *shape)), end
+    return arrays
+
+
+class Words(NamedState):
+    """High words of double-double numbers; ``low`` has the low words.
+
+    Rows, slices, copies and concatenations keep both words, and differences are computed with both; other arithmetic
+    uses the high words alone and returns ordinary arrays.
+    """
+
+    _low: Array | None = None
+
+    def __array_finalize__(self, other: Any) -> None:
+        super().__array_finalize__(other)
+        self._low = None
+
+    @property
+    def low(self) -> Array:
+        """Low words, of the same shape."""
+        if self._low is None:
+            self._low = np.zeros(self.shape)
+        return self._low
+
+    def mp(self) -> Any:
+        """Return the numbers as mpmath numbers of 40 digits in an object array."""
+        return as_mpmath(self)
+
+    def __getitem__(self, key: Any) -> Any:
+        high = super().__getitem__(key)
+        return with_low(high, NamedState.__getitem__(_named_as(self.low, self), key)) if np.ndim(high) else high
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        low = self.low
+        super().__setitem__(key, np.asarray(value))
+        low[key] = low_words(value)
+
+    def __sub__(self, other: Any) -> Any:
+        return (np.asarray(self) - np.asarray(other)) + (self.low - low_words(other))
+
+    def __array_function__(self, function: Any, types: Any, arguments: Any, keywords: Any) -> Any:
+        result = super().__array_function__(function, types, arguments, keywords)
+        if function is np.concatenate:
+            return with_low(np.asarray(result), np.concatenate([*map(low_words, arguments[0])], **keywords))
+        return result
+
+    def copy(self, order: Any = "C") -> Self:
+        """Return a copy of both words."""
+        result: Self = with_low(_named_as(np.array(self, order=order, subok=False), self), self.low.copy())
+        return result
+
+    def reshape(self, *shape: Any, **order: Any) -> Any:
+        """Return the numbers in another shape."""
+        return with_low(np.asarray(self).reshape(*shape, **order), self.low.reshape(*shape, **order))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return with_low, (np.asarray(self), self.low, self.shapes)
+
+
+def _named_as(array: Array, other: Any) -> NamedState:
+    state = array.view(NamedState)
+    state.shapes = other.shapes
+    return state
+
+
+def with_low(high: Any, low: Array, shapes: Any = None) -> Any:
+    """Return high words with these low words, in the same memory."""
+    result = high.view(Words)
+    result.shapes = getattr(high, "shapes", None) if shapes is None else shapes
+    result._low = np.asarray(low)
+    return result
+
+
+def low_words(values: Any) -> Array:
+    """Return the low words of numbers, 0 of doubles."""
+    return values.low if isinstance(values, Words) else np.zeros(np.shape(values))
+
+
+def from_block(block: Array) -> Words:
+    """Return numbers (.., m) from (.., 2m) high words and low words, in the same memory."""
+    m = block.shape[-1] // 2
+    words: Words = with_low(block[..., :m], block[..., m:])
+    return words
+
+
+def block_of(values: Any) -> Array:
+    """Return (.., 2m) high words and low words of (.., m) numbers; of doubles the array itself."""
+    if not isinstance(values, Words):
+        return np.asarray(values)
+    return np.concatenate([np.asarray(values), values.low], axis=-1)
+
+
+def as_mpmath(values: Any) -> Any:
+    """Return numbers as mpmath numbers in an object array, or one number."""
+    from mpmath import mp
+
+    with mp.workdps(DIGITS):
+        return np.frompyfunc(lambda a, b: mp.mpf(float(a)) + mp.mpf(float(b)), 2, 1)(
+            np.asarray(values), low_words(values)
+        )
+
+
+def as_text(values: Any) -> list[str]:
+    """Return numbers as text of 32 digits."""
+    from mpmath import mp
+
+    with mp.workdps(DIGITS):
+        return [mp.nstr(value, SHOWN_DIGITS) for value in as_mpmath(values)]
+
+
+def two_words(value: Any, name: str) -> tuple[float, float]:
+    """Return the nearest double to a number, and the nearest double to the rest.
+
+    Raises:
+        StateError: for anything but a finite real number.
+    """
+    if type(value) is float and np.isfinite(value):
+        return value, 0.0
+    from mpmath import mp
+
+    try:
+        if isinstance(value, bool | np.bool_ | complex) or value is None:
+            raise TypeError("not a real number")
+        with mp.workdps(DIGITS + 20):
+            if isinstance(value, Rational):
+                exact: Any = mp.mpf(value.numerator) / mp.mpf(value.denominator)
+            else:
+                exact = mp.mpf(value) if isinstance(value, str) else value
+            high = float(exact)
+            rest = exact - type(exact)(high) if np.isfinite(high) else 0.0  # exact for longdouble, 60 digits of mpf
+            low = float(rest)
+    except OverflowError:
+        high = low = np.inf
+    except (TypeError, ValueError, ZeroDivisionError) as error:
+        raise StateError(f"{name} must be a real number, not {repr(value)[:60]}: {error}") from error
+    if not (np.isfinite(high) and np.isfinite(low)):
+        raise StateError(f"{name} is {value}: it must be finite")
+    return high, low
+
+
+def split(values: Any, name: str) -> tuple[Any, Any]:
+    """Return the high and the low words of numbers of any kind, also by name; ``None`` of ``None``.
+
+    Raises:
+        StateError: if a value is not a finite real number.
+    """
+    if isinstance(values, Mapping):
+        parts = {key: split(value, f"{name}: '{key}'") for key, value in values.items()}
+        return {key: part[0] for key, part in parts.items()}, {key: part[1] for key, part in parts.items()}
+    if values is None or isinstance(values, Words):
+        return (None, None) if values is None else (np.asarray(values), values.low)
+    array = np.asarray(values) if isinstance(values, np.ndarray) else np.array(values, dtype=object)
+    if array.dtype == np.float64:
+        return array, np.zeros(array.shape)
+    words = [two_words(each, f"{name}{list(k) if k else ''}") for k, each in np.ndenumerate(array)]
+    high, low = np.array(words, dtype=float).reshape(array.size, 2).T.reshape(2, *array.shape)
+    return high, low
