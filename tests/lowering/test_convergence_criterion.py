@@ -345,6 +345,10 @@ static inline lanes lanes_of(double x)
     view.lane[j] = x;
   return view.all;
 }}
+#if LANES > 1
+typedef struct {{ lanes (*last)[M], (*before)[M]; }} history;
+#endif
+#define lanes_selected(which, x, y) (x)
 #define number_of(x) lanes_of(x)
 #define largest_number(x) (x)[0]
 #include "{folder}/{header}.h"

@@ -27,8 +27,6 @@ from benchmarks.cases.robots import chain
 from scvi_codegen.cli import main
 from scvi_codegen.methods import Method
 from scvi_codegen.models.model_files.ensemble_file import load_ensemble
-from scvi_codegen.native import building
-from scvi_codegen.native.binding import Binding
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.lanes import LaneBlock
 
@@ -404,24 +402,39 @@ class TestFailures:
         assert len(set(ends)) == 1
 
 
-@pytest.mark.parametrize("name", ["kepler", "double-pendulum"])
-def test_trajectories_do_not_depend_on_their_lanes(name: str) -> None:
-    """Trajectories that exchange their lanes have equal bits, with coordinates and momenta of both signs."""
-    stepper = stepper_for(name, sc.SVI(5))
-    binding = Binding(building.load(stepper.ensemble, flags=stepper.flags), stepper.ensemble.prefix)
-    q, p = states(name, len(binding.new("block *").active))
-    q, p = (x * np.where(np.arange(len(x)) % 3 == k, -1.0, 1.0)[:, np.newaxis] for k, x in enumerate((q, p)))
-    ends = []
-    for shift in range(len(q)):
-        runs = Ensemble(stepper, np.roll(q, shift, axis=0), np.roll(p, shift, axis=0), h=0.02, steps=9).common
-        assert runs is not None
-        block = runs.blocks()[0](0)
-        block.advance(9)
-        assert isinstance(block, LaneBlock)
-        assert not block.left
-        states_now = (np.roll(x, -shift, axis=1).tobytes() for x in (runs.q, runs.p))
-        ends.append((*states_now, block.memory.iterations, block.memory.guess))
-    assert len(set(ends)) == 1
+@pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
+@pytest.mark.parametrize(
+    ("name", "method", "plan"),
+    [
+        ("kepler", sc.SVI(5), {"h": 0.3, "steps": 40}),
+        ("kepler", sc.SVI(5), {"t_end": 3.0, "tolerance": 1e-8}),
+        ("kepler", sc.Composition.of(4), {"h": 0.3, "t_end": 2.0}),
+        ("double-pendulum", sc.SVI(3), {"h": 0.1, "steps": 20}),
+        ("double-pendulum", sc.SCVI(3), {"h": 0.1, "steps": 6}),
+        ("chain", sc.SVI(2), {"h": 0.1, "steps": 20}),
+    ],
+    ids=lambda value: getattr(value, "name", value) if not isinstance(value, dict) else next(iter(value)),
+)
+def test_bits_of_trajectories_do_not_depend_on_others(name: str, method: Method, plan: dict[str, Any]) -> None:
+    """In another order, in parts and in threads: with different numbers of iterations, accelerated and failed steps."""
+    generator = np.random.default_rng(4)
+    if name == "chain":  # slow iterations
+        stepper, count = sc.compile_stepper(chain(4).system, method), 20
+        q, p = generator.uniform(-1.5, 1.5, (count, 4)), generator.uniform(-0.1, 0.1, (count, 4))
+    else:
+        stepper, count = stepper_for(name, method), 20
+        q, p = (x * generator.choice([-1.0, 1.0], x.shape) for x in states(name, count))
+        q[3], p[3] = (0.0, p[3]) if name == "kepler" else (q[3], 1e4)
+    runs = stepper.integrate_ensemble(q, p, **plan, threads=1)
+    order = generator.permutation(count)
+    others = [stepper.integrate_ensemble(q[order], p[order], **plan, threads=3)]
+    others += [stepper.integrate_ensemble(q[part], p[part], **plan) for part in (slice(2, 5), slice(5, 20))]
+    for one, members in zip(others, (order, np.arange(2, 5), np.arange(5, 20)), strict=True):
+        for found, expected in ((one.q, runs.q), (one.p, runs.p)):
+            rows = min(len(found), len(expected))
+            assert found[:rows].tobytes() == expected[:rows, members].tobytes()
+        assert one.status.tolist() == runs.status[members].tolist()
+        assert one.steps.tolist() == runs.steps[members].tolist()
 
 
 class TestThreadsAndInterruption:

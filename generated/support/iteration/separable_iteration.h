@@ -403,6 +403,9 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   drift_words drifts[M];
   number inverse_size[M];
   const step_points w = {step, data, X[0], F[0], M, inverse_size, drifts, base[0], rests[0]};
+#ifndef POINTS
+  coordinates stored[S];
+#endif
 #endif
   progress now = before_iterations();
   int status;
@@ -417,7 +420,16 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
     if (is_stagnant(&now, options, k))
       measure_by_largest(stagnant(&now), inverse_size);
 #endif
+#ifndef POINTS
+    if (converge_early(&now)) {
+      store_early(&now, F[0], stored[0]);
+      mark_stored(&now);
+    }
+#endif
   }
+#ifndef POINTS
+  restore_early(&now, stored[0], F[0]);
+#endif
   status = outcome(&now, report);
   if (status != OK)
     return status;

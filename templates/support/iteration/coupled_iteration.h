@@ -14,6 +14,23 @@ enum { MASS_AGE = 16 };
 #include "secants.h"
 #endif
 
+#ifndef POINTS
+/* Stores the velocities and forces of the trajectories that converge before others. */
+static __attribute__((noinline)) void keep_early(const step_data *step, const iteration_data *data,
+    lanes (*value)[VALUES], lanes (*z)[M], lanes (*r)[M], progress *now, coordinates (*stored)[S])
+{
+#ifdef FOLLOWED
+  coordinates F[S];
+  converged_forces(step, data, value, z, r, F);
+  store_early(now, F[0], stored[1][0]);
+#else
+  (void)step, (void)data, (void)value, (void)r;
+#endif
+  store_early(now, z[0], stored[0][0]);
+  mark_stored(now);
+}
+#endif
+
 /* Computes the increments of one step: the velocities z at the points are corrected by mass^-1 (P - L_v) until they
  * converge; the increments follow from the forces at the converged points. The velocities are stored for the predictor.
  * On failure the increments are undefined. */
@@ -25,9 +42,12 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   lanes u[2 * M], value[GROUPS][VALUES], scaled[GROUPS][M], impulse[GROUPS][M], r[GROUPS][M], mass[GROUPS][MASS];
   number inverse_size[M] = {0.0};
   progress now = before_iterations();
+#ifndef POINTS
+  coordinates stored[2][S];
+#endif
 #ifdef SUPPORT_SECANTS_H
   secants before;
-  before.known = before.count = 0;
+  before.begun = number_of(0.0);
 #endif
   int status = OK;
   if (*steps > 0)
@@ -121,18 +141,28 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
     if (is_stagnant(&now, options, k))
       measure_by_largest(stagnant(&now), inverse_size);
 #ifdef SUPPORT_SECANTS_H
-    if (k >= FIRST_ITERATIONS && (before.known || any_positive(undecided(&now, ACCELERATED_LEVEL))))
-      accelerate(&before, k % MASS_AGE == 0, inverse_size, undecided(&now, 0.0), r, z);
+    if (k >= FIRST_ITERATIONS && begins(&before, undecided(&now, ACCELERATED_LEVEL)))
+      accelerate(&before, k, k % MASS_AGE == 0, inverse_size, before.begun * undecided(&now, 0.0), r, z);
 #endif
     if (must_amplify(&now, options, k))
       for (int n = 0; n < GROUPS; n++)
         for (int i = 0; i < M; i++)
           z[n][i] += amplification(&now) * r[n][i];
+#ifndef POINTS
+    if (converge_early(&now))
+      keep_early(step, data, value, z, r, &now, stored);
+#endif
   }
+#ifndef POINTS
+  restore_early(&now, stored[0][0], z[0]);
+#endif
   status = outcome(&now, report);
   if (status != OK)
     return status;
   converged_forces(step, data, value, z, r, impulse);
+#if defined(FOLLOWED) && !defined(POINTS)
+  restore_early(&now, stored[1][0], impulse[0]);
+#endif
   scale(data->momentum_weight, impulse, impulse);
   scale(data->position_weight, z, scaled);
   for (int i = 0; i < M; i++) {

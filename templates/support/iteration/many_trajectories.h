@@ -12,10 +12,34 @@ static inline coordinates *kept(history past, coordinates *own)
   return past.before;
 }
 
+/* Number of former steps that the predictor uses: 0 for all trajectories, or 1, to which 2^(j + 1) is added if it is 2
+ * for trajectory j. */
+#define TWO_STEPS ((2LL << LANES) - 1) /* for all */
+
+/* Extrapolates the stored values of some trajectories from the last step, of others from the last two. */
+static __attribute__((noinline)) void continue_differently(history past, long long steps, lanes (*x)[M])
+{
+  lane_view one;
+  for (int j = 0; j < LANES; j++)
+    one.lane[j] = steps & 2LL << j ? 0.0 : 1.0;
+  for (int i = 0; i < M; i++) {
+    lanes next[S];
+    for (int n = 0; n < S; n++)
+      next[n] = lanes_selected(
+          one.all, apply(LAST_ALONE, n, past.last, i), apply(LAST, n, past.last, i) + apply(BEFORE, n, x, i));
+    for (int n = 0; n < S; n++)
+      x[n][i] = next[n];
+  }
+}
+
 /* Extrapolates the stored values into this step from the last one or from the last two. */
 static inline void continue_curve(const step_data *step, history past, long long steps, lanes (*x)[M])
 {
   (void)step;
+  if (steps != 1 && steps != TWO_STEPS) {
+    continue_differently(past, steps, x);
+    return;
+  }
   for (int i = 0; i < M; i++) {
     lanes next[S];
     for (int n = 0; n < S; n++)
@@ -38,10 +62,12 @@ static inline int start_velocities(const step_data *step, lanes (*z)[M])
 }
 
 /* Progress of the iteration of a step in every lane, as trajectory_progress. status: 1 converged, 0 undecided, -1
- * failed in this iteration, -2 before; amplification: factor of the last change to be added, AMPLIFICATION or 0. */
+ * failed in this iteration, -2 before; amplification: factor of the last change to be added, AMPLIFICATION or 0;
+ * converged: their number; stored, stored_count: those whose values have been stored. */
 typedef struct {
   lanes first, last, before, earlier, amplified, since, status, amplification, by_largest, stagnant;
-  int pending;
+  lanes stored;
+  int pending, converged, stored_count;
 } progress;
 
 static inline progress before_iterations(void)
@@ -63,16 +89,18 @@ static inline void take_change(progress *now, lanes change, const solver_options
   const lane_view after = {change}, last = {now->last}, before = {now->before};
   lane_view status = {now->status}, active;
   const solver_options wanted = *options; /* a copy, which cannot alias what is written */
-  int pending = 0;
+  int pending = 0, converged = 0;
   memcpy(active.lane, report->active, sizeof active);
   for (int j = 0; j < LANES; j++) {
     const double found = iteration_status(after.lane[j], last.lane[j], before.lane[j], &wanted, k);
     const double first = active.lane[j] > 0.0 ? found : -2.0;
     status.lane[j] = status.lane[j] == 0.0 ? first : status.lane[j];
     pending += status.lane[j] == 0.0;
+    converged += status.lane[j] == 1.0;
   }
   now->status = status.all;
   now->pending = pending > 0;
+  now->converged = converged;
   now->first = k == 0 ? change : now->first;
   now->earlier = now->before;
   now->before = now->last;
@@ -149,6 +177,7 @@ static SELDOM int check_lanes(progress *now, const solver_options *options, int 
       amplified.lane[j] = seen.amplified;
       status.lane[j] = seen.status < 0 ? -2.0 : seen.status;
       since.lane[j] = seen.since;
+      now->converged += seen.status == 1;
       now->pending |= seen.status == 0;
     }
   now->last = last.all;
@@ -179,6 +208,38 @@ static inline lanes amplification(const progress *now)
   return now->amplification;
 }
 
+/* Returns 1 if the values of trajectories have to be stored, which have converged before others. */
+static inline int converge_early(const progress *now)
+{
+  return now->pending && now->converged > now->stored_count;
+}
+
+/* Stores the values of the trajectories that have converged. */
+static inline void store_early(const progress *now, const lanes *x, lanes *stored)
+{
+  for (int i = 0; i < S * M; i++)
+    stored[i] = now->stored_count ? lanes_selected(now->stored, stored[i], x[i]) : x[i];
+}
+
+/* After the values of trajectories have been stored. */
+static inline void mark_stored(progress *now)
+{
+  const lane_view status = {now->status};
+  lane_view stored;
+  for (int j = 0; j < LANES; j++)
+    stored.lane[j] = status.lane[j] == 1.0;
+  now->stored = stored.all;
+  now->stored_count = now->converged;
+}
+
+/* Replaces the values of trajectories that converged before others, whose iterations changed them. */
+static inline void restore_early(const progress *now, const lanes *stored, lanes *x)
+{
+  if (now->stored_count)
+    for (int i = 0; i < S * M; i++)
+      x[i] = lanes_selected(now->stored, stored[i], x[i]);
+}
+
 /* Trajectories that converge too slowly or left the domain become inactive. */
 static inline int outcome(const progress *now, const solver_report *report)
 {
@@ -196,9 +257,9 @@ static inline int accept(const step_data *step, const lanes *dq, const lanes *dp
 
 static inline long long next_guess(long long steps, const progress *now, const solver_report *report)
 {
-  const lane_view view = {now->first};
-  double largest = 0.0;
+  const lane_view first = {now->first};
+  long long two = 0;
   for (int j = 0; j < LANES; j++)
-    largest = report->active[j] > 0.0 ? larger(view.lane[j], largest) : largest;
-  return steps_to_continue(steps, largest);
+    two += first.lane[j] < GOOD_GUESS || !(report->active[j] > 0.0) ? 2LL << j : 0;
+  return steps > 0 ? 1 | two : 1;
 }

@@ -4,7 +4,7 @@
  * the changes dr, dg of r and g over the last iterations, the part of r in the span of the dr is removed,
  *   z = g - sum_j <dr_j, r> dg_j,
  * where the pairs are combined such that the dr_j are orthonormal. Requires: points.h, or trajectories.h, where every
- * trajectory has its own factors. */
+ * trajectory has its own factors and its own start, and the pair of an iteration has the same index for all. */
 #define DEPENDENT 1e-8 /* relative to its square: a change that the earlier ones span is not stored */
 #define ACCELERATED_LEVEL 1e-18 /* changes below 1e-9 of the state after the first iterations need no acceleration */
 
@@ -27,6 +27,10 @@ static inline int any_positive(number x)
 {
   return x > 0.0;
 }
+
+#define PAIR_INDEX(past, k) ((past)->count % SECANTS)
+#define PAIRS(past) ((past)->count < SECANTS ? (past)->count : SECANTS)
+#define IS_PAIR(factor) any_positive(factor)
 #else
 enum { SECANTS = 4 }; /* of each trajectory: less memory */
 
@@ -56,11 +60,17 @@ static inline int any_positive(number x)
     any |= view.lane[j] > 0.0;
   return any;
 }
+
+#define PAIR_INDEX(past, k) ((k) % SECANTS)
+#define PAIRS(past) SECANTS /* those that a trajectory lacks are 0 */
+#define IS_PAIR(factor) 1
 #endif
 
-/* known: whether r and g are those of the iteration before; count: of pairs since the last start. */
+/* begun: 1 if iterations are accelerated; known: 1 if r and g are those of the iteration before; count: of pairs since
+ * the last start. */
 typedef struct {
-  int known, count;
+  number begun, known;
+  int count;
   lanes r[GROUPS][M], g[GROUPS][M], dr[SECANTS][GROUPS][M], dg[SECANTS][GROUPS][M];
 } secants;
 
@@ -82,17 +92,39 @@ static inline void add_multiple(number factor, lanes (*y)[M], lanes (*x)[M])
       x[n][i] += factor * y[n][i];
 }
 
-/* Replaces z = g by the accelerated iterate, and stores r and g; restart: whether earlier ones are forgotten; share: 1,
- * or 0 for trajectories that have converged, which the iterations of others do not move. */
-static inline void accelerate(secants *past, int restart, const number *unit, number share, lanes (*r)[M],
+/* Forgets all pairs. */
+static inline void forget(secants *past)
+{
+  past->known = number_of(0.0);
+  past->count = 0;
+  if (PAIRS(past)) {
+    memset(past->dr, 0, sizeof past->dr);
+    memset(past->dg, 0, sizeof past->dg);
+    memset(past->r, 0, sizeof past->r);
+    memset(past->g, 0, sizeof past->g);
+  }
+}
+
+/* Begins where iterations converge slowly; returns 1 if some are accelerated. */
+static inline int begins(secants *past, number slow)
+{
+  if (any_positive(slow) && !any_positive(past->begun))
+    forget(past);
+  past->begun += slow * (1.0 - past->begun);
+  return any_positive(past->begun);
+}
+
+/* Replaces z = g by the accelerated iterate of iteration k, and stores r and g; restart: whether earlier ones are
+ * forgotten; share: 1, or 0 for trajectories that have converged, which the iterations of others do not move. */
+static inline void accelerate(secants *past, int k, int restart, const number *unit, number share, lanes (*r)[M],
     lanes (*z)[M])
 {
   lanes g[GROUPS][M];
   memcpy(g, z, sizeof g);
   if (restart)
-    past->known = past->count = 0;
-  if (past->known) {
-    const int last = past->count % SECANTS, known = past->count < SECANTS ? past->count : SECANTS;
+    forget(past);
+  if (any_positive(past->known)) {
+    const int last = PAIR_INDEX(past, k), known = PAIRS(past);
     lanes dr[GROUPS][M], dg[GROUPS][M];
     number size, factor;
     memcpy(dr, r, sizeof dr);
@@ -106,8 +138,8 @@ static inline void accelerate(secants *past, int restart, const number *unit, nu
         add_multiple(-along, past->dr[j], dr);
         add_multiple(-along, past->dg[j], dg);
       }
-    factor = normalisation(size, inner_product(dr, dr, unit));
-    if (any_positive(factor)) {
+    factor = past->known * normalisation(size, inner_product(dr, dr, unit));
+    if (IS_PAIR(factor)) {
       memset(past->dr[last], 0, sizeof dr);
       memset(past->dg[last], 0, sizeof dg);
       add_multiple(factor, dr, past->dr[last]);
@@ -115,9 +147,9 @@ static inline void accelerate(secants *past, int restart, const number *unit, nu
       past->count++;
     }
   }
-  past->known = 1;
+  past->known = past->begun;
   memcpy(past->r, r, sizeof past->r);
   memcpy(past->g, g, sizeof past->g);
-  for (int j = 0; j < past->count && j < SECANTS; j++)
+  for (int j = 0; j < PAIRS(past); j++)
     add_multiple(-share * inner_product(past->dr[j], r, unit), past->dg[j], z);
 }

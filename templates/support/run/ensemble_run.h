@@ -90,6 +90,7 @@ static void store_states(const state *now, int count, double *q, double *p)
 typedef struct {
   lanes curve[S][M], position[2 * M], momentum[2 * M];
   double active[LANES]; /* before the step, or before its repetition */
+  long long guess;
   int repeated;
 } first_results;
 
@@ -109,8 +110,10 @@ static SELDOM int repeats_failed(first_results *stored, history past, long long 
           dp[i][j] = stored->momentum[i][j];
         }
         active[j] = stored->active[j];
-      }
+      } else
+        stored->guess &= ~(2LL << j);
     }
+    *guess = stored->guess;
     return 0;
   }
   memcpy(stored->curve, past.before, sizeof stored->curve);
@@ -125,6 +128,7 @@ static SELDOM int repeats_failed(first_results *stored, history past, long long 
     stored->active[j] = succeeded;
   }
   stored->repeated = 1;
+  stored->guess = *guess;
   *guess = 0;
   return 1;
 }
