@@ -1,8 +1,9 @@
 """Sections of the benchmark that compare contenders at equal error: a case with its contenders and reference each."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 
@@ -104,7 +105,13 @@ def _published(make: Callable[[], Case], plan: Plan) -> Race:
 def _suite(name: str, plan: Plan) -> Race:
     """Return a problem of another project's benchmark; the end of one is published, that of a part of it is not."""
     race = _published(partial(suite_case, name), plan)
-    return replace(race, ends=SUITE_ENDS[name]) if name in SUITE_ENDS and not plan.quick else race
+
+    def once(make: Callable[..., Iterable[Contender]], *arguments: Any) -> Iterator[Contender]:
+        return (replace(each, starts=1) for each in make(*arguments))
+
+    peers = {peer: partial(once, make) for peer, make in race.peers.items()}
+    ends = race.ends if plan.quick else SUITE_ENDS.get(name, race.ends)
+    return replace(race, ours=partial(once, race.ours), peers=peers, ends=ends)
 
 
 def _rods(n: int, plan: Plan) -> Race:

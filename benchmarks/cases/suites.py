@@ -4,7 +4,7 @@
     sciml:pleiades, :three-body                          SciMLBenchmarks.jl, NonStiffODE
     heyoka:restricted, :three-bodies                     heyoka, benchmark/pcr3bp.cpp and ss_3bp.cpp
 
-The formulas are written here anew. A suite has one initial state, which is repeated. The span of SciML's Henon-Heiles
+The formulas are written here anew. Each has one initial state. The span of SciML's Henon-Heiles
 (100 to 50,000) is the shortest; those of its quadrupole boson and of heyoka's restricted problem (100 to 20,000; 2000)
 are shortened, because their motions are chaotic.
 The end of heyoka's three bodies is its published state of quadruple precision.
@@ -21,7 +21,6 @@ import numpy as np
 
 from benchmarks.cases.references import Reference
 from benchmarks.cases.unforced import (
-    STATES,
     SYSTEMS,
     Array,
     Bodies,
@@ -43,8 +42,8 @@ def suite_case(name: str) -> Case:
     return replace(SUITE_CASES[name](), name=name)
 
 
-def _repeated(vector: Sequence[float] | Array) -> Array:
-    return np.tile(np.array(vector, dtype=float), (STATES, 1))
+def _one(vector: Sequence[float] | Array) -> Array:
+    return np.array([vector], dtype=float)
 
 
 def _case(accelerations: Callable[..., list[Any]], data: Mapping[str, Any], **others: Any) -> Case:
@@ -53,8 +52,8 @@ def _case(accelerations: Callable[..., list[Any]], data: Mapping[str, Any], **ot
         name="",
         system=LagrangianSystem.from_text(**system) if system else problem(data["problem"]).system,
         formulations=hand_solved(accelerations),
-        q=_repeated(data["q"]),
-        velocity=_repeated(data["velocity"]),
+        q=_one(data["q"]),
+        velocity=_one(data["velocity"]),
         span=data["span"],
         **{"step": 0.1} | others,
     )
@@ -126,12 +125,12 @@ def _three_bodies() -> Case:
     gravity = (0.01720209895 * 365) ** 2
     how = {"name": "three bodies", "gravity": gravity, "span": data["span"], "step": 1.0}
     made = gravitating(data["masses"], q.tolist(), velocity.tolist(), **how)
-    return replace(made, q=_repeated(q), velocity=_repeated(velocity))
+    return replace(made, q=_one(q), velocity=_one(velocity))
 
 
 def _three_bodies_end(case: Case, _: Array | None) -> Reference:
     """Return the final positions of quadruple precision that heyoka publishes."""
-    return Reference(positions=_repeated(np.ravel(SUITES["three-bodies"]["end"])), accuracy=math.ulp(1.0))
+    return Reference(positions=_one(np.ravel(SUITES["three-bodies"]["end"])), accuracy=math.ulp(1.0))
 
 
 SUITE_CASES: Mapping[str, Callable[[], Case]] = {
