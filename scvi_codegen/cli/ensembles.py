@@ -16,6 +16,7 @@ from scvi_codegen.native.options import FAILURES
 from scvi_codegen.representation import counted
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
+from scvi_codegen.runtime.ensemble.lanes import CommonRuns
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 
 SHOWN_FAILURES = 8
@@ -73,8 +74,9 @@ def integrate_states(states: EnsembleStates) -> EnsembleOutcome:
 def _work(model: Model, stepper: Stepper, states: EnsembleStates) -> Ensemble:
     """Return the compiled ensemble; Ctrl-C still ends the process here."""
     start = stepper, states.q, states.momenta(stepper)
-    work = Ensemble(*start, parameters=states.parameters, options=model.solver_options, **model._run_arguments())
-    if work.common is not None:
+    arguments = {"options": model.solver_options, "device": model.device, **model._run_arguments()}
+    work = Ensemble(*start, parameters=states.parameters, **arguments)
+    if isinstance(work.common, CommonRuns):
         work.common.blocks()
     return work
 
@@ -82,14 +84,14 @@ def _work(model: Model, stepper: Stepper, states: EnsembleStates) -> Ensemble:
 def ensemble_summary(model: Model, outcome: EnsembleOutcome, balance: float | None) -> str:
     """Return a summary of an ensemble in a few lines."""
     result = outcome.result
-    steps = int(result.steps.sum())
+    steps, on_gpu = int(result.steps.sum()), "" if model.device is None else " on a GPU"
     counts = Counter(result.status.tolist())
     lines = [
         model.system.name,
         model.method.title,
         f"{counted(len(result), 'trajectory').replace('trajectorys', 'trajectories')} of "
         f"{_describe_steps(model, result)} saved of each",
-        f"{outcome.seconds:.3g} s, {duration(outcome.seconds / max(steps, 1))} per step of a trajectory; "
+        f"{outcome.seconds:.3g} s{on_gpu}, {duration(outcome.seconds / max(steps, 1))} per step of a trajectory; "
         f"prepared in {outcome.preparation:.2f} s",
         ", ".join(f"{number} {status}" for status, number in [("ok", counts.pop("ok", 0)), *sorted(counts.items())]),
     ]

@@ -56,7 +56,7 @@ class Model(TimeSpan):
             or axis and angle.
         p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
         velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
-        h, tolerance, error, span, steps, save_every, t, time_transformation, controller, precision,
+        h, tolerance, error, span, steps, save_every, t, time_transformation, controller, precision, device,
             solver_tolerance, max_iterations, threads, action: as of :class:`~scvi_codegen.models.time_span.TimeSpan`.
         inputs: by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as :meth:`Stepper.integrate` accepts
             it, or a number; a run requires all inputs of the system.
@@ -350,6 +350,7 @@ class Model(TimeSpan):
             options: convergence criterion of the solver; by default :attr:`solver_options`.
             threads: number of threads per step, for array sizes known at run time; by default those of the model.
         """
+        self._check_alone()
         stepper = stepper or self.stepper()
         state, h, common = self.initial_state(stepper), self.h, self._common(options, threads)
         tolerance = self.tolerance
@@ -391,6 +392,7 @@ class Model(TimeSpan):
 
     def integrate(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> Trajectory:
         """Integrate over the whole span; raises as :meth:`Stepper.integrate`."""
+        self._check_alone()
         stepper, arguments = self.stepper(), self._run_arguments()
         if self.h is None and self.has_time_transformation and self.error is None:
             plan = self.start(stepper).plan

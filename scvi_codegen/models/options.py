@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from scvi_codegen.controllers import CONTROLLERS, SYMPLECTIC
 from scvi_codegen.errors import ModelFileError
+from scvi_codegen.native.cuda import DEVICES
 from scvi_codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.validation import TOLERANCE_RANGE, checked_count
 
@@ -157,6 +158,11 @@ class RunOptions:
     )
     precision: str | None = run_option(
         *("run", CHOICE, "", f"Arithmetic [double]; {DOUBLE_DOUBLE}: 31 digits."), choices=PRECISIONS, common=False
+    )
+    device: str | None = run_option(
+        *("run", CHOICE, "", "With --ensemble: fixed steps on an NVIDIA GPU (extra 'cuda'; experimental)."),
+        choices=DEVICES,
+        common=False,
     )
     span: float | None = run_option("run", NUMBER, "T", "Duration of the run.", determines=DURATION)
     steps: int | None = run_option("run", COUNT, "N", "Number of steps, instead of --span.", determines=DURATION)

@@ -16,6 +16,7 @@ from scvi_codegen.models.options import (
     check_alternatives,
     options_of,
 )
+from scvi_codegen.native.cuda import DEVICES
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.validation import LARGEST_COUNT
@@ -41,6 +42,7 @@ class TimeSpan(RunOptions):
         controller: name of the step-size controller, ``None`` for the default; without ``time_transformation`` it
             requires adaptive steps.
         precision: ``"double-double"`` for runs with states of two words; ``None`` means ``"double"``.
+        device: ``"cuda"`` for ensembles with fixed steps on a GPU; single runs are not available with it.
         solver_tolerance, max_iterations: of the iteration on the stage equations, as of
             :class:`~scvi_codegen.SolverOptions`.
         threads: number of threads per step, for array sizes known at run time.
@@ -53,8 +55,9 @@ class TimeSpan(RunOptions):
         for option in RUN_FIELDS:
             if (value := getattr(self, option.field)) is not None:
                 object.__setattr__(self, option.field, option.checked(value))
-        if self.precision not in (None, *PRECISIONS):
-            raise ModelFileError(f"unknown precision {self.precision!r}: use {' or '.join(map(repr, PRECISIONS))}")
+        for name, known in (("precision", PRECISIONS), ("device", DEVICES)):
+            if (value := getattr(self, name)) not in (None, *known):
+                raise ModelFileError(f"unknown {name} {value!r}: use {' or '.join(map(repr, known))}")
         if self.h is None:
             if self.span is None:
                 raise ModelFileError("adaptive steps require a time span: give span, not steps")
@@ -85,6 +88,14 @@ class TimeSpan(RunOptions):
             raise ModelFileError(
                 f"{what} is not available with precision = 'double-double': omit it, or use precision = 'double' "
                 "([run] precision, run --precision)"
+            )
+
+    def _check_alone(self) -> None:
+        """Raise an error for a single run on a device."""
+        if self.device is not None:
+            raise ModelFileError(
+                f"device = {self.device!r} ([run] device, run --device) computes ensembles only: give --ensemble FILE, "
+                "or omit device"
             )
 
     def _run_section(self) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
-from scvi_codegen.runtime.ensemble.lanes import LaneBlock
+from scvi_codegen.runtime.ensemble.lanes import CommonRuns, LaneBlock
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, ViolationError, checked
 from scvi_codegen.verification.system_under_test import EPSILON, State, SystemUnderTest
@@ -167,7 +167,7 @@ def _lanes(tested: SystemUnderTest, starts: list[State], steps: int, carry: Arra
     first, m = starts[0], len(carry) // 2
     ensemble = Ensemble(tested.stepper, q, p, h=first.h, steps=steps, t=first.t, parameters=tested.parameters)
     work = ensemble.common
-    assert work is not None
+    assert isinstance(work, CommonRuns)
     make, width = work.blocks()
     block = make(0)
     assert isinstance(block, LaneBlock)

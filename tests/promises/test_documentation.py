@@ -31,7 +31,7 @@ MINUTES = "scvi-codegen reproduce all"
 """Command that takes minutes of processor time."""
 PICTURE = re.compile(r"!\[[^]]+\]\((\w+\.svg)\)")
 """Image that the code of a page draws."""
-PEERS = ("astropy", "casadi", "fmpy", "heyoka", "rebound")
+PEERS = ("astropy", "casadi", "cupy", "fmpy", "heyoka", "rebound")
 """Optional libraries of pages; a page is skipped if one of them is not installed."""
 SHOWN = {"python", "text", "console", "sh", "toml", "c", "julia", "diff"}
 """Permitted languages of code blocks."""

@@ -88,6 +88,7 @@ SITUATIONS = {
     "without derivatives": lambda: loaded(stepper_of()),
     "without second derivatives": lambda: stepper_of(damping=0.1),
     "without an error estimate": lambda: stepper_of("stoermer-verlet"),
+    "without trajectories in SIMD lanes": lambda: stepper_of("scvi:2"),
     "with sizes known at run time": lambda: stepper_of(**ARRAY),
     "with forces": lambda: stepper_of(forces={"q": "-q_dot"}),
     "": stepper_of,
@@ -125,6 +126,7 @@ OPERATIONS = {
     "tables": lambda s: run_of(s, tables={}),
     "with_sizes": lambda s: s.with_sizes(N=2),
     "ensembles": lambda s: s.integrate_ensemble(*map(stacked, state_of(s)), h=0.1, steps=3),
+    "device": lambda s: s.integrate_ensemble(*map(stacked, state_of(s)), h=0.1, steps=3, device="cuda"),
     "checkpoint": lambda s: s.start(*state_of(s), h=0.1, **end_of(s)).checkpoint(),
     "dense_output": lambda s: run_of(s).at([0.15]),
     "project": lambda s: s.project(*state_of(s)),
@@ -184,7 +186,7 @@ def test_refusals_of_the_table_are_those_of_the_operations(situation, situations
 @pytest.mark.parametrize("situation", [name for name in SITUATIONS if name != "without derivatives"])
 def test_operations_that_a_stepper_supports_work(situation, half, situations):
     """In the default tier half of the operations in each situation, each operation in half of the situations."""
-    stepper, left_out = situations(situation), {"fit", "flow", "periodic_orbit", "energy"}
+    stepper, left_out = situations(situation), {"device", "fit", "flow", "periodic_orbit", "energy"}
     of_sizes = {"work", "discrete_lagrangian", "chaos"} if stepper.run_time_sizes else set()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -17,10 +17,11 @@ from typing import NamedTuple
 import click
 
 from scvi_codegen.cli.command_group import FAILURE, CommandFailure, reporting, tell
-from scvi_codegen.errors import BuildError
+from scvi_codegen.errors import BuildError, MissingLibraryError
 from scvi_codegen.files.cache import CACHE_VARIABLE, cache_folder, cache_info, exposed, remedy_of
 from scvi_codegen.native.building import FLAGS_VARIABLE, TUNED_FLAGS
 from scvi_codegen.native.compilers import compiler_title, find_compiler, from_wheel, running
+from scvi_codegen.native.cuda import EXTRA_SIZE, NOT_YET_RUN, Device
 
 OK, MISSING, FAILED = "ok", "lacks", "fails"
 PACKAGE = "scvi-codegen"
@@ -73,6 +74,16 @@ def run_checks() -> Iterator[CheckResult]:
     for extra in dict.fromkeys(wanted["extra"] for wanted in _described(PACKAGE)):
         if extra:
             yield _packages(extra, f"extra {extra}")
+    yield _gpu()
+
+
+def _gpu() -> CheckResult:
+    """Look for a GPU; ``device="cuda"`` is experimental."""
+    try:
+        device = Device()
+    except (BuildError, MissingLibraryError) as error:
+        return CheckResult("gpu", MISSING, f"none ({NOT_YET_RUN})", f"{error} (extra cuda: {EXTRA_SIZE})")
+    return CheckResult("gpu", OK, f"{device.device.name}, {device.architecture} ({NOT_YET_RUN})")
 
 
 def _cores() -> str:

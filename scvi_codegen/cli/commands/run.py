@@ -138,6 +138,8 @@ def run(
         )
     if ensemble is not None:
         check_available(model, IN_ENSEMBLE)
+    else:
+        model._check_alone()
     for option, needed in (
         ("--ensemble", ensemble is not None),
         ("--advise", wanted["advise"] is not None),

@@ -19,6 +19,7 @@ OPERATIONS = {
     "tables": "tables=",
     "with_sizes": "with_sizes",
     "ensembles": "integrate_ensemble",
+    "device": "device=",
     "checkpoint": "checkpoint",
     "dense_output": "dense output",
     "project": "project",
@@ -63,6 +64,7 @@ PROPERTIES: dict[str, Callable[[Any], bool]] = {
     "with sizes known when compiled": lambda stepper: not stepper.run_time_sizes,
     "with sizes known at run time": lambda stepper: stepper.run_time_sizes,
     "with precision='double-double'": lambda stepper: stepper.interface.words > 1,
+    "without trajectories in SIMD lanes": lambda stepper: not stepper.run_time_sizes and stepper.ensemble is None,
     "without derivatives": lambda stepper: stepper._lacks("derivatives"),
     "without second derivatives": lambda stepper: stepper._lacks("second_derivatives"),
     "without an error estimate": lambda stepper: not (stepper._has_error_estimate or stepper._has_tau),
@@ -94,7 +96,7 @@ FEATURES = {
     for property_, operations, remedy in (
         (
             "with a time transformation",
-            "ensembles chaos_ensemble periodic_orbit fit flow",
+            "ensembles device chaos_ensemble periodic_orbit fit flow",
             "this requires fixed steps h; compile the stepper without time_transformation",
         ),
         ("with precision='double-double'", _IN_DOUBLE, "omit it, or use precision='double'"),
@@ -105,7 +107,7 @@ FEATURES = {
         ("in transformed time", "advice", "use --tolerance (local error)"),
         ("in transformed time", "adaptive", "give h (fixed step in tau)"),
         ("in transformed time", "inputs", "compile the original system"),
-        ("in transformed time", "chaos chaos_ensemble periodic_orbit fit flow", _ORIGINAL),
+        ("in transformed time", "device chaos chaos_ensemble periodic_orbit fit flow", _ORIGINAL),
         ("in transformed time", _ACTIONS, _ORIGINAL),
         ("with a time transformation", "shadow_energy path", "compile the stepper without time_transformation"),
         ("for a first-order system", _ACTIONS, "use a system whose velocities determine its momenta"),
@@ -115,7 +117,7 @@ FEATURES = {
         ("for a first-order system", "hessian", "use first derivatives and differences of them"),
         (
             "with events that change the state",
-            "error check_growth hessian chaos_ensemble flow advice",
+            "error device check_growth hessian chaos_ensemble flow advice",
             "make them terminal and restart",
         ),
         (
@@ -144,6 +146,12 @@ FEATURES = {
             "it requires forces at two or more stages, or velocities that vary along a step; give h and steps (fixed "
             "step size)",
         ),
+        (
+            "without trajectories in SIMD lanes",
+            "device",
+            "it requires explicit steps or a fixed-point iteration, as of SVI and Gauss methods without constraints; "
+            "omit device",
+        ),
         ("without derivatives", f"{_DERIVATIVES} {_ACTIONS}", "it was loaded without their source; compile the system"),
         (
             "without second derivatives",
@@ -159,11 +167,13 @@ FEATURES = {
             "threads share the steps of arrays whose sizes are known at run time only; omit threads, compile without "
             "sizes, or compile roll_sums(system).system, whose runs take its tables and parameters",
         ),
-        ("with sizes known at run time", "flow", f"pass stepper.with_sizes(..); {SIZES_REQUIRED}"),
+        ("with sizes known at run time", "flow device", f"pass stepper.with_sizes(..); {SIZES_REQUIRED}"),
         ("with save_every", "t_eval", "give either t_eval or save_every, not both"),
         ("with inputs", "t_eval", "omit t_eval"),
         ("with inputs", "observe", "omit observe"),
         ("with inputs", "sensitivity chaos", "use tangent or pullback, or run.pieces"),
+        ("with t_eval", "device", "give h, steps and save_every"),
+        ("with error", "device", "give h and steps (fixed step size)"),
         ("with t_eval", "observe", "omit observe"),
         ("with observe", "error dense_output", "omit observe"),
     )

@@ -352,6 +352,7 @@ class Stepper(Integrator):
         progress: Callable[[int], None] | None = None,
         threads: int | None = None,
         error: float | None = None,
+        device: str | None = None,
     ) -> EnsembleTrajectory:
         """Run k trajectories on all cores, with common fixed steps (SIMD lanes) or with adaptive steps for each.
 
@@ -372,13 +373,19 @@ class Stepper(Integrator):
             threads: number of threads, by default one per core.
             error: as of :meth:`integrate`, a bound of the relative global error of each trajectory, with a local
                 tolerance of its own: ``global_error``, ``confirmed_digits`` and ``confirmed_until`` of the result.
+            device: ``"cuda"`` for fixed steps on an NVIDIA GPU, one thread a trajectory (extra ``cuda``; experimental:
+                not yet run on a device). Arrays may then be in its memory (CuPy, PyTorch, JAX). Trajectories whose
+                steps fail are continued on the processor.
 
         Returns:
-            An :class:`EnsembleTrajectory`; states equal those of :meth:`integrate` to round-off. A trajectory that
-            fails has NaN after the failure and the reason in ``status``; the others are unaffected.
+            An :class:`EnsembleTrajectory`, with ``device`` a
+            :class:`~scvi_codegen.runtime.ensemble.device.DeviceEnsemble`; states equal those of :meth:`integrate` to
+            round-off. A trajectory that fails has NaN after the failure and the reason in ``status``; the others are
+            unaffected.
 
         Raises:
             StateError: if a shape, name or number is invalid.
+            BuildError: with ``device`` if there is no GPU, or too little memory on it.
         """
         q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
         if error is not None:
@@ -400,8 +407,11 @@ class Stepper(Integrator):
             parameters=parameters,
             options=options,
             error=error,
+            device=device,
         )
         work.run(progress=progress, threads=threads)
+        if device is not None:
+            return cast("EnsembleTrajectory", work.device_result())
         trajectories = work.result()
         warn_of_unconfirmed(trajectories.confirmations)
         warn_of_energy_errors(trajectories, None if work.successive is None else work.successive.energies)

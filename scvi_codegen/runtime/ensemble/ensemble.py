@@ -18,9 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import EventError, StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, real_array
+from scvi_codegen.native.cuda import DEVICES
 from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.runtime.core.features import check_together, require
 from scvi_codegen.runtime.core.validation import Array, States, check_left_to_inputs, columns_of_inputs, parameter_index
+from scvi_codegen.runtime.ensemble.device import DeviceEnsemble, DeviceRuns, on_processor
 from scvi_codegen.runtime.ensemble.initial_states import (
     EnsembleParameters,
     checked_ensemble,
@@ -94,10 +96,15 @@ class Ensemble:
         parameters: EnsembleParameters = None,
         options: SolverOptions | None = None,
         error: float | None = None,
+        device: str | None = None,
     ) -> None:
         interface = stepper.interface
+        _check_device(device, h, error=error, t_eval=t_eval)
         steps, t_end = _steps_or_end(t, h, steps, t_end, inputs, tolerance, t_eval)
         require(stepper, "ensembles")
+        if device is not None:
+            require(stepper, "device")
+            q, p, velocity, parameters = (on_processor(each) for each in (q, p, velocity, parameters))
         if h is None:
             require(stepper, "adaptive")
         self.stepper = stepper
@@ -120,7 +127,7 @@ class Ensemble:
             for values, at, momenta in zip(self.parameters, *self.start, strict=True):
                 values[energy] = stepper.energy(at, momenta, 0.0, values)
         self.values_at = partial(parameters_at, stepper.parameters, self.parameters, self.inputs)
-        self.common: CommonRuns | None = None
+        self.common: CommonRuns | DeviceRuns | None = None
         self.plans: list[StepPlan] = []
         self.saved: dict[int, SavedLane] = {}
         self.error, self.confirmations = error, list[GlobalError | None]()
@@ -132,13 +139,16 @@ class Ensemble:
         if self.inputs:
             self.parameters[:, columns_of_inputs(interface)] = 0.0
         if fixed is not None and not stepper.changes_states:
-            self.common = CommonRuns(stepper, self.options, self.start, self.parameters, self.values_at, fixed)
+            kind = CommonRuns if device is None else DeviceRuns
+            self.common = kind(stepper, self.options, self.start, self.parameters, self.values_at, fixed)
         self.states: list[Rows] = []
         self.successive = self._successive()
 
     def _successive(self) -> SuccessiveRuns | None:
         """Return the trajectories that C integrates one after the other, ``None`` for other ensembles."""
         stepper, common = self.stepper, self.common
+        if isinstance(common, DeviceRuns):
+            return None
         if self.inputs or stepper.changes_states or stepper.in_tau or not stepper.binding.reusable:
             return None
         if common is not None:
@@ -221,7 +231,7 @@ class Ensemble:
             for j, each in zip(range(part.start, part.stop), trajectories.each(), strict=True):
                 self.saved[j] = SavedLane(*each)
             return
-        common = self.common
+        common = cast(CommonRuns, self.common)
         common.q[:, part], common.p[:, part] = trajectories.q, trajectories.p
         common.status[part], common.done[part] = trajectories.status, trajectories.steps
         if common.times is not None:
@@ -240,6 +250,9 @@ class Ensemble:
             unit = self.length / len(self)
             report = None if progress is None else lambda done: progress(int(done * unit))
             self.successive.run(progress=report, threads=threads)
+            return
+        if isinstance(self.common, DeviceRuns):
+            self.common.run(progress=progress, threads=threads)
             return
         if self.common is not None:
             self._run_blocks(self.common, progress, threads)
@@ -329,22 +342,41 @@ class Ensemble:
         if self.successive is not None:
             common.done, ended = self.successive.done, self.successive.status >= 0
             common.status = np.where(ended, self.successive.names, OK)
-        unfinished = (common.status == OK) & (common.done < fixed.steps)
+        q, p = common.states()
         spans: tuple[Span, ...] = ()
         if fixed.t_end is not None:
             spans = tuple((rows, slice(None), partial(self.values_at, each.middle)) for rows, each in fixed.spans())
         return EnsembleTrajectory(
             t=fixed.times(tau=common.times is not None),
             times=common.times,
-            q=common.q,
-            p=common.p,
-            status=np.where(unfinished, INTERRUPTED, common.status),
+            q=q,
+            p=p,
+            status=self._status(common),
             steps=common.done,
             h=fixed.h,
             parameters=self.parameters,
             stepper=self.stepper,
             spans=spans,
         )
+
+    def device_result(self) -> DeviceEnsemble:
+        """Return the trajectories of a GPU, whose states stay in its memory."""
+        common = cast(DeviceRuns, self.common)
+        return DeviceEnsemble(
+            t=common.steps.times(tau=False),
+            q=common.q,
+            p=common.p,
+            status=self._status(common),
+            steps=common.done,
+            h=common.steps.h,
+            parameters=self.parameters,
+            stepper=self.stepper,
+            _to_host=self.result,
+        )
+
+    def _status(self, common: CommonRuns | DeviceRuns) -> NDArray[np.str_]:
+        unfinished = (common.status == OK) & (common.done < common.steps.steps)
+        return np.where(unfinished, INTERRUPTED, common.status)
 
     def _adaptive_result(self) -> EnsembleTrajectory:
         if self.successive is not None and not self.saved:
@@ -411,6 +443,17 @@ class Ensemble:
         return SavedLane(
             np.array([self.t0])[first], self.start[0][[j]][first], self.start[1][[j]][first], INTERRUPTED, 0
         )
+
+
+def _check_device(device: str | None, h: float | None, **others: Any) -> None:
+    """Raise ``StateError`` for an unknown device, and for arguments that ensembles on a GPU do not have."""
+    if device is None:
+        return
+    if device not in DEVICES:
+        raise StateError(f"device is {device!r}: it must be {' or '.join(map(repr, DEVICES))}, or omitted")
+    check_together(device=device, **others)
+    if h is None:
+        raise StateError("device='cuda' requires a fixed step size: give h and steps, or omit device")
 
 
 def _steps_or_end(

@@ -64,6 +64,10 @@ class CommonRuns:
     def __len__(self) -> int:
         return len(self.start[0])
 
+    def states(self) -> tuple[Array, Array]:
+        """Return the (n, k, m) saved positions and momenta."""
+        return self.q, self.p
+
     def successive(self) -> SuccessiveRuns:
         """Return the trajectories as successive runs, which store their states here."""
         steps, h, segments = self.steps, self.steps.segments[0].h, []
@@ -198,10 +202,11 @@ class LaneBlock:
 
 
 class SingleBlock:
-    """Block of one trajectory, for methods without SIMD lanes."""
+    """Block of one trajectory, for methods without SIMD lanes; other arguments as of :class:`SingleRun`."""
 
-    def __init__(self, work: CommonRuns, first: int) -> None:
-        self.step, self.run = 0, SingleRun(work, first, work.q[0, first], work.p[0, first])
+    def __init__(self, work: CommonRuns, first: int, *state: Array, step: int = 0, carries: Any = None) -> None:
+        q, p = state or (work.q[0, first], work.p[0, first])
+        self.step, self.run = step, SingleRun(work, first, q, p, step, carries)
 
     def advance(self, size: int) -> None:
         """Advance by ``size`` steps."""

@@ -4,47 +4,10 @@
  * prepare_iteration and fixed_point of a solver, which compute the increments of a step; EXPLICIT_STEPS if it does not
  * iterate. */
 
-void NAME(start)(block_memory *block, double t, double h)
-{
-  memset(block, 0, sizeof *block);
-  block->t = t;
-  block->h = h;
-}
-
-void NAME(set)(block_memory *block, int lane, const double *q, const double *p, const double *v,
-    const double *parameters)
-{
-  for (int i = 0; i < M; i++) {
-    block->q[i][lane] = q[i];
-    block->p[i][lane] = p[i];
-    for (int n = 0; STATUS(NEEDS_VELOCITIES) && n < S; n++)
-      block->memory[0][n][i][lane] = block->memory[1][n][i][lane] = v[i];
-  }
-  for (int i = 0; i < P; i++)
-    block->parameters[i][lane] = parameters[i];
-  block->active[lane] = 1.0;
-}
-
 /* The part of the state that a step changes, in local memory during a call. */
 typedef struct {
   lanes q[M], p[M], carry_q[M], carry_p[M];
 } state;
-
-static void load_state(const block_memory *block, state *now)
-{
-  memcpy(now->q, block->q, sizeof now->q);
-  memcpy(now->p, block->p, sizeof now->p);
-  memcpy(now->carry_q, block->carry_q, sizeof now->carry_q);
-  memcpy(now->carry_p, block->carry_p, sizeof now->carry_p);
-}
-
-static void save_state(const state *now, block_memory *block)
-{
-  memcpy(block->q, now->q, sizeof now->q);
-  memcpy(block->p, now->p, sizeof now->p);
-  memcpy(block->carry_q, now->carry_q, sizeof now->carry_q);
-  memcpy(block->carry_p, now->carry_p, sizeof now->carry_p);
-}
 
 /* x + carry += increment with its low word, in double-double arithmetic, in active lanes. */
 static void add_increments(lanes *x, lanes *carry, const lanes *increment, const double *active)
@@ -71,6 +34,46 @@ static void drop_infinite(const state *now, const lanes *dq, const lanes *dp, do
     sum.all += 0.0 * (now->q[i] + dq[i]) + 0.0 * (now->p[i] + dp[i]);
   for (int j = 0; j < LANES; j++)
     active[j] = sum.lane[j] == 0.0 ? active[j] : 0.0;
+}
+
+#ifdef SCVI_DEVICE
+#include "thread_run.h"
+#else
+void NAME(start)(block_memory *block, double t, double h)
+{
+  memset(block, 0, sizeof *block);
+  block->t = t;
+  block->h = h;
+}
+
+void NAME(set)(block_memory *block, int lane, const double *q, const double *p, const double *v,
+    const double *parameters)
+{
+  for (int i = 0; i < M; i++) {
+    block->q[i][lane] = q[i];
+    block->p[i][lane] = p[i];
+    for (int n = 0; STATUS(NEEDS_VELOCITIES) && n < S; n++)
+      block->memory[0][n][i][lane] = block->memory[1][n][i][lane] = v[i];
+  }
+  for (int i = 0; i < P; i++)
+    block->parameters[i][lane] = parameters[i];
+  block->active[lane] = 1.0;
+}
+
+static void load_state(const block_memory *block, state *now)
+{
+  memcpy(now->q, block->q, sizeof now->q);
+  memcpy(now->p, block->p, sizeof now->p);
+  memcpy(now->carry_q, block->carry_q, sizeof now->carry_q);
+  memcpy(now->carry_p, block->carry_p, sizeof now->carry_p);
+}
+
+static void save_state(const state *now, block_memory *block)
+{
+  memcpy(block->q, now->q, sizeof now->q);
+  memcpy(block->p, now->p, sizeof now->p);
+  memcpy(block->carry_q, now->carry_q, sizeof now->carry_q);
+  memcpy(block->carry_p, now->carry_p, sizeof now->carry_p);
 }
 
 /* Stores the states of the first `count` trajectories, one row each. */
@@ -188,3 +191,4 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
   save_state(&now, block);
   memcpy(block->memory, memory, sizeof memory);
 }
+#endif

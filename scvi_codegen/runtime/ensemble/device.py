@@ -1,0 +1,209 @@
+"""Ensembles with common fixed steps on a GPU: a thread is one trajectory, results stay in the memory of the device.
+
+A trajectory whose step fails stops there; the single integrator continues it on the processor, as it does those that
+leave a block of SIMD lanes (:mod:`scvi_codegen.runtime.ensemble.lanes`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.native.cuda import Device, constant, has_device_memory
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.rendering.source import Source
+from scvi_codegen.representation import one_line
+from scvi_codegen.runtime.core.integrator import Integrator
+from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.ensemble.lanes import CommonRuns, SingleBlock
+from scvi_codegen.runtime.ensemble.result import OK, EnsembleTrajectory
+from scvi_codegen.runtime.ensemble.schedule import CommonSteps
+from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
+from scvi_codegen.runtime.run.chunks import drive
+from scvi_codegen.runtime.run.descriptions import short_title
+
+FIRST_STEPS, GROWTH = 64, 8.0
+"""Steps of the first launch, and the largest ratio of those of successive ones."""
+HEAD = 4
+"""Numbers in front of the memory of a trajectory: time, its low word, steps for the predictor, 1 while active."""
+
+
+def on_processor(value: Any) -> Any:
+    """Return a copy on the processor of an array of a GPU, alone or in a mapping; other values unchanged."""
+    if isinstance(value, Mapping):
+        return {name: on_processor(each) for name, each in value.items()}
+    return Device().copy_of(value) if has_device_memory(value) else value
+
+
+class DeviceRuns:
+    """Trajectories with common fixed steps on a GPU; arguments as of :class:`CommonRuns`.
+
+    Attributes:
+        q, p: (n, k, m) saved states, on the device.
+        times: ``None``: all trajectories have the same times.
+        status, done: as of :class:`CommonRuns`.
+    """
+
+    times = None
+
+    def __init__(
+        self,
+        stepper: Integrator,
+        options: SolverOptions | None,
+        start: tuple[Array, Array],
+        parameters: Array,
+        values_at: Callable[[float, slice], Array],
+        steps: CommonSteps,
+    ) -> None:
+        self.stepper, self.options, self.start, self.steps = stepper, options or SolverOptions(), start, steps
+        self.values_at, self.device = values_at, Device()
+        source = cast(Source, stepper.ensemble)
+        self.launch = self.device.kernels(source)
+        count, self.m = map(int, start[0].shape)
+        self.count, device, shape = count, self.device, (len(steps.numbers), count, self.m)
+        self.q, self.p = device.empty(shape), device.empty(shape)
+        for initial, states in zip(start, (self.q, self.p), strict=True):
+            device.copy_in(initial, states)
+        self.parameters = device.copied(parameters if parameters.size else np.zeros((count, 1)))
+        self.points = constant(source, "S")
+        self.needs_velocities = bool(constant(source, f"{source.prefix.upper()}_NEEDS_VELOCITIES"))
+        self.h = steps.segments[0].h
+        self.memory = device.copied(self._first_memory(parameters))
+        self.counts = device.copied(np.zeros(count, np.int64))
+        self.status, self.done = np.full(count, OK, dtype="<U32"), np.zeros(count, dtype=np.int64)
+
+    def __len__(self) -> int:
+        return self.count
+
+    def states(self) -> tuple[Array, Array]:
+        """Return copies of the (n, k, m) saved positions and momenta on the processor."""
+        return self.device.copy_out(self.q), self.device.copy_out(self.p)
+
+    def _first_memory(self, parameters: Array) -> Array:
+        """Return (numbers, k) initial memory of the threads."""
+        memory = np.zeros((HEAD + (4 + 2 * self.points) * self.m, self.count))
+        memory[0], memory[3] = self.steps.t0, 1.0
+        for i, states in enumerate(self.start):
+            memory[HEAD + i * self.m : HEAD + (i + 1) * self.m] = states.T
+        self._reset_predictor(memory, parameters)
+        return memory
+
+    def _reset_predictor(self, memory: Array, parameters: Array) -> None:
+        """Discard the stored values of the last steps; where the predictor needs them, use the present velocities."""
+        memory[2] = 0.0
+        if not self.needs_velocities:
+            return
+        m, stored = self.m, memory[HEAD + 4 * self.m :].reshape(2 * self.points, self.m, -1)
+        for j in np.flatnonzero(memory[3] > 0.0):
+            q, p = memory[HEAD : HEAD + m, j], memory[HEAD + m : HEAD + 2 * m, j]
+            memory[3, j] = 0.0
+            with suppress(StateError):
+                stored[:, :, j] = self.stepper.velocity(q, p, memory[0, j], parameters[j])
+                memory[3, j] = 1.0
+
+    def run(self, *, progress: Callable[[int], None] | None, threads: int | None) -> None:
+        """Integrate all trajectories; then continue those that failed on the processor, with ``threads`` threads."""
+        step = 0
+
+        def advance(size: int) -> int:
+            nonlocal step
+            for chunk in self.steps.chunks(step, size):
+                if chunk.entered is not None:
+                    self._enter(chunk.entered.h, self.values_at(chunk.entered.middle, slice(None)))
+                self._advance(step, chunk.steps, chunk.save_every)
+                step += chunk.steps
+            return size
+
+        try:
+            drive(advance, self.steps.steps, first=FIRST_STEPS, growth=GROWTH, ended=lambda: False, progress=progress)
+        finally:
+            self.done = self.device.copy_out(self.counts)
+        self._continue(np.flatnonzero(self.done < self.steps.steps), threads)
+
+    def _enter(self, h: float, parameters: Array) -> None:
+        """Set step size and parameters; a new step size invalidates the predictor."""
+        device = self.device
+        if parameters.size:
+            device.copy_in(parameters, self.parameters)
+        if h != self.h:
+            self.h, memory = h, device.copy_out(self.memory)
+            self._reset_predictor(memory, parameters)
+            device.copy_in(memory, self.memory)
+
+    def _advance(self, begin: int, size: int, save_every: int) -> None:
+        rows = self.steps.row(begin) * self.count * self.m * self.q.dtype.itemsize
+        options = self.options
+        states = (np.uint64(each.ptr + rows) for each in (self.q, self.p))
+        numbers = float(options.tolerance), int(options.max_iterations), int(options.absolute)
+        memory = self.memory, self.parameters, *states, self.counts
+        self.launch("thread_advance", self.count, self.count, begin, size, save_every, float(self.h), *numbers, *memory)
+
+    def _continue(self, failed: NDArray[np.intp], threads: int | None) -> None:
+        """Continue trajectories from their last good states on the processor, and store their states on the device."""
+        if not failed.size:
+            return
+        memory = self.device.copy_out(self.memory)[HEAD : HEAD + 4 * self.m, failed]
+        q, p, *carries = (np.ascontiguousarray(each.T) for each in memory.reshape(4, self.m, -1))
+
+        def values_at(time: float, part: slice) -> Array:
+            return self.values_at(time, slice(None))[failed][part]
+
+        start = self.start[0][failed], self.start[1][failed]
+        initial = values_at(self.steps.segments[0].middle, slice(None))
+        work = CommonRuns(self.stepper, self.options, start, initial, values_at, self.steps)
+
+        def advance(j: int, check_stop: StopCheck) -> None:
+            step = int(self.done[failed[j]])
+            block = SingleBlock(work, j, q[j], p[j], step=step, carries=(carries[0][j], carries[1][j]))
+            block.advance(self.steps.steps - step)
+
+        run_jobs(len(failed), advance, progress=None, threads=threads)
+        self.status[failed], self.done[failed] = work.status, work.done
+        which, rows = self.device.copied(failed.astype(np.int64)), len(work.q)
+        for target, values in ((self.q, work.q), (self.p, work.p)):
+            arguments = self.count, rows, len(failed), which, self.device.copied(values), target
+            self.launch("thread_replace", rows * len(failed), *arguments)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DeviceEnsemble:
+    """States of k trajectories in the memory of a GPU, the initial state first.
+
+    Attributes:
+        t: (n,) times.
+        q, p: (n, k, m) positions and momenta, NaN after a failure; arrays of the device with ``__dlpack__``, for
+            ``cupy.from_dlpack(runs.q)`` and ``torch.from_dlpack``.
+        status, steps, h, parameters, stepper: as of :class:`EnsembleTrajectory`, on the processor.
+    """
+
+    t: Array
+    q: Any
+    p: Any
+    status: NDArray[np.str_]
+    steps: NDArray[np.int64]
+    h: float
+    parameters: Array
+    stepper: Integrator = field(repr=False)
+    _to_host: Callable[[], EnsembleTrajectory] = field(repr=False)
+
+    def __len__(self) -> int:
+        return len(self.status)
+
+    def __repr__(self) -> str:
+        states = f"{len(self.t)} states of each of {len(self)} trajectories on a GPU, {np.count_nonzero(self.ok)} ok"
+        return one_line(self, short_title(self.stepper.interface), states)
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """(k,) flags of the trajectories that reached the end."""
+        return np.asarray(self.status == OK)
+
+    def to_host(self) -> EnsembleTrajectory:
+        """Return a copy in the memory of the processor, with energies, plots and files."""
+        return self._to_host()
