@@ -229,7 +229,7 @@ def eliminate_constraints(
     ``angle_1`` of ``x1``, ``y1``, and 0 where the rod points along -y. Rods that close loops and all other constraints
     are kept. Coordinates without a rod, forces, damping, parameters and inputs are carried over; functions of events
     and time transformations may use the original names. The result has fewer unknowns than the original system and is
-    integrated several times as fast, except for chains of many rods, whose mass matrix is full.
+    integrated faster for few rods; the mass matrix of a chain is full, so that constraints are faster for many.
 
     Args:
         system: a Lagrangian system with constraints.
