@@ -415,14 +415,17 @@ class TestFailures:
     ],
     ids=lambda value: getattr(value, "name", value) if not isinstance(value, dict) else next(iter(value)),
 )
-def test_bits_of_trajectories_do_not_depend_on_others(name: str, method: Method, plan: dict[str, Any]) -> None:
-    """In another order, in parts and in threads: with different numbers of iterations, accelerated and failed steps."""
+def test_bits_of_trajectories_do_not_depend_on_others(
+    name: str, method: Method, plan: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In another order, in parts, in threads and calls: with different iterations, accelerated and failed steps."""
+    monkeypatch.setattr("scvi_codegen.runtime.ensemble.ensemble.CHUNK_SECONDS", 1e3)  # two blocks in a call
     generator = np.random.default_rng(4)
     if name == "chain":  # slow iterations
-        stepper, count = sc.compile_stepper(chain(4).system, method), 20
+        stepper, count = sc.compile_stepper(chain(4).system, method), 136
         q, p = generator.uniform(-1.5, 1.5, (count, 4)), generator.uniform(-0.1, 0.1, (count, 4))
     else:
-        stepper, count = stepper_for(name, method), 20
+        stepper, count = stepper_for(name, method), 136
         q, p = (x * generator.choice([-1.0, 1.0], x.shape) for x in states(name, count))
         q[3], p[3] = (0.0, p[3]) if name == "kepler" else (q[3], 1e4)
     runs = stepper.integrate_ensemble(q, p, **plan, threads=1)

@@ -11,7 +11,7 @@ from counting import TooMuchWorkError, at_most
 from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
-from scvi_codegen.runtime.ensemble import successive
+from scvi_codegen.runtime.ensemble import ensemble, successive
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 
 COUNT = 7
@@ -151,8 +151,14 @@ def test_threads_and_calls_do_not_change_results(name: str, plan: str, monkeypat
     assert reported[-1] == (33 if name == "rod" else COUNT)
 
 
-def test_python_costs_less_than_one_function_call_for_each_trajectory() -> None:
-    arguments: dict[str, Any] = {"t_end": 0.2, "tolerance": 1e-9, "save_every": 10**9}
+@pytest.mark.parametrize(
+    "arguments", [{"t_end": 0.2, "tolerance": 1e-9, "save_every": 10**9}, {"h": 0.05, "steps": 2, "threads": 1}]
+)
+def test_python_costs_less_than_one_function_call_for_each_trajectory(
+    arguments: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (ensemble, successive):
+        monkeypatch.setattr(module, "CHUNK_SECONDS", 1e3)  # independent of the clock
     one, (q, p) = stepper("kepler"), (np.repeat(x, 200, axis=0) for x in states("kepler"))
     one.integrate_ensemble(q, p, **arguments)
     with at_most(len(q) // 2):

@@ -7,6 +7,7 @@ or a bound of the global error. C runs without the GIL, so threads share the wor
 number of threads.
 """
 
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from functools import partial
@@ -52,6 +53,9 @@ from scvi_codegen.runtime.run.times import WHOLE
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import LARGEST_COUNT, checked_count
+
+FEW_STEPS = 10_000
+"""Largest number of steps of trajectories of which many are integrated in one call of C."""
 
 
 class SavedLane(NamedTuple):
@@ -286,8 +290,26 @@ class Ensemble:
                 ended=lambda: False,
             )
 
+        together, begun, blocks = None if self.inputs else common.lanes_in_one_call(), 0, 1
+        if together is not None and len(firsts) > 1 and common.steps.steps <= FEW_STEPS:
+            began = time.perf_counter()
+            advance(0, lambda _: None)
+            blocks = int(min(CHUNK_SECONDS / (time.perf_counter() - began), -(-len(firsts) // 16)))
+            begun, blocks = 1, max(1, blocks)
+        jobs = range(begun, len(firsts), blocks)  # of so many blocks each
+
+        def advance_many(number: int, check_stop: StopCheck) -> None:
+            first, last = jobs[number], min(jobs[number] + blocks, len(firsts))
+            failed = [firsts[first]]
+            if together is not None and blocks > 1:
+                failed = together(firsts[first], min(firsts[last - 1] + width, len(self)))
+                reached[first:last] = common.steps.steps
+            for each in failed:
+                reached[each // width] = 0
+                advance(each // width, check_stop)
+
         report = None if progress is None else lambda _: progress(int(reached.mean()))
-        run_jobs(len(firsts), advance, progress=report, threads=threads)
+        run_jobs(len(jobs), advance_many, progress=report, threads=threads)
 
     def _trajectory(self, j: int, check_stop: StopCheck) -> SavedLane:
         """Return trajectory j as :meth:`Stepper.integrate` does; with ``error`` its confirmed local tolerance is kept.

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import empty_array
@@ -70,18 +71,60 @@ class CommonRuns:
 
     def successive(self) -> SuccessiveRuns:
         """Return the trajectories as successive runs, which store their states here."""
-        steps, h, segments = self.steps, self.steps.segments[0].h, []
-        for chunk in steps.chunks(0, steps.steps):
-            h = h if chunk.entered is None else chunk.entered.h
-            segments.append((chunk.steps, chunk.save_every, h))
-        numbers, save_every, sizes = zip(*segments, strict=True)
-        fixed = FixedSegments(np.array(numbers, np.int64), np.array(save_every, np.int64), np.array(sizes, float))
-        return SuccessiveRuns(
-            self.stepper, self.options, self.start, self.parameters, steps.t0, fixed, store=self._store
-        )
+        fixed, _ = self.fixed_segments()
+        start = self.start, self.parameters, self.steps.t0
+        return SuccessiveRuns(self.stepper, self.options, *start, fixed, store=self._store)
 
     def _store(self, states: Rows) -> None:
         self.q[states.rows, states.trajectories], self.p[states.rows, states.trajectories] = states.q, states.p
+
+    def fixed_segments(self) -> tuple[FixedSegments, NDArray[np.int64]]:
+        """Return the steps in segments, and the row of the first state that is saved in each."""
+        steps, h, segments, begin = self.steps, self.steps.segments[0].h, [], 0
+        for chunk in steps.chunks(0, steps.steps):
+            h = h if chunk.entered is None else chunk.entered.h
+            segments.append((chunk.steps, chunk.save_every, h, steps.row(begin)))
+            begin += chunk.steps
+        numbers, save_every, sizes, rows = zip(*segments, strict=True)
+        fixed = FixedSegments(np.array(numbers, np.int64), np.array(save_every, np.int64), np.array(sizes, float))
+        return fixed, np.array(rows, np.int64)
+
+    def lanes_in_one_call(self) -> Callable[[int, int], list[int]] | None:
+        """Return a function that integrates a range of trajectories in one call of C; ``None`` without such lanes.
+
+        It returns the first trajectories of the blocks in which one failed, which have to be integrated singly.
+        """
+        binding = self.stepper._ensemble_binding
+        if binding is None or binding.constant("NEEDS_VELOCITIES") or not self.steps.steps:
+            return None
+        (steps, save_every, h), rows = self.fixed_segments()
+        width = len(binding.new("block *").active)
+        start = [np.ascontiguousarray(x) for x in (*self.start, self.parameters)]
+        if not start[-1].size:
+            start[-1] = np.zeros((1, 1))
+        active = np.zeros(len(self))
+
+        def advance(first: int, end: int) -> list[int]:
+            binding.function("advance_each")(
+                binding.new("block *"),
+                first,
+                end,
+                self.steps.t0,
+                *map(binding.pointer, start),
+                len(h),
+                *map(binding.whole_numbers, (steps, save_every, rows)),
+                binding.pointer(h),
+                binding.options(self.options),
+                binding.pointer(self.q),
+                binding.pointer(self.p),
+                self.start[0].size,
+                binding.pointer(active),
+            )
+            failed = np.flatnonzero(active[first:end] == 0.0) // width * width + first
+            self.done[first:end] = self.steps.steps
+            return sorted({*failed.tolist()})
+
+        return advance
 
     def blocks(self) -> tuple[Callable[[int], LaneBlock | SingleBlock], int]:
         """Return a function that makes the block beginning at a trajectory, and the trajectories per block."""

@@ -191,4 +191,28 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
   save_state(&now, block);
   memcpy(block->memory, memory, sizeof memory);
 }
+
+void NAME(advance_each)(block_memory *block, long long first, long long end, double t, const double *q0,
+    const double *p0, const double *parameters, int segments, const long long *steps, const long long *every,
+    const long long *row, const double *h, const solver_options *options, double *q, double *p, long long row_length,
+    double *active)
+{
+  for (; first < end; first += LANES) {
+    const int count = (int)(end - first < LANES ? end - first : LANES);
+    NAME(start)(block, t, h[0]);
+    for (int j = 0; j < LANES; j++) {
+      const long long from = first + (j < count ? j : count - 1);
+      NAME(set)(block, j, q0 + from * M, p0 + from * M, q0 + from * M, parameters + from * P);
+      block->active[j] = j < count;
+    }
+    for (int s = 0; s < segments; s++) {
+      block->guess = h[s] == block->h ? block->guess : 0;
+      block->h = h[s];
+      NAME(advance)(block, count, steps[s], every[s], options, q + row[s] * row_length + first * M,
+          p + row[s] * row_length + first * M, row_length);
+    }
+    for (int j = 0; j < count; j++)
+      active[first + j] = block->active[j];
+  }
+}
 #endif
