@@ -100,11 +100,15 @@ class DeviceRuns:
         if not self.needs_velocities:
             return
         m, stored = self.m, memory[HEAD + 4 * self.m :].reshape(2 * self.points, self.m, -1)
-        for j in np.flatnonzero(memory[3] > 0.0):
-            q, p = memory[HEAD : HEAD + m, j], memory[HEAD + m : HEAD + 2 * m, j]
+        q, p, running = memory[HEAD : HEAD + m].T, memory[HEAD + m : HEAD + 2 * m].T, memory[3] > 0.0
+        if running.all() and (parameters == parameters[0]).all():  # in one call
+            with suppress(StateError):
+                stored[:] = self.stepper.velocity(q, p, memory[0], parameters[0]).T
+                return
+        for j in np.flatnonzero(running):
             memory[3, j] = 0.0
             with suppress(StateError):
-                stored[:, :, j] = self.stepper.velocity(q, p, memory[0, j], parameters[j])
+                stored[:, :, j] = self.stepper.velocity(q[j], p[j], memory[0, j], parameters[j])
                 memory[3, j] = 1.0
 
     def run(self, *, progress: Callable[[int], None] | None, threads: int | None) -> None:
