@@ -249,7 +249,8 @@ def _interface(folder: Path, model: Model) -> SimpleNamespace:
     scalars = {name: value for name, value in model.parameters.items() if np.ndim(value) == 0}
     return SimpleNamespace(
         array=True, title=data["title"], system=model.system.name, coordinates=[], momentum_names=[], rotations=[],
-        constraints=[], map_names=[], parameters=list(scalars), defaults=list(scalars.values()), conserves_energy=True,
+        constraints=[], map_names=[], parameters=list(scalars), defaults=list(scalars.values()),
+        conserves_energy=not model.system.changes_energy,
         sizes=data["sizes"], inputs=[], energy_parameter="",
     )  # fmt: skip
 
@@ -387,7 +388,8 @@ def _description(shown: Page, interface: Any, *, initial: bool) -> dict[str, Any
     variables = _variables(interface, shape, len(q))
     plots = [[_variable(name, variables) for name in reversed(pair)] for pair in model.page.get("plots", ())]
     return {
-        "m": len(q), "q": q, "v": v, "t": float(model.t), "coordinates": interface.coordinates,
+        "m": len(q), "q": [] if initial else q, "v": [] if initial else v, "t": float(model.t),
+        "coordinates": interface.coordinates,
         "momenta": interface.momentum_names, "parameters": parameters, "quantities": interface.map_names,
         "energy": {"label": "Energy", "conserved": bool(interface.conserves_energy) and conserved}, "plots": plots,
         "causes": CAUSES, "events": [str(each.function) for each in model.events],
