@@ -6,7 +6,7 @@ from numpy import cos, pi, sin
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.pictures.animation import shape_of
+from scvi_codegen.pictures.animation import positions_of
 
 
 def run_of(axes, boundary, method, start, *, velocity=None, steps=20, **options):
@@ -62,16 +62,16 @@ def test_spectrum_decays_where_the_field_is_resolved(tmp_path):
 @pytest.mark.parametrize(("made", "lines", "dimension"), [(on_a_line, 1, 2), (in_the_plane, 7, 3)])
 def test_animation_shows_the_graph_over_the_points(made, lines, dimension):
     mesh, run = made()
-    shape = shape_of(run)
-    points = shape.points(run.q, run.p)
+    film = run.animate(seconds=0.1)
+    points = positions_of(film.shapes[0], film.shown[0])
     assert points.shape == (21, mesh.weights.size, dimension)
-    assert len(shape.solids) == lines
+    curves = np.split(np.arange(mesh.weights.size), lines)
     x, y = points[0, :, 0], points[0, :, 1]
     wave = cos(2 * pi * x) if dimension == 2 else sin(pi * x) * sin(2 * pi * y)
     assert points[0, :, -1] == pytest.approx(wave, abs=1e-12)
-    for line in shape.solids:
-        assert (np.diff(points[0, line, -2]) > 0).all()
-    run.animate(seconds=0.1).animation.to_jshtml()
+    for curve in curves:
+        assert (np.diff(points[0, curve, -2]) > 0).all()
+    film.animation.to_jshtml()
 
 
 def test_dataset_has_the_coordinates_of_the_mesh(tmp_path):

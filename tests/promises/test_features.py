@@ -51,12 +51,14 @@ def test_features_work_or_are_refused_with_a_reason(feature, kind, kinds, tmp_pa
             assert feature not in SUPPORTS or of.used.supports(SUPPORTS[feature])
 
 
-def stepper_of(method="svi:2", *, g=None, tau=None, events=None, **arguments):
+def stepper_of(method="svi:2", *, g=None, tau=None, events=None, precision="double", **arguments):
     """Return a stepper of one coordinate, or with arguments of the system."""
     lagrangian = arguments.pop("lagrangian", "q_dot**2/2 - q**2/2")
     system = sc.LagrangianSystem.from_text("body", arguments.pop("coordinates", ["q"]), lagrangian, **arguments)
     system = sc.reparametrise(system, tau) if tau else system
-    return sc.compile_stepper(system, method, time_transformation=g, events=events, flags=QUICK_FLAGS)
+    return sc.compile_stepper(
+        system, method, time_transformation=g, events=events, precision=precision, flags=QUICK_FLAGS
+    )
 
 
 def loaded(stepper):
@@ -90,6 +92,7 @@ SITUATIONS = {
     "without an error estimate": lambda: stepper_of("stoermer-verlet"),
     "without trajectories in SIMD lanes": lambda: stepper_of("scvi:2"),
     "with sizes known at run time": lambda: stepper_of(**ARRAY),
+    "with precision='double-double'": lambda: stepper_of(precision="double-double"),
     "with forces": lambda: stepper_of(forces={"q": "-q_dot"}),
     "": stepper_of,
 }

@@ -146,6 +146,7 @@ FEATURES = {
             "it requires forces at two or more stages, or velocities that vary along a step; give h and steps (fixed "
             "step size)",
         ),
+        ("with sizes known at run time", "flow device", f"pass stepper.with_sizes(..); {SIZES_REQUIRED}"),
         (
             "without trajectories in SIMD lanes",
             "device",
@@ -167,7 +168,6 @@ FEATURES = {
             "threads share the steps of arrays whose sizes are known at run time only; omit threads, compile without "
             "sizes, or compile roll_sums(system).system, whose runs take its tables and parameters",
         ),
-        ("with sizes known at run time", "flow device", f"pass stepper.with_sizes(..); {SIZES_REQUIRED}"),
         ("with save_every", "t_eval", "give either t_eval or save_every, not both"),
         ("with inputs", "t_eval", "omit t_eval"),
         ("with inputs", "observe", "omit observe"),

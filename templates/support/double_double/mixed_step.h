@@ -21,7 +21,8 @@ typedef struct {
 
 static inline double lane_of(const lanes *x, int j)
 {
-  return ((const lane_view *)x)->lane[j];
+  const lane_view view = {*x}; /* a cast of the pointer would alias */
+  return view.lane[j];
 }
 
 /* sum_j table_gj x_j of a coordinate: Dot2 (Ogita, Rump & Oishi 2005) with the low words of both factors. */
