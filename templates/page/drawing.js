@@ -116,10 +116,12 @@ function spring(pen, [x0, y0], [x1, y1], color) {
   }
   line(pen, [...points, [x1, y1]], color, 1.5);
 }
-function wall(pen, from, to) {
-  const length = Math.hypot(to[0] - from[0], to[1] - from[1]), [u, v] = [(to[0] - from[0]) / length, (to[1] - from[1]) / length];
-  for (let at = 4; at < length; at += 9) line(pen, [[from[0] + at * u, from[1] + at * v], [from[0] + at * u - 6 * u - 7 * v, from[1] + at * v - 6 * v + 7 * u]], colors.muted, 1, 0.6);
-  line(pen, [from, to], colors.muted, 2);
+function wall(pen, corners) {
+  corners.slice(1).forEach((to, k) => {
+    const from = corners[k], length = Math.hypot(to[0] - from[0], to[1] - from[1]), [u, v] = [(to[0] - from[0]) / length, (to[1] - from[1]) / length];
+    for (let at = 4; at < length; at += 9) line(pen, [[from[0] + at * u, from[1] + at * v], [from[0] + at * u - 6 * u - 7 * v, from[1] + at * v - 6 * v + 7 * u]], colors.muted, 1, 0.6);
+  });
+  line(pen, corners, colors.muted, 2);
 }
 
 /** Returns the faces of a body of revolution about the third axis, or of a box; `size` is its largest extent. */
@@ -206,7 +208,7 @@ const marked = () => {
         } else if (mark.kind === "rod") add(middle, () => line(pen, mark.points.map((k) => at[k]), colors.ink, 2.5 * a[3]));
         else if (mark.kind === "line") add(middle, () => line(pen, mark.points.map((k) => at[k]), colors.muted, 1.2));
         else if (mark.kind === "spring") add(middle, () => spring(pen, a, b, colors.muted));
-        else if (mark.kind === "wall") add(-1e9, () => wall(pen, a, b));
+        else if (mark.kind === "wall") add(-1e9, () => wall(pen, mark.points.map((k) => at[k])));
         else if (mark.kind === "arrow") { const color = colors[hue(number++)]; add(middle, () => arrow(pen, a, b, color)); }
         else if (mark.kind === "pivot") add(middle, () => disc(pen, a, 3.5, "muted"));
         else if (mark.kind === "particles") mark.points.forEach((k) => add(at[k][2], () => disc(pen, at[k], (mark.radius ? Math.max(2, mark.radius * view.scale) : clamped(Math.min(width, height) / 4 / mark.points.length ** (1 / shape.dimension), 2, 16)) * at[k][3], hue(0))));
