@@ -47,7 +47,6 @@ def test_edits_find_their_source_lines() -> None:
     first_of_each(EDITS, lambda edit: "one of them, of Python: those of C take thrice as long"),
     ids=lambda edit: f"{edit['group']}: {edit['name']}",
 )
-@pytest.mark.second
 def test_every_edit_is_detected(edit: Edit, copy: Path) -> None:
     path = copy / edit["file"]
     text = path.read_text(encoding="utf-8")
