@@ -32,6 +32,7 @@ from scvi_codegen.mechanics.constraints.holonomic import HOLONOMIC
 from scvi_codegen.mechanics.derived_systems import in_other_coordinates, rate_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.representation import summary
 from scvi_codegen.validation import checks_arguments
 
 Array = NDArray[np.float64]
@@ -58,7 +59,7 @@ class Rod(NamedTuple):
     angle: Symbol
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class EliminatedRods:
     """Maps between a system with constraints and the same system in the angles of its rods.
 
@@ -73,6 +74,8 @@ class EliminatedRods:
     rods: tuple[Rod, ...]
     positions: tuple[Expr, ...]
     remaining: Mapping[str, str]
+
+    __repr__ = summary("original", "rods", "remaining")
 
     @property
     def coordinates(self) -> tuple[Symbol, ...]:

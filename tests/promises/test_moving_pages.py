@@ -2,6 +2,7 @@
 
 import html
 import importlib
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,6 +23,7 @@ def extension(name: str) -> Any:
     """Return a module of the site's extensions."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(DOCS / "_extensions"))
+        patch.delitem(sys.modules, name, raising=False)  # of the tests
         return importlib.import_module(name)
 
 
