@@ -3,6 +3,7 @@
 import warnings
 from functools import cache
 from pathlib import Path
+from tempfile import mkdtemp
 
 import numpy as np
 import pytest
@@ -131,6 +132,9 @@ OPERATIONS = {
     "ensembles": lambda s: s.integrate_ensemble(*map(stacked, state_of(s)), h=0.1, steps=3),
     "device": lambda s: s.integrate_ensemble(*map(stacked, state_of(s)), h=0.1, steps=3, device="cuda"),
     "checkpoint": lambda s: s.start(*state_of(s), h=0.1, **end_of(s)).checkpoint(),
+    "recording": lambda s: sc.record_run(
+        s.start(*state_of(s), h=0.1, **end_of(s)), mkdtemp() + "/a.run", steps=None if end_of(s) else 3
+    ),
     "dense_output": lambda s: run_of(s).at([0.15]),
     "project": lambda s: s.project(*state_of(s)),
     "multipliers": lambda s: s.multipliers(*state_of(s)),

@@ -35,6 +35,7 @@ from scvi_codegen.results.recording.manifest import (
     write_manifest,
 )
 from scvi_codegen.results.recording.reading import RecordedRun, load_run
+from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.run.accuracy import warn_of_energy_error, warn_of_large_steps, warn_of_unresolved_fields
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.observation import Observation
@@ -93,6 +94,7 @@ def record_run(
         StepFailedError: if a step fails; the states before it are in the folder.
     """
     target = Path(folder)
+    require(run.stepper, "recording")
     if run.steps:
         raise StateError(f"record_run requires a run at its start, but this run has {run.steps} steps: start a new one")
     _check_inputs(run)

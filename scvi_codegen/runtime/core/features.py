@@ -21,6 +21,7 @@ OPERATIONS = {
     "ensembles": "integrate_ensemble",
     "device": "device=",
     "checkpoint": "checkpoint",
+    "recording": "record_run",
     "dense_output": "dense output",
     "project": "project",
     "multipliers": "multipliers",
@@ -87,7 +88,7 @@ _DERIVATIVES = f"{_FIRST} chaos chaos_ensemble periodic_orbit fit flow"
 _CURVE = "SVI, SCVI or a Gauss method"
 _ACTIONS = "action shadow_energy path"
 _IN_DOUBLE = (
-    "error check_growth events inputs ensembles project multipliers work discrete_lagrangian chaos_ensemble "
+    "error check_growth events inputs ensembles recording project multipliers work discrete_lagrangian chaos_ensemble "
     f"periodic_orbit energy fit flow advice {_ACTIONS}"
 )
 _ORIGINAL = "compile the original system, with fixed steps h, or with time_transformation=... or t_end=..."
