@@ -369,18 +369,30 @@ class Sources:
         with announced(f"deriving the {'second ' * second}derivatives of {self.system.name} by {self.method.name}"):
             return render_derivatives(derivatives_of(self.system, stages, program, second=second))
 
-    def acting(self) -> Source | None:
-        """Return the source of runs that sum the action of their steps; ``None`` if another solver takes the steps."""
+    def _acting_program(self) -> Program | None:
+        """Return the program of runs that sum the action of their steps; ``None`` if another solver takes the steps."""
         program = self.program()
         stages = discretise(self.system, self.method)
         found = program.fixed_point and summing_action(program.fixed_point, self.system, stages.shape)
         if not (found and program.quantities.integrates and self.uses_fallback_library) or self.g is not None:
             return None
-        control = control_of(program, self.controller, self.system, None)
+        return replace(program, fixed_point=found, acts_along=True)
+
+    def acting(self) -> Source | None:
+        """Return the source of runs that sum the action of their steps, or ``None``."""
+        program = self._acting_program()
+        if program is None:
+            return None
+        control = control_of(self.program(), self.controller, self.system, None)
         if control:
-            control = replace(control, growth=error_growth_of(self.system, program))
-        program = replace(program, fixed_point=found, acts_along=True)
+            control = replace(control, growth=error_growth_of(self.system, self.program()))
         return render(program, control, fallback="external")
+
+    def acting_ensemble(self) -> Source | None:
+        """Return the source of trajectories in SIMD lanes that sum the action; ``None`` unless forces are stored."""
+        program = self._acting_program()
+        separable = program and program.fixed_point and program.fixed_point.name == "separable"
+        return render_ensemble(program) if program and separable else None
 
     def changes(self, count: int) -> Source | None:
         """Return the ensemble source with tangent vectors; ``None`` unless it is a fixed point with constant mass."""
@@ -394,11 +406,12 @@ class Sources:
 
     def variant(self, name: str) -> Source | None:
         """Return the source of a variant, named as in :class:`~scvi_codegen.runtime.core.compiled_method.Variants`."""
-        kind, _, count = name.partition(" ")
+        kind, _, count = name.partition(" ") if name.startswith("changes") else (name, "", "")
         variants: dict[str, Callable[[], Source | None]] = {
             "ensemble": lambda: render_ensemble(self.program()),
             "fallback": self.fallback,
             "acting": self.acting,
+            "acting ensemble": self.acting_ensemble,
             "derivatives": self.tangent,
             "second_derivatives": lambda: self.tangent(second=True),
             "changes": lambda: self.changes(int(count)),

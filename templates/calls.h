@@ -1,6 +1,6 @@
 /* Runs whose arguments and results are one struct. Requires: NAME, STATUS, calls_declarations.h; HAS_ADVANCE_TO,
- * HAS_MEASURES_GROWTH, HAS_STEP_ERROR, HAS_REJECTED and HAS_SET_FALLBACK where the source has these. Functions are
- * called by volatile pointers: not inlined, so that the bits of steps do not depend on these callers. */
+ * HAS_ACTIONS, HAS_MEASURES_GROWTH, HAS_STEP_ERROR, HAS_REJECTED and HAS_SET_FALLBACK where the source has these. Functions
+ * are called by volatile pointers: not inlined, so that the bits of steps do not depend on these callers. */
 
 static int NAME(call_store)(const NAME(call) *c, long long row, long long steps, long long every)
 {
@@ -66,6 +66,9 @@ static int NAME(call_one)(NAME(each) *c, const double *parameters, long long ste
   double *t = c->times + row, *q = c->positions + row * m, *p = c->momenta + row * m;
   __typeof__(NAME(advance)) *volatile fixed = NAME(advance);
   int status = 0, arrived = 0;
+#ifdef HAS_ACTIONS
+  c->run->actions = c->actions + row;
+#endif
 #ifdef HAS_SET_FALLBACK
   const long long left = c->left;
   *c->before = *c->run;

@@ -26,6 +26,7 @@ typedef struct {
   const double *segment_h; /* step size from there on */
   double *times, *positions, *momenta; /* memory for states */
   int *iterations;
+  double *actions; /* memory for the actions up to the states, unless NULL */
   int *status; /* of all trajectories, -1 before their end */
   long long *stored, *done; /* numbers of states and of steps of all trajectories */
   double *energies; /* of all trajectories at both ends, unless NULL */

@@ -91,6 +91,7 @@ def ensemble_numbers(model: Model, outcome: EnsembleOutcome, balance: float | No
         "seconds": outcome.seconds,
         "preparation_seconds": outcome.preparation,
         **_conserved(result),
+        "action": result.action() if model.action else None,
         "energy_balance": balance,
         "failure": "interrupted" if outcome.interrupted else None,
     }

@@ -125,6 +125,24 @@ def test_actions_of_constraints_forces_damping_and_ensembles(stepper):
     assert runs.action(cumulative=True).shape == (21, 2)
 
 
+@pytest.mark.parametrize(
+    "steps", [{"h": 0.2, "t_end": 4.1, "save_every": 4}, {"t_end": 6.0}], ids=["lanes", "adaptive"]
+)
+def test_ensembles_sum_the_actions_of_their_runs(stepper, steps):
+    q, p = np.array([START[:2], [0.0, 0.1], [0.1, 0.2]]), np.array([START[2:], [0.3, 0.1], [0.1, 0.0]])
+    q[2] = [0.0, 9.0]  # leaves the lanes: its steps fail with h = 0.2
+    without, runs = (stepper.integrate_ensemble(q[:2], p[:2], action=each, **steps) for each in (False, True))
+    assert without.actions is None
+    assert np.array_equal(without.q, runs.q, equal_nan=True)
+    singles = [stepper.integrate(q[j], p[j], check_growth=False, **steps | {"save_every": 1}) for j in range(2)]
+    assert np.abs(runs.action() - [each.action() for each in singles]).max() < 1e-15
+    assert np.isfinite(runs.actions[:3]).all()
+    if "h" in steps:
+        wild = stepper.integrate_ensemble(q, p, action=True, **steps)
+        assert np.array_equal(wild.action()[:2], runs.action())
+        assert wild.ok[2] or np.isnan(wild.action()[2])
+
+
 def test_sums_are_compensated():
     terms = np.concatenate([[1.0], np.full(10_000, 1e-17)])
     assert np.cumsum(terms)[-1] == 1.0

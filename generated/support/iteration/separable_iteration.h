@@ -456,20 +456,21 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
 #ifdef RUN_ACTION
 /* Integral along a solved step, whose forces `memory` contains. Requires: the table VELOCITY, the kernel
  * integrand_lanes. */
-static inline void integrals_of_iteration(const step_data *step, const iteration_data *data, const double *memory,
-    double *sum)
+static inline void integrals_of_iteration(const step_data *step, const iteration_data *data, stored_forces memory,
+    number *sum)
 {
   coordinates u[2];
   lanes value[GROUPS];
   for (int g = 0; g < GROUPS; g++) {
     for (int i = 0; i < M; i++) {
-      const double inverse = data->inverse_mass[i], *force = memory + i * POINTS, v = inverse * step->p0[i];
-      u[0][i] = step->q0[i] + (step->h * v * DRIFT[g] + data->square * inverse * sum_over_points(PRODUCT, g, force));
-      u[1][i] = v + step->h * inverse * sum_over_points(VELOCITY, g, force);
+      const number inverse = data->inverse_mass[i], v = inverse * step->p0[i];
+      const lanes kick = sum_of_stored(VELOCITY, g, memory, i), bent = sum_of_stored(PRODUCT, g, memory, i);
+      u[0][i] = step->q0[i] + (step->h * v * DRIFT[g] + data->square * inverse * bent);
+      u[1][i] = v + step->h * inverse * kick;
     }
     integrand_lanes(u[0], step->t + step->h * ABSCISSA[g], step->parameters, &value[g]);
   }
-  *sum = step->h * weigh_apart(POINT_END_MOMENTUM, value, 1);
+  *sum = step->h * weigh_apart_twice(POINT_END_MOMENTUM, POINT_END_MOMENTUM_LOW, value, 1);
 }
 #endif
 

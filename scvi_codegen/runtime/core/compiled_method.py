@@ -124,6 +124,7 @@ class CompiledMethod(ChosenBySizes):
         self._released_runs: list[Any] = []
         self._known: dict[Hashable, Self] = {}
         self._with_action: Self | None = None
+        self.sums_action = False  # whether runs sum the action of their steps
         self._entries: dict[Event, tuple[Event, ...]] = {}
         self._plain = cast(Source, source)
         self.shapes = shapes_of(interface)
@@ -153,7 +154,7 @@ class CompiledMethod(ChosenBySizes):
         if stepper._with_action is None:
             source = stepper._variants["acting"]
             found = stepper._with_action = stepper._copy(stepper.events, source) if source else stepper
-            found._with_action = found
+            found._with_action, found.sums_action = found, source is not None
         return stepper._with_action
 
     def _copy(self, events: tuple[Event, ...], source: Source | None = None) -> Self:
@@ -307,7 +308,7 @@ class CompiledMethod(ChosenBySizes):
     @cached_property
     def _ensemble_binding(self) -> Binding | None:
         """Library of trajectories in SIMD lanes, compiled on first use; ``None`` if the method has none."""
-        source = self.ensemble
+        source = (self._variants["acting ensemble"] if self.sums_action else None) or self.ensemble
         return None if source is None else Binding(building.load(source, flags=self.flags), source.prefix)
 
     @cached_property

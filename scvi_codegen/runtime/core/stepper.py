@@ -353,6 +353,7 @@ class Stepper(Integrator):
         threads: int | None = None,
         error: float | None = None,
         device: str | None = None,
+        action: bool = False,
     ) -> EnsembleTrajectory:
         """Run k trajectories on all cores, with common fixed steps (SIMD lanes) or with adaptive steps for each.
 
@@ -376,6 +377,7 @@ class Stepper(Integrator):
             device: ``"cuda"`` for fixed steps on an NVIDIA GPU, one thread a trajectory (extra ``cuda``; experimental:
                 not yet run on a device). Arrays may then be in its memory (CuPy, PyTorch, JAX). Trajectories whose
                 steps fail are continued on the processor.
+            action: as of :meth:`integrate`; with adaptive steps the steps are computed again for the action.
 
         Returns:
             An :class:`EnsembleTrajectory`, with ``device`` a
@@ -392,7 +394,7 @@ class Stepper(Integrator):
             require(self, "error")
             error = checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance})
         work = Ensemble(
-            self,
+            self._for_run(None, action=action),
             q,
             p,
             inputs=inputs,

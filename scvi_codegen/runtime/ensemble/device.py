@@ -46,11 +46,11 @@ class DeviceRuns:
 
     Attributes:
         q, p: (n, k, m) saved states, on the device.
-        times: ``None``: all trajectories have the same times.
+        times, actions: ``None``: all trajectories have the same times, and no action is summed.
         status, done: as of :class:`CommonRuns`.
     """
 
-    times = None
+    times = actions = None
 
     def __init__(
         self,

@@ -10,6 +10,7 @@ number of threads.
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple, cast
@@ -371,6 +372,7 @@ class Ensemble:
         return EnsembleTrajectory(
             t=fixed.times(tau=common.times is not None),
             times=common.times,
+            actions=common.actions,
             q=q,
             p=p,
             status=self._status(common),
@@ -419,12 +421,14 @@ class Ensemble:
 
     def _successive_result(self, work: SuccessiveRuns) -> EnsembleTrajectory:
         states, shape = self.states, (1 + int(work.stored.max()), *self.start[0].shape)
-        q, p, times = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape[:2], np.nan)
-        q[0], p[0], times[0] = *self.start, self.t0
+        q, p, times, actions = *np.full((2, *shape), np.nan), *np.full((2, *shape[:2]), np.nan)
+        q[0], p[0], times[0], actions[0] = *self.start, self.t0, 0.0
         for rows, j, *values in states:
-            times[rows, j], q[rows, j], p[rows, j] = values
+            times[rows, j], q[rows, j], p[rows, j], actions[rows, j] = values
         if self.t_eval is None:
-            return self._trajectories(np.arange(shape[0], dtype=float), times, q, p, work.names, work.done)
+            numbers = np.arange(shape[0], dtype=float)
+            whole = self._trajectories(numbers, times, q, p, work.names, work.done)
+            return replace(whole, actions=actions) if self.stepper.sums_action else whole
         at = np.where(self.t_eval == self.t0, 0, 1)
         missing = np.full_like(q[:1], np.nan)
         q, p = (np.concatenate([each, missing])[at] for each in (q, p))  # if no trajectory reached the end

@@ -42,6 +42,7 @@ class CommonRuns:
         steps: the steps.
         q, p: (n, k, m) saved states; NaN where not reached.
         times: (n, k) times in transformed time, else ``None``.
+        actions: (n, k) actions up to each state if runs sum them, NaN where unknown, else ``None``.
         status, done: reason of the end and number of completed steps of each trajectory.
     """
 
@@ -57,6 +58,9 @@ class CommonRuns:
         self.q, self.p = empty_array(shape), empty_array(shape)
         self.q[:] = self.p[:] = np.nan
         self.q[0], self.p[0] = self.start
+        self.actions = np.full(shape[:2], np.nan) if self.stepper.sums_action else None
+        if self.actions is not None:
+            self.actions[0] = 0.0
         self.times = np.full(shape[:2], np.nan) if self.stepper.interface.energy_parameter else None
         if self.times is not None:
             self.times[0] = self.steps.t0
@@ -77,6 +81,8 @@ class CommonRuns:
 
     def _store(self, states: Rows) -> None:
         self.q[states.rows, states.trajectories], self.p[states.rows, states.trajectories] = states.q, states.p
+        if self.actions is not None:
+            self.actions[states.rows, states.trajectories] = states.actions
 
     def fixed_segments(self) -> tuple[FixedSegments, NDArray[np.int64]]:
         """Return the steps in segments, and the row of the first state that is saved in each."""
@@ -95,7 +101,7 @@ class CommonRuns:
         It returns the first trajectories of the blocks in which one failed, which have to be integrated singly.
         """
         binding = self.stepper._ensemble_binding
-        if binding is None or binding.constant("NEEDS_VELOCITIES") or not self.steps.steps:
+        if binding is None or binding.constant("NEEDS_VELOCITIES") or self.actions is not None or not self.steps.steps:
             return None
         (steps, save_every, h), rows = self.fixed_segments()
         width = len(binding.new("block *").active)
@@ -216,6 +222,8 @@ class LaneBlock:
             row = work.steps.row(begin)
             stride = len(work) * work.stepper.dimension
             offset = row * stride + self.first * work.stepper.dimension if row < len(work.q) else 0
+            if work.actions is not None and hasattr(self.memory, "actions"):
+                self.memory.actions = self.binding.pointer(work.actions) + offset // work.stepper.dimension
             self.binding.function("advance")(
                 self.memory,
                 self.count,
@@ -267,7 +275,7 @@ class SingleRun:
     def __init__(
         self, work: CommonRuns, j: int, q: Array, p: Array, step: int = 0, carries: tuple[Array, Array] | None = None
     ) -> None:
-        self.work, self.j = work, j
+        self.work, self.j, self.left = work, j, carries is not None
         self.run: Memory | None = None
         work.done[j] = step
         segment, time = work.steps.at(step)
@@ -302,3 +310,5 @@ class SingleRun:
         work.q[rows, j], work.p[rows, j] = trajectory.q[1:], trajectory.p[1:]
         if work.times is not None:
             work.times[rows, j] = trajectory.t[1:]
+        if work.actions is not None:
+            work.actions[rows, j] = np.nan if self.left or trajectory.actions is None else trajectory.actions[1:]

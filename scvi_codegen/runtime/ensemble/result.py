@@ -59,6 +59,7 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
         parameters: (k, number of parameters) values; zeros for the parameters of inputs.
         stepper: the compiled integrator.
         times: (n, k) times if every trajectory has its own (transformed time, adaptive steps), else ``None``.
+        actions: (n, k) actions up to each state if the runs summed them (``action=True``), else ``None``.
         plans: step plan of each trajectory for adaptive steps, else empty.
         spans: with inputs, rows of states of a slice of trajectories and their parameters.
         confirmations: with ``error=``, of each trajectory as of :class:`Trajectory`, ``None`` for one that fails; else
@@ -74,6 +75,7 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
     parameters: Array
     stepper: Integrator = field(repr=False)
     times: Array | None = None
+    actions: Array | None = field(default=None, repr=False)
     plans: tuple[StepPlan, ...] = ()
     spans: tuple[Span, ...] = field(default=(), repr=False)
     confirmations: tuple[GlobalError | None, ...] = field(default=(), repr=False)
@@ -107,6 +109,7 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
                     step_sizes=np.full(len(rows), self.h or np.nan),
                     h=self.h,
                     tau=self.t[rows] if in_tau else None,
+                    actions=None if self.actions is None else self.actions[rows, j],
                     parameters=parameters,
                     stepper=self.stepper,
                     plan=plan,
@@ -183,8 +186,10 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
 
     def action(self, *, cumulative: bool = False) -> Array:
         """Return (k,) actions, or (n, k) up to each state, as of :meth:`Trajectory.action`; NaN after a failure."""
-        actions = np.full(self.q.shape[:2], np.nan)
+        actions = np.full(self.q.shape[:2], np.nan) if self.actions is None else self.actions.copy()
         for j in range(len(self)):
+            if np.isfinite(actions[self._reached(j), j]).all():
+                continue
             actions[self._reached(j), j] = self[j].action(cumulative=True)
         last = [np.flatnonzero(self._reached(j))[-1] for j in range(len(self))]
         return actions if cumulative else np.where(self.ok, actions[last, np.arange(len(self))], np.nan)

@@ -43,17 +43,18 @@ class FixedSegments(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Saved states: row and trajectory of each, times, positions and momenta."""
+    """Saved states: row and trajectory of each, times, positions, momenta and actions (NaN unless runs sum them)."""
 
     rows: NDArray[np.intp]
     trajectories: NDArray[np.intp]
     t: Array
     q: Array
     p: Array
+    actions: Array
 
     def copies(self) -> Rows:
         """Return copies, in memory of their own."""
-        return Rows(self.rows, self.trajectories, self.t.copy(), self.q.copy(), self.p.copy())
+        return Rows(*self[:2], *(each.copy() for each in self[2:]))
 
 
 class SuccessiveRuns:
@@ -173,6 +174,8 @@ class _Call:
         call.next, call.end, call.segment, call.capacity = first, end, -1, self.capacity
         self.iterations = np.empty(self.capacity, np.int32)
         call.iterations = binding.integers(self.iterations)
+        self.actions = np.full(self.capacity, np.nan)
+        (call.actions,) = binding.pointers(self.actions)
         self.states = np.empty(self.capacity), np.empty((self.capacity, m)), np.empty((self.capacity, m))
         call.times, call.positions, call.momenta = binding.pointers(*self.states)
         self.take = binding.each(call)
@@ -212,7 +215,7 @@ class _Call:
         numbers = work.stored[each] + 1 - first
         last, t, q, p = np.cumsum(numbers), *self.states
         rows = np.arange(count) + np.repeat(first + numbers - last, numbers)
-        work.store(Rows(rows, np.repeat(each, numbers), t[:count], q[:count], p[:count]))
+        work.store(Rows(rows, np.repeat(each, numbers), t[:count], q[:count], p[:count], self.actions[:count]))
         self.flushed = int(call.next)
         self.before = int(work.stored[self.flushed]) if self.flushed < call.end and call.segment >= 0 else 0
         call.rows = 0

@@ -91,6 +91,14 @@ static inline lanes apply(const double (*table)[S], int n, lanes (*x)[M], int i)
   return contribution_of_points(table, n, &x[0][i], M);
 }
 
+/* The same of stored values. */
+typedef lanes (*stored_forces)[M];
+
+static inline lanes sum_of_stored(const double (*table)[S], int n, stored_forces x, int i)
+{
+  return apply(table, n, x, i);
+}
+
 /* sum_n weights_n x_n with the low words of the weights. */
 static inline number weigh_apart_twice(const weight *weights, const weight *low, const lanes *x, long long apart)
 {

@@ -89,6 +89,23 @@ static void store_states(const state *now, int count, double *q, double *p)
 }
 
 #ifndef EXPLICIT_STEPS
+#ifdef RUN_ACTION
+/* Adds the action of a solved step in active lanes. */
+static void add_actions(block_memory *block, const step_data *step, const iteration_data *data, history past)
+{
+  lane_view sum;
+  integrals_of_iteration(step, data, past.before, &sum.all);
+  for (int j = 0; j < LANES; j++)
+    add_compensated(&block->action[j], &block->action_low[j], block->active[j] > 0.0 ? sum.lane[j] : NAN, 0.0);
+}
+
+static void store_actions(const block_memory *block, int count, long long place)
+{
+  if (block->actions)
+    memcpy(block->actions + place, block->action, sizeof(double) * (size_t)count);
+}
+#endif
+
 /* Results of a step of which some trajectories are repeated. */
 typedef struct {
   lanes curve[S][M], position[2 * M], momentum[2 * M];
@@ -175,6 +192,9 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
         repeats_failed(&stored_results, past, &block->guess, dq, dp, block->active));
 #endif
     drop_infinite(&now, dq, dp, block->active);
+#ifdef RUN_ACTION
+    add_actions(block, &step, &data, past);
+#endif
     add_increments(now.q, now.carry_q, dq, block->active);
     add_increments(now.p, now.carry_p, dp, block->active);
     block->step++;
@@ -184,6 +204,9 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
         block->last_step[j] = block->step;
     if (block->step % every == 0) {
       store_states(&now, count, q + stored * row_length, p + stored * row_length);
+#ifdef RUN_ACTION
+      store_actions(block, count, stored * (row_length / M));
+#endif
       stored++;
     }
   }
