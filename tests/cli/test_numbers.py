@@ -519,6 +519,7 @@ def test_every_field_and_line_of_an_ensemble_is_correct(springs):
         "seconds": lambda x: 0.0 < x < 5.0,
         "preparation_seconds": lambda x: 0.0 < x < 60.0,
         "energy": lambda x: np.allclose(x, energy[0], rtol=1e-14),
+        "action": lambda x: x is None,
         "energy_change": lambda x: abs(x - change) < 1e-14 * largest(energy) and change > 1e-7,
         "energy_balance": lambda x: x is None,
         "momentum_errors": lambda x: abs(x["angular momentum"] - largest((turning - turning[0]) / sizes)) < 2e-15,
