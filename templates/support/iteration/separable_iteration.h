@@ -461,8 +461,8 @@ static inline void integrals_of_iteration(const step_data *step, const iteration
   for (int g = 0; g < GROUPS; g++) {
     for (int i = 0; i < M; i++) {
       const number inverse = data->inverse_mass[i], v = inverse * step->p0[i];
-      const lanes kick = sum_of_stored(VELOCITY, g, memory, i), bent = sum_of_stored(PRODUCT, g, memory, i);
-      u[0][i] = step->q0[i] + (step->h * v * DRIFT[g] + data->square * inverse * bent);
+      const lanes kick = sum_of_stored(VELOCITY, g, memory, i), displacement = sum_of_stored(PRODUCT, g, memory, i);
+      u[0][i] = step->q0[i] + (step->h * v * DRIFT[g] + data->square * inverse * displacement);
       u[1][i] = v + step->h * inverse * kick;
     }
     integrand_lanes(u[0], step->t + step->h * ABSCISSA[g], step->parameters, &value[g]);
