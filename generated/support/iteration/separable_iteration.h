@@ -60,10 +60,10 @@ typedef struct {
 static void prepare_step_size(double h, iteration_data *data)
 {
   data->square = h * h;
-  data->square_low = fma(h, h, -data->square);
+  data->square_low = rest_of_product(h, h, data->square);
   for (int n = 0; n < GROUPS; n++) {
     data->kick[n] = h * POINT_END_MOMENTUM[n];
-    data->kick_low[n] = fused_weights(h, POINT_END_MOMENTUM[n], -data->kick[n]) + h * POINT_END_MOMENTUM_LOW[n];
+    data->kick_low[n] = rest_of_weights(h, POINT_END_MOMENTUM[n], data->kick[n]) + h * POINT_END_MOMENTUM_LOW[n];
   }
 }
 
@@ -71,10 +71,10 @@ PASS drift_words find_drift(const step_points *w, long long i)
 {
   const double h = w->step->h;
   const number inverse = w->data->inverse_mass[i], v = inverse * w->step->p0[i];
-  const number v_low = fused_numbers(inverse, w->step->p0[i], -v);
+  const number v_low = rest_of_numbers(inverse, w->step->p0[i], v);
   drift_words of;
   of.high = h * v;
-  of.low = fused_numbers(number_of(h), v, -of.high) + h * (v_low + inverse * w->step->carry_p[i]);
+  of.low = rest_of_numbers(number_of(h), v, of.high) + h * (v_low + inverse * w->step->carry_p[i]);
   return of;
 }
 

@@ -62,14 +62,14 @@ static inline number largest_number(const number *x)
   return largest_between(x, 0, M);
 }
 
-static inline number fused_numbers(number a, number b, number c)
+static inline number rest_of_numbers(number a, number b, number product)
 {
-  return multiply_add(a, b, c);
+  return multiply_add(a, b, -product);
 }
 
-static inline weight fused_weights(double a, weight b, weight c)
+static inline weight rest_of_weights(double a, weight b, weight product)
 {
-  return fma(a, b, c);
+  return rest_of_product(a, b, product);
 }
 
 /* sum_j table_nj x_j, in two independent sums; values at successive points are `apart` elements apart. */

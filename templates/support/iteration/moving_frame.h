@@ -168,7 +168,7 @@ static inline double excess(const double *d)
     square[k] = d[k] * d[k];
   IN_MEMORY(square); /* rounded, not part of fused operations */
   for (int k = 0; k < 4; k++)
-    rest += fma(d[k], d[k], -square[k]) + rest_of_sum(sum, square[k], &sum);
+    rest += rest_of_product(d[k], d[k], square[k]) + rest_of_sum(sum, square[k], &sum);
   return 0.5 * (sum + rest);
 }
 

@@ -87,7 +87,7 @@ static int changes_at(const event_step *step, int e, const event_sample *at, eve
 static void add_product(real a, real b, real *sum, real *low)
 {
   const real product = a * b, total = *sum + product, moved = total - *sum;
-  *low += fma(a, b, -product) + ((*sum - (total - moved)) + (product - moved));
+  *low += rest_of_product(a, b, product) + ((*sum - (total - moved)) + (product - moved));
   *sum = total;
 }
 
