@@ -63,6 +63,8 @@ CAUSES = (
 """Text of each status of the generated C, then of ``entry.c.jinja``."""
 ARRAY = re.compile(r"(\w+)\[")
 NAME = re.compile(r"[A-Za-z_]\w*\b(?!\()")
+INDENTED = re.compile(r"^[ \t]+|^[ \t]*//.*\n|^[ \t]*/\*\* .* \*/\n", re.MULTILINE)
+"""Indentation and comments of the scripts, which a page omits."""
 LONG_NUMBER = re.compile(r"\d{12}")
 """Numbers of robots from files, with which a Lagrangian is not shown."""
 SECONDS = 30
@@ -215,19 +217,12 @@ class Page:
             sources = ("page.c", "motion.c", *(["motion_events.c"] if model.events else []))
             code = webassembly(folder, sources)
         description = _description(self, interface, initial=bool(initial))
-        return (
-            template_environment()
-            .get_template("page/page.html.jinja")
-            .render(
-                title=html.escape(interface.system),
-                method=html.escape(interface.title.split(": ", 1)[-1]),
-                version=__version__,
-                licences=LICENCES,
-                lagrangian=_lagrangian(document),
-                description=json.dumps(description, separators=(",", ":")).replace("<", "\\u003c"),
-                wasm=code,
-            )
-        )
+        text = template_environment().get_template("page/page.html.jinja").render(
+            title=html.escape(interface.system), method=html.escape(interface.title.split(": ", 1)[-1]),
+            version=__version__, licences=LICENCES, lagrangian=_lagrangian(document),
+            description=json.dumps(description, separators=(",", ":")).replace("<", "\\u003c"), wasm=code,
+        )  # fmt: skip
+        return INDENTED.sub("", text)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the file, atomically."""

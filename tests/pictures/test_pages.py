@@ -5,8 +5,10 @@ import gzip
 import html
 import importlib.util
 import json
+import platform
 import re
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,7 @@ from programs import needs
 import scvi_codegen as sc
 from scvi_codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.pages import page as pages
+from scvi_codegen.pages.webassembly import FLAGS
 
 MOTIONS = Path(__file__).parents[2] / "docs" / "motions"
 OSCILLATOR = """[system]
@@ -96,7 +99,14 @@ def test_a_page_has_no_address_no_text_as_code_and_the_licences(tmp_path):
     assert "<b> oscillator" not in text
     assert not re.search(r"\beval\(|new Function", text)
     assert re.search(r"default-src 'none'.*script-src 'unsafe-inline' 'wasm-unsafe-eval'", text)
-    assert all(word in text for word in ("musl", "compiler-rt", "MIT licence"))
+    permission = (
+        (Path(__file__).parents[2] / "LICENSE")
+        .read_text(encoding="utf-8")
+        .partition("\n\nPermission")[2]
+        .partition("\n---")[0]
+    )
+    assert " ".join(permission.split()) in " ".join(re.sub("<.?p>", " ", text).split())
+    assert all(word in text for word in ("Rich Felker, et al.", "Zig contributors", "Sun Microsystems", "Arm Limited"))
     assert [(each["low"], each["high"]) for each in data["parameters"]] == [(0.5, 2.0), (0.05, 3.0)]
     assert (data["q"], data["v"], data["step"]["value"]) == ([1.0, 0.0], [0.0, 0.5], 0.1)
     frame = page._repr_html_()
@@ -225,6 +235,16 @@ def test_a_missing_compiler_is_an_error_with_its_remedy(tmp_path, monkeypatch):
         sc.page(written(tmp_path))
 
 
+def computed(text, steps):
+    """Return the state of a page after steps, in node."""
+    node = needs("node")
+    pytest.importorskip("ziglang", reason="pages are compiled by the extra compiler")
+    about = described(text) | {"steps": steps}
+    code = gzip.decompress(base64.b64decode(re.search(r'id="wasm">(.*?)</script>', text)[1]))
+    done = subprocess.run([node, "-e", NODE, json.dumps(about)], input=code, capture_output=True, check=True)
+    return json.loads(done.stdout)
+
+
 @pytest.mark.second
 @pytest.mark.parametrize(
     ("text", "steps", "statuses"),
@@ -235,15 +255,10 @@ def test_a_missing_compiler_is_an_error_with_its_remedy(tmp_path, monkeypatch):
     ],
 )
 def test_the_webassembly_computes_the_bits_of_python_within_200_kilobytes(tmp_path, text, steps, statuses):
-    node = needs("node")
-    pytest.importorskip("ziglang", reason="pages are compiled by the extra compiler")
     path = written(tmp_path, text)
     page = sc.page(path)
     assert len(page.html) < 200_000
-    about = described(page.html) | {"steps": steps}
-    code = gzip.decompress(base64.b64decode(re.search(r'id="wasm">(.*?)</script>', page.html)[1]))
-    done = subprocess.run([node, "-e", NODE, json.dumps(about)], input=code, capture_output=True, check=True)
-    state = json.loads(done.stdout)
+    state = computed(page.html, steps)
     assert state["statuses"] == statuses
     model = sc.load_model(path)
     stepper = sc.compile_stepper(model.system, model.method, flags=PORTABLE_FLAGS, events=page.model.events or None)
@@ -255,3 +270,45 @@ def test_the_webassembly_computes_the_bits_of_python_within_200_kilobytes(tmp_pa
     assert np.array_equal(state["p"], run.p[-1])
     assert state["energy"] == run.energy()[-1]
     assert state["stored"] == len(run.t) - 1
+
+
+NATIVE = """
+#include <stdio.h>
+double *memory_of(int);
+int start(double, double), advance(int, int);
+int main(void)
+{
+  static const double q[] = {Q}, v[] = {V};
+  enum { SIZE = sizeof q / sizeof *q };
+  for (int i = 0; i < SIZE; i++)
+    memory_of(1)[i] = q[i], memory_of(3)[i] = v[i];
+  for (int k = start(0, H) || advance(STEPS, STEPS) ? 3 : 1; k < 3; k++)
+    for (int i = 0; i < SIZE; i++)
+      printf("%a ", memory_of(k)[i]);
+}
+"""
+
+
+@pytest.mark.full
+def test_the_webassembly_computes_the_bits_of_a_native_build_with_the_same_library(monkeypatch):
+    """The functions of the C library are those of musl in both; products of the native build are fused."""
+    path, compiled, states = MOTIONS / "double_pendulum.toml", pages.webassembly, []
+    model = sc.load_model(path)
+    values = {"Q": str(model.q)[1:-1], "V": str(model.velocity)[1:-1], "H": str(model.h), "STEPS": "200"}
+
+    def also_native(folder, sources):
+        text = re.sub(r"\b(Q|V|H|STEPS)\b", lambda name: values[name[0]], NATIVE)
+        (folder / "native.c").write_text(text, encoding="utf-8")
+        flags = [flag for flag in FLAGS[3:] if flag not in ("-msimd128", "-s")]
+        compiler = [sys.executable, "-m", "ziglang", "cc", "-target", "x86_64-linux-musl", "-mcpu=x86_64_v3", *flags]
+        subprocess.run([*compiler, "-w", *sources, "native.c", "-lm", "-o", "native"], cwd=folder, check=True)
+        states.append(subprocess.run([folder / "native"], capture_output=True, text=True, check=True).stdout)
+        (folder / "native.c").unlink()
+        return compiled(folder, sources)
+
+    pytest.importorskip("ziglang", reason="pages are compiled by the extra compiler")
+    if (sys.platform, platform.machine()) != ("linux", "x86_64"):
+        pytest.skip("the native build is for Linux on x86-64")
+    monkeypatch.setattr(pages, "webassembly", also_native)
+    state = computed(sc.page(path).html, 200)
+    assert [float.fromhex(word) for word in states[0].split()] == state["q"] + state["p"]
