@@ -27,7 +27,8 @@ from typing import Any
 from sympy import Expr
 
 from scvi_codegen.controllers import controller_named
-from scvi_codegen.errors import MethodError, SizesRequiredError
+from scvi_codegen.errors import MethodError, SizesRequiredError, SystemDefinitionError
+from scvi_codegen.formulas.expressions import gradient_tuple
 from scvi_codegen.indices import SIZES_REQUIRED
 from scvi_codegen.ir.derivatives import PointDerivatives
 from scvi_codegen.ir.program import Program
@@ -37,12 +38,13 @@ from scvi_codegen.lowering.derivatives import derivatives_of, point_derivatives_
 from scvi_codegen.lowering.loops import transforms, with_sums
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.lowering.solvers.points import summing_action
+from scvi_codegen.lowering.stage_groups import system_kernel
 from scvi_codegen.mechanics.arrays.legendre import SiteHamiltonian, site_hamiltonian
 from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.derived_systems import with_tangent_vectors
-from scvi_codegen.mechanics.legendre import equivalent_lagrangian
+from scvi_codegen.mechanics.legendre import energy_of_states, equivalent_lagrangian
 from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.mechanics.term_groups import roll_terms
@@ -50,7 +52,7 @@ from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretise, discretised_form
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.announcements import announced
-from scvi_codegen.rendering.events import with_events
+from scvi_codegen.rendering.events import EventFormulas, with_events
 from scvi_codegen.rendering.kernels.simd import Fallback
 from scvi_codegen.rendering.program_source import (
     EMBEDDED,
@@ -404,9 +406,49 @@ class Sources:
             return None
         return render_ensemble(lower(varied, self.method, prefix=self.prefix, solver="fixed-point"))
 
+    def observing(self, functions: str) -> Source | None:
+        """Return the ensemble source that observes functions of the state; ``None`` without trajectories in lanes.
+
+        Args:
+            functions: ``"extremes"`` of positions and momenta, ``"energy"``, or formulas of events, one a line.
+
+        Raises:
+            EventError: for an invalid formula.
+            MethodError: if velocities at given momenta, on which a function depends, have no formula.
+        """
+        system, program = self.system, self.program()
+        if render_ensemble(program) is None:
+            return None
+        states = *system.coordinates, *system.momentum_symbols
+        if functions == "extremes":
+            values: Sequence[Expr] = states
+        else:
+            formulas = EventFormulas(self.interface, as_events(functions.split("\n") if functions != "energy" else ()))
+            values = [
+                value.xreplace(dict(zip(formulas.p, system.momentum_symbols, strict=True)))
+                for value in formulas.functions
+            ]
+            if not values or any(value.free_symbols & {*system.velocities} for value in values):
+                values = self._at_momenta(values)
+        return render_ensemble(program, system_kernel(system, "observed_lanes", values, u=states))
+
+    def _at_momenta(self, values: Sequence[Expr]) -> Sequence[Expr]:
+        """Return functions of velocities as functions of momenta; the energy if there are none."""
+        system = self.system
+        try:
+            energy = energy_of_states(system)
+        except SystemDefinitionError as error:
+            raise MethodError(
+                f"ensembles of '{system.name}' cannot observe velocities or energies, whose formulas are unknown "
+                f"({error}): save states, or observe functions of coordinates and momenta"
+            ) from error
+        velocities = gradient_tuple(energy, system.momentum_symbols)
+        replaced = dict(zip(system.velocities, velocities, strict=True))
+        return [value.xreplace(replaced) for value in values] or [energy]
+
     def variant(self, name: str) -> Source | None:
         """Return the source of a variant, named as in :class:`~scvi_codegen.runtime.core.compiled_method.Variants`."""
-        kind, _, count = name.partition(" ") if name.startswith("changes") else (name, "", "")
+        kind, _, count = name.partition(" ") if name.startswith(("changes", "observing")) else (name, "", "")
         variants: dict[str, Callable[[], Source | None]] = {
             "ensemble": lambda: render_ensemble(self.program()),
             "fallback": self.fallback,
@@ -415,9 +457,10 @@ class Sources:
             "derivatives": self.tangent,
             "second_derivatives": lambda: self.tangent(second=True),
             "changes": lambda: self.changes(int(count)),
+            "observing": lambda: self.observing(count),
         }
         if self.precision == DOUBLE_DOUBLE:  # derivatives are those of the step in double
-            return None if kind in ("ensemble", "fallback") else self._in_double.variant(name)
+            return None if kind in ("ensemble", "observing", "fallback") else self._in_double.variant(name)
         return None if self.of_arrays else variants[kind]()
 
 

@@ -4,6 +4,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
@@ -74,7 +75,12 @@ def integrate_states(states: EnsembleStates) -> EnsembleOutcome:
 def _work(model: Model, stepper: Stepper, states: EnsembleStates) -> Ensemble:
     """Return the compiled ensemble; Ctrl-C still ends the process here."""
     start = stepper, states.q, states.momenta(stepper)
-    arguments = {"options": model.solver_options, "device": model.device, **model._run_arguments()}
+    arguments = {
+        "options": model.solver_options,
+        "device": model.device,
+        "observe": model.observe,
+        **model._run_arguments(),
+    }
     work = Ensemble(*start, parameters=states.parameters, **arguments)
     if isinstance(work.common, CommonRuns):
         work.common.blocks()
@@ -95,7 +101,17 @@ def ensemble_summary(model: Model, outcome: EnsembleOutcome, balance: float | No
         f"prepared in {outcome.preparation:.2f} s",
         ", ".join(f"{number} {status}" for status, number in [("ok", counts.pop("ok", 0)), *sorted(counts.items())]),
     ]
-    return "\n".join([*lines, *_failures(result), _energy_report(result, balance), *momentum_report(result)])
+    reports = _failures(result), _extremes(result), [_energy_report(result, balance)], momentum_report(result)
+    return "\n".join([*lines, *chain(*reports)])
+
+
+def _extremes(result: EnsembleTrajectory) -> Iterator[str]:
+    if result.observed is None or result.observed.ndim < 3:
+        return
+    interface = result.stepper.interface
+    least, largest = np.nanmin(result.observed[0], axis=0), np.nanmax(result.observed[1], axis=0)
+    for name, one, other in zip((*interface.coordinates, *interface.momenta), least, largest, strict=True):
+        yield f"  {name}: {one:.6g} to {other:.6g} over all steps"
 
 
 def _describe_steps(model: Model, result: EnsembleTrajectory) -> str:
@@ -130,6 +146,8 @@ def energy_balance(result: EnsembleTrajectory) -> float | None:
 def _energy_report(result: EnsembleTrajectory, balance: float | None) -> str:
     """Return one line: the largest error or change of the energy among all trajectories."""
     energies = result.energy()
+    if result.observed is not None and result.observed.ndim == 2:
+        energies = np.concatenate([energies, result.observed])
     sizes = np.abs(energies[0])
     reason = energy_reason(result.stepper)
     relative = bool((sizes > 0.0).all()) and not reason

@@ -56,6 +56,22 @@ def legendre_dual(system: MechanicalSystem, variables: Sequence[Symbol], duals: 
     )
 
 
+def energy_of_states(system: MechanicalSystem) -> Expr:
+    """Return the energy as a function of coordinates and ``momentum_symbols``.
+
+    Raises:
+        SystemDefinitionError: if velocities at given momenta have no formula.
+    """
+    forms, momenta = forms_of(system), system.momentum_symbols
+    if system.auxiliaries:
+        return forms.energy
+    if forms.inverse_mass is None:
+        return legendre_dual(system, system.velocities, momenta)
+    velocities = forms.inverse_mass.velocities
+    products = sympy.Add(*(p * v for p, v in zip(momenta, velocities, strict=True)))
+    return products - system.lagrangian.xreplace(dict(zip(system.velocities, velocities, strict=True)))
+
+
 def positive_parameters(system: MechanicalSystem) -> dict[Symbol, Symbol]:
     """Return positive dummies for the parameters with positive defaults, so that roots of their squares simplify."""
     return {

@@ -56,7 +56,7 @@ class Model(TimeSpan):
             or axis and angle.
         p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
         velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
-        h, tolerance, error, span, steps, save_every, t, time_transformation, controller, precision, device,
+        h, tolerance, error, span, steps, save_every, t, time_transformation, controller, precision, device, observe,
             solver_tolerance, max_iterations, threads, action: as of :class:`~scvi_codegen.models.time_span.TimeSpan`.
         inputs: by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as :meth:`Stepper.integrate` accepts
             it, or a number; a run requires all inputs of the system.

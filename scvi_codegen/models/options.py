@@ -16,6 +16,7 @@ from scvi_codegen.controllers import CONTROLLERS, SYMPLECTIC
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.native.cuda import DEVICES
 from scvi_codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
+from scvi_codegen.runtime.ensemble.observation import OBSERVED
 from scvi_codegen.validation import TOLERANCE_RANGE, checked_count
 
 NUMBER, COUNT, TEXT, CHOICE, SWITCH, METHOD = "number", "count", "text", "choice", "switch", "method"
@@ -162,6 +163,11 @@ class RunOptions:
     device: str | None = run_option(
         *("run", CHOICE, "", "With --ensemble: fixed steps on an NVIDIA GPU (extra 'cuda'; experimental)."),
         choices=DEVICES,
+        common=False,
+    )
+    observe: str | None = run_option(
+        *("run", CHOICE, "", "With --ensemble: record extremes of the state or of the energy over all fixed steps."),
+        choices=OBSERVED[:2],
         common=False,
     )
     span: float | None = run_option("run", NUMBER, "T", "Duration of the run.", determines=DURATION)

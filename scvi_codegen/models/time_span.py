@@ -19,6 +19,7 @@ from scvi_codegen.models.options import (
 from scvi_codegen.native.cuda import DEVICES
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
+from scvi_codegen.runtime.ensemble.observation import OBSERVED
 from scvi_codegen.validation import LARGEST_COUNT
 
 
@@ -43,6 +44,7 @@ class TimeSpan(RunOptions):
             requires adaptive steps.
         precision: ``"double-double"`` for runs with states of two words; ``None`` means ``"double"``.
         device: ``"cuda"`` for ensembles with fixed steps on a GPU; single runs are not available with it.
+        observe: ``"extremes"`` or ``"energy"`` of ensembles, as of :meth:`Stepper.integrate_ensemble`.
         solver_tolerance, max_iterations: of the iteration on the stage equations, as of
             :class:`~scvi_codegen.SolverOptions`.
         threads: number of threads per step, for array sizes known at run time.
@@ -55,7 +57,7 @@ class TimeSpan(RunOptions):
         for option in RUN_FIELDS:
             if (value := getattr(self, option.field)) is not None:
                 object.__setattr__(self, option.field, option.checked(value))
-        for name, known in (("precision", PRECISIONS), ("device", DEVICES)):
+        for name, known in (("precision", PRECISIONS), ("device", DEVICES), ("observe", OBSERVED[:2])):
             if (value := getattr(self, name)) not in (None, *known):
                 raise ModelFileError(f"unknown {name} {value!r}: use {' or '.join(map(repr, known))}")
         if self.h is None:
@@ -91,12 +93,13 @@ class TimeSpan(RunOptions):
             )
 
     def _check_alone(self) -> None:
-        """Raise an error for a single run on a device."""
-        if self.device is not None:
-            raise ModelFileError(
-                f"device = {self.device!r} ([run] device, run --device) computes ensembles only: give --ensemble FILE, "
-                "or omit device"
-            )
+        """Raise an error for a single run with an option of ensembles."""
+        for name in ("device", "observe"):
+            if (value := getattr(self, name)) is not None:
+                raise ModelFileError(
+                    f"{name} = {value!r} ([run] {name}, run --{name}) is for ensembles only: give --ensemble FILE, "
+                    f"or omit {name}"
+                )
 
     def _run_section(self) -> dict[str, Any]:
         """Return the section ``[run]`` of the model file."""

@@ -255,27 +255,28 @@ def _control_context(program: Program, control: Control | None) -> dict[str, obj
     return {"control": control, "own_headers": {name: text}, "growth_tables": growth_tables}
 
 
-def render_ensemble(program: Program) -> Source | None:
+def render_ensemble(program: Program, observed: Kernel | None = None) -> Source | None:
     """Return source that integrates many trajectories at once, one per lane, by fixed-point iteration or explicitly.
 
     ``None`` for other steps, for rigid bodies turned in closed form, and with integrals: with a time transformation,
-    trajectories have no common times.
+    trajectories have no common times. ``observed``: functions whose extremes and changes of sign are recorded.
     """
     fixed_point, split = program.fixed_point, program.splitting
     if program.quantities.integrals:
         return None
     if split is not None and not split.bodies:
-        kernels, points, source = split.kernels, 1, splitting_source(split)
+        kernels, points, source = split.kernels, 1, splitting_source(split, observed)
     elif fixed_point is not None and fixed_point.serves_many:
         kernels, points = fixed_point.kernels, len(fixed_point.guess.abscissae)
-        source = iteration_source(fixed_point, TRAJECTORIES)
+        source = iteration_source(fixed_point, TRAJECTORIES, kernels=(*kernels, *((observed,) if observed else ())))
     else:
         return None
     prefix = f"{program.prefix}_ensemble"
     context = {
         "program": program,
         "points": points,
-        "cut": is_divided(kernels),
+        "observed": observed.values if observed else 0,
+        "cut": is_divided((*kernels, *((observed,) if observed else ()))),
         "needs_velocities": fixed_point is not None and fixed_point.kept is StoredValues.VELOCITIES,
         "hot": "static",
         "fixed_point": source,

@@ -124,6 +124,53 @@ def test_trajectories_that_stop_are_continued_by_the_processor(gpu: EmulatedGpu)
     assert lost.ok.tolist() == [True, False]
 
 
+OBSERVED = {"energy": "kepler", "extremes": "double-pendulum", "events": "planar-pendulum"}
+
+
+def check_observed(stepper: sc.Stepper, start: tuple[np.ndarray, np.ndarray], observe: str) -> None:
+    """Compare what is observed on the GPU and on the processor with states after all steps."""
+    plan = {"h": 0.05, "steps": 150}
+    runs = [stepper.integrate_ensemble(*start, **plan, device=each, observe=observe) for each in ("cuda", None)]
+    on_device, on_processor, (q, p) = runs[0].observed, runs[1].observed, (runs[1].q, runs[1].p)
+    assert np.array_equal(runs[0].to_host().observed, on_device)
+    assert np.abs(on_device - on_processor).max() < 1e-13
+    if observe == "events":
+        expected = [np.count_nonzero((x[:-1] < 0) & (x[1:] >= 0), axis=0) for x in (q[:, :, 0], p[:, :, 0])]
+        expected[1] += np.count_nonzero((p[:-1, :, 0] > 0) & (p[1:, :, 0] <= 0), axis=0)
+        assert np.array_equal(on_processor, np.stack(expected, axis=1))
+        assert (on_processor > 0).all()
+    else:
+        values = runs[1].energy() if observe == "energy" else np.concatenate([q, p], axis=2)
+        assert np.abs(on_processor - [np.nanmin(values, axis=0), np.nanmax(values, axis=0)]).max() < 1e-13
+
+
+@pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
+@pytest.mark.parametrize(
+    "observe", ["energy", *(pytest.param(x, marks=pytest.mark.second) for x in ("extremes", "events"))]
+)
+def test_values_at_all_steps_are_observed_without_saving_them(gpu: EmulatedGpu, observe: str) -> None:
+    system = OBSERVED[observe]
+    stepper = compiled(system, sc.SVI(4)).with_events(
+        [sc.Event("q", direction=1), "q_dot"] if observe == "events" else ()
+    )
+    check_observed(stepper, states(system), observe)
+
+
+@pytest.mark.second
+@pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
+def test_trajectories_that_leave_their_lane_are_observed(gpu: EmulatedGpu) -> None:
+    e = np.array([0.1, 0.97, 0.98, 0.99, 0.5])
+    q, p = np.stack([1 - e, 0 * e], axis=1), np.stack([0 * e, np.sqrt((1 + e) / (1 - e))], axis=1)
+    stepper, plan = compiled("kepler", sc.SVI(4)), {"h": 0.1, "steps": 100}
+    full = stepper.integrate_ensemble(q, p, **plan)
+    assert full.ok.tolist() != [True] * 5
+    values = np.concatenate([full.q, full.p], axis=2)
+    for device in (None, "cuda"):
+        seen = stepper.integrate_ensemble(q, p, **plan, save_every=7, observe="extremes", device=device)
+        assert np.abs(seen.observed - [np.nanmin(values, axis=0), np.nanmax(values, axis=0)]).max() < 1e-9
+        assert np.array_equal(seen.steps, full.steps)
+
+
 def test_interrupted_runs_have_the_states_so_far(gpu: EmulatedGpu) -> None:
     stepper, (q, p) = compiled("kepler", sc.SVI(4)), states("kepler")
     work = Ensemble(stepper, q, p, h=0.05, steps=200, device="cuda")
@@ -162,7 +209,14 @@ def test_unavailable_arguments_are_refused(gpu: EmulatedGpu) -> None:
     refused("requires a fixed step size: give h and steps", h=None, steps=None, t_end=1.0)
     refused("not available with t_eval: give h, steps and save_every", h=None, steps=None, t_end=1.0, t_eval=[1.0])
     refused("not available with error: give h and steps", h=None, steps=None, t_end=1.0, error=1e-6)
+    for device in (None, "cuda"):
+        refused(
+            "ensembles have no observer 'energies'.* Known: extremes, energy, events", device=device, observe="energies"
+        )
+        refused("which has none: use with_events", sc.EventError, device=device, observe="events")
+        refused("requires a fixed step size and events", h=None, steps=None, t_end=1.0, device=None, observe="energy")
     lobatto = compiled("kepler", sc.SCVI(2))
+    refused("it requires trajectories in SIMD lanes", sc.MethodError, of=lobatto, device=None, observe="energy")
     refused("not available without trajectories in SIMD lanes", sc.MethodError, of=lobatto)
     gpu.memory = 1000
     refused("cannot allocate .* for states of shape .*: raise save_every, or split", sc.BuildError, steps=50)
@@ -182,12 +236,17 @@ def test_command_line_and_model_files_choose_the_device(gpu: EmulatedGpu, tmp_pa
     found = np.load(tmp_path / "a.npz")["q"]
     run(*words, *ensemble)
     assert np.abs(np.load(tmp_path / "a.npz")["q"] - found).max() < 1e-13
-    assert "computes ensembles only: give --ensemble FILE, or omit device" in run(*words, "--device", "cuda")
+    seen = run(*words, *ensemble, "--observe", "extremes")
+    assert "  q: " in seen
+    observed, whole = np.load(tmp_path / "a.npz")["observed"], found[:, :, 0]
+    assert np.abs(observed[:, :, 0] - [whole.min(axis=0), whole.max(axis=0)]).max() < 1e-13
+    assert "relative energy error: " in run(*words, *ensemble, "--observe", "energy")
+    assert "is for ensembles only: give --ensemble FILE, or omit device" in run(*words, "--device", "cuda")
     system = sc.problem("planar-pendulum").system
     model = sc.Model(system=system, method="svi:4", q=(0.5,), p=(0.0,), h=0.1, steps=20, device="cuda")
     sc.save_model(model, tmp_path / "model.toml")
     assert sc.load_model(tmp_path / "model.toml").device == "cuda"
-    with pytest.raises(sc.ModelFileError, match="computes ensembles only"):
+    with pytest.raises(sc.ModelFileError, match="is for ensembles only"):
         model.integrate()
     with pytest.raises(sc.ModelFileError, match="unknown device 'gpu': use 'cuda'"):
         replace(model, device="gpu")

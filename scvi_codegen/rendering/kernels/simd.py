@@ -141,9 +141,9 @@ def iteration_source(
     )
 
 
-def splitting_source(split: Splitting) -> IterationSource:
+def splitting_source(split: Splitting, observed: Kernel | None = None) -> IterationSource:
     """Return the template data of explicit steps of many trajectories, which are lanes."""
-    kernels = (split.force,) if split.by_masses else (split.force, split.drift)
+    kernels = (split.force, *(() if split.by_masses else (split.drift,)), *((observed,) if observed else ()))
     functions = {name for each in (*kernels, split.drift) for name in lane_functions(each, TRAJECTORIES.sources)}
     sizes = {"LEAPS": str(len(split.kicks)), "EXPLICIT_STEPS": "1", "SPLITTING": "static inline"}
     tables = (("KICK", split.kicks), ("DRIFT", split.drifts), ("KICK_ABSCISSA", split.abscissae))

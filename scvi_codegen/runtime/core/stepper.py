@@ -354,6 +354,7 @@ class Stepper(Integrator):
         error: float | None = None,
         device: str | None = None,
         action: bool = False,
+        observe: str | None = None,
     ) -> EnsembleTrajectory:
         """Run k trajectories on all cores, with common fixed steps (SIMD lanes) or with adaptive steps for each.
 
@@ -378,6 +379,9 @@ class Stepper(Integrator):
                 not yet run on a device). Arrays may then be in its memory (CuPy, PyTorch, JAX). Trajectories whose
                 steps fail are continued on the processor.
             action: as of :meth:`integrate`; with adaptive steps the steps are computed again for the action.
+            observe: what to record of the states after all fixed steps, saved or not, in ``observed`` of the result:
+                ``"extremes"`` of q and p, of the ``"energy"``, or numbers of ``"events"`` of the stepper
+                (:meth:`with_events`), changes of sign between successive states. Requires SIMD lanes, no inputs.
 
         Returns:
             An :class:`EnsembleTrajectory`, with ``device`` a
@@ -410,6 +414,7 @@ class Stepper(Integrator):
             options=options,
             error=error,
             device=device,
+            observe=observe,
         )
         work.run(progress=progress, threads=threads)
         if device is not None:

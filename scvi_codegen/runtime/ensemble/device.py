@@ -22,7 +22,8 @@ from scvi_codegen.representation import one_line
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.ensemble.lanes import CommonRuns, SingleBlock
-from scvi_codegen.runtime.ensemble.result import OK, EnsembleTrajectory
+from scvi_codegen.runtime.ensemble.observation import EnsembleObservation
+from scvi_codegen.runtime.ensemble.result import OK, EnsembleRuns, EnsembleTrajectory
 from scvi_codegen.runtime.ensemble.schedule import CommonSteps
 from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runtime.run.chunks import drive
@@ -60,10 +61,11 @@ class DeviceRuns:
         parameters: Array,
         values_at: Callable[[float, slice], Array],
         steps: CommonSteps,
+        observation: EnsembleObservation | None = None,
     ) -> None:
         self.stepper, self.options, self.start, self.steps = stepper, options or SolverOptions(), start, steps
-        self.values_at, self.device = values_at, Device()
-        source = cast(Source, stepper.ensemble)
+        self.values_at, self.observation, self.device = values_at, observation, Device()
+        source = cast(Source, stepper.ensemble) if observation is None else observation.source
         self.launch = self.device.kernels(source)
         count, self.m = map(int, start[0].shape)
         self.count, device, shape = count, self.device, (len(steps.numbers), count, self.m)
@@ -81,13 +83,20 @@ class DeviceRuns:
     def __len__(self) -> int:
         return self.count
 
+    @property
+    def size(self) -> int:
+        """Numbers in the memory of a trajectory, without observed values."""
+        return HEAD + (4 + 2 * self.points) * self.m
+
     def states(self) -> tuple[Array, Array]:
         """Return copies of the (n, k, m) saved positions and momenta on the processor."""
         return self.device.copy_out(self.q), self.device.copy_out(self.p)
 
     def _first_memory(self, parameters: Array) -> Array:
         """Return (numbers, k) initial memory of the threads."""
-        memory = np.zeros((HEAD + (4 + 2 * self.points) * self.m, self.count))
+        observed = np.empty((0, self.count)) if self.observation is None else self.observation.rows
+        memory = np.zeros((self.size + len(observed), self.count))
+        memory[self.size :] = observed
         memory[0], memory[3] = self.steps.t0, 1.0
         for i, states in enumerate(self.start):
             memory[HEAD + i * self.m : HEAD + (i + 1) * self.m] = states.T
@@ -99,7 +108,7 @@ class DeviceRuns:
         memory[2] = 0.0
         if not self.needs_velocities:
             return
-        m, stored = self.m, memory[HEAD + 4 * self.m :].reshape(2 * self.points, self.m, -1)
+        m, stored = self.m, memory[HEAD + 4 * self.m : self.size].reshape(2 * self.points, self.m, -1)
         q, p, running = memory[HEAD : HEAD + m].T, memory[HEAD + m : HEAD + 2 * m].T, memory[3] > 0.0
         if running.all() and (parameters == parameters[0]).all():  # in one call
             with suppress(StateError):
@@ -128,6 +137,8 @@ class DeviceRuns:
             drive(advance, self.steps.steps, first=FIRST_STEPS, growth=GROWTH, ended=lambda: False, progress=progress)
         finally:
             self.done = self.device.copy_out(self.counts)
+            if self.observation is not None:
+                self.observation.rows[:] = self.device.copy_out(self.memory)[self.size :]
         self._continue(np.flatnonzero(self.done < self.steps.steps), threads)
 
     def _enter(self, h: float, parameters: Array) -> None:
@@ -160,7 +171,8 @@ class DeviceRuns:
 
         start = self.start[0][failed], self.start[1][failed]
         initial = values_at(self.steps.segments[0].middle, slice(None))
-        work = CommonRuns(self.stepper, self.options, start, initial, values_at, self.steps)
+        observation = None if self.observation is None else self.observation.part(failed)
+        work = CommonRuns(self.stepper, self.options, start, initial, values_at, self.steps, observation)
 
         def advance(j: int, check_stop: StopCheck) -> None:
             step = int(self.done[failed[j]])
@@ -169,6 +181,8 @@ class DeviceRuns:
 
         run_jobs(len(failed), advance, progress=None, threads=threads)
         self.status[failed], self.done[failed] = work.status, work.done
+        if observation is not None and self.observation is not None:
+            self.observation.values[:, :, failed] = observation.values
         which, rows = self.device.copied(failed.astype(np.int64)), len(work.q)
         for target, values in ((self.q, work.q), (self.p, work.p)):
             arguments = self.count, rows, len(failed), which, self.device.copied(values), target
@@ -176,37 +190,21 @@ class DeviceRuns:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DeviceEnsemble:
-    """States of k trajectories in the memory of a GPU, the initial state first.
+class DeviceEnsemble(EnsembleRuns):
+    """States of k trajectories in the memory of a GPU, the initial state first; the rest is on the processor.
 
     Attributes:
-        t: (n,) times.
         q, p: (n, k, m) positions and momenta, NaN after a failure; arrays of the device with ``__dlpack__``, for
             ``cupy.from_dlpack(runs.q)`` and ``torch.from_dlpack``.
-        status, steps, h, parameters, stepper: as of :class:`EnsembleTrajectory`, on the processor.
     """
 
-    t: Array
     q: Any
     p: Any
-    status: NDArray[np.str_]
-    steps: NDArray[np.int64]
-    h: float
-    parameters: Array
-    stepper: Integrator = field(repr=False)
     _to_host: Callable[[], EnsembleTrajectory] = field(repr=False)
-
-    def __len__(self) -> int:
-        return len(self.status)
 
     def __repr__(self) -> str:
         states = f"{len(self.t)} states of each of {len(self)} trajectories on a GPU, {np.count_nonzero(self.ok)} ok"
         return one_line(self, short_title(self.stepper.interface), states)
-
-    @property
-    def ok(self) -> NDArray[np.bool_]:
-        """(k,) flags of the trajectories that reached the end."""
-        return np.asarray(self.status == OK)
 
     def to_host(self) -> EnsembleTrajectory:
         """Return a copy in the memory of the processor, with energies, plots and files."""

@@ -33,6 +33,7 @@ from scvi_codegen.runtime.ensemble.initial_states import (
     start_of_ensemble,
 )
 from scvi_codegen.runtime.ensemble.lanes import CommonRuns
+from scvi_codegen.runtime.ensemble.observation import EnsembleObservation
 from scvi_codegen.runtime.ensemble.result import EVENT_FAILED, INTERRUPTED, OK, EnsembleTrajectory, Span
 from scvi_codegen.runtime.ensemble.schedule import CommonSteps
 from scvi_codegen.runtime.ensemble.successive import CHUNK_SECONDS, FIRST_CHUNK_STEPS, GROWTH, Rows, SuccessiveRuns
@@ -102,9 +103,11 @@ class Ensemble:
         options: SolverOptions | None = None,
         error: float | None = None,
         device: str | None = None,
+        observe: str | None = None,
     ) -> None:
         interface = stepper.interface
         _check_device(device, h, error=error, t_eval=t_eval)
+        check_together(inputs=inputs, observe=observe, error=error, t_eval=t_eval)
         steps, t_end = _steps_or_end(t, h, steps, t_end, inputs, tolerance, t_eval)
         require(stepper, "ensembles")
         if device is not None:
@@ -145,7 +148,13 @@ class Ensemble:
             self.parameters[:, columns_of_inputs(interface)] = 0.0
         if fixed is not None and not stepper.changes_states:
             kind = CommonRuns if device is None else DeviceRuns
-            self.common = kind(stepper, self.options, self.start, self.parameters, self.values_at, fixed)
+            observation = None if observe is None else EnsembleObservation(stepper, observe, len(self))
+            self.common = kind(stepper, self.options, self.start, self.parameters, self.values_at, fixed, observation)
+        elif observe is not None:
+            raise StateError(
+                f"observe={observe!r} requires a fixed step size and events that do not change the state: give h and "
+                "steps, or observe each trajectory by integrate"
+            )
         self.states: list[Rows] = []
         self.successive = self._successive()
 
@@ -373,6 +382,7 @@ class Ensemble:
             t=fixed.times(tau=common.times is not None),
             times=common.times,
             actions=common.actions,
+            observed=None if common.observation is None else common.observation.result(),
             q=q,
             p=p,
             status=self._status(common),
@@ -388,6 +398,7 @@ class Ensemble:
         common = cast(DeviceRuns, self.common)
         return DeviceEnsemble(
             t=common.steps.times(tau=False),
+            observed=None if common.observation is None else common.observation.result(),
             q=common.q,
             p=common.p,
             status=self._status(common),

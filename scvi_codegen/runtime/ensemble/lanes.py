@@ -21,6 +21,7 @@ from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.ensemble.observation import EnsembleObservation
 from scvi_codegen.runtime.ensemble.result import OK
 from scvi_codegen.runtime.ensemble.schedule import CommonSteps
 from scvi_codegen.runtime.ensemble.successive import FixedSegments, Rows, SuccessiveRuns
@@ -40,6 +41,7 @@ class CommonRuns:
         parameters: (k, number of parameters) values.
         values_at: function that returns the parameters at a time of a slice of trajectories, one row each.
         steps: the steps.
+        observation: functions of the state that are observed along the runs, or ``None``.
         q, p: (n, k, m) saved states; NaN where not reached.
         times: (n, k) times in transformed time, else ``None``.
         actions: (n, k) actions up to each state if runs sum them, NaN where unknown, else ``None``.
@@ -52,6 +54,7 @@ class CommonRuns:
     parameters: Array
     values_at: Callable[[float, slice], Array]
     steps: CommonSteps
+    observation: EnsembleObservation | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.steps.numbers), *self.start[0].shape)
@@ -95,13 +98,19 @@ class CommonRuns:
         fixed = FixedSegments(np.array(numbers, np.int64), np.array(save_every, np.int64), np.array(sizes, float))
         return fixed, np.array(rows, np.int64)
 
+    @property
+    def _binding(self) -> Binding | None:
+        return self.stepper._ensemble_binding if self.observation is None else self.observation.binding
+
     def lanes_in_one_call(self) -> Callable[[int, int], list[int]] | None:
         """Return a function that integrates a range of trajectories in one call of C; ``None`` without such lanes.
 
         It returns the first trajectories of the blocks in which one failed, which have to be integrated singly.
         """
-        binding = self.stepper._ensemble_binding
-        if binding is None or binding.constant("NEEDS_VELOCITIES") or self.actions is not None or not self.steps.steps:
+        binding = self._binding
+        if self.observation is not None or self.actions is not None or not self.steps.steps:
+            return None
+        if binding is None or binding.constant("NEEDS_VELOCITIES"):
             return None
         (steps, save_every, h), rows = self.fixed_segments()
         width = len(binding.new("block *").active)
@@ -134,7 +143,7 @@ class CommonRuns:
 
     def blocks(self) -> tuple[Callable[[int], LaneBlock | SingleBlock], int]:
         """Return a function that makes the block beginning at a trajectory, and the trajectories per block."""
-        binding = self.stepper._ensemble_binding
+        binding = self._binding
         if binding is None:
             return lambda first: SingleBlock(self, first), 1
         return lambda first: LaneBlock(self, first, binding), len(binding.new("block *").active)
@@ -153,6 +162,8 @@ class LaneBlock:
         self.count, self.step = min(len(self.active), len(work) - first), 0
         self.left: dict[int, SingleRun] = {}
         self._fill()
+        if work.observation is not None:
+            self._advance(0, 1)  # includes the initial states
 
     def _fill(self) -> None:
         """Put a trajectory into each lane; surplus lanes repeat the last one and are inactive."""
@@ -236,6 +247,11 @@ class LaneBlock:
             )
         running = self.active[: self.count] > 0.0
         work.done[self.first : self.first + self.count][running] = self.step
+        if work.observation is not None:
+            seen = np.frombuffer(self.binding.buffer(self.memory.observed), dtype=np.float64)
+            here = work.observation.values[:, :, self.first : self.first + self.count]
+            lanes = [lane for lane in range(self.count) if lane not in self.left]
+            here[:, :, lanes] = seen.reshape(*here.shape[:2], -1)[:, :, lanes]
         for lane in np.flatnonzero(~running):
             self._continue_singly(int(lane), begin, save_every)
 
@@ -301,14 +317,19 @@ class SingleRun:
         if run is None:
             return
         row = work.steps.row(run.steps)
+        first, stride = run.steps, save_every if work.observation is None else 1
         try:
-            trajectory = record(run, step - run.steps, save_every=save_every)
+            trajectory = record(run, step - first, save_every=stride)
         except StepFailedError as failure:
             work.status[j], trajectory, self.run = failure.status, Trajectory.before(failure), None
         work.done[j] = run.steps
-        rows = slice(row, row + len(trajectory) - 1)
-        work.q[rows, j], work.p[rows, j] = trajectory.q[1:], trajectory.p[1:]
+        saved = np.arange(1, len(trajectory))
+        if work.observation is not None:
+            work.observation.include(j, trajectory.t, trajectory.q, trajectory.p, run.parameters)
+            saved = saved[(first + saved) % save_every == 0]
+        rows = slice(row, row + len(saved))
+        work.q[rows, j], work.p[rows, j] = trajectory.q[saved], trajectory.p[saved]
         if work.times is not None:
-            work.times[rows, j] = trajectory.t[1:]
+            work.times[rows, j] = trajectory.t[saved]
         if work.actions is not None:
-            work.actions[rows, j] = np.nan if self.left or trajectory.actions is None else trajectory.actions[1:]
+            work.actions[rows, j] = np.nan if self.left or trajectory.actions is None else trajectory.actions[saved]

@@ -46,18 +46,44 @@ Span: TypeAlias = tuple[slice, slice, Callable[[slice], Array]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
-    """States of k trajectories, the initial state first.
+class EnsembleRuns:
+    """Runs of k trajectories, wherever their states are.
 
     Attributes:
         t: (n,) common times; tau from 0 in transformed time; row numbers if every trajectory has its own times.
-        q, p: (n, k, m) positions and momenta; NaN after a failure, and after the end of a shorter trajectory.
         status: (k,) ``"ok"``, or the reason of the end (``"not converged"``, ``"singular"``, ``"not finite"``,
             ``"step size underflow"``, ``"interrupted"``).
         steps: (k,) completed steps.
         h: step size; 0 for adaptive steps.
         parameters: (k, number of parameters) values; zeros for the parameters of inputs.
         stepper: the compiled integrator.
+        observed: with ``observe=``, over the states after all steps: (2, k, 2m) smallest and largest values of (q, p)
+            (``"extremes"``), (2, k) energies (``"energy"``), or (k, number of events) changes of sign (``"events"``).
+    """
+
+    t: Array
+    status: NDArray[np.str_]
+    steps: NDArray[np.int64]
+    h: float
+    parameters: Array
+    stepper: Integrator = field(repr=False)
+    observed: Array | None = field(default=None, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.status)
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """(k,) flags of the trajectories that reached the end."""
+        return np.asarray(self.status == OK)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble):
+    """States of k trajectories, the initial state first; further attributes as of :class:`EnsembleRuns`.
+
+    Attributes:
+        q, p: (n, k, m) positions and momenta; NaN after a failure, and after the end of a shorter trajectory.
         times: (n, k) times if every trajectory has its own (transformed time, adaptive steps), else ``None``.
         actions: (n, k) actions up to each state if the runs summed them (``action=True``), else ``None``.
         plans: step plan of each trajectory for adaptive steps, else empty.
@@ -66,22 +92,13 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
             empty.
     """
 
-    t: Array
     q: Array
     p: Array
-    status: NDArray[np.str_]
-    steps: NDArray[np.int64]
-    h: float
-    parameters: Array
-    stepper: Integrator = field(repr=False)
     times: Array | None = None
     actions: Array | None = field(default=None, repr=False)
     plans: tuple[StepPlan, ...] = ()
     spans: tuple[Span, ...] = field(default=(), repr=False)
     confirmations: tuple[GlobalError | None, ...] = field(default=(), repr=False)
-
-    def __len__(self) -> int:
-        return len(self.status)
 
     @overload
     def __getitem__(self, j: int) -> Trajectory: ...
@@ -149,11 +166,6 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
     def __repr__(self) -> str:
         states = f"{len(self.t)} states of each of {len(self)} trajectories, {np.count_nonzero(self.ok)} of them ok"
         return one_line(self, short_title(self.stepper.interface), states)
-
-    @property
-    def ok(self) -> NDArray[np.bool_]:
-        """(k,) flags of the trajectories that reached the end."""
-        return np.asarray(self.status == OK)
 
     @property
     def ends(self) -> tuple[Array, Array, Array]:
@@ -312,7 +324,8 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
         return np.asarray(np.isfinite(self.q[:, j]).all(axis=1), dtype=np.bool_)
 
     def _write_npz(self, file: IO[bytes]) -> None:
-        times: dict[str, Any] = {} if self.times is None else {"times": self.times}
+        others = {"times": self.times, "observed": self.observed}
+        optional: dict[str, Any] = {name: values for name, values in others.items() if values is not None}
         np.savez(
             file,
             t=self.t,
@@ -325,7 +338,7 @@ class EnsembleTrajectory(AttitudeHistory, ConfirmedEnsemble):
             coordinates=np.array(self.stepper.coordinates),
             parameter_names=np.array(self.stepper.parameters, dtype=str),
             title=self.stepper.title,
-            **times,
+            **optional,
         )
 
     def _write_csv(self, file: IO[bytes]) -> None:

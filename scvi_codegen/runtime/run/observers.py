@@ -19,11 +19,15 @@ class Extremes(Observer):
     """Smallest and largest values of q and p over all states, (2, 2m)."""
 
     def __init__(self) -> None:
-        self.values = np.empty((0, 0))
+        self.values = np.empty(0)
+
+    def functions(self, chunk: StateChunk) -> Array:
+        """Return the (n, 2m) values at the states."""
+        return np.concatenate([chunk.states.q, chunk.states.p], axis=1)
 
     def receive(self, chunk: StateChunk) -> None:
         """Include the states."""
-        states = np.concatenate([chunk.states.q, chunk.states.p], axis=1)
+        states = self.functions(chunk)
         rows = states if chunk.is_first else np.concatenate([self.values, states])
         self.values = np.array([rows.min(axis=0), rows.max(axis=0)])
 
@@ -32,10 +36,19 @@ class Extremes(Observer):
         return self.values
 
 
+class EnergyExtremes(Extremes):
+    """Smallest and largest energy over all states, (2,)."""
+
+    def functions(self, chunk: StateChunk) -> Array:
+        """Return the (n,) energies of the states."""
+        return chunk.states.energy()
+
+
 Observe = Observer | Callable[[Any], ArrayLike] | str | None
 OBSERVERS: dict[str, Callable[[], Observer]] = {
     # each is made anew for a run
-    "extremes": Extremes
+    "extremes": Extremes,
+    "energy": EnergyExtremes,
 }
 """Observers by name, ``integrate(observe="extremes")``."""
 

@@ -36,6 +36,9 @@ static void drop_infinite(const state *now, const lanes *dq, const lanes *dp, do
     active[j] = sum.lane[j] == 0.0 ? active[j] : 0.0;
 }
 
+#ifdef OBSERVED
+#include "observation.h"
+#endif
 #ifdef SCVI_DEVICE
 #include "thread_run.h"
 #else
@@ -44,6 +47,12 @@ void NAME(start)(block_memory *block, double t, double h)
   memset(block, 0, sizeof *block);
   block->t = t;
   block->h = h;
+#ifdef OBSERVED
+  for (int n = 0; n < 3; n++)
+    for (int i = 0; i < OBSERVED; i++)
+      for (int j = 0; j < LANES; j++)
+        block->observed[n][i][j] = NAN;
+#endif
 }
 
 void NAME(set)(block_memory *block, int lane, const double *q, const double *p, const double *v,
@@ -177,6 +186,11 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
   memcpy(parameters, block->parameters, sizeof(lanes) * P);
   memcpy(memory, block->memory, sizeof memory);
   prepare_iteration(&step, &data);
+#ifdef OBSERVED
+  observation seen;
+  memcpy(&seen, block->observed, sizeof seen);
+  observe(&seen, &now, block->t, parameters, block->active);
+#endif
   for (long long k = 0, stored = 0; k < steps; k++) {
     const long long parity = block->step % 2;
     const history past = {memory[1 - parity], memory[parity]};
@@ -202,6 +216,9 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
     for (int j = 0; j < count; j++)
       if (block->active[j] > 0.0)
         block->last_step[j] = block->step;
+#ifdef OBSERVED
+    observe(&seen, &now, block->t, parameters, block->active);
+#endif
     if (block->step % every == 0) {
       store_states(&now, count, q + stored * row_length, p + stored * row_length);
 #ifdef RUN_ACTION
@@ -213,7 +230,31 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
   block->iterations += report.iterations;
   save_state(&now, block);
   memcpy(block->memory, memory, sizeof memory);
+#ifdef OBSERVED
+  memcpy(block->observed, &seen, sizeof seen);
+#endif
 }
+
+#ifdef OBSERVED
+void NAME(observe)(block_memory *block, int lane, long long count, const double *t, const double *q, const double *p)
+{
+  state now;
+  lanes parameters[P + 1];
+  observation seen;
+  double active[LANES] = {0.0};
+  active[lane] = 1.0;
+  memcpy(parameters, block->parameters, sizeof(lanes) * P);
+  memcpy(&seen, block->observed, sizeof seen);
+  for (long long k = 0; k < count; k++) {
+    for (int i = 0; i < M; i++) {
+      now.q[i] = lanes_of(q[k * M + i]);
+      now.p[i] = lanes_of(p[k * M + i]);
+    }
+    observe(&seen, &now, t[k], parameters, active);
+  }
+  memcpy(block->observed, &seen, sizeof seen);
+}
+#endif
 
 void NAME(advance_each)(block_memory *block, long long first, long long end, double t, const double *q0,
     const double *p0, const double *parameters, int segments, const long long *steps, const long long *every,

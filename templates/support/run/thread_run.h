@@ -9,6 +9,9 @@ typedef struct {
   lanes head[4];
   state now;
   lanes last[S][M], before[S][M];
+#ifdef OBSERVED
+  observation seen;
+#endif
 } thread_memory;
 
 /* Reads or writes numbers of a trajectory, which are `count` numbers apart in global memory. */
@@ -30,7 +33,10 @@ static inline void transfer_all(int writes, thread_memory *own, double *memory, 
   memory = transfer(writes, own->now.carry_q, M, memory, count);
   memory = transfer(writes, own->now.carry_p, M, memory, count);
   memory = transfer(writes, &own->last[0][0], S * M, memory, count);
-  transfer(writes, &own->before[0][0], S * M, memory, count);
+  memory = transfer(writes, &own->before[0][0], S * M, memory, count);
+#ifdef OBSERVED
+  transfer(writes, own->seen.last, 5 * OBSERVED, memory, count);
+#endif
 }
 
 /* Prepares the repetition of a failed step from the value at the beginning of the extrapolated curve, as in
@@ -49,8 +55,8 @@ static inline int starts_again(thread_memory *own, long long *guess, long long s
 #endif
 }
 
-/* Advances `count` trajectories from step number `begin`. memory: (4 + 4 M + 2 S M, count) numbers; parameters:
- * (count, P). Every `every` steps counted from the start states are stored in rows of (count, M) numbers. done: number
+/* Advances `count` trajectories from step number `begin`. memory: (4 + 4 M + 2 S M, count) numbers, and
+ * 5 OBSERVED more; parameters: (count, P). Every `every` steps counted from the start states are stored in rows of (count, M) numbers. done: number
  * of completed steps of each trajectory. */
 KERNEL NAME(thread_advance)(long long count, long long begin, long long steps, long long every, double h,
     double tolerance, long long max_iterations, long long absolute, double *memory, const double *parameters, double *q,
@@ -79,6 +85,9 @@ KERNEL NAME(thread_advance)(long long count, long long begin, long long steps, l
   step.t = own.head[0];
   guess = (long long)own.head[2];
   prepare_iteration(&step, &data);
+#ifdef OBSERVED
+  observe(&own.seen, &own.now, step.t, values, &active);
+#endif
   for (; n < begin + steps; n++) {
     const history past = {own.last, own.before};
     int repeated = 0;
@@ -98,6 +107,9 @@ KERNEL NAME(thread_advance)(long long count, long long begin, long long steps, l
         own.before[point][i] = earlier;
       }
     add_compensated(&step.t, &own.head[1], h, 0.0);
+#ifdef OBSERVED
+    observe(&own.seen, &own.now, step.t, values, &active);
+#endif
     if ((n + 1) % every == 0) {
       for (int i = 0; i < M; i++) {
         q[i] = own.now.q[i];
