@@ -92,7 +92,7 @@ class SystemDefinitionWarning(UserWarning):
 
 
 class AccuracyWarning(UserWarning):
-    """A run that completed with doubtful accuracy: too large steps, or an initial state projected onto its constraints.
+    """A result of doubtful accuracy or meaning: too large steps, a projected initial state, a closed path at rest.
 
     The equations were solved, but states computed with too large steps are unreliable.
     """

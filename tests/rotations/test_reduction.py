@@ -140,7 +140,7 @@ def test_orbits_of_a_rotation_a_direction_and_a_spin_have_the_periods_of_formula
     orbit = sc.periodic_orbit(
         compiled(direction, "svi:6"),
         {"n": [np.sin(amplitude), 0.02, -np.cos(amplitude)]},
-        velocity={"n": [0, 0.01, 0]},
+        velocity={"n": [-0.0002 / np.sin(amplitude), 0.01, 0]},
         period=1.01 * period,
         steps=40,
         energy=-np.cos(amplitude),

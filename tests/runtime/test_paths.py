@@ -262,6 +262,43 @@ def test_closed_path_with_another_coordinate_than_time():
     assert np.abs(run.q[-1] - run.q[0]).max() < 1e-9
 
 
+@pytest.mark.parametrize(
+    ("arguments", "closed", "start", "energy", "m", "zero_modes"),
+    [
+        ({"coordinates": ["a"], "lagrangian": "a_dot**2/2 + cos(a)"}, ["-a"], lambda t: [np.sin(t)], 0.5, 0.75, 1),
+        ({"coordinates": ["x"], "lagrangian": "x_dot**2/2 - x**2/2"}, ["-x"], lambda t: [np.cos(t)], 3.0, 0.0, 2),
+        pytest.param(
+            {
+                "coordinates": ["x", "y"],
+                "lagrangian": "(x_dot**2 + y_dot**2)/2 - y",
+                "constraints": ["x**2 + y**2 - 1"],
+            },
+            ["-x", "y"],
+            lambda t: [np.sin(np.sin(t)), -np.cos(np.sin(t))],
+            -0.5,
+            0.25,
+            1,
+            marks=pytest.mark.second,
+        ),
+    ],
+    ids=["pendulum", "oscillator", "constraint"],
+)
+def test_closed_paths_of_given_energy_have_the_period_of_formulas(arguments, closed, start, energy, m, zero_modes):
+    stepper = compiled(method="svi:6", **arguments)
+    path = stepper.path(T=3.0, steps=12, closed=closed, start=start, energy=energy)
+    assert path.period == pytest.approx(4 * ellipk(m), abs=1e-9)
+    assert path.run().energy() == pytest.approx(np.full(25, energy), abs=1e-9)
+    assert path.zero_modes == zero_modes
+
+
+def test_closed_path_at_rest_is_reported(oscillator):
+    with pytest.warns(sc.AccuracyWarning, match="give energy="):
+        path = oscillator.path(T=5.0, steps=20, closed=True, start=lambda t: [np.cos(t)])
+    assert path.at_rest
+    assert path.residual < 1e-13
+    assert not oscillator.path([1.0], [0.3], 2.0, steps=10).at_rest
+
+
 def test_refusals_name_the_remedy(kepler, oscillator):
     for call, error, words in (
         (lambda: kepler.path([1, 0], [0, 1]), StateError, "give T"),
@@ -271,11 +308,17 @@ def test_refusals_name_the_remedy(kepler, oscillator):
         (lambda: kepler.path(T=1.0, closed=True), StateError, "require start"),
         (lambda: kepler.path(T=1.0, closed=["x", "x"], start=np.ones((33, 2))), StateError, "each coordinate once"),
         (lambda: kepler.path(T=1.0, closed=np.ones((2, 2)), start=np.ones((33, 2))), StateError, "orthogonal"),
-        (lambda: kepler.path(T=1.0, closed=True, energy=1.0, start=np.ones((33, 2))), MethodError, "omit it"),
         (
             lambda: driven().path([0.1], [0.3], 1.0, energy=1.0, inputs={"u": 1.0}),
             MethodError,
             "which change the energy",
+        ),
+        (
+            lambda: compiled(
+                ["x", "y"], "(x_dot**2 + y_dot**2)/2 - x**2/2 - y", "svi:3", damping="1/10"
+            ).path(T=6.0, closed=True, energy=1.0, start=np.ones((33, 2))),
+            MethodError,
+            "damping takes it",
         ),
         (lambda: oscillator.path([1.0], [0.3], np.pi, steps=20), PathError, "no path was found"),
         (lambda: sc.compile_stepper(KEPLER, "radau-iia:2").path([1, 0], [0, 1], 1.0), MethodError, "sum of L"),

@@ -124,6 +124,8 @@ def text_in(path: str | os.PathLike[str], encoding: str, name: object = None) ->
 
 def read_method(section: Section) -> Method:
     """Return the method of the section ``[method]``."""
+    if "method" not in section:
+        check_keys(section, dict.fromkeys(["method", *chain.from_iterable(ARGUMENTS.values())]), "key", "[method]")
     name = text_of(section, "method", "[method]")
     if name in ARGUMENTS:
         check_keys(section, ("method", *ARGUMENTS[name]), "key", f"[method] for {name}")

@@ -512,10 +512,10 @@ class Stepper(Integrator):
             start: positions to start from: (steps + 1, m), or a function of time; by default the straight line.
             homotopy: if the straight line leads to no path, continue the path of duration T/16 to T. This finds the
                 direct one, without revolutions.
-            energy: of the path, whose duration is then unknown; T is an estimate of it.
+            energy: at the start, of closed paths the mean of all nodes; the duration is then unknown, T an estimate.
             closed: a closed path q(t + T) = M q(t) near ``start``, without q0 and q1: ``True`` (M = 1); the coordinates
                 that follow after T, in the order of all, as a permutation with signs, ``["x2", "-y2", ..]``; or an
-                orthogonal (m, m) matrix. Without forces a minimum of the action is sought first.
+                orthogonal (m, m) matrix. Without forces and energy= a minimum of the action is sought first.
             t, parameters, options: as in :meth:`step`.
             inputs: as in :meth:`integrate`; their breakpoints should be ends of steps.
 

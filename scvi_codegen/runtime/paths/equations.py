@@ -157,12 +157,17 @@ class Closed:
             matrix[after, after] += T.T @ e[k] @ T
             matrix[here, after] -= b[k] @ T
             matrix[after, here] += T.T @ c[k]
-        self.symmetric = symmetric
+        self.symmetric, self.matrix = symmetric, matrix
         if symmetric:
-            self.values, self.vectors = np.linalg.eigh((matrix + matrix.T) / 2.0)
-            self.kept = np.abs(self.values) > NULL_EIGENVALUE * np.abs(self.values).max()
+            self.matrix = (matrix + matrix.T) / 2.0
+            self.factorise()
         else:
             self.inverse = np.linalg.pinv(matrix, rcond=NULL_EIGENVALUE)
+
+    def factorise(self) -> None:
+        """Compute the eigenvalues of the matrix."""
+        self.values, self.vectors = np.linalg.eigh(self.matrix)
+        self.kept = np.abs(self.values) > NULL_EIGENVALUE * np.abs(self.values).max()
 
     def solve(self, r: Array) -> Array:
         """Return the solution of least norm."""
@@ -175,6 +180,40 @@ class Closed:
     def negative(self) -> int:
         """Number of negative eigenvalues."""
         return int((self.values[self.kept] < 0).sum())
+
+
+class Bordered:
+    """Factors of [H, border; row, corner] by those of H, with one more unknown and equation."""
+
+    def __init__(self, factors: Band | Sparse, border: Array, row: Array, corner: float) -> None:
+        self.factors, self.row, self.along = factors, row, factors.solve(border)
+        self.pivot = corner - float(row @ self.along[0])
+
+    def solve(self, r: Array) -> Array:
+        """Return the solution; the row is that of the first inner node."""
+        own = self.factors.solve(r[:-1])
+        last = (r[-1] - self.row @ own[0]) / self.pivot
+        return np.append(own - last * self.along, last)
+
+
+class BorderedClosed(Closed):
+    """Hessian of a closed path with the duration as a further unknown, which is scaled to the size of the others."""
+
+    def __init__(self, at: Linearised, M: Array, border: Array, corner: float) -> None:
+        self.border, self.corner = border.reshape(-1, 1), corner
+        super().__init__(at, M, symmetric=True)
+
+    def factorise(self) -> None:
+        """See :meth:`Closed.factorise`."""
+        self.scale = np.sqrt(np.abs(self.matrix).max() / abs(self.corner)) if self.corner else 1.0
+        side, corner = self.scale * self.border, np.array([[self.scale**2 * self.corner]])
+        self.matrix = np.block([[self.matrix, side], [side.T, corner]])
+        super().factorise()
+
+    def solve(self, r: Array) -> Array:
+        """See :meth:`Closed.solve`."""
+        kept, scales = self.vectors[:, self.kept], np.append(np.ones(r.size - 1), self.scale)
+        return np.asarray(scales * (kept @ ((kept.T @ (scales * r)) / self.values[self.kept])))
 
 
 def closed_residual(at: Linearised, M: Array, intervals: Intervals) -> Array:

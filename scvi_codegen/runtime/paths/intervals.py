@@ -7,6 +7,7 @@ of the step before it and p0 of the step after it; without forces it is the grad
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -65,9 +66,10 @@ class Intervals:
 
     def lasting(self, duration: float) -> Intervals:
         """Return the intervals of a path of another duration."""
-        count = len(self.h)
-        h = np.full(count, duration / count)
-        return type(self)(self.stepper, self.t[0] + np.arange(count) * h, h, self.parameters, self.options)
+        result = copy(self)
+        result.h = np.full(len(self.h), duration / len(self.h))
+        result.t = self.t[0] + np.arange(len(self.h)) * result.h
+        return result
 
     def moved(self, q: Array, y: Array) -> Array:
         """Return positions moved by y, whose rows are those of the last nodes before the end, or of all."""
@@ -152,14 +154,6 @@ class ManyCoordinates(Intervals):
             colours[j] = next(c for c in range(m) if c not in taken)
         self.rows, self.columns = (np.asarray(each) for each in np.nonzero(pattern))
         self.colours = colours
-
-    def lasting(self, duration: float) -> Intervals:
-        """See :meth:`Intervals.lasting`."""
-        result = super().lasting(duration)
-        for name in ("rows", "columns", "colours"):
-            if hasattr(self, name):
-                setattr(result, name, getattr(self, name))
-        return result
 
     def linearised(self, q: Array) -> Linearised:
         """See :meth:`Intervals.linearised`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.errors import MethodError, PathError, StateError
+from scvi_codegen.errors import AccuracyWarning, MethodError, PathError, StateError, warn
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.representation import summary
@@ -32,6 +32,8 @@ WAVES, RANDOM_STARTS, FEW_ITERATIONS, SAME_PATH = 3, 10, 25, 1e-6
 """Sine waves of a start at random, number of starts and of their iterations, and relative distance of equal paths."""
 SAME_MATRIX, MOST_REPETITIONS = 1e-9, 1000
 """Distance of equal symmetries of closed paths, and the longest period in multiples of T."""
+AT_REST = 1e-9
+"""Range of the positions of a path at rest, relative to 1 + max|q|."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,7 +48,8 @@ class Path:
             ``None`` with forces.
         conjugate_times: (c, 2) ends of the steps that contain points conjugate to the first one, as often as their
             multiplicity; empty for closed paths and with many coordinates.
-        residual: largest jump of the momentum between two steps, relative to the largest momentum.
+        residual: largest jump of the momentum between two steps, relative to the largest momentum; at rest, relative to
+            the momentum of a step of the size 1 + max|q|.
         iterations: number of Newton iterations.
         repetitions: of a closed path, the number of times T after which all coordinates return, else 1; 0 if they do
             not return.
@@ -71,6 +74,12 @@ class Path:
     solution: Any = field(default=None, repr=False)
 
     __repr__ = summary("q", "action", "index", "residual")
+
+    @property
+    def at_rest(self) -> bool:
+        """True if all positions are equal: an equilibrium."""
+        q = np.asarray(self.q)
+        return bool(np.ptp(q, axis=0).max() <= AT_REST * (1.0 + np.abs(q).max()))
 
     @property
     def period(self) -> float:
@@ -142,25 +151,33 @@ def find_path(
     intervals = kind(stepper, times, h, _parameters_of_steps(stepper, parameters, inputs, times + h / 2.0), options)
     arguments = {"parameters": parameters, "options": options, **({"inputs": inputs} if inputs is not None else {})}
     nodes = _given_nodes(stepper.interface, start, begin, duration, count)
+    values, wanted = intervals.parameters, None if energy is None else checked_number(energy, "energy")
+
+    def states(q: Array, p: Array) -> tuple[Array, Array]:
+        at = np.full(len(q), begin)
+        return np.asarray(stepper.energy(q, p, at, values)), np.asarray(stepper.velocity(q, p, at, values))
+
     if closed is not None:
         if nodes is None:
             raise StateError("closed paths require start=: an array (steps + 1, m), or a function of time")
         M, forced = _symmetry(stepper.interface, closed), bool(stepper.interface.exchange_names)
         minimised = not (forced or isinstance(intervals, ReducedIntervals))
-        found = solver.closed(intervals, nodes[:count], M, minimise=minimised, symmetric=not forced)
-        return _described(stepper, found, begin, arguments, M)
+        settings = {"minimise": minimised, "symmetric": not forced, "energy": wanted, "states": states}
+        closed_path = _described(stepper, solver.closed(intervals, nodes[:count], M, **settings), begin, arguments, M)
+        if closed_path.at_rest:
+            warn(
+                "path: the closed path is at rest in path.q[0], an equilibrium, which is closed for any T. For a "
+                f"motion give energy=, a start of larger amplitude, or a period of motions as T, not {duration:g}; for "
+                "small amplitudes it is near 2 pi over a frequency of the equilibrium",
+                AccuracyWarning,
+            )
+        return closed_path
     if q0 is None or q1 is None:
         raise StateError("path: give both positions q0 and q1, or closed= and start=")
     ends = [stepper._vector(_positions(stepper.interface, each, name), name) for each, name in ((q0, "q0"), (q1, "q1"))]
     found = _open_path(intervals, ends, nodes, duration, homotopy=homotopy and start is None)
-    if energy is not None:
-        wanted, values = checked_number(energy, "energy"), intervals.parameters
-
-        def at_start(q: Array, p: Array) -> tuple[float, Array]:
-            velocity = np.asarray(stepper.velocity(q, p, begin, values)).ravel()
-            return float(stepper.energy(q, p, begin, values)), velocity
-
-        found = solver.at_energy(found, duration, wanted, at_start)
+    if wanted is not None:
+        found = solver.AtEnergy(found.intervals, wanted, states).solved(found.q, found.iterations)
     return _described(stepper, found, begin, arguments)
 
 
@@ -228,8 +245,11 @@ def _kind_of_intervals(stepper: Any, *, closed: bool, energy: bool) -> type[Inte
             "path: energy= is not available with inputs, which change the energy and whose times do not follow the "
             "duration; omit it"
         )
-    if closed and energy:
-        raise MethodError("path: energy= is not available for closed paths; omit it and give their T")
+    if closed and energy and interface.changes_energy:
+        raise MethodError(
+            f"path: energy= is not available for a closed path that does not conserve it ({interface.changes_energy}); "
+            "omit it and give the duration T"
+        )
     if reduced:
         return ReducedIntervals
     return ManyCoordinates if stepper.dimension >= MANY_COORDINATES and not closed else Intervals
@@ -292,14 +312,14 @@ def _described(
         conjugate = np.stack([t[steps], t[steps + 1]], axis=1)
     jumps = at.residual if M is None else at.p1[:-1] - at.p0[1:]
     momenta = np.concatenate([at.p0, at.p1[-1:]])
-    return Path(
+    path = Path(
         t=t,
         q=stepper.named(found.q),
         p=stepper.named(momenta),
         action=float(np.sum(at.actions)),
         index=index,
         conjugate_times=conjugate,
-        residual=float(np.abs(jumps).max(initial=0.0) / (np.abs(momenta).max() or 1.0)),
+        residual=float(np.abs(jumps).max(initial=0.0)),
         iterations=found.iterations,
         stepper=stepper,
         repetitions=repetitions,
@@ -307,6 +327,8 @@ def _described(
         arguments=arguments,
         solution=found,
     )
+    size = float(np.abs(at.blocks).max() * (1.0 + np.abs(found.q).max()) if path.at_rest else np.abs(momenta).max())
+    return replace(path, residual=path.residual / (size or 1.0))
 
 
 def _parameters_of_steps(stepper: Any, parameters: Parameters, inputs: Mapping[str, Any] | None, times: Array) -> Array:

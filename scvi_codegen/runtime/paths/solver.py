@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from scvi_codegen.errors import PathError, StateError, StepFailedError
 from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.runtime.paths.equations import Closed, closed_residual, factors_of
+from scvi_codegen.runtime.paths.equations import Bordered, BorderedClosed, Closed, closed_residual, factors_of
 from scvi_codegen.runtime.paths.intervals import Intervals, Linearised
 
 TOLERANCE = 1e-11
@@ -32,6 +33,9 @@ FIRST_SHIFT, MOST_SHIFT, LEAST_SHIFT, MOST_DESCENTS = 1e-2, 1e3, 1e-10, 60
 """Shifts of the Hessian relative to its largest entry, and most iterations of the descent."""
 LEAST_DECREASE, NEAR = 1e-4, 1e-3
 """Part of the predicted decrease of the action that is required (Armijo), and the correction that ends the descent."""
+
+States = Callable[[Array, Array], tuple[Array, Array]]
+"""Type of a function of (n, m) positions and momenta that returns (n,) energies and (n, m) velocities."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,58 +149,65 @@ def descended(intervals: Intervals, q: Array) -> Solution:
     return Solution(found.q, intervals, found.at, found.factors, iterations + found.iterations)
 
 
-def at_energy(found: Solution, duration: float, energy: float, start: Callable[[Array, Array], Any]) -> Solution:
-    """Return the path of a given energy, whose duration is a further unknown (bordered Newton's method).
+class AtEnergy:
+    """Equations of a path of given energy, with its duration T as a further unknown behind those of the path.
+
+    The residuals are the derivatives of S(q, T) + E T. Between fixed ends the energy is that of the first node. Of a
+    closed path it is the mean of the nodes: its gradient is that of the discrete energy -dS/dT to the order of the
+    method, which makes the matrix symmetric.
 
     Args:
-        start: function of (q0, p0) that returns the energy and the velocity there.
+        intervals: steps of an estimate of T.
+        energy: required value.
+        states: function of (q, p) that returns the energies and velocities at nodes.
+        M: symmetry of a closed path.
     """
-    q, count, damping = found.q, len(found.intervals.h), 1.0
-    for iteration in range(MOST_ITERATIONS):
-        intervals = found.intervals.lasting(duration)
-        at = intervals.linearised(q)
-        factors = factors_of(at, intervals)
-        by_time = (at.by_h[1][:-1] - at.by_h[0][1:]) / count
-        along = -factors.solve(by_time)
-        value, velocity = start(q[0], at.p0[0])
+
+    def __init__(self, intervals: Intervals, energy: float, states: States, M: Any = None) -> None:
+        self.intervals, self.energy, self.states, self.M = intervals, energy, states, M
+        self.rows, self.velocities = len(intervals.h) - (M is None), np.empty(0)
+
+    def solved(self, q: Array, iterations: int = 0) -> Solution:
+        """Return the path near the nodes q, and the duration of the intervals."""
+        M, intervals = self.M, self.intervals
+        x = np.append(q if M is None else q[: self.rows], float(intervals.h.sum()))
+        x, at, _, more = newton(self.evaluate, self.factorise, self.move, x, MOST_ITERATIONS)
+        intervals = intervals.lasting(float(x[-1]))
+        own = factors_of(at, intervals) if M is None else Closed(at, self.intervals.basis_map(M), symmetric=True)
+        return Solution(self.nodes(x), intervals, at, own, iterations + more)
+
+    def nodes(self, x: Array) -> Array:
+        """Return the positions of all nodes."""
+        q = x[:-1].reshape(-1, self.intervals.stepper.dimension)
+        return q if self.M is None else np.concatenate([q, (self.M @ q[0])[np.newaxis]])
+
+    def evaluate(self, x: Array, derivatives: bool) -> tuple[Linearised, Array]:
+        """Return the steps, and the residuals of the nodes followed by that of the energy."""
+        if x[-1] * self.intervals.h[0] <= 0:
+            raise PathError("the duration became 0")
+        self.intervals = intervals = self.intervals.lasting(float(x[-1]))
+        at = (intervals.linearised if derivatives else intervals.evaluated)(self.nodes(x))
+        r = at.residual if self.M is None else closed_residual(at, self.M, intervals)
+        count = 1 if self.M is None else self.rows
+        energies, self.velocities = self.states(self.nodes(x)[:count], at.p0[:count])
+        return at, np.append(r, self.energy - energies.mean())
+
+    def factorise(self, at: Linearised) -> Any:
+        """Return the factors of the bordered matrix."""
+        intervals, (start, end) = self.intervals, at.by_h / len(at.p0)
+        velocities = [intervals.tangent(k, v) for k, v in enumerate(self.velocities)]
+        corner = -float(np.mean([v @ each for v, each in zip(velocities, start, strict=False)]))
+        border = end[:-1] - start[1:]
+        if self.M is not None:
+            M = intervals.basis_map(self.M)
+            return BorderedClosed(at, M, np.concatenate([(M.T @ end[-1] - start[0])[np.newaxis], border]), corner)
         first = at.blocks[1][0] if not intervals.sparse else _first_block(at, intervals)
-        velocity = intervals.tangent(0, velocity)
-        derivative = velocity @ (first @ along[0] + at.by_h[0][0] / count)
+        return Bordered(factors_of(at, intervals), border, -(first.T @ velocities[0]), corner)
 
-        def correction(
-            r: Array,
-            miss: float,
-            factors: Any = factors,
-            first: Any = first,
-            velocity: Array = velocity,
-            derivative: float = derivative,
-            along: Array = along,
-        ) -> tuple[Array, float]:
-            own = -factors.solve(r)
-            change = -(miss + velocity @ (first @ own[0])) / derivative
-            return own + change * along, float(change)
-
-        moved, change = correction(at.residual, value - energy)
-        size = max(float(np.abs(moved).max()), abs(change))
-        if not np.isfinite(size):
-            break
-        if size <= TOLERANCE * (1.0 + float(np.abs(q).max())):
-            return Solution(q, intervals, at, factors, found.iterations + iteration)
-        damping = min(1.0, 2.0 * damping)
-        while True:
-            trial, longer = intervals.moved(q, damping * moved), duration + damping * change
-            try:
-                there = intervals.lasting(longer).evaluated(trial)
-                simplified = correction(there.residual, start(trial[0], there.p0[0])[0] - energy)
-                if max(float(np.abs(simplified[0]).max()), abs(simplified[1])) < (1.0 - damping / 4.0) * size:
-                    break
-            except UNSOLVED:
-                pass
-            damping /= 2.0
-            if damping < LEAST_STEP:
-                raise PathError("Newton's method for the duration at this energy made no progress")
-        q, duration = trial, longer
-    raise PathError(f"no path of energy {energy:g} was found: give another T to start from")
+    def move(self, x: Array, correction: Array) -> Array:
+        """Return the nodes and the duration moved by a correction."""
+        q = self.intervals.moved(self.nodes(x), correction[:-1].reshape(self.rows, -1))
+        return np.append(q if self.M is None else q[:-1], x[-1] + correction[-1])
 
 
 def _first_block(at: Linearised, intervals: Any) -> Any:
@@ -205,8 +216,14 @@ def _first_block(at: Linearised, intervals: Any) -> Any:
     return csc_matrix((at.blocks[1][0], (intervals.rows, intervals.columns)), shape=(intervals.dimension,) * 2)
 
 
-def closed(intervals: Intervals, q: Array, M: Array, *, minimise: bool, symmetric: bool) -> Solution:
-    """Return the closed path q_N = M q_0 near the (N, d) nodes q; with ``minimise`` near a minimum of the action."""
+def closed(
+    intervals: Intervals, q: Array, M: Array, *, minimise: bool, symmetric: bool, energy: float | None, states: States
+) -> Solution:
+    """Return the closed path q_N = M q_0 near the (N, d) nodes q; with ``minimise`` near a minimum of the action.
+
+    With an energy the duration of the intervals is the first estimate. If Newton's method for both from q fails, it
+    starts from the path of this duration.
+    """
     intervals.symmetry = M
 
     def whole(nodes: Array) -> Array:
@@ -220,6 +237,9 @@ def closed(intervals: Intervals, q: Array, M: Array, *, minimise: bool, symmetri
         return at, closed_residual(at, M, intervals)
 
     q = intervals.on_manifold_all(q)
+    if energy is not None:
+        with suppress(*UNSOLVED):
+            return AtEnergy(intervals, energy, states, M).solved(q)
     at, r = evaluate(q, True)
     near = float(np.abs(Closed(at, intervals.basis_map(M), symmetric=symmetric).solve(r)).max()) < NEAR_CLOSED * float(
         np.abs(q).max()
@@ -229,6 +249,8 @@ def closed(intervals: Intervals, q: Array, M: Array, *, minimise: bool, symmetri
     found, at, factors, iterations = newton(
         evaluate, lambda at: Closed(at, intervals.basis_map(M), symmetric=symmetric), moved, q, MOST_ITERATIONS
     )
+    if energy is not None:
+        return AtEnergy(intervals, energy, states, M).solved(found, iterations)
     return Solution(whole(found), intervals, at, factors, iterations)
 
 
