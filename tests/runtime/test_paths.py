@@ -314,9 +314,9 @@ def test_refusals_name_the_remedy(kepler, oscillator):
             "which change the energy",
         ),
         (
-            lambda: compiled(
-                ["x", "y"], "(x_dot**2 + y_dot**2)/2 - x**2/2 - y", "svi:3", damping="1/10"
-            ).path(T=6.0, closed=True, energy=1.0, start=np.ones((33, 2))),
+            lambda: compiled(["x", "y"], "(x_dot**2 + y_dot**2)/2 - x**2/2 - y", "svi:3", damping="1/10").path(
+                T=6.0, closed=True, energy=1.0, start=np.ones((33, 2))
+            ),
             MethodError,
             "damping takes it",
         ),

@@ -114,7 +114,10 @@ def _numbers(model: Model, found: list[Path]) -> dict[str, Any]:
     def numbers(each: Path) -> dict[str, Any]:
         q, p = np.asarray(each.q), np.asarray(each.p)
         return {
-            **{name: getattr(each, name) for name in ("action", "index", "residual", "iterations", "conjugate_times")},
+            **{
+                name: getattr(each, name)
+                for name in ("action", "index", "residual", "at_rest", "iterations", "conjugate_times")
+            },
             "duration": float(each.t[-1] - each.t[0]),
             "period": each.period if each.solution.intervals.symmetry is not None else None,
             "energy": float(each.stepper.energy(q[0], p[0], model.t, each.solution.intervals.parameters_at_start)),
