@@ -162,8 +162,10 @@ def find_path(
             raise StateError("closed paths require start=: an array (steps + 1, m), or a function of time")
         M, forced = _symmetry(stepper.interface, closed), bool(stepper.interface.exchange_names)
         minimised = not (forced or isinstance(intervals, ReducedIntervals))
-        settings = {"minimise": minimised, "symmetric": not forced, "energy": wanted, "states": states}
-        closed_path = _described(stepper, solver.closed(intervals, nodes[:count], M, **settings), begin, arguments, M)
+        found = solver.closed(
+            intervals, nodes[:count], M, minimise=minimised, symmetric=not forced, energy=wanted, states=states
+        )
+        closed_path = _described(stepper, found, begin, arguments, M)
         if closed_path.at_rest:
             warn(
                 "path: the closed path is at rest in path.q[0], an equilibrium, which is closed for any T. For a "

@@ -195,7 +195,7 @@ class AtEnergy:
     def factorise(self, at: Linearised) -> Any:
         """Return the factors of the bordered matrix."""
         intervals, (start, end) = self.intervals, at.by_h / len(at.p0)
-        velocities = [intervals.tangent(k, v) for k, v in enumerate(self.velocities)]
+        velocities = [intervals.tangent(k, np.asarray(v)) for k, v in enumerate(self.velocities)]
         corner = -float(np.mean([v @ each for v, each in zip(velocities, start, strict=False)]))
         border = end[:-1] - start[1:]
         if self.M is not None:
