@@ -1,7 +1,7 @@
 // Sliders, buttons, keys, dragging, and the loop over frames.
-const BUDGET = 12; // milliseconds of a frame at most
+const scheduled = scheduler(() => performance.now());
 const CAUSES = about.causes;
-let running = true, pending = [], dragged, last, target = 0, stepCost = 0.01, drawCost = 2, frames = 0, dirty = true, notice = "", noticeEnds = 0;
+let running = true, pending = [], dragged, last, target = 0, frames = 0, dirty = true, notice = "", noticeEnds = 0;
 const motion = by("motion"), calm = matchMedia("(prefers-reduced-motion: reduce)");
 
 function tell(text) { notice = text; noticeEnds = performance.now() + 7000; dirty = true; }
@@ -15,11 +15,12 @@ function writeAddress() {
 function restart() {
   start();
   if (!fault && !shape.mesh && m <= 400) {
-    const began = performance.now(), states = [pointsOf(memory_q, memory_p, code.time())], span = 10 * settings.speed;
-    while (!fault && performance.now() - began < 4 && Math.abs(code.time() - about.t) < span && states.length < 4000) {
-      fault = code.advance(16, 4);
+    const states = [pointsOf(memory_q, memory_p, code.time())], span = 10 * settings.speed;
+    scheduled.begin(4);
+    scheduled.perform(() => (fault || Math.abs(code.time() - about.t) >= span || states.length >= 4000 ? 0 : 64), (now) => {
+      fault = code.advance(now, 4);
       for (let k = 0; k < code.stored() && !fault; k++) states.push(pointsOf(stored_q.subarray(k * m, (k + 1) * m), stored_p.subarray(k * m, (k + 1) * m), stored_t[k]));
-    }
+    });
     const shown = states.filter((points) => points.flat().every(Number.isFinite));
     start();
     picture.ahead(shown);
@@ -184,50 +185,49 @@ for (const name of ["pointerup", "pointercancel"]) motion.addEventListener(name,
 motion.addEventListener("dblclick", () => { view.reset(); dirty = true; });
 
 // ---- frames
-/** Performs the steps of a frame within the time that is left for them. */
-function go(elapsed, until) {
-  const sign = backward() ? -1 : 1, speed = settings.speed * sign;
-  target += elapsed * speed;
-  let performed = 0;
-  while (!fault && (target - code.time()) * sign > 0) {
-    const size = adaptive ? 1 : Math.ceil(((target - code.time()) * sign) / settings.step - 1e-9);
-    const now = Math.max(1, Math.min(size, Math.floor((until - performance.now()) / stepCost / 2))), began = performance.now(), every = Math.max(1, Math.ceil(size / 48));
-    if (now > 1) advance(now - 1, Math.min(every, now - 1));
+/** Performs the steps of a frame; what it has no time for is left out. */
+function go(elapsed) {
+  const sign = backward() ? -1 : 1;
+  target += elapsed * settings.speed * sign;
+  const needed = () => {
+    const ahead = fault ? 0 : (target - code.time()) * sign;
+    return ahead > 0 ? (adaptive ? 1 : Math.ceil(ahead / settings.step - 1e-9)) : 0;
+  };
+  const performed = scheduled.perform(needed, (now, size) => {
+    if (now > 1) advance(now - 1, Math.min(Math.max(1, Math.ceil(size / 48)), now - 1));
     if (!fault) single();
-    performed += now;
-    stepCost = 0.8 * stepCost + (0.2 * Math.max(performance.now() - began, 1e-3)) / now;
-    if (performance.now() > until) { if ((target - code.time()) * sign > 0) target = code.time(); break; }
-  }
+  });
+  if (needed()) target = code.time();
   return performed;
 }
 
 /** Performs the steps of an address, as many as a frame allows. */
-function replay(until) {
-  while (pending.length && !fault && performance.now() < until) {
-    const leg = pending[0];
-    if (leg > 0) { const every = Math.ceil(leg / 2000), now = Math.min(leg, 64 * every); advance(now, every); pending[0] -= now; }
-    else {
-      pending.shift();
+function replay() {
+  const needed = () => {
+    while (!fault && pending.length && !(pending[0] > 0)) {
+      const leg = pending.shift();
       if (leg === "r") turn(); else if (Array.isArray(leg)) hold(...leg);
     }
-  }
-  if (fault) pending = [];
+    return fault || !pending.length ? 0 : pending[0];
+  };
+  scheduled.perform(needed, (now, leg) => { advance(now, Math.ceil(leg / 2000)); pending[0] -= now; });
+  if (fault || !needed()) pending = [];
   if (!pending.length) { by("reverse").setAttribute("aria-pressed", String(backward())); target = code.time(); }
   dirty = true;
 }
 
 function frame(now) {
-  const began = performance.now(), until = began + Math.max(2, BUDGET - 1.5 - drawCost);
+  scheduled.begin();
   let performed = 0;
-  if (pending.length) replay(until);
+  if (pending.length) replay();
   else if (running && !fault) {
-    performed = go(Math.min(now - (last ?? now), 100) / 1000, until);
+    performed = go(Math.min(now - (last ?? now), 100) / 1000);
     last = now; dirty = true;
   }
   if (fault && running) play(false);
   const drawing = performance.now();
   if (dirty || frames % 60 === 0) draw(performed);
-  if (dirty) drawCost = 0.9 * drawCost + 0.1 * (performance.now() - drawing);
+  if (dirty) scheduled.drawn(performance.now() - drawing);
   dirty = dirty && panels.length > 1 && !running && stale-- > 0;
   frames++;
   requestAnimationFrame(frame);
