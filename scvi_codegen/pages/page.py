@@ -27,6 +27,7 @@ from scvi_codegen.display.mathml import mathml_terms
 from scvi_codegen.errors import ArgumentError, ExpressionError, MethodError, StateError, closest
 from scvi_codegen.files.atomic import regular, write_text
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.rotations import Rotation, RotationNames
 from scvi_codegen.formulas.symbols import input_parameters, symbol
 from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS
 from scvi_codegen.models.model import DEFAULT_METHOD, Model
@@ -219,7 +220,7 @@ class Page:
         description = _description(self, interface, initial=bool(initial))
         text = template_environment().get_template("page/page.html.jinja").render(
             title=html.escape(interface.system), method=html.escape(interface.title.split(": ", 1)[-1]),
-            version=__version__, licences=LICENCES, lagrangian=_lagrangian(document),
+            version=__version__, licences=LICENCES, lagrangian=_lagrangian(document, model),
             description=json.dumps(description, separators=(",", ":")).replace("<", "\\u003c"), wasm=code,
         )  # fmt: skip
         return INDENTED.sub("", text)
@@ -303,8 +304,10 @@ def _initial(document: Mapping[str, Any], names: Sequence[str]) -> tuple[str, ..
     return () if any("\n" in text for text in texts) else texts  # of functions that C does not have
 
 
-def _lagrangian(document: Mapping[str, Any]) -> list[str]:
-    """Return the Lagrangian, density or Hamiltonian as written, as terms of MathML; none of array systems."""
+def _lagrangian(document: Mapping[str, Any], model: Model) -> list[str]:
+    """Return the Lagrangian, density or Hamiltonian as written, as terms of MathML; none of arrays and robots."""
+    if getattr(model.system, "links", ()):
+        return []
     system = document.get("system", {})
     text = str(document.get("field", {}).get("density") or system.get("lagrangian") or system.get("hamiltonian") or "")
     try:
@@ -384,7 +387,7 @@ def _description(shown: Page, interface: Any, *, initial: bool) -> dict[str, Any
     plots = [[_variable(name, variables) for name in reversed(pair)] for pair in model.page.get("plots", ())]
     return {
         "m": len(q), "q": [] if initial else q, "v": [] if initial else v, "t": float(model.t),
-        "coordinates": interface.coordinates,
+        "coordinates": interface.coordinates, "rotations": _rotations(interface),
         "momenta": interface.momentum_names, "parameters": parameters, "quantities": interface.map_names,
         "energy": {"label": "Energy", "conserved": bool(interface.conserves_energy) and conserved}, "plots": plots,
         "causes": CAUSES, "events": [str(each.function) for each in model.events],
@@ -395,6 +398,19 @@ def _description(shown: Page, interface: Any, *, initial: bool) -> dict[str, Any
         "speed": {"value": speed, "low": speed / 50, "high": speed * 20},
         "ranges": sliders, "shape": shape,
     }  # fmt: skip
+
+
+def _rotations(interface: Any) -> list[dict[str, Any]]:
+    """Return the columns and the names of the angular velocity of each rotation."""
+    return [
+        {
+            "name": each.name,
+            "columns": [interface.coordinates.index(name) for name in each.coordinates],
+            "rates": [rate.name for rate in each.rates],
+        }
+        for each in RotationNames.members_of(interface.rotations)
+        if isinstance(each, Rotation)
+    ]
 
 
 def _variables(interface: Any, shape: Mapping[str, Any], size: int) -> list[str]:

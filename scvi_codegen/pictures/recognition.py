@@ -272,7 +272,6 @@ def _solids(drawn: DrawnSystem) -> MovingShape:
     solids, trails = [], []
     for number, member in enumerate(RotationNames.members_of(interface.rotations)):
         values, first = member.values(), len(points)
-        solid = {"name": member.name, "centre": 0, "columns": [names.index(each) for each in member.coordinates]}
         if isinstance(member, Rotation):
             matrix = Matrix(3, 3, [values[each] for each in member.entries])
             points += [program.point(centre + matrix[:, axis]) for axis in range(3)]
@@ -280,14 +279,13 @@ def _solids(drawn: DrawnSystem) -> MovingShape:
             kind = "top" if symmetric else "box"
             marks.append({"kind": kind, "points": [0, first, first + 1, first + 2], "color": number})
             marks.append({"kind": "body", "points": [first + 2], "mass": 0.1, "color": number + 1})
-            solid["rates"] = [each.name for each in member.rates]
         else:
             vector = Matrix([values[each] for each in member.entries])
             length = intermediate(sympy.sqrt(sympy.Add(*(each**2 for each in vector))))
             points.append(program.point(centre + vector / length))
             marks.append({"kind": "arrow", "points": [0, first], "color": number})
         trails.append(len(points) - 1)
-        solids.append(solid | {"tip": trails[-1]})
+        solids.append({"name": member.name, "centre": 0, "tip": trails[-1]})
     return MovingShape(dimension=3, points=points, program=program.entries, marks=marks, trails=trails, solids=solids)
 
 

@@ -56,7 +56,7 @@ class MovingShape:
         labels: of the axes, if the points are no positions in space.
         equal: use one scale for all axes.
         angles: coordinates of period 2 pi.
-        solids: rotations, directions and spins: name, points of the centre and the tip, columns of q, rates.
+        solids: rotations, directions and spins: name, points of the centre and the tip.
         mesh: nodes by axis, fields with their columns of q, and whether nodes are dots, instead of points.
         box: registers of the periods of the components of all points; none without periods.
     """

@@ -74,31 +74,42 @@ for (const { name, low, high, input } of about.parameters) {
   if (input) addSlider("Inputs", set(name), name, { low, high, get: () => held[name], set: (x) => { hold(name, x); dirty = true; } });
   else addSlider("Parameters", set(name), name, { low, high, get: () => settings.parameters[name], set: (x) => { settings.parameters[name] = x; restart(); } });
 }
-const rotations = about.from_momenta ? [] : shape.solids.filter((each) => each.rates);
-if (rotations.length) rotations.forEach(addRotation);
 if (!about.initial && about.ranges) {
   for (const kind of ["q", "v"]) about.coordinates.forEach((name, k) => {
-    if (rotations.some(({ columns }) => columns.includes(k))) return;
+    if (about.rotations.some(({ columns }) => columns.includes(k))) return;
     const [low, high] = about.ranges[kind][k];
     const momentum = kind === "v" && about.from_momenta ? about.momenta[k] : "";
     addSlider("Initial values", set(momentum || name, kind === "v" && !momentum), momentum || (kind === "q" ? name : `Velocity of ${name}`), { low, high, hard: false, get: () => settings[kind][k], set: (x) => { settings[kind] = settings[kind].with(k, x); restart(); } });
   });
 }
-if (groups["Initial values"] && sliders.length > 24) groups["Initial values"].open = false;
+about.rotations.forEach(addRotation);
+for (const [title, box] of Object.entries(groups)) if (sliders.length > 24 && /^(Initial|Rotation) /.test(title)) box.open = false;
 
-/** Adds sliders of a rotation: tilt about the first axis, and the angular velocity in the body. */
-function addRotation({ name, columns, rates: names }) {
+/** Adds sliders of a rotation: the angles of R = Rz Ry Rx, which keep the velocity in the body, and the angular velocity there. */
+function addRotation({ name, columns, rates }) {
   const product = ([a, b, c, d], [w, x, y, z]) => [a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y, a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w];
-  const attitude = () => columns.map((c) => settings.q[c]);
-  const omega = () => { const [w, x, y, z] = attitude(); return product([w, -x, -y, -z], columns.map((c) => settings.v[c])).slice(1).map((u) => 2 * u); };
-  const put = (q, rate) => {
-    const v = product(q, [0, ...rate]).map((u) => u / 2);
-    columns.forEach((c, k) => { settings.q = settings.q.with(c, q[k]); settings.v = settings.v.with(c, v[k]); });
-    restart();
+  const inverse = (q) => { const square = q.reduce((sum, u) => sum + u * u, 0); return q.map((u, k) => (k ? -u : u) / square); };
+  const attitude = () => columns.map((c) => settings.q[c]), motionOf = () => columns.map((c) => settings.v[c]);
+  const omega = () => product(inverse(attitude()), motionOf()).slice(1).map((u) => 2 * u);
+  const put = (q, v) => { columns.forEach((c, k) => { settings.q = settings.q.with(c, q[k]); settings.v = settings.v.with(c, v[k]); }); restart(); };
+  const turned = (angles) => angles.map((u, axis) => [Math.cos(u / 2), ...[0, 1, 2].map((k) => (k === axis ? Math.sin(u / 2) : 0))]).reduce((q, factor) => product(factor, q));
+  let chosen = [0, 0, 0]; // at a pitch of pi/2 the attitude does not determine the angles
+  const angles = () => {
+    const [w, x, y, z] = unit(attitude()), [a, b, c, d] = turned(chosen);
+    if (Math.abs(w * a + x * b + y * c + z * d) < 1 - 1e-12) chosen = [Math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)), Math.asin(clamped(2 * (w * y - z * x), -1, 1)), Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))];
+    return chosen;
   };
-  addSlider("Initial values", "Tilt", `Tilt of ${name}`, { low: 0, high: Math.PI, get: () => { const [w, x, y] = attitude(); return 2 * Math.atan2(Math.hypot(x, y), w); }, set: (x) => put([Math.cos(x / 2), Math.sin(x / 2), 0, 0], omega()) });
+  const title = about.rotations.length > 1 ? `Rotation ${name}` : "Initial values";
+  ["x", "y", "z"].forEach((letter, axis) => addSlider(title, `angle ${letter}`, `Angle of ${name} about ${letter}`, {
+    low: axis === 1 ? -Math.PI / 2 : -Math.PI, high: axis === 1 ? Math.PI / 2 : Math.PI, get: () => angles()[axis],
+    set: (x) => {
+      const next = angles().with(axis, x), size = Math.hypot(...attitude()), q = turned(next).map((u) => u * size);
+      chosen = next; put(q, product(product(q, inverse(attitude())), motionOf()));
+    },
+  }));
+  if (about.from_momenta) return;
   const largest = Math.max(4, ...omega().map((u) => 2 * Math.abs(u)));
-  [0, 1, 2].forEach((axis) => addSlider("Initial values", set(names[axis]), names[axis], { low: -largest, high: largest, hard: false, get: () => omega()[axis], set: (x) => put(attitude(), omega().with(axis, x)) }));
+  [0, 1, 2].forEach((axis) => addSlider(title, set(rates[axis]), rates[axis], { low: -largest, high: largest, hard: false, get: () => omega()[axis], set: (x) => put(attitude(), product(attitude(), [0, ...omega().with(axis, x)]).map((u) => u / 2)) }));
 }
 
 // ---- buttons and keys

@@ -16,6 +16,7 @@ import scvi_codegen as sc
 from scvi_codegen.native.building import PORTABLE_FLAGS
 
 DOCS = Path(__file__).parents[2] / "docs"
+ROBOT = Path(__file__).parents[1] / "mechanics" / "robots" / "ball.xml"
 pytestmark = pytest.mark.second
 
 
@@ -29,12 +30,14 @@ def extension(name: str) -> Any:
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Return the files of two pages: one without calls of the C library, and a field."""
+    """Return the files of three pages: one without calls of the C library, a field, and a robot with a ball joint."""
     pytest.importorskip("ziglang", reason="pages are compiled by the extra compiler")
     folder, result = tmp_path_factory.mktemp("pages"), {}
     for name, plots in (("figure_eight", [("x3", "y3"), ("t", "energy")]), ("kinks", [("q.80", "t")])):
         result[name] = folder / f"{name}.html"
         sc.page(DOCS / "motions" / f"{name}.toml", plots=plots).save(result[name])
+    robot, result["robot"] = sc.LagrangianSystem.from_mjcf(ROBOT), folder / "robot.html"
+    sc.page(robot, q=[0.4, 2.0, 0.0, 0.0, 0.0], velocity=[0.0] * 5, h=0.01, method="svi:2").save(result["robot"])
     return result
 
 
@@ -217,6 +220,35 @@ def test_a_number_out_of_range_is_replaced_and_explained(view, pages):
     view.wait_for_timeout(100)
     assert "v must be between 0.05 and 0.95; 1.2 was replaced" in view.inner_text("#fault")
     assert view.evaluate("page.state().settings.parameters.v") == 0.95
+
+
+def matrix_of(quaternion: np.ndarray) -> np.ndarray:
+    """Return the rotation of a quaternion of any length."""
+    w, v = quaternion[0], quaternion[1:]
+    turned = (w * w - v @ v) * np.eye(3) + 2 * np.outer(v, v) + 2 * w * np.cross(np.eye(3), v)
+    return turned / (quaternion @ quaternion)
+
+
+def test_sliders_of_a_ball_joint_are_angles_and_angular_velocities(view, pages):
+    """An angle turns the joint with its velocity in the body, which sliders set in any order."""
+    opened(view, pages["robot"])
+    angles = {"x": 2.5, "y": -1.2, "z": 0.7}
+    names = {f"Angle of R_ball about {axis}": angle for axis, angle in angles.items()}
+    for name, value in [*[*names.items()][:2], ("omega_ball_2", 1.5), *[*names.items()][2:]]:
+        view.fill(f"input[aria-label='{name}, value']", str(value))
+        view.keyboard.press("Enter")
+    settings = view.evaluate("page.state().settings")
+    q, v = (np.array(settings[kind][1:]) for kind in "qv")
+    expected = np.eye(3)
+    for axis, angle in enumerate(angles.values()):
+        plane, turn = [(axis + 1) % 3, (axis + 2) % 3], np.eye(3)
+        turn[np.ix_(plane, plane)] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        expected = turn @ expected
+    assert np.allclose(matrix_of(q), expected, atol=1e-12)
+    assert np.linalg.norm(q) == pytest.approx(2.0)
+    spin = matrix_of(q).T @ (matrix_of(q + 1e-6 * v) - matrix_of(q - 1e-6 * v)) / 2e-6
+    assert np.allclose([spin[2, 1], spin[0, 2], spin[1, 0]], [0.0, 1.5, 0.0], atol=1e-8)
+    assert view.locator("input[aria-label*='R_ball_']").count() == 0
 
 
 def test_a_page_in_a_frame_without_address_shows_its_link(view, pages):
