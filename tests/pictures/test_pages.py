@@ -227,6 +227,64 @@ def test_parameters_of_initial_formulas_are_used(recwarn):
     assert [str(each.message) for each in recwarn] == []
 
 
+def boxed():
+    """Return the model of two particles in a periodic box."""
+    gas = sc.LagrangianSystem.from_text(
+        "gas", ["r[N, 2]"], parameters={"box": 6.0, "cut": 2.5},
+        neighbours={"near": {"of": "r", "cutoff": "cut", "box": "box"}},
+        lagrangian="sum(i in N, sum(a in 2, r_dot[i, a]**2)/2)"
+        " - sum(i < j in near, (cut**2 - sum(a in 2, wrap(r[i, a] - r[j, a], box)**2))**2)",
+    )  # fmt: skip
+    q, velocity = {"r": [[0.0, 1.0], [2.0, 7.0]]}, {"r": np.zeros((2, 2))}
+    return sc.Model(system=gas, method="svi:2", q=q, velocity=velocity, h=0.1, steps=1)
+
+
+@pytest.mark.second
+@pytest.mark.parametrize(
+    ("model", "read", "expected"),
+    [
+        pytest.param(
+            MOTIONS / "foucault.toml",
+            lambda data: (
+                [(mark["kind"], mark["points"]) for mark in data["shape"]["marks"]],
+                data["shape"]["points"][0],
+            ),
+            ([("rod", [1, 0]), ("pivot", [1]), ("body", [0])], [1, 2, 3]),
+            id="a constraint on a distance is a rod",
+        ),
+        pytest.param(
+            MOTIONS / "lagrange_top.toml",
+            lambda data: (data["rotations"], np.round(data["v"], 12).tolist(), data["shape"]["marks"][0]["kind"]),
+            (
+                [{"name": "R", "columns": [0, 1, 2, 3], "rates": ["omega_1", "omega_2", "omega_3"]}],
+                np.round([0.0, 0.0, -4 * np.sin(0.25), 4 * np.cos(0.25)], 12).tolist(),  # q (0, omega)/2
+                "top",
+            ),
+            id="a rotation has its columns, rates and velocity",
+        ),
+        pytest.param(
+            MOTIONS / "kinks.toml",
+            lambda data: (
+                *(data[name] for name in ("initial", "q", "v", "m", "coordinates")),
+                data["shape"]["mesh"]["fields"],
+                [data["shape"]["mesh"]["axes"]["x"][k] for k in (0, 80, -1)],
+            ),
+            (True, [], [], 161, [], [{"name": "u", "columns": [0, 161]}], [-20.0, 0.0, 20.0]),
+            id="a field has its nodes, and formulas instead of values",
+        ),
+        pytest.param(
+            boxed,
+            lambda data: (data["q"], data["shape"]["points"], data["shape"]["box"], data["parameters"][0]["place"]),
+            ([0.0, 1.0, 2.0, 7.0], [[1, 2], [3, 4]], [9, 9], 0),  # registers: t, q, p, parameters
+            id="particles have the periods of their box",
+        ),
+    ],
+)
+@pytest.mark.usefixtures("without_compiler")
+def test_a_page_contains_what_its_scripts_need(model, read, expected):
+    assert read(described(sc.page(model() if callable(model) else model).html)) == expected
+
+
 def test_a_missing_compiler_is_an_error_with_its_remedy(tmp_path, monkeypatch):
     find = importlib.util.find_spec
     absent = lambda name, *more: None if name == "ziglang" else find(name, *more)  # noqa: E731
