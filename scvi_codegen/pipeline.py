@@ -62,6 +62,7 @@ from scvi_codegen.rendering.program_source import (
     render_double_double,
     render_embedded,
     render_ensemble,
+    render_thread,
     workspace_size,
 )
 from scvi_codegen.rendering.source import DOUBLE_DOUBLE, ArrayLayout, Interface, Source
@@ -458,9 +459,10 @@ class Sources:
             "second_derivatives": lambda: self.tangent(second=True),
             "changes": lambda: self.changes(int(count)),
             "observing": lambda: self.observing(count),
+            "thread": lambda: render_thread(self.program(), control_of(self.program(), self.controller, self.system)),
         }
         if self.precision == DOUBLE_DOUBLE:  # derivatives are those of the step in double
-            return None if kind in ("ensemble", "observing", "fallback") else self._in_double.variant(name)
+            return None if kind in ("ensemble", "observing", "thread", "fallback") else self._in_double.variant(name)
         return None if self.of_arrays else variants[kind]()
 
 

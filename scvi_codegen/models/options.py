@@ -161,7 +161,7 @@ class RunOptions:
         *("run", CHOICE, "", f"Arithmetic [double]; {DOUBLE_DOUBLE}: 31 digits."), choices=PRECISIONS, common=False
     )
     device: str | None = run_option(
-        *("run", CHOICE, "", "With --ensemble: fixed steps on an NVIDIA GPU (extra 'cuda'; experimental)."),
+        *("run", CHOICE, "", "With --ensemble: run on an NVIDIA GPU (extra 'cuda'; experimental)."),
         choices=DEVICES,
         common=False,
     )

@@ -43,7 +43,7 @@ class TimeSpan(RunOptions):
         controller: name of the step-size controller, ``None`` for the default; without ``time_transformation`` it
             requires adaptive steps.
         precision: ``"double-double"`` for runs with states of two words; ``None`` means ``"double"``.
-        device: ``"cuda"`` for ensembles with fixed steps on a GPU; single runs are not available with it.
+        device: ``"cuda"`` for ensembles on a GPU; single runs are not available with it.
         observe: ``"extremes"`` or ``"energy"`` of ensembles, as of :meth:`Stepper.integrate_ensemble`.
         solver_tolerance, max_iterations: of the iteration on the stage equations, as of
             :class:`~scvi_codegen.SolverOptions`.

@@ -231,7 +231,13 @@ def render_embedded(program: Program, precision: Embedded, control: Control | No
 
 def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") -> Source:
     """Return the source of entry templates from their context, with defaults for all of them."""
-    common = {"prefix": prefix, "target": DOUBLE, "real": DOUBLE.scalar, "max_iterations": MAX_ITERATIONS}
+    common = {
+        "prefix": prefix,
+        "target": DOUBLE,
+        "real": DOUBLE.scalar,
+        "max_iterations": MAX_ITERATIONS,
+        "on_device": False,
+    }
     environment, context = template_environment(), {**common, "two_words": None, **context}
     header = entry if entry in DECLARATIONS else "stepper"
     code = environment.get_template(f"{entry}.c.jinja").render(context)
@@ -282,6 +288,16 @@ def render_ensemble(program: Program, observed: Kernel | None = None) -> Source 
         "fixed_point": source,
     }
     return _render(prefix, context, "ensemble")
+
+
+def render_thread(program: Program, control: Control | None) -> Source | None:
+    """Return source of adaptive steps in threads of a GPU; ``None`` unless they are by fixed-point iteration."""
+    fixed_point = program.fixed_point
+    if not (control and control.predictor and fixed_point and fixed_point.in_groups) or program.quantities.integrals:
+        return None
+    program = replace(program, prefix=f"{program.prefix}_thread")
+    context = _context(program, DOUBLE, replace(control, growth=None), "none")
+    return _render(program.prefix, {**context, "on_device": True})
 
 
 def render_events(search: EventSearch) -> Source:

@@ -1,11 +1,13 @@
-"""Ensembles with common fixed steps on a GPU: a thread is one trajectory, results stay in the memory of the device.
+"""Ensembles on a GPU: a thread is one trajectory, results stay in the memory of the device.
 
-A trajectory whose step fails stops there; the single integrator continues it on the processor, as it does those that
-leave a block of SIMD lanes (:mod:`scvi_codegen.runtime.ensemble.lanes`).
+A trajectory whose step fails stops there. With common fixed steps the single integrator continues it on the processor,
+as it does those that leave a block of SIMD lanes (:mod:`scvi_codegen.runtime.ensemble.lanes`); with adaptive steps it
+repeats it from the start.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -14,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import StateError
+from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.native.cuda import Device, constant, has_device_memory
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Source
@@ -23,11 +25,13 @@ from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.ensemble.lanes import CommonRuns, SingleBlock
 from scvi_codegen.runtime.ensemble.observation import EnsembleObservation
-from scvi_codegen.runtime.ensemble.result import OK, EnsembleRuns, EnsembleTrajectory
+from scvi_codegen.runtime.ensemble.result import INTERRUPTED, OK, EnsembleRuns, EnsembleTrajectory
 from scvi_codegen.runtime.ensemble.schedule import CommonSteps
+from scvi_codegen.runtime.ensemble.successive import CHUNK_SECONDS, Rows, SuccessiveRuns
 from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.descriptions import short_title
+from scvi_codegen.validation import LARGEST_COUNT
 
 FIRST_STEPS, GROWTH = 64, 8.0
 """Steps of the first launch, and the largest ratio of those of successive ones."""
@@ -40,6 +44,11 @@ def on_processor(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {name: on_processor(each) for name, each in value.items()}
     return Device().copy_of(value) if has_device_memory(value) else value
+
+
+def options_of(options: SolverOptions) -> tuple[float, int, int]:
+    """Return the solver options as arguments of kernels."""
+    return float(options.tolerance), int(options.max_iterations), int(options.absolute)
 
 
 class DeviceRuns:
@@ -155,7 +164,7 @@ class DeviceRuns:
         rows = self.steps.row(begin) * self.count * self.m * self.q.dtype.itemsize
         options = self.options
         states = (np.uint64(each.ptr + rows) for each in (self.q, self.p))
-        numbers = float(options.tolerance), int(options.max_iterations), int(options.absolute)
+        numbers = options_of(options)
         memory = self.memory, self.parameters, *states, self.counts
         self.launch("thread_advance", self.count, self.count, begin, size, save_every, float(self.h), *numbers, *memory)
 
@@ -187,6 +196,111 @@ class DeviceRuns:
         for target, values in ((self.q, work.q), (self.p, work.p)):
             arguments = self.count, rows, len(failed), which, self.device.copied(values), target
             self.launch("thread_replace", rows * len(failed), *arguments)
+
+
+class AdaptiveDeviceRuns:
+    """Trajectories with adaptive steps on a GPU; arguments as of :class:`SuccessiveRuns`.
+
+    Each launch takes a number of steps. Threads of a warp wait for each other, so the trajectories of the next launch
+    are those that have not ended, sorted by the number of steps that they still need at their present rate.
+
+    Attributes:
+        q, p: (2, k, m) initial and final states, on the device.
+        t, status, done: (k,) times that were reached, reasons of the end, and numbers of completed steps.
+    """
+
+    def __init__(
+        self,
+        stepper: Integrator,
+        options: SolverOptions | None,
+        start: tuple[Array, Array],
+        parameters: Array,
+        t0: float,
+        t_end: Array,
+        *,
+        tolerance: float,
+    ) -> None:
+        source = stepper._variants["thread"]
+        if source is None:
+            raise MethodError(
+                f"adaptive steps on a GPU are not available for '{stepper.title}': they require a fixed-point "
+                "iteration with forces at two or more stages, as of SVI and Gauss methods; give h and steps, or omit "
+                "device"
+            )
+        self.stepper, self.options, self.start = stepper, options, start
+        self.values, self.t0, self.t_end, self.tolerance = parameters, t0, t_end, tolerance
+        device = self.device = Device()
+        self.launch, count = device.kernels(source), len(t_end)
+        self.q, self.p = (device.copied(np.stack([each, each])) for each in start)
+        self.t, self.status = np.full(count, t0), np.full(count, OK, dtype="<U32")
+        self.done = np.zeros(count, np.int64)
+
+    def run(self, *, progress: Callable[[int], None] | None, threads: int | None) -> None:
+        """Integrate all trajectories; then repeat those whose steps failed on the processor, in ``threads`` threads."""
+        device, count = self.device, len(self.done)
+        size, codes, reached = (device.copied(np.full(n, -1)) for n in (1, count, count))
+        self.launch("thread_size", 1, size)
+        runs = device.empty((int(device.copy_out(size)[0]) * count,), np.uint8)
+        ends = (np.uint64(each.ptr + each.dtype.itemsize * count * each.shape[2]) for each in (self.q, self.p))
+        parameters = device.copied(self.values if self.values.size else np.zeros((count, 1)))
+        numbers = (0.0, 0, 0) if self.options is None else options_of(self.options)
+        arrays = runs, parameters, device.copied(self.t), *ends, codes, reached
+        t_end, left, steps, first, status = (
+            device.copied(self.t_end),
+            np.arange(count),
+            FIRST_STEPS,
+            1,
+            np.full(count, -1),
+        )
+        try:
+            while left.size:
+                began, which = time.perf_counter(), device.copied(left)
+                plan = len(left), which, first, steps, float(self.t0), t_end, float(self.tolerance), *numbers
+                self.launch("thread_advance_to", len(left), *plan, *arrays)
+                status, self.t, self.done = map(device.copy_out, (codes, arrays[2], reached))
+                if progress is not None:
+                    progress(int(np.count_nonzero(status >= 0)))
+                left = self._sorted(np.flatnonzero(status < 0))
+                first, slow = 0, time.perf_counter() - began > CHUNK_SECONDS
+                steps = steps if slow else int(GROWTH) * steps
+        finally:
+            self.status[status < 0] = INTERRUPTED
+            if (status != 0).any():
+                self._replace(status, threads)
+
+    def _sorted(self, left: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Return trajectories in the order of the numbers of steps that they still need at their present rate."""
+        passed, rest = np.abs(self.t - self.t0)[left], np.abs(self.t_end - self.t)[left]
+        return left[np.argsort(rest * self.done[left] / np.where(passed > 0.0, passed, 1.0), kind="stable")]
+
+    def _replace(self, status: NDArray[np.int64], threads: int | None) -> None:
+        """Repeat the failed trajectories on the processor; final states are NaN where they are unknown."""
+        failed = np.flatnonzero(status > 0)
+        finals = [self.device.copy_out(each) for each in (self.q, self.p)]
+        for each in finals:
+            each[1, status != 0] = np.nan
+
+        def store(states: Rows) -> None:
+            for each, values in zip(finals, (states.q, states.p), strict=True):
+                each[1, failed[states.trajectories]] = values
+            self.t[failed[states.trajectories]] = states.t
+
+        if failed.size:
+            again = SuccessiveRuns(
+                self.stepper,
+                self.options,
+                (self.start[0][failed], self.start[1][failed]),
+                self.values[failed],
+                self.t0,
+                self.t_end[failed],
+                tolerance=self.tolerance,
+                save_every=LARGEST_COUNT,
+                store=store,
+            )
+            again.run(progress=None, threads=threads)
+            self.status[failed], self.done[failed] = again.names, again.done
+        for target, each in zip((self.q, self.p), finals, strict=True):
+            self.device.copy_in(each, target)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

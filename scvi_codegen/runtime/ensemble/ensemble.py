@@ -24,7 +24,7 @@ from scvi_codegen.native.cuda import DEVICES
 from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.runtime.core.features import check_together, require
 from scvi_codegen.runtime.core.validation import Array, States, check_left_to_inputs, columns_of_inputs, parameter_index
-from scvi_codegen.runtime.ensemble.device import DeviceEnsemble, DeviceRuns, on_processor
+from scvi_codegen.runtime.ensemble.device import AdaptiveDeviceRuns, DeviceEnsemble, DeviceRuns, on_processor
 from scvi_codegen.runtime.ensemble.initial_states import (
     EnsembleParameters,
     checked_ensemble,
@@ -106,7 +106,7 @@ class Ensemble:
         observe: str | None = None,
     ) -> None:
         interface = stepper.interface
-        _check_device(device, h, error=error, t_eval=t_eval)
+        _check_device(device, h, inputs, save_every, error=error, t_eval=t_eval)
         check_together(inputs=inputs, observe=observe, error=error, t_eval=t_eval)
         steps, t_end = _steps_or_end(t, h, steps, t_end, inputs, tolerance, t_eval)
         require(stepper, "ensembles")
@@ -156,18 +156,19 @@ class Ensemble:
                 "steps, or observe each trajectory by integrate"
             )
         self.states: list[Rows] = []
+        self.adaptive = None if device is None or self.common is not None else self._on_device()
         self.successive = self._successive()
 
     def _successive(self) -> SuccessiveRuns | None:
         """Return the trajectories that C integrates one after the other, ``None`` for other ensembles."""
         stepper, common = self.stepper, self.common
-        if isinstance(common, DeviceRuns):
+        if isinstance(common, DeviceRuns) or self.adaptive is not None:
             return None
         if self.inputs or stepper.changes_states or stepper.in_tau or not stepper.binding.reusable:
             return None
         if common is not None:
             return common.successive() if common.steps.steps and stepper.ensemble is None else None
-        ends = np.array([plan.t_end for plan in self.plans])
+        ends = self._ends()
         if self.error is not None or not (self.t_eval is None or self._saves_ends(ends)):
             return None
         return SuccessiveRuns(
@@ -181,6 +182,14 @@ class Ensemble:
             save_every=self.save_every if self.t_eval is None else LARGEST_COUNT,
             store=lambda states: self.states.append(states.copies()),
         )
+
+    def _ends(self) -> Array:
+        return np.array([plan.t_end for plan in self.plans])
+
+    def _on_device(self) -> AdaptiveDeviceRuns:
+        """Return the trajectories with adaptive steps that a GPU integrates."""
+        arguments = self.stepper, self.options, self.start, self.parameters, self.t0, self._ends()
+        return AdaptiveDeviceRuns(*arguments, tolerance=self.plans[0].tolerance)
 
     def _saves_ends(self, ends: Array) -> bool:
         """Return whether the output times are the common end of all trajectories, with or without their start."""
@@ -267,6 +276,9 @@ class Ensemble:
             return
         if isinstance(self.common, DeviceRuns):
             self.common.run(progress=progress, threads=threads)
+            return
+        if self.adaptive is not None:
+            self.adaptive.run(progress=progress, threads=threads)
             return
         if self.common is not None:
             self._run_blocks(self.common, progress, threads)
@@ -395,6 +407,8 @@ class Ensemble:
 
     def device_result(self) -> DeviceEnsemble:
         """Return the trajectories of a GPU, whose states stay in its memory."""
+        if self.adaptive is not None:
+            return DeviceEnsemble(q=self.adaptive.q, p=self.adaptive.p, _to_host=self.result, **self._adaptive_fields())
         common = cast(DeviceRuns, self.common)
         return DeviceEnsemble(
             t=common.steps.times(tau=False),
@@ -413,7 +427,17 @@ class Ensemble:
         unfinished = (common.status == OK) & (common.done < common.steps.steps)
         return np.where(unfinished, INTERRUPTED, common.status)
 
+    def _adaptive_fields(self) -> dict[str, Any]:
+        """Return the fields of results of a GPU with adaptive steps, but its states."""
+        runs = cast(AdaptiveDeviceRuns, self.adaptive)
+        times = np.array([np.full(len(self), self.t0), np.where(runs.status == OK, runs.t, np.nan)])
+        about = {"status": runs.status, "steps": runs.done, "h": 0.0, "plans": tuple(self.plans)}
+        return {"t": np.arange(2.0), "times": times, "parameters": self.parameters, "stepper": self.stepper, **about}
+
     def _adaptive_result(self) -> EnsembleTrajectory:
+        if self.adaptive is not None:
+            q, p = map(self.adaptive.device.copy_out, (self.adaptive.q, self.adaptive.p))
+            return EnsembleTrajectory(q=q, p=p, **self._adaptive_fields())
         if self.successive is not None and not self.saved:
             return self._successive_result(self.successive)
         lanes = [self.saved.get(j) or self._unfinished(j) for j in range(len(self))]
@@ -482,15 +506,18 @@ class Ensemble:
         )
 
 
-def _check_device(device: str | None, h: float | None, **others: Any) -> None:
+def _check_device(device: str | None, h: float | None, inputs: object, save_every: int, **others: Any) -> None:
     """Raise ``StateError`` for an unknown device, and for arguments that ensembles on a GPU do not have."""
     if device is None:
         return
     if device not in DEVICES:
         raise StateError(f"device is {device!r}: it must be {' or '.join(map(repr, DEVICES))}, or omitted")
     check_together(device=device, **others)
-    if h is None:
-        raise StateError("device='cuda' requires a fixed step size: give h and steps, or omit device")
+    if h is None and (inputs is not None or save_every != 1):
+        raise StateError(
+            "device='cuda' with adaptive steps saves the initial and the final states, and has no inputs: omit "
+            "save_every and inputs, give h and steps, or omit device"
+        )
 
 
 def _steps_or_end(

@@ -57,6 +57,8 @@ class EnsembleRuns:
         h: step size; 0 for adaptive steps.
         parameters: (k, number of parameters) values; zeros for the parameters of inputs.
         stepper: the compiled integrator.
+        times: (n, k) times if every trajectory has its own (transformed time, adaptive steps), else ``None``.
+        plans: step plan of each trajectory for adaptive steps, else empty.
         observed: with ``observe=``, over the states after all steps: (2, k, 2m) smallest and largest values of (q, p)
             (``"extremes"``), (2, k) energies (``"energy"``), or (k, number of events) changes of sign (``"events"``).
     """
@@ -67,6 +69,8 @@ class EnsembleRuns:
     h: float
     parameters: Array
     stepper: Integrator = field(repr=False)
+    times: Array | None = None
+    plans: tuple[StepPlan, ...] = ()
     observed: Array | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
@@ -84,9 +88,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble):
 
     Attributes:
         q, p: (n, k, m) positions and momenta; NaN after a failure, and after the end of a shorter trajectory.
-        times: (n, k) times if every trajectory has its own (transformed time, adaptive steps), else ``None``.
         actions: (n, k) actions up to each state if the runs summed them (``action=True``), else ``None``.
-        plans: step plan of each trajectory for adaptive steps, else empty.
         spans: with inputs, rows of states of a slice of trajectories and their parameters.
         confirmations: with ``error=``, of each trajectory as of :class:`Trajectory`, ``None`` for one that fails; else
             empty.
@@ -94,9 +96,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble):
 
     q: Array
     p: Array
-    times: Array | None = None
     actions: Array | None = field(default=None, repr=False)
-    plans: tuple[StepPlan, ...] = ()
     spans: tuple[Span, ...] = field(default=(), repr=False)
     confirmations: tuple[GlobalError | None, ...] = field(default=(), repr=False)
 

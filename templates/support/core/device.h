@@ -6,6 +6,7 @@
 #define DBL_EPSILON 2.220446049250313e-16
 #define DBL_MIN 2.2250738585072014e-308
 #define INFINITY __longlong_as_double(0x7ff0000000000000LL)
+#define NAN __longlong_as_double(0x7ff8000000000000LL)
 #define KERNEL extern "C" __global__ void
 #define TRAJECTORY ((long long)blockIdx.x * blockDim.x + threadIdx.x)
 #define SCVI_INVERSE_ROOT device_inverse_root
