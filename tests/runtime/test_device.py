@@ -317,7 +317,7 @@ def test_without_a_gpu_the_error_names_the_remedy(monkeypatch: pytest.MonkeyPatc
         compiled("kepler", sc.SVI(4)).integrate_ensemble([1.0, 0.0], [0.0, 1.0], h=0.1, steps=5, device="cuda")
 
 
-LIMITS = {("kepler", 4): (228, 0), ("henon-heiles", 4): (214, 0), ("kepler", 8): (255, 352)}
+LIMITS = {("kepler", 4): (220, 0), ("henon-heiles", 4): (206, 0), ("kepler", 8): (255, 352)}
 """Registers and bytes of spilled loads that are accepted; those on sm_90 by NVRTC 13.5, and 3 % more."""
 
 

@@ -1,7 +1,8 @@
 """PTX of a kernel, as NVRTC writes it, translated to C: executes the compiler's output on the processor, bit by bit.
 
 Covers the instructions of ensemble kernels; others raise ``NotImplementedError``. Registers become variables, local
-memory an array, parameters of calls 8 bytes.
+memory an array, parameters of calls 8 bytes. Calls with structs, which one lane does not take, and the reduction of
+large angles abort.
 """
 
 from __future__ import annotations
@@ -65,12 +66,8 @@ LIBRARY = """static uint64_t __internal_accurate_pow(uint64_t x, uint64_t y)
   memcpy(&bits, &z, 8);
   return bits;
 }
-static uint64_t __internal_trig_reduction_slowpathd()
-{
-  abort();
-}
 """
-"""Functions of CUDA's library that are calls: those of the processor, but the reduction of large angles aborts."""
+"""Functions of CUDA's library that are calls: those of the processor."""
 
 
 def ptx_of(text: str, architecture: str) -> str:
@@ -92,7 +89,12 @@ def translated(ptx: str) -> str:
     parts = [HEAD, ESTIMATE, LIBRARY]
     for bits, name, size, values in re.findall(r"\.align \d+ \.b(\d+) (\w+)\[(\d+)\] = \{([^}]*)\}", ptx):
         parts.append(f"static const uint{bits}_t {name}[{size}] __attribute__((aligned(16))) = {{{values}}};")
-    ptx = re.sub(r"\.func[^{]*?\b__internal_\w+\s*\([^()]*\)\s*\{.*?\n\}", "", ptx, flags=re.DOTALL)
+    own = r"\.func[^{]*?\b__internal_\w+\s*\([^()]*\)\s*\{.*?\n\}"
+    aside = r"\.func\s+(?:\([^()]*\)\s*)?(\w+)\s*\([^()]*\.b8[^()]*\)\s*\{.*?\n\}"  # with a struct, of many lanes
+    left_out = {match[1] for match in re.finditer(aside, ptx, re.DOTALL)}
+    ptx = re.sub(f"{own}|{aside}", "", ptx, flags=re.DOTALL)
+    names = "|".join([*left_out, "__internal_trig_reduction_slowpathd"])
+    ptx = re.sub(rf"call\.uni\s+(\([^()]*\),\s*)?({names})\s*,[^;]*;", "abort;", ptx)
     functions = re.findall(r"\.func\s+(\(.*?\))?\s*(\w+)\s*\(([^()]*)\)\s*\{(.*?)\n\}", ptx, re.DOTALL)
     heads = [_head(*function[:3]) for function in functions]
     bodies = [_function(head, *function[2:]) for head, function in zip(heads, functions, strict=True)]
@@ -140,6 +142,8 @@ def _statement(words: str) -> str:
     name, *kinds = operation.split(".")
     if name == "bra":
         return f"{guard}goto {rest.replace('$', '')};"
+    if name == "abort":
+        return "abort();"
     if name in ("ret", "exit"):
         return f"{guard}return {rest};"
     if name == "call":

@@ -36,7 +36,7 @@ static __attribute__((noinline)) void continue_differently(history past, long lo
 static inline void continue_curve(const step_data *step, history past, long long steps, lanes (*x)[M])
 {
   (void)step;
-  if (LANES > 1 && steps != 1 && steps != TWO_STEPS) {
+  if (steps != 1 && steps != TWO_STEPS) {
     continue_differently(past, steps, x);
     return;
   }
