@@ -33,8 +33,8 @@ KERNEL NAME(thread_advance_to)(long long number, const long long *which, long lo
     NAME(start)(&run, t0, 0.0, q + j * M, p + j * M);
   else
     run = runs[j];
-  result = NAME(advance_to)(&run, t_end[j], tolerance, steps, every, own, solver_tolerance > 0.0 ? &options : NULL, &end, q + j * M, p + j * M,
-      &iterations, &report, workspace);
+  result = NAME(advance_to)(&run, t_end[j], tolerance, steps, every, own, solver_tolerance > 0.0 ? &options : NULL,
+      &end, q + j * M, p + j * M, &iterations, &report, workspace);
   status[j] = result != OK ? result : has_arrived(run.t, run.t_low, t_end[j]) ? 0
                                                                               : -1;
   t[j] = run.t;
