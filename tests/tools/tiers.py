@@ -30,7 +30,7 @@ QUICK, SECOND = "not full and not second", "second"
 """Expressions of the quick tier, as in pyproject.toml, and of the second."""
 UNOPTIMISED_TIERS = (QUICK, SECOND, "not full")
 SECOND_TIER = Path(__file__).with_name("second_tier.txt")
-PARTS = 8
+PARTS = 16
 """Number of parts of the measured full tier, of which a run with SCVI_CODEGEN_TESTS_PART takes one."""
 
 Combination = tuple[tuple[str, int], ...]
