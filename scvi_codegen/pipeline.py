@@ -36,7 +36,7 @@ from scvi_codegen.lowering.arrays import check_solver as check_solver_of_arrays
 from scvi_codegen.lowering.control import control_of, error_growth_of
 from scvi_codegen.lowering.derivatives import derivatives_of, point_derivatives_of
 from scvi_codegen.lowering.loops import transforms, with_sums
-from scvi_codegen.lowering.program import lower
+from scvi_codegen.lowering.program import lower, summing_splitting
 from scvi_codegen.lowering.solvers.points import summing_action
 from scvi_codegen.lowering.stage_groups import system_kernel
 from scvi_codegen.mechanics.arrays.legendre import SiteHamiltonian, site_hamiltonian
@@ -139,7 +139,7 @@ def describe(
         parameters=program.layout.parameters,
         defaults=program.layout.defaults,
         unknowns=program.equations.unknowns,
-        workspace=workspace_size(program) + uses_fallback_library,
+        workspace=workspace_size(program) + (uses_fallback_library or program.splitting is not None),  # also of actions
         has_action=program.action or (uses_fallback_library and program.equations.acts),
         sums_action=program.quantities.integrates,
         map_names=tuple(each.name for each in program.quantities.momentum_maps),
@@ -373,11 +373,16 @@ class Sources:
             return render_derivatives(derivatives_of(self.system, stages, program, second=second))
 
     def _acting_program(self) -> Program | None:
-        """Return the program of runs that sum the action of their steps; ``None`` if another solver takes the steps."""
+        """Return the program of runs that sum the action of their steps; ``None`` if they are computed again for it."""
         program = self.program()
-        stages = discretise(self.system, self.method)
-        found = program.fixed_point and summing_action(program.fixed_point, self.system, stages.shape)
-        if not (found and program.quantities.integrates and self.uses_fallback_library) or self.g is not None:
+        if not program.quantities.integrates or self.g is not None or self.system.integrands:
+            return None
+        if program.splitting:
+            return replace(program, splitting=summing_splitting(program.splitting, self.system), acts_along=True)
+        if program.fixed_point is None:
+            return replace(program, summed=True, acts_along=True)
+        found = summing_action(program.fixed_point, self.system, discretise(self.system, self.method).shape)
+        if found is None or not self.uses_fallback_library:
             return None
         return replace(program, fixed_point=found, acts_along=True)
 
@@ -389,7 +394,7 @@ class Sources:
         control = control_of(self.program(), self.controller, self.system, None)
         if control:
             control = replace(control, growth=error_growth_of(self.system, self.program()))
-        return render(program, control, fallback="external")
+        return render(program, control, fallback="external" if self.uses_fallback_library else None)
 
     def acting_ensemble(self) -> Source | None:
         """Return the source of trajectories in SIMD lanes that sum the action; ``None`` unless forces are stored."""

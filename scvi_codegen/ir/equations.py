@@ -332,6 +332,7 @@ class Splitting:
             quaternion and the axes j and k (:mod:`scvi_codegen.mechanics.splitting`).
         turning: a_i, a_j - a_i and a_k - a_i of each body (no arguments), or ``None``.
         principal: of each body the principal axes as columns, row by row; empty if they are the body axes.
+        at_rest: L at v = 0 if runs sum the action, else ``None``.
     """
 
     kicks: tuple[Number, ...]
@@ -343,11 +344,12 @@ class Splitting:
     bodies: tuple[tuple[int, ...], ...] = ()
     turning: Kernel | None = None
     principal: NumberTable = ()
+    at_rest: Kernel | None = None
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """Kernels of kicks and drifts."""
-        return (self.force, self.drift, *((self.turning,) if self.turning else ()))
+        return tuple(each for each in (self.force, self.drift, self.turning, self.at_rest) if each)
 
     @property
     def acts(self) -> bool:

@@ -361,8 +361,10 @@ class Program:
     def memory(self) -> int:
         """Numbers that a run stores of its last steps to predict the next."""
         if self.splitting:
-            return self.dimension
+            return self.dimension + 2 * self.acts_along
         points = self.dimension * self.fixed_point.stored if self.fixed_point else 0
+        if self.acts_along and self.fixed_point and self.fixed_point.name == "shooting":
+            points += 1
         return max(points, self.equations.unknowns + self.point if self.newton else 0)
 
     @property

@@ -47,6 +47,7 @@ from scvi_codegen.lowering.stage_groups import (
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.first_order import FirstOrderSystem
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.splitting import kinetic_splitting
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, work_rates
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -121,6 +122,17 @@ def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
         turning=turning if split.bodies else None,
         principal=lower_matrix(tuple(tuple(map(mp.mpf, map(str, each))) for each in split.axes if turned)),
     )
+
+
+def summing_splitting(splitting: Splitting, system: MechanicalSystem) -> Splitting:
+    """Return a splitting with the kernel of L at rest, whose sum with the kinetic energies is the action of a run."""
+    split = kinetic_splitting(system)
+    assert not isinstance(split, str)  # since there is a splitting
+    assert isinstance(split.system, LagrangianSystem)
+    moved = split.system
+    value = moved.lagrangian.xreplace(dict.fromkeys(moved.velocities, sympy.S.Zero))
+    kernel = system_kernel(moved, "at_rest", (value,), u=moved.coordinates, purpose="L at v = 0, u = q.")
+    return replace(splitting, at_rest=kernel)
 
 
 SOLVERS = ("auto", "explicit", "fixed-point", "newton")

@@ -68,6 +68,16 @@ def test_observers_and_functions_save_the_same_times(stepper):
     assert np.array_equal(energies.conserved, extremes.conserved, equal_nan=True)
 
 
+def test_energy_errors_of_observed_runs_are_those_of_saved_ones(stepper):
+    arguments = {"q": [1.0, 0.0], "p": [0.0, 0.6], "t_end": 60.0, "tolerance": 0.3, "check_growth": False}
+    for observe in (None, "energy"):
+        with pytest.warns(sc.AccuracyWarning, match="energy changed from -0.82 to -0.551"):
+            run = stepper.integrate(**arguments, observe=observe)
+        assert run.energy_error() == pytest.approx(0.4448143, abs=1e-6)
+    ends = stepper.velocity(run.q, run.p, run.t[[0, -1]])
+    assert np.array_equal(run.velocity, ends)
+
+
 @pytest.mark.parametrize(("observe", "message"), [("extreme", "did you mean 'extremes'"), (3, "function of the run")])
 def test_unknown_observers_are_rejected(stepper, observe, message):
     with pytest.raises(sc.StateError, match=message):

@@ -49,6 +49,17 @@ static inline void evaluate_points(const step_data *step, const curve_data *curv
   action_lanes(u, step->t + step->h * POINT_TIME, step->parameters, action);
 }
 
+#ifdef RUN_ACTION
+/* h sum w L. Requires: the kernel integrand_lanes. */
+static inline double action_of_curve(const step_data *step, const iteration_data *data, const curve_data *curve)
+{
+  lanes u[2 * M], value;
+  place_points(step, curve, u);
+  integrand_lanes(u, step->t + step->h * POINT_TIME, step->parameters, &value);
+  return lanes_total(data->weight * value);
+}
+#endif
+
 /* Computes the increments of one step: accelerations, momentum, initial velocity and multipliers m are corrected in
  * turn until all converge. On failure the increments are undefined. */
 HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, double *dq,
@@ -127,8 +138,21 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
     return NOT_FINITE;
   save_curve(&curve, past);
   memcpy(past + CURVE_MEMORY, m, sizeof m);
+#ifdef RUN_ACTION
+  past[MEMORY - 1] = action_of_curve(step, data, &curve);
+#endif
   *steps = next_guess(*steps, &now, report);
   return OK;
 }
+
+#ifdef RUN_ACTION
+/* Action of a solved step, which `memory` contains. */
+static inline void integrals_of_iteration(const step_data *step, const iteration_data *data, const double *memory,
+    double *sum)
+{
+  (void)step, (void)data;
+  *sum = memory[MEMORY - 1];
+}
+#endif
 
 #endif

@@ -228,16 +228,16 @@ def summing_action(
 ) -> FixedPointIteration | None:
     """Return an iteration with the kernel of L at the points, whose sums are the action of a run; ``None`` if unknown.
 
-    Not with damping and turns, whose steps are more than the curve through the points.
+    Not with turns, whose steps are more than the curve through the points.
     """
     name, macros = fixed_point.name, dict(fixed_point.macros)
-    if system.damping != 0 or system.integrands or {"TURNS", "MOVING_FRAME"} & {*macros}:
+    if system.integrands or {"TURNS", "MOVING_FRAME"} & {*macros}:
         return None
     twin = StepProblem(system, shape).lagrangian
     if name == "Hamiltonian":
         arguments, velocities = forms_of(system).legendre_arguments, forms_of(system).legendre
         scalar = Add(*(p * v for p, v in zip(system.auxiliaries, velocities, strict=True)), -system.formula)
-    elif name in ("separable", "coupled") and twin:
+    elif name in ("separable", "coupled", "shooting") and twin:
         system, arguments, scalar = twin, (*twin.coordinates, *twin.velocities), twin.lagrangian
     else:
         return None

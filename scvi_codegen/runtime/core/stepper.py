@@ -378,7 +378,7 @@ class Stepper(Integrator):
             device: ``"cuda"`` for an NVIDIA GPU, one thread a trajectory (extra ``cuda``; experimental: not yet run on
                 a device). Arrays may then be in its memory (CuPy, PyTorch, JAX). Trajectories whose steps fail are
                 continued on the processor. With adaptive steps only initial and final states are saved.
-            action: as of :meth:`integrate`; with adaptive steps the steps are computed again for the action.
+            action: as of :meth:`integrate`.
             observe: what to record of the states after all fixed steps, saved or not, in ``observed`` of the result:
                 ``"extremes"`` of q and p, of the ``"energy"``, or numbers of ``"events"`` of the stepper
                 (:meth:`with_events`), changes of sign between successive states. Requires SIMD lanes, no inputs.

@@ -518,8 +518,8 @@ class Memory:
         binding, values = self.stepper.binding, []
         (start, positions, momenta), m = binding.pointers(t, q, p), len(self._q)
         function, energy = binding.function("energies"), binding.numbers("double *")
-        for k in (0, len(t) - 1):
-            row = start + k, positions + k * m, momenta + k * m
+        for j, k in ((0, 0), (len(t) - 1, len(q) - 1)):  # observed runs have the states at both ends alone
+            row = start + j, positions + k * m, momenta + k * m
             if function(1, *row, self._arguments[0], energy, self._workspace):
                 return None
             values.append(energy[0])

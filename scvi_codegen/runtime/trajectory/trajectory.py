@@ -388,8 +388,14 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
 
     @property
     def velocity(self) -> Array:
-        """(n, m) velocities of the states."""
-        values = self._joined(lambda piece: piece.stepper.velocity(piece.q, piece.p, piece.t, piece.parameters))
+        """(n, m) velocities of the states, with an observer of those at both ends."""
+
+        def of(piece: Self) -> Array:
+            t = piece.t if piece.observed is None else piece.t[:: max(1, len(piece.t) - 1)]
+            values: Array = piece.stepper.velocity(piece.q, piece.p, t, piece.parameters)
+            return values
+
+        values = self._joined(of)
         return self.stepper.named(values)
 
     def at(self, t: ArrayLike) -> tuple[Array, Array]:

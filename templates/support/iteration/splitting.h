@@ -20,11 +20,18 @@ static void prepare(const step_data *step, solver_data *data)
     data->inverse_mass[i] = 1 / data->inverse_mass[i];
 }
 
-/* Advances the positions by a part of the step with the momenta p0 + dp. */
-static inline void drift(const step_data *step, const solver_data *data, real part, number *dp, number *dq)
+/* Advances the positions by a part of the step with the momenta p0 + dp; adds their action, divided by h. */
+static inline void drift(const step_data *step, const solver_data *data, real part, number *dp, number *dq,
+    number *action)
 {
-  for (int i = 0; i < M; i++)
-    dq[i] += step->h * part * data->inverse_mass[i] * (step->p0[i] + (step->carry_p[i] + dp[i]));
+  (void)action;
+  for (int i = 0; i < M; i++) {
+    const number p = step->p0[i] + (step->carry_p[i] + dp[i]);
+    dq[i] += step->h * part * data->inverse_mass[i] * p;
+#ifdef RUN_ACTION
+    *action += part / 2 * data->inverse_mass[i] * p * p;
+#endif
+  }
 }
 #else
 /* Drift with velocities v(p, t). Requires: the kernel drift_velocity; of bodies free_rotation.h. */
@@ -50,9 +57,11 @@ static void prepare(const step_data *step, solver_data *data)
 }
 
 /* Advances the positions by a part of the step with the momenta p0 + dp. */
-static inline void drift(const step_data *step, const solver_data *data, real part, number *dp, number *dq)
+static inline void drift(const step_data *step, const solver_data *data, real part, number *dp, number *dq,
+    number *action)
 {
   number p[M], v[M];
+  (void)action;
   for (int i = 0; i < M; i++)
     p[i] = step->p0[i] + (step->carry_p[i] + dp[i]);
   drift_velocity(p, step->t, step->parameters, v);
@@ -74,25 +83,37 @@ static inline void drift(const step_data *step, const solver_data *data, real pa
 }
 #endif
 
-/* Requires: a drift, LEAPS, the tables, and the kernel force. */
+/* Requires: a drift, LEAPS, the tables, and the kernel force; with RUN_ACTION the kernel at_rest, L at v = 0. */
 
-/* Computes the increments of one step. F is the last force; it is that of the first kick if `known`. */
-SPLITTING void leap(const step_data *step, const solver_data *data, int known, number *F, number *dq, number *dp)
+/* Computes the increments of one step. F is the last force; it is that of the first kick if `known`. With RUN_ACTION,
+ * acted[0] is L at v = 0 at the last kick, and acted[1] the action of the step divided by h. */
+SPLITTING void leap(const step_data *step, const solver_data *data, int known, number *F, number *dq, number *dp,
+    number *acted)
 {
   number u[M];
+#ifdef RUN_ACTION
+  acted[1] = 0;
+#endif
   memset(dq, 0, sizeof(number) * M);
   memset(dp, 0, sizeof(number) * M);
   for (int n = 0; n < LEAPS; n++) {
     if (KICK[n] != 0) {
       for (int i = 0; i < M; i++)
         u[i] = step->q0[i] + (step->carry_q[i] + dq[i]);
-      if (n > 0 || !known)
+      if (n > 0 || !known) {
         force(u, step->t + KICK_ABSCISSA[n] * step->h, step->parameters, F);
+#ifdef RUN_ACTION
+        at_rest(u, step->t + KICK_ABSCISSA[n] * step->h, step->parameters, acted);
+#endif
+      }
       for (int i = 0; i < M; i++)
         dp[i] += step->h * KICK[n] * F[i];
+#ifdef RUN_ACTION
+      acted[1] += KICK[n] * acted[0];
+#endif
     }
     if (DRIFT[n] != 0)
-      drift(step, data, DRIFT[n], dp, dq);
+      drift(step, data, DRIFT[n], dp, dq, acted + 1);
   }
 }
 
@@ -102,15 +123,21 @@ SPLITTING void leap(const step_data *step, const solver_data *data, int known, n
 SPLITTING int solve(const step_data *step, const solver_data *data, real *memory, long long *guess, real *dq, real *dp,
     const solver_options *options, solver_report *report, real *workspace)
 {
-  real F[M];
+  real F[M], acted[2];
   (void)options;
   (void)workspace;
   memcpy(F, memory, sizeof F);
-  leap(step, data, *guess > 0, F, dq, dp);
+#ifdef RUN_ACTION
+  acted[0] = memory[M];
+#endif
+  leap(step, data, *guess > 0, F, dq, dp, acted);
   report->iterations++;
   if (!reaches(step, dq, dp))
     return NOT_FINITE;
   memcpy(memory, F, sizeof F);
+#ifdef RUN_ACTION
+  memory[M] = acted[0], memory[M + 1] = acted[1];
+#endif
   *guess = 1;
   return OK;
 }
@@ -127,8 +154,9 @@ static inline void fixed_point(const step_data *step, const iteration_data *data
     lanes *dq, lanes *dp, const solver_options *options, solver_report *report)
 {
   (void)options;
+  number acted[2];
   memcpy(past.before[0], past.last[0], sizeof(lanes) * M);
-  leap(step, data, *guess > 0, past.before[0], dq, dp);
+  leap(step, data, *guess > 0, past.before[0], dq, dp, acted);
   report->iterations++;
   *guess = 1;
 }
