@@ -142,8 +142,8 @@ class Stepper(Integrator):
                 if a step takes longer than some tens of microseconds; they are started by each call of C. The shapes
                 of the arrays determine the sizes, and without p and velocity the initial velocity is 0.
             action: sum the action along the run, for :meth:`Trajectory.action`, which otherwise computes the steps
-                again. SVI and Gauss methods solved by fixed-point iteration sum it in the loop over the steps (arrays
-                of run-time sizes are compiled with the sizes of the call); others ignore this.
+                again. Runs with events that change the state ignore this; arrays of run-time sizes are compiled with
+                the sizes of the call.
 
         Returns:
             A :class:`Trajectory` of steps // save_every + 1 states, fewer if an event ended it; with inputs states
