@@ -308,13 +308,13 @@ def _lagrangian(document: Mapping[str, Any], model: Model) -> list[str]:
     """Return the Lagrangian, density or Hamiltonian as written, as terms of MathML; none of arrays and robots."""
     if getattr(model.system, "links", ()):
         return []
-    system = document.get("system", {})
-    text = str(document.get("field", {}).get("density") or system.get("lagrangian") or system.get("hamiltonian") or "")
+    source = document.get("field") or document.get("system", {})
+    text = str(source.get("density") or source.get("lagrangian") or source.get("hamiltonian") or "")
     try:
         density = parse_expression(text, {name: symbol(name) for name in NAME.findall(text)})
     except ExpressionError:
         return []
-    name = sympy.Symbol("H" if "hamiltonian" in system else "L")
+    name = sympy.Symbol("H" if "hamiltonian" in source else "L")
     return [] if LONG_NUMBER.search(str(density)) else list(mathml_terms(density, name))
 
 

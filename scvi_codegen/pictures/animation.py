@@ -52,6 +52,7 @@ def drawn_system_of(motion: DrawnMotion) -> DrawnSystem:
     return DrawnSystem(
         interface=interface, momenta=interface.momenta, shapes=shapes, energy=None if layout.coordinates else energy,
         mesh=layout.mesh, links=layout.links, lengths=interface.lengths,
+        tables=stepper.binding.sizes.places if layout.coordinates else {},
     )  # fmt: skip
 
 
@@ -244,7 +245,17 @@ def _shown_on_terminal() -> Callable[[int, int], None]:
     return show
 
 
-WIDTHS = {"wall": 2.0, "rod": 1.8, "link": 1.8, "spring": 1.0, "arrow": 1.5, "curve": 1.2, "box": 1.2, "top": 1.2}
+WIDTHS = {
+    "wall": 2.0,
+    "rod": 1.8,
+    "bonds": 0.8,
+    "link": 1.8,
+    "spring": 1.0,
+    "arrow": 1.5,
+    "curve": 1.2,
+    "box": 1.2,
+    "top": 1.2,
+}
 """Widths of marks that are lines; others are dots."""
 SIZES = {"pivot": 3, "particles": 4}
 HALF_SIDES = np.array([0.5, 0.3, 0.12])
@@ -256,10 +267,13 @@ COILS = 10
 
 
 def _path(kind: str, points: Array) -> Array:
-    """Return the line of a mark through its points (k, d): edges of a box, coils of a spring, or the points."""
+    """Return the line of a mark through its points (k, d): edges of a box, coils of a spring, bonds, or the points."""
     if kind in ("box", "top"):
         centre, axes = points[0], points[1:] - points[0]
         return np.concatenate([centre + CORNERS @ axes, centre[np.newaxis], points[-1:]])
+    if kind == "bonds":
+        pairs = points.reshape(-1, 2, points.shape[1])
+        return np.concatenate([pairs, np.full_like(pairs[:, :1], np.nan)], axis=1).reshape(-1, points.shape[1])
     if kind == "spring":
         along = points[1] - points[0]
         across: Array = np.array([along[1], -along[0]]) if len(along) == 2 else np.cross(along, [0.3, 0.2, 1.0])
@@ -320,7 +334,7 @@ class _Scene:
         count = 0
         for mark in _marks_of(shape):
             kind, name = mark["kind"], mark.get("name", "") if which is None else ""
-            neutral = kind in ("rod", "wall", "spring", "pivot") and which is None
+            neutral = kind in ("rod", "wall", "spring", "pivot", "bonds") and which is None
             drawn = "0.35" if neutral else color(mark.get("color", count) if which is None else which)
             count += kind in ("body", "bob")
             form = "-" if kind in WIDTHS else "o"

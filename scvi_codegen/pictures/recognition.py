@@ -18,7 +18,7 @@ from scvi_codegen.formulas.intermediates import intermediate
 from scvi_codegen.formulas.rotations import Rotation, RotationNames
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.symmetry.sampling import bodies
-from scvi_codegen.pictures.shape import DrawnSystem, MovingShape, PointProgram
+from scvi_codegen.pictures.shape import DrawnSystem, MovingShape, PointProgram, graph_of
 
 NUMBERED = re.compile(r"(.*?)_?(\d+)")
 LENGTHS = ("l", "L", "length")
@@ -40,8 +40,7 @@ def shape_of(drawn: DrawnSystem) -> MovingShape:
     if drawn.links:
         return _robot(drawn)
     if drawn.mesh is not None and len(drawn.mesh.axes) < 3:
-        axes = {axis.name: axis.points.tolist() for axis in drawn.mesh.axes}
-        return _graph(axes, drawn.mesh.field_system.fields)
+        return graph_of(drawn.nodes, drawn.mesh.field_system.fields)
     if drawn.interface.rotations:
         return _solids(drawn)
     if found := bodies(names) or bodies([*names, *drawn.momenta]):
@@ -56,7 +55,7 @@ def shape_of(drawn: DrawnSystem) -> MovingShape:
         labels = (*names, *drawn.momenta)[:2]
         marks = [{"kind": "body", "points": [0]}]
         return MovingShape(points=[[1, 2]], marks=marks, trails=[0], movable=[0], labels=labels, equal=m == 2)
-    return _graph({"number of the coordinate": range(1, m + 1)}, ["q"], dots=True)
+    return graph_of({"number of the coordinate": range(1, m + 1)}, ["q"], dots=True)
 
 
 def _of_arrays(drawn: DrawnSystem) -> MovingShape | None:
@@ -67,25 +66,17 @@ def _of_arrays(drawn: DrawnSystem) -> MovingShape | None:
     if len(shape) not in (1, 2):
         return None
     axes = {letter: range(size) for letter, size in zip("ij", shape, strict=False)}
-    return _graph(axes, [name], dots=math.prod(shape) <= DOTS)
-
-
-def _graph(axes: Mapping[str, Any], fields: Sequence[str], *, dots: bool = False) -> MovingShape:
-    """Return the graphs of fields over the nodes of their axes."""
-    nodes = {name: [float(x) for x in each] for name, each in axes.items()}
-    size = math.prod(map(len, nodes.values()))
-    columns = [{"name": name, "columns": [k * size, (k + 1) * size]} for k, name in enumerate(fields)]
-    labels = (*nodes, fields[0])
-    return MovingShape(
-        dimension=len(labels), labels=labels, equal=False, mesh={"axes": nodes, "fields": columns, "dots": dots}
-    )
+    return graph_of(axes, [name], dots=math.prod(shape) <= DOTS)
 
 
 def _particles(drawn: DrawnSystem, shape: tuple[int, ...]) -> MovingShape:
-    """Return one point for each row of an array of positions, within their periodic box."""
+    """Return a point for each row of an array of positions, in their periodic box, and lines of a table ``bonds``."""
     count, dimension = shape
     points = (1 + np.arange(count * dimension).reshape(shape)).tolist()
-    marks = [{"kind": "particles", "points": list(range(count))}]
+    marks: list[dict[str, Any]] = [{"kind": "particles", "points": list(range(count))}]
+    bonds = np.asarray(drawn.tables.get("bonds", ()))
+    if bonds.ndim == 2 and bonds.shape[1] == 2 and bonds.size and bonds.max() < count:
+        marks.insert(0, {"kind": "bonds", "points": bonds.ravel().tolist()})
     program, known = PointProgram(drawn.names), {name: symbol(name) for name in drawn.interface.parameters}
     periods = [parse_expression(text, known) for _, kind, text in drawn.lengths if kind == "box"]
     box = program.point(periods[:dimension])

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -57,7 +57,8 @@ class MovingShape:
         equal: use one scale for all axes.
         angles: coordinates of period 2 pi.
         solids: rotations, directions and spins: name, points of the centre and the tip.
-        mesh: nodes by axis, fields with their columns of q, and whether nodes are dots, instead of points.
+        mesh: nodes by axis, fields with their columns of (q, p) and the weights that divide those of p, and whether
+            nodes are dots, instead of points.
         box: registers of the periods of the components of all points; none without periods.
     """
 
@@ -84,10 +85,11 @@ class MovingShape:
     def positions(self, t: Any, q: Values, p: Values, parameters: Any) -> Values:
         """Return the points (n, k, d) of states with t (n,), q and p (n, m), and parameters."""
         if self.mesh is not None:
-            nodes = np.meshgrid(*self.mesh["axes"].values(), indexing="ij")
-            begin, end = self.mesh["fields"][0]["columns"]
+            nodes, drawn = np.meshgrid(*self.mesh["axes"].values(), indexing="ij"), self.mesh["fields"][0]
+            begin, end = drawn["columns"]
             grids = [np.broadcast_to(np.ravel(each), (len(q), end - begin)) for each in nodes]
-            return np.stack([*grids, q[:, begin:end]], axis=2)
+            values = np.concatenate([q, p], axis=1)[:, begin:end] / drawn.get("weights", 1.0)
+            return np.stack([*grids, values], axis=2)
         registers = [t, *np.transpose(q), *np.transpose(p), *parameters]
         for entry in self.program:
             if isinstance(entry, float):
@@ -140,6 +142,7 @@ class DrawnSystem:
         mesh: of fields of a density.
         links: of a robot from a file.
         lengths: periods of lists of neighbours, as :attr:`Interface.lengths`.
+        tables: index tables by name.
     """
 
     interface: Any
@@ -149,6 +152,12 @@ class DrawnSystem:
     mesh: Any = None
     links: Sequence[Any] = ()
     lengths: Sequence[Sequence[str]] = ()
+    tables: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def nodes(self) -> dict[str, list[float]]:
+        """Nodes of the mesh by axis."""
+        return {axis.name: axis.points.tolist() for axis in self.mesh.axes}
 
     @property
     def coordinates(self) -> list[str]:
@@ -177,6 +186,17 @@ class DrawnSystem:
         return self.energy(q, np.zeros_like(q)) if self.energy else np.zeros(len(q))
 
 
+def graph_of(axes: Mapping[str, Any], fields: Sequence[str], *, dots: bool = False) -> MovingShape:
+    """Return the graphs of fields over the nodes of their axes."""
+    nodes = {name: [float(x) for x in each] for name, each in axes.items()}
+    size = math.prod(map(len, nodes.values()))
+    columns = [{"name": name, "columns": [k * size, (k + 1) * size]} for k, name in enumerate(fields)]
+    labels = (*nodes, fields[0])
+    return MovingShape(
+        dimension=len(labels), labels=labels, equal=False, mesh={"axes": nodes, "fields": columns, "dots": dots}
+    )
+
+
 def shape_of_picture(drawn: DrawnSystem, picture: Mapping[str, Any], where: str = "picture") -> MovingShape:
     """Return the shape that a user describes by formulas.
 
@@ -185,11 +205,14 @@ def shape_of_picture(drawn: DrawnSystem, picture: Mapping[str, Any], where: str 
         picture: ``points``, two or three formulas or numbers by name, in coordinates, momenta, entries of rotations,
             parameters and t; ``rods``, ``springs`` and ``walls``, lists of names of points; ``bodies`` and ``trails``,
             names of points, by default those that move and are not ends of walls, and the bodies.
+            Of a field on a mesh instead ``fields``, the names of fields or momenta that are drawn.
         where: of it, for messages.
 
     Raises:
         ModelFileError: for unknown keys and points, and formulas that are wrong.
     """
+    if drawn.mesh is not None and isinstance(picture, Mapping) and [*picture] == ["fields"]:
+        return _chosen_fields(drawn, _listed(picture, "fields", where), f"{where} fields")
     if not isinstance(picture, Mapping) or not isinstance(picture.get("points"), Mapping) or not picture["points"]:
         raise ModelFileError(
             f'{where} must have points, {{ bob = ["l*sin(q)", "-l*cos(q)"] }}, not {picture!r:.60}: give points'
@@ -220,6 +243,19 @@ def shape_of_picture(drawn: DrawnSystem, picture: Mapping[str, Any], where: str 
         dimension=len(formulas[0]), points=[program.point(each) for each in formulas], program=program.entries,
         marks=marks, trails=trails, movable=[k for k in shown if names[k] in moving],
     )  # fmt: skip
+
+
+def _chosen_fields(drawn: DrawnSystem, names: Sequence[Any], where: str) -> MovingShape:
+    """Return the graphs of fields and momenta by name; momenta of nodes are divided by the weights of the nodes."""
+    fields = drawn.mesh.field_system.fields
+    known = [*fields, *drawn.mesh.field_system.momenta]
+    numbers = _numbers(names, known, where)
+    if not numbers or len(drawn.nodes) > 2:
+        raise ModelFileError(f"{where} must name fields on one or two axes, {known}, not {names!r}")
+    graph = graph_of(drawn.nodes, known)
+    weights, mesh = np.ravel(drawn.mesh.weights).tolist(), dict(graph.mesh or {})
+    mesh["fields"] = [mesh["fields"][k] | ({"weights": weights} if k >= len(fields) else {}) for k in numbers]
+    return replace(graph, labels=(*drawn.nodes, known[numbers[0]]), mesh=mesh)
 
 
 def _reader(drawn: DrawnSystem) -> Callable[[str], Expr]:
@@ -267,7 +303,5 @@ def _numbers(names: Any, known: Sequence[str], where: str) -> list[int]:
         raise ModelFileError(f"{where} must be lists of points, [[{', '.join(map(repr, known[:2]))}]], not {names!r}")
     for name in names:
         if name not in known:
-            raise ModelFileError(
-                f"{where}: there is no point {name!r}{closest(str(name), known)} Known: {', '.join(known)}"
-            )
+            raise ModelFileError(f"{where}: there is no {name!r}{closest(str(name), known)} Known: {', '.join(known)}")
     return [known.index(name) for name in names]

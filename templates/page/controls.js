@@ -16,7 +16,7 @@ function restart() {
   start();
   if (!fault && !shape.mesh && m <= 400) {
     const states = [pointsOf(memory_q, memory_p, code.time())], span = 10 * settings.speed;
-    scheduled.begin(4);
+    scheduled.begin(frames ? 4 : 40); // longer when the page begins, and its code is compiled
     scheduled.perform(() => (fault || Math.abs(code.time() - about.t) >= span || states.length >= 4000 ? 0 : 64), (now) => {
       fault = code.advance(now, 4);
       for (let k = 0; k < code.stored() && !fault; k++) states.push(pointsOf(stored_q.subarray(k * m, (k + 1) * m), stored_p.subarray(k * m, (k + 1) * m), stored_t[k]));
@@ -52,7 +52,7 @@ function addSlider(title, label, name, { low, high, log = false, hard = true, ge
     if (document.activeElement !== range) range.value = at;
     range.style.setProperty("--at", `${100 * at}%`);
     range.setAttribute("aria-valuetext", short(x));
-    if (document.activeElement !== number) number.value = Math.abs(x) < 1e-15 ? 0 : +x.toPrecision(4);
+    if (document.activeElement !== number) number.value = Math.abs(x) < 1e-15 * Math.max(Math.abs(low), Math.abs(high)) ? 0 : [4, 3].map((digits) => +x.toPrecision(digits)).find((shown, k) => k || String(shown).length < 8);
   };
   const changed = (x) => { put(x); showSliders(); writeAddress(); };
   range.addEventListener("input", () => { const s = +range.value; changed(clamped(+(log ? low * (high / low) ** s : low + (high - low) * s).toPrecision(4), low, high)); });
@@ -258,7 +258,7 @@ function draw(performed) {
   const told = fault ? causeOf(fault) : performance.now() < noticeEnds ? notice : "";
   by("fault").hidden = !told;
   if (by("fault").textContent !== told) by("fault").textContent = told;
-  if (frames % 20 === 0 || !running) by("status").textContent = `${code.steps().toLocaleString("en")} steps${performed ? `, ${performed} a frame` : ""}${code.steps() > 0 ? `; ${short(code.iterations(), 2)} iterations a step${code.error() > 0 ? `; largest error of a step about ${short(code.error(), 1)}` : ""}` : ""}`;
+  if (frames % 20 === 0 || !running) by("status").textContent = `${code.steps().toLocaleString("en")} step${code.steps() === 1 ? "" : "s"}${performed ? `, ${performed} a frame` : ""}${code.steps() > 0 ? `; ${short(code.iterations(), 2)} iterations a step${code.error() > 0 ? `; largest error of a step about ${short(code.error(), 1)}` : ""}` : ""}`;
 }
 
 function open() {

@@ -169,6 +169,7 @@ const marked = () => {
   };
   const bodies = Object.fromEntries(["box", "top"].map((kind) => [kind, faces(kind, 1, hue(0))]));
   const centred = shape.solids.length && constant(shape.solids[0].centre);
+  const bonded = shape.marks.some(({ kind }) => kind === "bonds");
   const heaviest = () => Math.max(...shape.marks.map(({ mass }) => (mass === undefined ? 0 : Math.abs(value(mass))))) || 1;
   return {
     forget() { low = shape.dimension === 3 ? [Infinity, Infinity, Infinity] : [Infinity, Infinity]; high = low.map((x) => -x); first = undefined; this.begun = false; },
@@ -206,12 +207,12 @@ const marked = () => {
           const name = mark.color < 0 ? "muted" : hue(mark.color);
           add(middle, () => { line(pen, [a, b], mixed(name, "ink", 0.15), 7 * a[3]); [a, b].forEach((end) => disc(pen, end, 5 * end[3], name)); });
         } else if (mark.kind === "rod") add(middle, () => line(pen, mark.points.map((k) => at[k]), colors.ink, 2.5 * a[3]));
-        else if (mark.kind === "line") add(middle, () => line(pen, mark.points.map((k) => at[k]), colors.muted, 1.2));
+        else if (mark.kind === "bonds") for (let k = 0; k < mark.points.length; k += 2) { const [from, to] = [at[mark.points[k]], at[mark.points[k + 1]]]; add((from[2] + to[2]) / 2, () => line(pen, [from, to], colors.muted, 1.2)); }
         else if (mark.kind === "spring") add(middle, () => spring(pen, a, b, colors.muted));
         else if (mark.kind === "wall") add(-1e9, () => wall(pen, mark.points.map((k) => at[k])));
         else if (mark.kind === "arrow") { const color = colors[hue(number++)]; add(middle, () => arrow(pen, a, b, color)); }
         else if (mark.kind === "pivot") add(middle, () => disc(pen, a, 3.5, "muted"));
-        else if (mark.kind === "particles") mark.points.forEach((k) => add(at[k][2], () => disc(pen, at[k], (mark.radius ? Math.max(2, mark.radius * view.scale) : clamped(Math.min(width, height) / 4 / mark.points.length ** (1 / shape.dimension), 2, 16)) * at[k][3], hue(0))));
+        else if (mark.kind === "particles") mark.points.forEach((k) => add(at[k][2], () => disc(pen, at[k], (bonded ? 2.5 : clamped(Math.min(width, height) / 10 / mark.points.length ** (1 / shape.dimension), 2, 16)) * at[k][3], hue(0))));
         else if (mark.kind === "body" || mark.kind === "bob") {
           const name = hue(mark.color ?? number++), share = mark.mass === undefined ? 1 : Math.cbrt(Math.abs(value(mark.mass)) / largest);
           add(middle + 0.1 * view.reach, () => disc(pen, a, clamped(10 * share, 3.5, 10) * a[3], name));
@@ -238,7 +239,7 @@ const marked = () => {
       const [low, high] = [view.from([0, height]), view.from([width, 0])];
       const text = (string, x, y, align, baseline) => { pen.fillStyle = colors.muted; pen.textAlign = align; pen.textBaseline = baseline; pen.fillText(string, x, y); };
       for (const mark of ticks(low[0], high[0], clamped(width / 110, 3, 8))) { const [x] = view.to([mark, 0]); line(pen, [[x, 0], [x, height]], colors.rule, 1); if (x > 40 && x < width - 60) text(short(mark), x, height - 6, "center", "bottom"); }
-      for (const mark of ticks(low[1], high[1], clamped(height / 80, 3, 8))) { const [, y] = view.to([0, mark]); line(pen, [[0, y], [width, y]], colors.rule, 1); if (y > 40 && y < height - 30) text(short(mark), 8, y, "left", "middle"); }
+      for (const mark of ticks(low[1], high[1], clamped(height / 80, 3, 8))) { const [, y] = view.to([0, mark]); line(pen, [[0, y], [width, y]], colors.rule, 1); if (y > 54 && y < height - 30) text(short(mark), 8, y, "left", "middle"); }
       text(spelled(shape.labels[0]), width - 12, height - 6, "right", "bottom"); text(spelled(shape.labels[1]), 12, 32, "left", "top");
     },
     /** Draws what shows the directions of space: a sphere about one solid, or else a floor. */
@@ -324,27 +325,29 @@ const graph = () => {
     }
     return result;
   };
+  /** Returns the values of a field or momentum at the nodes. */
+  const nodes = ({ columns: [begin, end], weights }, q, p) => (begin < m ? q.subarray(begin, end) : Float64Array.from(p.subarray(begin - m, end - m), (u, k) => u / weights[k]));
   const across = grid(xs, ys ? 200 : WIDE), along = ys && grid(ys, 200);
   return {
     forget() { low = Infinity; high = -Infinity; past.length = 0; palette = undefined; },
     ahead() {},
-    see(q) {
-      const [begin, end] = fields[0].columns;
-      for (let k = begin; k < end; k++) { const u = q[k]; if (u < low) { low = u; palette = undefined; } if (u > high) { high = u; palette = undefined; } }
+    see(q, p) {
+      const u0 = nodes(fields[0], q, p);
+      for (const u of u0) { if (u < low) { low = u; palette = undefined; } if (u > high) { high = u; palette = undefined; } }
       if (ys) return;
-      past.push(Float32Array.from(across, ([j, s]) => q[begin + j] + s * (q[begin + j + 1] - q[begin + j])));
+      past.push(Float32Array.from(across, ([j, s]) => u0[j] + s * (u0[j + 1] - u0[j])));
       if (past.length > 2 * PAST) past.splice(0, past.length, ...past.filter((_, k) => k % 2 === 1));
     },
     draw(pen, q, p, t, width, height) {
       const left = 46, right = 16, top = 36, [first, last] = bounds(), x0 = xs[0], x1 = xs[xs.length - 1];
       pen.font = `12px ${colors.sans}`; pen.fillStyle = colors.muted;
-      if (ys) return this.plane(pen, q, width, height);
+      if (ys) return this.plane(pen, nodes(fields[0], q, p), width, height);
       const split = Math.round(height * 0.6), pad = 0.06 * (last - first), px = (x) => left + ((width - left - right) * (x - x0)) / (x1 - x0);
       const py = (u) => split - 14 - ((split - 14 - top) * (u - first + pad)) / (last - first + 2 * pad);
       pen.textAlign = "right"; pen.textBaseline = "middle";
       for (const mark of ticks(first, last, 5)) { line(pen, [[left, py(mark)], [width - right, py(mark)]], colors.rule, 1); pen.fillText(short(mark), left - 6, py(mark)); }
-      fields.forEach(({ columns: [begin, end] }, k) => {
-        const points = Array.from(q.subarray(begin, end), (u, j) => [px(xs[j]), py(u)]);
+      fields.forEach((field, k) => {
+        const points = Array.from(nodes(field, q, p), (u, j) => [px(xs[j]), py(u)]);
         line(pen, points, colors[hue(k)], dots ? 1.2 : 2.2, dots ? 0.5 : 1);
         if (dots) points.forEach((point) => disc(pen, point, clamped(width / xs.length / 4, 2, 6), hue(k)));
       });
@@ -361,11 +364,11 @@ const graph = () => {
       fields.forEach(({ name }, k) => { pen.fillStyle = colors[hue(k)]; pen.fillText(name, left + 6 + 22 * k, top - 4); });
       pen.fillStyle = colors.muted; pen.fillText("t", left - 16, split + 2);
     },
-    plane(pen, q, width, height) {
-      const n = xs.length, values = new Float32Array(200 * 200), [begin] = fields[0].columns, [first, last] = bounds();
+    plane(pen, u, width, height) {
+      const n = xs.length, values = new Float32Array(200 * 200), [first, last] = bounds();
       // nodes are stored with the last axis contiguous
       along.forEach(([j, s], row) => across.forEach(([i, r], column) => {
-        const at = begin + i * ys.length + j, near = q[at] + s * (q[at + 1] - q[at]), far = q[at + ys.length] + s * (q[at + ys.length + 1] - q[at + ys.length]);
+        const at = i * ys.length + j, near = u[at] + s * (u[at + 1] - u[at]), far = u[at + ys.length] + s * (u[at + ys.length + 1] - u[at + ys.length]);
         values[(199 - row) * 200 + column] = near + r * (far - near);
       }));
       image.width = image.height = 200;

@@ -7,21 +7,30 @@ async function inflated() {
   const bytes = Uint8Array.from(atob(by("wasm").textContent.trim()), (c) => c.charCodeAt(0));
   return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
 }
-let code;
+let code, exported;
 try {
-  code = (await WebAssembly.instantiate(await inflated(), {})).instance.exports;
+  exported = (await WebAssembly.instantiate(await inflated(), {})).instance.exports;
 } catch (error) {
   by("fault").hidden = false;
   by("fault").textContent = `WebAssembly could not be started (${error.message}). Use a current browser, and allow 'wasm-unsafe-eval' in the content security policy.`;
   return;
 }
-code._initialize?.();
-const capacity = code.capacity();
-const block = (k, length) => new Float64Array(code.memory.buffer, length ? code.memory_of(k) : 0, length);
-const memory_parameters = block(0, about.values), memory_q = block(1, m), memory_p = block(2, m), memory_v = block(3, m);
-const stored_t = block(4, capacity), stored_q = block(5, capacity * m), stored_p = block(6, capacity * m), stored_energy = block(7, capacity);
-const stored_quantities = block(8, capacity * count);
-const memory_rates = about.from_momenta ? memory_p : memory_v; // given at the start
+exported._initialize?.();
+const capacity = exported.capacity();
+let memory_parameters, memory_q, memory_p, memory_v, memory_rates, stored_t, stored_q, stored_p, stored_energy, stored_quantities;
+/** Views the memory of the integrator, again whenever this grows. */
+function viewMemory() {
+  const block = (k, length) => new Float64Array(exported.memory.buffer, length ? exported.memory_of(k) : 0, length);
+  [memory_parameters, memory_q, memory_p, memory_v] = [about.values, m, m, m].map((length, k) => block(k, length));
+  [stored_t, stored_q, stored_p, stored_energy, stored_quantities] = [1, m, m, 1, count].map((length, k) => block(4 + k, capacity * length));
+  memory_rates = about.from_momenta ? memory_p : memory_v; // given at the start
+}
+viewMemory();
+code = Object.fromEntries(Object.entries(exported).filter(([, each]) => typeof each === "function").map(([name, call]) => [name, (...given) => {
+  const result = call(...given);
+  if (memory_q.buffer !== exported.memory.buffer) viewMemory();
+  return result;
+}]));
 const events = about.events.length > 0;
 
 const clamped = (x, low, high) => Math.min(high, Math.max(low, x));
@@ -134,7 +143,7 @@ function forget() {
 }
 
 function keep(t, q, p, energy, quantities) {
-  picture.see?.(q, t);
+  picture.see?.(q, p);
   if (shape.trails.length) {
     const points = pointsOf(q, p, t);
     shape.trails.forEach((which, k) => { trails[k].push({ t, at: points[which] }); if (trails[k].length > TRAIL) trails[k].shift(); });

@@ -9,6 +9,7 @@ import platform
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -221,12 +222,6 @@ def test_a_system_with_its_motion_has_a_page(tmp_path):
         sc.page(model.system, h=0.1)
 
 
-@pytest.mark.usefixtures("without_compiler")
-def test_parameters_of_initial_formulas_are_used(recwarn):
-    sc.page(MOTIONS / "kinks.toml")
-    assert [str(each.message) for each in recwarn] == []
-
-
 def boxed():
     """Return the model of two particles in a periodic box."""
     gas = sc.LagrangianSystem.from_text(
@@ -281,8 +276,9 @@ def boxed():
     ],
 )
 @pytest.mark.usefixtures("without_compiler")
-def test_a_page_contains_what_its_scripts_need(model, read, expected):
+def test_a_page_contains_what_its_scripts_need(model, read, expected, recwarn):
     assert read(described(sc.page(model() if callable(model) else model).html)) == expected
+    assert [str(each.message) for each in recwarn] == []  # parameters of initial formulas are used
 
 
 def test_a_missing_compiler_is_an_error_with_its_remedy(tmp_path, monkeypatch):
@@ -404,3 +400,22 @@ def test_the_webassembly_computes_the_bits_of_a_native_build_with_the_same_libra
     monkeypatch.setattr(pages, "webassembly", also_native)
     state = computed(sc.page(path).html, 200)
     assert [float.fromhex(word) for word in states[0].split()] == state["q"] + state["p"]
+
+
+@pytest.mark.full
+def test_every_motion_of_the_site_moves_within_its_size(browser, tmp_path):
+    for path in sorted(MOTIONS.glob("*.toml")):
+        file, messages, view = tmp_path / f"{path.stem}.html", [], browser.new_page()
+        sc.page(path).save(file)
+        assert file.stat().st_size < 200_000, path
+        view.on("console", lambda message, to=messages: to.append(message.text))
+        view.on("pageerror", lambda error, to=messages: to.append(str(error)))
+        view.goto(file.as_uri())
+        for _ in range(200):
+            time.sleep(0.1)
+            if (state := view.evaluate("globalThis.page ? page.state() : null")) and (
+                state["steps"] > 5 or state["fault"]
+            ):
+                break
+        assert (state["steps"] > 5, state["fault"], messages) == (True, 0, []), path
+        view.close()

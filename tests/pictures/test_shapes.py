@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from scvi_codegen.pictures.recognition import shape_of
 from scvi_codegen.pictures.shape import shape_of_picture
 
 ROOT = Path(__file__).parents[2]
+MOTIONS = ROOT / "docs" / "motions"
 CART = """[system]
 name = "cart and pendulum"
 coordinates = ["x", "theta"]
@@ -74,7 +76,7 @@ def test_a_picture_is_drawn_in_films_and_written_to_files(tmp_path):
         ('cart = ["x", 0]', 'cart = ["x", 0, 0]', "must all have two components, in the plane, or all three"),
         ('cart = ["x", 0]', 'cart = ["x", true]', "points cart: True must be a formula or a number"),
         ("springs", "strings", r"unknown key 'strings' in \[picture\]; did you mean 'springs'"),
-        ('["end", "cart"]', '["end", "card"]', "springs: there is no point 'card'; did you mean 'cart'"),
+        ('["end", "cart"]', '["end", "card"]', "springs: there is no 'card'; did you mean 'cart'"),
         ('["end", "cart"]', '["end"]', r"springs: \['end'\] must be two points"),
         ('[["end", "cart"]]', '"end"', "springs must be a list, not 'end'"),
         ('[["end", "cart"]]', '["end", "cart"]', r"springs must be lists of points, .* not 'end'"),
@@ -98,6 +100,28 @@ def test_pictures_of_arrays_and_rotations_use_entries():
     assert np.allclose(shape.positions(0.0, np.array([[0.5] * 4]), np.zeros((1, 4)), ())[0, 0], [0, 1, 0])
 
 
+@pytest.mark.second
+def test_bonds_of_a_table_are_lines_and_momenta_of_a_field_are_drawn():
+    model = sc.load_model(MOTIONS / "cloth.toml")
+    shape = shape_of(drawn_system_of_model(model))
+    bonds = shape.marks[0]
+    assert (bonds["kind"], bonds["points"][:4], len(bonds["points"])) == ("bonds", [10, 0, 11, 1], 2 * 342)
+    pytest.importorskip("matplotlib")
+    film = replace(model, span=None, steps=2).integrate().animate(seconds=0.2)
+    assert film.shapes[0].marks[0] == bonds
+    film.animation._init_draw()
+    line = film.animation._fig.axes[0].lines[0].get_data_3d()
+    assert np.isnan(line).sum(axis=1).tolist() == [342] * 3
+    kdv = sc.load_model(MOTIONS / "kdv.toml")
+    shape = shape_of_picture(drawn_system_of_model(kdv), kdv.picture)
+    q, p = (np.ravel(each["q"])[np.newaxis] for each in (kdv.q, kdv.p))
+    x, values = shape.positions(np.zeros(1), q, p, ())[0].T
+    assert x[values.argmax()] == pytest.approx(-4.3, abs=0.3)  # the high soliton, of height one half, of u/2 1.2
+    assert np.allclose(values, p / 32 * 63, rtol=1e-12)
+    with pytest.raises(sc.ModelFileError, match=r"fields: there is no 'r'.* Known: q, p"):
+        shape_of_picture(drawn_system_of_model(kdv), {"fields": ["r"]})
+
+
 NODE = """
 const { about, states } = JSON.parse(require("fs").readFileSync(0)), { m } = about;
 const memory_parameters = about.parameters;
@@ -113,7 +137,7 @@ def shapes():
     points = {f"p{k}": [each, "-theta**3/p_x"] for k, each in enumerate(formulas)}
     model = parse_model(CART)
     yield model, shape_of_picture(drawn_system_of_model(model), {"points": points})
-    top = sc.load_model(ROOT / "docs" / "motions" / "lagrange_top.toml")
+    top = sc.load_model(MOTIONS / "lagrange_top.toml")
     for name in ("figure.xml", "ball.xml"):
         system = sc.LagrangianSystem.from_mjcf(ROOT / "tests" / "mechanics" / "robots" / name)
         q = [0.4 + 0.1 * k for k in range(system.dimension)]

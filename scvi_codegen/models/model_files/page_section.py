@@ -16,7 +16,7 @@ from scvi_codegen.models.options import real
 from scvi_codegen.pictures.shape import MARKS, DrawnSystem, shape_of_picture
 
 PAGE_KEYS = ("ranges", "speed", "plots")
-PICTURE_KEYS = ("points", *MARKS)
+PICTURE_KEYS = ("points", "fields", *MARKS)
 
 
 def starts_from_momenta(model: Model) -> bool:
@@ -73,7 +73,9 @@ def drawn_system_of_model(model: Model) -> DrawnSystem:
         interface = SimpleNamespace(coordinates=[], parameters=scalars, rotations=[], constraints=[], map_names=[])
         lengths = [length for each in model.array_system.neighbours for length in each.lengths]
         sized = {name: np.shape(values) for name, values in model.q.items()}
-        return DrawnSystem(interface=interface, momenta=[], shapes=sized, mesh=model.mesh, lengths=lengths)
+        return DrawnSystem(
+            interface=interface, momenta=[], shapes=sized, mesh=model.mesh, lengths=lengths, tables=model.tables
+        )
     interface = SimpleNamespace(
         coordinates=[each.name for each in system.coordinates], parameters=[each.name for each in system.parameters],
         rotations=[each.declaration for each in system.rotations], constraints=[], map_names=[],
