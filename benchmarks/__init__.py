@@ -9,6 +9,7 @@
     comparison   timing of all contenders of a case in turn, in one process
     sections     which contenders and which reference belong to a case
     report       time at equal error, by interpolation; tables and JSON of results; plots: their pictures
+    digits       double-double arithmetic, and heyoka in long double and quadruple precision
     tables       energy drift, time from text to the first step
     machine      description of the machine
     settings     settings of a benchmark; processor times of functions
@@ -28,6 +29,7 @@ from typing import Any
 from benchmarks.cases.unforced import CASES
 from benchmarks.comparison import run_race
 from benchmarks.contenders.peers import PEERS
+from benchmarks.digits import run_digits
 from benchmarks.machine import machine
 from benchmarks.report import LEGEND, PRECISION, CaseResult, ResultTable, degree_table, header_lines
 from benchmarks.sections import BUILDERS
@@ -43,6 +45,7 @@ SCHEMA = 2
 
 SECTIONS: Mapping[str, Callable[[Plan, ReportActivity], CaseResult | ResultTable]] = {
     **{name: partial(run_race, build) for name, build in BUILDERS.items()},
+    "digits": run_digits,
     "drift": run_drift,
     "first-step": run_first_steps,
 }

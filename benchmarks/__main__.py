@@ -47,6 +47,7 @@ def main(
       mechanisms:2, :5, :10, :20                                            SymPy mechanisms; lambdify and PyDy
       fields:breather, :wave-2d, :schroedinger                              partial differential equations; py-pde
       lattices:ring:1000, ..    array systems; C by hand, REBOUND, OpenMM
+      digits                    31 digits; heyoka in long double and quadruple precision
       drift                     energy over ten million steps
       first-step                time from text to the first step
 

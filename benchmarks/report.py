@@ -58,7 +58,7 @@ def finite(entries: dict[str, Any]) -> dict[str, Any]:
 FLOOR = 1e-13
 """Errors below count as equal to it: they are round-off and chance."""
 
-LEAST = 1e-18
+LEAST = 1e-34
 """Substitute for an error of 0."""
 
 MARGIN = 2.0
@@ -73,7 +73,7 @@ class Point:
     error: float
 
 
-def frontier(points: Iterable[Point]) -> list[Point]:
+def frontier(points: Iterable[Point], floor: float = FLOOR) -> list[Point]:
     """Return the Pareto-optimal points in time and error, fastest first, up to the first below the floor.
 
     >>> points = [Point(seconds=s, error=e) for s, e in [(1, 1e-3), (2, 1e-6), (3, 1e-5), (4, 1e-15), (5, 1e-16)]]
@@ -83,12 +83,12 @@ def frontier(points: Iterable[Point]) -> list[Point]:
     points_on: list[Point] = []
     for point in sorted(points, key=lambda point: (point.seconds, point.error)):
         last = points_on[-1].error if points_on else math.inf
-        if last > FLOOR and point.error < last:
+        if last > floor and point.error < last:
             points_on.append(point)
     return points_on
 
 
-def time_at(points: Iterable[Point], error: float) -> float | None:
+def time_at(points: Iterable[Point], error: float, floor: float = FLOOR) -> float | None:
     """Return the seconds to reach an error, linearly interpolated in log-log along the frontier.
 
     Nothing is extrapolated: a larger error than any measured takes the time of the fastest setting, and for an error
@@ -97,19 +97,19 @@ def time_at(points: Iterable[Point], error: float) -> float | None:
     >>> round(time_at([Point(seconds=1.0, error=1e-4), Point(seconds=4.0, error=1e-8)], 1e-6), 12)
     2.0
     """
-    curve, wanted = frontier(points), max(error, FLOOR)
+    curve, wanted = frontier(points, floor), max(error, floor)
     if not curve or wanted < curve[-1].error:
         return None
     errors = -np.log([max(point.error, LEAST) for point in curve])
     return float(np.exp(np.interp(-np.log(wanted), errors, np.log([point.seconds for point in curve]))))
 
 
-def common_error(one: Sequence[Point], other: Sequence[Point]) -> float | None:
+def common_error(one: Sequence[Point], other: Sequence[Point], floor: float = FLOOR) -> float | None:
     """Return the smallest error that both methods reach safely: twice the larger of their smallest, or the floor."""
-    curves = frontier(one), frontier(other)
+    curves = frontier(one, floor), frontier(other, floor)
     if not all(curves):
         return None
-    return max(FLOOR, *(MARGIN * curve[-1].error if curve[-1].error > FLOOR else FLOOR for curve in curves))
+    return max(floor, *(MARGIN * curve[-1].error if curve[-1].error > floor else floor for curve in curves))
 
 
 ERRORS = (1e-3, 1e-6, 1e-9, 1e-12)

@@ -17,7 +17,7 @@ from mpmath import mp
 
 import benchmarks as bench
 from benchmarks import __main__ as command
-from benchmarks import comparison, report, tables
+from benchmarks import comparison, digits, report, tables
 from benchmarks.cases import unforced
 from benchmarks.cases.adaptive import adaptive_case
 from benchmarks.cases.forced import driven_pendulum
@@ -135,6 +135,27 @@ class TestCases:
         x, out = np.random.default_rng(5).standard_normal(16), np.empty(16)
         names["rates"](out, 0.0, x, 0)
         np.testing.assert_allclose(out, chosen.formulations[0].rates(list(x), chosen.parameters, math), rtol=1e-13)
+
+
+class TestDigits:
+    def test_times_are_compared_at_twice_the_larger_error_below_those_of_doubles(self):
+        ours, peer = points((1.0, 1e-20), (2.0, 1e-30)), points((10.0, 1e-15), (400.0, 5e-27))
+        row = digits.compared(ours, peer)
+        assert row["at_error"] == pytest.approx(1e-26)
+        assert row["our_ms"] == pytest.approx(1e3 * 2**0.6)
+        assert 300 < row["peer_ms"] / 1e3 < 400
+        assert digits.compared(ours, []) == {"our_smallest": 1e-30, "smallest": None}
+
+    @pytest.mark.second
+    def test_section_compares_with_a_reference_of_200_bits(self, monkeypatch):
+        pytest.importorskip("heyoka")
+        monkeypatch.setattr(digits, "SPANS", {"planar-pendulum": (256.0, 1024)})
+        monkeypatch.setattr(digits, "METHODS", ("svi:12",))
+        monkeypatch.setattr(digits, "KINDS", {"heyoka long double": ("longdouble", (0.0,))})
+        (row,) = digits.run_digits(bench.Plan(quick=True, peers=("heyoka",)), lambda text: None).rows
+        assert row["reference"] < 1e-40
+        assert row["our_smallest"] < 1e-27
+        assert 1e-21 < row["smallest"] < 1e-16
 
 
 def kepler_position(q, v, t):
