@@ -410,7 +410,8 @@ class Sources:
         varied = with_tangent_vectors(twin, count)
         if varied is None:
             return None
-        return render_ensemble(lower(varied, self.method, prefix=self.prefix, solver="fixed-point"))
+        program = lower(varied, self.method, prefix=self.prefix, solver="fixed-point")
+        return render_ensemble(program, tangents=count)
 
     def observing(self, functions: str) -> Source | None:
         """Return the ensemble source that observes functions of the state; ``None`` without trajectories in lanes.

@@ -261,11 +261,16 @@ def _control_context(program: Program, control: Control | None) -> dict[str, obj
     return {"control": control, "own_headers": {name: text}, "growth_tables": growth_tables}
 
 
-def render_ensemble(program: Program, observed: Kernel | None = None) -> Source | None:
+def render_ensemble(program: Program, observed: Kernel | None = None, *, tangents: int = 0) -> Source | None:
     """Return source that integrates many trajectories at once, one per lane, by fixed-point iteration or explicitly.
 
     ``None`` for other steps, for rigid bodies turned in closed form, and with integrals: with a time transformation,
-    trajectories have no common times. ``observed``: functions whose extremes and changes of sign are recorded.
+    trajectories have no common times.
+
+    Args:
+        program: the program.
+        observed: functions whose extremes and changes of sign are recorded.
+        tangents: number of tangent vectors among the coordinates.
     """
     fixed_point, split = program.fixed_point, program.splitting
     if program.quantities.integrals:
@@ -282,6 +287,7 @@ def render_ensemble(program: Program, observed: Kernel | None = None) -> Source 
         "program": program,
         "points": points,
         "observed": observed.values if observed else 0,
+        "tangents": tangents,
         "cut": is_divided((*kernels, *((observed,) if observed else ()))),
         "needs_velocities": fixed_point is not None and fixed_point.kept is StoredValues.VELOCITIES,
         "hot": "static",

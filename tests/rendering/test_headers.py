@@ -31,6 +31,7 @@ ELSEWHERE = {
     "support/frameworks/xla_flow.h": "tests/rendering/test_flow_text.py",
     "support/run/inputs.h": "tests/models/test_package_inputs.py",
     "support/run/observation.h": "tests/runtime/test_device.py",
+    "support/run/tangent_growth.h": "tests/runtime/test_device.py",
     "support/run/thread_advance_to.h": "tests/runtime/test_device.py",
     "support/run/thread_run.h": "tests/runtime/test_device.py",
 }

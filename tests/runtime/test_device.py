@@ -216,6 +216,20 @@ def test_adaptive_trajectories_that_fail_are_repeated_by_the_processor(gpu: Emul
     assert len(gpu.launches) == launched + 2
 
 
+@pytest.mark.second
+@pytest.mark.parametrize("count", [1, 3])
+def test_chaos_indicators_agree_with_those_of_the_processor(gpu: EmulatedGpu, count: int) -> None:
+    stepper, (q, p) = compiled("henon-heiles", sc.SVI(4)), states("henon-heiles")
+    q[1:3] *= 30.0  # escapes, within and after the first block of steps
+    plan = {"h": -0.1, "steps": 60, "save_every": 20, "count": count}
+    ours, theirs = (stepper.chaos_indicators_ensemble(q, p, **plan, device=device) for device in ("cuda", None))
+    assert ours.status.tolist() == theirs.status.tolist() != ["ok"] * COUNT
+    for series in ("log_norms", "max_log_norms", "log_r_diagonal", "rates", "mean_rates"):
+        same = np.isclose(getattr(ours, series), getattr(theirs, series), rtol=1e-11, atol=1e-12, equal_nan=True)
+        assert same.all(), series
+    assert gpu.launches == [("advance", 64)]
+
+
 def test_interrupted_runs_have_the_states_so_far(gpu: EmulatedGpu) -> None:
     stepper, (q, p) = compiled("kepler", sc.SVI(4)), states("kepler")
     work = Ensemble(stepper, q, p, h=0.05, steps=200, device="cuda")
@@ -262,6 +276,12 @@ def test_unavailable_arguments_are_refused(gpu: EmulatedGpu) -> None:
         )
         refused("which has none: use with_events", sc.EventError, device=device, observe="events")
         refused("requires a fixed step size and events", h=None, steps=None, t_end=1.0, device=None, observe="energy")
+    for message, of in (
+        ("it must be 'cuda'", stepper),
+        ("require constant diagonal masses", compiled("kepler", sc.SCVI(2))),
+    ):
+        with pytest.raises((sc.StateError, sc.MethodError), match=message):
+            of.chaos_indicators_ensemble(*start, h=0.1, steps=5, count=1, device="cuda" if of is not stepper else "gpu")
     lobatto = compiled("kepler", sc.SCVI(2))
     refused("it requires trajectories in SIMD lanes", sc.MethodError, of=lobatto, device=None, observe="energy")
     refused("not available without trajectories in SIMD lanes", sc.MethodError, of=lobatto)
@@ -303,7 +323,7 @@ def test_code_of_the_page_runs(gpu: EmulatedGpu, monkeypatch: pytest.MonkeyPatch
     page = (ROOT / "docs" / "gpu.md").read_text(encoding="utf-8")
     monkeypatch.setitem(sys.modules, "cupy", np)
     exec("\n".join(part.text for part in runnable(page) if part.kind == "python"), {})
-    assert capsys.readouterr().out == "True (10,)\nTrue\nTrue (10, 2)\n"
+    assert capsys.readouterr().out == "True (10,)\nTrue\nTrue (10, 2)\n(6,)\n"
 
 
 def test_without_a_gpu_the_error_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -333,6 +353,18 @@ def test_nvrtc_compiles_kernels_within_registers(system: str, degree: int) -> No
         used = [int(number) for number in re.findall(r"Used (\d+) registers", log.getvalue())]
         spilled = [int(number) for number in re.findall(r"(\d+) bytes spill loads", log.getvalue())]
         assert (max(used), max(spilled)) <= LIMITS[system, degree]
+
+
+@pytest.mark.second
+def test_ptx_of_nvrtc_computes_the_same_growth_as_c(gpu: EmulatedGpu) -> None:
+    pytest.importorskip("cuda.core")
+    pytest.importorskip("cuda.bindings.nvrtc")
+    stepper, start = compiled("henon-heiles", sc.SVI(2)), states("henon-heiles")
+    by_c = stepper.chaos_indicators_ensemble(*start, h=0.2, steps=30, count=2, device="cuda")
+    gpu.by_nvrtc = True
+    by_ptx = stepper.chaos_indicators_ensemble(*start, h=0.2, steps=30, count=2, device="cuda")
+    assert np.array_equal(by_ptx.log_r_diagonal, by_c.log_r_diagonal)
+    assert np.array_equal(by_ptx.mean_rates, by_c.mean_rates)
 
 
 @pytest.mark.second

@@ -13,11 +13,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.native import building
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.binding import Binding
+from scvi_codegen.native.cuda import constant
 from scvi_codegen.native.options import SolverOptions, checked_options
+from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.chaos.growth import SERIES, Growth, ill_conditioned, r_factors
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
 from scvi_codegen.runtime.chaos.tangent_propagation import MOST as LARGEST_CHUNK
@@ -25,8 +27,10 @@ from scvi_codegen.runtime.chaos.tangent_propagation import InitialTangents, Step
 from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, States
+from scvi_codegen.runtime.ensemble.device import DeviceRuns
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, start_of_ensemble
 from scvi_codegen.runtime.ensemble.result import OK
+from scvi_codegen.runtime.ensemble.schedule import CommonSteps
 from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runtime.run.accuracy import warn_of_large_steps
 from scvi_codegen.runtime.run.memory import Memory
@@ -61,8 +65,10 @@ class ChaosIndicatorsEnsemble:
         t: float,
         parameters: EnsembleParameters,
         options: SolverOptions | None,
+        device: str | None = None,
     ) -> None:
         require(stepper, "chaos_ensemble")
+        self.device = device
         self.stepper, self.options = stepper, checked_options(options)
         self.h, steps = checked_step(h), checked_count(steps, "steps", least=1)
         self.save_every = steps if save_every is None else checked_count(save_every, "save_every", least=1)
@@ -83,7 +89,9 @@ class ChaosIndicatorsEnsemble:
         Trajectories without SIMD support, or whose SIMD steps failed, use the derivatives of single steps.
         """
         report, left = progress or (lambda _: None), np.arange(len(self.q))
-        if (binding := self._lanes()) is not None:
+        if self.device is not None:
+            left = self._on_device(report, threads)
+        elif (binding := self._lanes()) is not None:
             left = self._all_in_lanes(binding, report, threads)
         if len(left):
             self.stepper.tangent  # noqa: B018  (compiled once, before threads ask for it)
@@ -110,11 +118,35 @@ class ChaosIndicatorsEnsemble:
         if worst is not None:
             warn_of_large_steps(runs[worst], remedy=f" (trajectory {worst} of {len(self.q)})")
 
-    def _lanes(self) -> Binding | None:
-        """Return the compiled ensemble library with tangent vectors, or ``None``."""
+    def _source(self) -> Source | None:
+        """Return the source of an ensemble with tangent vectors, or ``None``."""
         if self.stepper.interface.constraints or self.stepper.interface.rotations:
             return None
-        source = self.stepper._variants[f"changes {self.values.shape[-1]}"]
+        return self.stepper._variants[f"changes {self.values.shape[-1]}"]
+
+    def _on_device(self, report: Callable[[int], None], threads: int | None) -> NDArray[np.intp]:
+        """Process all trajectories on a GPU; return those that failed."""
+        source = self._source()
+        if source is None or constant(source, f"{source.prefix.upper()}_NEEDS_VELOCITIES"):
+            raise MethodError(
+                f"chaos indicators on a GPU are not available for '{self.stepper.title}': they require constant "
+                "diagonal masses, forces of positions and time, and SVI or collocation; omit device"
+            )
+        count, steps, first = len(self.q), len(self.t) - 1, self._first(0)
+        growth = _ThreadGrowth(source, first, count)
+        plan = CommonSteps(self.t[0], self.h, steps=steps, t_end=None, inputs={}, save_every=self.save_every)
+        start = [np.hstack([x, np.tile(growth.frame(part), (count, 1))]) for part, x in enumerate((self.q, self.p))]
+        arguments = self.stepper, self.options, (start[0], start[1]), self.parameters
+        runs = DeviceRuns(*arguments, lambda _, part: self.parameters[part], plan, record=growth)
+        runs.run(progress=lambda done: report(done * count // steps), threads=threads)
+        ended = runs.done == steps
+        values = runs.device.copy_out(runs.q).reshape(len(plan.numbers), count, len(SERIES), -1)
+        self.values[:, :, ended] = values.transpose(2, 0, 1, 3)[:, :, ended]
+        return np.flatnonzero(~ended)
+
+    def _lanes(self) -> Binding | None:
+        """Return the compiled ensemble library with tangent vectors, or ``None``."""
+        source = self._source()
         return None if source is None else Binding(building.load(source, flags=self.stepper.flags), source.prefix)
 
     def _all_in_lanes(self, binding: Binding, report: Callable[[int], None], threads: int | None) -> NDArray[np.intp]:
@@ -217,6 +249,23 @@ def _factors(images: Array) -> tuple[Array, Array]:
         return np.asarray(orthonormal), np.asarray(upper)
     lengths = r_factors(images)
     return images / lengths, lengths
+
+
+class _ThreadGrowth:
+    """Growth of the same initial tangent vectors (2m, k) of K trajectories, in the memory of threads of a GPU."""
+
+    def __init__(self, source: Source, tangents: Array, count: int) -> None:
+        self.source, (self.orthonormal, triangle) = source, np.linalg.qr(tangents)
+        k = tangents.shape[1]
+        with np.errstate(divide="ignore"):  # linearly dependent directions span zero volume
+            diagonal = np.log(np.abs(np.diagonal(triangle)))
+        numbers = np.concatenate([np.zeros(2 * k), diagonal, np.zeros(3 * k), triangle.ravel()])
+        self.rows = np.tile(numbers[:, np.newaxis], count)
+        self.saved: Array | None = np.tile(numbers[: len(SERIES) * k], (count, 1))
+
+    def frame(self, part: int) -> Array:
+        """Return the (m k,) positions or momenta of the orthonormal tangent vectors, one after the other."""
+        return np.split(self.orthonormal, 2)[part].T.ravel()
 
 
 class _TangentLanes:

@@ -31,6 +31,7 @@ from scvi_codegen.runtime.core.compiled_method import OF_KNOWN_SIZES, Variants
 from scvi_codegen.runtime.core.features import check_together, require
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, Parameters, States, flat_state
+from scvi_codegen.runtime.ensemble.device import check_device, on_processor
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, momenta_of_each
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
@@ -442,6 +443,7 @@ class Stepper(Integrator):
         options: SolverOptions | None = None,
         progress: Callable[[int], None] | None = None,
         threads: int | None = None,
+        device: str | None = None,
     ) -> ChaosIndicators:
         """Return chaos indicators of K initial states over ``steps`` steps of size h.
 
@@ -455,6 +457,7 @@ class Stepper(Integrator):
             save_every: steps between saved values; by default only the last is saved.
             t, parameters, options, threads: as of :meth:`integrate_ensemble`.
             progress: called with the number of completed trajectories.
+            device: as of :meth:`integrate_ensemble`; results are on the processor, which repeats failed trajectories.
 
         Returns:
             :class:`ChaosIndicators` of shape (n, K, k): ``megno()[-1]`` has K values. A trajectory that fails has NaN
@@ -466,6 +469,9 @@ class Stepper(Integrator):
             StateError: if a shape, name or number is invalid.
         """
         q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
+        if device is not None:
+            check_device(device)
+            q, p, velocity, parameters = map(on_processor, (q, p, velocity, parameters))
         p = momenta_of_each(self, q, p, velocity, t, parameters)
         work = ChaosIndicatorsEnsemble(
             self,
@@ -479,6 +485,7 @@ class Stepper(Integrator):
             t=t,
             parameters=parameters,
             options=options,
+            device=device,
         )
         return work.run(progress=progress, threads=threads)
 

@@ -11,13 +11,13 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import MethodError, StateError
-from scvi_codegen.native.cuda import Device, constant, has_device_memory
+from scvi_codegen.native.cuda import DEVICES, Device, constant, has_device_memory
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.representation import one_line
@@ -39,6 +39,12 @@ HEAD = 4
 """Numbers in front of the memory of a trajectory: time, its low word, steps for the predictor, 1 while active."""
 
 
+def check_device(device: str) -> None:
+    """Raise ``StateError`` for an unknown device."""
+    if device not in DEVICES:
+        raise StateError(f"device is {device!r}: it must be {' or '.join(map(repr, DEVICES))}, or omitted")
+
+
 def on_processor(value: Any) -> Any:
     """Return a copy on the processor of an array of a GPU, alone or in a mapping; other values unchanged."""
     if isinstance(value, Mapping):
@@ -51,11 +57,28 @@ def options_of(options: SolverOptions) -> tuple[float, int, int]:
     return float(options.tolerance), int(options.max_iterations), int(options.absolute)
 
 
+class ThreadRecord(Protocol):
+    """What the threads of an ensemble record besides states, or instead of them.
+
+    Attributes:
+        source: of the ensemble.
+        rows: (numbers, k) initial values in the memory of the threads, which are replaced by the final ones.
+        saved: (k, numbers) initial values of what is saved instead of positions, or ``None``.
+    """
+
+    source: Source
+    saved: Array | None
+
+    @property
+    def rows(self) -> Array:
+        """Values in the memory of the threads, which change in place."""
+
+
 class DeviceRuns:
     """Trajectories with common fixed steps on a GPU; arguments as of :class:`CommonRuns`.
 
     Attributes:
-        q, p: (n, k, m) saved states, on the device.
+        q, p: (n, k, m) saved states, on the device; with a record that is saved instead, (n, k, numbers) and nothing.
         times, actions: ``None``: all trajectories have the same times, and no action is summed.
         status, done: as of :class:`CommonRuns`.
     """
@@ -71,15 +94,19 @@ class DeviceRuns:
         values_at: Callable[[float, slice], Array],
         steps: CommonSteps,
         observation: EnsembleObservation | None = None,
+        *,
+        record: ThreadRecord | None = None,
     ) -> None:
         self.stepper, self.options, self.start, self.steps = stepper, options or SolverOptions(), start, steps
         self.values_at, self.observation, self.device = values_at, observation, Device()
-        source = cast(Source, stepper.ensemble) if observation is None else observation.source
+        record = self.record = record or observation
+        source = cast(Source, stepper.ensemble) if record is None else record.source
         self.launch = self.device.kernels(source)
         count, self.m = map(int, start[0].shape)
-        self.count, device, shape = count, self.device, (len(steps.numbers), count, self.m)
-        self.q, self.p = device.empty(shape), device.empty(shape)
-        for initial, states in zip(start, (self.q, self.p), strict=True):
+        self.count, device = count, self.device
+        saved = start if record is None or record.saved is None else (record.saved, np.empty((0, 0)))
+        self.q, self.p = (device.empty((len(steps.numbers), *each.shape)) for each in saved)
+        for initial, states in zip(saved, (self.q, self.p), strict=True):
             device.copy_in(initial, states)
         self.parameters = device.copied(parameters if parameters.size else np.zeros((count, 1)))
         self.points = constant(source, "S")
@@ -103,9 +130,9 @@ class DeviceRuns:
 
     def _first_memory(self, parameters: Array) -> Array:
         """Return (numbers, k) initial memory of the threads."""
-        observed = np.empty((0, self.count)) if self.observation is None else self.observation.rows
-        memory = np.zeros((self.size + len(observed), self.count))
-        memory[self.size :] = observed
+        recorded = np.empty((0, self.count)) if self.record is None else self.record.rows
+        memory = np.zeros((self.size + len(recorded), self.count))
+        memory[self.size :] = recorded
         memory[0], memory[3] = self.steps.t0, 1.0
         for i, states in enumerate(self.start):
             memory[HEAD + i * self.m : HEAD + (i + 1) * self.m] = states.T
@@ -146,9 +173,10 @@ class DeviceRuns:
             drive(advance, self.steps.steps, first=FIRST_STEPS, growth=GROWTH, ended=lambda: False, progress=progress)
         finally:
             self.done = self.device.copy_out(self.counts)
-            if self.observation is not None:
-                self.observation.rows[:] = self.device.copy_out(self.memory)[self.size :]
-        self._continue(np.flatnonzero(self.done < self.steps.steps), threads)
+            if self.record is not None:
+                self.record.rows[:] = self.device.copy_out(self.memory)[self.size :]
+        if self.record is self.observation:
+            self._continue(np.flatnonzero(self.done < self.steps.steps), threads)
 
     def _enter(self, h: float, parameters: Array) -> None:
         """Set step size and parameters; a new step size invalidates the predictor."""
@@ -161,7 +189,7 @@ class DeviceRuns:
             device.copy_in(memory, self.memory)
 
     def _advance(self, begin: int, size: int, save_every: int) -> None:
-        rows = self.steps.row(begin) * self.count * self.m * self.q.dtype.itemsize
+        rows = self.steps.row(begin) * self.count * self.q.shape[2] * self.q.dtype.itemsize
         options = self.options
         states = (np.uint64(each.ptr + rows) for each in (self.q, self.p))
         numbers = options_of(options)

@@ -20,11 +20,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import EventError, StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, real_array
-from scvi_codegen.native.cuda import DEVICES
 from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.runtime.core.features import check_together, require
 from scvi_codegen.runtime.core.validation import Array, States, check_left_to_inputs, columns_of_inputs, parameter_index
-from scvi_codegen.runtime.ensemble.device import AdaptiveDeviceRuns, DeviceEnsemble, DeviceRuns, on_processor
+from scvi_codegen.runtime.ensemble.device import (
+    AdaptiveDeviceRuns,
+    DeviceEnsemble,
+    DeviceRuns,
+    check_device,
+    on_processor,
+)
 from scvi_codegen.runtime.ensemble.initial_states import (
     EnsembleParameters,
     checked_ensemble,
@@ -510,8 +515,7 @@ def _check_device(device: str | None, h: float | None, inputs: object, save_ever
     """Raise ``StateError`` for an unknown device, and for arguments that ensembles on a GPU do not have."""
     if device is None:
         return
-    if device not in DEVICES:
-        raise StateError(f"device is {device!r}: it must be {' or '.join(map(repr, DEVICES))}, or omitted")
+    check_device(device)
     check_together(device=device, **others)
     if h is None and (inputs is not None or save_every != 1):
         raise StateError(
