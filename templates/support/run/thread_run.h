@@ -75,8 +75,8 @@ static inline int starts_again(thread_memory *own, long long *guess, long long s
 
 /* Advances `count` trajectories from step number `begin`. memory: (4 + 4 M + 2 S M, count) numbers, and 5 OBSERVED or
  * (6 + TANGENTS) TANGENTS more; parameters: (count, P). Every `every` steps counted from the start states are stored in
- * rows of (count, M) numbers, or the growth of tangent vectors in rows of (count, 5 TANGENTS) numbers of q. done: numbers
- * of completed steps. */
+ * rows of (count, M) numbers, or the growth of tangent vectors in rows of (count, 5 TANGENTS) numbers of q. done: the
+ * numbers of completed steps. */
 KERNEL NAME(thread_advance)(long long count, long long begin, long long steps, long long every, double h,
     double tolerance, long long max_iterations, long long absolute, double *memory, const double *parameters, double *q,
     double *p, long long *done)
