@@ -27,7 +27,7 @@ from scvi_codegen.display.mathml import mathml_terms
 from scvi_codegen.errors import ArgumentError, ExpressionError, MethodError, StateError, closest
 from scvi_codegen.files.atomic import regular, write_text
 from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.formulas.rotations import Rotation, RotationNames
+from scvi_codegen.formulas.rotations import Rotation, RotationNames, Spin
 from scvi_codegen.formulas.symbols import input_parameters, symbol
 from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS
 from scvi_codegen.models.model import DEFAULT_METHOD, Model
@@ -401,15 +401,15 @@ def _description(shown: Page, interface: Any, *, initial: bool) -> dict[str, Any
 
 
 def _rotations(interface: Any) -> list[dict[str, Any]]:
-    """Return the columns and the names of the angular velocity of each rotation."""
+    """Return the columns and the names of the angular velocity of each rotation, and the columns of each spin."""
     return [
         {
             "name": each.name,
             "columns": [interface.coordinates.index(name) for name in each.coordinates],
-            "rates": [rate.name for rate in each.rates],
+            "rates": [rate.name for rate in each.rates] if isinstance(each, Rotation) else [],
         }
         for each in RotationNames.members_of(interface.rotations)
-        if isinstance(each, Rotation)
+        if isinstance(each, Rotation | Spin)
     ]
 
 

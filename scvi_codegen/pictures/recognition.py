@@ -26,6 +26,8 @@ LENGTHS = ("l", "L", "length")
 MAX_RODS = 6
 GENERIC = 0.3, 0.17
 """First angle, and difference between angles, of a state without accidental symmetry."""
+SPACING = 1.5
+"""Distance between the centers of bodies without positions."""
 DOTS = 100
 """Number of nodes up to which those of a chain are drawn as dots."""
 
@@ -253,30 +255,35 @@ def _difference(drawn: DrawnSystem, upper: Sequence[float], lower: Sequence[floa
 
 
 def _solids(drawn: DrawnSystem) -> MovingShape:
-    """Return a box for each rotation (a top if it is symmetric), an arrow for each direction and spin, at (x, y, z)."""
+    """Return a box for each rotation (a top if it is symmetric), an arrow for each direction and spin.
+
+    They are at (x, y, z), else several rotations, and members of arrays, are side by side.
+    """
     interface, program = drawn.interface, PointProgram(drawn.names)
-    names = interface.coordinates
-    centred = all(name in names for name in "xyz")
-    centre = Matrix([symbol(name) for name in "xyz"]) if centred else sympy.zeros(3, 1)
-    points = [program.point(centre)]
+    members = RotationNames.members_of(interface.rotations)
+    moving = all(name in drawn.coordinates for name in "xyz")
+    apart = SPACING if not moving and (drawn.shapes or isinstance(members[-1], Rotation)) else 0
+    points: list[list[int]] = []
     marks: list[dict[str, Any]] = []
     solids, trails = [], []
-    for number, member in enumerate(RotationNames.members_of(interface.rotations)):
-        values, first = member.values(), len(points)
+    for number, member in enumerate(members):
+        centre = Matrix([symbol(name) for name in "xyz"] if moving else [apart * number, 0, 0])
+        points.append(program.point(centre))
+        values, place, first = member.values(), len(points) - 1, len(points)
         if isinstance(member, Rotation):
             matrix = Matrix(3, 3, [values[each] for each in member.entries])
             points += [program.point(centre + matrix[:, axis]) for axis in range(3)]
             symmetric = f"body momentum 3 of {member.name}" in interface.map_names
             kind = "top" if symmetric else "box"
-            marks.append({"kind": kind, "points": [0, first, first + 1, first + 2], "color": number})
+            marks.append({"kind": kind, "points": [place, first, first + 1, first + 2], "color": number})
             marks.append({"kind": "body", "points": [first + 2], "mass": 0.1, "color": number + 1})
         else:
             vector = Matrix([values[each] for each in member.entries])
             length = intermediate(sympy.sqrt(sympy.Add(*(each**2 for each in vector))))
             points.append(program.point(centre + vector / length))
-            marks.append({"kind": "arrow", "points": [0, first], "color": number})
+            marks.append({"kind": "arrow", "points": [place, first], "color": number})
         trails.append(len(points) - 1)
-        solids.append({"name": member.name, "centre": 0, "tip": trails[-1]})
+        solids.append({"name": member.name, "centre": place, "tip": trails[-1]})
     return MovingShape(dimension=3, points=points, program=program.entries, marks=marks, trails=trails, solids=solids)
 
 

@@ -162,7 +162,7 @@ class DrawnSystem:
     @property
     def coordinates(self) -> list[str]:
         """Names of the coordinates, ``q_0_1`` of the entries of arrays."""
-        if not self.shapes:
+        if self.interface.coordinates:
             return [*self.interface.coordinates]
         return [
             "_".join(map(str, (name, *index))) for name, shape in self.shapes.items() for index in np.ndindex(*shape)
@@ -211,7 +211,11 @@ def shape_of_picture(drawn: DrawnSystem, picture: Mapping[str, Any], where: str 
     Raises:
         ModelFileError: for unknown keys and points, and formulas that are wrong.
     """
-    if drawn.mesh is not None and isinstance(picture, Mapping) and [*picture] == ["fields"]:
+    if isinstance(picture, Mapping) and "fields" in picture:
+        if drawn.mesh is None or len(picture) > 1:
+            raise ModelFileError(
+                f"{where}: fields chooses what is drawn of a field on a mesh, without other keys: omit it"
+            )
         return _chosen_fields(drawn, _listed(picture, "fields", where), f"{where} fields")
     if not isinstance(picture, Mapping) or not isinstance(picture.get("points"), Mapping) or not picture["points"]:
         raise ModelFileError(

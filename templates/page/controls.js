@@ -82,7 +82,8 @@ if (!about.initial && about.ranges) {
     addSlider("Initial values", set(momentum || name, kind === "v" && !momentum), momentum || (kind === "q" ? name : `Velocity of ${name}`), { low, high, hard: false, get: () => settings[kind][k], set: (x) => { settings[kind] = settings[kind].with(k, x); restart(); } });
   });
 }
-about.rotations.forEach(addRotation);
+const turned = about.rotations.filter(({ rates }) => rates.length); // spins have no sliders
+turned.forEach(addRotation);
 for (const [title, box] of Object.entries(groups)) if (sliders.length > 24 && /^(Initial|Rotation) /.test(title)) box.open = false;
 
 /** Adds sliders of a rotation: the angles of R = Rz Ry Rx, which keep the velocity in the body, and the angular velocity there. */
@@ -92,18 +93,18 @@ function addRotation({ name, columns, rates }) {
   const attitude = () => columns.map((c) => settings.q[c]), motionOf = () => columns.map((c) => settings.v[c]);
   const omega = () => product(inverse(attitude()), motionOf()).slice(1).map((u) => 2 * u);
   const put = (q, v) => { columns.forEach((c, k) => { settings.q = settings.q.with(c, q[k]); settings.v = settings.v.with(c, v[k]); }); restart(); };
-  const turned = (angles) => angles.map((u, axis) => [Math.cos(u / 2), ...[0, 1, 2].map((k) => (k === axis ? Math.sin(u / 2) : 0))]).reduce((q, factor) => product(factor, q));
+  const quaternionOf = (angles) => angles.map((u, axis) => [Math.cos(u / 2), ...[0, 1, 2].map((k) => (k === axis ? Math.sin(u / 2) : 0))]).reduce((q, factor) => product(factor, q));
   let chosen = [0, 0, 0]; // at a pitch of pi/2 the attitude does not determine the angles
   const angles = () => {
-    const [w, x, y, z] = unit(attitude()), [a, b, c, d] = turned(chosen);
+    const [w, x, y, z] = unit(attitude()), [a, b, c, d] = quaternionOf(chosen);
     if (Math.abs(w * a + x * b + y * c + z * d) < 1 - 1e-12) chosen = [Math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)), Math.asin(clamped(2 * (w * y - z * x), -1, 1)), Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))];
     return chosen;
   };
-  const title = about.rotations.length > 1 ? `Rotation ${name}` : "Initial values";
+  const title = turned.length > 1 ? `Rotation ${name}` : "Initial values";
   ["x", "y", "z"].forEach((letter, axis) => addSlider(title, `angle ${letter}`, `Angle of ${name} about ${letter}`, {
     low: axis === 1 ? -Math.PI / 2 : -Math.PI, high: axis === 1 ? Math.PI / 2 : Math.PI, get: () => angles()[axis],
     set: (x) => {
-      const next = angles().with(axis, x), size = Math.hypot(...attitude()), q = turned(next).map((u) => u * size);
+      const next = angles().with(axis, x), size = Math.hypot(...attitude()), q = quaternionOf(next).map((u) => u * size);
       chosen = next; put(q, product(product(q, inverse(attitude())), motionOf()));
     },
   }));

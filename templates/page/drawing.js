@@ -168,7 +168,7 @@ const marked = () => {
     });
   };
   const bodies = Object.fromEntries(["box", "top"].map((kind) => [kind, faces(kind, 1, hue(0))]));
-  const centred = shape.solids.length && constant(shape.solids[0].centre);
+  const centred = shape.solids.length && shape.solids.every(({ centre }) => constant(centre) && String(shape.points[centre]) === String(shape.points[shape.solids[0].centre]));
   const bonded = shape.marks.some(({ kind }) => kind === "bonds");
   const heaviest = () => Math.max(...shape.marks.map(({ mass }) => (mass === undefined ? 0 : Math.abs(value(mass))))) || 1;
   return {

@@ -51,7 +51,7 @@ function addPanel(title, draw) {
   return panel;
 }
 const [solid] = shape.solids;
-const defaults = about.plots.length ? about.plots : [solid ? [`${solid.name}.y`, `${solid.name}.x`] : m <= WHOLE && about.coordinates.length ? ((k) => (k < 0 ? [about.coordinates[0], "t"] : [about.momenta[k] || "t", about.coordinates[k]]))(about.coordinates.findIndex((_, k) => !about.rotations.some(({ columns }) => columns.includes(k)))) : [`q.${probes[0]}`, "t"]];
+const defaults = about.plots.length ? about.plots : [solid && m <= WHOLE && about.coordinates.length ? [`${solid.name}.y`, `${solid.name}.x`] : m <= WHOLE && about.coordinates.length ? ((k) => (k < 0 ? [about.coordinates[0], "t"] : [about.momenta[k] || "t", about.coordinates[k]]))(about.coordinates.findIndex((_, k) => !about.rotations.some(({ columns }) => columns.includes(k)))) : [`q.${probes[0]}`, "t"]];
 for (const [y, x] of defaults) {
   const shown = { y: named(y, 2), x: named(x, 0) };
   const panel = addPanel("Plot of two variables", ({ canvas }) => {

@@ -98,6 +98,14 @@ def test_pictures_of_arrays_and_rotations_use_entries():
     model = sc.Model(system=body, method="svi:2", q=[0.5, 0.5, 0.5, 0.5], velocity=[0.0] * 4, h=0.1, steps=1)
     shape = shape_of_picture(drawn_system_of_model(model), {"points": {"a": ["R_11", "R_21", "R_31"], "o": [0, 0, 0]}})
     assert np.allclose(shape.positions(0.0, np.array([[0.5] * 4]), np.zeros((1, 4)), ())[0, 0], [0, 1, 0])
+    pair = sc.LagrangianSystem.from_text(
+        "pair", rotations={"R[2]": "w"}, lagrangian="sum(i in 2, w_1[i]**2 + w_2[i]**2 + w_3[i]**2)"
+    )
+    model = sc.Model(system=pair, method="svi:2", q=[0.5] * 8, velocity=[0.0] * 8, h=0.1, steps=1)
+    shape = shape_of(drawn_system_of_model(model))
+    (state,) = shape.positions(0.0, np.array([[0.5] * 8]), np.zeros((1, 8)), ())
+    assert np.allclose(state[4:], np.add(state[:4], [1.5, 0, 0]))  # side by side
+    assert np.allclose(state[:4], [[0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0]])
 
 
 @pytest.mark.second
@@ -118,8 +126,12 @@ def test_bonds_of_a_table_are_lines_and_momenta_of_a_field_are_drawn():
     x, values = shape.positions(np.zeros(1), q, p, ())[0].T
     assert x[values.argmax()] == pytest.approx(-4.3, abs=0.3)  # the high soliton, of height one half, of u/2 1.2
     assert np.allclose(values, p / 32 * 63, rtol=1e-12)
-    with pytest.raises(sc.ModelFileError, match=r"fields: there is no 'r'.* Known: q, p"):
-        shape_of_picture(drawn_system_of_model(kdv), {"fields": ["r"]})
+    for picture, message in (
+        ({"fields": ["r"]}, r"fields: there is no 'r'.* Known: q, p"),
+        ({"fields": ["p"], "rods": []}, "without other keys: omit it"),
+    ):
+        with pytest.raises(sc.ModelFileError, match=message):
+            shape_of_picture(drawn_system_of_model(kdv), picture)
 
 
 NODE = """
